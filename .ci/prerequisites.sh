@@ -439,8 +439,10 @@ for need; do
         cargo_deb
         ;;
     vm)
+        other=aarch64
+        [ "$(dpkg --print-architecture)" = amd64 ] || other=x86-64
         packages clang mmdebstrap arch-test qemu-system-arm qemu-system-x86 qemu-user-static e2fsprogs make \
-            g++-x86-64-linux-gnu g++-aarch64-linux-gnu libfastrtps-dev cyclonedds-dev cyclonedds-tools
+            g++ "g++-$other-linux-gnu" libfastrtps-dev cyclonedds-dev cyclonedds-tools
         rust
         musl x86_64 aarch64
         ;;

@@ -2,7 +2,6 @@
 // callbacks of a topic or a node.
 
 import { count, duration, percent, rate } from './format.js';
-import { html, Name } from './ui.js';
 
 /** Returns a table's rows as cells: text, or numbers that are already printed.
  * @param {any} inside @returns {[string, string[], [string, ...string[]][]][]} */
@@ -35,28 +34,17 @@ export function tables(inside) {
   return all.filter(([, , rows]) => rows.length > 0);
 }
 
+/** Says why nothing is shown yet. @param {any} answer null before the first one */
+export function waiting(answer) {
+  if (!answer) return 'The agent begins to observe calls.';
+  if (answer.mode === 'off') return 'The agent observes no calls: capture.inside is off.';
+  return answer.reason ?? 'No call has been observed yet.';
+}
+
 /** @param {any} it */
 function trigger(it) {
   if (it.kind === 'timer') {
     return it.period_seconds == null ? 'timer' : `timer ${duration(it.period_seconds)}`;
   }
   return it.name ? (it.kind === 'service' ? `service ${it.name}` : it.name) : it.kind;
-}
-
-/** @param {{inside: any}} props */
-export function Inside({ inside }) {
-  const shown = inside ? tables(inside) : [];
-  if (!shown.length && !inside?.lifecycle_state) return null;
-  return html`<section aria-labelledby="inside"><h2 id="inside">Inside the processes</h2>
-    ${inside.lifecycle_state && html`<p>Lifecycle state: <${Name}
-      text=${inside.lifecycle_state} /></p>`}
-    ${inside.busy_ratio != null && html`<p>Its callbacks take ${percent(inside.busy_ratio)} of the
-      time.</p>`}
-    ${shown.map(([title, head, rows]) => html`<div class="scroll" key=${title} tabindex="0"
-      role="group" aria-label=${title}><table><caption>${title}</caption><thead><tr>${head.map(
-      (name, at) => html`<th scope="col" class=${at > 1 ? 'number' : ''}>${name}</th>`)}</tr></thead>
-      <tbody>${rows.map((row, place) => html`<tr key=${place}>${row.map((cell, at) => at === 0
-        ? html`<th scope="row"><${Name} text=${cell} /></th>` : at === 1
-          ? html`<td><${Name} text=${cell} /></td>` : html`<td class="number">${cell}</td>`)}</tr>`)}
-      </tbody></table></div>`)}</section>`;
 }

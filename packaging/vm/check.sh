@@ -3,7 +3,6 @@
 # directory with the package, the demo robot, peers in C++ and the scripts.
 cd "$(dirname "$0")" || exit 1
 . ./lib.sh
-override=/etc/systemd/system/ros2probe.service.d
 source=${SOURCE:-host}
 
 active() {
@@ -77,27 +76,89 @@ END
         [ "$lost" -ge 75 ] && [ "$causes" = "before_host $lost" ]
 }
 
-# Every message in Fast DDS's shared memory, by a uprobe, with the lines of docs/shared-memory.md. Of
-# messages in several pieces, sampling misses most.
-exactly() {
-    mkdir -p $override
-    cat >$override/override.conf <<END
-[Service]
-CapabilityBoundingSet=CAP_SYS_ADMIN CAP_SYS_PTRACE
-AmbientCapabilities=CAP_SYS_ADMIN CAP_SYS_PTRACE
-SystemCallFilter=perf_event_open
-END
-    sed -i 's/^  # shm: .*/  shm: {exact: uprobe}/' $config
-    systemctl daemon-reload
-    restart
+# A recording has every message of Fast DDS's shared memory, with the packaged configuration: the
+# broker attaches for the agent. Of messages in several pieces, sampling misses most. Nothing is left
+# in a process after the agent and the broker were killed.
+recorded() {
+    rm -rf bag
+    rp bag record -o bag "/$1" >record.log 2>&1 &
+    recorder=$!
+    begun() { grep -q 'Recording' record.log; }
+    wait_until 20 begun
     counted ./fastdds "$@" --transport default
     status=$?
-    figure="sent $published, counted $messages, received $received"
-    rm $override/override.conf
-    cp config.before $config
-    systemctl daemon-reload
-    restart
+    kill -INT $recorder
+    wait $recorder
+    in_bag=$(rp bag info bag | sed -n 's/^Messages: *\([0-9]*\).*/\1/p')
+    figure="sent $published, received $received, in the bag $in_bag"
+    [ $status = 0 ] && [ "$in_bag" = "$published" ]
+}
+# A default robot of Fast DDS with six topics, small and frequent to large and rare, in one recording: in
+# the bag is what each publisher sent.
+six_topics() {
+    rm -rf bag6 six_*.jsonl
+    set -- 64:250 320:100 4000:50 150000:10 700000:5 2700000:1
+    topics= peers=
+    for each; do topics="$topics /six_${each%:*}"; done
+    # shellcheck disable=SC2086
+    rp bag record -o bag6 $topics >record.log 2>&1 &
+    recorder=$!
+    begun() { grep -q 'Recording' record.log; }
+    wait_until 20 begun
+    for each; do
+        size=${each%:*} rate=${each#*:}
+        stream="--topic /six_$size --size $size --reliable --transport default"
+        # shellcheck disable=SC2086
+        ./fastdds --role sub $stream --log "six_sub_$size.jsonl" >/dev/null 2>&1 &
+        peers="$peers $!"
+        # shellcheck disable=SC2086
+        timeout 120 ./fastdds --role pub $stream --rate "$rate" --count $((rate * 20)) --linger 10 \
+            --log "six_pub_$size.jsonl" >/dev/null 2>&1 &
+        peers="$peers $!"
+    done
+    all_sent() {
+        for each; do
+            [ "$(grep -c '"ev":"pub"' "six_pub_${each%:*}.jsonl" 2>/dev/null)" = $((${each#*:} * 20)) ] || return 1
+        done
+    }
+    wait_until 60 all_sent "$@"
+    status=$?
+    sleep 3
+    kill -INT $recorder
+    wait $recorder
+    figure=
+    for each; do
+        size=${each%:*}
+        published=$(grep -c '"ev":"pub"' "six_pub_$size.jsonl")
+        in_bag=$(rp bag info bag6 | sed -n "s/.*Topic: \/six_$size |.*Count: \([0-9]*\).*/\1/p")
+        [ "$published" = "${in_bag:-0}" ] || status=1
+        figure="$figure${figure:+, }$size B: ${in_bag:-0} of $published"
+    done
+    # shellcheck disable=SC2086
+    kill -INT $peers 2>/dev/null
+    # shellcheck disable=SC2086
+    wait $peers
     return $status
+}
+# The broker's unit ends when nothing is read.
+broker_rests() {
+    rests() { ! systemctl --quiet is-active ros2probe-attach.service; }
+    wait_until 30 rests
+    status=$?
+    level=$(systemd-analyze security --no-pager ros2probe-attach.service 2>/dev/null | sed -n 's/.*exposure level for .*: \([0-9.]*\) .*/\1/p')
+    figure="$(systemctl is-active ros2probe-attach.socket), $(systemctl is-active ros2probe-attach.service), exposure level ${level:-unknown}"
+    return $status
+}
+# With a masked socket, shared memory is sampled and the reason is reported.
+masked() {
+    systemctl --quiet mask --now ros2probe-attach.socket 2>/dev/null
+    restart
+    reason=$(page | grep '^ros2probe_capture_ability{.*shared_memory_exact' | head -1)
+    figure="$reason"
+    systemctl --quiet unmask ros2probe-attach.socket 2>/dev/null
+    systemctl start ros2probe-attach.socket
+    restart
+    [ "${reason##* }" = 0 ]
 }
 
 stop_peers() {
@@ -254,7 +315,11 @@ if [ "$source" = host ]; then
     check "Fast DDS, UDP" at_sockets ./fastdds fast 320 100 1000 --reliable --transport udp
     check "Cyclone DDS" at_sockets ./cyclonedds cyclone 320 100 1000 --reliable
     check "nothing missed at the sockets" complete
-    check "Fast DDS, shared memory, uprobe" exactly exact 150000 10 100 --reliable
+    check "Fast DDS, shared memory, recorded" recorded exact 150000 10 100 --reliable
+    check "Fast DDS, shared memory, 2.7 MB, recorded" recorded large_exact 2700000 5 50 --reliable
+    check "Fast DDS by default, six topics, recorded" six_topics
+    check "the broker rests" broker_rests
+    check "the broker masked" masked
 fi
 check "rp doctor" explained
 if [ "$(stat -fc %T /sys/fs/cgroup)" = tmpfs ]; then

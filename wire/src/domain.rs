@@ -11,6 +11,33 @@ impl DomainId {
     pub const MAX: Self = Self(232);
 }
 
+/// A number is no domain id.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct InvalidDomainId(pub u32);
+
+impl fmt::Display for InvalidDomainId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self(number) = self;
+        let most = DomainId::MAX;
+        write!(f, "domain_id is {number}, must be between 0 and {most}")
+    }
+}
+
+impl core::error::Error for InvalidDomainId {}
+
+impl TryFrom<u32> for DomainId {
+    type Error = InvalidDomainId;
+
+    /// # Errors
+    /// Fails if UDP has no ports for this domain.
+    fn try_from(number: u32) -> Result<Self, InvalidDomainId> {
+        let id = Self(number);
+        (id <= Self::MAX)
+            .then_some(id)
+            .ok_or(InvalidDomainId(number))
+    }
+}
+
 impl fmt::Display for DomainId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         self.0.fmt(f)

@@ -46,7 +46,7 @@ pub mod walk;
 pub mod zenoh;
 
 pub use cursor::{Cursor, Endianness, Reason, WireError};
-pub use domain::DomainId;
+pub use domain::{DomainId, InvalidDomainId};
 pub use expansion::{ExpandsTooFar, Expansion};
 pub use guid::{EntityId, Guid, GuidPrefix};
 pub use record::Record;

@@ -41,18 +41,18 @@ pub enum Diagnosis<'a> {
         participants: Vec<String>,
     },
     /// A writer without a matching reader.
-    UnheardPublisher {
+    UnmatchedPublisher {
         /// GUID of the writer.
         writer: String,
         /// The nearest mismatch: an endpoint with other QoS (`qos`), of another `type`, or in
-        /// another `partition`; `nobody` if the topic has no reader.
+        /// another `partition`; `no_endpoint` if the topic has no reader.
         reason: Cow<'static, str>,
     },
     /// A reader without a matching writer.
-    UnfedSubscriber {
+    UnmatchedSubscription {
         /// GUID of the reader.
         reader: String,
-        /// The nearest mismatch: `qos`, `type` or `partition`; `nobody` if the topic
+        /// The nearest mismatch: `qos`, `type` or `partition`; `no_endpoint` if the topic
         /// has no writer.
         reason: Cow<'static, str>,
     },
@@ -148,8 +148,8 @@ impl Diagnosis<'_> {
             Self::TypeConflict { .. } => "type_conflict",
             Self::TypeHashConflict { .. } => "type_hash_conflict",
             Self::DuplicateNode { .. } => "duplicate_node",
-            Self::UnheardPublisher { .. } => "unheard_publisher",
-            Self::UnfedSubscriber { .. } => "unfed_subscriber",
+            Self::UnmatchedPublisher { .. } => "unmatched_publisher",
+            Self::UnmatchedSubscription { .. } => "unmatched_subscription",
             Self::HangingCall { .. } => "hanging_call",
             Self::NodeInSeveralDomains { .. } => "node_in_several_domains",
             Self::SlowCallback { .. } => "slow_callback",

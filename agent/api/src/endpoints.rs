@@ -4,6 +4,7 @@ use std::borrow::Cow;
 
 use serde::{Deserialize, Serialize};
 
+use crate::latched::Latched;
 use crate::measurement::Measurement;
 
 /// A writer or reader.
@@ -41,6 +42,9 @@ pub struct Endpoint<'a> {
     pub first_seen_timestamp_seconds: f64,
     /// Counts and times of this writer; null for readers and for topics that are not watched.
     pub measurement: Option<Measurement>,
+    /// The last message of this writer, if it is transient local and the agent keeps such messages;
+    /// null for readers and for other writers.
+    pub latched: Option<Latched>,
 }
 
 /// Quality of service as announced. A null duration is infinite.

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 pub struct Inside<'a> {
     /// Unix time of the state that this answer describes.
     pub timestamp_seconds: f64,
-    /// Mode of the source: `off`, `topics` or `full`.
+    /// Mode of the source: `off`, `topics`, `full` or `auto`.
     pub mode: Cow<'a, str>,
     /// Why the source shows nothing although it is switched on; null if it works, or is `off`.
     pub reason: Option<Cow<'a, str>>,
@@ -29,7 +29,7 @@ pub struct Inside<'a> {
     pub reader_queues: Vec<ReaderQueue<'a>>,
     /// Buffers of subscriptions within a process, in Iron and later.
     pub buffers: Vec<Buffer<'a>>,
-    /// Callbacks, in the mode `full`.
+    /// Callbacks, in the modes `full` and `auto`.
     pub callbacks: Vec<Callback<'a>>,
     /// Last known lifecycle state of each managed node.
     pub lifecycle_states: Vec<LifecycleState<'a>>,

@@ -25,6 +25,7 @@ pub mod events;
 pub mod graph;
 pub mod health;
 pub mod inside;
+pub mod latched;
 pub mod live;
 pub mod measurement;
 pub mod messages;

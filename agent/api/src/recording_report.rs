@@ -7,6 +7,8 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use crate::latched::Latched;
+
 /// The reason in [`Report::unobserved`] for a topic without a subscriber; such a topic is complete.
 pub const NO_SUBSCRIBER: &str = "no_subscriber";
 
@@ -32,6 +34,9 @@ pub struct Report {
     /// Topics that keep samples for late joiners (transient local) and whose samples from before
     /// the recording are not in the bag.
     pub sent_before: Vec<String>,
+    /// Of these topics, what became of a publisher's last message, which the agent may keep.
+    #[serde(default)]
+    pub latched: BTreeMap<String, Latched>,
     /// Topics that are not recorded because they have several types; a bag stores one type per
     /// topic.
     pub left_out: Vec<String>,

@@ -201,6 +201,10 @@ pub struct Reason {
     pub detail: String,
 }
 
+/// Why a published topic is silent that has no subscriber, in words, for each surface on which a
+/// client waits for its messages.
+pub const UNSUBSCRIBED: &str = "no subscriber exists, so nothing is sent";
+
 /// Why some or all messages of a topic are not observed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]

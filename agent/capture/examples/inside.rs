@@ -11,12 +11,12 @@ use std::os::fd::AsRawFd as _;
 use std::ptr;
 use std::time::Duration;
 
+use ros2probe_attach::client::Broker;
+use ros2probe_attach::library;
 use ros2probe_capture::breakpoints::Means;
 use ros2probe_capture::inside::programs;
 use ros2probe_capture::inside::table::ProcessTable;
-use ros2probe_capture::memory_reader::read_memory;
 use ros2probe_capture::system::Clocks;
-use ros2probe_capture::uprobe::library;
 use ros2probe_wire::inside::kind;
 
 /// Calls of each function.
@@ -48,10 +48,10 @@ fn main() {
 }
 
 fn check(library: &str, has_callbacks: bool) -> Result<String, Box<dyn Error>> {
-    let (mut programs, mut tables) = programs::load(has_callbacks, None, Means::of_this_kernel())?;
+    let (programs, mut tables) = programs::load(has_callbacks, None, Means::of_this_kernel())?;
     tables.set_clocks(&Clocks::read())?;
     let file = File::open(library)?;
-    let attached = programs.attach(&file)?;
+    let attached = programs.attach_here(&file)?;
     let names = ["publish", "take", "start", "end"].map(|name| match name {
         "publish" => "ros_trace_rcl_publish",
         "take" => "ros_trace_rmw_take",
@@ -104,12 +104,13 @@ fn check(library: &str, has_callbacks: bool) -> Result<String, Box<dyn Error>> {
     if counts != [CALLS, CALLS, callbacks] {
         return Err(format!("counted {counts:?}").into());
     }
-    let mut table = ProcessTable::new(has_callbacks, Box::new(read_memory));
+    let mut table = ProcessTable::new(has_callbacks);
     let second = Duration::from_secs(1);
-    let round = table.round(&mut tables, &Clocks::read(), second, |_| false);
+    let mut broker = Broker::here();
+    let round = table.round(&mut tables, &Clocks::read(), second, &mut broker, |_| false);
     drop(attached);
     let alone = times(message);
-    let after = table.round(&mut tables, &Clocks::read(), second, |_| false);
+    let after = table.round(&mut tables, &Clocks::read(), second, &mut broker, |_| false);
     Ok(format!(
         "{counts:?} of {CALLS} counted, {} calls, {} after the probes were removed; four calls take \
          {watched} ns with probes and {alone} ns without (median / 99th percentile)",

@@ -6,7 +6,7 @@
 
 use std::collections::{HashMap, VecDeque};
 
-use ros2probe_model::bounded::{Bounded, Sum};
+use ros2probe_model::facts::bounded::{Bounded, Sum};
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::record::{Body, Record, flag};
 

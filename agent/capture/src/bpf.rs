@@ -6,6 +6,7 @@ use std::os::fd::{AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
 
 use aya_obj::Function;
 use libc::c_int;
+use ros2probe_attach::kernel::TRACE_UPROBE_MULTI;
 
 /// Commands of `linux/bpf.h`.
 const MAP_LOOKUP_ELEM: c_int = 1;
@@ -15,9 +16,8 @@ const BTF_LOAD: c_int = 18;
 const LINK_CREATE: c_int = 28;
 const ITER_CREATE: c_int = 33;
 
-/// Type of programs at functions, and the attach type of those that one link puts at many.
+/// Type of programs at functions.
 const PROG_TYPE_KPROBE: u32 = 2;
-const TRACE_UPROBE_MULTI: u32 = 48;
 
 /// Attributes of `BPF_PROG_LOAD`.
 #[repr(C)]
@@ -54,24 +54,6 @@ struct TypesAttributes {
     unused: u32,
 }
 
-/// Attributes of `BPF_LINK_CREATE` for functions of a file.
-#[repr(C)]
-#[derive(Default)]
-struct FunctionsAttributes {
-    program: u32,
-    target: u32,
-    attach_type: u32,
-    flags: u32,
-    path: u64,
-    offsets: u64,
-    reference_counters: u64,
-    cookies: u64,
-    count: u32,
-    function_flags: u32,
-    process: u32,
-    unused: u32,
-}
-
 /// Attributes of `BPF_MAP_UPDATE_ELEM`.
 #[repr(C)]
 struct UpdateAttributes {
@@ -96,7 +78,7 @@ pub(crate) fn load_types(types: &[u8]) -> io::Result<OwnedFd> {
     unsafe { descriptor(BTF_LOAD, &attributes) }
 }
 
-/// Loads a program for [`link_functions`], which aya 0.14 cannot. `license`: as in the object.
+/// Loads a program for [`link_functions`](ros2probe_attach::kernel::link_functions), which aya 0.14 cannot. `license`: as in the object.
 /// `types`: of the object; without them the kernel verifies each global function with its callers.
 ///
 /// # Errors
@@ -130,31 +112,6 @@ pub(crate) fn load_for_functions(
     }
     // SAFETY: instructions, license and functions outlive the call.
     unsafe { descriptor(PROG_LOAD, &attributes) }
-}
-
-/// Puts a program of [`load_for_functions`] at instructions of a file in all processes, with one
-/// cookie for each (Linux 6.6). Closing the descriptor removes them together.
-///
-/// # Errors
-/// Fails if the kernel has no such links, or if an offset is not an instruction.
-pub(crate) fn link_functions(
-    program: BorrowedFd<'_>,
-    path: &CStr,
-    offsets: &[u64],
-    cookies: &[u64],
-) -> io::Result<OwnedFd> {
-    assert_eq!(offsets.len(), cookies.len(), "one cookie for each offset");
-    let attributes = FunctionsAttributes {
-        program: number(program),
-        attach_type: TRACE_UPROBE_MULTI,
-        path: address(path.as_ptr()),
-        offsets: address(offsets.as_ptr()),
-        cookies: address(cookies.as_ptr()),
-        count: length(offsets)?,
-        ..FunctionsAttributes::default()
-    };
-    // SAFETY: path, offsets and cookies outlive the call.
-    unsafe { descriptor(LINK_CREATE, &attributes) }
 }
 
 /// Sets an entry of an array of programs.

@@ -4,49 +4,27 @@
 //! one function, and needs no capability beyond those that load a program. Earlier kernels have a
 //! perf event for each function, which now needs CAP_SYS_ADMIN, and of which each removal takes
 //! 0.1 s. Either is removed by the kernel when its descriptor is closed, however this process ends.
+//!
+//! This process loads the programs. The broker attaches them, and returns the descriptors.
 
-use std::collections::{BTreeMap, HashSet};
-use std::ffi::{CStr, CString};
+use std::collections::HashSet;
 use std::fs::File;
-use std::io;
 use std::os::fd::{AsFd as _, AsRawFd as _, BorrowedFd, OwnedFd};
-use std::path::Path;
 
 use aya::Ebpf;
 use aya::maps::{Map, MapData};
 use aya::programs::UProbe;
-use aya::programs::uprobe::{UProbeLink, UProbeScope};
 use aya_obj::Object;
+use ros2probe_attach::attach::{self, AttachError};
+use ros2probe_attach::client::Broker;
+use ros2probe_attach::functions::Calls;
+use ros2probe_attach::request::Place;
 
 use crate::bpf;
 use crate::filter::FilterError;
-use crate::tracepoints::release;
+use crate::uprobe::attachments::Refusal;
 
-/// File in which the kernel announces uprobes. Without it aya falls back to older interfaces, whose
-/// probes outlive a killed process.
-const KIND: &str = "/sys/bus/event_source/devices/uprobe/type";
-/// First release with links of many functions.
-const HAS_LINKS: (u32, u32) = (6, 6);
-
-/// How programs are put at functions.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Means {
-    /// One link for all functions of a library.
-    Links,
-    /// One perf event for each function.
-    PerfEvents,
-}
-
-impl Means {
-    /// Returns the best that this kernel has.
-    #[must_use]
-    pub fn of_this_kernel() -> Self {
-        match release() {
-            Some(release) if release >= HAS_LINKS => Self::Links,
-            _ => Self::PerfEvents,
-        }
-    }
-}
+pub use ros2probe_attach::request::Means;
 
 /// A program that calls the others by the cookie of a function: their place in an array.
 #[derive(Clone, Copy)]
@@ -58,13 +36,11 @@ pub(crate) struct Dispatcher {
 /// Programs in the kernel, and the maps that remain of their object.
 pub(crate) struct Breakpoints {
     pub(crate) ebpf: Ebpf,
-    /// The programs, unless aya has loaded them.
-    links: Option<Linked>,
-}
-
-/// Programs for links.
-struct Linked {
-    programs: BTreeMap<&'static str, OwnedFd>,
+    /// Functions that have a loaded program.
+    pub(crate) calls: Calls,
+    means: Means,
+    /// Programs for links, in the order of [`Calls::programs`]. aya has those for perf events.
+    linked: Vec<OwnedFd>,
     dispatching: Option<Dispatching>,
 }
 
@@ -76,44 +52,45 @@ struct Dispatching {
 }
 
 /// The breakpoints in one library; dropping them removes them.
-pub(crate) enum Attached {
-    /// One link, or one for each program without a dispatcher.
-    Links { _links: Vec<OwnedFd> },
-    /// One perf event for each function.
-    PerfEvents { _links: Vec<UProbeLink> },
+pub struct Attached {
+    _descriptors: Vec<OwnedFd>,
+    /// Functions that the library has, by the names in [`Calls::programs`].
+    pub functions: Vec<String>,
 }
 
 impl Breakpoints {
-    /// Loads `names` of an `object` whose maps are in `ebpf`, and with links also `dispatcher`.
+    /// Loads the programs of `calls` from an `object` whose maps are in `ebpf`, and with links also
+    /// `dispatcher`.
     pub(crate) fn load(
         mut ebpf: Ebpf,
         object: &[u8],
-        names: impl Iterator<Item = &'static str>,
+        calls: Calls,
         dispatcher: Option<Dispatcher>,
         means: Means,
     ) -> Result<Self, FilterError> {
-        if !Path::new(KIND).exists() {
-            return Err(FilterError::Missing(
-                "place to attach: uprobes are disabled",
-            ));
-        }
+        let names = calls.programs().into_iter().map(|(name, _)| name);
         if means == Means::PerfEvents {
             for name in names {
-                uprobe(&mut ebpf, name)?
-                    .load()
-                    .map_err(FilterError::program)?;
+                let program = ebpf.program_mut(name).ok_or(FilterError::Missing(name))?;
+                let program: &mut UProbe = program.try_into().map_err(FilterError::Program)?;
+                program.load().map_err(FilterError::program)?;
             }
-            return Ok(Self { ebpf, links: None });
+            return Ok(Self {
+                ebpf,
+                calls,
+                means,
+                linked: Vec::new(),
+                dispatching: None,
+            });
         }
         let relocated = Relocated::new(object, &ebpf)?;
-        let programs = names
-            .map(|name| Ok((name, relocated.load(name)?)))
-            .collect::<Result<BTreeMap<_, _>, FilterError>>()?;
+        let linked = names.map(|name| relocated.load(name));
+        let linked = linked.collect::<Result<Vec<_>, _>>()?;
         let dispatching = dispatcher.map(|Dispatcher { program, array }| {
             let Some(Map::ProgramArray(array)) = ebpf.take_map(array) else {
                 return Err(FilterError::Missing(array));
             };
-            for (index, program) in (0..).zip(programs.values()) {
+            for (index, program) in (0..).zip(&linked) {
                 bpf::set_program(array.fd().as_fd(), index, program.as_fd())
                     .map_err(FilterError::breakpoint_program)?;
             }
@@ -122,87 +99,76 @@ impl Breakpoints {
                 _array: array,
             })
         });
-        let links = Some(Linked {
+        Ok(Self {
             dispatching: dispatching.transpose()?,
-            programs,
-        });
-        Ok(Self { ebpf, links })
+            ebpf,
+            calls,
+            means,
+            linked,
+        })
     }
 
-    /// Returns a loaded program.
-    pub(crate) fn program(&self, name: &'static str) -> Result<BorrowedFd<'_>, FilterError> {
-        match &self.links {
-            Some(links) => links.program(name),
-            None => {
-                let program = self.ebpf.program(name).ok_or(FilterError::Missing(name))?;
-                let program: &UProbe = program.try_into().map_err(FilterError::Program)?;
-                Ok(program.fd().map_err(FilterError::Program)?.as_fd())
-            }
+    /// Returns the loaded programs, in the order of [`Calls::programs`].
+    pub(crate) fn programs(&self) -> Result<Vec<BorrowedFd<'_>>, FilterError> {
+        if self.means == Means::Links {
+            return Ok(self.linked.iter().map(|program| program.as_fd()).collect());
         }
+        let programs = self.calls.programs().into_iter().map(|(name, _)| {
+            let program = self.ebpf.program(name).ok_or(FilterError::Missing(name))?;
+            let program: &UProbe = program.try_into().map_err(FilterError::Program)?;
+            Ok(program.fd().map_err(FilterError::Program)?.as_fd())
+        });
+        programs.collect()
     }
 
-    /// Puts programs at offsets in a library's file.
+    /// Lets the broker put the programs at the functions of a library. `calls`: those for which the
+    /// programs are loaded, or a part of them.
     ///
     /// # Errors
-    /// Returns [`FilterError::Probe`] or [`FilterError::Breakpoint`] if the kernel refuses one.
+    /// Returns [`Refusal`] if the broker refuses or cannot be reached.
     pub(crate) fn attach(
-        &mut self,
-        file: &File,
-        places: &[(&'static str, u64)],
-    ) -> Result<Attached, FilterError> {
-        // Refers to the inspected file, even if its path now names another one.
-        let path = format!("/proc/self/fd/{}", file.as_raw_fd());
-        if let Some(links) = &self.links {
-            let path = CString::new(path).map_err(io::Error::from);
-            return links.attach(&path.map_err(FilterError::Breakpoint)?, places);
-        }
-        let mut links = Vec::new();
-        for (name, offset) in places {
-            let program = uprobe(&mut self.ebpf, name)?;
-            let link = program
-                .attach(*offset, &path, UProbeScope::AllProcesses)
-                .and_then(|id| program.take_link(id))
-                .map_err(FilterError::Probe)?;
-            links.push(link);
-        }
-        Ok(Attached::PerfEvents { _links: links })
-    }
-}
-
-impl Linked {
-    fn program(&self, name: &'static str) -> Result<BorrowedFd<'_>, FilterError> {
-        let program = self.programs.get(name);
-        Ok(program.ok_or(FilterError::Missing(name))?.as_fd())
-    }
-
-    fn attach(&self, path: &CStr, places: &[(&'static str, u64)]) -> Result<Attached, FilterError> {
-        let link = |program: BorrowedFd<'_>, offsets: &[u64], cookies: &[u64]| {
-            bpf::link_functions(program, path, offsets, cookies).map_err(FilterError::Breakpoint)
-        };
-        let Some(dispatching) = &self.dispatching else {
-            let links = places
-                .iter()
-                .map(|(name, offset)| link(self.program(name)?, &[*offset], &[0]));
-            let links = links.collect::<Result<_, _>>()?;
-            return Ok(Attached::Links { _links: links });
-        };
-        let mut offsets = Vec::new();
-        let mut cookies = Vec::new();
-        for (cookie, name) in (0..).zip(self.programs.keys()) {
-            let places = places.iter().filter(|(each, _)| each == name);
-            for (_, offset) in places {
-                offsets.push(*offset);
-                cookies.push(cookie);
+        &self,
+        broker: &mut Broker,
+        calls: Calls,
+        place: Place,
+    ) -> Result<Attached, Refusal> {
+        let attached = match &self.dispatching {
+            Some(dispatching) => {
+                let programs = [dispatching.program.as_fd()];
+                broker.attach((calls, place, self.means), &programs)
             }
-        }
-        let link = link(dispatching.program.as_fd(), &offsets, &cookies)?;
-        Ok(Attached::Links { _links: vec![link] })
+            None => {
+                let programs = self
+                    .programs()
+                    .map_err(|error| Refusal::Program(error.into()))?;
+                broker.attach((calls, place, self.means), &programs)
+            }
+        };
+        let (descriptors, functions) = attached?;
+        Ok(Attached {
+            _descriptors: descriptors,
+            functions,
+        })
     }
-}
 
-fn uprobe<'a>(ebpf: &'a mut Ebpf, name: &'static str) -> Result<&'a mut UProbe, FilterError> {
-    let program = ebpf.program_mut(name).ok_or(FilterError::Missing(name))?;
-    program.try_into().map_err(FilterError::Program)
+    /// Puts the programs at the functions of a file with the rights of this process, without a
+    /// broker: for tests and examples.
+    ///
+    /// # Errors
+    /// As [`attach::attach`].
+    pub(crate) fn attach_here(&self, calls: Calls, file: &File) -> Result<Attached, AttachError> {
+        let programs = self.programs().unwrap_or_default();
+        let dispatcher = self.dispatching.as_ref();
+        let programs = match dispatcher.map(|dispatching| dispatching.program.as_fd()) {
+            Some(program) => vec![program],
+            None => programs,
+        };
+        let attached = attach::attach(file, calls, self.means, &programs)?;
+        Ok(Attached {
+            _descriptors: attached.descriptors,
+            functions: attached.functions,
+        })
+    }
 }
 
 /// An object whose programs refer to loaded maps and types.

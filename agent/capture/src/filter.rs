@@ -21,7 +21,7 @@ use zerocopy::FromBytes;
 use super::tracepoints::KernelLayout;
 
 pub use host_hook::{CapturedPiece, Links};
-pub use uprobe::{Form, Probe, Probes};
+pub use uprobe::{Form, Probes};
 
 /// The object built by `agent-ebpf/build.sh`. Aligned, because ELF is read in place.
 static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../agent-ebpf/filter.bpf.o"));
@@ -54,15 +54,9 @@ pub enum FilterError {
          cgroup"
     )]
     AttachNotPermitted(#[source] io::Error),
-    /// The kernel refuses a breakpoint in the library.
-    #[error("the kernel refuses the uprobe")]
-    Probe(#[source] ProgramError),
     /// The verifier refuses a program for functions of libraries.
     #[error("the kernel refuses a program for functions of libraries")]
     BreakpointProgram(#[source] io::Error),
-    /// The kernel refuses breakpoints in the library.
-    #[error("the kernel refuses breakpoints")]
-    Breakpoint(#[source] io::Error),
     /// The cgroup accepts no program.
     #[error("failed to attach the host hook to the cgroup")]
     Attach(#[source] io::Error),

@@ -18,9 +18,9 @@ use super::reorder_buffer::{Next, ReorderBuffer, Segment};
 use super::system::Clocks;
 use super::zenoh::{Chunk, Streams};
 use crate::tables::FreshDatagrams;
-use ros2probe_model::bounded::Bounded;
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::Observer;
+use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Observer;
 
 /// Records younger than this wait for records held back in a run of fragments.
 pub const SETTLE_NANOSECONDS: u64 = 50_000_000;

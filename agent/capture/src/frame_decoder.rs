@@ -4,7 +4,7 @@
 //! The live source reads its frames from the ring itself. Nothing here waits; a replay at a given
 //! speed waits between packets.
 
-use ros2probe_model::input::Input;
+use ros2probe_model::observe::input::Input;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::{self, PacketType, Payload};
 use ros2probe_wire::walk::Envelope;
@@ -12,8 +12,8 @@ use ros2probe_wire::walk::Envelope;
 use super::pcap::{Captured, PcapError, PcapReader};
 use crate::reassembly::{FlowKey, Limits, Reassembly};
 use crate::zenoh::{Chunk, Streams, flow, flow_of};
-use ros2probe_model::observer::Observer;
-use ros2probe_model::zenoh::StreamId;
+use ros2probe_model::graph::zenoh::StreamId;
+use ros2probe_model::observe::observer::Observer;
 
 /// State of one replayed capture.
 #[derive(Debug)]

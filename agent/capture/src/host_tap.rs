@@ -18,7 +18,7 @@ use super::sockets::Sockets;
 use super::system::Clocks;
 use super::tracepoints::Abilities;
 use crate::threads::Spawn;
-use ros2probe_model::observer::Observer;
+use ros2probe_model::observe::observer::Observer;
 
 /// Why the host hook cannot be opened.
 #[derive(Debug, thiserror::Error)]

@@ -11,7 +11,7 @@ use std::os::fd::{AsFd, BorrowedFd, FromRawFd, OwnedFd};
 
 use crate::tables::KnownInterfaces;
 use globset::{Glob, GlobSet, GlobSetBuilder};
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_wire::{Cursor, Endianness, WireError};
 
 /// Longest message of the kernel for one interface.

@@ -17,7 +17,7 @@
 //! use ros2probe_capture::pcap::PcapReader;
 //! use ros2probe_wire::Expansion;
 //! use ros2probe_capture::reassembly::Limits;
-//! use ros2probe_model::observer::{Observer, Settings};
+//! use ros2probe_model::observe::observer::{Observer, Settings};
 //!
 //! let mut reader = PcapReader::open(Path::new("robot.pcap.gz"), Expansion::Limited)?;
 //! let mut observer = Observer::new(Settings::default());
@@ -42,7 +42,6 @@ pub mod interfaces;
 pub mod kernel_types;
 pub mod live;
 pub mod mappings;
-pub mod memory_reader;
 pub mod netns;
 pub mod owners;
 pub mod pcap;

@@ -37,8 +37,8 @@ use crate::inside::{Facts as InsideFacts, Inside};
 use crate::reassembly::Limits;
 use crate::settings::{CaptureSettings, ShmMode};
 use open::{open_exact, open_host, open_inside, open_wires, scope};
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Wanted};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Wanted};
 
 /// Capture budget of all unclassified writers per second: enough for a dozen nodes that start at
 /// once, and a bound for a storm of forged writers.
@@ -272,6 +272,11 @@ impl LiveSource {
         self.inside.as_ref().map(Inside::facts)
     }
 
+    /// Sets whether a client needs calls inside processes, if they are observed on demand.
+    pub fn want_inside(&self, wanted: bool) {
+        self.inside.iter().for_each(|inside| inside.want(wanted));
+    }
+
     /// Returns why processes are not observed from inside although that is configured.
     #[must_use]
     pub fn without_inside(&self) -> Option<&str> {
@@ -371,6 +376,9 @@ impl LiveSource {
             for publication in &round.publications {
                 observer.input(Input::CausalPublication(publication));
             }
+            if round.is_last {
+                observer.input(Input::InsideDetached);
+            }
         }
         self.apply_wanted(clocks.monotonic, observer);
         self.clock = Timestamp(clocks.now.0.saturating_sub(settle));
@@ -411,6 +419,10 @@ impl LiveSource {
             return;
         }
         self.wanted_asked = now;
+        self.want(observer);
+    }
+
+    fn want(&self, observer: &Observer) {
         let wanted = observer.wanted_of_shared_memory();
         if let Shm::Running(shared_memory) = &self.shared_memory {
             shared_memory.want(wanted);
@@ -418,6 +430,13 @@ impl LiveSource {
         if let Some(exact) = &self.exact {
             exact.want(wanted == Wanted::EverySample);
         }
+    }
+
+    /// Passes the model's requests for shared memory to its readers now. Returns whether the programs
+    /// that read every sample are still being attached for them.
+    pub fn is_attaching(&self, observer: &Observer) -> bool {
+        self.want(observer);
+        self.exact.as_ref().is_some_and(Uprobe::is_attaching)
     }
 
     /// Passes everything that still waits to the model, at the end.

@@ -1,16 +1,18 @@
 //! Notices which processes map a library, at that moment.
 //!
 //! The kernel writes a record for each executable mapping of every process into a ring for each CPU
-//! (`PERF_RECORD_MMAP`, perf_event_open(2)). It needs CAP_PERFMON, and changes nothing in the
-//! processes. Processes are identified as in the agent's PID namespace.
+//! (`PERF_RECORD_MMAP`, perf_event_open(2)). The broker opens the events, which needs CAP_PERFMON;
+//! reading them needs no privilege, and changes nothing in the processes. Processes are identified
+//! as in the broker's PID namespace.
 
 use std::collections::BTreeSet;
-use std::fs;
 use std::io;
-use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
+use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd, OwnedFd};
 use std::ptr::{self, NonNull};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
+
+use ros2probe_attach::client::{Broker, BrokerError};
 
 use crate::error_chain::in_words;
 
@@ -19,19 +21,9 @@ pub const UNCONCERNED: Duration = Duration::from_millis(2);
 
 /// Pages of records in each ring, a power of two: some 250 mappings, about two starts of a node.
 const PAGES: usize = 8;
-/// Most CPUs with a ring.
-const MAX_CPUS: usize = 1024;
 /// Offsets in the ring's first page, `struct perf_event_mmap_page`.
 const HEAD: usize = 1024;
 const TAIL: usize = 1032;
-/// `PERF_TYPE_SOFTWARE` and `PERF_COUNT_SW_DUMMY`: an event that never occurs.
-const SOFTWARE: u64 = 1;
-const DUMMY: u64 = 9;
-/// Bits of `struct perf_event_attr`: records of executable mappings, and a wake-up after some bytes.
-const RECORD_MAPPINGS: u64 = 1 << 8;
-const WAKE_BY_BYTES: u64 = 1 << 14;
-/// `PERF_FLAG_FD_CLOEXEC`.
-const CLOSE_ON_EXEC: libc::c_ulong = 1 << 3;
 /// Types of records.
 const MAPPED: u32 = 1;
 const LOST: u32 = 2;
@@ -46,6 +38,17 @@ pub struct MappingEvents {
     record: Vec<u8>,
 }
 
+/// Why mappings are not noticed.
+#[derive(Debug, thiserror::Error)]
+pub enum MappingError {
+    /// The broker does not open the events.
+    #[error(transparent)]
+    Broker(#[from] BrokerError),
+    /// The rings cannot be mapped.
+    #[error("the rings of mapped files cannot be mapped")]
+    Ring(#[from] io::Error),
+}
+
 /// Processes that mapped a library since the last call.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct NewMappings {
@@ -56,13 +59,12 @@ pub struct NewMappings {
 }
 
 impl MappingEvents {
-    /// Opens a ring for each CPU that is online.
+    /// Maps the ring of each event that the broker opens.
     ///
     /// # Errors
-    /// Fails without the privileges, or if the kernel has no such events.
-    pub fn open() -> io::Result<Self> {
-        let online = fs::read_to_string("/sys/devices/system/cpu/online")?;
-        let rings = cpus(&online).take(MAX_CPUS).map(Ring::open);
+    /// Fails if the broker refuses, or if the kernel has no such events.
+    pub fn open(broker: &mut Broker) -> Result<Self, MappingError> {
+        let rings = broker.mappings()?.into_iter().map(Ring::new);
         Ok(Self {
             rings: rings.collect::<io::Result<_>>()?,
             record: Vec::new(),
@@ -72,8 +74,8 @@ impl MappingEvents {
     /// Opens the rings for the configuration key `key`. Without them, its thread finds a library at
     /// its next round.
     #[must_use]
-    pub fn open_or_warn(key: &str) -> Option<Self> {
-        let opened = Self::open();
+    pub fn open_or_warn(key: &str, broker: &mut Broker) -> Option<Self> {
+        let opened = Self::open(broker);
         if let Err(error) = &opened {
             let reason = in_words(error);
             tracing::warn!(
@@ -116,37 +118,7 @@ struct Ring {
 unsafe impl Send for Ring {}
 
 impl Ring {
-    fn open(cpu: i32) -> io::Result<Self> {
-        // The first 64 bytes of `struct perf_event_attr`, PERF_ATTR_SIZE_VER0: type and size, config,
-        // period, types of samples and of reads, flags, bytes before a wake-up, address.
-        let attributes: [u64; 8] = [
-            SOFTWARE | 64 << 32,
-            DUMMY,
-            0,
-            0,
-            0,
-            RECORD_MAPPINGS | WAKE_BY_BYTES,
-            1,
-            0,
-        ];
-        let (every_process, no_group): (libc::pid_t, libc::c_int) = (-1, -1);
-        // SAFETY: `attributes` has the size that it states, and outlives the call.
-        let descriptor = unsafe {
-            libc::syscall(
-                libc::SYS_perf_event_open,
-                attributes.as_ptr(),
-                every_process,
-                cpu,
-                no_group,
-                CLOSE_ON_EXEC,
-            )
-        };
-        let descriptor = i32::try_from(descriptor).unwrap_or(-1);
-        if descriptor < 0 {
-            return Err(io::Error::last_os_error());
-        }
-        // SAFETY: a new descriptor without another owner.
-        let event = unsafe { OwnedFd::from_raw_fd(descriptor) };
+    fn new(event: OwnedFd) -> io::Result<Self> {
         // SAFETY: sysconf accesses no memory of this process.
         let page = unsafe { libc::sysconf(libc::_SC_PAGESIZE) };
         let page = usize::try_from(page).map_err(io::Error::other)?;
@@ -229,28 +201,12 @@ fn process(record: &[u8], is_library: impl Fn(&str) -> bool) -> Option<u32> {
     (is_known && is_library(std::str::from_utf8(name).ok()?)).then_some(process)
 }
 
-/// Returns the numbers of a list such as `0-3,5`.
-fn cpus(list: &str) -> impl Iterator<Item = i32> {
-    list.trim().split(',').flat_map(|range| {
-        let (first, last) = range.split_once('-').unwrap_or((range, range));
-        let ends = first.parse().ok().zip(last.parse().ok());
-        ends.into_iter().flat_map(|(first, last)| first..=last)
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use std::time::{Duration, Instant};
 
     use super::*;
     use crate::system::wait;
-
-    #[test]
-    fn cpus_are_those_of_the_list() {
-        assert_eq!(cpus("0-3,5\n").collect::<Vec<_>>(), [0, 1, 2, 3, 5]);
-        assert_eq!(cpus("0\n").collect::<Vec<_>>(), [0]);
-        assert_eq!(cpus("").count(), 0);
-    }
 
     #[test]
     fn a_record_that_is_cut_off_names_no_process() {
@@ -268,7 +224,7 @@ mod tests {
 
     #[test]
     fn a_process_that_maps_a_library_is_noticed_at_once_and_others_are_not() {
-        let mut events = MappingEvents::open()
+        let mut events = MappingEvents::open(&mut Broker::here())
             .expect("records of all processes need root: run the tests with sudo");
         let is_library = |name: &str| name.starts_with("libc.so") || name.starts_with("libc-");
         events.take(is_library);

@@ -7,7 +7,7 @@
 use std::borrow::Cow;
 use std::collections::VecDeque;
 
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_wire::host::{PIECE_BYTES, Piece};
 
 use crate::tables::OpenPieces;

@@ -13,7 +13,7 @@ mod flow;
 
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 
-use ros2probe_model::bounded::{Bounded, Counted, Sum};
+use ros2probe_model::facts::bounded::{Bounded, Counted, Sum};
 use ros2probe_wire::frame::{Fragment, Packet};
 use ros2probe_wire::record::{Record, flag};
 use ros2probe_wire::{Cursor, Endianness, Timestamp};

@@ -17,9 +17,9 @@
 
 use std::collections::{HashSet, VecDeque};
 
-use ros2probe_model::bounded::{self, Bounded, Sum};
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::Observer;
+use ros2probe_model::facts::bounded::{self, Bounded, Sum};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Observer;
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{Body, flag};
 use ros2probe_wire::walk::Envelope;
@@ -345,7 +345,7 @@ impl ReorderBuffer {
 
 #[cfg(test)]
 mod tests {
-    use ros2probe_model::zenoh::StreamId;
+    use ros2probe_model::graph::zenoh::StreamId;
     use ros2probe_wire::Timestamp;
     use ros2probe_wire::record::kind;
 

@@ -28,6 +28,8 @@ pub struct CaptureSettings {
     pub shm: ShmSettings,
     /// What is observed inside processes.
     pub inside: InsideChoice,
+    /// Socket of the process that attaches breakpoints, if one listens there.
+    pub broker: PathBuf,
     /// TCP ports of Zenoh, at most [`ros2probe_wire::filter::PORT_CAPACITY`].
     pub zenoh_ports: Vec<u16>,
 }
@@ -37,12 +39,15 @@ pub struct CaptureSettings {
 #[serde(rename_all = "lowercase")]
 pub enum InsideChoice {
     /// The source is off.
-    #[default]
     Off,
     /// Messages that are published and taken, also within a process.
     Topics,
     /// Also callbacks, timers and lifecycle transitions.
     Full,
+    /// Like `full`, but calls are observed only while a client needs them; otherwise only the
+    /// creation of nodes, publishers, subscriptions, timers and services.
+    #[default]
+    Auto,
 }
 
 /// How shared memory is observed.
@@ -74,12 +79,12 @@ pub enum ShmMode {
 #[serde(rename_all = "lowercase")]
 pub enum ExactChoice {
     /// Shared memory is only sampled.
-    #[default]
     Off,
     /// By a kernel breakpoint in the code of the sending processes.
     Uprobe,
     /// Like `uprobe`, but only while messages of a topic in shared memory are delivered to a client or
     /// recording; otherwise shared memory is sampled.
+    #[default]
     Auto,
 }
 

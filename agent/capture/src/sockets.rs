@@ -14,9 +14,9 @@ use super::cgroup_paths::CgroupPaths;
 use super::filter::Filter;
 use super::owners::Owner;
 use super::tracepoints::Tracepoints;
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::Observer;
-use ros2probe_model::snapshot::SocketFacts;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Observer;
+use ros2probe_model::report::snapshot::SocketFacts;
 
 /// Interval of looking for new sockets: every second round of an idle agent.
 const PERIOD: u64 = 19 * SECOND / 10;
@@ -197,7 +197,7 @@ impl Known {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ros2probe_model::observer::Settings;
+    use ros2probe_model::observe::observer::Settings;
 
     fn owner(drops: u32) -> Owner {
         Owner {

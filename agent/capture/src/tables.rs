@@ -1,7 +1,7 @@
 //! Declarations of the capture's tables: what foreign input can fill, and how far.
 
-use ros2probe_model::bounded::CONFIGURED;
-use ros2probe_model::bounded::Rule::Oldest;
+use ros2probe_model::facts::bounded::CONFIGURED;
+use ros2probe_model::facts::bounded::Rule::Oldest;
 use ros2probe_wire::filter::UNKNOWN_CAPACITY;
 use ros2probe_wire::inside::HANDLE_CAPACITY;
 
@@ -138,7 +138,7 @@ ros2probe_model::tables! {
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use ros2probe_model::bounded::{Declared, ledger};
+    use ros2probe_model::facts::bounded::{Declared, ledger};
 
     /// Asserts that this test filled a table to its cap, and not beyond.
     pub(crate) fn assert_driven<D: Declared>() {

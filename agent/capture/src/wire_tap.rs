@@ -23,9 +23,9 @@ use super::system::Clocks;
 use super::zenoh::{Chunk, Streams, flow, flow_of};
 use crate::ahead::{Ahead, Ready};
 use crate::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::Observer;
-use ros2probe_model::zenoh::StreamId;
+use ros2probe_model::graph::zenoh::StreamId;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Observer;
 
 /// Records younger than this wait for frames captured before them: a frame waits up to 100 ms until
 /// its block is full.

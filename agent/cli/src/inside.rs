@@ -9,42 +9,6 @@ use crate::top::text::{safe, seconds};
 /// Width between two columns.
 const GAP: usize = 2;
 
-/// Keeps what belongs to this node or topic.
-pub fn select(inside: &mut Inside<'_>, name: &str) {
-    let is_own = |owner: &Owner<'_>| owner.node.as_deref() == Some(name);
-    let is_topic = |topic: Option<&str>| topic == Some(name);
-    inside
-        .publishers
-        .retain(|each| is_own(&each.owner) || each.topic == name);
-    inside
-        .subscriptions
-        .retain(|each| is_own(&each.owner) || each.topic == name);
-    inside
-        .reader_queues
-        .retain(|each| is_own(&each.owner) || each.topic == name);
-    inside
-        .buffers
-        .retain(|each| is_own(&each.owner) || is_topic(each.topic.as_deref()));
-    inside
-        .callbacks
-        .retain(|each| is_own(&each.owner) || is_topic(each.trigger.name.as_deref()));
-    inside
-        .lifecycle_states
-        .retain(|each| each.node.as_deref() == Some(name));
-    let publishers = inside.publishers.iter().map(|each| &each.owner);
-    let subscriptions = inside.subscriptions.iter().map(|each| &each.owner);
-    let buffers = inside.buffers.iter().map(|each| &each.owner);
-    let callbacks = inside.callbacks.iter().map(|each| &each.owner);
-    let owners = publishers.chain(subscriptions).chain(buffers);
-    let own: Vec<u32> = owners
-        .chain(callbacks)
-        .map(|owner| owner.process_id)
-        .collect();
-    inside
-        .processes
-        .retain(|each| own.contains(&each.process_id) || each.nodes.iter().any(|it| it == name));
-}
-
 /// Returns whether nothing is known.
 #[must_use]
 pub fn is_empty(inside: &Inside<'_>) -> bool {
@@ -305,19 +269,5 @@ mod tests {
             "{text}"
         );
         assert!(!text.contains("SUBSCRIPTION"));
-    }
-
-    #[test]
-    fn a_name_selects_a_node_or_a_topic_with_its_processes() {
-        let mut of_node = inside();
-        select(&mut of_node, "/lidar");
-        let counts = (of_node.publishers.len(), of_node.callbacks.len());
-        assert_eq!((counts, of_node.processes.len()), ((1, 0), 1));
-        let mut of_topic = inside();
-        select(&mut of_topic, "/scan");
-        assert_eq!((of_topic.publishers.len(), of_topic.buffers.len()), (1, 0));
-        let mut of_none = inside();
-        select(&mut of_none, "/imu");
-        assert!(is_empty(&of_none));
     }
 }

@@ -12,6 +12,7 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::Parser as _;
 use ros2probe_daemon::agent;
+use ros2probe_daemon::broker;
 use ros2probe_daemon::config::{Config, ConfigError};
 use ros2probe_daemon::escape::visible_lines;
 use ros2probe_daemon::privilege::{CapabilitiesRemain, ConfineError, Missing};
@@ -26,12 +27,13 @@ const BAD_CONFIG: u8 = 78;
 const BROKEN_PIPE: u8 = 141;
 
 fn main() -> ExitCode {
+    broker::declare_command();
     let done = |done: Result<()>| done.map(|()| ExitCode::SUCCESS);
     let ended = match Arguments::parse().command {
         None => cli::help(&[]),
         Some(Command::Run(options)) => done(agent::run(options.into())),
         Some(Command::CheckConfig { file }) => done(check_config(&file)),
-        Some(Command::MemoryReader) => done(agent::read_memory()),
+        Some(Command::Attach(options)) => done(options.run()),
         Some(Command::Discover(options)) => done(ask::discover(&options)),
         Some(Command::Completions(completions)) => completions.print(),
         Some(Command::Man(manual)) => manual.print(),

@@ -7,19 +7,18 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result};
 use ros2probe_capture::live::LiveSource;
-use ros2probe_capture::memory_reader;
 pub use ros2probe_capture::pcap::Speed;
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::system::{give_back_memory, hide_memory};
 use ros2probe_message::{Dialect, Library, Sources};
-use ros2probe_model::discovery::Memory;
-use ros2probe_model::history::History;
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{self, Observer};
+use ros2probe_model::graph::discovery::Memory;
+use ros2probe_model::measure::history::History;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{self, Observer};
 pub use ros2probe_wire::Expansion;
 use tokio_util::sync::CancellationToken;
 
-use crate::config::{Access, Config, ConfigError, PageChoice, Watch};
+use crate::config::{Access, Config, ConfigError, PageChoice, RetainChoice, Watch};
 use crate::logging::Log;
 use crate::privilege::{self, Identity, Role, Sandbox, Unprivileged};
 use crate::recording::{self, Recordings, Refusal, Snapshots};
@@ -192,17 +191,6 @@ impl Components<'_> {
             reloads,
         })
     }
-}
-
-/// Answers requests of an agent for memory of other processes, on standard input, until it ends.
-///
-/// # Errors
-///
-/// Standard input is not a socket of an agent, or the process cannot be confined.
-pub fn read_memory() -> Result<()> {
-    hide_memory().context("cannot protect the memory of this process")?;
-    privilege::confine(Role::MemoryReader)?;
-    memory_reader::serve().context("cannot answer the agent")
 }
 
 /// Runs an agent until a signal, a failure or the end of a report.
@@ -525,6 +513,7 @@ fn settings(config: &Config, is_live: bool) -> observer::Settings {
     observer::Settings {
         topic_grace: config.topic_grace,
         service_timeout: config.service_timeout,
+        keeps_latched: config.retain == RetainChoice::Latched,
         directed: is_live,
         ..observer::Settings::default().with_limits(&config.limits)
     }

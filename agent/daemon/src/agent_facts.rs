@@ -7,7 +7,7 @@ use ros2probe_wire::Timestamp;
 
 use crate::privilege::{self, Sandbox};
 use crate::state::StateFacts;
-use ros2probe_model::dispatch::MissedReason;
+use ros2probe_model::facts::dispatch::MissedReason;
 
 /// State of the agent at one moment.
 #[derive(Clone, Debug)]
@@ -92,8 +92,12 @@ pub struct ExactFacts {
 /// State of the observation inside processes.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct InsideSourceFacts {
-    /// `topics` or `full`.
+    /// `topics`, `full` or `auto`.
     pub mode: &'static str,
+    /// Whether calls are observed on demand, and no client needs them.
+    pub is_resting: bool,
+    /// Whether calls have been observed for long enough to show rates.
+    pub shows_rates: bool,
     /// Observed libraries.
     pub libraries: Vec<InsideLibrary>,
     /// Counters of the kernel programs, all of them in a fixed order.

@@ -1,16 +1,16 @@
 //! Chains in a bag: reads its messages, and passes the stamps of their headers to the model.
 //!
 //! A bag names no nodes, so hops lead from topic to topic
-//! ([`ros2probe_model::chain::recorded`]).
+//! ([`ros2probe_model::derive::chain::recorded`]).
 
 use std::collections::HashMap;
 use std::path::Path;
 
 use ros2probe_api::chains::Chain;
 use ros2probe_bag::messages::{self, Message, MessagesError};
-use ros2probe_model::chain::recorded::{RecordedChains, RecordedFacts};
-use ros2probe_model::header::begins_with_header;
-use ros2probe_model::names::TopicName;
+use ros2probe_model::derive::chain::recorded::{RecordedChains, RecordedFacts};
+use ros2probe_model::facts::header::begins_with_header;
+use ros2probe_model::facts::names::TopicName;
 use ros2probe_wire::{Expansion, Timestamp};
 
 use crate::run::CaptureTime;

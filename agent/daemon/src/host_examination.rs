@@ -3,6 +3,7 @@
 use std::error::Error;
 use std::path::{Path, PathBuf};
 
+use ros2probe_attach::functions::Library;
 use ros2probe_capture::cgroup::{Cgroup, CgroupError, has_version_1, topmost};
 use ros2probe_capture::error_chain::in_words;
 pub use ros2probe_capture::system::ClockState;
@@ -66,7 +67,7 @@ pub fn uprobes_lack(effective: CapabilitySet) -> Vec<&'static str> {
 /// Returns whether a file of this name is the library of Fast DDS.
 #[must_use]
 pub fn is_fast_dds(name: &str) -> bool {
-    uprobe::processes::is_library(name)
+    Library::FastDds.has_name(name)
 }
 
 /// Error and its causes in one line. Of a verifier log, only the first line.

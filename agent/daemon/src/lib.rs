@@ -24,6 +24,7 @@
 pub mod agent;
 pub mod agent_facts;
 pub mod bag_chains;
+pub mod broker;
 pub mod config;
 mod control;
 pub mod discover;
@@ -31,6 +32,7 @@ pub mod escape;
 pub mod events;
 pub mod file;
 pub mod host_examination;
+mod latched;
 pub mod limit_facts;
 mod logging;
 mod memory;

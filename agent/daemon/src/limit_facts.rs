@@ -235,7 +235,7 @@ impl Drop for Slot {
 mod tests {
     use super::*;
     use crate::agent_facts::{AgentFacts, SourceKind};
-    use ros2probe_model::snapshot::{Snapshot, TableFacts};
+    use ros2probe_model::report::snapshot::{Snapshot, TableFacts};
 
     #[test]
     fn places_are_as_many_as_the_cap_and_come_back() {

@@ -8,7 +8,7 @@ use crate::config::{StateChoice, Watch};
 use crate::state::{Loaded, Newer, StateDirectory};
 use crate::watches::{self, LoadedWatches, Watches};
 use anyhow::anyhow;
-use ros2probe_model::discovery::Memory;
+use ros2probe_model::graph::discovery::Memory;
 
 /// Default directory of the package and of the service manager.
 const DEFAULT: &str = "/var/lib/ros2probe";

@@ -2,7 +2,7 @@
 //! requests their announcements. All surfaces take both from here.
 
 use ros2probe_api::participants::UnknownWriter;
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::rtps::VendorId;
 
 /// Requests the announcements of all DDS participants. Without `--all` it only lists them.

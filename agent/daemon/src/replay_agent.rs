@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use ros2probe_capture::pcap::{PcapError, Speed, link_name};
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_message::{Library, Sources};
-use ros2probe_model::observer::{self, Observer};
+use ros2probe_model::observe::observer::{self, Observer};
 use ros2probe_wire::Expansion;
 use ros2probe_wire::frame::Link;
 use tokio::io::{DuplexStream, duplex};
@@ -17,7 +17,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
 use crate::agent::{AssembledAgent, Components};
-use crate::config::{Config, Watch};
+use crate::config::{Config, RetainChoice, Watch};
 use crate::run::replay::{Replay, ReplayControl, pause_at};
 use crate::run::{CaptureTime, Run, RunError, Source};
 use crate::settings_cell::Settings;
@@ -240,6 +240,7 @@ fn assemble(
     let settings = observer::Settings {
         // No kernel filter has to be updated first.
         payload_delay: Duration::ZERO,
+        keeps_latched: config.retain == RetainChoice::Latched,
         directed: false,
         ..observer::Settings::default().with_limits(&config.limits)
     };

@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_model::facts::topic_kind::TopicKind;
 
 /// ROS name of a topic. Topics of services and actions keep their DDS names, because a request, its
 /// reply and a topic may share their ROS name. A DDS name that looks like a ROS name is marked.

@@ -8,18 +8,21 @@ use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
 
-use arc_swap::ArcSwap;
+use arc_swap::{ArcSwap, ArcSwapOption};
 use tokio::sync::Notify;
 
 use super::agent_facts::{AgentFacts, SourceKind};
 use ros2probe_capture::bell::Bell;
-use ros2probe_model::history::Past;
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::measure::history::Past;
+use ros2probe_model::report::snapshot::Snapshot;
 
 /// Age above which the state no longer describes the robot.
 const FRESH: Duration = Duration::from_secs(5);
 /// Seconds after a reading of the last seconds in which each further one is published.
 const PAST_SECONDS: u8 = 5;
+
+/// Time for which calls inside processes are observed after the last request for them.
+const CALLS_HELD: Duration = Duration::from_secs(10);
 
 /// The latest state and the last seconds.
 #[derive(Debug)]
@@ -32,6 +35,8 @@ pub struct SnapshotCell {
     asked: AtomicBool,
     /// Whether the state was read since [`Self::was_read`].
     read: AtomicBool,
+    /// When a client last needed calls inside processes.
+    calls_wanted: ArcSwapOption<Instant>,
     bell: Arc<CaptureBell>,
     news: Notify,
 }
@@ -92,6 +97,7 @@ impl SnapshotCell {
             past_wanted: AtomicU8::new(0),
             asked: AtomicBool::new(false),
             read: AtomicBool::new(false),
+            calls_wanted: ArcSwapOption::empty(),
             bell: Arc::new(CaptureBell::new()),
             news: Notify::new(),
         }
@@ -119,6 +125,24 @@ impl SnapshotCell {
     #[must_use]
     pub fn was_read(&self) -> bool {
         self.read.swap(false, Ordering::Relaxed)
+    }
+
+    /// Notes that a client needs calls inside processes.
+    pub fn want_calls(&self) {
+        let before = self.calls_wanted.swap(Some(Arc::new(Instant::now())));
+        if before.is_none_or(|before| before.elapsed() > CALLS_HELD) {
+            self.bell.ring();
+        }
+    }
+
+    /// Returns whether a client needed calls inside processes lately.
+    #[must_use]
+    pub fn are_calls_wanted(&self, now: Instant) -> bool {
+        let wanted = self.calls_wanted.load();
+        let age = wanted
+            .as_deref()
+            .map(|at| now.saturating_duration_since(*at));
+        age.is_some_and(|age| age <= CALLS_HELD)
     }
 
     /// Counts one second, and returns whether the last seconds were read lately.
@@ -370,6 +394,17 @@ mod tests {
         assert_eq!(wanted, usize::from(PAST_SECONDS));
         let _ = cell.past();
         assert!(cell.wants_past());
+    }
+
+    #[test]
+    fn calls_are_wanted_until_ten_seconds_after_the_last_request() {
+        let cell = SnapshotCell::new(SourceKind::Host);
+        let after = |seconds| cell.are_calls_wanted(Instant::now() + Duration::from_secs(seconds));
+        assert!(!after(0));
+        cell.want_calls();
+        let rings = cell.bell().descriptor().unwrap();
+        assert_eq!(wait(&[rings], Duration::ZERO).unwrap(), Some(0));
+        assert!(after(0) && after(9) && !after(11));
     }
 
     #[tokio::test]

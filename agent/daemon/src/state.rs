@@ -21,7 +21,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::file;
 use ros2probe_capture::threads::Progress;
-use ros2probe_model::discovery::Memory;
+use ros2probe_model::graph::discovery::Memory;
 
 /// Version of the written format. Fields added so far may be missing in a file and then have
 /// defaults. An agent that does not know a field must not accept the file. Every further change

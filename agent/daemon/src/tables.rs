@@ -1,6 +1,6 @@
 //! Declarations of the daemon's tables: what clients, viewers and robots can fill, and how far.
 
-use ros2probe_model::bounded::Rule::Oldest;
+use ros2probe_model::facts::bounded::Rule::Oldest;
 
 ros2probe_model::tables! {
     /// Events kept for streams and export
@@ -22,15 +22,6 @@ ros2probe_model::tables! {
     }
     /// Series with a start time
     SeriesStarts { name: "otlp.starts", entries: 200_000, effect: "further ones start with the agent" }
-    /// Writers with a retained message
-    RetainedWriters {
-        name: "retained.writers", entries: 256, effect: "the oldest is dropped", reported: "`ros2probe_retained_bytes`",
-    }
-    /// Bytes of retained messages
-    RetainedBytes {
-        name: "retained.bytes", entries: 4 << 20, effect: "the oldest is dropped",
-        reported: "`ros2probe_retained_bytes`",
-    }
     /// Writers that one stream of messages has described
     DescribedWriters { name: "samples.described", entries: 65_536, effect: "further ones are not described" }
     /// Losses of one subscription, by writer and reason, until its client reads them
@@ -73,7 +64,7 @@ ros2probe_model::tables! {
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use ros2probe_model::bounded::{Declared, ledger};
+    use ros2probe_model::facts::bounded::{Declared, ledger};
 
     /// Asserts that this test filled a table to its cap, and not beyond.
     pub(crate) fn assert_driven<D: Declared>() {

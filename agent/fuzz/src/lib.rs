@@ -12,6 +12,7 @@ use std::time::Duration;
 
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::bag::{self, Sort};
+use ros2probe_attach::library;
 use ros2probe_bag::info::Bag;
 use ros2probe_bag::reindex::{Found, reindex};
 use ros2probe_capture::pcap::PcapReader;
@@ -21,15 +22,14 @@ use ros2probe_capture::shm::cell::Cell;
 use ros2probe_capture::shm::classifier::MessageClassifier;
 use ros2probe_capture::shm::port::Port;
 use ros2probe_capture::shm::segment::{Buffer, Message};
-use ros2probe_capture::uprobe::library;
 use ros2probe_daemon::config::{Config, Watch, Watchlist};
 use ros2probe_daemon::surface::foxglove::protocol;
 use ros2probe_daemon::surface::ros2_daemon::call::{self, Argument, Call};
 use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::{Decoded, Definition, MessageType, Truncation, csv, decode, yaml};
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::selection::{Depth, SampleRequest, Selection};
+use ros2probe_model::facts::selection::{Depth, SampleRequest, Selection};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_wire::frame::{self, Packet, Payload};
 use ros2probe_wire::record::Record;
 use ros2probe_wire::walk::{self, Envelope};
@@ -440,6 +440,7 @@ const SMALL: Settings = Settings {
     topic_grace: Duration::from_secs(1),
     service_timeout: Duration::from_secs(1),
     payload_delay: Duration::from_millis(400),
+    keeps_latched: true,
     directed: true,
 };
 

@@ -10,9 +10,9 @@ use criterion::{BatchSize, Criterion, Throughput, criterion_group, criterion_mai
 use ros2probe_capture::frame_decoder::FrameDecoder;
 use ros2probe_capture::pcap::PcapReader;
 use ros2probe_capture::reassembly::Limits;
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::watch::{Watch, Watchlist};
+use ros2probe_model::facts::watch::{Watch, Watchlist};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::{EntityId, Expansion, Guid, GuidPrefix, Record, Timestamp};

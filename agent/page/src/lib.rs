@@ -29,7 +29,7 @@ impl File {
 }
 
 /// Every file, by its path below `/page/`; `index.html` is also served at `/`.
-pub static FILES: [File; 37] = [
+pub static FILES: [File; 38] = [
     File::new("api.js", SCRIPT, include_bytes!("../api.js")),
     File::new("app.css", CSS, include_bytes!("../app.css")),
     File::new("app.js", SCRIPT, include_bytes!("../app.js")),
@@ -105,6 +105,11 @@ pub static FILES: [File; 37] = [
         "views/graph.js",
         SCRIPT,
         include_bytes!("../views/graph.js"),
+    ),
+    File::new(
+        "views/inside.js",
+        SCRIPT,
+        include_bytes!("../views/inside.js"),
     ),
     File::new(
         "views/nodes.js",

@@ -1,6 +1,6 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
-import { tables } from '../inside.js';
+import { tables, waiting } from '../inside.js';
 
 const owner = { process_id: 42, node: '/nav' };
 
@@ -31,4 +31,11 @@ test('each kind of entity has a table, and empty ones are left out', () => {
 
 test('an agent without the source has no table', () => {
   assert.deepEqual(tables({}), []);
+});
+
+test('while nothing is shown the reason is', () => {
+  assert.match(waiting(null), /begins/);
+  assert.match(waiting({ mode: 'off' }), /capture\.inside is off/);
+  assert.equal(waiting({ mode: 'auto', reason: 'no broker' }), 'no broker');
+  assert.match(waiting({ mode: 'auto', reason: null }), /No call/);
 });

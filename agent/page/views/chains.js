@@ -42,7 +42,7 @@ const limitOf = (expected) => (expected?.max_latency_ms == null ? null
 export function Chains({ query }) {
   useLive();
   const { filter = '', sort = '' } = query;
-  const { data, problem } = usePoll('chains', EVERY_MS);
+  const { data, problem } = usePoll('chains?calls=true', EVERY_MS);
   const change = (/** @type {Record<string, any>} */ more) => replaceAddress(
     address('chains', null, { ...query, ...more }));
   const all = data ? rowsOf(data) : [];
@@ -108,7 +108,8 @@ function NoChain() {
         >${several(measured, 'topic')} now</a>) or belong to a configured chain,</li>
       <li>their types begin with a header, and they have subscriptions,</li>
       <li>the nodes between them copy the stamp of their input into their output.</li></ul>
-    <p>With <code>capture.inside: full</code> neither headers nor stamps are necessary.</p></div>`;
+    <p>Where calls inside processes are observed, as they are while this view is open, neither headers
+      nor stamps are necessary.</p></div>`;
 }
 
 /** @param {{from: string, query: Record<string, string>}} props */
@@ -117,7 +118,7 @@ export function ChainView({ from, query }) {
   const { to = '', domain = '' } = query;
   const words = new URLSearchParams({
     from, ...(to && { to }), ...(domain && { domain_id: domain }) });
-  const { data, problem } = usePoll(`chains?${words}`, EVERY_MS);
+  const { data, problem } = usePoll(`chains?calls=true&${words}`, EVERY_MS);
   const chain = data && chosen(data.chains, from, query);
   const end = chain?.to ?? to;
   const expected = data?.expected.find((/** @type {any} */ each) => each.from === from

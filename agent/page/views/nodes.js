@@ -4,12 +4,12 @@ import { useRef } from '../vendor/hooks.mjs';
 import { named } from '../api.js';
 import { bytes, calls, count, date, percent, several } from '../format.js';
 import { nodeKey } from '../graph-model.js';
-import { Inside } from '../inside.js';
 import { address } from '../router.js';
 import { replaceAddress, state, useLive, usePoll } from '../store.js';
 import { sorted, Table } from '../table.js';
 import { Failed, Filter, html, Mark, matches, Name, NodeLink } from '../ui.js';
 import { InChains } from './chains.js';
+import { Inside } from './inside.js';
 import { Findings } from './overview.js';
 import { Incomplete } from './overview.js';
 
@@ -188,7 +188,8 @@ export function NodeView({ name, query }) {
     <p>Parameters: ${services.data
       ? known.length ? 'the node has parameter services.' : 'the node has no parameter services.'
       : '–'}</p>
-    <${Inside} inside=${data?.inside} />
+    <${Inside} key=${`inside ${node.id}`} inside=${data?.inside} name=${node.name}
+      domain=${node.domain} />
     ${list('Publishers', data?.publishers, 'topics')}
     ${list('Subscriptions', data?.subscriptions, 'topics')}
     ${list('Services', data?.services, null)}

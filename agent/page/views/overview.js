@@ -65,7 +65,7 @@ export function grouped(list) {
   const seen = new Map();
   const more = new Map();
   const firsts = list.filter((finding) => {
-    if (finding.topic == null || !/^un(fed|heard)_/.test(finding.kind)) return true;
+    if (finding.topic == null || !/^unmatched_/.test(finding.kind)) return true;
     const key = `${finding.kind} ${finding.topic}`;
     const first = seen.get(key);
     if (first) more.set(first, (more.get(first) ?? 0) + 1);

@@ -10,8 +10,8 @@ import { LiveMessage } from '../message.js';
 import { Endpoints, Offered } from '../qos.js';
 import { state, stream, useLive, usePoll } from '../store.js';
 import { Badges, Failed, Figure, html, Mark, Name, PASSAGES, Text } from '../ui.js';
-import { Inside } from '../inside.js';
 import { InChains } from './chains.js';
+import { Inside } from './inside.js';
 import { Findings } from './overview.js';
 import { Measure } from './topics.js';
 
@@ -65,7 +65,8 @@ export function Topic({ name, query }) {
     ${details.data && html`
       <${Endpoints} details=${details.data} topic=${topic} />
       <${Offered} details=${details.data} />
-      <${Inside} inside=${details.data.inside} />
+      <${Inside} key=${`inside ${topic.id}`} inside=${details.data.inside} name=${topic.name}
+        domain=${topic.domain} />
       <${Waterfall} details=${details.data} />
       <${Passages} details=${details.data} />`}
     <${Definition} key=${`definition ${topic.id}`} path=${named('topics', apiName(topic),

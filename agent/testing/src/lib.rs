@@ -23,6 +23,7 @@ pub mod forged;
 pub mod harness;
 pub mod local_agent;
 pub mod model;
+pub mod ports;
 pub mod program_run;
 pub mod pseudo_terminal;
 pub mod rotel;

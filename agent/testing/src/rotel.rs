@@ -1,12 +1,12 @@
 //! A real OpenTelemetry receiver, rotel, and its printed output.
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::net::{SocketAddr, TcpListener};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command};
 use std::time::{Duration, Instant};
 
-use crate::repository;
+use crate::{ports::free_address, repository};
 
 /// Longest wait for anything.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -43,11 +43,7 @@ pub struct Export {
 impl Rotel {
     /// Starts a receiver on a free port, or again on this one, printing into `directory`.
     pub fn start(command: &mut Command, directory: &Path, address: Option<SocketAddr>) -> Self {
-        let free = || {
-            let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-            listener.local_addr().unwrap()
-        };
-        let (address, other) = (address.unwrap_or_else(free), free());
+        let (address, other) = (address.unwrap_or_else(free_address), free_address());
         let output = directory.join(format!("rotel-{}", other.port()));
         let child = command
             .arg("start")
@@ -68,7 +64,7 @@ impl Rotel {
             .args(["--otlp-grpc-endpoint", &address.to_string()])
             .args(["--otlp-http-endpoint", &other.to_string()])
             .stdout(File::create(&output).unwrap())
-            .stderr(Stdio::null())
+            .stderr(File::create(output.with_extension("errors")).unwrap())
             .spawn()
             .unwrap_or_else(|error| panic!("rotel: {error}; run `make prerequisites`"));
         let mut rotel = Self {
@@ -108,8 +104,9 @@ impl Rotel {
             let ended = self.child.try_wait().unwrap();
             assert!(
                 ended.is_none() && Instant::now() < deadline,
-                "rotel, while waiting until {what} ({ended:?}):\n{}",
-                names(&text)
+                "rotel, while waiting until {what} ({ended:?}):\n{}\n{}",
+                names(&text),
+                fs::read_to_string(self.output.with_extension("errors")).unwrap_or_default()
             );
             std::thread::sleep(Duration::from_millis(50));
         }

@@ -10,27 +10,27 @@ use ros2probe_daemon::agent_facts::{
     AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
 };
 use ros2probe_daemon::state::StateFacts;
-use ros2probe_model::chain::exemplar::Exemplars;
-use ros2probe_model::chain::expected::{ChainState, ExpectedChain, ExpectedFacts};
-use ros2probe_model::chain::path::{ChainFacts, ChainsFacts, HopHistograms, Quantiles};
-use ros2probe_model::chain::trace::{HopTimes, Method, Path, Point};
-use ros2probe_model::diagnosis::{
+use ros2probe_model::derive::chain::exemplar::Exemplars;
+use ros2probe_model::derive::chain::expected::{ChainState, ExpectedChain, ExpectedFacts};
+use ros2probe_model::derive::chain::path::{ChainFacts, ChainsFacts, HopHistograms, Quantiles};
+use ros2probe_model::derive::chain::trace::{HopTimes, Method, Path, Point};
+use ros2probe_model::derive::services::latency::Latencies;
+use ros2probe_model::facts::diagnosis::{
     Diagnoses, Diagnosis, Policies, Policy, QosPairs, TopicKey, Unmatched,
 };
-use ros2probe_model::discovery::Addresses;
-use ros2probe_model::histogram::Histogram;
-use ros2probe_model::loss_share::LossShare;
-use ros2probe_model::services::latency::Latencies;
-use ros2probe_model::snapshot::{
+use ros2probe_model::facts::histogram::Histogram;
+use ros2probe_model::facts::loss_share::LossShare;
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::facts::watch::Watch;
+use ros2probe_model::graph::discovery::Addresses;
+use ros2probe_model::graph::zenoh::{Counters, ZenohFacts};
+use ros2probe_model::report::snapshot::{
     AcknowledgementFacts, ActionFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered,
     DeliveryFacts, Direction, EarlierCounts, EndpointFacts, GoalCounts, LatencyFacts, Measurement,
     NodeFacts, ParticipantFacts, ProcessFacts, SampledFacts, ServiceFacts, Snapshot, SocketFacts,
     Source, Subscriber, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts,
     WatchFacts, WatchState, WatchedTopicFacts,
 };
-use ros2probe_model::topic_kind::TopicKind;
-use ros2probe_model::watch::Watch;
-use ros2probe_model::zenoh::{Counters, ZenohFacts};
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::{History, HistoryKind, Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
@@ -274,12 +274,12 @@ fn diagnoses() -> Diagnoses {
             node: "/lidar".into(),
             participants: vec![participant; 3],
         },
-        Diagnosis::UnheardPublisher {
+        Diagnosis::UnmatchedPublisher {
             topic: topic.clone(),
             writer,
             reason: Unmatched::Qos,
         },
-        Diagnosis::UnfedSubscriber {
+        Diagnosis::UnmatchedSubscription {
             topic: topic.clone(),
             reader,
             reason: Unmatched::Type,
@@ -381,6 +381,7 @@ pub fn topic(name: &str) -> TopicFacts {
         first_seen: Timestamp(4),
         measurement: Some(Box::new(measurement())),
         transports: 1,
+        latched: None,
     };
     TopicFacts {
         domain_id: DomainId(0),

@@ -1,9 +1,9 @@
 //! Writes messages of Zenoh as rmw_zenoh does (`reference/zenoh.md`), for tests.
 
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::Observer;
-use ros2probe_model::route::Destination;
-use ros2probe_model::zenoh::{Flow, StreamEvent, StreamId, StreamReport};
+use ros2probe_model::facts::route::Destination;
+use ros2probe_model::graph::zenoh::{Flow, StreamEvent, StreamId, StreamReport};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Observer;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::zenoh::vle;
 

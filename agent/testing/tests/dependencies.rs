@@ -19,7 +19,9 @@ use serde_json::Value;
 const ALLOWED: &[(&str, &[&str])] = &[
     ("wire", &[]),
     ("model", &["wire"]),
-    ("capture", &["wire", "model"]),
+    // It reads libraries with the one bounded cursor.
+    ("attach", &["wire"]),
+    ("capture", &["wire", "model", "attach"]),
     // Both read payloads and times with the one bounded cursor.
     ("message", &["wire"]),
     ("bag", &["wire"]),
@@ -27,7 +29,9 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("page", &[]),
     (
         "daemon",
-        &["wire", "model", "capture", "message", "bag", "api", "page"],
+        &[
+            "wire", "model", "attach", "capture", "message", "bag", "api", "page",
+        ],
     ),
     // The package is called ros2probe. It reaches a running agent only through the API; the daemon
     // composes a replay, listens for `rp discover` and examines this host for `rp doctor`.

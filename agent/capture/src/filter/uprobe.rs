@@ -8,34 +8,18 @@
 use std::fs::File;
 use std::os::fd::AsFd as _;
 
+use ros2probe_attach::attach::AttachError;
+use ros2probe_attach::client::Broker;
+use ros2probe_attach::functions::Calls;
+pub use ros2probe_attach::library::Form;
+use ros2probe_attach::request::Place;
+
 use super::{Filter, FilterError, FilterSettings, OBJECT, UNUSED, open, ring_size, take};
 use crate::breakpoints::{Attached, Breakpoints, Means};
-
-/// How a library's function receives its message.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Form {
-    /// In one piece (Fast DDS 2.x).
-    Whole,
-    /// In a list of buffers (Fast DDS 3.x).
-    List,
-}
+use crate::uprobe::attachments::Refusal;
 
 /// The loaded programs; their maps are in the [`Filter`] returned with them.
 pub struct Probes(Breakpoints);
-
-/// The probe of one library; dropping it removes the breakpoint.
-pub struct Probe {
-    _attached: Attached,
-}
-
-impl Form {
-    const fn program(self) -> &'static str {
-        match self {
-            Self::Whole => "shm_handed",
-            Self::List => "shm_handed_list",
-        }
-    }
-}
 
 impl Filter {
     /// Loads the programs for shared-memory messages and their maps, without attaching them.
@@ -58,9 +42,10 @@ impl Filter {
             ("CANDIDATES", UNUSED),
         ];
         let ebpf = open(settings, false, &sizes, None, within.unwrap_or(0))?;
-        let names = [Form::Whole, Form::List].into_iter().map(Form::program);
-        let mut breakpoints = Breakpoints::load(ebpf, &OBJECT.0, names, None, means)?;
-        let program = breakpoints.program(Form::Whole.program())?;
+        let calls = Calls::SharedMemory;
+        let mut breakpoints = Breakpoints::load(ebpf, &OBJECT.0, calls, None, means)?;
+        let program = breakpoints.programs()?.into_iter().next();
+        let program = program.ok_or(FilterError::Missing("shm_handed"))?;
         let program = program.try_clone_to_owned().map_err(FilterError::Attach)?;
         let ebpf = &mut breakpoints.ebpf;
         let mut filter = Self::with_maps(ebpf, program.as_fd(), None)?;
@@ -70,15 +55,20 @@ impl Filter {
 }
 
 impl Probes {
-    /// Attaches to a library at an offset in its file: every call there is then seen.
+    /// Lets the broker attach to a library: every message that its processes put into shared memory
+    /// is then seen.
     ///
     /// # Errors
-    /// Returns [`FilterError::Probe`] or [`FilterError::Breakpoint`] without the privilege for
-    /// `means`, or if the offset is not an instruction.
-    pub fn attach(&mut self, file: &File, offset: u64, form: Form) -> Result<Probe, FilterError> {
-        let attached = self.0.attach(file, &[(form.program(), offset)])?;
-        Ok(Probe {
-            _attached: attached,
-        })
+    /// Returns why the broker refuses.
+    pub fn attach(&self, broker: &mut Broker, place: Place) -> Result<Attached, Refusal> {
+        self.0.attach(broker, Calls::SharedMemory, place)
+    }
+
+    /// Attaches to a library's file with the rights of this process, for tests.
+    ///
+    /// # Errors
+    /// Fails if the library lacks the function, or if the kernel refuses.
+    pub fn attach_here(&self, file: &File) -> Result<Attached, AttachError> {
+        self.0.attach_here(Calls::SharedMemory, file)
     }
 }

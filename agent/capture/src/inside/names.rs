@@ -4,9 +4,9 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_model::bounded::Bounded;
-use ros2probe_model::inside::report::Trigger;
-use ros2probe_model::names::{NodeName, TopicName};
+use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::facts::calls::report::Trigger;
+use ros2probe_model::facts::names::{NodeName, TopicName};
 use ros2probe_wire::inside::{Announcement, Figures, Handle, announced, kind};
 
 use crate::tables::InsideNames;
@@ -70,6 +70,14 @@ pub struct Endpoint {
 }
 
 impl Names {
+    /// Iterates over the names of all nodes.
+    pub fn nodes(&self) -> impl Iterator<Item = &NodeName> {
+        self.known.values().filter_map(|named| match named {
+            Named::Node(name) => Some(name),
+            _ => None,
+        })
+    }
+
     /// Adds what an announcement says. Returns the name of a new node.
     pub fn announce(&mut self, said: &Announcement) -> Option<NodeName> {
         let (address, parent) = (said.address, said.parent);

@@ -7,14 +7,19 @@
 use std::fs::File;
 use std::os::fd::{AsFd as _, BorrowedFd};
 
-use aya::EbpfLoader;
-use aya::maps::{Array, HashMap, MapData, PerCpuArray, RingBuf};
+use aya::maps::{Array, HashMap, MapData, MapError, PerCpuArray, RingBuf};
+use aya::{EbpfLoader, Pod};
+use ros2probe_attach::attach::AttachError;
+use ros2probe_attach::client::Broker;
+use ros2probe_attach::functions::{Calls, ENQUEUE};
+use ros2probe_attach::request::Place;
 use ros2probe_wire::inside::{Counter, Figures, Handle, Process, clock};
+use zerocopy::FromZeros as _;
 
 use crate::breakpoints::{self, Breakpoints, Dispatcher, Means};
 use crate::filter::{Aligned, FilterError, absent_is_fine, failed, take};
 use crate::system::{Clocks, raw_difference};
-use crate::uprobe::library::{self, LibraryError};
+use crate::uprobe::attachments::Refusal;
 
 /// The object built by `agent-ebpf/build.sh`. Aligned, because ELF is read in place.
 static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../../agent-ebpf/inside.bpf.o"));
@@ -23,56 +28,16 @@ const DISPATCHER: Dispatcher = Dispatcher {
     program: "called",
     array: "CALLS",
 };
-/// Begin of the functions' names.
-const PREFIX: &str = "ros_trace_";
-/// The function that reports messages entering a ring buffer, since Iron. Without it, only
-/// callbacks show messages within a process.
-const ENQUEUE: &str = "rclcpp_ring_buffer_enqueue";
-
-/// Functions of messages, with programs of the same name.
-const MESSAGES: [&str; 14] = [
-    "rcl_publish",
-    "rmw_take",
-    "rclcpp_intra_publish",
-    "rclcpp_construct_ring_buffer",
-    ENQUEUE,
-    "rclcpp_ring_buffer_dequeue",
-    "rclcpp_ring_buffer_clear",
-    "rclcpp_buffer_to_ipb",
-    "rclcpp_ipb_to_subscription",
-    "rcl_node_init",
-    "rcl_publisher_init",
-    "rcl_subscription_init",
-    "rclcpp_subscription_init",
-    "rclcpp_subscription_callback_added",
-];
-/// Functions of callbacks, likewise.
-const CALLBACKS: [&str; 11] = [
-    "callback_start",
-    "callback_end",
-    "rclcpp_executor_execute",
-    "rclcpp_executor_get_next_ready",
-    "rcl_timer_init",
-    "rclcpp_timer_link_node",
-    "rclcpp_timer_callback_added",
-    "rcl_service_init",
-    "rclcpp_service_callback_added",
-    "rcl_lifecycle_state_machine_init",
-    "rcl_lifecycle_transition",
-];
-/// Where only messages are observed: this program at `callback_start`.
-const RECEIVED: (&str, &str) = ("callback_received", "callback_start");
-
 type FiguresWords = [u64; size_of::<Figures>() / 8];
 type ProcessWords = [u64; size_of::<Process>() / 8];
 type HandleWords = [u64; size_of::<Handle>() / 8];
+/// `Thread` and `Entry` of the programs.
+type ThreadWords = [u64; 9];
+type EntryWords = [u64; 2];
 const _: () = assert!(size_of::<Figures>().is_multiple_of(8));
 
 /// The loaded programs.
-pub struct Programs {
-    breakpoints: Breakpoints,
-    has_callbacks: bool,
-}
+pub struct Programs(Breakpoints);
 
 /// Tables of the programs.
 pub struct Tables {
@@ -81,6 +46,10 @@ pub struct Tables {
     clocks: Array<MapData, u64>,
     counters: PerCpuArray<MapData, [u64; Counter::ALL.len()]>,
     announcements: RingBuf<MapData>,
+    /// The last calls of each thread.
+    threads: HashMap<MapData, u32, ThreadWords>,
+    /// Times of entry of messages in ring buffers.
+    waiting: HashMap<MapData, EntryWords, u64>,
 }
 
 /// The probes in one library; dropping them removes the breakpoints.
@@ -109,8 +78,11 @@ pub fn load(
         .override_global("WITHIN", &within, true)
         .load(&OBJECT.0)
         .map_err(FilterError::load)?;
-    let names = used(has_callbacks);
-    let mut breakpoints = Breakpoints::load(ebpf, &OBJECT.0, names, Some(DISPATCHER), means)?;
+    let calls = match has_callbacks {
+        true => Calls::Callbacks,
+        false => Calls::Messages,
+    };
+    let mut breakpoints = Breakpoints::load(ebpf, &OBJECT.0, calls, Some(DISPATCHER), means)?;
     let ebpf = &mut breakpoints.ebpf;
     let tables = Tables {
         processes: take(ebpf, "PROCESSES")?,
@@ -118,69 +90,51 @@ pub fn load(
         clocks: take(ebpf, "CLOCKS")?,
         counters: take(ebpf, "INSIDE_COUNTERS")?,
         announcements: take(ebpf, "ANNOUNCEMENTS")?,
+        threads: take(ebpf, "THREADS")?,
+        waiting: take(ebpf, "WAITING")?,
     };
-    let programs = Programs {
-        breakpoints,
-        has_callbacks,
-    };
-    Ok((programs, tables))
-}
-
-/// Returns the names of the programs in use.
-fn used(has_callbacks: bool) -> impl Iterator<Item = &'static str> {
-    let callbacks: &[&str] = match has_callbacks {
-        true => &CALLBACKS,
-        false => &[RECEIVED.0],
-    };
-    MESSAGES.into_iter().chain(callbacks.iter().copied())
-}
-
-/// Why a library is not observed.
-#[derive(Debug, thiserror::Error)]
-pub enum AttachError {
-    /// The library cannot be read.
-    #[error(transparent)]
-    Library(#[from] LibraryError),
-    /// The library has no functions to attach to.
-    #[error("it has no functions ros_trace_rcl_publish and ros_trace_rmw_take")]
-    NoFunctions,
-    /// The kernel refuses the probes.
-    #[error(transparent)]
-    Probe(#[from] FilterError),
+    Ok((Programs(breakpoints), tables))
 }
 
 impl Programs {
-    /// Attaches to the functions that a library has.
+    /// Lets the broker attach to the functions that a library has, or to those of a `part`.
     ///
     /// # Errors
-    /// Fails if the library has none of them, or if the kernel refuses a probe.
-    pub fn attach(&mut self, file: &File) -> Result<Attached, AttachError> {
-        let places: Vec<_> = used(self.has_callbacks)
-            .map(|program| match program {
-                program if program == RECEIVED.0 => (program, RECEIVED.1),
-                program => (program, program),
-            })
-            .collect();
-        let names: Vec<_> = places
-            .iter()
-            .map(|(_, function)| format!("{PREFIX}{function}"))
-            .collect();
-        let names: Vec<_> = names.iter().map(String::as_str).collect();
-        let offsets = library::functions(file, &names)?;
-        let found = || places.iter().zip(&offsets);
-        let has = |wanted| found().any(|((each, _), at)| *each == wanted && at.is_some());
-        if !has("rcl_publish") && !has("rmw_take") {
-            return Err(AttachError::NoFunctions);
-        }
-        let shows_intra_process = has(ENQUEUE);
-        let found = found().filter_map(|((name, _), offset)| Some((*name, (*offset)?)));
-        let found: Vec<_> = found
-            .filter(|(name, _)| *name != RECEIVED.0 || !shows_intra_process)
-            .collect();
-        Ok(Attached {
-            _attached: self.breakpoints.attach(file, &found)?,
+    /// Returns why the broker refuses.
+    pub fn attach(
+        &self,
+        broker: &mut Broker,
+        part: Option<Calls>,
+        place: Place,
+    ) -> Result<Attached, Refusal> {
+        let calls = part.unwrap_or(self.0.calls);
+        Ok(Attached::new(self.0.attach(broker, calls, place)?))
+    }
+
+    /// Attaches to a library's file with the rights of this process, for tests and examples.
+    ///
+    /// # Errors
+    /// Fails if the library has none of the functions, or if the kernel refuses.
+    pub fn attach_here(&self, file: &File) -> Result<Attached, AttachError> {
+        Ok(Attached::new(self.0.attach_here(self.0.calls, file)?))
+    }
+}
+
+/// Removes all entries.
+fn clear<K: Pod, V: Pod>(map: &mut HashMap<MapData, K, V>) -> Result<(), MapError> {
+    let keys: Vec<_> = map.keys().filter_map(Result::ok).collect();
+    keys.iter()
+        .try_for_each(|key| absent_is_fine(map.remove(key)))
+}
+
+impl Attached {
+    fn new(attached: breakpoints::Attached) -> Self {
+        let mut functions = attached.functions.iter();
+        let shows_intra_process = functions.any(|function| function == ENQUEUE);
+        Self {
+            _attached: attached,
             shows_intra_process,
-        })
+        }
     }
 }
 
@@ -252,6 +206,27 @@ impl Tables {
     pub fn remove_handle(&mut self, handle: Handle) -> Result<(), FilterError> {
         let key: HandleWords = zerocopy::transmute!(handle);
         absent_is_fine(self.handles.remove(&key)).map_err(failed("HANDLES", "remove"))
+    }
+
+    /// Forgets all calls so far, while the programs of [`Calls::Runtime`] are detached: later ones
+    /// have nothing to do with them. What is announced stays announced.
+    ///
+    /// # Errors
+    /// Fails if the kernel refuses an update.
+    pub fn forget_calls(&mut self) -> Result<(), FilterError> {
+        let handles: Vec<_> = self.figures().collect();
+        for (handle, figures) in handles {
+            let new = Figures {
+                announced: figures.announced,
+                ..Figures::new_zeroed()
+            };
+            let (key, words): (HandleWords, FiguresWords) =
+                (zerocopy::transmute!(handle), zerocopy::transmute!(new));
+            let set = self.handles.insert(key, words, 0);
+            set.map_err(failed("HANDLES", "update"))?;
+        }
+        clear(&mut self.threads).map_err(failed("THREADS", "remove"))?;
+        clear(&mut self.waiting).map_err(failed("WAITING", "remove"))
     }
 
     /// Returns all counters, summed over CPUs.

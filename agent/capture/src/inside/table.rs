@@ -4,13 +4,14 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_model::bounded::Bounded;
-use ros2probe_model::chain::causality::CausalPublication;
-use ros2probe_model::inside::report::{
+use ros2probe_attach::client::Broker;
+use ros2probe_model::derive::chain::causality::CausalPublication;
+use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::facts::calls::report::{
     BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report,
     SubscriptionReport, Transition,
 };
-use ros2probe_model::names::{NodeName, TopicName};
+use ros2probe_model::facts::names::{NodeName, TopicName};
 use ros2probe_wire::inside::{
     self, Announcement, Figures, Handle, Process, announced, distribution, kind, state,
 };
@@ -18,7 +19,7 @@ use ros2probe_wire::{DomainId, Timestamp};
 use zerocopy::FromBytes as _;
 
 use super::names::{Endpoint, Names, text};
-use super::process::{ReadMemory, Stat};
+use super::process::Stat;
 use super::programs::Tables;
 use crate::system::Clocks;
 use crate::tables::{CausalHops, InsideBuffers, NewNodes, ReportedHandles, Transitions};
@@ -32,7 +33,6 @@ const RECHECK: u32 = 5;
 
 /// The observed processes.
 pub struct ProcessTable {
-    read: ReadMemory,
     known: HashMap<u32, Observed>,
     has_callbacks: bool,
     hops: Bounded<CausalHops, Vec<inside::Hop>>,
@@ -51,12 +51,16 @@ pub struct Round {
     pub publications: Vec<CausalPublication>,
     /// Calls per second of all processes; 0 if they were not judged.
     pub hits: u64,
+    /// Whether the programs are detached until a client needs calls again.
+    pub is_last: bool,
 }
 
 #[derive(Debug, Default)]
 struct Observed {
-    /// `None` if the process had ended before it was inspected.
+    /// `None` if the process had ended before it was inspected, or if the broker did not answer.
     stat: Option<Stat>,
+    /// Whether it had ended before it was inspected. Another process may have its id by now.
+    had_ended: bool,
     domain: DomainId,
     names: Names,
     new_nodes: Bounded<NewNodes, Vec<NodeName>>,
@@ -97,14 +101,22 @@ impl Observed {
         self.reported.clear();
         self.buffers.clear();
     }
+
+    /// Lets the next round report everything again.
+    fn forget_reports(&mut self) {
+        self.forget_reported();
+        self.new_nodes.clear();
+        for node in self.names.nodes() {
+            self.new_nodes.push(node.clone());
+        }
+    }
 }
 
 impl ProcessTable {
-    /// Creates an empty table. `read` reads the memory of observed processes.
+    /// Creates an empty table.
     #[must_use]
-    pub fn new(has_callbacks: bool, read: ReadMemory) -> Self {
+    pub fn new(has_callbacks: bool) -> Self {
         Self {
-            read,
             known: HashMap::new(),
             has_callbacks,
             hops: Bounded::default(),
@@ -126,25 +138,25 @@ impl ProcessTable {
         self.known.is_empty()
     }
 
-    /// Reads the announcements that wait.
-    pub fn drain(&mut self, tables: &mut Tables, clocks: &Clocks) {
+    /// Reads the announcements that wait. `broker` knows the processes.
+    pub fn drain(&mut self, tables: &mut Tables, clocks: &Clocks, broker: &mut Broker) {
         while let Some(item) = tables.next_announcement(Item::read) {
-            self.note(item, clocks);
+            self.note(item, clocks, broker);
         }
     }
 
-    fn note(&mut self, item: Option<Item>, clocks: &Clocks) {
+    fn note(&mut self, item: Option<Item>, clocks: &Clocks, broker: &mut Broker) {
         match item {
             Some(Item::Hop(hop)) => {
                 self.hops.push(hop);
             }
-            Some(Item::Announcement(said)) => self.announced(&said, clocks),
+            Some(Item::Announcement(said)) => self.announced(&said, clocks, broker),
             None => {}
         }
     }
 
-    fn announced(&mut self, said: &Announcement, clocks: &Clocks) {
-        let observed = self.observe(said.process);
+    fn announced(&mut self, said: &Announcement, clocks: &Clocks, broker: &mut Broker) {
+        let observed = self.observe(said.process, broker);
         if said.kind == announced::TRANSITION {
             let transition = Transition {
                 process: said.process,
@@ -162,17 +174,63 @@ impl ProcessTable {
     }
 
     /// Returns the state of a process, new if necessary. The kernel's table bounds their number.
-    fn observe(&mut self, process: u32) -> &mut Observed {
-        let read = &mut self.read;
+    fn observe(&mut self, process: u32, broker: &mut Broker) -> &mut Observed {
         self.known.entry(process).or_insert_with(|| {
-            let stat = Stat::read(process);
-            let domain = stat.as_ref().and_then(|stat| stat.domain(process, read));
+            // Without an answer it has no name, and its domain is taken for 0.
+            let states = broker.activities(&[process]);
+            let had_ended = states.as_ref().is_ok_and(Vec::is_empty);
+            let state = states.unwrap_or_default().into_iter().next();
+            let domain = state
+                .is_some()
+                .then(|| broker.domain(process).ok().flatten());
             Observed {
-                domain: domain.unwrap_or_default(),
-                stat,
+                domain: DomainId(domain.flatten().unwrap_or_default()),
+                stat: state.map(Stat::from),
+                had_ended,
                 ..Observed::default()
             }
         })
+    }
+
+    /// Lets the next round report everything again, after [`Tables::forget_calls`].
+    pub fn forget_reports(&mut self) {
+        self.hops.clear();
+        for observed in self.known.values_mut() {
+            observed.forget_reports();
+        }
+    }
+
+    /// Forgets processes that have ended, without a report: their ids may be used again.
+    pub fn forget_ended(&mut self, tables: &mut Tables, clocks: &Clocks, broker: &mut Broker) {
+        self.drain(tables, clocks, broker);
+        let processes: Vec<_> = tables.processes().map(|(id, _)| id).collect();
+        // Without an answer it is unknown which processes have ended.
+        let Ok(states) = broker.activities(&processes) else {
+            return;
+        };
+        let running = states.into_iter();
+        let running: HashMap<_, _> = running
+            .map(|state| (state.process, state.started))
+            .collect();
+        let is_running = |id: &u32, observed: Option<&Observed>| {
+            let started = observed.and_then(|observed| Some(observed.stat.as_ref()?.started));
+            let at = running.get(id);
+            at.is_some_and(|at| started.is_none_or(|started| started == *at))
+        };
+        for id in &processes {
+            if !is_running(id, self.known.get(id)) {
+                let _ = tables.remove_process(*id);
+                self.known.remove(id);
+            }
+        }
+        let present: HashSet<_> = tables.processes().map(|(id, _)| id).collect();
+        let handles: Vec<_> = tables.figures().map(|(handle, _)| handle).collect();
+        for handle in handles {
+            if !present.contains(&handle.process) {
+                let _ = tables.remove_handle(handle);
+            }
+        }
+        self.known.retain(|id, _| present.contains(id));
     }
 
     /// Reads everything once. `elapsed`: time since the last round. `shows_intra_process`: whether a
@@ -182,15 +240,31 @@ impl ProcessTable {
         tables: &mut Tables,
         clocks: &Clocks,
         elapsed: Duration,
+        broker: &mut Broker,
         shows_intra_process: impl Fn(u32) -> bool,
     ) -> Round {
         self.rounds = self.rounds.wrapping_add(1);
         self.unjudged += elapsed;
         let is_due = self.unjudged >= JUDGED_OVER;
         let judged = is_due.then(|| std::mem::take(&mut self.unjudged));
-        self.drain(tables, clocks);
+        self.drain(tables, clocks, broker);
         let (mut reports, mut hits) = (HashMap::new(), 0);
         let processes: Vec<_> = tables.processes().collect();
+        let counted = processes
+            .iter()
+            .filter(|(_, process)| process.state != state::OUTSIDE);
+        let counted: Vec<_> = counted.map(|(id, _)| *id).collect();
+        for id in &counted {
+            self.observe(*id, broker);
+        }
+        // Without an answer it is unknown which processes have ended.
+        let states = broker.activities(&counted).ok();
+        let states = states.map(|states| {
+            let states = states
+                .into_iter()
+                .map(|state| (state.process, state.into()));
+            states.collect::<HashMap<u32, Stat>>()
+        });
         for (id, process) in &processes {
             if process.state == state::OUTSIDE {
                 if self.rounds.is_multiple_of(RECHECK) {
@@ -201,7 +275,7 @@ impl ProcessTable {
             if let Some(over) = judged {
                 hits += self.judge(tables, *id, process, over);
             }
-            let report = self.process(*id, process);
+            let report = self.process(*id, process, states.as_ref());
             reports.insert(*id, report);
         }
         // A process that has ended makes no further calls, so these figures are its last.
@@ -213,7 +287,7 @@ impl ProcessTable {
         let mut figures: Vec<_> = tables.figures().collect();
         // Publishers name their buffers, and buffers their callbacks.
         figures.sort_unstable_by_key(|(handle, _)| handle.kind);
-        self.drain(tables, clocks);
+        self.drain(tables, clocks, broker);
         for (handle, figures) in &figures {
             if let Some(report) = reports.get_mut(&handle.process) {
                 self.handle(report, *handle, figures, clocks);
@@ -248,18 +322,28 @@ impl ProcessTable {
             report,
             publications,
             hits,
+            is_last: false,
         }
     }
 
-    /// Returns the report of a process without its handles.
-    fn process(&mut self, id: u32, process: &Process) -> ProcessReport {
-        let observed = self.observe(id);
-        // Another process may have received the same id.
-        let started = observed.stat.as_ref().map(|stat| stat.started);
-        let stat = Stat::read(id).filter(|stat| Some(stat.started) == started);
-        let has_ended = stat.is_none();
-        if !has_ended {
-            observed.stat = stat;
+    /// Returns the report of a process without its handles. `states`: of the processes that have
+    /// not ended, if known.
+    fn process(
+        &mut self,
+        id: u32,
+        process: &Process,
+        states: Option<&HashMap<u32, Stat>>,
+    ) -> ProcessReport {
+        let observed = self.known.entry(id).or_default();
+        let mut has_ended = observed.had_ended;
+        if let Some(states) = states.filter(|_| !has_ended) {
+            // Another process may have received the same id.
+            let started = observed.stat.as_ref().map(|stat| stat.started);
+            let stat = states
+                .get(&id)
+                .filter(|stat| started.is_none_or(|at| at == stat.started));
+            has_ended = stat.is_none();
+            observed.stat = stat.cloned().or_else(|| observed.stat.take());
         }
         let stat = observed.stat.as_ref();
         ProcessReport {
@@ -278,7 +362,7 @@ impl ProcessTable {
 
     /// Applies the budget of a process to its calls over this time. Returns its calls per second.
     fn judge(&mut self, tables: &mut Tables, id: u32, process: &Process, over: Duration) -> u64 {
-        let observed = self.observe(id);
+        let observed = self.known.entry(id).or_default();
         let milliseconds = u64::try_from(over.as_millis()).unwrap_or(u64::MAX).max(1);
         let hits = process.hits.saturating_sub(observed.hits);
         let rate = hits.saturating_mul(1000) / milliseconds;
@@ -465,13 +549,13 @@ mod tests {
     use zerocopy::FromZeros as _;
 
     fn table() -> ProcessTable {
-        ProcessTable::new(false, Box::new(|_, _, _| None))
+        ProcessTable::new(false)
     }
 
     fn announced(table: &mut ProcessTable, kind: u32, address: u64) {
         let mut said = Announcement::new_zeroed();
         (said.process, said.kind, said.address) = (u32::MAX, kind, address);
-        table.announced(&said, &Clocks::read());
+        table.announced(&said, &Clocks::read(), &mut Broker::here());
     }
 
     #[test]
@@ -491,7 +575,7 @@ mod tests {
         let (mut table, clocks) = (table(), Clocks::read());
         for _ in 0..20_000 {
             let hop = inside::Hop::new_zeroed();
-            table.note(Some(Item::Hop(hop)), &clocks);
+            table.note(Some(Item::Hop(hop)), &clocks, &mut Broker::here());
         }
         assert_driven::<CausalHops>();
     }

@@ -65,6 +65,9 @@ pub(super) fn open_exact(
     if settings.shm.exact == ExactChoice::Off {
         return (None, None);
     }
+    if !host && settings.shm.exact == ExactChoice::Auto {
+        return (None, None);
+    }
     if !host {
         // Where these programs run, processes can be selected by control group only.
         let reason = "uprobes require observing the host's sockets (capture.source: host)";
@@ -72,6 +75,7 @@ pub(super) fn open_exact(
     }
     let opened = Uprobe::open(
         settings.cgroup.as_deref(),
+        &settings.broker,
         settings.ring_bytes,
         settings.record_ring_bytes,
         settings.shm.exact == ExactChoice::Auto,
@@ -87,7 +91,11 @@ pub(super) fn open_inside(settings: &CaptureSettings) -> (Option<Inside>, Option
     if settings.inside == InsideChoice::Off {
         return (None, None);
     }
-    match Inside::open(settings.inside, settings.cgroup.as_deref()) {
+    match Inside::open(
+        settings.inside,
+        settings.cgroup.as_deref(),
+        &settings.broker,
+    ) {
         Ok(inside) => (Some(inside), None),
         Err(error) => (None, Some(in_words(&error))),
     }

@@ -6,7 +6,7 @@
 
 use std::collections::HashMap;
 
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_wire::filter::UNKNOWN_CAPTURE_BYTES;
 use ros2probe_wire::record::{Record, Verdict, guid_words};
 use ros2probe_wire::time::SECOND;

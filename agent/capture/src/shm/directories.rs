@@ -12,7 +12,7 @@ use std::time::{Duration, SystemTime};
 use super::cell::SegmentId;
 use super::owner::{LOCKED, Locks};
 use crate::tables::{Directories, DirectoryFiles, ScopeProcesses};
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 
 /// Directory of shared memory.
 const SHARED_MEMORY: &str = "/dev/shm";

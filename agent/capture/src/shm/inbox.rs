@@ -3,7 +3,7 @@
 use std::os::fd::BorrowedFd;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use ros2probe_model::bounded::{Bounded, Counted, Sum};
+use ros2probe_model::facts::bounded::{Bounded, Counted, Sum};
 use ros2probe_wire::record::{Record, Sample};
 
 use crate::bell::Bell;

@@ -40,8 +40,8 @@ use self::tap::{Counters, Tap};
 use super::reorder_buffer::ReorderBuffer;
 use super::system::{Clocks, DirectoryWatch, calendar, monotonic, run_first, thread_cpu, wait};
 use crate::threads::{Progress, Spawn, Task};
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Wanted};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Wanted};
 
 /// Interval at which the counters are published.
 const REPORT: u64 = 200_000_000;

@@ -5,7 +5,7 @@
 //! `write_p`, then fills the cell, and sets its reference counter last. So a cell counts as filled
 //! if it is referenced or if it differs from its content one round before.
 
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 
 use super::cell::{Cell, Descriptor};
 use super::source::Source;

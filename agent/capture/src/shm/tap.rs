@@ -24,7 +24,7 @@ use super::source::SharedFile;
 use crate::system::thread_cpu;
 use crate::tables::{AbandonedPorts, Ports, Segments};
 use recent_messages::{Identity, RecentMessages};
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 
 /// Most messages read per poll; the rest of a flood is read in the next.
 const MAX_PER_POLL: usize = 2048;

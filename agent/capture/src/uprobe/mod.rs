@@ -1,12 +1,12 @@
 //! Every message into Fast DDS's shared memory, read in the process that sends it.
 //!
-//! Opt-in, because it puts a breakpoint into code of other processes, which costs them a
-//! microsecond per message. In return nothing is sampled: the kernel program reads a message before
-//! it is copied, so names, samples and losses are as exact as at a socket. It sees messages passed
-//! to the transport, even those that a full port or segment then refuses.
+//! A breakpoint in the code of other processes costs them some microseconds per message. By default
+//! it is there while processes start, which announce their names once, and while a client reads
+//! messages. Nothing is sampled then: the kernel program reads a message before it is copied, so
+//! names, samples and losses are as exact as at a socket. It sees messages passed to the transport,
+//! even those that a full port or segment then refuses.
 
 pub mod attachments;
-pub mod library;
 pub mod processes;
 pub mod search;
 
@@ -25,8 +25,9 @@ use super::reorder_buffer::ReorderBuffer;
 use super::shm::directories::Scope;
 use super::system::Clocks;
 use crate::threads::Spawn;
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::Observer;
+use ros2probe_attach::client::Broker;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Observer;
 use rustix::thread::{CapabilitySet, capabilities};
 
 /// Factor by which the record ring is larger: a process can write a hundred thousand messages per
@@ -36,9 +37,9 @@ const RECORD_RINGS: usize = 4;
 /// Why messages cannot be read in the processes that send them.
 #[derive(Debug, thiserror::Error)]
 pub enum UprobeError {
-    /// A capability for breakpoints in other processes, or for listing processes, is missing.
-    #[error("uprobes need {0}")]
-    Missing(String),
+    /// The broker, a child of this process, cannot be started.
+    #[error("the broker that attaches breakpoints cannot be started")]
+    Start(#[source] io::Error),
     /// The control group cannot be inspected.
     #[error("the cgroup {} cannot be inspected", path.display())]
     Cgroup {
@@ -59,9 +60,9 @@ pub enum UprobeError {
     Filter(#[from] FilterError),
 }
 
-/// Returns the capabilities required by breakpoints in other processes, apart from those that load
-/// programs: for events of mapped files, and for reading mapped files of other users' processes.
-/// Perf events need the wider one on recent kernels.
+/// Returns the capabilities that the broker needs, apart from those that load programs: for events
+/// of mapped files, and for reading mapped files of other users' processes. Perf events need the
+/// wider one on recent kernels.
 fn needed() -> [(CapabilitySet, &'static str); 2] {
     let events = match Means::of_this_kernel() {
         Means::Links => (CapabilitySet::PERFMON, "CAP_PERFMON"),
@@ -70,12 +71,24 @@ fn needed() -> [(CapabilitySet, &'static str); 2] {
     [events, (CapabilitySet::SYS_PTRACE, "CAP_SYS_PTRACE")]
 }
 
-/// Returns the capabilities that attaching programs to libraries can use: those required, and one
-/// for opening a mapped file that another one has replaced.
+/// Returns the capabilities that the broker can use: those required, and one for opening a mapped
+/// file that another one has replaced.
 #[must_use]
 pub fn useful() -> CapabilitySet {
     let required: CapabilitySet = needed().iter().map(|(one, _)| *one).collect();
     required | CapabilitySet::CHECKPOINT_RESTORE
+}
+
+/// Returns the broker that listens at `socket`. Without a socket, a process with its privileges
+/// starts one as a child.
+///
+/// # Errors
+/// Fails if the child cannot be started.
+pub(crate) fn broker(socket: &Path) -> Result<Broker, UprobeError> {
+    match !socket.exists() && missing().is_empty() {
+        true => Broker::start().map_err(UprobeError::Start),
+        false => Ok(Broker::at(socket)),
+    }
 }
 
 /// Returns the names of required capabilities that `effective` lacks.
@@ -107,21 +120,19 @@ pub struct Uprobe {
 }
 
 impl Uprobe {
-    /// Loads the programs. Attaches them to installed libraries, or with `on_demand` to none before
-    /// [`Self::want`]. `cgroup`: only for processes of this control group.
+    /// Loads the programs, and attaches them to installed libraries. `on_demand`: they are detached
+    /// while no process starts, and [`Self::want`] does not need them. `cgroup`: only for processes of this control group. `broker`: socket of the
+    /// process that attaches.
     ///
     /// # Errors
-    /// Fails if a capability is missing, or if the kernel has no uprobes.
+    /// Fails if the programs may not be loaded, or if the kernel has no uprobes.
     pub fn open(
         cgroup: Option<&Path>,
+        broker: &Path,
         ring_bytes: usize,
         record_ring_bytes: usize,
         on_demand: bool,
     ) -> Result<Self, UprobeError> {
-        let missing = missing();
-        if !missing.is_empty() {
-            return Err(UprobeError::Missing(missing.join(" and ")));
-        }
         let within = cgroup.map(inode).transpose()?;
         let size = |bytes| u32::try_from(bytes).unwrap_or(u32::MAX >> 1);
         let settings = FilterSettings {
@@ -139,13 +150,12 @@ impl Uprobe {
         });
         Ok(Self {
             reader: FilterReader::new(filter, &[]),
-            search: LibrarySearch::new(probes, scope, on_demand),
+            search: LibrarySearch::new(probes, scope, self::broker(broker)?, on_demand),
             was_attached: false,
         })
     }
 
-    /// Starts a thread with the required privileges that finds further libraries and attaches to
-    /// them.
+    /// Starts a thread that finds further libraries and lets the broker attach to them.
     ///
     /// # Errors
     /// Fails if the thread cannot be started.
@@ -162,6 +172,12 @@ impl Uprobe {
     /// programs are attached on demand.
     pub fn want(&self, wanted: bool) {
         self.search.want(wanted);
+    }
+
+    /// Returns whether the programs are wanted, and not yet in all processes that can have them.
+    #[must_use]
+    pub fn is_attaching(&self) -> bool {
+        self.search.is_attaching()
     }
 
     /// Returns the buffer in which records from polling wait for their turn; `None` while no process

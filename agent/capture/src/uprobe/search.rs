@@ -2,7 +2,7 @@
 //!
 //! Attached once to a file, a probe is in every process that maps it, including later ones. A
 //! library that no process uses is detached only after a while, so that a restarted robot is seen
-//! from its first message. The thread reads `/proc` and library files, and writes nothing.
+//! from its first message. The broker reads other processes for the thread.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -12,11 +12,17 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use super::attachments::{Attachments, LibraryFacts, Refusal, installed};
-use super::library;
-use super::processes::{Mapped, Processes, is_library};
-use crate::filter::{Probe, Probes};
-use crate::mappings::{MappingEvents, UNCONCERNED};
+use ros2probe_attach::client::Broker;
+use ros2probe_attach::functions::Library;
+use ros2probe_attach::mapped::Mapped;
+
+use super::attachments::{Attachments, LibraryFacts};
+use super::processes::Processes;
+use crate::bell::Bell;
+use crate::breakpoints::Attached;
+use crate::error_chain::in_words;
+use crate::filter::Probes;
+use crate::mappings::{MappingEvents, NewMappings, UNCONCERNED};
 use crate::shm::directories::{Name, Scope, ShmDirectories};
 use crate::system::{DirectoryWatch, wait};
 use crate::threads::{Progress, Spawn, Task};
@@ -25,6 +31,8 @@ use crate::threads::{Progress, Spawn, Task};
 const EVERY: Duration = Duration::from_secs(1);
 /// How long to collect events: a starting participant creates several files at once.
 const GATHER: Duration = Duration::from_millis(20);
+/// Time after the start of a process in which its names are announced, each once.
+const STARTING: Duration = Duration::from_secs(10);
 /// Time between resuming the polls of shared memory and detaching the probes.
 const OVERLAP: Duration = Duration::from_millis(400);
 /// Why nothing is attached on demand.
@@ -34,7 +42,7 @@ const RESTING: &str =
 pub struct LibrarySearch {
     shared: Arc<Shared>,
     /// State passed to the thread when it starts.
-    waiting: Option<(Attachments<Probe>, Scope)>,
+    waiting: Option<(Attachments<Attached>, Scope, Broker)>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -56,11 +64,15 @@ struct Shared {
     /// Also set until the first search ends: that takes a moment, and installed libraries are
     /// attached.
     covers_all: AtomicBool,
-    /// Whether the probes are needed.
+    /// Whether every message is needed.
     wanted: AtomicBool,
+    /// Rings when that changes. Without it, the thread notices within a second.
+    bell: Option<Bell>,
     /// Whether any probe may be attached.
     attached: AtomicBool,
-    /// Whether probes are attached only while they are needed.
+    /// Whether all processes have been visited since the probes were last wanted.
+    visited: AtomicBool,
+    /// Whether probes are attached only while processes start, and while every message is needed.
     on_demand: bool,
     progress: Arc<Progress>,
     stop: AtomicBool,
@@ -91,50 +103,45 @@ impl Default for Facts {
 }
 
 impl LibrarySearch {
-    /// Attaches to installed libraries before the thread starts; with `on_demand` to none until
-    /// they are needed.
+    /// Attaches to installed libraries before the thread starts. `on_demand`: the thread detaches when
+    /// no process has started for a while and not every message is needed.
     #[must_use]
-    pub fn new(probes: Probes, scope: Scope, on_demand: bool) -> Self {
+    pub fn new(probes: Probes, scope: Scope, mut broker: Broker, on_demand: bool) -> Self {
         let progress = Arc::new(Progress::default());
         let mut attachments = attachments(probes, Arc::clone(&progress));
         // A participant announces its names once, within a tenth of a second: installed libraries
         // are attached in advance.
-        if !on_demand {
-            attachments.install(&installed(is_library), Instant::now());
-            progress.rest();
-        }
-        let facts = match on_demand {
-            true => Facts::resting(),
-            false => Facts::default(),
-        };
+        attachments.install(Library::FastDds, Instant::now(), &mut broker);
+        progress.rest();
         let shared = Arc::new(Shared {
-            facts: Mutex::new(facts),
+            facts: Mutex::default(),
             progress,
-            covers_all: AtomicBool::new(!on_demand),
+            covers_all: AtomicBool::new(true),
             wanted: AtomicBool::new(!on_demand),
-            attached: AtomicBool::new(!on_demand),
+            bell: Bell::new().ok(),
+            attached: AtomicBool::new(true),
+            visited: AtomicBool::default(),
             on_demand,
             stop: AtomicBool::new(false),
         });
         Self {
             shared,
-            waiting: Some((attachments, scope)),
+            waiting: Some((attachments, scope, broker)),
             thread: None,
         }
     }
 
-    /// Starts the search, once, in a thread that drops the privileges it does not need; the caller
-    /// may drop all of its own afterwards.
+    /// Starts the search, once, in a thread without privileges.
     ///
     /// # Errors
     /// Fails if the thread cannot be started.
     pub fn start(&mut self, spawn: Spawn) -> io::Result<()> {
-        let Some((attachments, scope)) = self.waiting.take() else {
+        let Some((attachments, scope, broker)) = self.waiting.take() else {
             return Ok(());
         };
         let thread = std::thread::Builder::new().name("exact".to_owned());
         let shared = Arc::clone(&self.shared);
-        let work = Box::new(move || follow(&shared, attachments, scope));
+        let work = Box::new(move || follow(&shared, attachments, scope, broker));
         let spawned = spawn(Task::Probes, thread, work);
         if spawned.is_err() {
             let facts = self.shared.facts.lock();
@@ -145,15 +152,21 @@ impl LibrarySearch {
         Ok(())
     }
 
-    /// Attaches or detaches all probes, if they are attached on demand.
+    /// Sets whether every message is needed, if probes are attached on demand.
     pub fn want(&self, wanted: bool) {
         let shared = &self.shared;
         if !shared.on_demand || shared.wanted.swap(wanted, Ordering::AcqRel) == wanted {
             return;
         }
-        if let Some(thread) = &self.thread {
-            thread.thread().unpark();
-        }
+        shared.visited.store(false, Ordering::Release);
+        shared.ring();
+    }
+
+    /// Returns whether the probes are wanted, and not yet in all processes that can have them.
+    #[must_use]
+    pub fn is_attaching(&self) -> bool {
+        let shared = &self.shared;
+        shared.wanted.load(Ordering::Acquire) && !shared.visited.load(Ordering::Acquire)
     }
 
     /// Returns whether any probe may be attached.
@@ -186,20 +199,21 @@ impl LibrarySearch {
 impl Drop for LibrarySearch {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Release);
-        if let Some(thread) = self.thread.take() {
-            // Otherwise it wakes within a second, too long for a shutdown.
-            thread.thread().unpark();
-            drop(thread);
-        }
+        // Otherwise it wakes within a second, too long for a shutdown.
+        self.shared.ring();
+        drop(self.thread.take());
     }
 }
 
 /// The thread's main function.
-fn follow(shared: &Shared, attachments: Attachments<Probe>, scope: Scope) {
+fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, broker: Broker) {
     let mut followed = Followed {
-        processes: Processes::new(scope.clone(), is_library),
+        processes: Processes::new(scope.clone(), Library::FastDds),
         attachments,
-        mappings: MappingEvents::open_or_warn("capture.shm.exact"),
+        broker,
+        failed: None,
+        mappings: None,
+        starting_until: Instant::now() + STARTING,
     };
     let mut shared_memory = ShmDirectories::new(scope);
     // Without inotify, a starting participant is noticed within a second.
@@ -208,19 +222,19 @@ fn follow(shared: &Shared, attachments: Attachments<Probe>, scope: Scope) {
     let (mut somebody_came, mut asked_all) = (true, None::<Instant>);
     while !shared.stop.load(Ordering::Acquire) {
         shared.progress.step();
-        if !shared.wanted.load(Ordering::Acquire) {
+        let is_starting = Instant::now() < followed.starting_until;
+        if !shared.wanted.load(Ordering::Acquire) && !is_starting {
             if shared.attached.load(Ordering::Acquire) {
                 // Polling of shared memory resumes before the probes are detached.
                 shared.report(Facts::resting());
                 std::thread::sleep(OVERLAP);
-                followed.attachments.clear();
+                followed.rest();
                 shared.attached.store(false, Ordering::Release);
                 tracing::info!("no longer attached: no samples are read");
             }
             somebody_came = true;
             asked_all = None;
-            shared.progress.rest();
-            std::thread::park_timeout(EVERY);
+            followed.wait_resting(shared);
             continue;
         }
         shared.attached.store(true, Ordering::Release);
@@ -235,6 +249,7 @@ fn follow(shared: &Shared, attachments: Attachments<Probe>, scope: Scope) {
             followed.find(true, now);
         }
         shared.report(followed.facts());
+        shared.visited.store(true, Ordering::Release);
         let Some(watch) = &mut watch else {
             followed.wait_attaching(None, EVERY, shared);
             continue;
@@ -259,18 +274,73 @@ fn follow(shared: &Shared, attachments: Attachments<Probe>, scope: Scope) {
 /// The processes, and the libraries that they use.
 struct Followed {
     processes: Processes,
-    attachments: Attachments<Probe>,
+    attachments: Attachments<Attached>,
+    broker: Broker,
+    /// Why the broker did not answer last time.
+    failed: Option<String>,
     mappings: Option<MappingEvents>,
+    /// End of the time in which a process that has started announces its names.
+    starting_until: Instant,
 }
 
 impl Followed {
     fn find(&mut self, all: bool, now: Instant) {
-        self.processes.find(all);
-        self.attachments.follow(&self.processes, now);
+        // Before anything else: a process that starts announces its names at once.
+        self.install(now);
+        let found = self.processes.find(all, &mut self.broker);
+        self.failed = found.err().map(|error| in_words(&error));
+        // The broker may come after the agent.
+        self.install(now);
+        self.attachments
+            .follow(&self.processes, now, &mut self.broker);
     }
 
     fn facts(&self) -> Facts {
-        facts(&self.attachments, &self.processes)
+        facts(&self.attachments, &self.processes, self.failed.clone())
+    }
+
+    /// Attaches to installed libraries, and notices which processes map others.
+    fn install(&mut self, now: Instant) {
+        if self.failed.is_some() {
+            return;
+        }
+        let broker = &mut self.broker;
+        self.attachments.install(Library::FastDds, now, broker);
+        if self.mappings.is_none() {
+            self.mappings = MappingEvents::open_or_warn("capture.shm.exact", &mut self.broker);
+        }
+    }
+
+    /// Detaches from everything, so that the broker may end.
+    fn rest(&mut self) {
+        self.attachments.clear();
+        self.broker.rest();
+    }
+
+    /// Waits until a process maps a library, or every message is needed.
+    fn wait_resting(&mut self, shared: &Shared) {
+        let bell = shared.bell.iter().map(Bell::descriptor);
+        let mapped = self.mappings.iter().flat_map(MappingEvents::descriptors);
+        let descriptors: Vec<_> = bell.chain(mapped).collect();
+        shared.progress.rest();
+        let ready = wait(&descriptors, EVERY);
+        shared.progress.step();
+        shared.bell.iter().for_each(Bell::silence);
+        let new = self.take_mapped();
+        if new.is_incomplete || self.processes.are_in_scope(&new.processes) {
+            self.starting_until = Instant::now() + STARTING;
+        } else if matches!(ready, Ok(Some(_))) {
+            std::thread::sleep(UNCONCERNED);
+        }
+    }
+
+    fn take_mapped(&mut self) -> NewMappings {
+        let is_library = |name: &str| Library::FastDds.has_name(name);
+        let new = self
+            .mappings
+            .as_mut()
+            .map(|mappings| mappings.take(is_library));
+        new.unwrap_or_default()
     }
 
     /// Waits until a file is created, at most `limit`, and returns whether one was. Attaches to
@@ -302,24 +372,28 @@ impl Followed {
     }
 
     fn attach_mapped(&mut self, shared: &Shared) {
-        let new = self
-            .mappings
-            .as_mut()
-            .map(|mappings| mappings.take(is_library));
-        let new = new.unwrap_or_default();
-        if new.is_incomplete {
-            self.processes.find(true);
-        } else if new.processes.is_empty() {
+        let new = self.take_mapped();
+        if self.processes.are_in_scope(&new.processes) {
+            self.starting_until = Instant::now() + STARTING;
+        }
+        if let Err(error) = self.processes.meet(&new, &mut self.broker) {
+            self.failed = Some(in_words(&error));
+        } else if !new.is_incomplete && new.processes.is_empty() {
             std::thread::sleep(UNCONCERNED);
             return;
         }
-        self.processes.inspect(&new.processes);
-        self.attachments.follow(&self.processes, Instant::now());
+        let now = Instant::now();
+        self.attachments
+            .follow(&self.processes, now, &mut self.broker);
         shared.report(self.facts());
     }
 }
 
 impl Shared {
+    fn ring(&self) {
+        self.bell.iter().for_each(Bell::ring);
+    }
+
     fn report(&self, facts: Facts) {
         self.covers_all
             .store(facts.uncovered.is_none(), Ordering::Release);
@@ -336,28 +410,31 @@ impl Shared {
 }
 
 /// Returns attachments of the function that copies a message into shared memory.
-fn attachments(mut probes: Probes, progress: Arc<Progress>) -> Attachments<Probe> {
+fn attachments(probes: Probes, progress: Arc<Progress>) -> Attachments<Attached> {
     Attachments::new(
         "every message is seen",
-        Box::new(move |file| {
+        Box::new(move |broker, place| {
             progress.step();
-            let entry = library::find(file)?;
-            let probe = probes.attach(file, entry.offset, entry.form);
-            probe.map_err(|error| Refusal::Probe(error.into()))
+            probes.attach(broker, place)
         }),
     )
 }
 
-fn facts(attachments: &Attachments<Probe>, processes: &Processes) -> Facts {
+/// `failed`: why the broker does not answer.
+fn facts(
+    attachments: &Attachments<Attached>,
+    processes: &Processes,
+    failed: Option<String>,
+) -> Facts {
     Facts {
         libraries: attachments.facts(),
-        uncovered: uncovered(attachments, processes),
+        uncovered: failed.or_else(|| uncovered(attachments, processes)),
         has_inspected: true,
         is_resting: false,
     }
 }
 
-fn uncovered(attachments: &Attachments<Probe>, processes: &Processes) -> Option<String> {
+fn uncovered(attachments: &Attachments<Attached>, processes: &Processes) -> Option<String> {
     for (process, used) in processes.using() {
         if used.libraries.is_empty() {
             return Some(format!(
@@ -389,6 +466,7 @@ mod tests {
     use crate::filter::{Filter, FilterSettings};
     use crate::tables::tests::assert_driven;
     use crate::tables::{Libraries, MappedLibraries};
+    use ros2probe_attach::mapped;
 
     /// Maps a file into this process permanently.
     fn map(file: &fs::File) {
@@ -409,15 +487,14 @@ mod tests {
     #[test]
     fn a_library_beyond_the_cap_is_reported_as_uncovered_until_another_is_no_longer_used() {
         let directory = tempfile::tempdir().unwrap();
+        let program = ros2probe_testing::harness::peer::built("handed").unwrap();
         for number in 0..=Libraries::CAP {
-            let path = directory.path().join(format!("library.{number}"));
-            fs::write(&path, library::tests::library()).unwrap();
+            let path = directory.path().join(format!("libfastdds.so.{number}"));
+            fs::copy(&program, &path).unwrap();
             map(&fs::File::open(&path).unwrap());
         }
-        // Other tests expect this process not to use Fast DDS.
         let maps = fs::read_to_string("/proc/self/maps").unwrap();
-        let maps = maps.replace("/library.", "/libfastdds.so.");
-        let mut used = Use::parse(&maps, is_library);
+        let mut used = Use::from(mapped::Use::parse(&maps, Library::FastDds));
         assert_driven::<MappedLibraries>();
         let process = std::process::id();
         let all = Processes::of(process, used.clone());
@@ -425,10 +502,10 @@ mod tests {
             Filter::load_uprobe(&FilterSettings::default(), None, Means::of_this_kernel())
                 .expect("loading the kernel filter needs root: run the tests with sudo");
         let mut attachments = attachments(probes, Arc::default());
-        let start = Instant::now();
-        attachments.follow(&all, start);
-        attachments.follow(&all, start + RETRY);
-        let facts = super::facts(&attachments, &all);
+        let (start, broker) = (Instant::now(), &mut Broker::here());
+        attachments.follow(&all, start, broker);
+        attachments.follow(&all, start + RETRY, broker);
+        let facts = super::facts(&attachments, &all, None);
         assert_driven::<Libraries>();
         let refused = facts.libraries.iter().find_map(|each| each.refused.clone());
         assert_eq!(refused, None);
@@ -442,9 +519,9 @@ mod tests {
         used.libraries.remove(0);
         let fewer = Processes::of(process, used);
         let later = start + RETRY + LINGER + EVERY;
-        attachments.follow(&fewer, later);
-        attachments.follow(&fewer, later + EVERY);
-        let facts = super::facts(&attachments, &fewer);
+        attachments.follow(&fewer, later, broker);
+        attachments.follow(&fewer, later + EVERY, broker);
+        let facts = super::facts(&attachments, &fewer, None);
         assert_eq!(facts.libraries.len(), Libraries::CAP);
         assert_eq!(facts.uncovered, None);
     }

@@ -1,7 +1,7 @@
 //! Chunks as the programs at the sockets write them, and as frames contain them.
 
-use ros2probe_model::route::Destination;
-use ros2probe_model::zenoh::{Flow, StreamId};
+use ros2probe_model::facts::route::Destination;
+use ros2probe_model::graph::zenoh::{Flow, StreamId};
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::{Packet, Segment};
 use ros2probe_wire::host::{Piece, chunk};

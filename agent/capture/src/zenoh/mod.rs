@@ -14,9 +14,9 @@ use std::collections::{HashMap, VecDeque};
 use std::time::Duration;
 
 use crate::tables::{ZenohOrder, ZenohStreamBytes, ZenohStreams};
-use ros2probe_model::bounded::{Bounded, Counted, Sum};
-use ros2probe_model::snapshot::TableFacts;
-use ros2probe_model::zenoh::{Flow, StreamEvent, StreamId, StreamReport, Unseen};
+use ros2probe_model::facts::bounded::{Bounded, Counted, Sum};
+use ros2probe_model::graph::zenoh::{Flow, StreamEvent, StreamId, StreamReport, Unseen};
+use ros2probe_model::report::snapshot::TableFacts;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::quic;
 use ros2probe_wire::zenoh::PORT;

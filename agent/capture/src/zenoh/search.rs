@@ -4,7 +4,7 @@
 //! as they can be read as batches. Two messages that continue the numbers of a lane are proof. A
 //! KEEP_ALIVE alone in its batch, or an INIT, needs no other one.
 
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_wire::zenoh::{Batch, Lane, Message, Resolution, VERSION};
 
 use crate::tables::SearchedBytes;

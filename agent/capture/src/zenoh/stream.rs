@@ -3,8 +3,8 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use ros2probe_model::bounded::{Bounded, Sum};
-use ros2probe_model::zenoh::StreamEvent;
+use ros2probe_model::facts::bounded::{Bounded, Sum};
+use ros2probe_model::graph::zenoh::StreamEvent;
 use ros2probe_wire::Timestamp;
 
 use super::search::{Looks, Search, begins_tls};

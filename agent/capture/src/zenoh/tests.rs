@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use proptest::prelude::*;
-use ros2probe_model::zenoh::Flow;
+use ros2probe_model::graph::zenoh::Flow;
 use ros2probe_wire::Expansion;
 
 use super::*;
@@ -47,7 +47,7 @@ struct Segment {
 }
 
 fn segments() -> Vec<Segment> {
-    use ros2probe_model::route::Destination;
+    use ros2probe_model::facts::route::Destination;
     use ros2probe_wire::frame::{self, Payload};
 
     let path = Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -174,7 +174,7 @@ fn a_connection_that_is_older_than_the_capture_is_found() {
 
 #[test]
 fn other_connections_are_left_alone_and_tls_is_named() {
-    let place = |port| ros2probe_model::route::Destination {
+    let place = |port| ros2probe_model::facts::route::Destination {
         address: [1; 16],
         port,
     };
@@ -222,7 +222,7 @@ proptest! {
                 time: Timestamp(u64::from(*number)),
                 stream: StreamId {
                     flow: Flow {
-                        source: ros2probe_model::route::Destination { address: [0; 16], port: *port },
+                        source: ros2probe_model::facts::route::Destination { address: [0; 16], port: *port },
                         ..Flow::default()
                     },
                     ..StreamId::default()
@@ -244,7 +244,7 @@ proptest! {
 
 /// A chunk of the connection from this port.
 fn chunk(port: u16, sequence_number: u32, bytes: &[u8]) -> Chunk<'_> {
-    use ros2probe_model::route::Destination;
+    use ros2probe_model::facts::route::Destination;
     let source = Destination {
         address: [1; 16],
         port,
@@ -460,7 +460,7 @@ fn quic_in(datagrams: &[(u16, u16, Vec<u8>)]) -> u64 {
     use crate::frame_decoder::FrameDecoder;
     use crate::pcap::Captured;
     use crate::reassembly::Limits;
-    use ros2probe_model::observer::{Observer, Settings};
+    use ros2probe_model::observe::observer::{Observer, Settings};
     use ros2probe_wire::frame::Link;
 
     let mut observer = Observer::new(Settings::default());

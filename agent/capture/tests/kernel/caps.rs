@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use ros2probe_capture::filter_reader::FilterReader;
 use ros2probe_capture::system::Clocks;
 use ros2probe_capture::tables::{FreshDatagrams, WaitingRecords};
-use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_testing::program_run::{self, Hook, Kernel};
 use ros2probe_wire::filter::{
     Counter, FLOW_CAPACITY, INTEREST_CAPACITY, INTERFACE_CAPACITY, PARTICIPANT_CAPACITY,

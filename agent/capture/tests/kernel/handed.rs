@@ -10,10 +10,10 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
-use ros2probe_capture::breakpoints::Means;
-use ros2probe_capture::filter::{Filter, FilterSettings, Form, Probe, Probes};
+use ros2probe_attach::library;
+use ros2probe_capture::breakpoints::{Attached, Means};
+use ros2probe_capture::filter::{Filter, FilterSettings, Form, Probes};
 use ros2probe_capture::piece_assembler::PieceAssembler;
-use ros2probe_capture::uprobe::library;
 use ros2probe_testing::forged::{SAMPLES_WRITER, Talker};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::network::Namespace;
@@ -29,7 +29,7 @@ const EXACT: u16 = flag::SHM | flag::EXACT;
 /// A process that passes messages, a filter that observes it, and the participant that it imitates.
 struct Handing {
     filter: Filter,
-    probe: Option<Probe>,
+    probe: Option<Attached>,
     _probes: Probes,
     program: PathBuf,
     sender: Process,
@@ -45,7 +45,7 @@ impl Handing {
     fn by(means: Means, form: Form) -> Result<Handing> {
         let host = Namespace::alone()?;
         let within = File::open(host.cgroup())?.metadata()?.ino();
-        let (mut filter, mut probes) =
+        let (mut filter, probes) =
             Filter::load_uprobe(&FilterSettings::default(), Some(within), means)?;
         let program = harness::peer::built(match form {
             Form::Whole => "handed",
@@ -54,7 +54,7 @@ impl Handing {
         let file = File::open(&program)?;
         let entry = library::find(&file)?;
         ensure!(entry.form == form, "{entry:?}");
-        let probe = Some(probes.attach(&file, entry.offset, entry.form)?);
+        let probe = Some(probes.attach_here(&file)?);
         let mut sender = Process::start(&host.on_network(), &program, [""; 0])?;
         sender.wait_for("ready", PATIENCE)?;
         let talker = Talker::new(1, "/points");

@@ -15,7 +15,7 @@ use anyhow::{Context as _, Result, ensure};
 use ros2probe_capture::filter::{Filter, FilterSettings};
 use ros2probe_capture::netns;
 use ros2probe_capture::sockets::Sockets;
-use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::{PREFIX, run};

@@ -5,12 +5,12 @@ use std::io::{BufRead as _, BufReader, Write as _};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::Duration;
 
+use ros2probe_attach::client::Broker;
 use ros2probe_capture::breakpoints::Means;
 use ros2probe_capture::inside::programs::{self, Attached, Programs, Tables};
 use ros2probe_capture::inside::table::{MAX_PROCESS_HITS, ProcessTable, Round};
-use ros2probe_capture::memory_reader::read_memory;
 use ros2probe_capture::system::Clocks;
-use ros2probe_model::inside::report::{ProcessReport, Trigger};
+use ros2probe_model::facts::calls::report::{ProcessReport, Trigger};
 use ros2probe_testing::harness::traced_program::TracedProgram;
 use ros2probe_wire::inside::{Counter, HANDLE_CAPACITY, HOPS_PER_SECOND};
 
@@ -45,14 +45,14 @@ impl Robot {
             program,
             programs,
             tables,
-            table: ProcessTable::new(has_callbacks, Box::new(read_memory)),
+            table: ProcessTable::new(has_callbacks),
             attached: None,
         }
     }
 
     fn attach(&mut self) {
         let library = File::open(self.program.library()).unwrap();
-        self.attached = Some(self.programs.attach(&library).unwrap());
+        self.attached = Some(self.programs.attach_here(&library).unwrap());
     }
 
     fn start(&self) -> Process {
@@ -82,8 +82,13 @@ impl Robot {
             .as_ref()
             .is_some_and(|it| it.shows_intra_process);
         let clocks = Clocks::read();
-        self.table
-            .round(&mut self.tables, &clocks, elapsed, |_| shows)
+        self.table.round(
+            &mut self.tables,
+            &clocks,
+            elapsed,
+            &mut Broker::here(),
+            |_| shows,
+        )
     }
 
     /// Returns what is reported of a process.
@@ -453,9 +458,9 @@ fn calls_of_a_moment_are_judged_with_those_of_the_time_after_it() {
 
 #[test]
 fn a_file_without_the_functions_is_refused() {
-    let mut robot = Robot::new(248, &[], false);
+    let robot = Robot::new(248, &[], false);
     let program = File::open(robot.program.program()).unwrap();
-    let refused = robot.programs.attach(&program).err().unwrap();
+    let refused = robot.programs.attach_here(&program).err().unwrap();
     assert!(
         refused.to_string().contains("ros_trace_rcl_publish"),
         "{refused}"
@@ -465,7 +470,7 @@ fn a_file_without_the_functions_is_refused() {
     assert!(
         robot
             .programs
-            .attach(&File::open(garbage).unwrap())
+            .attach_here(&File::open(garbage).unwrap())
             .is_err()
     );
 }

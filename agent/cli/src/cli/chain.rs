@@ -57,7 +57,7 @@ impl Chain {
         }
         let domain_id = self.target.domain()?;
         let agent = Agent::reach_measured(&self.target, None)?;
-        let mut path = format!("/chains?domain_id={domain_id}");
+        let mut path = format!("/chains?calls=true&domain_id={domain_id}");
         for (key, name) in [("from", &self.first_topic), ("to", &self.last_topic)] {
             if let Some(name) = name {
                 let _ = write!(path, "&{key}={}", encoded(name));

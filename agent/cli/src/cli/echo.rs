@@ -1,5 +1,6 @@
 //! `rp topic echo`: prints the messages of a topic.
 
+use std::collections::BTreeSet;
 use std::process::ExitCode;
 
 use anyhow::Result;
@@ -9,6 +10,8 @@ use ros2probe::client::{Agent, Target};
 use ros2probe::ros2::Refused;
 use ros2probe::ros2::echo::{self, FieldPath, Lost, mixed_offers};
 use ros2probe::ros2::name::full_name;
+use ros2probe_api::endpoints::Endpoint;
+use ros2probe_api::latched::Latched;
 use ros2probe_api::samples::Sample;
 use ros2probe_api::topics::Topic;
 use ros2probe_daemon::escape::visible_lines;
@@ -31,7 +34,8 @@ const CLEAR: &str = "\x1b[H\x1b[2J\n";
 numbers, strings, comparisons, in, and, or, not, + - * / // % **, lists, abs, all, any, bool, float,
 int, len, max, min, str, sum, and for strings startswith, endswith, lower, upper.
 
-rp does not subscribe, so it cannot request messages that were sent before.
+rp does not subscribe, so it cannot request messages that were sent before. Of transient-local
+publishers, it prints the last message first, which the agent keeps.
 
 Examples:
   rp topic echo /chatter --once
@@ -306,16 +310,18 @@ fn hint(name: &str, known: &Topic<'_>, expected: Option<&str>) {
     {
         eprintln!("rp: {name} carries {}, not {expected}", types.join(", "));
     }
-    if known
-        .publishers
-        .iter()
-        .any(|one| one.qos.durability == "TRANSIENT_LOCAL")
-    {
-        eprintln!(
-            "rp: {name} is latched; rp does not subscribe, so it cannot request earlier messages (see \
-             `retain: last`)"
-        );
+    for missing in missing_latched(name, &known.publishers) {
+        eprintln!("rp: {}", visible_lines(&missing));
     }
+}
+
+/// Returns why messages of latched publishers that were sent before are not printed.
+fn missing_latched(name: &str, publishers: &[Endpoint<'_>]) -> BTreeSet<String> {
+    let latched = publishers
+        .iter()
+        .filter(|one| one.qos.durability == "TRANSIENT_LOCAL");
+    let missing = latched.filter_map(|one| Latched::missing(one.latched.as_ref(), name));
+    missing.collect()
 }
 
 #[expect(clippy::cast_precision_loss, reason = "microseconds survive")]

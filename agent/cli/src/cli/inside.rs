@@ -7,6 +7,7 @@ use clap::Args;
 use ros2probe::client::{Agent, Target};
 use ros2probe::inside;
 use ros2probe_api::inside::Inside as Answer;
+use ros2probe_api::path::encoded;
 
 use super::UserError;
 use super::shared::print_text;
@@ -14,7 +15,9 @@ use super::shared::print_text;
 /// `rp inside`.
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The agent shows this with `capture: {inside: topics}`, and callbacks with `inside: full`.
+By default the agent observes calls from this request until ten seconds after the last one. The first
+answer takes up to five seconds, and counts begin then. `capture: {inside: full}` observes calls
+always, `off` never.
 
 PUBLISHER     messages published; WITHIN: passed directly to subscriptions of the same process
 SUBSCRIPTION  messages taken from the middleware; FAILED: attempts without a message
@@ -44,14 +47,14 @@ pub(crate) struct Inside {
 impl Inside {
     pub(crate) fn ask(self) -> Result<ExitCode> {
         let agent = Agent::reach(&self.target)?;
-        let path = "/inside";
-        let mut answer: Answer<'static> = match self.json {
-            true => agent.get(path)?,
-            false => agent.get_visible(path)?,
+        let path = match &self.name {
+            Some(name) => format!("/inside?name={}", encoded(name)),
+            None => "/inside".to_owned(),
         };
-        if let Some(name) = &self.name {
-            inside::select(&mut answer, name);
-        }
+        let answer: Answer<'static> = match self.json {
+            true => agent.get(&path)?,
+            false => agent.get_visible(&path)?,
+        };
         if self.json {
             return print_text(&(serde_json::to_string_pretty(&answer)? + "\n"));
         }

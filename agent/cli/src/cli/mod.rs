@@ -2,6 +2,7 @@
 //! agent, formats the answer and prints it.
 
 mod action;
+mod attach;
 mod bag;
 mod chain;
 mod convert;
@@ -34,6 +35,7 @@ use anyhow::Result;
 use clap::{CommandFactory as _, Parser, Subcommand};
 use ros2probe_daemon::agent::DEFAULT_CONFIG;
 
+pub(crate) use attach::Attach;
 pub(crate) use discover::Discover;
 pub(crate) use output::{Output, UserError, is_broken_pipe};
 pub(crate) use run::Run;
@@ -60,9 +62,9 @@ pub(crate) enum Command {
     },
     /// Request that participants repeat their announcements: the only command that sends
     Discover(Discover),
-    /// Read memory of other processes for an agent, which starts it
-    #[command(hide = true)]
-    MemoryReader,
+    /// Run the privileged broker that attaches uprobes for the agent
+    #[command(after_help = "Without --listen, ros2probe-attach.socket or an agent starts it.")]
+    Attach(Attach),
     /// Print completions for a shell
     Completions(reference::Completions),
     /// Print or write man pages

@@ -13,7 +13,7 @@ use ros2probe_api::health::Health;
 use ros2probe_api::path::encoded;
 use ros2probe_api::problem::Code;
 use ros2probe_api::samples::{Missed, MissedReason};
-use ros2probe_api::topics::{Reason, ReasonCode, Topic, TopicList};
+use ros2probe_api::topics::{Reason, ReasonCode, Topic, TopicList, UNSUBSCRIBED};
 use ros2probe_daemon::escape::visible;
 use ros2probe_daemon::recording::{GraphSnapshot, PublishedTopic};
 
@@ -193,8 +193,8 @@ impl<'a> Notes<'a> {
         let text = match code {
             ReasonCode::NoPublisher => "it has no publisher",
             ReasonCode::NoSubscriber => {
-                "it has no subscriber, so its publishers send nothing; rp does not subscribe: start a \
-                 subscriber"
+                let remedy = "rp does not subscribe: start a subscriber";
+                return Some(format!("{UNSUBSCRIBED}; {remedy}"));
             }
             ReasonCode::Encrypted => {
                 "its publisher uses DDS security; its messages may be encrypted"

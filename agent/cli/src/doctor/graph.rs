@@ -296,7 +296,7 @@ fn shared_memory(health: &Health) -> OffNetwork {
         let words = "only Fast DDS shared memory, which is sampled";
         let remedy: Helps = |finding| {
             finding.configure(
-                "capture: {shm: {exact: uprobe}}    # every message; instruments the senders",
+                "capture: {shm: {exact: auto}}    # every message; instruments the senders",
             )
         };
         (Severity::Note, words, Some(remedy))
@@ -531,7 +531,7 @@ mod tests {
 
     #[test]
     fn endpoints_that_do_not_fit_are_named_by_topic() {
-        let topics = r#"{"name":"/a","diagnoses":[{"kind":"qos_incompatible"},{"kind":"unheard_publisher"}]},
+        let topics = r#"{"name":"/a","diagnoses":[{"kind":"qos_incompatible"},{"kind":"unmatched_publisher"}]},
             {"name":"/b","diagnoses":[{"kind":"qos_incompatible"}]},{"name":"/c"}"#;
         let findings = check(&answers(WELL, topics, ""), None);
         let finding = findings

@@ -110,6 +110,9 @@ fn containers(answers: &Answers) -> Option<Finding> {
     ))
 }
 
+/// Lets systemd listen for the broker.
+const ENABLE_BROKER: &str = "sudo systemctl unmask ros2probe-attach.socket; sudo systemctl start ros2probe-attach.socket    # or sudo rp run, with its own broker";
+
 /// Finding for uprobes, if they are configured.
 fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
     let is_exact = settings.shm.mode != ShmMode::Off && settings.shm.exact != ExactChoice::Off;
@@ -121,16 +124,16 @@ fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
         (true, true) => "capture.shm.exact and capture.inside need",
     };
     let missing = ros2probe_daemon::host_examination::uprobes_lack(host.capabilities);
-    if missing.is_empty() {
+    let socket = settings.broker.display().to_string();
+    if missing.is_empty() || host.files.exists(&socket) {
         return None;
     }
     let missing = missing.join(" and ");
-    let sentence = format!("{keys} {missing}, which this shell lacks");
+    let sentence =
+        format!("{keys} the broker, which does not listen, or {missing}, which this shell lacks");
     let finding = Finding::new(AREA, "probes", Severity::Note, sentence);
-    let finding = finding.seen(&missing, "CapEff, this process");
-    Some(finding.elsewhere(
-        "AmbientCapabilities=CAP_SYS_PTRACE CAP_CHECKPOINT_RESTORE    # before Linux 6.6 also CAP_SYS_ADMIN; and SystemCallFilter=perf_event_open process_vm_readv, with systemctl edit ros2probe",
-    ))
+    let finding = finding.seen("not there", socket);
+    Some(finding.remedy(ENABLE_BROKER))
 }
 
 /// Returns whether the service's unit is installed.
@@ -298,11 +301,19 @@ mod tests {
     fn uprobes_are_checked_where_they_are_asked_for() {
         let (_directory, host) = host(&[]);
         let mut settings = Config::default().capture;
+        let both = probes(&host, &settings).unwrap();
+        assert_eq!(both.severity, Severity::Note);
+        assert!(both.sentence.contains("capture.inside need "), "{both:?}");
+        settings.shm.exact = ExactChoice::Off;
+        let inside = probes(&host, &settings).unwrap();
+        assert!(inside.sentence.starts_with("capture.inside "), "{inside:?}");
+        settings.inside = InsideChoice::Off;
         assert_eq!(probes(&host, &settings), None);
         settings.shm.exact = ExactChoice::Uprobe;
-        assert_eq!(probes(&host, &settings).unwrap().severity, Severity::Note);
-        settings.inside = InsideChoice::Topics;
-        let both = probes(&host, &settings).unwrap();
-        assert!(both.sentence.contains("capture.inside need "), "{both:?}");
+        let exact = probes(&host, &settings).unwrap();
+        assert!(
+            exact.sentence.starts_with("capture.shm.exact "),
+            "{exact:?}"
+        );
     }
 }

@@ -193,16 +193,14 @@ fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
             Severity::Note,
             "Fast DDS shared memory is sampled; not every message is seen".to_owned(),
             Some(
-                "capture: {shm: {exact: uprobe}}    # and CAP_SYS_PTRACE, before Linux 6.6 also CAP_SYS_ADMIN",
+                "capture: {shm: {exact: auto}}    # with ros2probe-attach.socket, while clients read",
             ),
         ),
         Ability::Inside => (
             Severity::Note,
             "messages within one process, with data sharing, iceoryx or security are not counted"
                 .to_owned(),
-            Some(
-                "capture: {inside: topics}    # and CAP_SYS_PTRACE, before Linux 6.6 also CAP_SYS_ADMIN",
-            ),
+            Some("capture: {inside: topics}    # always; with auto while `rp inside` runs"),
         ),
         _ => (Severity::Warning, format!("not {}", words(ability)), None),
     };

@@ -263,11 +263,11 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
             let message_type = safe(message_type);
             format!("definitions of {message_type} differ: {}", hashes.join(","))
         }
-        Open::Known(Diagnosis::UnheardPublisher { writer, reason }) => {
+        Open::Known(Diagnosis::UnmatchedPublisher { writer, reason }) => {
             let reason = safe(unmatched(reason));
             format!("{} has no matching subscriber ({reason})", name(writer))
         }
-        Open::Known(Diagnosis::UnfedSubscriber { reader, reason }) => {
+        Open::Known(Diagnosis::UnmatchedSubscription { reader, reason }) => {
             let reason = safe(unmatched(reason));
             format!("{} has no matching publisher ({reason})", name(reader))
         }
@@ -295,13 +295,13 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
     }
 }
 
-/// Text for the reason of `unheard_publisher` and `unfed_subscriber`.
+/// Text for the reason of `unmatched_publisher` and `unmatched_subscription`.
 fn unmatched(reason: &str) -> &str {
     match reason {
         "qos" => "incompatible QoS",
         "type" => "type mismatch",
         "partition" => "another partition",
-        "nobody" => "none announced",
+        "no_endpoint" => "none announced",
         other => other,
     }
 }

@@ -309,7 +309,7 @@ fn problems(topic: &Topic<'_>, standing: Standing, is_losing: bool) -> Vec<&'sta
             "type_conflict" => say("type"),
             "type_hash_conflict" => say("hash"),
             // Common: a tool that publishes without a subscriber.
-            "unheard_publisher" | "unfed_subscriber" | "" => {}
+            "unmatched_publisher" | "unmatched_subscription" | "" => {}
             _ => say("graph"),
         }
     }
@@ -437,7 +437,7 @@ mod tests {
         assert_eq!(state(slow, json!([])), "!slow,late");
         let few = json!([{"state": "violated", "violations": ["publishers", "subscribers"]}]);
         assert_eq!(state(few, json!([])), "!few pub,few sub");
-        let qos = json!([{"kind": "qos_incompatible"}, {"kind": "unheard_publisher"}]);
+        let qos = json!([{"kind": "qos_incompatible"}, {"kind": "unmatched_publisher"}]);
         assert_eq!(state(json!([{"state": "ok"}]), qos), "!qos");
         assert_eq!(state(json!([{"state": "silent"}]), json!([])), "!silent");
     }

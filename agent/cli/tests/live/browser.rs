@@ -54,11 +54,25 @@ fn every_view_shows_a_robot_that_runs() -> Result<()> {
 }
 
 #[test]
-fn every_view_is_accessible_in_both_themes_on_a_phone_and_enlarged() -> Result<()> {
+fn every_view_is_accessible_in_both_themes() -> Result<()> {
+    is_accessible("themes")
+}
+
+#[test]
+fn every_view_is_accessible_on_a_phone() -> Result<()> {
+    is_accessible("phone")
+}
+
+#[test]
+fn every_view_is_accessible_enlarged_and_by_keys() -> Result<()> {
+    is_accessible("enlarged")
+}
+
+fn is_accessible(how: &str) -> Result<()> {
     let place = Place::new()?;
     let _agent = place.agent(&format!("{SENSORS}{}", place.recordings()))?;
     let _robot = Robot::start(&place.host)?;
-    watch(&place.inside(), "access", &[PAGE])
+    watch(&place.inside(), "access", &[PAGE, how])
 }
 
 #[test]

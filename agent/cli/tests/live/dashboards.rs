@@ -266,7 +266,7 @@ fn start<'a>(host: &'a Namespace, directory: &Path) -> Result<Agent<'a>> {
         "watch:\n\
          - {{topic: /**, per_subscriber: true}}\n\
          - {{topic: /imu, min_rate_hz: 1000, publishers: 9, subscribers: 9}}\n\
-         - {{topic: /scan, max_rate_hz: 1, max_latency_ms: 0.001}}\n\
+         - {{topic: /cmd_vel, max_rate_hz: 1, max_latency_ms: 0.001}}\n\
          - {{topic: /quiet, max_silence_s: 1}}\n\
          - {{topic: /camera, max_silence_s: 1}}\n\
          chains: [{{from: /scan, to: /cmd_vel, max_latency_ms: 100, domain: 0}}]\n\

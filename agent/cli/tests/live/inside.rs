@@ -9,6 +9,7 @@ use ros2probe_api::chains::ChainList;
 use ros2probe_api::inside::Inside;
 use ros2probe_capture::breakpoints::Means;
 use ros2probe_testing::harness::agent::Agent;
+use ros2probe_testing::harness::code;
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::traced_program::TracedProgram;
@@ -150,10 +151,103 @@ fn a_library_of_another_inode_is_observed_from_the_first_call_on() -> Result<()>
     .with_context(|| text.clone())
 }
 
+/// Functions of `libtracetools.so`: one is called for each message, the other once for a publisher.
+const CALL: &str = "ros_trace_rcl_publish";
+const CREATION: &str = "ros_trace_rcl_publisher_init";
+
+#[test]
+fn calls_are_observed_while_a_client_asks_and_names_from_the_start() -> Result<()> {
+    let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let program = TracedProgram::build(248, &[])?;
+    let agent = agent_with(&host, directory.path(), "auto")?;
+    let start = |node: &str| {
+        let arguments = ["/in", "/out", node];
+        Process::start(&host.inside(), program.program(), arguments)
+    };
+    let ask = |path: &str| {
+        let socket = directory.path().join("api.sock");
+        run(&format!("{RP} {path} --socket {}", socket.display()))
+    };
+    let published = |node: &str| -> Result<Option<u64>> {
+        let text = ask("inside --json")?;
+        let inside: Inside<'_> = serde_json::from_str(&text)?;
+        ensure!(inside.mode == "auto", "{text}");
+        if inside.reason.is_some() {
+            // On a busy machine the first answer comes before the breakpoints are there.
+            return Ok(None);
+        }
+        let name = format!("/robot1/{node}");
+        let mut publishers = inside.publishers.iter();
+        let found = publishers.find(|each| each.owner.node.as_deref() == Some(&*name));
+        Ok(found.map(|publisher| publisher.published_messages))
+    };
+    let has = |process: &Process, symbol: &str| -> Result<bool> {
+        let code = code::at_symbol(process, &program.library(), symbol)?;
+        Ok(code.in_memory != code.in_file)
+    };
+    let publish = |process: &mut Process| -> Result<()> {
+        process.write_line(&format!("publish {MESSAGES}"))?;
+        process.wait_for("publish", PATIENCE)
+    };
+
+    // Before any request the process publishes unobserved, but its names are known.
+    let mut first = start("first")?;
+    // It maps the library while it starts.
+    wait_until("the creation is observed", || {
+        Ok(has(&first, CREATION).unwrap_or(false))
+    })?;
+    first.write_line("init")?;
+    first.wait_for("init", PATIENCE)?;
+    publish(&mut first)?;
+    ensure!(!has(&first, CALL)?, "no client has asked");
+    let resting = agent.scrape()?;
+    let info = resting.sum("ros2probe_inside_info", &[("mode", "auto")]);
+    ensure!(info == 1.0, "{info}");
+
+    // A process that starts in the meantime is observed from its first call.
+    let is_observed_from_zero = |process: &Process| -> Result<bool> {
+        Ok(published("first")? == Some(0) && has(process, CALL)?)
+    };
+    wait_until("calls are observed", || is_observed_from_zero(&first))?;
+    publish(&mut first)?;
+    let mut second = start("second")?;
+    wait_until("the new process is observed", || {
+        Ok(has(&second, CALL).unwrap_or(false))
+    })?;
+    second.write_line("init")?;
+    second.wait_for("init", PATIENCE)?;
+    publish(&mut second)?;
+    for node in ["first", "second"] {
+        wait_until("each message is counted", || {
+            Ok(published(node)? == Some(MESSAGES as u64))
+        })?;
+    }
+
+    // Ten seconds after the last request the breakpoints of calls are gone, and what follows is not
+    // counted later.
+    wait_until("calls are no longer observed", || {
+        Ok(!has(&first, CALL)? && !has(&second, CALL)?)
+    })?;
+    ensure!(has(&first, CREATION)? && has(&second, CREATION)?);
+    publish(&mut first)?;
+    wait_until("calls are observed again", || is_observed_from_zero(&first))?;
+    publish(&mut first)?;
+    wait_until("the new messages are counted", || {
+        Ok(published("first")? == Some(MESSAGES as u64))
+    })?;
+    ensure!(published("second")? == Some(0));
+    Ok(())
+}
+
 fn agent<'n>(host: &'n Namespace, directory: &Path) -> Result<Agent<'n>> {
+    agent_with(host, directory, "full")
+}
+
+fn agent_with<'n>(host: &'n Namespace, directory: &Path, inside: &str) -> Result<Agent<'n>> {
     let configuration = directory.join("ros2probe.yaml");
     let capture = format!(
-        "capture: {{source: host, cgroup: {}, inside: full}}\n",
+        "capture: {{source: host, cgroup: {}, inside: {inside}}}\n",
         host.cgroup().display()
     );
     let socket = directory.join("api.sock");

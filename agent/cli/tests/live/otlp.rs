@@ -7,8 +7,8 @@ use std::process::Command;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_model::discovery::hexadecimal;
-use ros2probe_model::trace::Message;
+use ros2probe_model::derive::trace::Message;
+use ros2probe_model::graph::discovery::hexadecimal;
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, robot};

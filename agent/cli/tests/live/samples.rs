@@ -57,6 +57,54 @@ fn payloads_on_the_wire_are_what_was_sent() -> Result<()> {
     payloads_are_what_was_sent(Stack::Cyclone, &[644_000], on_the_wire)
 }
 
+#[test]
+fn the_last_message_of_a_transient_local_publisher_comes_first_without_a_watch() -> Result<()> {
+    let on_the_wire = |_: &Namespace| ON_THE_WIRE.to_owned();
+    comes_first(Stack::Fast, at_the_sockets_of)?;
+    comes_first(Stack::Cyclone, at_the_sockets_of)?;
+    comes_first(Stack::Cyclone, on_the_wire)
+}
+
+fn comes_first(stack: Stack, source: impl Fn(&Namespace) -> String) -> Result<()> {
+    let size = SIZES[0];
+    let link = Link::new()?;
+    let observed = Observed::start(&link.robot, &source(&link.robot))?;
+    let stream = Stream {
+        reliable: true,
+        transient_local: true,
+        // Its message lives as long as the publisher.
+        linger: 90.0,
+        ..Stream::point_cloud(size, 3)
+    };
+    let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, stack, &stream)?;
+    // The kernel knows the publisher by now. No client requests its topic.
+    publisher.go()?;
+    let bytes = f64::from(u32::try_from(size)?);
+    let kept = |page: &Scrape| page.sum("ros2probe_retained_bytes", &[]) == bytes;
+    observed
+        .agent
+        .scrape_until("the last message is kept", kept)?;
+    let sent = || Ok(publisher.log()?.sequences("pub").len() == 3);
+    wait_until("all are sent", sent)?;
+    std::thread::sleep(Duration::from_secs(1));
+    let topic = observed.topic("/points")?;
+    ensure!(topic["measurement"].is_null(), "no watch: {topic}");
+    ensure!(
+        topic["publishers"][0]["latched"]["state"] == "kept",
+        "{topic}"
+    );
+
+    let client = observed.client()?;
+    let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
+    let Some(News::Sample(sample, payload)) = next(&mut lines)? else {
+        bail!("no sample comes first");
+    };
+    let pattern: Vec<u8> = (8..size).map(pattern).collect();
+    ensure!(check(&payload, &pattern)? == 2, "the last of three");
+    ensure!(sample.sequence_number == 3, "{sample:?}");
+    Ok(())
+}
+
 /// No watch is configured: the interest of one stream of samples suffices.
 fn payloads_are_what_was_sent(
     stack: Stack,

@@ -13,7 +13,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::agent::{Agent, Scrape};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::process::Process;
@@ -510,8 +510,10 @@ fn files_of(memory: &Path) -> Result<(Vec<String>, Vec<String>)> {
 
 fn start_agent<'a>(host: &'a Namespace, directory: &Path) -> Result<Agent<'a>> {
     let configuration = directory.join("ros2probe.yaml");
-    let text = format!("watch: [/**]\n{}", at_the_sockets_of(host));
-    fs::write(&configuration, text)?;
+    // These tests are about polling.
+    let cgroup = host.cgroup().display();
+    let capture = format!("capture: {{source: host, cgroup: {cgroup}, shm: {{exact: off}}}}");
+    fs::write(&configuration, format!("watch: [/**]\n{capture}\n"))?;
     Agent::start(host, env!("CARGO_BIN_EXE_rp"), &configuration)
 }
 

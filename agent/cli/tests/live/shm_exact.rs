@@ -15,7 +15,12 @@ use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_until;
+use tempfile::TempDir;
 
+use crate::hostile::start_as;
+
+/// User of the agent without rights.
+const UNPRIVILEGED: u32 = 65_534;
 const PATIENCE: Duration = Duration::from_secs(60);
 const SAMPLES: u64 = 600;
 /// Samples at full speed. The ring has room for all of them: the agent may get no CPU during the
@@ -29,6 +34,7 @@ fn every_message_is_seen_and_none_is_when_the_agent_is_killed() -> Result<()> {
     let host = Host::new()?;
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&host.network, directory.path(), &[])?;
+    let _first = host.attached(&agent)?;
     let stream = Stream {
         count: SAMPLES,
         linger: 60.0,
@@ -92,6 +98,108 @@ fn every_message_is_seen_and_none_is_when_the_agent_is_killed() -> Result<()> {
     Ok(())
 }
 
+/// As packaged: the agent has no right over other processes.
+#[test]
+fn by_the_broker_an_agent_without_rights_sees_every_message_in_every_start_order() -> Result<()> {
+    for is_broker_first in [true, false] {
+        let host = Host::new()?;
+        let directory = tempfile::tempdir()?;
+        let mut broker = match is_broker_first {
+            true => Some(start_broker(directory.path())?),
+            false => None,
+        };
+        let capabilities = "-all,+net_admin,+bpf,+perfmon";
+        let start = start_as(UNPRIVILEGED, capabilities, &directory)?;
+        let configuration = configured(host.network.cgroup(), directory.path())?;
+        let agent = Agent::start(&host.network, start, &configuration)?;
+        let is_able = || -> Result<bool> {
+            let ability = [("ability", "shared_memory_exact")];
+            Ok(agent.scrape()?.sum("ros2probe_capture_ability", &ability) == 1.0)
+        };
+        if broker.is_none() {
+            ensure!(!is_able()?, "there is no broker");
+            broker = Some(start_broker(directory.path())?);
+        }
+        wait_until("the broker attaches", is_able)?;
+        wait_until("calls inside processes only wait for a client", || {
+            let reasons = agent.scrape()?.labels_of("ros2probe_inside_info", "reason");
+            let mut reasons = reasons.iter();
+            Ok(reasons.any(|reason| reason.contains("no client needs calls")))
+        })?;
+        let _first = host.attached(&agent)?;
+        let stream = Stream {
+            count: SAMPLES,
+            stretch: SAMPLES / 2,
+            linger: 60.0,
+            ..shared("/imu")
+        };
+        let (mut publisher, mut subscriber) = host.pair(&stream)?;
+        known(&agent, "/imu")?;
+        publisher.go()?;
+        counted(&agent, "/imu", SAMPLES / 2)?;
+
+        // The breakpoints belong to the agent, and a new broker goes on.
+        let library = library_of(&publisher)?;
+        let is_attached = |peer: &Peer| -> Result<bool> {
+            let Code { in_memory, in_file } = code::at_function(&peer.process, &library)?;
+            Ok(in_memory != in_file)
+        };
+        ensure!(is_attached(&publisher)?, "attached");
+        if let Some(mut broker) = broker.take() {
+            broker.signal("KILL")?;
+            broker.wait(PATIENCE)?;
+        }
+        wait_until("the lost broker is reported", || Ok(!is_able()?))?;
+        ensure!(
+            is_attached(&publisher)?,
+            "the breakpoints end with the agent, not with the broker"
+        );
+        let _broker = start_broker(directory.path())?;
+        wait_until("the new broker attaches", is_able)?;
+        publisher.go()?;
+        counted(&agent, "/imu", SAMPLES)?;
+        ensure!(
+            received(&mut subscriber, 0, SAMPLES)? == SAMPLES,
+            "received"
+        );
+
+        for thread in threads(agent.process.pid())? {
+            // It attaches to a recreated control group.
+            let is_allowed = thread.capabilities == 0 || thread.name == "cgroup";
+            ensure!(is_allowed, "{thread:?}");
+        }
+        agent.process.signal("KILL")?;
+        wait_until("the breakpoint is taken out", || {
+            Ok(!is_attached(&publisher)?)
+        })?;
+    }
+    Ok(())
+}
+
+#[derive(Debug)]
+struct Thread {
+    name: String,
+    capabilities: u64,
+}
+
+fn threads(process: u32) -> Result<Vec<Thread>> {
+    let mut threads = Vec::new();
+    for entry in fs::read_dir(format!("/proc/{process}/task"))? {
+        let status = fs::read_to_string(entry?.path().join("status"))?;
+        let value = |name: &str| {
+            let line = status.lines().find_map(|line| line.strip_prefix(name));
+            line.map(|value| value.trim().to_owned())
+                .context("no such line")
+        };
+        threads.push(Thread {
+            name: value("Name:")?,
+            capabilities: u64::from_str_radix(&value("CapEff:")?, 16)?,
+        });
+    }
+    ensure!(threads.len() > 3, "{threads:?}");
+    Ok(threads)
+}
+
 #[test]
 fn without_the_means_for_uprobes_shared_memory_is_sampled_and_the_reason_reported() -> Result<()> {
     let host = Host::new()?;
@@ -103,7 +211,7 @@ fn without_the_means_for_uprobes_shared_memory_is_sampled_and_the_reason_reporte
     let [reason] = &reasons.into_iter().collect::<Vec<_>>()[..] else {
         panic!("{}", page.0);
     };
-    assert!(reason.contains("CAP_SYS_PTRACE"), "{reason}");
+    assert!(reason.contains("cannot connect to the broker"), "{reason}");
     let able = |name: &str| page.sum("ros2probe_capture_ability", &[("ability", name)]);
     assert_eq!(able("shared_memory_exact"), 0.0);
     assert_eq!(able("shared_memory"), 1.0);
@@ -210,6 +318,8 @@ struct Host {
     cgroup: PathBuf,
     /// Keeps the mount namespace.
     keeper: Process,
+    /// A copy of Fast DDS: agents of other tests may have breakpoints in the installed one.
+    libraries: TempDir,
 }
 
 impl Host {
@@ -219,11 +329,27 @@ impl Host {
         let arguments = ["--mount", "sh", "-c", script];
         let mut keeper = Process::start(&network.on_network(), "unshare", arguments)?;
         keeper.wait_for("ready", Duration::from_secs(10))?;
+        let library = Stack::Fast.library("libfastrtps.so")?;
+        let libraries = tempfile::tempdir()?;
+        let name = library.file_name().context("a library without a name")?;
+        fs::copy(&library, libraries.path().join(name))?;
         Ok(Host {
+            libraries,
             cgroup: network.cgroup().to_owned(),
             network,
             keeper,
         })
+    }
+
+    /// A process whose library has breakpoints, so that later ones have them from the beginning.
+    fn attached(&self, agent: &Agent<'_>) -> Result<Peer> {
+        let peer = self.launch(Role::Subscriber, &shared("/first"))?;
+        let place = self.libraries.path().display().to_string();
+        agent.scrape_until("the library is attached", |page| {
+            let libraries = page.labels_of("ros2probe_shm_exact_info", "library");
+            libraries.iter().any(|library| library.starts_with(&place))
+        })?;
+        Ok(peer)
     }
 
     /// A publisher and a matched subscriber.
@@ -242,7 +368,9 @@ impl Host {
         let mounts = format!("--mount=/proc/{}/ns/mnt", self.keeper.pid());
         let inside = format!("echo 0 >{}/cgroup.procs", self.cgroup.display());
         let inside = format!("{inside} && exec \"$0\" \"$@\"");
-        enter.extend(["sh", "-c", &inside, "nsenter", &mounts].map(str::to_owned));
+        let path = format!("LD_LIBRARY_PATH={}", self.libraries.path().display());
+        let words = ["sh", "-c", &inside, "nsenter", &mounts, "env", &path];
+        enter.extend(words.map(str::to_owned));
         let node = match role {
             Role::Publisher => "/talker",
             Role::Subscriber => "/listener",
@@ -273,14 +401,7 @@ fn start_agent_at<'a>(
     directory: &Path,
     words: &[String],
 ) -> Result<Agent<'a>> {
-    let configuration = directory.join("ros2probe.yaml");
-    let cgroup = cgroup.display();
-    let text = format!(
-        "watch: [/imu, /burst]\n\
-         capture: {{source: host, cgroup: {cgroup}, record_ring_bytes: {RING}, \
-         shm: {{exact: uprobe}}}}\n"
-    );
-    fs::write(&configuration, text)?;
+    let configuration = configured(cgroup, directory)?;
     let program = env!("CARGO_BIN_EXE_rp");
     if words.is_empty() {
         return Agent::start(host, program, &configuration);
@@ -290,6 +411,32 @@ fn start_agent_at<'a>(
     fs::write(&script, text)?;
     harness::run(&format!("chmod 755 {}", script.display()))?;
     Agent::start(host, script, &configuration)
+}
+
+/// Writes a configuration with exact mode.
+fn configured(cgroup: &Path, directory: &Path) -> Result<PathBuf> {
+    let configuration = directory.join("ros2probe.yaml");
+    let cgroup = cgroup.display();
+    let text = format!(
+        "watch: [/imu, /burst]\n\
+         capture: {{source: host, cgroup: {cgroup}, record_ring_bytes: {RING}, broker: {}, \
+         shm: {{exact: uprobe}}}}\n",
+        socket_of(directory).display()
+    );
+    fs::write(&configuration, text)?;
+    Ok(configuration)
+}
+
+/// Socket of the broker, if one is started.
+fn socket_of(directory: &Path) -> PathBuf {
+    directory.join("attach.sock")
+}
+
+/// Starts a broker for agents of [`UNPRIVILEGED`].
+fn start_broker(directory: &Path) -> Result<Process> {
+    let socket = socket_of(directory).display().to_string();
+    let arguments = ["attach", "--user", "nobody", "--listen", &socket];
+    Process::start(&["env".to_owned()], env!("CARGO_BIN_EXE_rp"), arguments)
 }
 
 /// Returns whether a topic's writer and reader and both nodes are known, all from shared memory.

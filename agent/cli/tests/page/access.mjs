@@ -1,5 +1,5 @@
 // Accessibility of every view: axe finds nothing in either theme, nothing scrolls sideways at 360
-// px and at 400 % zoom, and everything is reached by keys.
+// px and at 400 % zoom, and everything is reached by keys. The second argument is one of these.
 
 import assert from 'node:assert/strict';
 import { scenario, until } from './tab.mjs';
@@ -8,7 +8,7 @@ import { scenario, until } from './tab.mjs';
 const VIEWS = [
   ['', '.figures'],
   ['#/topics', 'main tbody tr[data-row]'],
-  ['#/topics/%2Fpoints?domain=0', '.plot canvas'],
+  ['#/topics/%2Fimu?domain=0', '.plot canvas'],
   ['#/graph', '.vertex'],
   ['#/graph?services=1&actions=1&boxes=process', '.vertex.service'],
   ['#/graph?mode=nodes&hubs=1', '.vertex'],
@@ -85,7 +85,7 @@ async function byKeyboard(tab) {
   await tab.heading(second.trim());
 }
 
-await scenario(async (open) => {
+async function themes(open) {
   for (const theme of ['light', 'dark']) {
     const tab = await open({ theme });
     await tab.live();
@@ -102,21 +102,6 @@ await scenario(async (open) => {
     await dialogs(tab, theme);
     await tab.page.close();
   }
-  // 360 px wide; then 1280 px at 400 %, which is 320 px of CSS.
-  for (const [width, height, scale] of [[360, 740, 3], [320, 256, 4]]) {
-    const tab = await open({ width, height, scale });
-    await tab.live();
-    for (const [fragment, ready] of VIEWS) {
-      await tab.go(fragment);
-      await tab.page.locator(ready).first().waitFor({ state: 'attached' });
-      await unfold(tab);
-      await tab.narrow(`${width} px ${fragment}`);
-      await tab.accessible(`${width} px ${fragment}`);
-    }
-    await dialogs(tab, `${width} px`);
-    await tab.page.close();
-  }
-  await byKeyboard(await open());
   // The choice of a theme stays, whatever the system prefers.
   const tab = await open({ theme: 'light' });
   await tab.live();
@@ -126,4 +111,30 @@ await scenario(async (open) => {
   await tab.live();
   assert.equal(await tab.page.evaluate(() => document.documentElement.dataset.theme), 'dark');
   await tab.accessible('dark by choice');
-});
+}
+
+async function small(open, width, height, scale) {
+  const tab = await open({ width, height, scale });
+  await tab.live();
+  for (const [fragment, ready] of VIEWS) {
+    await tab.go(fragment);
+    await tab.page.locator(ready).first().waitFor({ state: 'attached' });
+    await unfold(tab);
+    await tab.narrow(`${width} px ${fragment}`);
+    await tab.accessible(`${width} px ${fragment}`);
+  }
+  await dialogs(tab, `${width} px`);
+  await tab.page.close();
+}
+
+const HOW = {
+  themes,
+  phone: (open) => small(open, 360, 740, 3),
+  // 1280 px at 400 %, which is 320 px of CSS.
+  enlarged: async (open) => {
+    await small(open, 320, 256, 4);
+    await byKeyboard(await open());
+  },
+};
+
+await scenario(HOW[process.argv[3]]);

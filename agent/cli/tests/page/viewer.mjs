@@ -32,7 +32,9 @@ let server;
 const graph = new Map();
 
 client.on('error', (error) => problems.push(String(error)));
-client.on('status', (status) => problems.push(status.message));
+// The demo's robot does not subscribe to these. The agent says so if the viewer is there for long.
+const SILENT = '/parameter_events, /rosout: no subscriber exists, so nothing is sent';
+client.on('status', ({ message }) => { if (message !== SILENT) problems.push(message); });
 client.on('serverInfo', (info) => { server = info; });
 client.on('open', () => client.subscribeConnectionGraph());
 client.on('connectionGraphUpdate', (update) => {

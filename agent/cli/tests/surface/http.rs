@@ -1,12 +1,12 @@
 //! The listener: both formats, health, reload, and a real Prometheus that scrapes it.
 
-use std::net::TcpListener;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use crate::rp;
 use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, metric, promtool, request};
+use ros2probe_testing::ports::free_address;
 
 const PROMETHEUS_ACCEPTS: &str = "Accept: application/openmetrics-text;version=1.0.0,\
     application/openmetrics-text;version=0.0.1;q=0.75,text/plain;version=0.0.4;q=0.5,*/*;q=0.1\r\n";
@@ -164,17 +164,14 @@ fn series_of_deliveries_come_with_a_reload_that_asks_for_them() {
 }
 
 /// A Prometheus, killed when its value is dropped.
-struct Prometheus {
+pub(crate) struct Prometheus {
     child: Child,
     address: std::net::SocketAddr,
 }
 
 impl Prometheus {
-    fn start(directory: &Path, target: std::net::SocketAddr) -> Self {
-        let address = TcpListener::bind("127.0.0.1:0")
-            .unwrap()
-            .local_addr()
-            .unwrap();
+    pub(crate) fn start(directory: &Path, target: std::net::SocketAddr) -> Self {
+        let address = free_address();
         let config = directory.join("prometheus.yml");
         let text = format!(
             "global: {{scrape_interval: 1s}}\n\
@@ -188,11 +185,21 @@ impl Prometheus {
                 directory.join("data").display()
             ))
             .arg(format!("--web.listen-address={address}"))
+            .arg("--enable-feature=exemplar-storage")
             .stdout(Stdio::null())
             .stderr(Stdio::null())
             .spawn()
             .unwrap_or_else(|error| panic!("prometheus: {error}; `apt-get install prometheus`"));
         Self { child, address }
+    }
+
+    /// Returns the answer of the API; null until the server has started.
+    pub(crate) fn get(&self, path: &str) -> serde_json::Value {
+        if std::net::TcpStream::connect(self.address).is_err() {
+            return serde_json::Value::Null;
+        }
+        let body = request(self.address, "GET", path, "").body;
+        serde_json::from_str(&body).unwrap_or_default()
     }
 
     /// Repeats the query until the first sample of the answer is as wanted.
@@ -201,18 +208,13 @@ impl Prometheus {
         let encoded: String = query.bytes().map(|byte| format!("%{byte:02X}")).collect();
         let path = format!("/api/v1/query?query={encoded}");
         loop {
-            let body = if std::net::TcpStream::connect(self.address).is_ok() {
-                request(self.address, "GET", &path, "").body
-            } else {
-                String::new()
-            };
-            let answer: serde_json::Value = serde_json::from_str(&body).unwrap_or_default();
+            let answer = self.get(&path);
             let value = answer
                 .pointer("/data/result/0/value/1")
                 .and_then(|value| value.as_str());
             match value.and_then(|value| value.parse().ok()) {
                 Some(value) if wanted(value) => return value,
-                _ if Instant::now() > deadline => panic!("{query}: {body}"),
+                _ if Instant::now() > deadline => panic!("{query}: {answer}"),
                 _ => std::thread::sleep(Duration::from_millis(200)),
             }
         }

@@ -8,12 +8,12 @@ use ros2probe_daemon::agent_facts::{AgentFacts, InsideSourceFacts, SourceKind};
 use ros2probe_daemon::config::{Limits, Watch, Watchlist};
 use ros2probe_daemon::settings_cell::Settings;
 use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
-use ros2probe_model::input::Input;
-use ros2probe_model::inside::report::{
+use ros2probe_model::facts::calls::report::{
     BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report, Transition,
     Trigger,
 };
-use ros2probe_model::observer::{self, Observer};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{self, Observer};
 use ros2probe_testing::local_agent;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Timestamp};

@@ -20,9 +20,9 @@ use ros2probe_daemon::subscriptions::{
     Caps, Depth, Item, Overflow, Request, Selection, Subscription, Subscriptions, Topic,
 };
 use ros2probe_daemon::surface::MetricSources;
-use ros2probe_model::dispatch::{Dispatch, Sample, SampleOutcome};
-use ros2probe_model::observer::Settings;
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::facts::dispatch::{Dispatch, Sample, SampleOutcome};
+use ros2probe_model::observe::observer::Settings;
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask, metric};
 use ros2probe_testing::model::domain::VirtualDomain;
 use ros2probe_testing::model::forge::{Message, SEDP_WRITERS, SPDP};

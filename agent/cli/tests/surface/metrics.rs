@@ -1,6 +1,6 @@
 //! The metrics page: complete, well-formed in both formats whatever the network sends, bounded.
 
-use ros2probe_model::snapshot::ChainsFacts;
+use ros2probe_model::report::snapshot::ChainsFacts;
 use ros2probe_wire::DomainId;
 use std::collections::BTreeSet;
 use std::net::Ipv4Addr;
@@ -17,12 +17,12 @@ use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind, markdown};
 use ros2probe_daemon::surface::otlp::Signal;
 use ros2probe_daemon::surface::ros2_daemon::PortState;
 use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
-use ros2probe_model::bounded::Table;
-use ros2probe_model::snapshot::{
+use ros2probe_model::facts::bounded::Table;
+use ros2probe_model::facts::tables::ALL;
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::report::snapshot::{
     DeliveryFacts, Direction, Snapshot, WatchFacts, WatchState, WatchedTopicFacts,
 };
-use ros2probe_model::tables::ALL;
-use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_testing::local_agent::promtool;
 use ros2probe_testing::sample_robot;
 
@@ -145,7 +145,7 @@ fn the_book_s_tables_are_those_of_the_sources() {
         derived.iter().any(|name| table.name.starts_with(name))
     };
     let declared = |page, tables: &[Table]| {
-        let (begin, end) = ("src/tables.rs -->\n", "<!-- tables: end");
+        let (begin, end) = ("/tables.rs -->\n", "<!-- tables: end");
         (page, begin, end, tables_markdown(tables))
     };
     let tables = |page, derived| {
@@ -166,7 +166,7 @@ fn the_book_s_tables_are_those_of_the_sources() {
         ),
         (
             "limits.md",
-            "model/src/limits.rs -->\n",
+            "model/src/facts/limits.rs -->\n",
             "<!-- limits: end",
             limits_markdown(),
         ),

@@ -1,7 +1,6 @@
 //! A real OpenTelemetry receiver gets the values of the page, and the agent continues when it stops.
 
 use std::collections::BTreeMap;
-use std::net::TcpListener;
 use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -15,6 +14,7 @@ use opentelemetry_proto::tonic::collector::metrics::v1::{
 };
 use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind};
 use ros2probe_testing::local_agent::{self, LocalAgent, metric};
+use ros2probe_testing::ports::free_address;
 use ros2probe_testing::repository;
 use ros2probe_testing::rotel::{Export, Item, Rotel, exports};
 
@@ -345,8 +345,7 @@ fn logged_events(agent: &LocalAgent) -> Vec<LoggedEvent> {
 #[test]
 fn a_late_receiver_gets_all_events_as_log_records_in_order() {
     let directory = tempfile::tempdir().unwrap();
-    let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr();
-    let address = address.unwrap();
+    let address = free_address();
     let configuration = directory.path().join("ros2probe.yaml");
     let yaml = format!("otlp: {{endpoint: 'http://{address}', metrics: false, robot: marvin}}\n");
     std::fs::write(&configuration, yaml).unwrap();

@@ -168,8 +168,8 @@ impl Receiver {
 
     /// Waits for a whole collection that begins from now on.
     fn next_collection(&self) -> AllSeries {
-        // The present one may have begun before.
-        let wanted = self.0.lock().unwrap().seen + 1;
+        // The present one may have begun before, and another one may be on its way.
+        let wanted = self.0.lock().unwrap().seen + 2;
         let deadline = Instant::now() + PATIENCE;
         loop {
             let received = self.0.lock().unwrap();

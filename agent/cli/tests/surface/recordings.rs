@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::io::{BufRead as _, BufReader};
 use std::net::SocketAddr;
 use std::os::unix::net::UnixListener;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
@@ -329,28 +329,63 @@ fn the_seconds_around_an_event_are_in_a_bag_that_names_it() {
 }
 
 #[test]
-fn a_late_recording_has_what_was_sent_once_before_it_where_the_watchlist_asks_for_that() {
+fn a_late_recording_and_a_late_echo_have_what_was_sent_once_before_them() {
+    for more in ["", "watch: [{topic: /tf_static, retain: last}]\n"] {
+        let directory = tempfile::tempdir().unwrap();
+        let agent = agent_on(&sent_once(), directory.path(), "10", more);
+        agent.wait_for_metric("ros2probe_retained_bytes", |bytes| bytes > 50.0);
+        // The capture sends it once: a recording that begins now is too late for it.
+        let ended = record_late(&agent, 1);
+        assert_eq!(ended["report"]["sent_before"], serde_json::json!([]));
+        let messages = messages(&directory.path().join("bags/late"));
+        assert_eq!(messages["/tf_static"].len(), 1, "{messages:?}");
+        let host = agent.api.to_string();
+        let echo = ["topic", "echo", "/tf_static", "--once", "--host", &host];
+        let echoed = rp().args(echo).output().unwrap();
+        let (out, err) = (echoed.stdout, String::from_utf8(echoed.stderr).unwrap());
+        let out = String::from_utf8(out).unwrap();
+        assert!(out.starts_with("transforms:\n"), "{out}{err}");
+        assert!(!err.contains("latched"), "{err}");
+    }
+}
+
+#[test]
+fn without_retention_a_late_recording_and_a_late_echo_name_what_they_miss() {
     let directory = tempfile::tempdir().unwrap();
-    let capture = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/echo/capture.pcap.gz");
-    let more = "watch: [{topic: /tf_static, retain: last}]\n";
-    let agent = agent_on(&capture, directory.path(), "10", more);
-    agent.wait_for_metric("ros2probe_retained_bytes", |bytes| bytes > 50.0);
-    // The capture sends it once: a recording that begins now is too late for it.
+    let mut agent = agent_on(&sent_once(), directory.path(), "10", "retain: off\n");
+    agent.wait_for_log("the capture has ended");
+    let host = agent.api.to_string();
+    let echo = [
+        "topic",
+        "echo",
+        "/tf_static",
+        "--timeout",
+        "1",
+        "--host",
+        &host,
+    ];
+    let echoed = rp().args(echo).output().unwrap();
+    let said = String::from_utf8(echoed.stderr).unwrap();
+    let missing = "the latched message of /tf_static is not kept: set `retain: last` in a watch";
+    assert!(said.contains(missing), "{said}");
+    assert!(echoed.stdout.is_empty());
+}
+
+fn sent_once() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/echo/capture.pcap.gz")
+}
+
+/// Records until this many messages of `/tf_static` are there.
+fn record_late(agent: &LocalAgent, messages: u64) -> Value {
     let body = r#"{"name": "late", "topics": {"topics": ["/tf_static", "/chatter"]}}"#;
     let (status, begun) = ask(agent.api, "POST", "/recordings", body);
     assert_eq!(status, 201, "{begun}");
     wait_for(agent.api, "late", |recording| {
-        recording["report"]["topics"]["/tf_static"]["messages"] == 1
+        recording["report"]["topics"]["/tf_static"]["messages"] == messages
     });
     let (status, ended) = ask(agent.api, "DELETE", "/recordings/late", "");
     assert_eq!(status, 200, "{ended}");
-    assert_eq!(
-        ended["report"]["sent_before"],
-        serde_json::json!([]),
-        "{ended}"
-    );
-    let messages = messages(&directory.path().join("bags/late"));
-    assert_eq!(messages["/tf_static"].len(), 1, "{messages:?}");
+    ended
 }
 
 #[test]

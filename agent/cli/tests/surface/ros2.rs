@@ -13,6 +13,7 @@ use std::process::Output;
 
 use crate::rp;
 use ros2probe_testing::local_agent::{self, LocalAgent};
+use ros2probe_testing::ports::free_address;
 
 pub fn run(arguments: &[&str]) -> Output {
     let mut rp = rp();
@@ -125,9 +126,7 @@ fn answering(answer: &'static [u8]) -> String {
 #[test]
 fn an_unreachable_agent_is_reported_in_one_line() {
     let ask = |host: &str| run(&["topic", "list", "--host", host]);
-    // The port is closed once the listener is dropped.
-    let closed = TcpListener::bind("127.0.0.1:0").unwrap().local_addr();
-    fails_with(&ask(&closed.unwrap().to_string()), "connection refused");
+    fails_with(&ask(&free_address().to_string()), "connection refused");
     fails_with(
         &ask(&answering(b"SSH-2.0-OpenSSH_9.6\r\n")),
         "is not a ros2probe agent",

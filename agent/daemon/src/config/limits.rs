@@ -4,8 +4,8 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use ros2probe_model::bounded::{CONFIGURED, Table};
-use ros2probe_model::limits::{Limit, Limits, Row};
+use ros2probe_model::facts::bounded::{CONFIGURED, Table};
+use ros2probe_model::facts::limits::{Limit, Limits, Row};
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};

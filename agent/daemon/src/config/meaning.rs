@@ -149,6 +149,7 @@ impl Reader {
             recordings: self.recordings(shape.recordings.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             service_timeout: Duration::from_secs_f64(shape.service_timeout_s),
+            retain: shape.retain,
             state_directory: state(&shape.state_directory),
             log: shape.log,
         }
@@ -333,6 +334,7 @@ impl Reader {
                 reading_cpu_percent: shm.reading_cpu_percent,
             },
             inside: shape.inside,
+            broker: PathBuf::from(shape.broker),
             zenoh_ports: shape.zenoh.unwrap_or_default().ports,
         };
         if settings.zenoh_ports.len() > PORT_CAPACITY {

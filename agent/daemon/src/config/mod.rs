@@ -28,15 +28,15 @@ pub use ros2probe_capture::settings::{
     CaptureSettings, ExactChoice, InsideChoice, ShmMode, ShmSettings, SourceChoice,
 };
 use ros2probe_message::Dialect;
-pub use ros2probe_model::chain::expected::ExpectedChain;
-pub use ros2probe_model::glob;
-pub use ros2probe_model::limits::{Limit, Limits, Row as LimitRow};
-pub use ros2probe_model::loss_share::LossShare;
-pub use ros2probe_model::rehearsal;
-pub use ros2probe_model::watch::{
+pub use ros2probe_model::derive::chain::expected::ExpectedChain;
+pub use ros2probe_model::facts::glob;
+pub use ros2probe_model::facts::limits::{Limit, Limits, Row as LimitRow};
+pub use ros2probe_model::facts::loss_share::LossShare;
+pub use ros2probe_model::facts::watch::{
     self, Expectations, ManyGlobs, PatternError, Retain, Watch, Watchlist, check_globs,
     check_pattern,
 };
+pub use ros2probe_model::measure::rehearsal;
 
 /// Largest file accepted, in bytes.
 const MAX_BYTES: u64 = 1 << 20;
@@ -70,6 +70,8 @@ pub struct Config {
     pub topic_grace: Duration,
     /// Time without a reply after which a call of a service is reported as hanging.
     pub service_timeout: Duration,
+    /// Last messages that are kept.
+    pub retain: RetainChoice,
     /// Directory of the saved discovery state.
     pub state_directory: StateChoice,
     /// Least severe level that is logged.
@@ -115,6 +117,18 @@ pub enum PageChoice {
     #[default]
     On,
     /// Do not serve it.
+    Off,
+}
+
+/// Last messages that are kept for clients that begin later.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum RetainChoice {
+    /// Of each transient-local writer, messages of up to 1 MiB; of watches with `retain: last` also
+    /// larger ones. 16 MiB together.
+    #[default]
+    Latched,
+    /// Only of watches with `retain: last`.
     Off,
 }
 
@@ -411,6 +425,7 @@ impl Config {
             ("otlp", self.otlp != new.otlp),
             ("recordings", self.recordings != new.recordings),
             ("topic_grace_s", self.topic_grace != new.topic_grace),
+            ("retain", self.retain != new.retain),
             (
                 "service_timeout_s",
                 self.service_timeout != new.service_timeout,
@@ -455,6 +470,7 @@ impl Default for Config {
                     reading_cpu_percent: defaults::SHM_READING_CPU_PERCENT,
                 },
                 inside: InsideChoice::default(),
+                broker: PathBuf::from(defaults::BROKER),
                 zenoh_ports: vec![defaults::ZENOH_PORT],
             },
             metrics: MetricsSettings {
@@ -480,6 +496,7 @@ impl Default for Config {
             recordings: RecordingSettings::default(),
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
             service_timeout: Duration::from_secs_f64(defaults::service_timeout_s()),
+            retain: RetainChoice::default(),
             state_directory: StateChoice::default(),
             log: Level::default(),
         }
@@ -505,6 +522,7 @@ mod defaults {
     use super::shape::Switch;
 
     pub(super) const RING_BYTES: usize = 4 << 20;
+    pub(super) const BROKER: &str = ros2probe_attach::request::SOCKET;
     pub(super) const RECORD_RING_BYTES: usize = 1 << 20;
     pub(super) const ZENOH_PORT: u16 = ros2probe_wire::zenoh::PORT;
     pub(super) const SHM_CPU_PERCENT: f64 = 1.5;

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::limits::LimitsShape;
 use super::{
     Access, Compression, ExactChoice, InsideChoice, Level, OtlpProtocol, PageChoice, Retain,
-    ShmMode, SourceChoice, defaults,
+    RetainChoice, ShmMode, SourceChoice, defaults,
 };
 
 /// Configuration of the ros2probe agent. Every key is optional.
@@ -59,6 +59,9 @@ pub(super) struct ConfigShape {
     #[schemars(range(min = 0.1, max = 86_400.0))]
     #[serde(default = "defaults::service_timeout_s")]
     pub(super) service_timeout_s: f64,
+    /// Last messages that are kept for recordings, viewers and commands that begin later.
+    #[serde(default)]
+    pub(super) retain: RetainChoice,
     /// Directory of the saved discovery state, so that a restart on a running robot loses no name:
     /// an absolute path, `off`, or `auto`: `$STATE_DIRECTORY` as set by the service manager, else
     /// /var/lib/ros2probe if it exists and is writable.
@@ -186,9 +189,12 @@ pub(super) struct CaptureShape {
     pub(super) shm: Option<ShmShape>,
     /// Calls inside ROS processes, by kernel breakpoints in their library `libtracetools.so`,
     /// whatever their middleware. `topics`: messages published and taken, also within a process;
-    /// `full`: also callbacks, timers and lifecycle transitions. Each call costs the observed
-    /// process some microseconds.
+    /// `full`: also callbacks, timers and lifecycle transitions; `auto`: as `full`, while a client
+    /// needs calls. Each observed call costs the process some microseconds.
     pub(super) inside: InsideChoice,
+    /// Socket of the process that attaches breakpoints (`rp attach`). Without a socket there, an agent
+    /// with the privileges starts one of its own.
+    pub(super) broker: String,
     /// Connections of Zenoh (rmw_zenoh).
     pub(super) zenoh: Option<ZenohShape>,
 }
@@ -211,9 +217,9 @@ pub(super) struct ZenohShape {
 pub(super) struct ShmShape {
     /// `auto`: read it if it exists; `off`: never.
     pub(super) mode: ShmMode,
-    /// `uprobe`: read every message, by a kernel breakpoint in all processes that use Fast DDS; if
-    /// that is impossible, shared memory is sampled. `auto`: the same, but only while messages of a
-    /// topic in shared memory are recorded, echoed, retained or measured by a command.
+    /// `auto`: while messages of a topic in shared memory are recorded, echoed or measured by a command,
+    /// read every message. A kernel breakpoint in all processes that use Fast DDS shows it. If that is
+    /// impossible, shared memory is sampled. `uprobe`: the same, always; `off`: never.
     pub(super) exact: ExactChoice,
     /// Share of one CPU for polling, in percent; briefly exceeded while participants discover each
     /// other. With less, fewer messages are read, but all are counted.
@@ -544,6 +550,7 @@ impl Default for CaptureShape {
             record_ring_bytes: defaults::RECORD_RING_BYTES,
             shm: None,
             inside: InsideChoice::default(),
+            broker: defaults::BROKER.to_owned(),
             zenoh: None,
         }
     }

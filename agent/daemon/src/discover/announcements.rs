@@ -1,6 +1,6 @@
 //! Announcements that a participant repeated on request.
 
-use ros2probe_model::naming::Naming;
+use ros2probe_model::facts::naming::Naming;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::entities::NodeEntities;
 

@@ -9,7 +9,7 @@ use ros2probe_wire::discovery::Role;
 use ros2probe_wire::record::Gap;
 
 use crate::tables::ReceivedAnnouncements;
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 
 use super::message::{MOST_NUMBERS, PUBLICATIONS_READER, SUBSCRIPTIONS_READER};
 

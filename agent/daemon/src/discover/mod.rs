@@ -23,7 +23,7 @@ use ros2probe_wire::Timestamp;
 
 use self::message::{LocalParticipant, VENDOR};
 use self::session::{Outgoing, Session, Target};
-use ros2probe_model::snapshot::ParticipantFacts;
+use ros2probe_model::report::snapshot::ParticipantFacts;
 
 /// Interval at which the session advances without input.
 const SLICE: Duration = Duration::from_millis(5);

@@ -5,10 +5,10 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use ros2probe_capture::live::LiveSource;
 use ros2probe_capture::reassembly::Limits;
-use ros2probe_model::discovery::hexadecimal;
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::{ParticipantFacts, ProcessFacts};
+use ros2probe_model::graph::discovery::hexadecimal;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
+use ros2probe_model::report::snapshot::{ParticipantFacts, ProcessFacts};
 use ros2probe_wire::GuidPrefix;
 
 use super::Refusal;

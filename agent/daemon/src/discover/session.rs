@@ -23,8 +23,8 @@ use super::message::{
     SUBSCRIPTIONS_READER,
 };
 use crate::tables::{DiscoveredEndpoints, PartialAnnouncements, UserWriters};
-use ros2probe_model::bounded::Bounded;
-use ros2probe_model::discovery_fragments::DiscoveryFragments;
+use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::graph::discovery_fragments::DiscoveryFragments;
 
 /// Most packets sent to one participant, including the goodbye.
 pub const MOST_PACKETS: u32 = 6;

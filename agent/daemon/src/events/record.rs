@@ -13,11 +13,11 @@ use ros2probe_wire::{DomainId, Timestamp};
 use super::table::{self, Definition, Severity};
 use crate::agent_facts::SourceKind;
 use crate::series_name::series_name;
-use ros2probe_model::churn;
-use ros2probe_model::diagnosis::{Diagnosis, Policy};
-use ros2probe_model::event::{EventKind, LossBurst, bounded};
-use ros2probe_model::naming::Naming;
-use ros2probe_model::snapshot::WatchState;
+use ros2probe_model::facts::churn;
+use ros2probe_model::facts::diagnosis::{Diagnosis, Policy};
+use ros2probe_model::facts::event::{EventKind, LossBurst, bounded};
+use ros2probe_model::facts::naming::Naming;
+use ros2probe_model::report::snapshot::WatchState;
 
 const SECONDS_OF_A_DAY: u64 = 86_400;
 /// State of a managed node that handles an error (`lifecycle_msgs/msg/State`).
@@ -222,8 +222,8 @@ impl Occurrence {
             // Common while nodes start, and with tools that publish without a subscriber.
             Self::Robot(EventKind::Diagnosis { finding, .. }) => matches!(
                 finding,
-                Diagnosis::UnheardPublisher { .. }
-                    | Diagnosis::UnfedSubscriber { .. }
+                Diagnosis::UnmatchedPublisher { .. }
+                    | Diagnosis::UnmatchedSubscription { .. }
                     | Diagnosis::RestampingNode { .. }
             ),
             Self::Agent(
@@ -434,11 +434,11 @@ fn finding(finding: &Diagnosis) -> Values {
             ("ros_node", Some(text(node))),
             ("participants", list(participants)),
         ],
-        Diagnosis::UnheardPublisher { writer, reason, .. } => vec![
+        Diagnosis::UnmatchedPublisher { writer, reason, .. } => vec![
             ("writer", written(writer)),
             ("reason", Some(text(reason.label()))),
         ],
-        Diagnosis::UnfedSubscriber { reader, reason, .. } => vec![
+        Diagnosis::UnmatchedSubscription { reader, reason, .. } => vec![
             ("reader", written(reader)),
             ("reason", Some(text(reason.label()))),
         ],

@@ -232,7 +232,7 @@ pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
     "Another fault of the graph, named by `diagnosis`: type_conflict, type_hash_conflict, \
      duplicate_node, node_in_several_domains, slow_callback, executor_wait, \
      intra_process_overflow, reader_queue_overflow, observation_suspended, slow_chain, or (INFO) \
-     unheard_publisher, unfed_subscriber, restamping_node.",
+     unmatched_publisher, unmatched_subscription, restamping_node.",
 )
 .relief(Severity::Info);
 pub(super) const GRAPH_RESOLVED: Definition = Definition::new(

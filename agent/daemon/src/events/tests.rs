@@ -3,9 +3,9 @@
 use ros2probe_wire::{DomainId, Guid};
 
 use super::*;
-use ros2probe_model::churn;
-use ros2probe_model::event::{Event, EventKind};
-use ros2probe_model::inside::facts::LifecycleState;
+use ros2probe_model::facts::calls::facts::LifecycleState;
+use ros2probe_model::facts::churn;
+use ros2probe_model::facts::event::{Event, EventKind};
 
 fn node(at: u64) -> Event {
     Event {

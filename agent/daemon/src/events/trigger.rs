@@ -1,6 +1,6 @@
 //! Triggers: conditions on events, which configurations name.
 
-use ros2probe_model::diagnosis::Diagnosis;
+use ros2probe_model::facts::diagnosis::Diagnosis;
 
 use super::record::{Record, Value};
 use super::table::{self, Definition, EVENTS, Severity};

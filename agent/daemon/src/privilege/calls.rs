@@ -2,8 +2,8 @@
 //!
 //! A refused call fails with `EPERM`, as without a privilege. Calls that C libraries try before an
 //! older allowed one fail with `ENOSYS`, which makes them use that one. Some calls are restricted
-//! by their arguments: memory never becomes executable, only the reader of memory creates
-//! processes, and threads that read the network or other processes open no file for writing.
+//! by their arguments: memory never becomes executable, only the broker creates processes, and
+//! threads that read the network or other processes open no file for writing.
 
 use std::collections::BTreeMap;
 
@@ -274,31 +274,54 @@ impl Allowed {
             }
             Role::Exact => {
                 allowed.always(NOTICE);
-                allowed.attach_probes(&[])?;
+                allowed.ask_broker()?;
             }
-            Role::Inside => allowed.attach_probes(&command::MAPS)?,
-            Role::MemoryReader => {
-                let spaces = libc::CLONE_NEWUSER | libc::CLONE_NEWNS | libc::CLONE_NEWNET;
-                let plain = condition(0, SeccompCmpOp::MaskedEq(wide(spaces)), 0)?;
-                allowed.when(libc::SYS_clone, &[plain])?;
-                allowed.always(&[
-                    libc::SYS_kill,
-                    libc::SYS_pipe2,
-                    libc::SYS_process_vm_readv,
-                    libc::SYS_wait4,
-                ]);
+            Role::Inside => {
+                allowed.ask_broker()?;
+                allowed.bpf(command::MAPS.into_iter())?;
             }
+            Role::Broker => allowed.answer_agents()?,
         }
         Ok(allowed)
     }
 
-    /// Allows attaching uprobes to libraries, and further commands of `bpf`.
-    fn attach_probes(&mut self, commands: &[libc::c_int]) -> Result<(), BackendError> {
+    /// Allows requests to the broker over a unix socket, and reading libraries' directories.
+    fn ask_broker(&mut self) -> Result<(), BackendError> {
         self.always(LOOK).open_for_reading()?;
-        self.always(&[libc::SYS_perf_event_open]);
-        let commands = commands.iter().copied();
-        self.bpf(commands.chain([command::LINK_CREATE]))?;
-        self.end_perf_events()?;
+        self.always(&[libc::SYS_connect, libc::SYS_recvmsg, libc::SYS_sendmsg]);
+        self.always(&[libc::SYS_setsockopt]);
+        self.socket(libc::AF_UNIX, libc::SOCK_SEQPACKET)
+    }
+
+    /// Allows the broker's answers, each in a fork, and what they do.
+    fn answer_agents(&mut self) -> Result<(), BackendError> {
+        self.always(LOOK).open_for_reading()?;
+        let spaces = [
+            libc::CLONE_NEWUSER,
+            libc::CLONE_NEWNS,
+            libc::CLONE_NEWNET,
+            libc::CLONE_NEWPID,
+            libc::CLONE_NEWIPC,
+            libc::CLONE_NEWUTS,
+            libc::CLONE_NEWCGROUP,
+        ];
+        let spaces = spaces.into_iter().fold(0, |all, one| all | one);
+        let plain = condition(0, SeccompCmpOp::MaskedEq(wide(spaces)), 0)?;
+        self.when(libc::SYS_clone, &[plain])?;
+        self.always(&[
+            libc::SYS_accept4,
+            libc::SYS_getsockopt,
+            libc::SYS_kill,
+            libc::SYS_perf_event_open,
+            libc::SYS_pidfd_open,
+            libc::SYS_recvmsg,
+            libc::SYS_sendmsg,
+            libc::SYS_wait4,
+            #[cfg(target_arch = "x86_64")]
+            libc::SYS_fork,
+        ]);
+        self.bpf([command::LINK_CREATE].into_iter())?;
+        self.when(libc::SYS_prctl, &[equal(0, libc::PR_SET_PDEATHSIG)?])?;
         for request in [request::PERF_ENABLE, request::PERF_SET_BPF] {
             self.when(libc::SYS_ioctl, &[equal(1, request)?])?;
         }

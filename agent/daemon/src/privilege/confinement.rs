@@ -61,12 +61,13 @@ pub enum Role {
         /// As determined by [`Role::reattach`].
         needs_bpf: bool,
     },
-    /// Attaching programs to libraries: those that [`uprobe::useful`] returns.
+    /// Asking the broker to attach programs to libraries. No capability.
     Exact,
     /// As [`Role::Exact`], and reading the programs' maps.
     Inside,
-    /// The process that reads memory of other processes: `CAP_SYS_PTRACE`. Forks, opens nothing.
-    MemoryReader,
+    /// The broker, a process of its own: the capabilities that [`uprobe::useful`] returns. Forks,
+    /// accepts connections, and opens files for reading; creates no connection.
+    Broker,
 }
 
 /// A thread could not be confined.
@@ -150,16 +151,19 @@ impl Role {
             }
         };
         match self {
-            Self::Service | Self::Serve | Self::Export | Self::Ros2Daemon => nothing,
+            Self::Service
+            | Self::Serve
+            | Self::Export
+            | Self::Ros2Daemon
+            | Self::Exact
+            | Self::Inside => nothing,
             Self::Capture { needs_bpf } => bpf(needs_bpf),
             Self::Reattach { needs_bpf } => CapabilitySet::NET_ADMIN | bpf(needs_bpf),
-            Self::SharedMemory { needs_nice: false } | Self::MemoryReader => {
-                CapabilitySet::SYS_PTRACE
-            }
+            Self::SharedMemory { needs_nice: false } => CapabilitySet::SYS_PTRACE,
             Self::SharedMemory { needs_nice: true } => {
                 CapabilitySet::SYS_PTRACE | CapabilitySet::SYS_NICE
             }
-            Self::Exact | Self::Inside => uprobe::useful(),
+            Self::Broker => uprobe::useful(),
         }
     }
 }

@@ -19,4 +19,4 @@ pub use confinement::{
     ConfineError, Role, Sandbox, SpawnError, confine, give_up, sandbox, spawn, spawn_source,
 };
 pub use threads::{ThreadCapabilities, threads};
-pub use user::{Identity, become_own_user};
+pub use user::{Identity, become_own_user, user_id};

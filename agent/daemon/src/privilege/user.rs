@@ -66,6 +66,15 @@ fn find(users: &str, groups: &str) -> Option<(Uid, Gid)> {
     Some((Uid::from_raw(user), Gid::from_raw(group)))
 }
 
+/// Id of a user; `None` if it does not exist.
+#[must_use]
+pub fn user_id(name: &str) -> Option<u32> {
+    let users = fs::read_to_string("/etc/passwd").ok()?;
+    let mut lines = users.lines().map(|line| line.split(':'));
+    let mut found = lines.find(|fields| fields.clone().next() == Some(name))?;
+    found.nth(2)?.parse().ok()
+}
+
 fn become_user(user: Uid, group: Gid) -> io::Result<()> {
     set_thread_groups(&[])?;
     set_thread_res_gid(group, group, group)?;

@@ -243,7 +243,7 @@ fn expression(text: &str) -> Result<Regex, FilterError> {
     if text.len() > MAX_EXPRESSION {
         return Err(refuse(format!("longer than {MAX_EXPRESSION} bytes")));
     }
-    ros2probe_model::selection::expression(text).map_err(|error| {
+    ros2probe_model::facts::selection::expression(text).map_err(|error| {
         let text = error.to_string();
         let last = text.lines().last().unwrap_or_default();
         refuse(last.trim_start_matches("error: ").to_owned())

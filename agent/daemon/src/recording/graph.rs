@@ -4,12 +4,15 @@
 use std::collections::HashMap;
 
 use ros2probe_api::endpoints::Endpoint;
+use ros2probe_api::latched::Latched;
 use ros2probe_api::participants::UnknownWriter;
 use ros2probe_api::samples::OfferedQos;
 use ros2probe_api::topics::Topic;
-use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts, Transport};
-use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot, TopicFacts, Transport};
 use ros2probe_wire::qos::Durability;
+
+use crate::latched::latched;
 
 const VOLATILE: &str = "VOLATILE";
 
@@ -36,9 +39,18 @@ pub struct PublishedTopic {
     /// Transport of most pairs, if none of them uses the network.
     pub other_transport: Option<String>,
     /// Publishers that send stored samples to late joiners.
-    pub durable_publishers: Vec<String>,
+    pub durable_publishers: Vec<DurablePublisher>,
     /// Messages counted so far; `None` if the topic is not measured.
     pub messages: Option<u64>,
+}
+
+/// A publisher that sends stored samples to late joiners.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct DurablePublisher {
+    /// GUID.
+    pub guid: String,
+    /// Its last message, if the agent keeps such messages.
+    pub latched: Option<Latched>,
 }
 
 /// Topics of one domain by the names that messages have: ROS names of topics, else DDS names.
@@ -88,7 +100,10 @@ impl From<&Topic<'_>> for PublishedTopic {
             subscribed: !topic.subscriptions.is_empty(),
             other_transport: other_transport(passages).map(str::to_owned),
             durable_publishers: durable_publishers
-                .map(|publisher| publisher.guid.clone())
+                .map(|publisher| DurablePublisher {
+                    guid: publisher.guid.clone(),
+                    latched: publisher.latched.clone(),
+                })
                 .collect(),
             messages: topic.measurement.as_ref().map(|measured| measured.messages),
         }
@@ -134,7 +149,10 @@ impl From<&TopicFacts> for PublishedTopic {
             subscribed: !facts.subscriptions.is_empty(),
             other_transport: other_transport(passages).map(str::to_owned),
             durable_publishers: durable_publishers
-                .map(|publisher| publisher.guid.to_string())
+                .map(|publisher| DurablePublisher {
+                    guid: publisher.guid.to_string(),
+                    latched: publisher.latched.map(latched),
+                })
                 .collect(),
             messages: facts.measurement.as_ref().map(|measured| measured.messages),
         }

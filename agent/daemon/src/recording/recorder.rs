@@ -26,8 +26,8 @@ use ros2probe_api::recordings::FilterOptions;
 use ros2probe_bag::{
     Compressed, Error, FileCompression, Schema, Summary, TopicDescription, TopicId, Writer,
 };
-use ros2probe_model::bounded::{Bounded, Sum};
-use ros2probe_model::dispatch::{Offered, Sample};
+use ros2probe_model::facts::bounded::{Bounded, Sum};
+use ros2probe_model::facts::dispatch::{Offered, Sample};
 
 /// Interval of writes to the operating system, by the time of samples. A killed process loses at
 /// most this much.

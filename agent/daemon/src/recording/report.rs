@@ -3,9 +3,12 @@
 
 use std::collections::BTreeMap;
 
+use ros2probe_api::latched::Latched;
 use ros2probe_api::recording_report::{
     MissingRun, NO_SUBSCRIBER, OtherDomain, Report, UnknownWriters,
 };
+
+use ros2probe_api::topics::UNSUBSCRIBED;
 
 use crate::subscriptions::{Missed, MissedReason};
 use crate::tables::RecordedTopics;
@@ -16,10 +19,7 @@ const RUNS: usize = 256;
 const NAMES: usize = 8;
 /// Reasons for a published topic without visible messages, with their texts.
 const UNOBSERVED: [(&str, &str); 5] = [
-    (
-        NO_SUBSCRIBER,
-        "without a subscriber the publisher sends nothing",
-    ),
+    (NO_SUBSCRIBER, UNSUBSCRIBED),
     (
         "shared_memory",
         "publisher and subscriber use shared memory, which was not observed",
@@ -137,10 +137,10 @@ pub fn shortfalls(report: &Report) -> Vec<String> {
         ));
     }
     for name in &report.sent_before {
-        lines.push(format!(
-            "{name} is transient local: messages sent before recording started are missing \
-             (see `retain: last`)"
-        ));
+        let latched = report.latched.get(name);
+        lines.push(Latched::missing(latched, name).unwrap_or_else(|| {
+            format!("{name} is transient local: messages sent before recording started are missing")
+        }));
     }
     for name in &report.left_out {
         lines.push(format!(

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use ros2probe_wire::Timestamp;
 
-use ros2probe_model::dispatch::Sample;
+use ros2probe_model::facts::dispatch::Sample;
 
 /// Memory of a sample besides its payload, in bytes.
 const OVERHEAD: usize = 256;

@@ -23,8 +23,8 @@ use crate::limit_facts::{LimitFigures, Slot, Slots};
 use crate::recording::RecordingFigures;
 use crate::snapshot_cell::SnapshotCell;
 use crate::subscriptions::{
-    Candidate, ChoiceError, Depth, NextItem, Overflow, Refused, Request, Selection, Subscription,
-    Subscriptions,
+    Begin, Candidate, ChoiceError, Depth, NextItem, Overflow, Refused, Request, Selection,
+    Subscription, Subscriptions,
 };
 use ros2probe_api::recording_report::Report;
 use ros2probe_api::recordings::{FilterOptions, RecordingState};
@@ -109,10 +109,19 @@ pub struct Recording {
     pub asked: FilterOptions,
     /// Time of its start.
     pub began: SystemTime,
+    begin: Begin,
     status: Mutex<Status>,
     commands: Mutex<Sender<Command>>,
     thread: Mutex<Option<JoinHandle<()>>>,
     over: Notify,
+}
+
+impl Recording {
+    /// Returns a handle that waits until each message of the requested topics is captured.
+    #[must_use]
+    pub const fn begin(&self) -> &Begin {
+        &self.begin
+    }
 }
 
 /// Status of a recording.
@@ -198,8 +207,7 @@ impl Recordings {
         }
     }
 
-    /// Starts a recording. Its subscription is open when this returns; see
-    /// [`Subscription::in_force`].
+    /// Starts a recording. Its subscription is open when this returns; see [`Recording::begin`].
     ///
     /// # Errors
     ///
@@ -234,6 +242,7 @@ impl Recordings {
             domain_id: wanted.domain_id,
             asked: wanted.asked,
             began: SystemTime::now(),
+            begin: subscription.begin(),
             status: Mutex::default(),
             commands: Mutex::new(give),
             thread: Mutex::default(),
@@ -361,7 +370,7 @@ impl Recordings {
     ) -> Result<Subscription, Refusal> {
         Ok(self.subscriptions.open(Request {
             topics,
-            domain_id: Some(domain_id),
+            domain_id: Some(DomainId(domain_id)),
             depth: Depth::Payloads,
             queue_bytes: self.queue_bytes,
             overflow: Overflow::DropOldest,

@@ -25,11 +25,11 @@ pub use capture_time::CaptureTime;
 use ros2probe_capture::live::{CaptureError, LiveSource};
 use ros2probe_capture::pcap::PcapError;
 use ros2probe_capture::system::give_back_memory;
-use ros2probe_model::history::History;
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::Observer;
-use ros2probe_model::selection::SampleRequest;
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::facts::selection::SampleRequest;
+use ros2probe_model::measure::history::History;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Observer;
+use ros2probe_model::report::snapshot::Snapshot;
 pub use source::{Source, probe};
 
 /// Longest time of a replay without checking commands.
@@ -47,6 +47,8 @@ const PUBLISH_ASKED: Duration = Duration::from_millis(50);
 const SNAPSHOT_UNREAD: Duration = Duration::from_secs(5);
 /// Longest interval of clock items to subscribers during silence.
 const SLICE_SUBSCRIBED: Duration = Duration::from_millis(90);
+/// Longest time that readers wait for breakpoints in the processes that send to them.
+const ATTACHES_WITHIN: Duration = Duration::from_secs(5);
 const CLOCK_INTERVAL: Duration = Duration::from_millis(100);
 /// Step back of the clock that means it was set.
 const SET_BACK: Duration = Duration::from_secs(1);
@@ -74,6 +76,8 @@ pub struct Run {
     subscriptions: Arc<Subscriptions>,
     /// Requests that subscriptions wait for.
     sample_requests: Option<Arc<Vec<SampleRequest>>>,
+    /// Requests in force whose readers wait until every message is seen, and since when.
+    unconfirmed: Option<(Arc<Vec<SampleRequest>>, Instant)>,
     /// Last clock item sent to subscriptions.
     published_until: Timestamp,
     /// When the latest snapshot was taken, and the revision of the graph in it.
@@ -116,6 +120,7 @@ impl Run {
             watches,
             subscriptions,
             sample_requests: None,
+            unconfirmed: None,
             published_until: Timestamp::default(),
             taken: None,
             stop,
@@ -160,6 +165,7 @@ impl Run {
         if has_applied_lists {
             self.confirm_wishes();
         }
+        self.confirm_complete();
         self.publish();
         let mut published = Instant::now();
         while !self.stop.is_cancelled() {
@@ -192,6 +198,7 @@ impl Run {
             if has_applied_lists {
                 self.confirm_wishes();
             }
+            self.confirm_complete();
             let age = published.elapsed();
             let is_current = age < PUBLISH_ASKED && !self.source.is_paused();
             let is_asked = !is_current && self.outputs.latest.is_asked();
@@ -269,6 +276,7 @@ impl Run {
         let output = self.observer.drain();
         if let Source::Live(live) = &mut self.source {
             live.apply(&output.interest);
+            live.want_inside(self.outputs.latest.are_calls_wanted(Instant::now()));
         }
         self.outputs.events.add(output.events, now);
         self.outputs.spans.add(output.spans, output.chain_spans);
@@ -303,14 +311,35 @@ impl Run {
         self.apply_lists()
     }
 
-    /// Confirms requests that are in force in the kernel, before the next packets.
+    /// Gives readers the retained samples of requests that are in force in the kernel, before the next
+    /// packets.
     fn confirm_wishes(&mut self) {
         if let Some(sample_requests) = self.sample_requests.take() {
-            self.subscriptions.in_force(&sample_requests);
+            let observer = &mut self.observer;
+            (self.subscriptions).in_force(&sample_requests, |request| observer.latched(request));
+            self.unconfirmed = Some((Arc::clone(&sample_requests), Instant::now()));
             if sample_requests.is_empty() {
                 // Buffers of large messages are free now, and the next subscription may be far off.
                 give_back_memory();
             }
+        }
+    }
+
+    /// Confirms requests in force once every message is seen, or after a while. Readers report the
+    /// reason then.
+    fn confirm_complete(&mut self) {
+        let Some((_, since)) = self.unconfirmed else {
+            return;
+        };
+        let is_attaching = match &self.source {
+            Source::Live(live) => live.is_attaching(&self.observer),
+            Source::Replay(_) => false,
+        };
+        if is_attaching && since.elapsed() < ATTACHES_WITHIN {
+            return;
+        }
+        if let Some((sample_requests, _)) = self.unconfirmed.take() {
+            self.subscriptions.confirm(&sample_requests);
         }
     }
 
@@ -364,6 +393,7 @@ impl Run {
     fn facts(&mut self) -> AgentFacts {
         let mut facts = self.source.facts();
         facts.subscriptions = self.subscriptions.facts();
+        facts.subscriptions.retained_bytes = self.observer.latched_bytes();
         if let Some(keeper) = &mut self.keeper {
             let (revision, now) = (self.observer.memory_revision(), Instant::now());
             if keeper.wants(revision, now) {

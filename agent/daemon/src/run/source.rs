@@ -15,16 +15,19 @@ use crate::agent_facts::{
     Ability, AgentFacts, ExactFacts, InsideLibrary, InsideSourceFacts, InterfaceFacts,
     SharedMemoryFacts, SourceKind,
 };
-use crate::config::CaptureSettings;
+use crate::config::{CaptureSettings, InsideChoice};
 use ros2probe_capture::host_tap::HostTap;
 use ros2probe_capture::live::{CaptureError, LiveSource, Part};
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::shm;
 use ros2probe_capture::tables::{ZenohStreamBytes, ZenohStreams};
 use ros2probe_capture::zenoh::Streams;
-use ros2probe_model::bounded::Declared as _;
-use ros2probe_model::observer::Observer;
-use ros2probe_model::snapshot::TableFacts;
+use ros2probe_model::facts::bounded::Declared as _;
+use ros2probe_model::observe::observer::Observer;
+use ros2probe_model::report::snapshot::TableFacts;
+
+/// Why no calls are observed on demand.
+const INSIDE_RESTS: &str = "capture.inside is auto, and no client needs calls";
 
 /// Source of packets.
 pub enum Source {
@@ -65,7 +68,10 @@ impl Source {
             tracing::warn!("capture.shm.exact not used: {reason}; shared memory is sampled");
         }
         if let Some(reason) = live.without_inside() {
-            tracing::warn!("capture.inside not used: {reason}");
+            match settings.inside {
+                InsideChoice::Auto => tracing::info!("capture.inside not used: {reason}"),
+                _ => tracing::warn!("capture.inside not used: {reason}"),
+            }
         }
         if !live.is_on_the_wire() && !settings.network_namespaces.is_empty() {
             tracing::info!("capture.network_namespaces is not needed: all sockets are seen");
@@ -307,15 +313,19 @@ fn inside(live: &LiveSource) -> Option<InsideSourceFacts> {
         processes: library.processes as u64,
         refused: library.refused,
     });
+    let resting = || facts.is_resting.then(|| INSIDE_RESTS.to_owned());
+    let reason_off = facts.detached.or_else(|| stalled(live, Part::Inside));
     Some(InsideSourceFacts {
-        mode: if facts.has_callbacks {
-            "full"
-        } else {
-            "topics"
+        mode: match (facts.is_on_demand, facts.has_callbacks) {
+            (true, _) => "auto",
+            (false, true) => "full",
+            (false, false) => "topics",
         },
+        is_resting: facts.is_resting,
+        shows_rates: facts.shows_rates,
         libraries: libraries.collect(),
         counters: facts.counters,
-        reason_off: facts.detached.or_else(|| stalled(live, Part::Inside)),
+        reason_off: reason_off.or_else(resting),
     })
 }
 
@@ -398,7 +408,8 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
     if is_exact && !is_stalled(Part::Exact) {
         abilities.push(Ability::SharedMemoryExact);
     }
-    if live.inside().is_some() && !is_stalled(Part::Inside) {
+    let is_observed = live.inside().is_some_and(|facts| !facts.is_resting);
+    if is_observed && !is_stalled(Part::Inside) {
         abilities.push(Ability::Inside);
     }
     abilities
@@ -406,11 +417,13 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
 
 /// Missing abilities that this source gains while a client needs them.
 fn on_demand(live: &LiveSource) -> Vec<Ability> {
-    let is_resting = live.exact().is_some_and(|facts| facts.is_resting);
-    is_resting
-        .then_some(Ability::SharedMemoryExact)
-        .into_iter()
-        .collect()
+    let is_exact_resting = live.exact().is_some_and(|facts| facts.is_resting);
+    let is_inside_resting = live.inside().is_some_and(|facts| facts.is_resting);
+    let abilities = [
+        is_exact_resting.then_some(Ability::SharedMemoryExact),
+        is_inside_resting.then_some(Ability::Inside),
+    ];
+    abilities.into_iter().flatten().collect()
 }
 
 /// Reasons for missing abilities, if known.
@@ -431,7 +444,7 @@ fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
     let shared_memory = stalled(live, Part::SharedMemory);
     blind.extend(shared_memory.map(|reason| (Ability::SharedMemory, reason)));
     let inside = live.without_inside().map(str::to_owned);
-    let inside = inside.or_else(|| stalled(live, Part::Inside));
+    let inside = inside.or_else(|| self::inside(live)?.reason_off);
     blind.extend(inside.map(|reason| (Ability::Inside, reason)));
     blind
 }

@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use super::Item;
 use super::channel::QueuedBytes;
-use ros2probe_model::names::DdsName;
+use ros2probe_model::facts::names::DdsName;
 
 /// Entries by arrival number.
 #[derive(Debug, Default)]

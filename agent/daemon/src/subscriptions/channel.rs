@@ -14,9 +14,9 @@ use tokio_util::sync::CancellationToken;
 use super::backlog::Backlog;
 use super::{Choice, Depth, Item, Overflow, Request, Selection, TopicKey};
 use crate::tables::QueueLosses;
-use ros2probe_model::bounded::Bounded;
-use ros2probe_model::dispatch::{Missed, MissedReason, Sample};
-use ros2probe_model::selection::SampleRequest;
+use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::facts::dispatch::{Missed, MissedReason, Sample};
+use ros2probe_model::facts::selection::SampleRequest;
 
 /// Memory of a queued entry besides its payload, in bytes.
 const OVERHEAD: usize = 256;
@@ -49,7 +49,7 @@ struct Wanted {
 
 #[derive(Debug)]
 struct ChannelOptions {
-    domain_id: Option<u32>,
+    domain_id: Option<DomainId>,
     depth: Depth,
     queue_bytes: usize,
     overflow: Overflow,
@@ -150,7 +150,7 @@ impl Channel {
         SampleRequest {
             id: self.id,
             selection: self.selection(),
-            domain_id: self.request.domain_id.map(DomainId),
+            domain_id: self.request.domain_id,
             depth: self.request.depth,
         }
     }

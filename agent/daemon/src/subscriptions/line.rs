@@ -10,7 +10,7 @@ use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{RtpsDuration, Timestamp};
 
 use super::Item;
-use ros2probe_model::dispatch::{Missed, MissedReason, Offered, Sample, Topic};
+use ros2probe_model::facts::dispatch::{Missed, MissedReason, Offered, Sample, Topic};
 
 /// Line of an item.
 #[must_use]

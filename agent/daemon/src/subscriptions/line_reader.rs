@@ -5,15 +5,15 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use ros2probe_api::samples::{self, Line, Open};
-use ros2probe_model::discovery::hexadecimal;
-use ros2probe_model::dispatch::{Missed, MissedReason, Sample, Topic};
+use ros2probe_model::facts::dispatch::{Missed, MissedReason, Sample, Topic};
+use ros2probe_model::graph::discovery::hexadecimal;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::Item;
 use super::line::announced;
 use crate::tables::{StreamTopics, StreamWriters};
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 
 /// Converts lines to items, with the topics that earlier lines described.
 #[derive(Debug)]

@@ -17,7 +17,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use arc_swap::{ArcSwap, ArcSwapOption};
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::{DomainId, Timestamp};
 use tokio_util::sync::CancellationToken;
 
 use crate::agent_facts::SubscriptionFacts;
@@ -25,13 +25,14 @@ use crate::config::watch::{MAX_GLOB_BYTES, MAX_GLOBS};
 use crate::config::{Watch, check_globs};
 use crate::snapshot_cell::SnapshotCell;
 use channel::Channel;
-use retained::Retained;
-use ros2probe_model::dispatch::{Dispatch, Sample, SampleOutcome};
-use ros2probe_model::selection::SampleRequest;
+use ros2probe_model::facts::dispatch::{Dispatch, Sample, SampleOutcome};
+use ros2probe_model::facts::selection::SampleRequest;
 
-pub use ros2probe_model::dispatch::{Missed, MissedReason, Topic};
-pub use ros2probe_model::header::begins_with_header;
-pub use ros2probe_model::selection::{Candidate, Choice, ChoiceError, Depth, Selection, TopicKey};
+pub use ros2probe_model::facts::dispatch::{Missed, MissedReason, Topic};
+pub use ros2probe_model::facts::header::begins_with_header;
+pub use ros2probe_model::facts::selection::{
+    Candidate, Choice, ChoiceError, Depth, Selection, TopicKey,
+};
 
 /// Most regular expressions in all subscriptions together.
 const MAX_REGEXES: usize = 16;
@@ -60,7 +61,7 @@ pub struct Request {
     /// Selection of topics, including those that appear later.
     pub topics: Selection,
     /// Domain of the topics; `None` for every domain.
-    pub domain_id: Option<u32>,
+    pub domain_id: Option<DomainId>,
     /// Whether payloads are included.
     pub depth: Depth,
     /// Capacity of the queue in bytes.
@@ -116,7 +117,8 @@ pub struct Subscriptions {
     channels: ArcSwap<Vec<Arc<Channel>>>,
     /// Locked while `channels` changes.
     changing: Mutex<Opened>,
-    retained: Mutex<Retained>,
+    /// Requests of watches for the last messages of their topics.
+    retained: ArcSwap<Vec<SampleRequest>>,
     /// Latest requests that the capture thread has not read yet.
     news: ArcSwapOption<Vec<SampleRequest>>,
     latest: Arc<SnapshotCell>,
@@ -153,7 +155,7 @@ impl Subscriptions {
         Self {
             channels: ArcSwap::default(),
             changing: Mutex::default(),
-            retained: Mutex::default(),
+            retained: ArcSwap::default(),
             news: ArcSwapOption::default(),
             latest,
             caps,
@@ -218,7 +220,7 @@ impl Subscriptions {
             missed: missed.map(|count| count.load(Ordering::Relaxed)),
             crowded_out: self.crowded_out.load(Ordering::Relaxed),
             queued_bytes: self.queued.load(Ordering::Relaxed),
-            retained_bytes: self.retained().bytes(),
+            retained_bytes: 0,
         }
     }
 
@@ -234,23 +236,25 @@ impl Subscriptions {
         self.news.swap(None)
     }
 
-    /// For the capture thread: retains samples for these watches.
+    /// For the capture thread: requests the messages for which these watches ask.
     pub fn retain(&self, watches: &[Arc<Watch>]) {
         let changing = self.changing();
-        let mut retained = self.retained();
-        let before = retained.sample_requests().count();
-        retained.set(watches.iter().map(|watch| &**watch));
-        let is_idle = before == 0 && retained.sample_requests().count() == 0;
-        drop(retained);
-        if !is_idle {
+        let retained = Arc::new(retained::sample_requests(watches));
+        let is_idle = retained.is_empty();
+        let before = self.retained.swap(retained);
+        if !is_idle || !before.is_empty() {
             self.change(self.channels.load().to_vec());
         }
         drop(changing);
     }
 
-    /// For the capture thread: marks these requests as in force in model and kernel. Readers first
-    /// receive the retained samples of topics that are new to them.
-    pub fn in_force(&self, sample_requests: &[SampleRequest]) {
+    /// For the capture thread: these requests are in force in model and kernel. Readers first receive
+    /// the last messages, which `latched` returns, of topics that are new to them.
+    pub fn in_force(
+        &self,
+        sample_requests: &[SampleRequest],
+        mut latched: impl FnMut(&SampleRequest) -> Vec<Arc<Sample>>,
+    ) {
         for channel in self.channels.load().iter() {
             let mut requests = sample_requests.iter();
             let Some(request) = requests.find(|request| request.id == channel.id()) else {
@@ -260,36 +264,33 @@ impl Subscriptions {
                 continue;
             };
             if channel.depth() == Depth::Payloads {
-                let known = self.latest.state();
-                let topics = || known.known().topics.iter();
-                let is_there = |writer| {
-                    let mut publishers = topics().flat_map(|topic| &topic.publishers);
-                    publishers.any(|publisher| publisher.guid == writer)
-                };
                 let fresh = SampleRequest {
                     selection: fresh,
                     ..request.clone()
                 };
-                let samples = self.retained().for_reader(&fresh, is_there);
-                for sample in samples {
+                for sample in latched(&fresh) {
                     self.given.fetch_add(1, Ordering::Relaxed);
                     channel.sample(&sample, None, &self.stop);
                 }
                 channel.wake();
             }
-            channel.set_in_force();
+        }
+    }
+
+    /// For the capture thread: marks these requests as in force, with every message seen from now on.
+    pub fn confirm(&self, sample_requests: &[SampleRequest]) {
+        for channel in self.channels.load().iter() {
+            if sample_requests
+                .iter()
+                .any(|request| request.id == channel.id())
+            {
+                channel.set_in_force();
+            }
         }
     }
 
     /// For the capture thread: queues samples from the model, then the clock if it has advanced.
     pub fn deliver(&self, given: Vec<Dispatch>, clock: Option<Timestamp>) {
-        let mut retained = self.retained();
-        for Dispatch { to, outcome } in &given {
-            if let SampleOutcome::Sample(sample) = outcome {
-                retained.keep(to, sample);
-            }
-        }
-        drop(retained);
         let channels = self.channels.load();
         if channels.is_empty() {
             return;
@@ -382,21 +383,26 @@ impl Subscriptions {
     /// Replaces the open channels. The caller holds `changing`.
     fn change(&self, channels: Vec<Arc<Channel>>) {
         let sample_requests = channels.iter().map(|channel| channel.request());
-        let retained = self.retained();
-        let sample_requests = sample_requests
-            .chain(retained.sample_requests().cloned())
-            .collect();
-        drop(retained);
+        let retained = self.retained.load();
+        let sample_requests = sample_requests.chain(retained.iter().cloned()).collect();
         self.channels.store(Arc::new(channels));
         self.news.store(Some(Arc::new(sample_requests)));
     }
 
-    fn retained(&self) -> std::sync::MutexGuard<'_, Retained> {
-        self.retained.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     fn changing(&self) -> std::sync::MutexGuard<'_, Opened> {
         self.changing.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Waits until a subscription is in force.
+#[derive(Clone, Debug)]
+pub struct Begin(Arc<Channel>);
+
+impl Begin {
+    /// Waits as [`Subscription::in_force`]. One task may wait at a time.
+    pub async fn in_force(&self, timeout: Duration) -> bool {
+        let known = self.0.in_force();
+        tokio::time::timeout(timeout, known).await.is_ok()
     }
 }
 
@@ -419,8 +425,13 @@ impl Subscription {
     /// Waits for at most `timeout` until the request is in force, and returns whether it is. All
     /// messages sent after that are delivered.
     pub async fn in_force(&self, timeout: Duration) -> bool {
-        let known = self.channel.in_force();
-        tokio::time::timeout(timeout, known).await.is_ok()
+        self.begin().in_force(timeout).await
+    }
+
+    /// Returns a handle that waits for the request to be in force.
+    #[must_use]
+    pub fn begin(&self) -> Begin {
+        Begin(Arc::clone(&self.channel))
     }
 
     /// Selection of topics.

@@ -302,7 +302,10 @@ async fn a_reader_is_woken_told_the_end_and_then_nothing() {
         .open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest))
         .unwrap();
     assert!(!reader.in_force(Duration::from_millis(1)).await);
-    all.in_force(&all.take_changed().unwrap());
+    let requests = all.take_changed().unwrap();
+    all.in_force(&requests, |_| Vec::new());
+    assert!(!reader.in_force(Duration::from_millis(1)).await);
+    all.confirm(&requests);
     assert!(reader.in_force(LONG).await);
     let source = std::thread::spawn({
         let all = Arc::clone(&all);

@@ -18,7 +18,7 @@ use crate::limit_facts::{LimitFacts, LimitFigures};
 use crate::recording::{RecordingFigures, SnapshotFigures};
 use crate::settings_cell::Reload;
 use crate::snapshot_cell::State;
-use ros2probe_model::dispatch::MissedReason;
+use ros2probe_model::facts::dispatch::MissedReason;
 
 /// Writes version, source and readiness of the agent.
 pub(super) fn identity(sink: &mut MetricSink<'_>, state: &State, now: Instant) -> fmt::Result {

@@ -3,11 +3,11 @@
 use std::collections::BTreeSet;
 use std::fmt;
 
-use ros2probe_model::chain::exemplar::Exemplars;
-use ros2probe_model::chain::expected::{ChainState, ExpectedFacts};
-use ros2probe_model::chain::path::Quantiles;
-use ros2probe_model::histogram::Histogram;
-use ros2probe_model::snapshot::{ChainFacts, Snapshot};
+use ros2probe_model::derive::chain::exemplar::Exemplars;
+use ros2probe_model::derive::chain::expected::{ChainState, ExpectedFacts};
+use ros2probe_model::derive::chain::path::Quantiles;
+use ros2probe_model::facts::histogram::Histogram;
+use ros2probe_model::report::snapshot::{ChainFacts, Snapshot};
 
 use super::catalogue::{self as metric, Metric};
 use super::metric_sink::{Label, MetricSink};
@@ -98,7 +98,7 @@ fn shown(chains: &[ChainFacts]) -> Vec<&ChainFacts> {
 
 fn ends(chain: &ChainFacts) -> impl Ord + '_ {
     let path = &chain.path;
-    let name = |end: Option<&'_ (ros2probe_model::names::TopicName, _)>| {
+    let name = |end: Option<&'_ (ros2probe_model::facts::names::TopicName, _)>| {
         end.map(|(topic, _)| topic.clone())
     };
     let (first, last) = (path.topics.first(), path.topics.last());

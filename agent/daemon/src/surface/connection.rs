@@ -24,6 +24,8 @@ const REQUEST: Duration = Duration::from_secs(10);
 /// A client must read [`LEAST`] bytes of a complete answer within this time.
 const PROGRESS: Duration = Duration::from_secs(10);
 const LEAST: usize = 64 << 10;
+/// An agent that acts this long after a deadline had no CPU time.
+const LATE: Duration = Duration::from_secs(1);
 /// Bytes of unfinished requests that a listener holds, in addition to [`FREE`] per connection.
 const UNFINISHED: usize = 256 << 10;
 /// Bytes of an unfinished request that every connection may use.
@@ -53,6 +55,9 @@ struct Progress {
     read: usize,
     /// Bytes that are counted in [`Connections::unfinished`].
     counted: usize,
+    /// Whether nothing had arrived when the connection was read last. An agent without CPU time has
+    /// not read every connection yet, and those did not wait for their clients.
+    was_empty: bool,
     /// Time since which the client reads too slowly, and the bytes read since then.
     stalled: Option<(Instant, usize)>,
 }
@@ -95,13 +100,14 @@ impl Connections {
         }
     }
 
-    /// Closes the connection with the longest time without a complete request. Returns false if
-    /// there is no such connection.
+    /// Closes the connection whose client has let it wait longest for a complete request. Returns
+    /// false if there is no such connection.
     pub(super) fn make_room(&self) -> bool {
         let connections = self.lock();
         let waiting = connections.iter().filter_map(|state| {
             let progress = state.lock();
             let is_waiting = matches!(progress.phase, Phase::Waiting | Phase::Receiving)
+                && progress.was_empty
                 // The end of an answer is still being sent.
                 && progress.stalled.is_none();
             (is_waiting && !state.end.is_cancelled()).then_some((progress.since, state))
@@ -142,6 +148,7 @@ impl ConnectionState {
                 since: Instant::now(),
                 read: 0,
                 counted: 0,
+                was_empty: false,
                 stalled: None,
             }),
             end: CancellationToken::new(),
@@ -254,6 +261,7 @@ impl<S> Connection<S> {
             progress.since = Instant::now();
         }
         progress.read += bytes;
+        progress.was_empty = false;
         let beyond = progress.read.saturating_sub(FREE);
         let fresh = beyond.saturating_sub(progress.counted);
         if !self.connections.hold(fresh) {
@@ -263,9 +271,9 @@ impl<S> Connection<S> {
         Ok(())
     }
 
-    /// Counts written bytes, or a failed attempt (0). Fails if the client has read too slowly for
-    /// too long.
-    fn has_written(&self, bytes: usize) -> io::Result<()> {
+    /// Counts written bytes. An agent without CPU time may come after the deadline of a client that
+    /// has read in time, whose time then begins anew.
+    fn has_written(&self, bytes: usize) {
         let now = Instant::now();
         let mut progress = self.state.lock();
         // The request has been processed.
@@ -278,13 +286,11 @@ impl<S> Connection<S> {
             *taken += bytes;
             if *taken >= LEAST {
                 progress.stalled = None;
-            } else if now.saturating_duration_since(*since) >= PROGRESS
-                && progress.phase != Phase::Streaming
-            {
-                return Err(io::ErrorKind::TimedOut.into());
+            } else if *since + PROGRESS + LATE <= now {
+                // Else the deadline would have closed the connection.
+                progress.stalled = Some((now, 0));
             }
         }
-        Ok(())
     }
 
     fn stalls(&self) {
@@ -313,7 +319,10 @@ impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
     ) -> Poll<io::Result<()>> {
         let before = buffer.filled().len();
         match Pin::new(&mut self.stream).poll_read(context, buffer) {
-            Poll::Pending => self.overdue(context),
+            Poll::Pending => {
+                self.state.lock().was_empty = true;
+                self.overdue(context)
+            }
             Poll::Ready(Ok(())) => {
                 let bytes = buffer.filled().len().saturating_sub(before);
                 Poll::Ready(self.has_read(bytes))
@@ -334,7 +343,10 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
                 self.stalls();
                 self.overdue(context)
             }
-            Poll::Ready(Ok(written)) => Poll::Ready(self.has_written(written).map(|()| written)),
+            Poll::Ready(Ok(written)) => {
+                self.has_written(written);
+                Poll::Ready(Ok(written))
+            }
             failed => failed,
         }
     }
@@ -352,6 +364,7 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
 
 #[cfg(test)]
 mod tests {
+    use futures_util::FutureExt as _;
     use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, DuplexStream, duplex};
 
     use super::*;
@@ -458,6 +471,22 @@ mod tests {
         assert_eq!(reading.await.unwrap(), 1 << 20);
     }
 
+    #[tokio::test(start_paused = true)]
+    async fn an_agent_that_comes_late_to_a_client_that_has_read_goes_on() {
+        let (_crowd, join) = connections();
+        let (mut connection, mut client) = join();
+        connection.state().requested(true);
+        connection.state().answers(true);
+        for _ in 0..3 {
+            let stopped = connection.write_all(&[7; 2 << 10]).now_or_never();
+            assert!(stopped.is_none(), "the buffer is full");
+            client.read_exact(&mut [0; 1 << 10]).await.unwrap();
+            // The agent gets no CPU time.
+            tokio::time::advance(2 * PROGRESS).await;
+        }
+        assert_eq!(connection.write(&[7; 1 << 10]).await.unwrap(), 1 << 10);
+    }
+
     #[tokio::test]
     async fn unfinished_requests_of_all_connections_share_a_budget_and_small_ones_need_none() {
         let (connections, join) = connections();
@@ -487,12 +516,17 @@ mod tests {
         let (connections, join) = connections();
         let (answered, _one) = join();
         answered.state().requested(true);
-        let (oldest, _two) = join();
+        let (mut oldest, _two) = join();
         tokio::time::advance(Duration::from_secs(1)).await;
-        let (newest, _three) = join();
+        let (mut newest, _three) = join();
         let is_closed = |connection: &Connection<DuplexStream>| connection.state.end.is_cancelled();
+        // The agent has not had the time to read them.
+        assert!(!connections.make_room());
+        let read = [&mut oldest, &mut newest].map(|each| each.read_u8().now_or_never());
+        assert!(read.iter().all(Option::is_none));
+        let (unread, _four) = join();
         assert!(connections.make_room() && is_closed(&oldest) && !is_closed(&newest));
         assert!(connections.make_room() && is_closed(&newest) && !is_closed(&answered));
-        assert!(!connections.make_room());
+        assert!(!connections.make_room() && !is_closed(&unread));
     }
 }

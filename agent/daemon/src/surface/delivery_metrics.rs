@@ -9,10 +9,10 @@ use super::catalogue::{self as metric, Metric};
 use super::metric_sink::{Family, Label, MetricSink, Number};
 use super::ros2_metrics::TopicRow;
 use crate::settings_cell::Settings;
-use ros2probe_model::histogram::Histogram;
-use ros2probe_model::loss::LossCause;
-use ros2probe_model::snapshot::Subscriber;
-use ros2probe_model::snapshot::{
+use ros2probe_model::facts::histogram::Histogram;
+use ros2probe_model::facts::loss::LossCause;
+use ros2probe_model::report::snapshot::Subscriber;
+use ros2probe_model::report::snapshot::{
     AcknowledgementFacts, Breakdown, Delivered, DeliveryFacts, Direction, SocketFacts, TopicFacts,
 };
 

@@ -7,8 +7,8 @@ use std::fmt;
 use super::catalogue::{self as metric, Metric};
 use super::metric_sink::{Label, MetricSink};
 use crate::series_name::series_name;
-use ros2probe_model::diagnosis::{Diagnosis, TopicKey};
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::DomainId;
 
 /// Returns how much one finding adds to a family.
@@ -82,10 +82,10 @@ fn per_topic(sink: &mut MetricSink<'_>, list: &[Diagnosis]) -> fmt::Result {
             _ => 0,
         }),
         (&metric::UNHEARD_PUBLISHERS, |each| {
-            usize::from(matches!(each, Diagnosis::UnheardPublisher { .. }))
+            usize::from(matches!(each, Diagnosis::UnmatchedPublisher { .. }))
         }),
         (&metric::UNFED_SUBSCRIPTIONS, |each| {
-            usize::from(matches!(each, Diagnosis::UnfedSubscriber { .. }))
+            usize::from(matches!(each, Diagnosis::UnmatchedSubscription { .. }))
         }),
     ];
     for (metric, count) in metrics {

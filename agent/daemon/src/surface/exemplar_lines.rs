@@ -10,7 +10,7 @@ use std::fmt::{self, Write};
 use std::sync::{Mutex, PoisonError};
 
 use super::catalogue::{CHAIN_LATENCY, HOP_LATENCY};
-use ros2probe_model::chain::exemplar::{Exemplar, Exemplars};
+use ros2probe_model::derive::chain::exemplar::{Exemplar, Exemplars};
 
 /// Families whose histograms have exemplars.
 const FAMILIES: [&str; 2] = [CHAIN_LATENCY.name, HOP_LATENCY.name];

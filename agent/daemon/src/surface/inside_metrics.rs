@@ -10,10 +10,10 @@ use super::metric_sink::{Label, MetricSink};
 use super::ros2_metrics::TopicRow;
 use crate::agent_facts::InsideSourceFacts;
 use crate::settings_cell::Settings;
-use ros2probe_model::histogram::Histogram;
-use ros2probe_model::inside::facts::{Callback, InsideFacts, TopicInside};
-use ros2probe_model::inside::report::Trigger;
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::facts::calls::facts::{Callback, InsideFacts, TopicInside};
+use ros2probe_model::facts::calls::report::Trigger;
+use ros2probe_model::facts::histogram::Histogram;
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::DomainId;
 
 /// Largest number of callbacks with series of their own.
@@ -282,7 +282,7 @@ impl CallbackSum {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ros2probe_model::inside::facts::{Owner, Quantiles};
+    use ros2probe_model::facts::calls::facts::{Owner, Quantiles};
     use ros2probe_wire::Timestamp;
 
     fn callback(number: usize) -> Callback {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use ros2probe_model::inside::facts::InsideFacts;
+use ros2probe_model::facts::calls::facts::InsideFacts;
 use ros2probe_wire::DomainId;
 
 /// Activity of one node.

@@ -67,7 +67,11 @@ impl<L> LimitedListener<L> {
         }
         self.limits.reached(self.limit, 1);
         if !self.connections.make_room() {
-            return None;
+            // Those that were accepted a moment ago have not been read.
+            tokio::task::yield_now().await;
+            if !self.connections.make_room() {
+                return None;
+            }
         }
         let freed = async {
             loop {

@@ -15,15 +15,15 @@ use prometheus_client::encoding::{
 use prometheus_client::metrics::MetricType;
 use prometheus_client::metrics::exemplar::Exemplar;
 use prometheus_client::registry::Unit;
-use ros2probe_model::chain::exemplar::Exemplars;
-use ros2probe_model::snapshot::Subscriber;
+use ros2probe_model::derive::chain::exemplar::Exemplars;
+use ros2probe_model::report::snapshot::Subscriber;
 use ros2probe_wire::Guid;
 use ros2probe_wire::rtps::VendorId;
 
 use super::catalogue::{Kind, Metric};
 use super::exemplar_lines::Waiting;
 use super::otlp::points::Points;
-use ros2probe_model::histogram::{BOUNDS, Histogram};
+use ros2probe_model::facts::histogram::{BOUNDS, Histogram};
 
 /// Longest label value in bytes; ROS allows 255 characters, so longer ones are hostile.
 const MAX_LABEL_BYTES: usize = 256;

@@ -10,14 +10,14 @@ use super::metric_sink::{Family, Label, MetricSink, Number};
 use crate::config::Watch;
 use crate::series_name::series_name;
 use crate::settings_cell::Settings;
-use ros2probe_model::histogram::Histogram;
-use ros2probe_model::names::TypeName;
-use ros2probe_model::snapshot::UnknownWriterFacts;
-use ros2probe_model::snapshot::{
+use ros2probe_model::facts::histogram::Histogram;
+use ros2probe_model::facts::names::TypeName;
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::report::snapshot::UnknownWriterFacts;
+use ros2probe_model::report::snapshot::{
     EndpointFacts, Measurement, ProcessFacts, SampledFacts, Snapshot, TopicFacts, WatchFacts,
     WatchState,
 };
-use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_wire::DomainId;
 
 /// Largest number of unknown writers with their own series.

@@ -5,7 +5,7 @@ use std::fmt;
 use super::catalogue::{self as metric, Metric};
 use super::metric_sink::{Label, MetricSink};
 use crate::settings_cell::Settings;
-use ros2probe_model::snapshot::{ActionFacts, LatencyFacts, ServiceFacts, Snapshot};
+use ros2probe_model::report::snapshot::{ActionFacts, LatencyFacts, ServiceFacts, Snapshot};
 
 /// Reads a number of a service.
 type Count = fn(&ServiceFacts) -> u64;

@@ -2,8 +2,8 @@
 
 use std::fmt;
 
-use ros2probe_model::snapshot::Snapshot;
-use ros2probe_model::zenoh::{Unseen, ZenohFacts};
+use ros2probe_model::graph::zenoh::{Unseen, ZenohFacts};
+use ros2probe_model::report::snapshot::Snapshot;
 
 use super::catalogue::{self as metric, Metric};
 use super::metric_sink::{Label, MetricSink};

@@ -11,11 +11,12 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use ros2probe_capture::threads::Progress;
-use ros2probe_wire::DomainId;
+use ros2probe_wire::{DomainId, InvalidDomainId};
 use serde::{Deserialize, Serialize};
 
 use crate::config::watch::{
-    ExpectationValues, Expectations, Retain, Watch, check_pattern, check_trace,
+    ExpectationError, ExpectationValues, Expectations, PatternError, Retain, Watch, check_pattern,
+    check_trace,
 };
 use crate::config::{Limit, check_globs};
 use crate::state::{ENDING, Form, Found, Newer, StateDirectory, from_json, join_until};
@@ -117,7 +118,9 @@ pub fn load(directory: &StateDirectory) -> LoadedWatches {
     let watches = if document.watches.len() > Limit::Watches.row().range.1 {
         Err(format!("it has {} watches", document.watches.len()))
     } else {
-        document.watches.into_iter().map(Watch::try_from).collect()
+        let watches = document.watches.into_iter().map(Watch::try_from);
+        let watches: Result<_, InvalidLine> = watches.collect();
+        watches.map_err(|error| error.to_string())
     };
     let watches = watches.and_then(|watches: Vec<Watch>| {
         let patterns = watches.iter().map(|watch| watch.pattern.as_str());
@@ -133,17 +136,27 @@ pub fn load(directory: &StateDirectory) -> LoadedWatches {
     }
 }
 
-impl TryFrom<Line> for Watch {
-    type Error = String;
+/// Why a saved watch is invalid.
+#[derive(Debug, thiserror::Error)]
+enum InvalidLine {
+    /// Its pattern matches no topic.
+    #[error("`{topic}` {error}")]
+    Pattern { topic: String, error: PatternError },
+    #[error(transparent)]
+    Domain(#[from] InvalidDomainId),
+    #[error(transparent)]
+    Expectation(#[from] ExpectationError),
+}
 
-    fn try_from(line: Line) -> Result<Self, String> {
-        check_pattern(&line.topic).map_err(|error| format!("`{}` {error}", line.topic))?;
-        if let Some(domain_id) = line
-            .domain_id
-            .filter(|domain_id| *domain_id > DomainId::MAX.0)
-        {
-            return Err(format!("invalid domain {domain_id}"));
-        }
+impl TryFrom<Line> for Watch {
+    type Error = InvalidLine;
+
+    fn try_from(line: Line) -> Result<Self, InvalidLine> {
+        check_pattern(&line.topic).map_err(|error| InvalidLine::Pattern {
+            topic: line.topic.clone(),
+            error,
+        })?;
+        let domain_id = line.domain_id.map(DomainId::try_from).transpose()?;
         let values = ExpectationValues {
             min_rate_hz: line.min_rate_hz,
             max_rate_hz: line.max_rate_hz,
@@ -158,7 +171,7 @@ impl TryFrom<Line> for Watch {
         check_trace(line.trace)?;
         Ok(Self {
             pattern: line.topic,
-            domain_id: line.domain_id.map(DomainId),
+            domain_id,
             expectations,
             per_subscriber: line.per_subscriber,
             trace: line.trace,

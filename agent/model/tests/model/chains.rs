@@ -8,8 +8,8 @@ mod restamping;
 mod spans;
 mod traps;
 
-use ros2probe_model::chain::path::ChainFacts;
-use ros2probe_model::chain::trace::Method;
+use ros2probe_model::derive::chain::path::ChainFacts;
+use ros2probe_model::derive::chain::trace::Method;
 
 use fixtures::{MICROSECOND, Robot, hops, near, shown};
 

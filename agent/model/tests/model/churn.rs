@@ -2,10 +2,10 @@
 //! counting allocator measures the heap exactly.
 
 use crate::allocator;
-use ros2probe_model::input::Input;
-use ros2probe_model::limits::Limits;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::watch::{Watch, Watchlist};
+use ros2probe_model::facts::limits::Limits;
+use ros2probe_model::facts::watch::{Watch, Watchlist};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};

@@ -4,9 +4,9 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 use std::time::Instant;
 
-use ros2probe_model::diagnosis::{Diagnoses, Diagnosis, Policy, Unmatched};
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::facts::diagnosis::{Diagnoses, Diagnosis, Policy, Unmatched};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_testing::zenoh;
 use ros2probe_wire::time::MILLISECOND;
@@ -164,24 +164,24 @@ fn incompatible_pairs_are_named_with_every_policy_and_gone_with_the_cause() {
         let pairs = expected.contains(&policy).then_some(1);
         assert_eq!(world.pairs(policy), pairs, "{policy:?}");
     }
-    let unfed = world.found("unfed_subscriber");
+    let subscriptions = world.found("unmatched_subscription");
     assert!(
         matches!(
-            &unfed[..],
-            [Diagnosis::UnfedSubscriber {
+            &subscriptions[..],
+            [Diagnosis::UnmatchedSubscription {
                 reason: Unmatched::Qos,
                 ..
             }]
         ),
-        "{unfed:?}"
+        "{subscriptions:?}"
     );
-    assert_eq!(world.found("unheard_publisher"), []);
+    assert_eq!(world.found("unmatched_publisher"), []);
 
     // The subscriber requests less.
     world.announce(reader(2, 1), "rt/points", STRING, &[BEST_EFFORT]);
     assert_eq!(world.found("qos_incompatible"), []);
     assert_eq!(world.diagnoses().qos_pairs, []);
-    assert_eq!(world.found("unfed_subscriber"), []);
+    assert_eq!(world.found("unmatched_subscription"), []);
 }
 
 #[test]
@@ -192,17 +192,17 @@ fn endpoints_of_two_domains_are_no_pair() {
     world.participant(2, &[]);
     world.announce(reader(2, 1), "rt/points", STRING, &[RELIABLE]);
     assert_eq!(world.found("qos_incompatible"), []);
-    let unfed = world.found("unfed_subscriber");
+    let subscriptions = world.found("unmatched_subscription");
     assert!(
         matches!(
-            &unfed[..],
-            [Diagnosis::UnfedSubscriber {
+            &subscriptions[..],
+            [Diagnosis::UnmatchedSubscription {
                 topic,
-                reason: Unmatched::Nobody,
+                reason: Unmatched::NoEndpoint,
                 ..
             }] if topic.domain_id == DomainId(5)
         ),
-        "{unfed:?}"
+        "{subscriptions:?}"
     );
 }
 
@@ -221,16 +221,16 @@ fn endpoints_of_dds_and_zenoh_are_no_pair() {
         zenoh::send(observer, stream, START, &batch);
     }
     assert_eq!(world.found("qos_incompatible"), []);
-    let unfed = world.found("unfed_subscriber");
+    let subscriptions = world.found("unmatched_subscription");
     assert!(
         matches!(
-            &unfed[..],
-            [Diagnosis::UnfedSubscriber {
-                reason: Unmatched::Nobody,
+            &subscriptions[..],
+            [Diagnosis::UnmatchedSubscription {
+                reason: Unmatched::NoEndpoint,
                 ..
             }]
         ),
-        "{unfed:?}"
+        "{subscriptions:?}"
     );
     let snapshot = world.observer.snapshot(Timestamp(world.now));
     let topic = snapshot
@@ -246,16 +246,16 @@ fn partitions_keep_apart_on_purpose() {
     world.announce(writer(1, 1), "rt/points", STRING, &[BEST_EFFORT]);
     world.announce(reader(2, 1), "rt/points", STRING, &[RELIABLE, PARTITION_A]);
     assert_eq!(world.found("qos_incompatible"), []);
-    let unheard = world.found("unheard_publisher");
+    let publishers = world.found("unmatched_publisher");
     assert!(
         matches!(
-            &unheard[..],
-            [Diagnosis::UnheardPublisher {
+            &publishers[..],
+            [Diagnosis::UnmatchedPublisher {
                 reason: Unmatched::Partition,
                 ..
             }]
         ),
-        "{unheard:?}"
+        "{publishers:?}"
     );
 }
 
@@ -295,17 +295,17 @@ fn two_types_and_two_definitions_of_one_are_found() {
     assert_eq!(&*topic.name, "/b");
     let types: Vec<_> = types.iter().map(|each| &**each).collect();
     assert_eq!(types, ["sensor_msgs/msg/Image", "std_msgs/msg/String"]);
-    let unheard = world.found("unheard_publisher");
+    let publishers = world.found("unmatched_publisher");
     assert!(
         matches!(
-            &unheard[..],
-            [Diagnosis::UnheardPublisher {
+            &publishers[..],
+            [Diagnosis::UnmatchedPublisher {
                 topic,
                 reason: Unmatched::Type,
                 ..
             }] if &*topic.name == "/b"
         ),
-        "{unheard:?}"
+        "{publishers:?}"
     );
 }
 
@@ -332,8 +332,8 @@ fn an_unmatched_endpoint_is_found_after_a_while_and_not_where_that_is_normal() {
         found.list.iter().map(named).collect()
     };
     let expected = [
-        ("unheard_publisher", "/points".to_owned()),
-        ("unfed_subscriber", "/cmd_vel".to_owned()),
+        ("unmatched_publisher", "/points".to_owned()),
+        ("unmatched_subscription", "/cmd_vel".to_owned()),
     ];
     assert_eq!(names(&world.diagnoses()), expected);
 
@@ -355,10 +355,10 @@ fn no_endpoint_is_unmatched_while_a_participants_endpoints_are_unknown() {
     // The participant announced itself before the agent started to capture its endpoints.
     let payload = forge::participant(prefix(3), 1_000_000, None);
     world.put(Message::from(prefix(3)).data(SPDP, 1, &payload));
-    assert_eq!(world.found("unheard_publisher"), []);
+    assert_eq!(world.found("unmatched_publisher"), []);
     // Once its endpoints are known, the missing subscriber is a finding.
     world.announce(reader(3, 1), "rt/other", STRING, &[]);
-    assert_eq!(world.found("unheard_publisher").len(), 1);
+    assert_eq!(world.found("unmatched_publisher").len(), 1);
 }
 
 #[test]

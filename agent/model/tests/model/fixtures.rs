@@ -14,7 +14,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use replayed::Replayed;
-use ros2probe_model::snapshot::Measurement;
+use ros2probe_model::report::snapshot::Measurement;
 use ros2probe_testing::truth::{self, Facts, GraphLine, Scenario};
 use ros2probe_wire::names::DdsType;
 

@@ -5,10 +5,10 @@
 use std::sync::Arc;
 
 use proptest::prelude::*;
-use ros2probe_model::dispatch::{Dispatch, SampleOutcome};
-use ros2probe_model::input::Input;
-use ros2probe_model::selection::{Depth, SampleRequest, Selection};
-use ros2probe_model::snapshot::Measurement;
+use ros2probe_model::facts::dispatch::{Dispatch, SampleOutcome};
+use ros2probe_model::facts::selection::{Depth, SampleRequest, Selection};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::report::snapshot::Measurement;
 use ros2probe_testing::model::host::{BOB, CapturePoint, Host};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::kind;

@@ -1,7 +1,7 @@
 //! Compares the model's list of types that begin with a header with their definitions.
 
 use ros2probe_message::{Dialect, Element, Library, Sources};
-use ros2probe_model::header::begins_with_header;
+use ros2probe_model::facts::header::begins_with_header;
 
 /// Uses the definitions built into the program; a unit test there finds each of them in this list.
 #[test]

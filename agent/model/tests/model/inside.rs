@@ -11,16 +11,16 @@ mod unknown;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_model::input::Input;
-use ros2probe_model::inside::facts::TopicInside;
-use ros2probe_model::inside::report::{
+use ros2probe_model::facts::calls::facts::TopicInside;
+use ros2probe_model::facts::calls::report::{
     BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report,
     SubscriptionReport, Transition, Trigger,
 };
-use ros2probe_model::names::NodeName;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::{Snapshot, TopicFacts};
-use ros2probe_model::watch::{Watch, Watchlist};
+use ros2probe_model::facts::names::NodeName;
+use ros2probe_model::facts::watch::{Watch, Watchlist};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
+use ros2probe_model::report::snapshot::{Snapshot, TopicFacts};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::time::{MILLISECOND, SECOND};
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};

@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use ros2probe_model::event::EventKind;
-use ros2probe_model::expectation::WatchState;
-use ros2probe_model::input::Input;
-use ros2probe_model::loss_share::LossShare;
-use ros2probe_model::watch::{Expectations, Watch, Watchlist};
+use ros2probe_model::facts::event::EventKind;
+use ros2probe_model::facts::loss_share::LossShare;
+use ros2probe_model::facts::watch::WatchState;
+use ros2probe_model::facts::watch::{Expectations, Watch, Watchlist};
+use ros2probe_model::observe::input::Input;
 use ros2probe_testing::model::host::{BOB, CAROL, CapturePoint, Host};
 
 /// Creates a host that expects at most this share of losses.

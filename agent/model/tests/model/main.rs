@@ -17,6 +17,8 @@ mod fixtures;
 mod forged;
 mod header;
 mod inside;
+mod latched;
+mod layers;
 mod loss;
 mod memory;
 mod observer;

@@ -12,10 +12,10 @@ use crate::allocator;
 use ros2probe_bag::{Options, Storage, TopicDescription, Writer};
 use ros2probe_daemon::agent_facts::{AgentFacts, SourceKind};
 use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
-use ros2probe_model::input::Input;
-use ros2probe_model::limits::{Limit, Limits};
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::watch::{Watch, Watchlist};
+use ros2probe_model::facts::limits::{Limit, Limits};
+use ros2probe_model::facts::watch::{Watch, Watchlist};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_testing::model::host::{self, BOB, CapturePoint, Host};
 use ros2probe_wire::record::{flag, guid_words, kind};
@@ -269,6 +269,7 @@ fn all_limits_reached_together_fit_into_the_unit_s_memory() {
         .find_map(|line| line.strip_prefix("MemoryMax="));
     let allowed = megabytes.unwrap().strip_suffix('M').unwrap();
     let allowed = allowed.parse::<usize>().unwrap() << 20;
-    let all = Limits::default().bytes() + Limits::BESIDE + Limits::ZENOH;
+    let all = Limits::default().bytes() + Limits::BESIDE + Limits::ZENOH + Limits::LATCHED;
+    let all = all + Limits::INSIDE;
     assert!(all <= allowed, "{} of {} KiB", all >> 10, allowed >> 10);
 }

@@ -11,9 +11,9 @@ mod unknown_writers;
 
 use std::ops::{Deref, DerefMut};
 
-use ros2probe_model::event::EventKind;
-use ros2probe_model::observer::Settings;
-use ros2probe_model::snapshot::{Measurement, TopicFacts};
+use ros2probe_model::facts::event::EventKind;
+use ros2probe_model::observe::observer::Settings;
+use ros2probe_model::report::snapshot::{Measurement, TopicFacts};
 use ros2probe_testing::model::domain::{VirtualDomain, watchlist};
 use ros2probe_testing::model::forge::Message;
 use ros2probe_wire::time::{MILLISECOND, SECOND};

@@ -4,10 +4,10 @@
 use std::sync::Arc;
 
 use proptest::prelude::*;
-use ros2probe_model::dispatch::{MissedReason, SampleOutcome};
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::Settings;
-use ros2probe_model::selection::{Depth, SampleRequest, Selection};
+use ros2probe_model::facts::dispatch::{MissedReason, SampleOutcome};
+use ros2probe_model::facts::selection::{Depth, SampleRequest, Selection};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Settings;
 use ros2probe_testing::model::forge;
 use ros2probe_testing::model::forge::Message;
 use ros2probe_testing::model::host::{

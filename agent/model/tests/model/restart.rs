@@ -6,12 +6,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use proptest::prelude::*;
-use ros2probe_model::discovery::Memory;
-use ros2probe_model::event::EventKind;
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::Snapshot;
-use ros2probe_model::watch::{Expectations, Watch, Watchlist};
+use ros2probe_model::facts::event::EventKind;
+use ros2probe_model::facts::watch::{Expectations, Watch, Watchlist};
+use ros2probe_model::graph::discovery::Memory;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::time::{MILLISECOND, SECOND};

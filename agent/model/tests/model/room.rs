@@ -5,10 +5,10 @@ use std::ops::{Deref, DerefMut};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ros2probe_model::input::Input;
-use ros2probe_model::limits::Limits;
-use ros2probe_model::observer::Settings;
-use ros2probe_model::snapshot::{SocketFacts, TopicFacts};
+use ros2probe_model::facts::limits::Limits;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Settings;
+use ros2probe_model::report::snapshot::{SocketFacts, TopicFacts};
 use ros2probe_testing::model::domain::{VirtualDomain, watchlist};
 use ros2probe_testing::model::forge::{Message, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};

@@ -4,12 +4,12 @@ mod caps;
 mod fixtures;
 mod paths;
 
-use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::event::EventKind;
-use ros2probe_model::input::Input;
-use ros2probe_model::names::TopicName;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::{ActionFacts, GoalCounts, ServiceFacts};
+use ros2probe_model::facts::diagnosis::Diagnosis;
+use ros2probe_model::facts::event::EventKind;
+use ros2probe_model::facts::names::TopicName;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
+use ros2probe_model::report::snapshot::{ActionFacts, GoalCounts, ServiceFacts};
 use ros2probe_testing::model::domain::VirtualDomain;
 use ros2probe_testing::model::forge::{self, Message};
 use ros2probe_testing::model::host::MILLISECOND;

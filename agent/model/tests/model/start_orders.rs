@@ -4,9 +4,9 @@
 use std::net::SocketAddrV4;
 use std::sync::Arc;
 
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::{Delivered, TopicFacts};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
+use ros2probe_model::report::snapshot::{Delivered, TopicFacts};
 use ros2probe_testing::model::domain::watchlist;
 use ros2probe_testing::model::host::{ALICE, BOB, CAROL, CapturePoint, Host, READER, START};
 use ros2probe_testing::permutations;

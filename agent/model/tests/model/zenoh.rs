@@ -6,13 +6,13 @@ mod routers;
 use std::ops::Range;
 
 use crate::allocator;
-use ros2probe_model::bounded::ledger;
-use ros2probe_model::discovery::Memory;
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::{Snapshot, TableFacts, TopicFacts};
-use ros2probe_model::watch::{Expectations, Retain, Watch, Watchlist};
-use ros2probe_model::zenoh::{StreamEvent, Unseen, ZenohFacts};
+use ros2probe_model::facts::bounded::ledger;
+use ros2probe_model::facts::watch::{Expectations, Retain, Watch, Watchlist};
+use ros2probe_model::graph::discovery::Memory;
+use ros2probe_model::graph::zenoh::{StreamEvent, Unseen, ZenohFacts};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
+use ros2probe_model::report::snapshot::{Snapshot, TableFacts, TopicFacts};
 use ros2probe_testing::zenoh::{
     Role, connection, declare_key, declare_token, fragment, frame, init, open, publisher, push,
     report, response, send, undeclare_token,
@@ -194,6 +194,19 @@ fn a_session_ends_with_its_last_connection_and_not_with_the_router() {
     report(&mut observer, &to_peer, at + SECOND, StreamEvent::End);
     report(&mut observer, &from_peer, at + SECOND, StreamEvent::End);
     assert_eq!(participants(&observer, at + SECOND), 0);
+}
+
+#[test]
+fn a_connection_whose_ends_were_both_silent_ends_once() {
+    for first in [0, 1] {
+        let (mut observer, _) = talking();
+        // The host was asleep, or the agent without CPU time: no keep-alive arrived for its lease.
+        let at = START + 58 * SECOND;
+        let ends = connection(1001);
+        report(&mut observer, &ends[first], at, StreamEvent::End);
+        report(&mut observer, &ends[1 - first], at, StreamEvent::End);
+        assert_eq!(participants(&observer, at), 1, "{first}");
+    }
 }
 
 #[test]

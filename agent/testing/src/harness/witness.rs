@@ -13,10 +13,10 @@ use ros2probe_capture::live::LiveSource;
 use ros2probe_capture::netns;
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_daemon::config::{Config, Watchlist};
-use ros2probe_model::input::Input;
-use ros2probe_model::loss::{DeliveryLoss, Loss};
-use ros2probe_model::observer::{self, Observer};
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::facts::loss::{DeliveryLoss, Loss};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{self, Observer};
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::filter::Counter;
 

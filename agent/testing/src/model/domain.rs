@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::Snapshot;
-use ros2probe_model::watch::{Watch, Watchlist};
+use ros2probe_model::facts::watch::{Watch, Watchlist};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
 use super::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};

@@ -3,13 +3,13 @@
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 
-use ros2probe_model::input::Input;
-use ros2probe_model::loss::LossCause;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::{
+use ros2probe_model::facts::loss::LossCause;
+use ros2probe_model::facts::watch::{Watch, Watchlist};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
+use ros2probe_model::report::snapshot::{
     DeliveryFacts, Direction, Measurement, Snapshot, SocketFacts, TopicFacts,
 };
-use ros2probe_model::watch::{Watch, Watchlist};
 use ros2probe_wire::record::{flag, guid_words, kind};
 pub use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::walk::Envelope;

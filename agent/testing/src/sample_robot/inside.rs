@@ -4,13 +4,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_daemon::agent_facts::{InsideLibrary, InsideSourceFacts};
-use ros2probe_model::diagnosis::{Diagnosis, TopicKey};
-use ros2probe_model::inside::facts::{
+use ros2probe_model::facts::calls::facts::{
     Buffer, Callback, InsideFacts, LifecycleState, ObservedProcess, Owner, Publisher, Quantiles,
     ReaderQueue, Subscription, TopicCounts, TopicInside,
 };
-use ros2probe_model::inside::report::{Durations, Trigger};
-use ros2probe_model::names::TopicName;
+use ros2probe_model::facts::calls::report::{Durations, Trigger};
+use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
+use ros2probe_model::facts::names::TopicName;
 use ros2probe_wire::{DomainId, Timestamp};
 
 const LAST: Timestamp = Timestamp(1_700_000_000_000_000_000);
@@ -121,6 +121,8 @@ pub fn topic() -> TopicInside {
 pub fn source() -> InsideSourceFacts {
     InsideSourceFacts {
         mode: "full",
+        is_resting: false,
+        shows_rates: true,
         libraries: vec![
             InsideLibrary {
                 path: "/opt/ros/jazzy/lib/libtracetools.so".to_owned(),

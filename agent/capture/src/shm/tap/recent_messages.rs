@@ -2,7 +2,7 @@
 
 use std::collections::{HashSet, VecDeque};
 
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 
 use crate::tables::RememberedMessages;
 

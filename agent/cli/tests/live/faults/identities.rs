@@ -172,9 +172,7 @@ fn without_root_a_library_is_attached_by_its_path_unless_another_file_is_there()
     let page = agent.scrape()?;
     let reasons = page.labels_of("ros2probe_inside_library_info", "reason");
     ensure!(
-        reasons
-            .iter()
-            .any(|reason| reason.contains("it was replaced")),
+        reasons.iter().any(|reason| reason.contains("was replaced")),
         "{reasons:?}"
     );
     Ok(())

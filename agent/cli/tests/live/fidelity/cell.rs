@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
-use ros2probe_model::loss::LossCause;
+use ros2probe_model::facts::loss::LossCause;
 
 /// Writer's sequence numbers throughout.
 #[derive(Debug)]

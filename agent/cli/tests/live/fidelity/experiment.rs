@@ -5,9 +5,9 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use ros2probe_model::loss::DeliveryLoss;
-use ros2probe_model::loss::LossCause;
-use ros2probe_model::snapshot::{Delivered, Direction, Snapshot};
+use ros2probe_model::facts::loss::DeliveryLoss;
+use ros2probe_model::facts::loss::LossCause;
+use ros2probe_model::report::snapshot::{Delivered, Direction, Snapshot};
 use ros2probe_wire::{EntityId, Guid};
 
 use super::cell::Cell;

@@ -5,8 +5,8 @@ use ros2probe_wire::SequenceNumber;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_model::loss::LossCause;
-use ros2probe_model::snapshot::{AcknowledgementFacts, Delivered, Snapshot};
+use ros2probe_model::facts::loss::LossCause;
+use ros2probe_model::report::snapshot::{AcknowledgementFacts, Delivered, Snapshot};
 
 use super::experiment::{DISCOVERY, Truth, is, reported, sums};
 use ros2probe_testing::harness::loss::{Loss, Part};

@@ -22,7 +22,7 @@ fn payloads_in_shared_memory_are_what_was_sent() -> Result<()> {
 #[test]
 fn samples_above_64_kib_are_read_from_shared_memory_by_looking() -> Result<()> {
     let host = Host::new()?;
-    let observed = host.observe("mode: auto")?;
+    let observed = host.observe("exact: off")?;
     let stream = Stream {
         rate: 10.0,
         ..in_shared_memory(150_000, 60)
@@ -57,11 +57,14 @@ fn on_demand_every_sample_is_seen_and_the_last_reader_removes_the_breakpoint() -
         let code = harness::code::at_function(&peer.process, &library)?;
         Ok(code.in_memory != code.in_file)
     };
-    ensure!(!is_attached(&publisher)?, "nobody reads samples yet");
+    wait_until("the breakpoint of the start is taken out", || {
+        Ok(!is_attached(&publisher)?)
+    })?;
     let client = observed.client()?;
+    // The first line of the stream follows once every message is seen.
     let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
-    observed.wait_for_view("exact")?;
     ensure!(is_attached(&publisher)?, "a sample is to be read");
+    observed.wait_for_view("exact")?;
     publisher.go()?;
     let (whole, missed) = given(&mut lines, &stream)?;
     ensure!((whole, missed) == (stream.count, 0), "{whole} {missed}");

@@ -5,6 +5,7 @@ use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::process::Output;
 use std::thread::{self, JoinHandle};
 
+use ros2probe_testing::ports::free_address;
 use ros2probe_wire::zenoh::Batch;
 
 use super::answers::{final_, frame, init, open, token};
@@ -161,11 +162,8 @@ fn a_dry_run_prints_the_messages_and_does_not_connect() {
 
 #[test]
 fn a_closed_port_is_no_router() {
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let address = listener.local_addr().unwrap();
-    drop(listener);
     says(
-        &ask(address, &[]),
+        &ask(free_address(), &[]),
         &[
             "no Zenoh router at 127.0.0.1:",
             "ros2 run rmw_zenoh_cpp rmw_zenohd",

@@ -3,8 +3,8 @@
 use super::*;
 use ros2probe_capture::tables as capture;
 use ros2probe_daemon::tables as daemon;
-use ros2probe_model::bounded::Table;
-use ros2probe_model::tables as model;
+use ros2probe_model::facts::bounded::Table;
+use ros2probe_model::facts::tables as model;
 
 #[test]
 fn every_limit_of_the_configuration_is_on_the_page_and_in_the_answer_on_health() {
@@ -92,7 +92,7 @@ fn every_cap_names_the_test_that_drives_it_over() {
     let declared =
         |all: &'static [Table], path: &'static str| all.iter().map(move |table| (table.name, path));
     let rows = rows
-        .chain(declared(model::ALL, "agent/model/src/tables.rs"))
+        .chain(declared(model::ALL, "agent/model/src/facts/tables.rs"))
         .chain(declared(capture::ALL, "agent/capture/src/tables.rs"))
         .chain(declared(daemon::ALL, "agent/daemon/src/tables.rs"));
     let rows: BTreeSet<_> = rows.collect();

@@ -162,7 +162,8 @@ fn a_silent_topic_is_explained_once_on_stderr() {
     with_silence(&capture);
     let inside = "rp: no message on /inside: publisher and subscriber share one process; nothing \
                   crosses the network";
-    let alone = "rp: no message on /alone: it has no subscriber";
+    let alone = "rp: no message on /alone: no subscriber exists, so nothing is sent; rp does not \
+                 subscribe: start a subscriber";
     let unknown = "rp: no message on /nothing: no endpoint on /nothing";
     for (verb, topic, why) in [
         ("echo", "/inside", inside),
@@ -171,6 +172,8 @@ fn a_silent_topic_is_explained_once_on_stderr() {
         ("delay", "/inside", inside),
         ("hz", "/alone", alone),
         ("echo", "/alone", alone),
+        ("bw", "/alone", alone),
+        ("delay", "/alone", alone),
         ("hz", "/nothing", unknown),
     ] {
         let mut command = rp();
@@ -180,6 +183,8 @@ fn a_silent_topic_is_explained_once_on_stderr() {
         let output = command.env_remove("ROS_DOMAIN_ID").output().unwrap();
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(said.matches(why).count(), 1, "{verb} {topic}: {said}");
+        let out = String::from_utf8(output.stdout).unwrap();
+        assert!(!out.contains("subscriber"), "{verb}: {out}");
     }
 
     // As long as it runs: after some seconds, once.
@@ -201,6 +206,7 @@ fn a_silent_topic_is_explained_once_on_stderr() {
     for verb in &mut running {
         verb.wait_for(inside);
     }
+    recording.wait_for("/alone: no message recorded; no subscriber exists, so nothing is sent");
     recording.wait_for("/inside: no message recorded; publisher and subscriber share one process");
     recording.wait_for("/missing has no known publisher");
     std::thread::sleep(Duration::from_secs(2));

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use ros2probe_model::chain::expected::{ExpectedChain, MAX_CHAINS};
+use ros2probe_model::derive::chain::expected::{ExpectedChain, MAX_CHAINS};
 use ros2probe_wire::DomainId;
 
 use super::super::shape::ChainShape;

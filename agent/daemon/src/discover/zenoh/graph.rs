@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use crate::tables::RouterTokens;
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_wire::DomainId;
 pub use ros2probe_wire::zenoh::EndpointKind;
 use ros2probe_wire::zenoh::{Gid, Token};

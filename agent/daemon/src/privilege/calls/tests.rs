@@ -232,8 +232,7 @@ fn kernel_maps_probes_and_memory_are_of_the_threads_that_need_them() {
             let expected = if reads { may } else { Some(libc::EPERM) };
             assert_eq!(looked_up, expected, "{role:?}");
             let open = call(libc::SYS_perf_event_open, [0, 0, -1, -1, 0, 0]);
-            let probes = matches!(role, Role::Exact | Role::Inside);
-            assert_eq!(open != Some(libc::EPERM), probes, "{role:?}");
+            assert_eq!(open, Some(libc::EPERM), "{role:?}");
             let memory = call(libc::SYS_process_vm_readv, [0; 6]);
             assert_eq!(memory, Some(libc::EPERM), "{role:?}");
         });
@@ -241,18 +240,23 @@ fn kernel_maps_probes_and_memory_are_of_the_threads_that_need_them() {
 }
 
 #[test]
-fn the_reader_of_memory_forks_and_opens_nothing() {
-    confined(Role::MemoryReader, || {
+fn the_broker_attaches_and_creates_no_socket_no_file_and_no_namespace() {
+    confined(Role::Broker, || {
+        let probe = call(libc::SYS_perf_event_open, [0, 0, -1, -1, 0, 0]);
+        assert_ne!(probe, Some(libc::EPERM));
         let memory = call(libc::SYS_process_vm_readv, [0; 6]);
-        assert_ne!(memory, Some(libc::EPERM));
+        assert_eq!(memory, Some(libc::EPERM));
         let namespace = c_long::from(libc::CLONE_NEWUSER | libc::SIGCHLD);
         let fork = call(libc::SYS_clone, [namespace, 0, 0, 0, 0, 0]);
         assert_eq!(fork, Some(libc::EPERM));
-        assert!(std::fs::read("/proc/self/stat").is_err());
-        let socket = [libc::AF_UNIX.into(), libc::SOCK_STREAM.into(), 0, 0, 0, 0];
-        assert_eq!(call(libc::SYS_socket, socket), Some(libc::EPERM));
-        let probe = call(libc::SYS_perf_event_open, [0, 0, -1, -1, 0, 0]);
-        assert_eq!(probe, Some(libc::EPERM));
+        assert!(std::fs::read("/proc/self/stat").is_ok());
+        assert!(std::fs::write("/tmp/ros2probe-broker", "x").is_err());
+        for kind in [libc::SOCK_STREAM, libc::SOCK_SEQPACKET] {
+            let socket = [libc::AF_UNIX.into(), kind.into(), 0, 0, 0, 0];
+            assert_eq!(call(libc::SYS_socket, socket), Some(libc::EPERM));
+        }
+        let lookup = call(libc::SYS_bpf, [1, 0, 0, 0, 0, 0]);
+        assert_eq!(lookup, Some(libc::EPERM));
     });
 }
 
@@ -285,11 +289,11 @@ fn links_news_of_files_and_scheduling_are_of_the_threads_that_need_them() {
             other => other,
         };
         confined(role, move || {
-            let attaches = matches!(role, Role::Reattach { .. } | Role::Exact | Role::Inside);
+            let attaches = matches!(role, Role::Reattach { .. });
             let schedules = matches!(role, Role::SharedMemory { .. });
             assert_eq!(call(libc::SYS_bpf, link) != refused, attaches, "{role:?}");
             let notices = call(libc::SYS_inotify_init1, [0; 6]) != refused;
-            let is_noticed = attaches && role != Role::Inside;
+            let is_noticed = attaches || role == Role::Exact;
             assert_eq!(notices, is_noticed || schedules, "{role:?}");
             let scheduled = call(libc::SYS_sched_setscheduler, running_first) != refused;
             assert_eq!(scheduled, schedules, "{role:?}");

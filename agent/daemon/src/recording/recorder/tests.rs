@@ -4,6 +4,7 @@ use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, EntityId, GuidPrefix, SequenceNumber};
 
 use super::*;
+use crate::recording::graph::DurablePublisher;
 use crate::recording::shortfalls;
 use crate::subscriptions::{Missed, MissedReason};
 use crate::tables::tests::assert_driven;
@@ -60,7 +61,10 @@ fn static_transforms() -> GraphSnapshot {
         topics: vec![PublishedTopic {
             name: "/tf_static".to_owned(),
             subscribed: true,
-            durable_publishers: vec![writer(1).to_string()],
+            durable_publishers: vec![DurablePublisher {
+                guid: writer(1).to_string(),
+                latched: None,
+            }],
             ..PublishedTopic::default()
         }],
         ..GraphSnapshot::default()

@@ -1,37 +1,39 @@
 //! Notes in the final report about messages that were sent before, were not observed, or belong to
 //! another domain.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, HashMap};
 
 use super::{Recorder, TopicDecision};
-use crate::recording::graph::GraphSnapshot;
+use crate::recording::graph::{DurablePublisher, GraphSnapshot};
+use ros2probe_api::latched::Latched;
 use ros2probe_api::recording_report::OtherDomain;
 
 impl Recorder<'_> {
-    /// Notes publishers with stored samples for late joiners whose first samples are not in the
-    /// bag.
+    /// Notes publishers with stored samples for late joiners of which the bag has neither the first
+    /// sample nor the one that the agent keeps.
     pub(super) fn note_what_was_sent_before(&mut self, graph: &GraphSnapshot) {
+        let topics = graph.topics.iter();
         let mut names: Vec<String> = Vec::new();
-        for topic in graph
-            .topics
-            .iter()
-            .filter(|topic| topic.domain_id == self.domain_id)
-        {
+        for topic in topics.filter(|topic| topic.domain_id == self.domain_id) {
             let Some(TopicDecision::Recorded(taken)) = self.topics.get(&topic.name) else {
                 continue;
             };
-            let begun: HashSet<String> = taken
+            let first: HashMap<String, u64> = taken
                 .first
                 .iter()
-                .filter(|(_, first)| first.0 <= 1)
-                .map(|(writer, _)| writer.to_string())
+                .map(|(writer, first)| (writer.to_string(), first.0))
                 .collect();
-            if topic
-                .durable_publishers
-                .iter()
-                .any(|keeper| !begun.contains(keeper))
-            {
+            let is_missing = |publisher: &&DurablePublisher| {
+                let is_kept = publisher.latched.as_ref().is_some_and(Latched::is_kept);
+                let first = first.get(&publisher.guid);
+                first.is_none_or(|number| *number > 1 && !is_kept)
+            };
+            if let Some(missing) = topic.durable_publishers.iter().find(is_missing) {
                 names.push(topic.name.clone());
+                if let Some(latched) = &missing.latched {
+                    let report = &mut self.report.latched;
+                    report.insert(topic.name.clone(), latched.clone());
+                }
             }
         }
         names.sort();

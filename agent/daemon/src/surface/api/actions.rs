@@ -18,7 +18,7 @@ use super::problem::Problem;
 use super::scope::Scope;
 use super::services::sorted;
 use ros2probe_api::services::{Action, ActionList, Goals};
-use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_model::report::snapshot::{Snapshot, TopicFacts};
 use ros2probe_wire::DomainId;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {

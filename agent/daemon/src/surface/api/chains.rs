@@ -6,9 +6,9 @@ use axum::Json;
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
 use ros2probe_api::chains::{Chain, ChainList, ExpectedChain, Hop, Quantiles};
-use ros2probe_model::chain::expected::ExpectedFacts;
-use ros2probe_model::chain::path;
-use ros2probe_model::snapshot::ChainFacts;
+use ros2probe_model::derive::chain::expected::ExpectedFacts;
+use ros2probe_model::derive::chain::path;
+use ros2probe_model::report::snapshot::ChainFacts;
 use ros2probe_wire::DomainId;
 use serde::Deserialize;
 use utoipa::IntoParams;
@@ -18,6 +18,7 @@ use utoipa_axum::routes;
 use super::Context;
 use super::parameters::Parameters;
 use super::problem::{Code, Problem};
+use super::scope::domain;
 
 /// The chains of an answer.
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
@@ -31,6 +32,9 @@ struct Ends {
     from: Option<String>,
     /// ROS name of a topic; chains are cut after it, and others left out.
     to: Option<String>,
+    /// Whether calls inside processes are needed, which show how a callback uses its messages. With
+    /// `capture.inside: auto` they are observed until ten seconds after the last such request.
+    calls: Option<bool>,
 }
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
@@ -49,14 +53,13 @@ async fn list(
     State(context): State<Context>,
     Parameters(ends): Parameters<Ends>,
 ) -> Result<Response, Problem> {
-    if let Some(domain_id) = ends.domain_id.filter(|id| *id > DomainId::MAX.0) {
-        let most = DomainId::MAX;
-        let detail = format!("domain_id is {domain_id}, must be between 0 and {most}");
-        return Err(Problem::new(Code::MalformedRequest, detail));
+    let only = domain(ends.domain_id, Code::MalformedRequest)?;
+    if ends.calls == Some(true) {
+        context.latest.want_calls();
     }
     let state = context.state().await;
     let snapshot = state.known();
-    let is_meant = |domain_id: DomainId| ends.domain_id.is_none_or(|id| DomainId(id) == domain_id);
+    let is_meant = |domain_id: DomainId| only.is_none_or(|only| only == domain_id);
     let meant = snapshot.chains.chains.iter();
     let meant = meant.filter(|facts| is_meant(facts.path.domain_id));
     let chains = parts(meant, ends.from.as_deref(), ends.to.as_deref());
@@ -142,8 +145,8 @@ fn chain(facts: &ChainFacts, (from, to): (usize, usize)) -> Option<Chain<'_>> {
 }
 
 type Topic = (
-    ros2probe_model::names::TopicName,
-    Option<ros2probe_model::names::NodeName>,
+    ros2probe_model::facts::names::TopicName,
+    Option<ros2probe_model::facts::names::NodeName>,
 );
 
 fn hop<'a>(facts: &ChainFacts, position: usize, ends: &'a [Topic]) -> Option<Hop<'a>> {

@@ -4,8 +4,9 @@ use std::borrow::Cow;
 
 use super::index::Index;
 use super::measured::measurement;
+use crate::latched::latched;
 use ros2probe_api::endpoints::{Endpoint, Process, Qos};
-use ros2probe_model::snapshot::{EndpointFacts, ProcessFacts};
+use ros2probe_model::report::snapshot::{EndpointFacts, ProcessFacts};
 use ros2probe_wire::rtps::VendorId;
 
 /// Returns the answer's form of a writer or reader.
@@ -34,6 +35,7 @@ pub(super) fn endpoint<'a>(facts: &'a EndpointFacts, index: &Index<'a>) -> Endpo
         },
         first_seen_timestamp_seconds: facts.first_seen.seconds(),
         measurement: facts.measurement.as_deref().map(measurement),
+        latched: facts.latched.map(latched),
     }
 }
 

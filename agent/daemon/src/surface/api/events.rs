@@ -35,7 +35,7 @@ use crate::surface::places::Places;
 use crate::tables::StreamEvents;
 use ros2probe_api::attributes::{self, Attributes};
 use ros2probe_api::events::{self as answers, Lagged};
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_wire::DomainId;
 
 /// Slots for streams of all listeners: fewer than connections, so that other requests still get

@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use super::endpoint::{printed, texts};
 use super::inside::trigger;
 use ros2probe_api::diagnosis::{Diagnosis, Finding};
-use ros2probe_model::diagnosis;
+use ros2probe_model::facts::diagnosis;
 
 /// Returns the answer's form of a problem.
 pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
@@ -37,14 +37,14 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
         diagnosis::Diagnosis::DuplicateNode { participants, .. } => Diagnosis::DuplicateNode {
             participants: printed(participants),
         },
-        diagnosis::Diagnosis::UnheardPublisher { writer, reason, .. } => {
-            Diagnosis::UnheardPublisher {
+        diagnosis::Diagnosis::UnmatchedPublisher { writer, reason, .. } => {
+            Diagnosis::UnmatchedPublisher {
                 writer: writer.to_string(),
                 reason: reason.label().into(),
             }
         }
-        diagnosis::Diagnosis::UnfedSubscriber { reader, reason, .. } => {
-            Diagnosis::UnfedSubscriber {
+        diagnosis::Diagnosis::UnmatchedSubscription { reader, reason, .. } => {
+            Diagnosis::UnmatchedSubscription {
                 reader: reader.to_string(),
                 reason: reason.label().into(),
             }

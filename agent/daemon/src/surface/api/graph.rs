@@ -18,8 +18,8 @@ use super::scope::Scope;
 use super::services::services;
 use ros2probe_api::Open;
 use ros2probe_api::graph::{Edge, EdgeKind, Graph, Vertex, VertexKind};
-use ros2probe_model::snapshot::{Snapshot, TopicFacts};
-use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::report::snapshot::{Snapshot, TopicFacts};
 
 /// The graph under construction.
 #[derive(Debug, Default)]

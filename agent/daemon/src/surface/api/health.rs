@@ -1,6 +1,6 @@
 //! `GET /health`: whether the agent observes the robot, and how completely.
 
-use ros2probe_model::zenoh::ZenohFacts;
+use ros2probe_model::graph::zenoh::ZenohFacts;
 use std::collections::BTreeSet;
 use std::sync::LazyLock;
 use std::time::{Instant, SystemTime};

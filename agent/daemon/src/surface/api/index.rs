@@ -4,8 +4,8 @@ use std::collections::HashMap;
 
 use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
-use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::snapshot::{
+use ros2probe_model::facts::diagnosis::Diagnosis;
+use ros2probe_model::report::snapshot::{
     EndpointFacts, ParticipantFacts, Snapshot, TopicFacts, WatchFacts, WatchedTopicFacts,
 };
 

@@ -6,6 +6,8 @@ use std::borrow::Cow;
 use axum::Json;
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
+use serde::Deserialize;
+use utoipa::IntoParams;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
@@ -13,17 +15,29 @@ use super::Context;
 use super::endpoint::texts;
 use super::parameters::Parameters;
 use super::problem::Problem;
-use super::scope::Scope;
+use super::scope::Domain;
 use crate::agent_facts::InsideSourceFacts;
 use crate::surface::inside_nodes::NodeActivity;
 use ros2probe_api::inside::{
     Buffer, Callback, Counter, Durations, Inside, Library, LifecycleState, NodeInside, Owner,
     Process, Publisher, ReaderQueue, Subscription, TopicInside, Trigger,
 };
-use ros2probe_model::inside::facts::{self, InsideFacts, Quantiles};
-use ros2probe_model::inside::report;
-use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_model::facts::calls::facts::{self, InsideFacts, Quantiles};
+use ros2probe_model::facts::calls::report;
+use ros2probe_model::report::snapshot::{Snapshot, TopicFacts};
 use ros2probe_wire::DomainId;
+
+/// The facts that an answer contains.
+#[derive(Clone, Debug, Default, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields, default)]
+#[into_params(parameter_in = Query)]
+struct Of {
+    /// Domain id; by default every domain.
+    #[param(minimum = 0, maximum = 232)]
+    domain_id: Option<u32>,
+    /// ROS name of a node or topic; by default all.
+    name: Option<String>,
+}
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(show))
@@ -32,23 +46,27 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 /// Calls inside processes
 ///
 /// Publications, takes, messages within processes and callbacks, as uprobes on `libtracetools.so`
-/// show them. The lists are empty unless `capture.inside` is switched on.
+/// show them. With `capture.inside: auto`, calls are observed from the first request until ten seconds
+/// after the last; the first answer takes up to five seconds. The lists are empty with `off`.
 #[utoipa::path(
     get,
     path = "/inside",
     tag = "graph",
-    params(Scope),
+    params(Of),
     responses((status = 200, description = "What processes show.", body = Inside<'static>))
 )]
 async fn show(
     State(context): State<Context>,
-    Parameters(scope): Parameters<Scope>,
+    Parameters(of): Parameters<Of>,
 ) -> Result<Response, Problem> {
-    let scope = scope.checked()?;
+    let domain = Domain::of(of.domain_id).checked()?;
     let state = context.state().await;
     let snapshot = state.known();
     let source = state.agent.inside.as_ref();
-    let answer = inside(snapshot, source, |domain_id| scope.admits(domain_id));
+    let mut answer = inside(snapshot, source, |domain_id| domain.admits(domain_id));
+    if let Some(name) = of.name {
+        select(&mut answer, &name);
+    }
     Ok(Json(answer).into_response())
 }
 
@@ -100,6 +118,40 @@ fn inside<'a>(
     answer
 }
 
+/// Keeps what belongs to this node or topic.
+fn select(inside: &mut Inside<'_>, name: &str) {
+    let is_own = |owner: &Owner<'_>| owner.node.as_deref() == Some(name);
+    let is_topic = |topic: Option<&str>| topic == Some(name);
+    inside
+        .publishers
+        .retain(|each| is_own(&each.owner) || each.topic == name);
+    inside
+        .subscriptions
+        .retain(|each| is_own(&each.owner) || each.topic == name);
+    inside
+        .reader_queues
+        .retain(|each| is_own(&each.owner) || each.topic == name);
+    inside
+        .buffers
+        .retain(|each| is_own(&each.owner) || is_topic(each.topic.as_deref()));
+    inside
+        .callbacks
+        .retain(|each| is_own(&each.owner) || is_topic(each.trigger.name.as_deref()));
+    inside
+        .lifecycle_states
+        .retain(|each| each.node.as_deref() == Some(name));
+    let publishers = inside.publishers.iter().map(|each| &each.owner);
+    let subscriptions = inside.subscriptions.iter().map(|each| &each.owner);
+    let buffers = inside.buffers.iter().map(|each| &each.owner);
+    let callbacks = inside.callbacks.iter().map(|each| &each.owner);
+    let owners = publishers.chain(subscriptions).chain(buffers);
+    let owners = owners.chain(callbacks);
+    let own: Vec<u32> = owners.map(|owner| owner.process_id).collect();
+    inside.processes.retain(|each| {
+        own.contains(&each.process_id) || each.nodes.iter().any(|node| node == name)
+    });
+}
+
 /// Returns what processes show of a topic, without the lists.
 pub(super) fn topic(facts: &TopicFacts) -> Option<TopicInside<'_>> {
     let inside = facts.inside.as_deref()?;
@@ -131,7 +183,8 @@ pub(super) fn topic_details<'a>(
     let (mut shown, known) = (topic(facts)?, known?);
     let name = &facts.name;
     let is_here = |owner: &facts::Owner| owner.domain_id == facts.domain_id;
-    let own = |owner, topic: &ros2probe_model::names::TopicName| is_here(owner) && topic == name;
+    let own =
+        |owner, topic: &ros2probe_model::facts::names::TopicName| is_here(owner) && topic == name;
     let publishers = known.publishers.iter();
     let publishers = publishers.filter(|each| own(&each.owner, &each.topic));
     shown.publishers = publishers.map(publisher).collect();
@@ -312,11 +365,11 @@ fn lifecycle_state(facts: &facts::LifecycleState) -> LifecycleState<'_> {
 mod tests {
     use std::time::Duration;
 
-    use ros2probe_model::input::Input;
-    use ros2probe_model::inside::report::{
+    use ros2probe_model::facts::calls::report::{
         CallbackReport, ProcessReport, PublisherReport, Report, Trigger,
     };
-    use ros2probe_model::observer::{Observer, Settings};
+    use ros2probe_model::observe::input::Input;
+    use ros2probe_model::observe::observer::{Observer, Settings};
     use ros2probe_wire::Timestamp;
     use ros2probe_wire::time::SECOND;
 
@@ -392,6 +445,20 @@ mod tests {
         assert_eq!((node.callbacks.len(), node.publishers.len()), (1, 1));
         assert_eq!(node.callbacks[0].trigger.words(), "timer 100 ms");
         assert!(super::node(DomainId(0), "/camera", known).is_none());
+    }
+
+    #[test]
+    fn a_name_selects_a_node_or_a_topic_with_its_processes() {
+        let snapshot = robot();
+        let selected = |name| {
+            let mut answer = inside(&snapshot, None, |_| true);
+            select(&mut answer, name);
+            let counts = (answer.publishers.len(), answer.callbacks.len());
+            (counts, answer.processes.len())
+        };
+        assert_eq!(selected("/lidar"), ((1, 1), 1));
+        assert_eq!(selected("/scan"), ((1, 0), 1));
+        assert_eq!(selected("/imu"), ((0, 0), 0));
     }
 
     #[test]

@@ -3,8 +3,8 @@
 use ros2probe_api::measurement::{
     Breakdown, Bucket, Delivered, Distribution, Measurement, Sampled,
 };
-use ros2probe_model::histogram::Histogram;
-use ros2probe_model::snapshot;
+use ros2probe_model::facts::histogram::Histogram;
+use ros2probe_model::report::snapshot;
 
 /// Returns the buckets of a histogram; empty if the histogram is.
 pub(super) fn buckets(values: &Histogram) -> Vec<Bucket> {

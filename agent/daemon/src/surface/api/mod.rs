@@ -80,6 +80,10 @@ pub use server::{OpenError, Server};
 
 /// Longest time that a request waits for a snapshot that includes earlier requests.
 const TIMEOUT: Duration = Duration::from_millis(600);
+/// Longest time that a request waits until calls inside processes are observed.
+const CALLS_WITHIN: Duration = Duration::from_secs(5);
+/// How often it looks.
+const CALLS_POLLED: Duration = Duration::from_millis(250);
 
 /// State that the routes share.
 #[derive(Clone)]
@@ -117,6 +121,25 @@ pub struct Context {
 }
 
 impl Context {
+    /// Notes that calls inside processes are needed, and waits at most five seconds until their
+    /// rates are known.
+    async fn observe_calls(&self) {
+        self.latest.want_calls();
+        let is_known = async {
+            loop {
+                self.latest.refresh(TIMEOUT).await;
+                let state = self.latest.own_state();
+                let source = state.agent.inside.as_ref();
+                // What is always observed, or cannot be, needs no wait.
+                if source.is_none_or(|source| source.mode != "auto" || source.shows_rates) {
+                    return;
+                }
+                tokio::time::sleep(CALLS_POLLED).await;
+            }
+        };
+        let _ = tokio::time::timeout(CALLS_WITHIN, is_known).await;
+    }
+
     /// Returns the current state, or a slightly older one if the capture is busy.
     async fn state(&self) -> Arc<State> {
         self.latest.refresh(TIMEOUT).await;
@@ -135,6 +158,14 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         Some(context) => views.layer(middleware::from_fn_with_state(context.clone(), take_turns)),
         None => views,
     };
+    // They wait outside of the turns of others.
+    let calls = |views: OpenApiRouter<Context>| match context {
+        Some(context) => views.layer(middleware::from_fn_with_state(
+            context.clone(),
+            observe_calls,
+        )),
+        None => views,
+    };
     let needs = |read, change, routes: OpenApiRouter<Context>| {
         let needs = Needs { read, change };
         routes.layer(middleware::from_fn_with_state(needs, security::within))
@@ -148,6 +179,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(needs(Access::All, Access::All, downloads::routes()))
         .merge(needs(Access::All, Access::All, snapshots::routes()))
         .merge(turns(views()))
+        .merge(calls(turns(inside::routes())))
         .merge(processes::routes())
         .merge(health::routes())
         .merge(needs(Access::All, Access::All, reload::routes()))
@@ -162,11 +194,20 @@ fn views() -> OpenApiRouter<Context> {
         .merge(nodes::routes())
         .merge(services::routes())
         .merge(actions::routes())
-        .merge(inside::routes())
         .merge(chains::routes())
         .merge(participants::routes())
         .merge(graph::routes())
         .merge(names::routes())
+}
+
+/// Observes calls inside processes before the answer, if that is done on demand.
+async fn observe_calls(
+    Extract(context): Extract<Context>,
+    request: Request,
+    next: Next,
+) -> Response {
+    context.observe_calls().await;
+    next.run(request).await
 }
 
 /// Large answers that are being created and read.

@@ -19,7 +19,7 @@ use super::scope::Scope;
 use super::services::{Halves, services, sorted};
 use crate::missed_announcements;
 use ros2probe_api::names::{Names, NodeName, ServiceName, TopicName};
-use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_model::report::snapshot::{Snapshot, TopicFacts};
 use ros2probe_wire::DomainId;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {

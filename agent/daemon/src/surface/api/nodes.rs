@@ -23,9 +23,9 @@ use super::problem::{Code, Problem, ProblemBody};
 use super::scope::{Scope, only};
 use ros2probe_api::diagnosis::Finding;
 use ros2probe_api::nodes::{Named, Node, NodeInstance, NodeList};
-use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::snapshot::{NodeFacts, Snapshot};
-use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_model::facts::diagnosis::Diagnosis;
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::report::snapshot::{NodeFacts, Snapshot};
 
 /// Names with their types, sorted.
 #[derive(Debug, Default)]

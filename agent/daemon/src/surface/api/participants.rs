@@ -18,7 +18,7 @@ use super::parameters::Parameters;
 use super::problem::Problem;
 use super::scope::Domain;
 use ros2probe_api::participants::{Participant, ParticipantList, UnknownWriter};
-use ros2probe_model::snapshot::{ParticipantFacts, Snapshot, UnknownWriterFacts};
+use ros2probe_model::report::snapshot::{ParticipantFacts, Snapshot, UnknownWriterFacts};
 
 /// Nodes, writers and readers of each participant.
 type Counts<'a> = HashMap<GuidPrefix, (Vec<Cow<'a, str>>, usize, usize)>;

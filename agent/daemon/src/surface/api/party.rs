@@ -8,8 +8,8 @@ use ros2probe_wire::{EntityId, Guid};
 
 use super::endpoint::printed;
 use ros2probe_api::services::Party;
-use ros2probe_model::snapshot::TopicFacts;
-use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::report::snapshot::TopicFacts;
 
 /// A side of a service or action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

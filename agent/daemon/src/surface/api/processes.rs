@@ -16,7 +16,7 @@ use super::Context;
 use super::problem::{Code, Problem};
 use crate::surface::process::Usage;
 use ros2probe_api::participants::{ProcessList, ProcessUsage};
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::report::snapshot::Snapshot;
 
 /// Largest number of processes per answer.
 const MAX_PROCESSES: usize = 512;
@@ -80,7 +80,7 @@ fn read(ids: BTreeMap<u32, Option<Arc<str>>>) -> ProcessList {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ros2probe_model::snapshot::{ParticipantFacts, ProcessFacts};
+    use ros2probe_model::report::snapshot::{ParticipantFacts, ProcessFacts};
     use ros2probe_wire::rtps::VendorId;
     use ros2probe_wire::{DomainId, Guid, RtpsDuration, Timestamp};
 

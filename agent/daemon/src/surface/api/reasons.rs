@@ -6,10 +6,9 @@ use super::index::Index;
 use crate::agent_facts::SourceKind;
 use crate::config::Watchlist;
 use ros2probe_api::Open;
-use ros2probe_api::topics::{Reason, ReasonCode};
-use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::inside::facts::TopicInside;
-use ros2probe_model::snapshot::{
+use ros2probe_api::topics::{Reason, ReasonCode, UNSUBSCRIBED};
+use ros2probe_model::facts::diagnosis::Diagnosis;
+use ros2probe_model::report::snapshot::{
     EndpointFacts, Measurement, Snapshot, Source, TopicFacts, Transport,
 };
 
@@ -42,7 +41,7 @@ impl<'a> Circumstances<'a> {
             say(ReasonCode::AgentNotReady, reason.clone());
         }
         let is_connected = match (topic.publishers.len(), topic.subscriptions.len()) {
-            (0, _) | (_, 0) if topic.inside.as_deref().is_some_and(is_connected_inside) => true,
+            (0, _) | (_, 0) if topic.is_connected_inside() => true,
             (0, _) if topic.vanished => {
                 say(
                     ReasonCode::NoPublisher,
@@ -55,11 +54,12 @@ impl<'a> Circumstances<'a> {
                 say(ReasonCode::NoPublisher, detail);
                 false
             }
-            (_, 0) => {
-                let detail = "no subscribers: most writers send nothing".to_owned();
-                say(ReasonCode::NoSubscriber, detail);
+            (_, 0) if topic.is_unsubscribed() => {
+                say(ReasonCode::NoSubscriber, UNSUBSCRIBED.to_owned());
                 false
             }
+            // Messages are counted, so a subscriber exists whose announcement was missed.
+            (_, 0) => true,
             (_, _) => match self.unmatched(topic) {
                 Some(detail) => {
                     say(ReasonCode::NoMatchedSubscriber, detail);
@@ -100,13 +100,13 @@ impl<'a> Circumstances<'a> {
     /// Returns why no publisher has a matching subscriber, or `None` if one has.
     fn unmatched(&self, topic: &'a TopicFacts) -> Option<String> {
         let findings = self.index.findings(topic);
-        let is_unheard = |publisher: &EndpointFacts| {
+        let is_unmatched = |publisher: &EndpointFacts| {
             findings.iter().any(|finding| {
-                matches!(finding, Diagnosis::UnheardPublisher { writer, .. }
+                matches!(finding, Diagnosis::UnmatchedPublisher { writer, .. }
                     if *writer == publisher.guid)
             })
         };
-        if !topic.publishers.iter().all(is_unheard) {
+        if !topic.publishers.iter().all(is_unmatched) {
             return None;
         }
         let mut policies: Vec<&str> = Vec::new();
@@ -116,7 +116,7 @@ impl<'a> Circumstances<'a> {
                 Diagnosis::QosIncompatible { policies: own, .. } => {
                     policies.extend(own.iter().map(|policy| policy.label()));
                 }
-                Diagnosis::UnheardPublisher { reason, .. } => reasons.push(reason.label()),
+                Diagnosis::UnmatchedPublisher { reason, .. } => reasons.push(reason.label()),
                 _ => {}
             }
         }
@@ -217,9 +217,4 @@ impl<'a> Circumstances<'a> {
             }
         }
     }
-}
-
-/// Returns whether observed processes publish the topic and subscribe to it.
-const fn is_connected_inside(inside: &TopicInside) -> bool {
-    inside.publishers > 0 && inside.subscriptions > 0
 }

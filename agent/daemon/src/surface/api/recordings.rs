@@ -17,14 +17,17 @@ use utoipa_axum::routes;
 use super::Context;
 use super::body::Body;
 use super::problem::{Code, Problem, ProblemBody};
+use super::scope::domain;
 use super::security::MAX_BODY;
 use crate::recording::{Command, Recording, RecordingOptions, Refusal};
 use ros2probe_api::recordings::{self as answers, FilterOptions, RecordingList, RecordingRequest};
 use ros2probe_bag::{Form, Options, Storage};
-use ros2probe_wire::DomainId;
 
 /// Longest time that an answer waits for a bag to be completed.
 const TIMEOUT: Duration = Duration::from_secs(10);
+/// Longest time that a new recording waits for the capture to apply its subscription, and for
+/// breakpoints in the processes that send the messages.
+const BEGINS_WITHIN: Duration = Duration::from_secs(6);
 /// Longest duration of one file, a year.
 const MAX_DURATION: u64 = 31_536_000;
 
@@ -89,8 +92,11 @@ async fn begin(
     let begun = tokio::task::spawn_blocking(move || recordings.begin(wanted)).await;
     let begun = begun.map_err(|_| Problem::new(Code::Ending, "the agent is shutting down"))?;
     let recording = begun.map_err(|refusal| problem(&refusal))?;
-    // From the next snapshot on, the kernel's filter captures the requested topics.
-    context.state().await;
+    // From then on, the kernel's programs capture each message of the requested topics.
+    tokio::select! {
+        _ = recording.begin().in_force(BEGINS_WITHIN) => {}
+        () = context.stop.cancelled() => {}
+    }
     let location = format!("/recordings/{}", recording.name);
     let answer = Json(view(&recording));
     Ok((StatusCode::CREATED, [(LOCATION, location)], answer).into_response())
@@ -221,13 +227,7 @@ pub(super) fn find(context: &Context, name: &str) -> Result<Arc<Recording>, Prob
 
 fn wanted(request: RecordingRequest) -> Result<RecordingOptions, Problem> {
     let invalid = |detail: String| Problem::new(Code::InvalidRequest, detail);
-    if request.domain_id > DomainId::MAX.0 {
-        let id = request.domain_id;
-        return Err(invalid(format!(
-            "domain_id is {id}, must be at most {}",
-            DomainId::MAX
-        )));
-    }
+    domain(Some(request.domain_id), Code::InvalidRequest)?;
     if request.max_bag_duration_seconds > MAX_DURATION {
         let detail = format!("max_bag_duration_seconds must be at most {MAX_DURATION}");
         return Err(invalid(detail));

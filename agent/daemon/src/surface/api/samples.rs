@@ -24,6 +24,7 @@ use super::body_stream::{Pieces, stream_of};
 use super::endpoint::printed;
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
+use super::scope::domain;
 use super::security::Granted;
 use crate::agent_facts::SourceKind;
 use crate::config::Access;
@@ -33,8 +34,8 @@ use crate::subscriptions::{
 };
 use crate::tables::DescribedWriters;
 use ros2probe_api::samples::{LINES, Line, Open, OpenTopic, SAMPLES};
-use ros2probe_model::bounded::Bounded;
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::report::snapshot::Snapshot;
 
 /// Largest number of names and globs per request, and of characters in them and in a regular
 /// expression.
@@ -47,8 +48,9 @@ const BATCH_BYTES: usize = 16 * 1024;
 const ARRIVALS_BYTES: usize = 1 << 20;
 const PAYLOADS_BYTES: usize = 16 << 20;
 const LEAST_BYTES: usize = 64 << 10;
-/// Longest time that the first line waits for the capture to apply the subscription.
-const TIMEOUT: Duration = Duration::from_secs(2);
+/// Longest time that the first line waits for the capture to apply the subscription, and for
+/// breakpoints in the processes that send the samples.
+const TIMEOUT: Duration = Duration::from_secs(6);
 
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
@@ -130,14 +132,7 @@ async fn samples(
     if wanted.payload {
         granted.require(Access::All)?;
     }
-    let domain_id = wanted.domain_id;
-    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > DomainId::MAX.0) {
-        let detail = format!(
-            "domain_id is {domain_id}, must be at most {}",
-            DomainId::MAX
-        );
-        return Err(Problem::new(Code::InvalidRequest, detail));
-    }
+    let domain_id = domain(wanted.domain_id, Code::InvalidRequest)?;
     let is_replay = context.latest.state().agent.source == SourceKind::Replay;
     let (depth, queue_bytes, media_type) = if wanted.payload {
         (Depth::Payloads, PAYLOADS_BYTES, SAMPLES)
@@ -164,7 +159,11 @@ async fn samples(
     let known = if is_replay {
         context.latest.state()
     } else {
-        subscription.in_force(TIMEOUT).await;
+        tokio::select! {
+            _ = subscription.in_force(TIMEOUT) => {}
+            // The stream then ends with this reason.
+            () = context.stop.cancelled() => {}
+        }
         context.state().await
     };
     let most = context.limits.caps().topics;
@@ -283,11 +282,11 @@ fn patterns(names: Option<&str>, regex: Option<&str>) -> Result<Vec<Choice>, Pro
 fn topics(
     snapshot: &Snapshot,
     selection: &Selection,
-    domain_id: Option<u32>,
+    domain_id: Option<DomainId>,
     most: usize,
 ) -> Vec<OpenTopic> {
     let topics = snapshot.topics.iter().filter(|topic| {
-        domain_id.is_none_or(|wanted| wanted == topic.domain_id.0)
+        domain_id.is_none_or(|wanted| wanted == topic.domain_id)
             && selection.covers(&Candidate::from(*topic))
     });
     topics

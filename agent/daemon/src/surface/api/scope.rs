@@ -35,7 +35,7 @@ impl Scope {
     /// # Errors
     /// Fails if the domain id is invalid.
     pub(super) fn checked(self) -> Result<Self, Problem> {
-        check(self.domain_id)?;
+        domain(self.domain_id, Code::MalformedRequest)?;
         Ok(self)
     }
 
@@ -57,7 +57,7 @@ impl Domain {
     /// # Errors
     /// Fails if the domain id is invalid.
     pub(super) fn checked(self) -> Result<Self, Problem> {
-        check(self.domain_id)?;
+        domain(self.domain_id, Code::MalformedRequest)?;
         Ok(self)
     }
 
@@ -66,17 +66,13 @@ impl Domain {
     }
 }
 
-fn check(domain_id: Option<u32>) -> Result<(), Problem> {
-    match domain_id {
-        Some(domain_id) if domain_id > DomainId::MAX.0 => {
-            let detail = format!(
-                "domain_id is {domain_id}, must be between 0 and {}",
-                DomainId::MAX
-            );
-            Err(Problem::new(Code::MalformedRequest, detail))
-        }
-        _ => Ok(()),
-    }
+/// Returns the domain of a request; a number that is none has this problem code.
+///
+/// # Errors
+/// Fails if the number is no domain id.
+pub(super) fn domain(number: Option<u32>, code: Code) -> Result<Option<DomainId>, Problem> {
+    let domain_id = number.map(DomainId::try_from).transpose();
+    domain_id.map_err(|error| Problem::new(code, error.to_string()))
 }
 
 /// Returns the only entity among `found`, which are paired with their domains.

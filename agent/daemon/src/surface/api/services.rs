@@ -18,8 +18,8 @@ use super::party::{Parties, service_type};
 use super::problem::Problem;
 use super::scope::Scope;
 use ros2probe_api::services::{Calls, Service, ServiceList};
-use ros2probe_model::snapshot::{ServiceFacts, Snapshot, TopicFacts, Transport};
-use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::report::snapshot::{ServiceFacts, Snapshot, TopicFacts, Transport};
 use ros2probe_wire::DomainId;
 
 /// The known topics of a service.

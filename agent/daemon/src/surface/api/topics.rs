@@ -32,10 +32,10 @@ use crate::watches::InForce;
 use ros2probe_api::topics::{
     self, Acknowledgement, Delivery, Topic, TopicDetails, TopicList, Watching,
 };
-use ros2probe_model::snapshot::{
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::report::snapshot::{
     AcknowledgementFacts, DeliveryFacts, Snapshot, TopicFacts, Transport,
 };
-use ros2probe_model::topic_kind::TopicKind;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()

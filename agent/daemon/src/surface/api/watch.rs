@@ -20,6 +20,7 @@ use super::Context;
 use super::body::Body;
 use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
+use super::scope;
 use super::security::MAX_BODY;
 use crate::config::watch::{self, ExpectationValues, Watch, check_pattern, check_trace};
 use crate::watches::{self, Done, Entry, Refused};
@@ -27,7 +28,9 @@ use ros2probe_api::watches::{
     Expectations, Origin, Retain, TopicState, WatchList, WatchRequest, WatchState, WatchedTopic,
 };
 use ros2probe_api::{Open, watches as answers};
-use ros2probe_model::snapshot::{self, Snapshot, TopicFacts, WatchFacts, WatchedTopicFacts};
+use ros2probe_model::report::snapshot::{
+    self, Snapshot, TopicFacts, WatchFacts, WatchedTopicFacts,
+};
 use ros2probe_wire::DomainId;
 
 #[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
@@ -42,16 +45,8 @@ struct Domain {
 impl Domain {
     /// Fails if the domain id is invalid.
     fn checked(self) -> Result<Self, Problem> {
-        match self.domain_id {
-            Some(domain_id) if domain_id > DomainId::MAX.0 => {
-                let detail = format!(
-                    "domain_id is {domain_id}, must be at most {}",
-                    DomainId::MAX
-                );
-                Err(Problem::new(Code::MalformedRequest, detail))
-            }
-            _ => Ok(self),
-        }
+        scope::domain(self.domain_id, Code::MalformedRequest)?;
+        Ok(self)
     }
 }
 
@@ -227,12 +222,7 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
         }
         (one, other) => one.or(other),
     };
-    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > DomainId::MAX.0) {
-        return invalid(format!(
-            "domain_id is {domain_id}, must be between 0 and {}",
-            DomainId::MAX
-        ));
-    }
+    let domain_id = scope::domain(domain_id, Code::InvalidRequest)?;
     let values = ExpectationValues {
         min_rate_hz: settings.min_rate_hz,
         max_rate_hz: settings.max_rate_hz,
@@ -248,7 +238,7 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
     match expectations.and_then(|expectations| check_trace(trace).map(|()| expectations)) {
         Ok(expectations) => Ok(Watch {
             pattern: topic,
-            domain_id: domain_id.map(DomainId),
+            domain_id,
             expectations,
             per_subscriber: settings.per_subscriber,
             trace,
@@ -257,7 +247,7 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
                 Retain::Last => watch::Retain::Last,
             },
         }),
-        Err(mistake) => invalid(mistake),
+        Err(mistake) => invalid(mistake.to_string()),
     }
 }
 

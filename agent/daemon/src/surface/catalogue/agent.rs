@@ -275,7 +275,8 @@ pub(in crate::surface) const SAMPLES_QUEUED: Metric = Metric::gauge(
 pub(in crate::surface) const SAMPLES_RETAINED: Metric = Metric::gauge(
     "ros2probe_retained_bytes",
     &[],
-    "Bytes of last messages kept for later recordings (watches with retain: last), at most 4 MiB.",
+    "Bytes of last messages of transient-local writers that are kept for later recordings and \
+     viewers, at most 16 MiB.",
 )
 .unit("bytes");
 pub(in crate::surface) const FOXGLOVE_CLIENTS: Metric = Metric::gauge(

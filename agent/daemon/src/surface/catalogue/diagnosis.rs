@@ -23,12 +23,12 @@ pub(in crate::surface) const TOPIC_CONFLICTING_TYPE_HASHES: Metric = Metric::gau
     "Definitions of one type on a topic that has several: its nodes misread each other.",
 );
 pub(in crate::surface) const UNHEARD_PUBLISHERS: Metric = Metric::gauge(
-    "ros2_topic_unheard_publishers",
+    "ros2_topic_unmatched_publishers",
     TOPIC,
     "Publishers without a matching subscriber for 5 s, except on /rosout and similar topics.",
 );
 pub(in crate::surface) const UNFED_SUBSCRIPTIONS: Metric = Metric::gauge(
-    "ros2_topic_unfed_subscriptions",
+    "ros2_topic_unmatched_subscriptions",
     TOPIC,
     "Subscriptions without a matching publisher for 5 s, except on /rosout and similar topics.",
 );

@@ -5,9 +5,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use ros2probe_message::Library;
-use ros2probe_model::bounded::Bounded;
-use ros2probe_model::names::{DdsName, TypeName};
-use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::facts::names::{DdsName, TypeName};
+use ros2probe_model::report::snapshot::{Snapshot, TopicFacts};
 use ros2probe_wire::DomainId;
 use tokio::task::spawn_blocking;
 

@@ -12,10 +12,11 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::{SinkExt as _, StreamExt as _};
-use ros2probe_model::dispatch::{Missed, MissedReason, Sample};
+use ros2probe_api::topics::UNSUBSCRIBED;
+use ros2probe_model::facts::dispatch::{Missed, MissedReason, Sample};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
-use tokio::time::{Interval, MissedTickBehavior, interval, timeout};
+use tokio::time::{Instant, Interval, MissedTickBehavior, interval, timeout};
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::{CloseCode, Data};
 use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
@@ -30,7 +31,7 @@ use super::statistics::{self, Previous};
 use crate::config::Access;
 use crate::subscriptions::{Depth, Item, Overflow, Selection, Subscription, TopicKey};
 use crate::tables::{ViewerLosses, ViewerSubscriptions};
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 
 /// Largest message of a client, in bytes.
 const MAX_MESSAGE: usize = 256 << 10;
@@ -49,6 +50,11 @@ const MAX_UNANSWERED: u32 = 3;
 const QUIET_TICKS: u32 = 10;
 /// Topics that the status of losses names.
 const NAMED: usize = 3;
+
+/// Silence of a topic after which a missing subscriber is named.
+const SILENT: Duration = Duration::from_secs(5);
+/// Id of the status that names topics without a subscriber.
+const NO_SUBSCRIBER: &str = "no_subscriber";
 
 /// Longest time until a client reads why it is closed.
 const FAREWELL: Duration = Duration::from_secs(1);
@@ -82,6 +88,8 @@ pub(super) struct Client<S> {
     messages: Option<Subscription>,
     graph: Option<Arc<Graph>>,
     losses: [Losses; LOSSES.len()],
+    /// The status about topics without a subscriber; empty without one.
+    unsubscribed: String,
     unanswered: u32,
 }
 
@@ -89,6 +97,9 @@ pub(super) struct Client<S> {
 struct Subscribed {
     channel: Arc<Channel>,
     previous: Previous,
+    since: Instant,
+    /// Whether a message was sent for it.
+    is_heard: bool,
 }
 
 /// Lost messages of one reason, since its status was last removed.
@@ -149,6 +160,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
             messages: None,
             graph: None,
             losses: Default::default(),
+            unsubscribed: String::new(),
             unanswered: 0,
         }
     }
@@ -186,6 +198,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 _ = ticks.tick() => {
                     count = count.wrapping_add(1);
                     self.report_losses().await?;
+                    self.report_unsubscribed().await?;
                     if count.is_multiple_of(PING_TICKS) {
                         self.ping().await?;
                     }
@@ -291,6 +304,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
             let subscribed = Subscribed {
                 channel: Arc::clone(channel),
                 previous: Previous::default(),
+                since: Instant::now(),
+                is_heard: false,
             };
             self.subscribed.insert(*id, subscribed);
             fresh.extend(content.messages_of());
@@ -483,6 +498,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         match (id, &sample.payload) {
             (Some(id), Some(payload)) => {
                 let id = *id;
+                if let Some(subscribed) = self.subscribed.get_mut(&id) {
+                    subscribed.is_heard = true;
+                }
                 self.send_data(id, sample.time, payload).await
             }
             _ => Ok(()),
@@ -528,6 +546,46 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
             }
         }
         Ok(())
+    }
+
+    /// Reports topics that stay silent because no subscriber exists: the agent is none.
+    async fn report_unsubscribed(&mut self) -> Result<(), End> {
+        let message = self.unsubscribed_now();
+        if message == self.unsubscribed {
+            return Ok(());
+        }
+        self.unsubscribed.clone_from(&message);
+        if message.is_empty() {
+            let status_ids = [NO_SUBSCRIBER];
+            return self.send(&Message::RemoveStatus { status_ids }).await;
+        }
+        self.status(Level::Info, NO_SUBSCRIBER, &message).await
+    }
+
+    /// Returns a sentence about the silent topics that have no subscriber; empty without any.
+    fn unsubscribed_now(&self) -> String {
+        let silent = self.subscribed.values().filter_map(|subscribed| {
+            let is_silent = !subscribed.is_heard && subscribed.since.elapsed() >= SILENT;
+            let key = subscribed.channel.content.messages_of()?;
+            is_silent.then(|| (key, subscribed.channel.topic()))
+        });
+        let silent: BTreeMap<TopicKey, &str> = silent.collect();
+        if silent.is_empty() {
+            return String::new();
+        }
+        let state = self.shared.latest.state();
+        let topics = state.known().topics.iter();
+        let names = topics.filter_map(|topic| {
+            let name = silent.get(&(topic.domain_id, topic.dds_name.clone()))?;
+            topic.is_unsubscribed().then_some(*name)
+        });
+        let names: Vec<&str> = names.collect();
+        let named = names.get(..NAMED).unwrap_or(&names).join(", ");
+        match (names.len(), names.len().saturating_sub(NAMED)) {
+            (0, _) => String::new(),
+            (_, 0) => format!("{named}: {UNSUBSCRIBED}"),
+            (_, more) => format!("{named} and {more} more: {UNSUBSCRIBED}"),
+        }
     }
 
     async fn ping(&mut self) -> Result<(), End> {

@@ -2,8 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use ros2probe_model::snapshot::{EndpointFacts, Snapshot};
-use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot};
 
 use super::names::DomainNames;
 use super::protocol::{Message, Providers, Publishers, Subscribers};

@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
-use ros2probe_model::names::TopicName;
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::facts::names::TopicName;
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::DomainId;
 
 /// The domain that each plain name belongs to.

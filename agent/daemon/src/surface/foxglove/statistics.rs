@@ -3,8 +3,8 @@
 
 use std::sync::{Arc, LazyLock};
 
-use ros2probe_model::histogram::Histogram;
-use ros2probe_model::snapshot::{Measurement, TopicFacts};
+use ros2probe_model::facts::histogram::Histogram;
+use ros2probe_model::report::snapshot::{Measurement, TopicFacts};
 use serde_json::{Map, Value, json};
 
 /// Name of the schema.

@@ -4,9 +4,12 @@ use std::collections::BTreeMap;
 
 use futures_util::{SinkExt as _, StreamExt as _};
 use ros2probe_message::Sources;
-use ros2probe_model::dispatch::{Dispatch, Missed, MissedReason, Sample, SampleOutcome, Topic};
-use ros2probe_model::naming::Naming;
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::facts::dispatch::{
+    Dispatch, Missed, MissedReason, Sample, SampleOutcome, Topic,
+};
+use ros2probe_model::facts::naming::Naming;
+use ros2probe_model::facts::selection::SampleRequest;
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_testing::sample_robot;
 use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
@@ -18,7 +21,6 @@ use tokio_tungstenite::tungstenite::protocol::Role;
 
 use super::*;
 use crate::agent_facts::AgentFacts;
-use crate::config::{Retain, Watch};
 use crate::subscriptions::Caps;
 use crate::tables::tests::assert_driven;
 use crate::tables::{ViewerChannels, ViewerSubscriptions};
@@ -402,43 +404,68 @@ async fn a_channel_has_the_messages_and_losses_of_its_domain_and_type_only() {
     assert_eq!(message, expected);
 }
 
+#[tokio::test(start_paused = true)]
+async fn a_silent_topic_without_a_subscriber_is_named_until_it_has_one() {
+    let shared = shared(MEGABYTE);
+    let publish = |subscribed: bool| {
+        let mut snapshot = robot(&["/points", "/chatter"]);
+        for topic in &mut snapshot.topics {
+            let is_alone = *topic.name == *"/points" && !subscribed;
+            if is_alone {
+                topic.subscriptions.clear();
+                topic.measurement = None;
+                topic.inside = None;
+            }
+        }
+        let agent = AgentFacts::new(SourceKind::Wire, std::time::Instant::now());
+        shared.latest.publish(snapshot, agent);
+    };
+    publish(false);
+    let mut scene = Scene::of(Arc::clone(&shared)).await;
+    scene.subscribe(&["/chatter", "/points"]).await;
+    let begun = tokio::time::Instant::now();
+    let status = loop {
+        let status = scene.json().await;
+        if status["op"] == "status" {
+            break status;
+        }
+    };
+    let message = "/points: no subscriber exists, so nothing is sent";
+    assert_eq!(status["message"], message);
+    assert!(begun.elapsed() >= std::time::Duration::from_secs(5));
+    publish(true);
+    let removed = loop {
+        let removed = scene.json().await;
+        if removed["op"] == "removeStatus" {
+            break removed;
+        }
+        assert_ne!(removed["op"], "status", "it is named once");
+    };
+    assert_eq!(removed["statusIds"], json!(["no_subscriber"]));
+}
+
 #[tokio::test]
 async fn the_last_message_of_a_latched_topic_comes_at_once_and_again_after_a_new_subscription() {
     let mut scene = Scene::new(MEGABYTE).await;
-    let retaining = Watch {
-        retain: Retain::Last,
-        ..Watch::named("/points").unwrap()
-    };
     let subscriptions = Arc::clone(&scene.shared.subscriptions);
-    subscriptions.retain(&[Arc::new(retaining)]);
-    let requests = subscriptions.take_changed().unwrap();
-    let mut kept = Sample::clone(&sample("/points", 7, 20));
-    let topic = &robot(&["/points"]).topics[0];
-    let publisher = &topic.publishers[0];
-    kept.writer = publisher.guid;
-    let mut qos = (*publisher.qos).clone();
-    qos.durability = ros2probe_wire::qos::Durability::TRANSIENT_LOCAL;
-    kept.topic = Arc::new(Topic {
-        offered: Some(Arc::new(ros2probe_model::dispatch::Offered {
-            type_hash: None,
-            qos: Arc::new(qos),
-        })),
-        ..Topic::clone(&kept.topic)
-    });
-    let to = [requests[0].id].into();
-    let outcome = SampleOutcome::Sample(Arc::new(kept));
-    subscriptions.deliver(vec![Dispatch { to, outcome }], None);
+    let kept = sample("/points", 7, 20);
+    let latched = |request: &SampleRequest| {
+        let topic = &kept.topic;
+        let dds_name = DdsTopic::parse(&topic.dds_name).unwrap();
+        let is_covered = request.covers(topic.domain_id, &Naming::of(&dds_name));
+        is_covered.then(|| Arc::clone(&kept)).into_iter().collect()
+    };
     scene.subscribe(&["/chatter", "/points"]).await;
     for round in 0..2 {
         // As the capture thread does.
         let requests = loop {
             match subscriptions.take_changed() {
-                Some(requests) if requests.len() == 2 => break requests,
+                Some(requests) if requests.len() == 1 => break requests,
                 _ => tokio::task::yield_now().await,
             }
         };
-        subscriptions.in_force(&requests);
-        subscriptions.in_force(&requests);
+        subscriptions.in_force(&requests, latched);
+        subscriptions.in_force(&requests, latched);
         let data = loop {
             if let Message::Binary(data) = scene.socket.next().await.unwrap().unwrap() {
                 break data;

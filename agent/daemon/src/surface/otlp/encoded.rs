@@ -35,8 +35,8 @@ use tonic::transport::Channel;
 use super::reports;
 use super::transport::SentHeaders;
 use crate::surface::catalogue::Metric;
-use ros2probe_model::chain::exemplar::Exemplar;
-use ros2probe_model::histogram::Histogram;
+use ros2probe_model::derive::chain::exemplar::Exemplar;
+use ros2probe_model::facts::histogram::Histogram;
 
 /// Families of such points, until they are sent.
 #[derive(Debug)]

@@ -16,8 +16,8 @@ use super::instruments::{self, Instruments, REQUEST_POINTS, is_real};
 use super::starts::Starts;
 use crate::surface::catalogue::{Kind, Metric};
 use crate::surface::metric_sink::{Label, Number, write_capped};
-use ros2probe_model::chain::exemplar::Exemplars;
-use ros2probe_model::histogram::Histogram;
+use ros2probe_model::derive::chain::exemplar::Exemplars;
+use ros2probe_model::facts::histogram::Histogram;
 
 /// Estimated size in bytes at which a request ends.
 const REQUEST_BYTES: usize = 1 << 20;
@@ -306,7 +306,7 @@ mod tests {
 
     use super::*;
     use crate::surface::catalogue::CATALOGUE;
-    use ros2probe_model::snapshot::Subscriber;
+    use ros2probe_model::report::snapshot::Subscriber;
 
     fn metric(name: &str) -> &'static Metric {
         CATALOGUE.iter().find(|metric| metric.name == name).unwrap()

@@ -8,7 +8,7 @@ use opentelemetry_sdk::resource::{EnvResourceDetector, ResourceDetector as _};
 use percent_encoding::percent_decode_str;
 
 use crate::config::OtlpSettings;
-use ros2probe_model::identity::Identity;
+use ros2probe_model::facts::identity::Identity;
 
 /// Identity of a host, from its operating system.
 #[derive(Clone, Debug, Default)]

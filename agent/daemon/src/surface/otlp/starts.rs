@@ -10,7 +10,7 @@ use std::hash::{BuildHasher as _, Hash as _, Hasher as _};
 use crate::surface::catalogue::Metric;
 use crate::surface::metric_sink::Label;
 use crate::tables::SeriesStarts;
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 
 /// The series of the last collection.
 #[derive(Debug)]

@@ -23,12 +23,12 @@ use crate::surface::{Exposition, Format, MetricSources};
 use opentelemetry_proto::tonic::common::v1::any_value::Value;
 use opentelemetry_proto::tonic::metrics::v1::metric::Data;
 use opentelemetry_proto::tonic::metrics::v1::number_data_point;
-use ros2probe_model::input::Input;
-use ros2probe_model::inside::report::{
+use ros2probe_model::facts::calls::report::{
     CallbackReport, Durations, ProcessReport, PublisherReport, Report, Transition, Trigger,
 };
-use ros2probe_model::observer::{self, Observer};
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{self, Observer};
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Timestamp};
 

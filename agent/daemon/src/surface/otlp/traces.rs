@@ -25,10 +25,10 @@ use super::events::time;
 use super::exports::{Exports, Reason, Signal};
 use super::points::scope;
 use crate::tables::WaitingSpans;
-use ros2probe_model::bounded::Bounded;
-use ros2probe_model::chain::spans::{ChainSpan, ChainSpans};
-use ros2probe_model::identity::Identity;
-use ros2probe_model::trace::{Span, SpanStage, Spans};
+use ros2probe_model::derive::chain::spans::{ChainSpan, ChainSpans};
+use ros2probe_model::derive::trace::{Span, SpanStage, Spans};
+use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::facts::identity::Identity;
 
 /// Largest number of spans in one request.
 const REQUEST: usize = 512;
@@ -313,8 +313,8 @@ mod tests {
     use ros2probe_wire::SequenceNumber;
 
     use super::*;
-    use ros2probe_model::route::Destination;
-    use ros2probe_model::trace::{Message, WriterDescription};
+    use ros2probe_model::derive::trace::{Message, WriterDescription};
+    use ros2probe_model::facts::route::Destination;
 
     fn span(stage: SpanStage) -> Span {
         let writer = Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 3]));

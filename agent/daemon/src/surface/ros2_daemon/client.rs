@@ -4,7 +4,7 @@ use std::cell::OnceCell;
 use std::path::Path;
 
 use ros2probe_message::Dialect;
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::DomainId;
 use ros2probe_wire::rtps::VendorId;
 

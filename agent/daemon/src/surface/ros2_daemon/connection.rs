@@ -17,7 +17,7 @@ use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
 
 use crate::tables::Ros2DaemonClients;
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 
 /// Longest time from an answer to the end of the next request and its answer.
 pub(super) const IDLE: Duration = Duration::from_secs(10);

@@ -4,7 +4,7 @@
 //! of 24 bytes, Lyrical renamed the module of the classes.
 
 use ros2probe_message::Dialect;
-use ros2probe_model::snapshot::EndpointFacts;
+use ros2probe_model::report::snapshot::EndpointFacts;
 use ros2probe_wire::RtpsDuration;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::{Durability, HistoryKind, Liveliness, Qos, Reliability};

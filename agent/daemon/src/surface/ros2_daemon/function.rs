@@ -421,7 +421,7 @@ impl<'a> Query<'a> {
         &self,
         arguments: &[&str],
         ends: Endpoints,
-    ) -> Result<Vec<&'a ros2probe_model::snapshot::EndpointFacts>, Fault> {
+    ) -> Result<Vec<&'a ros2probe_model::report::snapshot::EndpointFacts>, Fault> {
         Ok(self.graph.endpoints(&full_name(arguments, "topic")?, ends))
     }
 

@@ -6,8 +6,8 @@
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 
 use ros2probe_message::Dialect;
-use ros2probe_model::snapshot::{EndpointFacts, NodeFacts, Snapshot, TopicFacts};
-use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::report::snapshot::{EndpointFacts, NodeFacts, Snapshot, TopicFacts};
 use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
 /// Suffixes of an action's feedback topic and of its type.

@@ -19,7 +19,7 @@ use tokio_util::sync::CancellationToken;
 use super::figures::{PortState, Ros2DaemonFigures, port};
 use crate::surface::listen::listen;
 use crate::tables::Ros2DaemonPorts;
-use ros2probe_model::bounded::Bounded;
+use ros2probe_model::facts::bounded::Bounded;
 
 /// Time for which a released port stays free.
 pub(super) const RELEASED: Duration = Duration::from_secs(60);

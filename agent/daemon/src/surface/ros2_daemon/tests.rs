@@ -5,8 +5,8 @@ mod robot;
 use std::sync::Arc;
 
 use ros2probe_message::Dialect;
-use ros2probe_model::snapshot::{Snapshot, TopicFacts};
-use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::report::snapshot::{Snapshot, TopicFacts};
 use ros2probe_wire::DomainId;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::{History, HistoryKind, Qos, Role};

@@ -1,7 +1,7 @@
 //! Forged messages with stamps, of which some continue others, and forged publications.
 
-use ros2probe_model::chain::causality::CausalPublication;
-use ros2probe_model::chain::expected::ExpectedChain;
+use ros2probe_model::derive::chain::causality::CausalPublication;
+use ros2probe_model::derive::chain::expected::ExpectedChain;
 use ros2probe_testing::model::forge::AnnouncedNode;
 use ros2probe_wire::DomainId;
 

@@ -1,7 +1,7 @@
 //! Reports of ever new processes, handles and states, some of them of an announced participant.
 
 use super::*;
-use ros2probe_model::inside::report::{
+use ros2probe_model::facts::calls::report::{
     CallbackReport, Durations, ProcessReport, PublisherReport, Report, SubscriptionReport,
     Transition, Trigger,
 };

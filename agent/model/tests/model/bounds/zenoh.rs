@@ -1,7 +1,7 @@
 //! Forged connections of Zenoh: sessions, aliases, tokens, publications and unfinished messages.
 
 use super::*;
-use ros2probe_model::zenoh::{StreamEvent, Unseen};
+use ros2probe_model::graph::zenoh::{StreamEvent, Unseen};
 use ros2probe_testing::zenoh::{
     Role, connection, declare_key, declare_token, fragment, frame, init, publisher, push, report,
     response, send,

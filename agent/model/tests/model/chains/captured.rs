@@ -7,12 +7,12 @@ use std::sync::Arc;
 use ros2probe_capture::frame_decoder::FrameDecoder;
 use ros2probe_capture::pcap::PcapReader;
 use ros2probe_capture::reassembly::Limits;
-use ros2probe_model::chain::spans::ChainSpan;
-use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::event::EventKind;
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::watch::{Watch, Watchlist};
+use ros2probe_model::derive::chain::spans::ChainSpan;
+use ros2probe_model::facts::diagnosis::Diagnosis;
+use ros2probe_model::facts::event::EventKind;
+use ros2probe_model::facts::watch::{Watch, Watchlist};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_wire::Expansion;
 
 use super::*;

@@ -1,7 +1,7 @@
 //! Chains of publications within callbacks.
 
-use ros2probe_model::chain::causality::CausalPublication;
-use ros2probe_model::input::Input;
+use ros2probe_model::derive::chain::causality::CausalPublication;
+use ros2probe_model::observe::input::Input;
 use ros2probe_wire::{DomainId, Timestamp};
 
 use super::*;

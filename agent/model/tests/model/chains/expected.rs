@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
-use ros2probe_model::chain::expected::{ChainState, ExpectedChain};
-use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::event::EventKind;
+use ros2probe_model::derive::chain::expected::{ChainState, ExpectedChain};
+use ros2probe_model::facts::diagnosis::Diagnosis;
+use ros2probe_model::facts::event::EventKind;
 
 use super::*;
 

@@ -3,13 +3,13 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use ros2probe_model::chain::expected::ExpectedChain;
-use ros2probe_model::chain::path::ChainFacts;
-use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::Snapshot;
-use ros2probe_model::watch::{Watch, Watchlist};
+use ros2probe_model::derive::chain::expected::ExpectedChain;
+use ros2probe_model::derive::chain::path::ChainFacts;
+use ros2probe_model::facts::diagnosis::Diagnosis;
+use ros2probe_model::facts::watch::{Watch, Watchlist};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::{Observer, Settings};
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_testing::model::domain::watchlist;
 use ros2probe_testing::model::forge::{
     self, AnnouncedNode, Message, SEDP_READERS, SEDP_WRITERS, SPDP,

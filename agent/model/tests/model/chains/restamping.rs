@@ -1,6 +1,6 @@
 //! Nodes that give their outputs new stamps.
 
-use ros2probe_model::diagnosis::Diagnosis;
+use ros2probe_model::facts::diagnosis::Diagnosis;
 
 use super::*;
 

@@ -5,9 +5,9 @@ mod hosts;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use ros2probe_model::chain::spans::{ChainSpan, ChainSpans, SpanId};
-use ros2probe_model::tables::FinishedChainSpans;
-use ros2probe_model::trace::Message;
+use ros2probe_model::derive::chain::spans::{ChainSpan, ChainSpans, SpanId};
+use ros2probe_model::derive::trace::Message;
+use ros2probe_model::facts::tables::FinishedChainSpans;
 
 use super::*;
 

@@ -1,7 +1,7 @@
 //! Causes of losses: before the host, in a socket buffer, in reassembly.
 
-use ros2probe_model::input::Input;
-use ros2probe_model::loss::LossCause;
+use ros2probe_model::facts::loss::LossCause;
+use ros2probe_model::observe::input::Input;
 use ros2probe_testing::model::host::{BOB, Host};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{flag, kind};

@@ -1,6 +1,6 @@
 //! HEARTBEAT and ACKNACK: the samples that a writer still has, and those that a reader waits for.
 
-use ros2probe_model::loss::LossCause;
+use ros2probe_model::facts::loss::LossCause;
 use ros2probe_testing::model::host::{BOB, CAROL, Host};
 
 #[test]

@@ -1,7 +1,7 @@
 //! Every sent sample is delivered, lost for exactly one cause, or irrelevant.
 
 use proptest::prelude::*;
-use ros2probe_model::loss::LossCause;
+use ros2probe_model::facts::loss::LossCause;
 use ros2probe_testing::model::host::{BOB, CapturePoint, Host};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{flag, kind};

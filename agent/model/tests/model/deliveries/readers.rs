@@ -1,7 +1,7 @@
 //! Only a reader that matches the writer makes a process a subscriber.
 
-use ros2probe_model::input::Input;
-use ros2probe_model::snapshot::SocketFacts;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::report::snapshot::SocketFacts;
 use ros2probe_testing::model::host::{BOB, CAROL, CapturePoint, Host};
 use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{GuidPrefix, Record};
@@ -267,7 +267,7 @@ fn losses_at_a_socket_of_an_unknown_participant_stay_bounded() {
     }
     (0..15).for_each(|_| host.wait(1000));
     assert!(host.deliveries().is_empty());
-    let withheld = ros2probe_model::bounded::ledger()["delivery.withheld"];
+    let withheld = ros2probe_model::facts::bounded::ledger()["delivery.withheld"];
     assert_eq!(withheld.largest, withheld.cap);
     assert!(withheld.refused > 0);
 }

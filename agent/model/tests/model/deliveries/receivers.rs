@@ -2,8 +2,8 @@
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 
-use ros2probe_model::input::Input;
-use ros2probe_model::snapshot::SocketFacts;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::report::snapshot::SocketFacts;
 use ros2probe_testing::model::host::{BOB, CAROL, CapturePoint, GROUP, Host, READER};
 use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::{Guid, GuidPrefix, Record};

@@ -1,11 +1,11 @@
 //! One delivery with several routes: multicast and unicast, mirrored, and the caps of routes.
 
-use std::net::SocketAddrV4;
+use std::net::{Ipv4Addr, SocketAddrV4};
 
-use ros2probe_model::loss::LossCause;
-use ros2probe_model::observer::Settings;
-use ros2probe_model::snapshot::Direction;
-use ros2probe_model::snapshot::Subscriber;
+use ros2probe_model::facts::loss::LossCause;
+use ros2probe_model::observe::observer::Settings;
+use ros2probe_model::report::snapshot::Direction;
+use ros2probe_model::report::snapshot::Subscriber;
 use ros2probe_testing::model::host::{BOB, CAROL, CapturePoint, GROUP, Host};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::kind;
@@ -68,6 +68,48 @@ fn ways_are_put_together_when_their_socket_is_known_late() {
         host.losses(LossCause::BeforeHost),
         [10, 30, 50, 70, 90, 100]
     );
+}
+
+#[test]
+fn a_receiver_whose_socket_is_known_late_is_still_one() {
+    for names in [&[false, true][..], &[true, true], &[false, false, true]] {
+        let mut host = Host::new();
+        // The participant does not announce the address of a connection.
+        let bob = CapturePoint {
+            address: SocketAddrV4::new(Ipv4Addr::LOCALHOST, 33_983),
+            ..host.reader(BOB, 7411)
+        };
+        let unknown = CapturePoint { socket: 0, ..bob };
+        let mut number = 0;
+        for is_known in names {
+            if *is_known {
+                host.owner(bob, BOB);
+            }
+            for _ in 0..100 {
+                number += 1;
+                host.data(bob.leaving(), number);
+                host.data(if *is_known { bob } else { unknown }, number);
+                host.wait(1);
+            }
+            // The connection is idle.
+            (0..30).for_each(|_| host.wait(1000));
+        }
+        let deliveries = host.deliveries();
+        let received = deliveries
+            .iter()
+            .filter(|delivery| delivery.direction == Direction::Received);
+        let [delivery] = &received.collect::<Vec<_>>()[..] else {
+            panic!("one receiver: {deliveries:#?}")
+        };
+        let facts = delivery.delivered;
+        assert_eq!(
+            (facts.messages, facts.lost(), facts.pending),
+            (number, 0, 0)
+        );
+        let total = host.topic().received.unwrap();
+        assert_eq!((total.messages, total.lost()), (number, 0));
+        assert_eq!(delivery.sockets, [7411]);
+    }
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Every sample is at each time delivered, lost or pending, also when the writer falls silent.
 
-use ros2probe_model::loss::LossCause;
+use ros2probe_model::facts::loss::LossCause;
 use ros2probe_testing::model::forge::{Message, SEDP_WRITERS};
 use ros2probe_testing::model::host::{ALICE, BOB, CapturePoint, Host, WRITER};
 use ros2probe_wire::Guid;

@@ -1,8 +1,8 @@
 //! Findings about callbacks and queues, and their absence on a healthy robot.
 
 use super::*;
-use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::event::EventKind;
+use ros2probe_model::facts::diagnosis::Diagnosis;
+use ros2probe_model::facts::event::EventKind;
 
 /// A process whose callbacks are called at steady rates.
 #[derive(Default)]

@@ -2,8 +2,8 @@
 
 use std::collections::VecDeque;
 
-use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::inside::facts::ReaderQueue;
+use ros2probe_model::facts::calls::facts::ReaderQueue;
+use ros2probe_model::facts::diagnosis::Diagnosis;
 use ros2probe_testing::model::host::{BOB, CAROL, CapturePoint, Host, READER};
 
 use super::*;

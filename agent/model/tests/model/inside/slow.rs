@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use ros2probe_model::inside::facts::{Callback, Quantiles};
+use ros2probe_model::facts::calls::facts::{Callback, Quantiles};
 
 use super::*;
 

@@ -1,7 +1,7 @@
 //! One truth per topic: the network's counts, or those from inside.
 
 use super::*;
-use ros2probe_model::snapshot::{Source, Transport, WatchState};
+use ros2probe_model::report::snapshot::{Source, Transport, WatchState};
 
 /// A world with a writer and a reader of `/scan` in participants of two processes.
 fn pair(writer_process: u16, reader_process: u16) -> (World, Guid) {

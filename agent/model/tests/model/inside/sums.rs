@@ -1,6 +1,6 @@
 //! Sums per topic, rates, nodes and domains.
 
-use ros2probe_model::event::EventKind;
+use ros2probe_model::facts::event::EventKind;
 
 use super::*;
 

@@ -3,10 +3,9 @@
 use std::time::Duration;
 
 use ros2probe_daemon::agent_facts::InsideSourceFacts;
-use ros2probe_model::inside::report::{
+use ros2probe_model::facts::calls::report::{
     CallbackReport, Durations, ProcessReport, PublisherReport, Report, Transition, Trigger,
 };
-use ros2probe_testing::repository;
 use ros2probe_wire::DomainId;
 use ros2probe_wire::time::SECOND;
 
@@ -55,18 +54,9 @@ fn process(id: u32, second: u64, now: u64) -> ProcessReport {
     }
 }
 
-/// Returns the number of MiB in the `MemoryMax=` of a file.
-fn memory_max(path: &str) -> usize {
-    let text = fs::read_to_string(repository(path)).unwrap();
-    let mut lines = text.lines();
-    let value = lines.find_map(|line| line.strip_prefix("MemoryMax=")?.strip_suffix('M'));
-    value.unwrap().parse().unwrap()
-}
-
-/// Compares the tables at their caps, with two snapshots and a page, with the `MemoryMax` that
-/// `docs/inside.md` gives the service with `capture.inside`.
+/// Compares the tables at their caps, with two snapshots and a page, with the unit's part for them.
 #[test]
-fn figures_from_inside_processes_fit_into_the_memory_that_their_page_adds() {
+fn figures_from_inside_processes_fit_into_their_part_of_the_unit_s_memory() {
     let _alone = ALONE.lock().unwrap();
     let before = resident();
     let mut observer = Observer::new(Settings::default());
@@ -123,21 +113,16 @@ fn figures_from_inside_processes_fit_into_the_memory_that_their_page_adds() {
     }
     let all = resident() - before;
     let kernel = 7 << 20;
-    let (unit, with_inside) = (
-        memory_max("systemd/ros2probe.service"),
-        memory_max("docs/inside.md"),
-    );
     println!(
-        "model {} KiB, with two snapshots and pages ({} KiB each) {} KiB; the page adds {} MiB",
+        "model {} KiB, with two snapshots and pages ({} KiB each) {} KiB",
         modelled >> 10,
         pages[0].len() >> 10,
         all >> 10,
-        with_inside - unit
     );
-    let added = (with_inside - unit) << 20;
-    assert!(all + kernel <= added, "{all} bytes and {kernel} of {added}");
+    let part = Limits::INSIDE;
+    assert!(all + kernel <= part, "{all} bytes and {kernel} of {part}");
     assert!(
-        (all + kernel) * 3 >= added,
-        "the page adds far too much: {all} and {kernel} of {added}"
+        (all + kernel) * 3 >= part,
+        "the part is far too large: {all} and {kernel} of {part}"
     );
 }

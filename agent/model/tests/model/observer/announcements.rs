@@ -1,6 +1,6 @@
 //! Discovery data: repeated, fragmented, relayed, malformed; names of nodes.
 
-use ros2probe_model::input::Input;
+use ros2probe_model::observe::input::Input;
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::{EntityId, GuidPrefix};

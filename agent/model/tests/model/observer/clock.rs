@@ -1,8 +1,8 @@
 //! Steps of the wall clock, jumps, and reproducible results.
 
-use ros2probe_model::churn;
-use ros2probe_model::event::EventKind;
-use ros2probe_model::input::Input;
+use ros2probe_model::facts::churn;
+use ros2probe_model::facts::event::EventKind;
+use ros2probe_model::observe::input::Input;
 use ros2probe_wire::time::{MILLISECOND, SECOND};
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 

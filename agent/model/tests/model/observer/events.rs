@@ -3,11 +3,11 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_model::churn;
-use ros2probe_model::event::EventKind;
-use ros2probe_model::input::Input;
-use ros2probe_model::snapshot::WatchState;
-use ros2probe_model::watch::{Expectations, Watch, Watchlist};
+use ros2probe_model::facts::churn;
+use ros2probe_model::facts::event::EventKind;
+use ros2probe_model::facts::watch::{Expectations, Watch, Watchlist};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::report::snapshot::WatchState;
 use ros2probe_testing::model::forge::{Message, SEDP_WRITERS};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Timestamp};
@@ -270,7 +270,7 @@ fn expectations_are_judged_in_the_sources_time() {
         expectations,
         per_subscriber: false,
         trace: 0.0,
-        retain: ros2probe_model::watch::Retain::None,
+        retain: ros2probe_model::facts::watch::Retain::None,
     };
     world.observer.input(Input::Watchlist(Arc::new(
         Watchlist::new(vec![watch]).unwrap(),

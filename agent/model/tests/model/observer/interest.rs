@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::Settings;
-use ros2probe_model::snapshot::TopicFacts;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Settings;
+use ros2probe_model::report::snapshot::TopicFacts;
 use ros2probe_testing::model::forge::{Message, SEDP_WRITERS};
 use ros2probe_wire::EntityId;
 use ros2probe_wire::record::Verdict;

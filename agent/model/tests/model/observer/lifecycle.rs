@@ -1,6 +1,6 @@
 //! Participants and endpoints appear, renew, are disposed, expire and return.
 
-use ros2probe_model::input::Input;
+use ros2probe_model::observe::input::Input;
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::Envelope;

@@ -1,6 +1,6 @@
 //! Floods of forgeries: tables stay within their caps, and real topics are counted.
 
-use ros2probe_model::observer::Settings;
+use ros2probe_model::observe::observer::Settings;
 use ros2probe_testing::model::forge::Message;
 use ros2probe_wire::{EntityId, Guid};
 

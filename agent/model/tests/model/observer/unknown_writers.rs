@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
-use ros2probe_model::history::History;
-use ros2probe_model::input::Input;
-use ros2probe_model::snapshot::SocketFacts;
+use ros2probe_model::measure::history::History;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::report::snapshot::SocketFacts;
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::walk::Envelope;

@@ -1,8 +1,8 @@
 //! The caps of the tables of services.
 
 use super::*;
-use ros2probe_model::bounded::ledger;
-use ros2probe_model::tables::ServiceWriters;
+use ros2probe_model::facts::bounded::ledger;
+use ros2probe_model::facts::tables::ServiceWriters;
 
 /// Largest size of a table so far, and its cap.
 fn size(table: &str) -> (usize, usize) {

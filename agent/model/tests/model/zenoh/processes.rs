@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::Observer;
-use ros2probe_model::snapshot::{Direction, SocketFacts};
-use ros2probe_model::zenoh::{StreamEvent, StreamId};
+use ros2probe_model::graph::zenoh::{StreamEvent, StreamId};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Observer;
+use ros2probe_model::report::snapshot::{Direction, SocketFacts};
 use ros2probe_testing::zenoh::{
     Role, connection, declare_key, declare_token, frame, init, publisher, push, report, send,
 };

@@ -3,11 +3,11 @@
 //! The agent observes one host. The story of all messages is fixed; an agent that starts late sees
 //! the end of it only, and then what a joining session receives.
 
-use ros2probe_model::discovery::Memory;
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::Observer;
-use ros2probe_model::snapshot::Direction;
-use ros2probe_model::zenoh::{StreamEvent, StreamId};
+use ros2probe_model::graph::discovery::Memory;
+use ros2probe_model::graph::zenoh::{StreamEvent, StreamId};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Observer;
+use ros2probe_model::report::snapshot::Direction;
 use ros2probe_testing::zenoh::{
     Role, answer_end, connection, declare_token, frame, init, interest, open, publisher, push,
     report, send, undeclare_token,

@@ -12,10 +12,10 @@ use crate::agent_facts::{Ability, AgentFacts, SourceKind};
 use crate::missed_announcements;
 use crate::recording::counted;
 use ros2probe_api::live::{Finding, Severity};
-use ros2probe_model::diagnosis::{Diagnosis, Policies, Policy, TopicKey};
-use ros2probe_model::history::Past;
-use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts, WatchState};
-use ros2probe_model::zenoh::Unseen;
+use ros2probe_model::facts::diagnosis::{Diagnosis, Policies, Policy, TopicKey};
+use ros2probe_model::graph::zenoh::Unseen;
+use ros2probe_model::measure::history::Past;
+use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot, TopicFacts, WatchState};
 
 /// Largest number of findings per stream.
 const MOST: usize = 512;
@@ -244,7 +244,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             }
             .with_remedy("give each node a name or a namespace of its own")
         }
-        Diagnosis::UnheardPublisher {
+        Diagnosis::UnmatchedPublisher {
             topic,
             writer,
             reason,
@@ -252,7 +252,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             writer: Some(writer.to_string()),
             ..unmatched(kind, topic, *writer, reason.label(), ends, PUBLISHER)
         },
-        Diagnosis::UnfedSubscriber {
+        Diagnosis::UnmatchedSubscription {
             topic,
             reader,
             reason,
@@ -556,8 +556,8 @@ mod tests {
     use std::time::Instant;
 
     use super::*;
-    use ros2probe_model::diagnosis::Diagnoses;
-    use ros2probe_model::zenoh::ZenohFacts;
+    use ros2probe_model::facts::diagnosis::Diagnoses;
+    use ros2probe_model::graph::zenoh::ZenohFacts;
 
     #[test]
     fn of_more_findings_than_are_sent_the_worst_are() {

@@ -5,8 +5,8 @@ use std::time::Duration;
 use super::findings::finding;
 use super::structure::Ids;
 use ros2probe_api::live::{Finding, Severity};
-use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::inside::facts::Owner;
+use ros2probe_model::facts::calls::facts::Owner;
+use ros2probe_model::facts::diagnosis::Diagnosis;
 
 /// Describes a problem from inside a process.
 pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {

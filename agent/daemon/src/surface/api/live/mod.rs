@@ -33,7 +33,7 @@ use crate::agent_facts::SourceKind;
 use crate::events::Reader;
 use crate::surface::places::Places;
 use ros2probe_api::live::{End, Events, Line, Open, Replay};
-use ros2probe_model::snapshot::Transport;
+use ros2probe_model::report::snapshot::Transport;
 use shared_lines::SharedLines;
 
 /// Largest number of streams of all listeners: fewer than connections, so that other requests still

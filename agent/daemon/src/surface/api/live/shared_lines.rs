@@ -17,8 +17,8 @@ use crate::agent_facts::SourceKind;
 use crate::snapshot_cell::State;
 use crate::watches::InForce;
 use ros2probe_api::live::{Ability, Agent, Graph, Line, Progress, Row, Totals, Values};
-use ros2probe_model::history::Past;
-use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::measure::history::Past;
+use ros2probe_model::report::snapshot::Snapshot;
 
 /// The lines of the current state, with the rounds of their last changes.
 #[derive(Debug, Default)]

@@ -10,8 +10,8 @@ use super::super::endpoint::{texts, vendor};
 use super::super::index::Index;
 use crate::watches::{InForce, Origin};
 use ros2probe_api::live::{Endpoint, Graph, Node, Participant, Topic};
-use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts};
-use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot, TopicFacts};
 
 /// Numbers that identify entities within the streams.
 #[derive(Debug, Default)]

@@ -7,9 +7,9 @@ use super::super::index::Index;
 use super::structure::{Ids, is_measured, is_shown};
 use crate::config::Watchlist;
 use ros2probe_api::live::{History, Rates, Row, Totals};
-use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::history::{Past, Second};
-use ros2probe_model::snapshot::{Snapshot, TopicFacts, Transport, WatchState};
+use ros2probe_model::facts::diagnosis::Diagnosis;
+use ros2probe_model::measure::history::{Past, Second};
+use ros2probe_model::report::snapshot::{Snapshot, TopicFacts, Transport, WatchState};
 
 /// Step of the initial rates, in seconds.
 const STEP: usize = 10;
@@ -22,8 +22,8 @@ pub(super) const FLAGS: [&str; 12] = [
     "qos",
     "type",
     "definition",
-    "unheard",
-    "unfed",
+    "unmatched_publisher",
+    "unmatched_subscription",
     "silent",
     "violated",
     "loss",
@@ -39,8 +39,8 @@ enum Flag {
     Qos,
     Type,
     Definition,
-    Unheard,
-    Unfed,
+    UnmatchedPublisher,
+    UnmatchedSubscription,
     Silent,
     Violated,
     Loss,
@@ -105,17 +105,17 @@ impl Figures<'_> {
     fn flags(&self, topic: &TopicFacts, known: Option<u32>) -> u32 {
         let mut flags = 0;
         let mut mark = |flag: Flag, holds: bool| flags |= u32::from(holds) << flag as u32;
-        let mut unheard = 0;
+        let mut unmatched = 0;
         for finding in self.index.findings(topic) {
             match finding {
                 Diagnosis::QosIncompatible { .. } => mark(Flag::Qos, true),
                 Diagnosis::TypeConflict { .. } => mark(Flag::Type, true),
                 Diagnosis::TypeHashConflict { .. } => mark(Flag::Definition, true),
-                Diagnosis::UnheardPublisher { .. } => {
-                    unheard += 1;
-                    mark(Flag::Unheard, true);
+                Diagnosis::UnmatchedPublisher { .. } => {
+                    unmatched += 1;
+                    mark(Flag::UnmatchedPublisher, true);
                 }
-                Diagnosis::UnfedSubscriber { .. } => mark(Flag::Unfed, true),
+                Diagnosis::UnmatchedSubscription { .. } => mark(Flag::UnmatchedSubscription, true),
                 Diagnosis::DuplicateNode { .. }
                 | Diagnosis::NodeInSeveralDomains { .. }
                 | Diagnosis::HangingCall { .. }
@@ -130,7 +130,7 @@ impl Figures<'_> {
         }
         let measured = topic.measurement.as_deref();
         let is_measured = is_measured(topic, self.index);
-        let is_connected = unheard < topic.publishers.len() && !topic.subscriptions.is_empty();
+        let is_connected = unmatched < topic.publishers.len() && !topic.subscriptions.is_empty();
         let is_quiet = topic.is_silent(self.snapshot.at);
         let watches = self.index.watches(topic);
         let stands = |state| watches.iter().any(|(_, watch)| watch.state == state);

@@ -31,8 +31,8 @@ use crate::config::Access;
 use crate::subscriptions::{Depth, Item, Overflow, Refused, Request, Selection, Subscription};
 use ros2probe_api::messages::{self, Beat, Definition, End, Message, Missed};
 use ros2probe_message::{Library, Limits, MessageType, decode};
-use ros2probe_model::dispatch::Sample;
-use ros2probe_model::names::{DdsName, TypeName};
+use ros2probe_model::facts::dispatch::Sample;
+use ros2probe_model::facts::names::{DdsName, TypeName};
 use ros2probe_wire::DomainId;
 use ros2probe_wire::discovery::TypeHash;
 use tree::{ELEMENTS, Tree};
@@ -203,7 +203,7 @@ pub(super) async fn follow(
 fn request(domain_id: DomainId, dds_name: &DdsName) -> Request {
     Request {
         topics: Selection::of_topics([(domain_id, dds_name.clone())]),
-        domain_id: Some(domain_id.0),
+        domain_id: Some(domain_id),
         depth: Depth::Payloads,
         queue_bytes: QUEUE_BYTES,
         // A slow client must not delay the agent, nor a replay.
@@ -399,7 +399,7 @@ mod tests {
     use crate::agent_facts::SourceKind;
     use crate::snapshot_cell::SnapshotCell;
     use crate::subscriptions::{Caps, Subscriptions};
-    use ros2probe_model::dispatch::{Dispatch, SampleOutcome, Topic};
+    use ros2probe_model::facts::dispatch::{Dispatch, SampleOutcome, Topic};
 
     #[test]
     fn messages_that_wait_beyond_the_bytes_go_and_are_counted() {

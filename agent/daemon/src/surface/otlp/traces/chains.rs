@@ -5,8 +5,8 @@ use opentelemetry::trace::{Link, SpanKind};
 use opentelemetry_sdk::trace::SpanLinks;
 
 use super::{Parts, attribute, context, int, send_id};
-use ros2probe_model::chain::spans::{ChainMessage, ChainSpan, ChainStage, SpanId};
-use ros2probe_model::identity::Identity;
+use ros2probe_model::derive::chain::spans::{ChainMessage, ChainSpan, ChainStage, SpanId};
+use ros2probe_model::facts::identity::Identity;
 
 /// Returns the span as it is exported by the agent of this host.
 pub(super) fn parts(span: &ChainSpan, host: u128) -> Parts {
@@ -109,7 +109,7 @@ fn attributes(span: &ChainSpan) -> Vec<KeyValue> {
 mod tests {
     use std::sync::Arc;
 
-    use ros2probe_model::chain::trace::Method;
+    use ros2probe_model::derive::chain::trace::Method;
     use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
     use super::*;

@@ -2,8 +2,10 @@
 
 use std::sync::Arc;
 
-use ros2probe_model::snapshot::{EndpointFacts, NodeFacts, ParticipantFacts, Snapshot, TopicFacts};
-use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::report::snapshot::{
+    EndpointFacts, NodeFacts, ParticipantFacts, Snapshot, TopicFacts,
+};
 use ros2probe_testing::sample_robot;
 use ros2probe_wire::qos::{Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
@@ -33,6 +35,7 @@ fn endpoint(
         first_seen: ros2probe_wire::Timestamp(1),
         measurement: None,
         transports: 0,
+        latched: None,
     }
 }
 

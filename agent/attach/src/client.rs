@@ -1,0 +1,442 @@
+//! The agent's side of the broker.
+
+use std::io;
+use std::os::fd::{AsFd as _, BorrowedFd, OwnedFd};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use rustix::net::sockopt::{Timeout, set_socket_timeout};
+use rustix::net::{
+    AddressFamily, SendFlags, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with,
+    socketpair,
+};
+
+use crate::functions::{Calls, Library};
+use crate::mapped::Use;
+use crate::message::{receive, send};
+use crate::request::{Activity, Answer, MAX_PROCESSES, Means, Numbered, PATIENCE, Place, Request};
+use crate::server::Peer;
+use crate::server::answer::answer;
+
+/// Name of the command that runs the broker. The connection is its standard input.
+pub const COMMAND: &str = "attach";
+/// Whether this program has [`COMMAND`].
+static HAS_COMMAND: AtomicBool = AtomicBool::new(false);
+/// Time to wait for an answer. The broker itself gives up earlier.
+const ANSWERS_WITHIN: Duration = PATIENCE.saturating_add(Duration::from_secs(1));
+/// Pause before another attempt to connect.
+const RETRY: Duration = Duration::from_secs(5);
+
+/// Declares that this program runs the broker with [`COMMAND`]. Any other program would start a copy of
+/// itself that does something else.
+pub fn declare_command() {
+    HAS_COMMAND.store(true, Ordering::Relaxed);
+}
+
+/// Why the broker did not answer.
+#[derive(Debug, thiserror::Error)]
+pub enum BrokerError {
+    /// Nothing listens at its socket.
+    #[error(
+        "cannot connect to the broker at {} (systemctl start ros2probe-attach.socket, unless it is \
+         masked, or start the agent as root)", path.display()
+    )]
+    Unreachable {
+        /// Path of the socket.
+        path: PathBuf,
+        /// Cause of the failure.
+        #[source]
+        source: io::Error,
+    },
+    /// It ended, and was started with the agent.
+    #[error("the broker has ended: restart the agent")]
+    Ended,
+    /// It closed the connection.
+    #[error("the broker closed the connection: it accepts the user of its option --user, and root")]
+    Closed,
+    /// It did not answer in time, or not in this protocol.
+    #[error("the broker did not answer")]
+    Answer(#[source] io::Error),
+    /// It refuses the request, for this reason.
+    #[error("{0}")]
+    Refused(String),
+}
+
+/// A connection to the broker, which is opened again when the broker restarts.
+#[derive(Debug)]
+pub struct Broker {
+    reach: Reach,
+    socket: Option<OwnedFd>,
+    /// When the last attempt to connect failed, and the code of the error.
+    failed: Option<(Instant, Option<i32>)>,
+    number: u64,
+}
+
+#[derive(Debug)]
+enum Reach {
+    Socket(PathBuf),
+    Child(Child),
+    /// No broker: the calling process has the rights itself.
+    Here,
+}
+
+/// Processes that use a library.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Users {
+    /// With their use of it.
+    pub used: Vec<(u32, Use)>,
+    /// Processes that the broker may not read.
+    pub closed: Vec<u32>,
+}
+
+impl Broker {
+    /// Returns a client of the broker that listens at a socket. It connects with the first request.
+    #[must_use]
+    pub fn at(path: &Path) -> Self {
+        Self {
+            reach: Reach::Socket(path.to_path_buf()),
+            socket: None,
+            failed: None,
+            number: 0,
+        }
+    }
+
+    /// Starts a broker with the privileges of the calling thread: this program with [`COMMAND`]. It
+    /// ends with the client.
+    ///
+    /// # Errors
+    /// Fails if no process can be started, or if this program has not [declared](declare_command) the
+    /// command.
+    pub fn start() -> io::Result<Self> {
+        if !HAS_COMMAND.load(Ordering::Relaxed) {
+            let reason = "this program does not contain the broker";
+            return Err(io::Error::new(io::ErrorKind::Unsupported, reason));
+        }
+        let (own, other) = pair()?;
+        let child = Command::new("/proc/self/exe")
+            .arg(COMMAND)
+            .stdin(Stdio::from(other))
+            .stdout(Stdio::null())
+            .spawn()?;
+        Ok(Self {
+            reach: Reach::Child(child),
+            socket: Some(own),
+            failed: None,
+            number: 0,
+        })
+    }
+
+    /// Answers with the rights of the calling process, without a broker, deadlines or forks: for
+    /// tests and examples.
+    #[must_use]
+    pub const fn here() -> Self {
+        Self {
+            reach: Reach::Here,
+            socket: None,
+            failed: None,
+            number: 0,
+        }
+    }
+
+    /// Closes the connection. The packaged broker ends some time after the last one has closed.
+    pub fn rest(&mut self) {
+        if matches!(self.reach, Reach::Socket(_)) {
+            self.socket = None;
+        }
+    }
+
+    /// Returns all processes of the host.
+    ///
+    /// # Errors
+    /// Fails if the broker refuses, or cannot be reached.
+    pub fn processes(&mut self) -> Result<Vec<u32>, BrokerError> {
+        let mut all = Vec::new();
+        self.ask(Request::Processes, &[], |answer, _| {
+            if let Answer::Processes(mut part) = answer {
+                all.append(&mut part);
+            }
+        })?;
+        Ok(all)
+    }
+
+    /// Returns which of these processes use a library.
+    ///
+    /// # Errors
+    /// Fails if the broker refuses, or cannot be reached.
+    pub fn users(&mut self, library: Library, processes: &[u32]) -> Result<Users, BrokerError> {
+        let mut users = Users::default();
+        for part in processes.chunks(MAX_PROCESSES) {
+            let processes = part.to_vec();
+            self.ask(Request::Uses { library, processes }, &[], |answer, _| {
+                if let Answer::Uses { used, closed } = answer {
+                    for (process, part) in used {
+                        users.add(process, part);
+                    }
+                    users.closed.extend(closed);
+                }
+            })?;
+        }
+        Ok(users)
+    }
+
+    /// Returns the state of these processes; those that ended are left out.
+    ///
+    /// # Errors
+    /// Fails if the broker refuses, or cannot be reached.
+    pub fn activities(&mut self, processes: &[u32]) -> Result<Vec<Activity>, BrokerError> {
+        let mut all = Vec::new();
+        for part in processes.chunks(MAX_PROCESSES) {
+            let processes = part.to_vec();
+            self.ask(Request::Activities { processes }, &[], |answer, _| {
+                if let Answer::Activities(mut part) = answer {
+                    all.append(&mut part);
+                }
+            })?;
+        }
+        Ok(all)
+    }
+
+    /// Returns the domain in the environment of a process, 0 without one; `None` if it cannot be
+    /// read.
+    ///
+    /// # Errors
+    /// Fails if the broker refuses, or cannot be reached.
+    pub fn domain(&mut self, process: u32) -> Result<Option<u32>, BrokerError> {
+        let mut found = None;
+        self.ask(Request::Domain { process }, &[], |answer, _| {
+            if let Answer::Domain(domain) = answer {
+                found = domain;
+            }
+        })?;
+        Ok(found)
+    }
+
+    /// Attaches programs to functions of a library. Returns the descriptors of the breakpoints and
+    /// the functions that the library has.
+    ///
+    /// # Errors
+    /// Fails if the broker refuses, or cannot be reached.
+    pub fn attach(
+        &mut self,
+        (calls, place, means): (Calls, Place, Means),
+        programs: &[BorrowedFd<'_>],
+    ) -> Result<(Vec<OwnedFd>, Vec<String>), BrokerError> {
+        let mut attached = None;
+        let request = Request::Attach {
+            calls,
+            place,
+            means,
+        };
+        self.ask(request, programs, |answer, descriptors| {
+            if let Answer::Attached { functions } = answer {
+                attached = Some((descriptors, functions));
+            }
+        })?;
+        attached.ok_or_else(unexpected)
+    }
+
+    /// Returns perf events that report which process maps a file, one for each CPU.
+    ///
+    /// # Errors
+    /// Fails if the broker refuses, or cannot be reached.
+    pub fn mappings(&mut self) -> Result<Vec<OwnedFd>, BrokerError> {
+        let mut events = Vec::new();
+        self.ask(Request::Mappings, &[], |_, descriptors| {
+            events = descriptors;
+        })?;
+        Ok(events)
+    }
+
+    /// Passes each part of an answer with its descriptors.
+    fn ask(
+        &mut self,
+        request: Request,
+        descriptors: &[BorrowedFd<'_>],
+        mut with: impl FnMut(Answer, Vec<OwnedFd>),
+    ) -> Result<(), BrokerError> {
+        if let Reach::Here = self.reach {
+            return here(request, descriptors, with);
+        }
+        let number = self.send(&request, descriptors)?;
+        loop {
+            let (answer, descriptors) = self.receive(number)?;
+            let is_last = answer.is_last();
+            with(answer, descriptors);
+            if is_last {
+                return Ok(());
+            }
+        }
+    }
+
+    fn send(
+        &mut self,
+        request: &Request,
+        descriptors: &[BorrowedFd<'_>],
+    ) -> Result<u64, BrokerError> {
+        self.number += 1;
+        let number = self.number;
+        let message = Numbered {
+            number,
+            content: request,
+        };
+        // The packaged broker may have ended for lack of requests since the last one.
+        let is_connected = self.socket.is_some();
+        let sent = send(self.connected()?, &message, descriptors, SendFlags::empty());
+        let sent = match sent {
+            Err(_) if is_connected && matches!(self.reach, Reach::Socket(_)) => {
+                self.socket = None;
+                send(self.connected()?, &message, descriptors, SendFlags::empty())
+            }
+            sent => sent,
+        };
+        match sent {
+            Ok(()) => Ok(number),
+            Err(error) => Err(self.lost(error)),
+        }
+    }
+
+    fn receive(&mut self, number: u64) -> Result<(Answer, Vec<OwnedFd>), BrokerError> {
+        loop {
+            let socket = self.socket.as_ref().ok_or(BrokerError::Ended)?;
+            let received = receive::<Numbered<Answer>>(socket.as_fd());
+            let (answer, descriptors) = match received {
+                Ok(Some(received)) => received,
+                Ok(None) => return Err(self.lost(io::ErrorKind::UnexpectedEof.into())),
+                Err(error) => return Err(self.lost(error)),
+            };
+            // A late answer to an earlier request, which the broker had given up.
+            if answer.number < number {
+                continue;
+            }
+            return match answer.content {
+                Answer::Refused(reason) => Err(BrokerError::Refused(reason)),
+                content => Ok((content, descriptors)),
+            };
+        }
+    }
+
+    /// Returns the error of a connection that is of no more use.
+    fn lost(&mut self, error: io::Error) -> BrokerError {
+        self.socket = None;
+        match self.reach {
+            Reach::Child(_) => BrokerError::Ended,
+            Reach::Socket(_) if is_closed(&error) => BrokerError::Closed,
+            Reach::Socket(_) | Reach::Here => BrokerError::Answer(error),
+        }
+    }
+
+    fn connected(&mut self) -> Result<BorrowedFd<'_>, BrokerError> {
+        if self.socket.is_none() {
+            let Reach::Socket(path) = &self.reach else {
+                return Err(BrokerError::Ended);
+            };
+            let unreachable = |source| BrokerError::Unreachable {
+                path: path.clone(),
+                source,
+            };
+            if let Some((_, code)) = self.failed.filter(|(at, _)| at.elapsed() < RETRY) {
+                let same = code.map_or(
+                    io::ErrorKind::NotConnected.into(),
+                    io::Error::from_raw_os_error,
+                );
+                return Err(unreachable(same));
+            }
+            let opened = open(path);
+            let failed = opened.as_ref().err().map(io::Error::raw_os_error);
+            self.failed = failed.map(|code| (Instant::now(), code));
+            self.socket = Some(opened.map_err(unreachable)?);
+        }
+        self.socket
+            .as_ref()
+            .map(|socket| socket.as_fd())
+            .ok_or(BrokerError::Ended)
+    }
+}
+
+impl Users {
+    fn add(&mut self, process: u32, part: Use) {
+        match self.used.last_mut() {
+            // The libraries of one process come in parts.
+            Some((last, used)) if *last == process => used.libraries.extend(part.libraries),
+            _ => self.used.push((process, part)),
+        }
+    }
+}
+
+impl Drop for Broker {
+    fn drop(&mut self) {
+        // The child ends when its socket closes. It never waits for files itself.
+        self.socket = None;
+        if let Reach::Child(child) = &mut self.reach {
+            let _ = child.wait();
+        }
+    }
+}
+
+fn is_closed(error: &io::Error) -> bool {
+    let kinds = [
+        io::ErrorKind::UnexpectedEof,
+        io::ErrorKind::BrokenPipe,
+        io::ErrorKind::ConnectionReset,
+    ];
+    kinds.contains(&error.kind())
+}
+
+/// Answers a request in this process.
+fn here(
+    request: Request,
+    given: &[BorrowedFd<'_>],
+    mut with: impl FnMut(Answer, Vec<OwnedFd>),
+) -> Result<(), BrokerError> {
+    let own = Peer {
+        process: std::process::id(),
+        user: rustix::process::geteuid().as_raw(),
+    };
+    let given = given.iter().map(BorrowedFd::try_clone_to_owned);
+    let given: Vec<_> = given
+        .collect::<io::Result<_>>()
+        .map_err(BrokerError::Answer)?;
+    let mut refused = None;
+    let answered = answer(own, request, &given, &mut |answer, descriptors| {
+        match answer {
+            Answer::Refused(reason) => refused = Some(reason),
+            answer => with(answer, descriptors),
+        }
+        Ok(())
+    });
+    answered.map_err(BrokerError::Answer)?;
+    refused.map_or(Ok(()), |reason| Err(BrokerError::Refused(reason)))
+}
+
+fn unexpected() -> BrokerError {
+    BrokerError::Answer(io::ErrorKind::InvalidData.into())
+}
+
+fn pair() -> io::Result<(OwnedFd, OwnedFd)> {
+    let (own, other) = socketpair(
+        AddressFamily::UNIX,
+        SocketType::SEQPACKET,
+        SocketFlags::CLOEXEC,
+        None,
+    )?;
+    bounded(&own)?;
+    Ok((own, other))
+}
+
+fn open(path: &Path) -> io::Result<OwnedFd> {
+    let flags = SocketFlags::CLOEXEC;
+    let socket = socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)?;
+    // A broker with too many connections accepts later.
+    bounded(&socket)?;
+    connect(&socket, &SocketAddrUnix::new(path)?)?;
+    Ok(socket)
+}
+
+fn bounded(socket: &OwnedFd) -> io::Result<()> {
+    for timeout in [Timeout::Recv, Timeout::Send] {
+        set_socket_timeout(socket, timeout, Some(ANSWERS_WITHIN))?;
+    }
+    Ok(())
+}

@@ -1,0 +1,412 @@
+//! Accepts connections, and answers requests.
+//!
+//! Each connection has a process of its own, and each request of it a child process with a deadline.
+//! Descriptors of a client, files and memory can block any of them, which delays that client alone. A
+//! child that never ends, because the kernel waits in it, becomes a child of the broker.
+//!
+//! None of these processes has a second thread.
+
+pub(crate) mod answer;
+
+use std::io;
+use std::os::fd::{AsFd as _, BorrowedFd, OwnedFd};
+use std::time::{Duration, Instant};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
+use rustix::net::{SendFlags, SocketFlags, accept_with};
+use rustix::process::{
+    Pid, PidfdFlags, Signal, WaitOptions, kill_process, pidfd_open,
+    set_parent_process_death_signal, wait, waitpid,
+};
+
+use crate::kernel;
+use crate::message::{receive, send};
+use crate::request::{Answer, Numbered, Request};
+
+/// Most connections. The sources of one agent need two, and further ones wait.
+pub const MAX_CONNECTIONS: usize = 8;
+/// Requests of a connection per second, and at once. Further ones wait in the socket.
+pub const RATE: f64 = 1000.0;
+/// The domain of each process of a starting robot is one request.
+pub const BURST: f64 = 1000.0;
+/// The same for requests whose answers have descriptors, which the client keeps.
+pub const ATTACHMENT_RATE: f64 = 5.0;
+/// A client that attaches to all libraries of a host does so at once.
+pub const ATTACHMENT_BURST: f64 = 250.0;
+/// Most requests of a connection that never ended. Until one of them ends, further ones are refused.
+pub const MAX_STUCK: usize = 4;
+/// Pause after the kernel refused a connection or a process.
+const PAUSE: Duration = Duration::from_millis(200);
+/// Longest wait of the broker, which then counts its children.
+const ROUND: Duration = Duration::from_secs(1);
+
+/// The peer of a connection (SO_PEERCRED, unix(7)).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Peer {
+    /// Its process id; 0 in another PID namespace.
+    pub process: u32,
+    /// Its user id.
+    pub user: u32,
+}
+
+/// Answers connections of root and of `users` to a listening socket. Returns after `idle` without a
+/// child process. The calling process should adopt its descendants (PR_SET_CHILD_SUBREAPER).
+///
+/// # Errors
+/// Fails if the kernel refuses to wait.
+pub fn serve(listener: OwnedFd, users: &[u32], idle: Duration) -> io::Result<()> {
+    let mut listener = Some(listener);
+    let mut connections = Vec::new();
+    let mut used = Instant::now();
+    while let Some(listening) = &listener {
+        // Children of connections that have ended are children, too.
+        if reap(&mut connections) {
+            used = Instant::now();
+        }
+        let rest = idle.saturating_sub(used.elapsed());
+        if rest.is_zero() {
+            break;
+        }
+        let has_room = connections.len() < MAX_CONNECTIONS;
+        let source = has_room.then(|| listening.as_fd());
+        if ready(source, rest.min(ROUND))?
+            && let Some(socket) = accept(listening)
+        {
+            connections.extend(begin(socket, users, &mut listener));
+        }
+    }
+    Ok(())
+}
+
+/// Reaps children that have ended, and returns whether others are left.
+fn reap(connections: &mut Vec<Pid>) -> bool {
+    loop {
+        match wait(WaitOptions::NOHANG) {
+            Ok(Some((ended, _))) => connections.retain(|connection| *connection != ended),
+            Ok(None) => return true,
+            Err(_) => return false,
+        }
+    }
+}
+
+/// Accepts a connection. Failures are transient: a client that has gone, or too many open files.
+fn accept(listener: &OwnedFd) -> Option<OwnedFd> {
+    match accept_with(listener, SocketFlags::CLOEXEC) {
+        Ok(socket) => Some(socket),
+        Err(error) => {
+            tracing::warn!(%error, "accept failed");
+            std::thread::sleep(PAUSE);
+            None
+        }
+    }
+}
+
+/// Starts the process of a connection, which closes the listening socket.
+fn begin(socket: OwnedFd, users: &[u32], listener: &mut Option<OwnedFd>) -> Option<Pid> {
+    let peer = match peer(&socket) {
+        Ok(peer) => peer,
+        Err(error) => {
+            tracing::warn!(%error, "SO_PEERCRED failed");
+            return None;
+        }
+    };
+    let Peer {
+        process: peer_pid,
+        user: peer_uid,
+    } = peer;
+    if peer_uid != 0 && !users.contains(&peer_uid) {
+        tracing::warn!(
+            peer_pid,
+            peer_uid,
+            "refused a connection: not the agent's user"
+        );
+        return None;
+    }
+    // SAFETY: the broker has one thread.
+    match unsafe { kernel::fork() } {
+        Ok(None) => in_child(|| {
+            drop(listener.take());
+            Connection::new(socket, peer).serve()
+        }),
+        Ok(child) => child,
+        Err(error) => {
+            tracing::error!(%error, "fork failed");
+            std::thread::sleep(PAUSE);
+            None
+        }
+    }
+}
+
+/// Answers one connection until it is closed.
+///
+/// # Errors
+/// Fails if the kernel refuses to wait.
+pub fn serve_one(socket: OwnedFd) -> io::Result<()> {
+    let peer = peer(&socket)?;
+    Connection::new(socket, peer).serve()
+}
+
+/// Runs the rest of a child process, and ends it also after a panic.
+fn in_child(work: impl FnOnce() -> io::Result<()>) -> ! {
+    struct End;
+    impl Drop for End {
+        fn drop(&mut self) {
+            kernel::end_fork(1);
+        }
+    }
+    let _end = End;
+    // It must not outlive its parent.
+    let bound = set_parent_process_death_signal(Some(Signal::KILL));
+    let done = bound.map_err(io::Error::from).and_then(|()| work());
+    kernel::end_fork(i32::from(done.is_err()))
+}
+
+fn peer(socket: &OwnedFd) -> io::Result<Peer> {
+    let (process, user) = kernel::peer(socket.as_fd())?;
+    Ok(Peer { process, user })
+}
+
+/// Waits until the source is readable, at most `limit`, and returns whether it is.
+fn ready(source: Option<BorrowedFd<'_>>, limit: Duration) -> io::Result<bool> {
+    let source = source.map(|source| PollFd::from_borrowed_fd(source, PollFlags::IN));
+    let mut polled: Vec<_> = source.into_iter().collect();
+    let limit = Timespec::try_from(limit).unwrap_or_default();
+    match poll(&mut polled, Some(&limit)) {
+        Ok(_) | Err(Errno::INTR) => {}
+        Err(error) => return Err(error.into()),
+    }
+    Ok(polled.iter().any(|each| !each.revents().is_empty()))
+}
+
+/// A bucket of tokens: so many per second, and at once.
+struct Tokens {
+    left: f64,
+    rate: f64,
+    most: f64,
+    filled: Instant,
+}
+
+impl Tokens {
+    fn new(rate: f64, most: f64) -> Self {
+        Self {
+            left: most,
+            rate,
+            most,
+            filled: Instant::now(),
+        }
+    }
+
+    /// Takes a token, or waits for the next one.
+    fn take(&mut self) {
+        let now = Instant::now();
+        let new = (now - self.filled).as_secs_f64() * self.rate;
+        (self.left, self.filled) = ((self.left + new).min(self.most), now);
+        self.left -= 1.0;
+        if self.left < 0.0 {
+            std::thread::sleep(Duration::from_secs_f64(-self.left / self.rate));
+        }
+    }
+}
+
+/// A connection with its requests, in a process of its own.
+struct Connection {
+    socket: OwnedFd,
+    peer: Peer,
+    tokens: Tokens,
+    attachments: Tokens,
+    /// Requests that were aborted, and whose processes have not ended.
+    stuck: Vec<(Request, Pid)>,
+}
+
+impl Connection {
+    fn new(socket: OwnedFd, peer: Peer) -> Self {
+        Self {
+            socket,
+            peer,
+            tokens: Tokens::new(RATE, BURST),
+            attachments: Tokens::new(ATTACHMENT_RATE, ATTACHMENT_BURST),
+            stuck: Vec::new(),
+        }
+    }
+
+    /// Answers requests until the client closes the connection.
+    fn serve(&mut self) -> io::Result<()> {
+        loop {
+            self.tokens.take();
+            let Peer {
+                process: peer_pid,
+                user: peer_uid,
+            } = self.peer;
+            match receive::<Numbered<Request>>(self.socket.as_fd()) {
+                Ok(Some((request, given))) => self.handle(request, &given)?,
+                Ok(None) => return Ok(()),
+                Err(error) => {
+                    tracing::warn!(peer_pid, peer_uid, %error, "closed a connection: malformed request");
+                    return Ok(());
+                }
+            }
+        }
+    }
+
+    fn handle(&mut self, request: Numbered<Request>, given: &[OwnedFd]) -> io::Result<()> {
+        let number = request.number;
+        if matches!(request.content, Request::Attach { .. } | Request::Mappings) {
+            self.attachments.take();
+        }
+        self.stuck.retain(|(_, child)| is_running(*child));
+        let is_stuck = |known: &(Request, Pid)| known.0 == request.content;
+        if self.stuck.iter().any(is_stuck) {
+            return self.refuse(number, "the same request is stuck in the kernel".to_owned());
+        }
+        if self.stuck.len() >= MAX_STUCK {
+            let count = self.stuck.len();
+            return self.refuse(
+                number,
+                format!("{count} earlier requests are stuck in the kernel"),
+            );
+        }
+        // SAFETY: the process of a connection has one thread.
+        let child = match unsafe { kernel::fork() } {
+            Ok(None) => in_child(|| self.answer(request, given)),
+            Ok(Some(child)) => child,
+            Err(error) => return self.refuse(number, format!("fork failed: {error}")),
+        };
+        self.finish(child, request)
+    }
+
+    /// Waits for the answer of a child process, which is killed at its deadline.
+    fn finish(&mut self, child: Pid, request: Numbered<Request>) -> io::Result<()> {
+        let (number, patience) = (request.number, request.content.patience());
+        let end = pidfd_open(child, PidfdFlags::empty());
+        let has_ended = end.is_ok_and(|end| ready(Some(end.as_fd()), patience).unwrap_or(false));
+        if has_ended {
+            let status = waitpid(Some(child), WaitOptions::empty())?;
+            let is_done = status.is_some_and(|(_, status)| status.exit_status() == Some(0));
+            return match is_done {
+                true => Ok(()),
+                false => self.refuse(
+                    number,
+                    "the request failed: see the broker's log".to_owned(),
+                ),
+            };
+        }
+        let _ = kill_process(child, Signal::KILL);
+        let reason = format!("aborted after {patience:?}: reading a file or a process blocked");
+        let request = request.content;
+        tracing::warn!(
+            peer_pid = self.peer.process,
+            ?request,
+            reason,
+            "request aborted"
+        );
+        if is_running(child) {
+            self.stuck.push((request, child));
+        }
+        self.refuse(number, reason)
+    }
+
+    /// Answers in the child process.
+    fn answer(&self, request: Numbered<Request>, given: &[OwnedFd]) -> io::Result<()> {
+        let number = request.number;
+        let answered = answer::answer(self.peer, request.content, given, &mut |content, owned| {
+            let descriptors: Vec<_> = owned.iter().map(OwnedFd::as_fd).collect();
+            let message = Numbered { number, content };
+            send(
+                self.socket.as_fd(),
+                &message,
+                &descriptors,
+                SendFlags::empty(),
+            )
+        });
+        if let Err(error) = &answered {
+            tracing::warn!(peer_pid = self.peer.process, %error, "cannot answer");
+        }
+        answered
+    }
+
+    fn refuse(&self, number: u64, reason: String) -> io::Result<()> {
+        let content = Answer::Refused(reason);
+        let answer = Numbered { number, content };
+        // A client that reads nothing has no use for it.
+        match send(self.socket.as_fd(), &answer, &[], SendFlags::DONTWAIT) {
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => Ok(()),
+            sent => sent,
+        }
+    }
+}
+
+/// Returns whether a child process has not ended; reaps one that has.
+fn is_running(child: Pid) -> bool {
+    matches!(waitpid(Some(child), WaitOptions::NOHANG), Ok(None))
+}
+
+#[cfg(test)]
+mod tests {
+    use rustix::net::{AddressFamily, SocketType, socketpair};
+
+    use super::*;
+
+    #[test]
+    fn beside_requests_that_never_end_others_are_refused() {
+        let kind = SocketType::SEQPACKET;
+        let pair = socketpair(AddressFamily::UNIX, kind, SocketFlags::CLOEXEC, None);
+        let (own, other) = pair.unwrap();
+        let peer = peer(&own).unwrap();
+        assert_eq!(peer.process, std::process::id());
+        let mut connection = Connection::new(own, peer);
+        // Children that run: they stand for those that the kernel does not end.
+        let mut children: Vec<_> = (0..MAX_STUCK)
+            .map(|_| {
+                std::process::Command::new("sleep")
+                    .arg("60")
+                    .spawn()
+                    .unwrap()
+            })
+            .collect();
+        let domain = |process: usize| Request::Domain {
+            process: process as u32,
+        };
+        let running = children.iter().enumerate().map(|(number, child)| {
+            (
+                domain(number),
+                Pid::from_raw(child.id().cast_signed()).unwrap(),
+            )
+        });
+        connection.stuck = running.collect();
+        let mut refused = |content| {
+            let request = Numbered { number: 7, content };
+            connection.handle(request, &[]).unwrap();
+            let (answer, _) = receive::<Numbered<Answer>>(other.as_fd()).unwrap().unwrap();
+            assert_eq!(answer.number, 7);
+            let Answer::Refused(reason) = answer.content else {
+                panic!("{answer:?}");
+            };
+            reason
+        };
+        assert_eq!(
+            refused(domain(0)),
+            "the same request is stuck in the kernel"
+        );
+        let reason = refused(Request::Processes);
+        assert_eq!(reason, "4 earlier requests are stuck in the kernel");
+        for child in &mut children {
+            child.kill().unwrap();
+            child.wait().unwrap();
+        }
+    }
+
+    #[test]
+    fn tokens_beyond_a_burst_come_at_their_rate() {
+        let mut tokens = Tokens::new(100.0, 5.0);
+        let began = Instant::now();
+        for _ in 0..15 {
+            tokens.take();
+        }
+        assert!(
+            began.elapsed() >= Duration::from_millis(90),
+            "{:?}",
+            began.elapsed()
+        );
+    }
+}

@@ -1,0 +1,393 @@
+//! The thread that lets the broker attach the programs, and reads their tables.
+
+use std::collections::HashSet;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use ros2probe_attach::client::{Broker, BrokerError};
+use ros2probe_attach::functions::{Calls, Library};
+use ros2probe_wire::inside::{Counter, PROCESS_CAPACITY};
+
+use super::programs::{Attached, Programs, Tables};
+use super::table::ProcessTable;
+use super::{Facts, MAX_HITS, Shared, Work};
+use crate::bell::Bell;
+use crate::error_chain::in_words;
+use crate::mappings::{MappingEvents, NewMappings, UNCONCERNED};
+use crate::system::{Clocks, wait};
+use crate::threads::Progress;
+use crate::uprobe::attachments::{Attachments, LibraryFacts, RETRY};
+use crate::uprobe::processes::Processes;
+
+/// Interval of reports.
+const EVERY: Duration = Duration::from_secs(1);
+/// How long to collect announcements before they are read.
+const GATHER: Duration = Duration::from_millis(250);
+/// Time for which the programs stay detached after all calls exceeded their budget.
+const PAUSE: Duration = Duration::from_secs(60);
+/// Intervals of looking for processes that have ended while no calls are observed: each needs the
+/// broker, which otherwise ends.
+const REVIEW: Duration = Duration::from_secs(600);
+const REVIEW_OF_MANY: Duration = Duration::from_secs(60);
+/// Known processes that are many: half of those that the programs can have.
+const MANY: usize = PROCESS_CAPACITY as usize / 2;
+/// Rounds after which rates are known: two reports of the calls of a second each.
+const ROUNDS_OF_RATES: u32 = 3;
+
+/// The breakpoints in all libraries.
+pub(super) struct Probes {
+    /// Those that stay: at all functions, or at those of initialization alone.
+    lasting: Attachments<Attached>,
+    /// At the functions of runtime, if calls are observed on demand.
+    on_demand: Option<Attachments<Attached>>,
+}
+
+impl Probes {
+    /// Creates probes in no library.
+    pub(super) fn new(programs: Programs, is_on_demand: bool, progress: &Arc<Progress>) -> Self {
+        let programs = Arc::new(programs);
+        let at = |meaning, part| {
+            let (programs, progress) = (Arc::clone(&programs), Arc::clone(progress));
+            Attachments::new(
+                meaning,
+                Box::new(move |broker, place| {
+                    progress.step();
+                    programs.attach(broker, part, place)
+                }),
+            )
+        };
+        if !is_on_demand {
+            return Self {
+                lasting: at("calls are observed", None),
+                on_demand: None,
+            };
+        }
+        let creation = "the creation of nodes and endpoints is observed";
+        Self {
+            lasting: at(creation, Some(Calls::Initialization)),
+            on_demand: Some(at("calls are observed", Some(Calls::Runtime))),
+        }
+    }
+
+    /// Attaches to installed libraries what stays.
+    pub(super) fn install(&mut self, now: Instant, broker: &mut Broker) {
+        self.lasting.install(Library::Tracing, now, broker);
+    }
+
+    /// Attaches to the libraries in use. `to_calls`: also to what is observed on demand.
+    fn follow(&mut self, processes: &Processes, to_calls: bool, now: Instant, broker: &mut Broker) {
+        self.lasting.follow(processes, now, broker);
+        if let Some(on_demand) = self.on_demand.as_mut().filter(|_| to_calls) {
+            on_demand.install(Library::Tracing, now, broker);
+            on_demand.follow(processes, now, broker);
+        }
+    }
+
+    /// Detaches from calls.
+    fn detach(&mut self) {
+        self.at_calls_mut().clear();
+    }
+
+    fn at_calls_mut(&mut self) -> &mut Attachments<Attached> {
+        self.on_demand.as_mut().unwrap_or(&mut self.lasting)
+    }
+
+    /// Returns the probes at calls.
+    fn at_calls(&self) -> &Attachments<Attached> {
+        self.on_demand.as_ref().unwrap_or(&self.lasting)
+    }
+
+    /// Returns the libraries in use.
+    fn facts(&self, is_resting: bool) -> Vec<LibraryFacts> {
+        match is_resting {
+            true => self.lasting.facts(),
+            false => self.at_calls().facts(),
+        }
+    }
+}
+
+/// The thread's main function.
+pub(super) fn follow(shared: &Shared, work: Work) {
+    let mut observation = Observation::new(work);
+    while !shared.stop.load(Ordering::Acquire) {
+        shared.progress.step();
+        if observation.is_resting && !shared.is_wanted() {
+            observation.rest(shared);
+        } else {
+            observation.look(shared);
+        }
+    }
+    shared.progress.rest();
+}
+
+/// State of the thread.
+struct Observation {
+    probes: Probes,
+    tables: Tables,
+    has_callbacks: bool,
+    broker: Broker,
+    processes: Processes,
+    table: ProcessTable,
+    mappings: Option<MappingEvents>,
+    /// When the programs were detached because of the budget of all calls.
+    suspended_at: Option<Instant>,
+    /// Whether calls are observed on demand, and no client needs them.
+    is_resting: bool,
+    /// Rounds since calls are observed.
+    rounds: u32,
+    last_round: Instant,
+    last_review: Instant,
+    /// Whether the broker did not answer last time: it may start later than this process.
+    lacks_broker: bool,
+}
+
+impl Observation {
+    fn new(work: Work) -> Self {
+        let now = Instant::now();
+        Self {
+            probes: work.probes,
+            tables: work.tables,
+            has_callbacks: work.has_callbacks,
+            broker: work.broker,
+            processes: Processes::new(work.scope, Library::Tracing),
+            table: ProcessTable::new(work.has_callbacks),
+            mappings: None,
+            suspended_at: None,
+            is_resting: false,
+            rounds: 0,
+            last_round: now,
+            last_review: now,
+            lacks_broker: false,
+        }
+    }
+
+    /// Attaches to what processes use, and reads the tables; then waits for the next round, or rests.
+    fn look(&mut self, shared: &Shared) {
+        let now = Instant::now();
+        if std::mem::take(&mut self.is_resting) {
+            self.last_round = now;
+            tracing::info!("observing calls: a client needs them");
+        }
+        if self.suspended_at.is_some_and(|at| now - at >= PAUSE) {
+            self.suspended_at = None;
+            tracing::info!("attached again inside processes");
+        }
+        // The last round must not be left out.
+        let ends = !shared.is_wanted() && !shared.is_late();
+        let failed = self.find(now, !ends && self.suspended_at.is_none());
+        if ends {
+            self.probes.detach();
+        }
+        let clocks = self.set_clocks();
+        if !shared.is_late() {
+            self.round(shared, &clocks, ends);
+        }
+        if ends {
+            self.begin_rest(shared, failed);
+            return;
+        }
+        self.rounds = self.rounds.saturating_add(1);
+        let over = || format!("all processes made more than {MAX_HITS} calls per second");
+        let detached = failed.or_else(|| self.suspended_at.map(|_| over()));
+        self.report(shared, detached);
+        self.wait(shared, now + EVERY);
+    }
+
+    /// Finds processes and attaches to their libraries. Returns why the broker did not answer.
+    fn find(&mut self, now: Instant, to_calls: bool) -> Option<String> {
+        let broker = &mut self.broker;
+        let found = self.processes.find(false, broker);
+        let failed = found.err().map(|error| in_words(&error));
+        if failed.is_none() {
+            if self.mappings.is_none() {
+                self.mappings = MappingEvents::open_or_warn("capture.inside", broker);
+            }
+            self.probes.install(now, broker);
+        }
+        self.probes.follow(&self.processes, to_calls, now, broker);
+        self.lacks_broker = failed.is_some();
+        failed
+    }
+
+    fn round(&mut self, shared: &Shared, clocks: &Clocks, is_last: bool) {
+        let elapsed = self.last_round.elapsed();
+        self.last_round += elapsed;
+        let showing = self.showing_intra_process();
+        let (tables, broker) = (&mut self.tables, &mut self.broker);
+        let is_showing = |process| showing.contains(&process);
+        let mut round = (self.table).round(tables, clocks, elapsed, broker, is_showing);
+        round.is_last = is_last;
+        let hits = round.hits;
+        shared.put(round);
+        if self.suspended_at.is_none() && !is_last && hits > MAX_HITS {
+            tracing::warn!(
+                calls_per_second = hits,
+                "detached inside processes for a minute: together they exceed the budget"
+            );
+            self.probes.detach();
+            self.suspended_at = Some(Instant::now());
+        }
+    }
+
+    /// Forgets the calls so far; the next ones begin anew.
+    fn begin_rest(&mut self, shared: &Shared, failed: Option<String>) {
+        if let Err(error) = self.tables.forget_calls() {
+            let reason = in_words(&error);
+            tracing::warn!(
+                reason,
+                "calls are still counted from their first observation"
+            );
+        }
+        self.table.forget_reports();
+        self.broker.rest();
+        self.is_resting = true;
+        self.rounds = 0;
+        self.last_review = Instant::now();
+        self.report(shared, failed);
+    }
+
+    /// Waits until a client needs calls, and follows which processes begin.
+    fn rest(&mut self, shared: &Shared) {
+        let now = Instant::now();
+        let interval = match self.lacks_broker {
+            true => RETRY,
+            false if self.table.len() >= MANY => REVIEW_OF_MANY,
+            false => REVIEW,
+        };
+        if now - self.last_review >= interval {
+            self.last_review = now;
+            let failed = self.find(now, false);
+            let clocks = Clocks::read();
+            (self.table).forget_ended(&mut self.tables, &clocks, &mut self.broker);
+            self.report(shared, failed);
+        }
+        self.wait(shared, now + EVERY);
+        self.set_clocks();
+        (self.table).drain(&mut self.tables, &Clocks::read(), &mut self.broker);
+        self.broker.rest();
+    }
+
+    /// Waits until `end`, or until the demand changes. Reads announcements during the wait: their
+    /// ring could overflow.
+    fn wait(&mut self, shared: &Shared, end: Instant) {
+        let mut gathers_until = Instant::now();
+        while let Some(event) = self.next_event(shared, gathers_until, end) {
+            shared.progress.step();
+            match event {
+                Event::Announced => {
+                    (self.table).drain(&mut self.tables, &Clocks::read(), &mut self.broker);
+                    gathers_until = Instant::now() + GATHER;
+                }
+                Event::Mapped => self.meet_mapped(),
+                Event::Demanded => {
+                    shared.bell.iter().for_each(Bell::silence);
+                    return;
+                }
+            }
+        }
+    }
+
+    /// Attaches to a library that a process has just mapped.
+    fn meet_mapped(&mut self) {
+        let new = self.take_mapped();
+        if !new.is_incomplete && new.processes.is_empty() {
+            std::thread::sleep(UNCONCERNED);
+            return;
+        }
+        // A broker that does not answer is reported in the next round.
+        let met: Result<(), BrokerError> = self.processes.meet(&new, &mut self.broker);
+        if met.is_ok() {
+            let to_calls = !self.is_resting && self.suspended_at.is_none();
+            let now = Instant::now();
+            (self.probes).follow(&self.processes, to_calls, now, &mut self.broker);
+        }
+    }
+
+    fn take_mapped(&mut self) -> NewMappings {
+        let is_library = |name: &str| Library::Tracing.has_name(name);
+        let new = self.mappings.as_mut().map(|all| all.take(is_library));
+        new.unwrap_or_default()
+    }
+
+    /// Waits until `end` for the next event, for announcements only from `gathers_until` on; returns
+    /// `None` at the end.
+    fn next_event(&self, shared: &Shared, gathers_until: Instant, end: Instant) -> Option<Event> {
+        loop {
+            let now = Instant::now();
+            let is_gathering = now < gathers_until;
+            let until = match is_gathering {
+                true => end.min(gathers_until),
+                false => end,
+            };
+            let timeout = until.saturating_duration_since(now);
+            if timeout.is_zero() {
+                return None;
+            }
+            let bell = shared
+                .bell
+                .iter()
+                .map(|bell| (Event::Demanded, bell.descriptor()));
+            let announced = (!is_gathering).then(|| (Event::Announced, self.tables.descriptor()));
+            let mapped = self.mappings.iter().flat_map(MappingEvents::descriptors);
+            let mapped = mapped.map(|ring| (Event::Mapped, ring));
+            let (events, descriptors): (Vec<_>, Vec<_>) =
+                bell.chain(announced).chain(mapped).unzip();
+            match wait(&descriptors, timeout) {
+                Ok(Some(first)) => return events.get(first).copied(),
+                Ok(None) if is_gathering => {}
+                Ok(None) | Err(_) => return None,
+            }
+        }
+    }
+
+    /// Returns the processes whose library reports every step of messages within them.
+    fn showing_intra_process(&self) -> HashSet<u32> {
+        let at_calls = self.probes.at_calls();
+        let attached = |id| at_calls.probe(id)?.as_ref().ok();
+        let shows = |id| attached(id).is_some_and(|attached| attached.shows_intra_process);
+        let using = self.processes.using();
+        let showing =
+            using.filter(|(_, used)| used.libraries.iter().any(|library| shows(&library.id)));
+        showing.map(|(process, _)| process).collect()
+    }
+
+    /// Sets the difference of the clocks for the programs, and returns their reading.
+    fn set_clocks(&mut self) -> Clocks {
+        let clocks = Clocks::read();
+        if let Err(error) = self.tables.set_clocks(&clocks) {
+            let reason = in_words(&error);
+            tracing::debug!(
+                reason,
+                "latencies inside processes use an older clock reading"
+            );
+        }
+        clocks
+    }
+
+    fn report(&self, shared: &Shared, detached: Option<String>) {
+        let values = self.tables.counters().unwrap_or_default();
+        let labels = Counter::ALL.iter().map(|counter| counter.label());
+        shared.report(Facts {
+            has_callbacks: self.has_callbacks,
+            is_on_demand: self.probes.on_demand.is_some(),
+            has_inspected: true,
+            libraries: self.probes.facts(self.is_resting),
+            detached,
+            is_resting: self.is_resting,
+            shows_rates: self.rounds >= ROUNDS_OF_RATES,
+            counters: labels.zip(values).collect(),
+        });
+    }
+}
+
+/// What ends a wait between two rounds.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Event {
+    /// A process mapped a file.
+    Mapped,
+    /// Many announcements wait.
+    Announced,
+    /// A client needs calls, or the last one no longer does.
+    Demanded,
+}

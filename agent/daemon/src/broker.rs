@@ -1,0 +1,98 @@
+//! The broker's process: its socket, its users, and its privileges.
+
+use std::fs::Permissions;
+use std::io;
+use std::os::fd::{AsFd as _, OwnedFd};
+use std::os::unix::fs::{FileTypeExt as _, PermissionsExt as _};
+use std::path::Path;
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, bail};
+pub use ros2probe_attach::client::declare_command;
+use ros2probe_attach::server::{serve, serve_one};
+use ros2probe_capture::system::hide_memory;
+use rustix::io::Errno;
+use rustix::net::sockopt::socket_acceptconn;
+use rustix::net::{
+    AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, connect, listen, socket_with,
+};
+use rustix::process::{getpid, set_child_subreaper};
+
+use crate::config::Level;
+use crate::logging::Log;
+use crate::privilege::{self, Role, user_id};
+
+/// Time without a connection after which a broker that systemd starts on demand ends.
+const IDLE: Duration = Duration::from_secs(10);
+/// A broker that a person starts stays.
+const FOREVER: Duration = Duration::from_secs(u64::MAX / 4);
+/// Connections that may wait to be accepted.
+const WAITING: i32 = 8;
+const NO_SOCKET: &str =
+    "standard input is not a socket: start ros2probe-attach.socket, or pass --listen PATH";
+/// Permissions of the socket. The broker itself accepts one user only.
+const PERMISSIONS: u32 = 0o666;
+
+/// Answers requests of agents for breakpoints and for facts of other processes. `path`: a new socket.
+/// Without it, standard input is the listening socket of systemd, or the connection of the agent
+/// that started the broker. `user`: the agents' user.
+///
+/// # Errors
+/// Fails without a socket, or if the process cannot be confined.
+pub fn run(path: Option<&Path>, user: &str) -> Result<()> {
+    let _log = Log::start(Level::Info, None);
+    hide_memory().context("cannot protect the memory of this process")?;
+    let (listener, idle) = match path {
+        Some(path) => (bound(path)?, FOREVER),
+        None => {
+            let input = io::stdin().as_fd().try_clone_to_owned()?;
+            if !socket_acceptconn(&input).context(NO_SOCKET)? {
+                confine()?;
+                return serve_one(input).context("cannot answer the agent");
+            }
+            (input, IDLE)
+        }
+    };
+    let id = user_id(user);
+    if id.is_none() {
+        tracing::warn!(user, "the user does not exist: only root may connect");
+    }
+    // Waits for requests that the kernel does not end before it ends itself.
+    set_child_subreaper(Some(getpid())).context("cannot adopt child processes")?;
+    confine()?;
+    tracing::info!(user, "listening");
+    let users: Vec<_> = id.into_iter().collect();
+    serve(listener, &users, idle).context("cannot answer agents")
+}
+
+fn confine() -> Result<()> {
+    privilege::confine(Role::Broker)?;
+    if let Some(reason) = privilege::sandbox().reason() {
+        tracing::warn!(reason, "system calls are not filtered");
+    }
+    Ok(())
+}
+
+fn is_socket(path: &Path) -> bool {
+    std::fs::symlink_metadata(path).is_ok_and(|file| file.file_type().is_socket())
+}
+
+/// Listens at a new socket. An old one without a listener is replaced.
+fn bound(path: &Path) -> Result<OwnedFd> {
+    let kind = SocketType::SEQPACKET;
+    let socket = socket_with(AddressFamily::UNIX, kind, SocketFlags::CLOEXEC, None)?;
+    let address = SocketAddrUnix::new(path)?;
+    let probe = socket_with(AddressFamily::UNIX, kind, SocketFlags::CLOEXEC, None)?;
+    let shown = path.display();
+    match connect(&probe, &address) {
+        Ok(()) => bail!("another broker listens at {shown}"),
+        // A file that is no socket refuses connections, too.
+        Err(Errno::CONNREFUSED) if is_socket(path) => std::fs::remove_file(path)
+            .with_context(|| format!("cannot replace the socket {shown}"))?,
+        Err(_) => {}
+    }
+    bind(&socket, &address).with_context(|| format!("cannot listen at {shown}"))?;
+    std::fs::set_permissions(path, Permissions::from_mode(PERMISSIONS))?;
+    listen(&socket, WAITING)?;
+    Ok(socket)
+}

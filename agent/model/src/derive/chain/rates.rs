@@ -1,0 +1,43 @@
+//! Rates of measured topics, for the comparison of a node's output with its inputs.
+
+use ros2probe_wire::Timestamp;
+
+use crate::facts::rate::{SECONDS, Slot};
+use crate::measure::profiler::Profiler;
+use crate::measure::topic::{TopicId, Topics};
+
+/// Smallest number of messages from which rates are compared.
+const FEWEST: u64 = 20;
+
+/// The numbers of messages of the last seconds.
+pub(super) struct Rates<'a> {
+    topics: &'a Topics,
+    profiler: &'a Profiler,
+    now: Timestamp,
+}
+
+impl<'a> Rates<'a> {
+    pub(super) const fn new(topics: &'a Topics, profiler: &'a Profiler, now: Timestamp) -> Self {
+        Self {
+            topics,
+            profiler,
+            now,
+        }
+    }
+
+    /// Returns whether the rates of both topics differ by at most 5 %, or one message.
+    pub(super) fn are_equal(&self, one: TopicId, other: TopicId) -> bool {
+        let (one, other) = (self.messages(one), self.messages(other));
+        one.min(other) >= FEWEST && one.abs_diff(other) <= (one.max(other) / 20).max(1)
+    }
+
+    fn messages(&self, id: TopicId) -> u64 {
+        let topic = self.topics.get(id);
+        let writers = topic.into_iter().flat_map(|topic| &topic.writers);
+        let measured = writers.filter_map(|writer| self.profiler.get(*writer));
+        let recent = measured.map(|each| each.writer.recent(self.now, SECONDS));
+        let mut sum = Slot::default();
+        recent.for_each(|(slot, _)| sum.add(&slot));
+        sum.messages
+    }
+}

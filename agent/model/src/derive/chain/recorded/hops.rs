@@ -1,0 +1,291 @@
+//! Hops between recorded topics, and the messages that went along them.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Arc;
+
+use ros2probe_wire::{DomainId, Timestamp};
+
+use super::RecordedChains;
+use super::Times;
+use super::relation::{Relation, relation};
+use crate::derive::chain::trace::{Method, Path, Point, Trace, ways};
+use crate::facts::names::TopicName;
+
+/// Number of matches from which on a hop may be accepted.
+const ENOUGH: u64 = 5;
+/// Messages of one stamp that are closer than this are published together.
+const TOGETHER: i64 = 1_000_000;
+/// Number of stamps from which delays are computed.
+const SAMPLES: usize = 4096;
+
+/// What a recording shows.
+#[derive(Default)]
+pub(super) struct Found {
+    pub(super) traces: Vec<Trace>,
+    pub(super) together: Vec<(TopicName, TopicName)>,
+    pub(super) unclear: Vec<(TopicName, Vec<TopicName>)>,
+}
+
+/// The messages of each stamp with their times, in the order of these.
+type Stamps = Vec<Vec<(u16, Timestamp)>>;
+
+/// How often two topics had one stamp, and how often the first came before the second.
+#[derive(Clone, Copy, Default)]
+struct Pair {
+    both: u64,
+    before: u64,
+}
+
+type Pairs = HashMap<(u16, u16), Pair>;
+
+/// Messages of a topic by their cause.
+#[derive(Default)]
+struct Causes {
+    matched: BTreeMap<u16, u64>,
+    /// Those of which several topics may be the cause, and these topics.
+    unclear: u64,
+    candidates: BTreeSet<u16>,
+}
+
+/// Finds the hops, and the ways of messages along them.
+pub(super) fn find(recorded: &RecordedChains, times: Times, preferred: &[&str]) -> Found {
+    let mut stamps: Stamps = recorded.stamps(times).collect();
+    let together = together(recorded, &stamps, preferred);
+    for stamp in &mut stamps {
+        join(stamp, &together);
+    }
+    let pairs = pairs(&stamps);
+    let relations = relations(recorded, &stamps, &pairs);
+    // The cause of each message of each stamp, by position.
+    let mut chosen: Vec<Vec<Option<usize>>> = Vec::with_capacity(stamps.len());
+    let mut causes: BTreeMap<u16, Causes> = BTreeMap::new();
+    for stamp in &stamps {
+        let mut of_stamp = Vec::with_capacity(stamp.len());
+        for (place, (topic, at)) in stamp.iter().enumerate() {
+            let earlier = stamp.iter().take(place).enumerate();
+            let candidates: Vec<(usize, u16)> = earlier
+                .filter(|(_, (input, before))| {
+                    before < at && follows(recorded, &pairs, *input, *topic)
+                })
+                .map(|(place, (input, _))| (place, *input))
+                .collect();
+            let nearest = nearest(&candidates, *topic, &relations);
+            let causes = causes.entry(*topic).or_default();
+            let mut cause = None;
+            match nearest.as_slice() {
+                [] => {}
+                [(place, input)] => {
+                    *causes.matched.entry(*input).or_default() += 1;
+                    cause = Some(*place);
+                }
+                several => {
+                    causes.unclear += 1;
+                    causes
+                        .candidates
+                        .extend(several.iter().map(|(_, input)| input));
+                }
+            }
+            of_stamp.push(cause);
+        }
+        chosen.push(of_stamp);
+    }
+    let accepts = |input: u16, output: u16| {
+        let causes = causes.get(&output);
+        causes.is_some_and(|causes| causes.accepts(input, recorded.stamps_of(output)))
+    };
+    let mut found = Found::default();
+    for (stamp, causes) in stamps.iter().zip(&chosen) {
+        traces(recorded, stamp, causes, &accepts, &mut found.traces);
+    }
+    for (topic, causes) in &causes {
+        let is_hop = causes.matched.keys().any(|input| accepts(*input, *topic));
+        if causes.unclear >= ENOUGH && !is_hop {
+            let names = causes.candidates.iter().map(|input| recorded.name(*input));
+            let unclear = (recorded.name(*topic), names.collect());
+            found.unclear.push(unclear);
+        }
+    }
+    let joined = together.into_iter();
+    let joined = joined.map(|(topic, lead)| (recorded.name(topic), recorded.name(lead)));
+    found.together = joined.collect();
+    found.together.sort();
+    found.unclear.sort();
+    found
+}
+
+impl Causes {
+    /// Returns whether messages with `stamps` stamps continue this input.
+    fn accepts(&self, input: u16, stamps: u64) -> bool {
+        let matched = self.matched.get(&input).copied().unwrap_or(0);
+        let all: u64 = self.matched.values().sum();
+        matched >= ENOUGH && matched * 10 >= stamps && all * 5 >= stamps * 4
+    }
+}
+
+/// Returns whether the output regularly comes after the input with its stamp, and hardly ever
+/// before it.
+fn follows(recorded: &RecordedChains, pairs: &Pairs, input: u16, output: u16) -> bool {
+    pairs.get(&(input, output)).is_some_and(|pair| {
+        let late = pair.both - pair.before;
+        pair.before >= ENOUGH
+            && late * 50 <= pair.before
+            && pair.before * 10 >= recorded.stamps_of(output)
+    })
+}
+
+/// Removes the candidates that are not the direct cause.
+fn nearest(
+    candidates: &[(usize, u16)],
+    output: u16,
+    relations: &HashMap<[u16; 3], Relation>,
+) -> Vec<(usize, u16)> {
+    let relation = |one: u16, other: u16| relations.get(&[one, other, output]).copied();
+    let is_direct = |(_, input): &&(usize, u16)| {
+        candidates.iter().all(|(_, other)| {
+            relation(*input, *other) != Some(Relation::Through)
+                && relation(*other, *input) != Some(Relation::Beside)
+        })
+    };
+    candidates.iter().filter(is_direct).copied().collect()
+}
+
+fn pairs(stamps: &Stamps) -> Pairs {
+    let mut pairs = Pairs::new();
+    for stamp in stamps {
+        for (input, before) in stamp {
+            for (output, at) in stamp.iter().filter(|(output, _)| output != input) {
+                let pair = pairs.entry((*input, *output)).or_default();
+                pair.both += 1;
+                pair.before += u64::from(before < at);
+            }
+        }
+    }
+    pairs
+}
+
+/// Returns the relation of all triples whose topics follow each other.
+fn relations(
+    recorded: &RecordedChains,
+    stamps: &Stamps,
+    pairs: &Pairs,
+) -> HashMap<[u16; 3], Relation> {
+    let follows = |input: u16, output: u16| follows(recorded, pairs, input, output);
+    let mut delays: HashMap<[u16; 3], Vec<(f64, f64)>> = HashMap::new();
+    for stamp in stamps {
+        for (place, (first, start)) in stamp.iter().enumerate() {
+            let later = stamp.get(place + 1..).unwrap_or_default();
+            for (place, (second, middle)) in later.iter().enumerate() {
+                if !follows(*first, *second) {
+                    continue;
+                }
+                for (third, end) in later.get(place + 1..).unwrap_or_default() {
+                    if !follows(*first, *third) || !follows(*second, *third) {
+                        continue;
+                    }
+                    let known = delays.entry([*first, *second, *third]).or_default();
+                    if known.len() < SAMPLES {
+                        let delay = |at: &Timestamp| (*at - *start).as_secs_f64();
+                        known.push((delay(middle), delay(end)));
+                    }
+                }
+            }
+        }
+    }
+    let relations = delays.into_iter();
+    let relations = relations.map(|(topics, delays)| (topics, relation(&delays)));
+    relations.collect()
+}
+
+/// Returns the topics that are published together with another one, each with the one that stands
+/// for all of them.
+fn together(recorded: &RecordedChains, stamps: &Stamps, preferred: &[&str]) -> BTreeMap<u16, u16> {
+    // How often both had a stamp, how often less than 1 ms apart, and how often the first led.
+    let mut pairs: BTreeMap<(u16, u16), (u64, u64)> = BTreeMap::new();
+    let mut led: BTreeMap<u16, u64> = BTreeMap::new();
+    for stamp in stamps {
+        for (place, (one, start)) in stamp.iter().enumerate() {
+            for (other, end) in stamp.get(place + 1..).unwrap_or_default() {
+                let pair = pairs.entry((*one.min(other), *one.max(other))).or_default();
+                pair.0 += 1;
+                let is_near = end.nanoseconds_since(*start).abs() < TOGETHER;
+                pair.1 += u64::from(is_near);
+                *led.entry(*one).or_default() += u64::from(is_near);
+            }
+        }
+    }
+    let mut leads: BTreeMap<u16, u16> = BTreeMap::new();
+    let lead_of =
+        |leads: &BTreeMap<u16, u16>, topic: u16| leads.get(&topic).copied().unwrap_or(topic);
+    for ((one, other), (both, near)) in &pairs {
+        let fewest = recorded.stamps_of(*one).min(recorded.stamps_of(*other));
+        if *both < ENOUGH || both * 5 < fewest * 4 || near * 2 < *both {
+            continue;
+        }
+        let (one, other) = (lead_of(&leads, *one), lead_of(&leads, *other));
+        let rank = |topic: u16| {
+            let name = recorded.name(topic);
+            let is_preferred = preferred.contains(&name.as_str());
+            let led = led.get(&topic).copied().unwrap_or(0);
+            (is_preferred, led, std::cmp::Reverse(name))
+        };
+        let (lead, joined) = match rank(one) >= rank(other) {
+            true => (one, other),
+            false => (other, one),
+        };
+        if lead != joined {
+            leads.insert(joined, lead);
+            let mut all = leads.values_mut();
+            while let Some(known) = all.find(|known| **known == joined) {
+                *known = lead;
+            }
+        }
+    }
+    leads
+}
+
+/// Replaces topics that are published together by the first message of them.
+fn join(stamp: &mut Vec<(u16, Timestamp)>, together: &BTreeMap<u16, u16>) {
+    let mut seen = BTreeSet::new();
+    stamp.retain_mut(|(topic, _)| {
+        *topic = together.get(topic).copied().unwrap_or(*topic);
+        seen.insert(*topic)
+    });
+}
+
+/// Adds the ways along accepted hops that no other hop continues.
+fn traces(
+    recorded: &RecordedChains,
+    stamp: &[(u16, Timestamp)],
+    causes: &[Option<usize>],
+    accepts: &dyn Fn(u16, u16) -> bool,
+    traces: &mut Vec<Trace>,
+) {
+    let topic = |place: usize| stamp.get(place).map(|(topic, _)| *topic);
+    let accepted = |place: usize| {
+        let cause = causes.get(place).copied().flatten()?;
+        accepts(topic(cause)?, topic(place)?).then_some(cause)
+    };
+    let causes: Vec<_> = (0..stamp.len()).map(accepted).collect();
+    for way in ways(&causes) {
+        let way: Vec<_> = way
+            .into_iter()
+            .filter_map(|place| stamp.get(place))
+            .collect();
+        let topics = way.iter().map(|(topic, _)| (recorded.name(*topic), None));
+        let path = Path {
+            domain_id: DomainId(0),
+            method: Method::Stamps,
+            topics: topics.collect(),
+        };
+        let point = |(_, at): &&(u16, Timestamp)| Point {
+            published: *at,
+            arrived: None,
+            started: None,
+        };
+        traces.push(Trace {
+            path: Arc::new(path),
+            points: way.iter().map(point).collect(),
+            trace_id: None,
+        });
+    }
+}

@@ -1,0 +1,258 @@
+//! Finds problems of the graph: examines discovery and topics after changes, and keeps findings
+//! within caps.
+
+mod endpoints;
+mod nodes;
+
+use std::cmp::Ordering;
+use std::collections::{BTreeSet, HashMap};
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::{DomainId, Guid, Timestamp};
+
+use crate::derive::chain::Chains;
+use crate::derive::inside::Inside;
+use crate::derive::services::Services;
+use crate::facts::diagnosis::{Diagnoses, Diagnosis, QosPairs};
+use crate::graph::discovery::Discovery;
+use crate::measure::topic::Topics;
+use endpoints::{EndpointExaminer, UnmatchedEndpoint};
+
+/// Time that an endpoint may be without a counterpart, since nodes start one after another.
+const MATCH_TIMEOUT: Duration = Duration::from_secs(5);
+/// Largest number of findings kept of each kind.
+const PER_KIND: usize = 256;
+/// Largest number of series for incompatible pairs.
+const MAX_QOS_PAIRS: usize = 1024;
+/// Largest number of steps per examination, about ten nanoseconds each, and per topic.
+const STEPS: usize = 500_000;
+const STEPS_PER_TOPIC: usize = 50_000;
+
+/// Examines the graph after each change.
+#[derive(Debug, Default)]
+pub struct Examiner {
+    /// Revisions of discovery, of the hanging calls, of the findings from inside processes and of the
+    /// chains at the last examination.
+    revision: Option<(u64, u64, u64, u64)>,
+    /// Time at which the first unmatched endpoint becomes a finding.
+    due: Option<Timestamp>,
+    /// Time since which each endpoint is unmatched.
+    alone: HashMap<Guid, Timestamp>,
+    current: Arc<Diagnoses>,
+    /// Time at which each finding appeared.
+    since: Arc<Vec<Timestamp>>,
+    left_out: u64,
+}
+
+/// Collects findings within the caps.
+#[derive(Debug)]
+struct Findings {
+    list: Vec<Diagnosis>,
+    counts: [usize; Diagnosis::KINDS.len()],
+    qos_pairs: Vec<QosPairs>,
+    left_out: u64,
+    unexamined: u64,
+    /// Remaining steps, in total and for this topic.
+    steps: usize,
+    steps_here: usize,
+}
+
+impl Examiner {
+    /// Returns the findings of the last examination.
+    #[must_use]
+    pub const fn current(&self) -> &Arc<Diagnoses> {
+        &self.current
+    }
+
+    /// Returns the time at which each finding appeared, in the order of the findings.
+    #[must_use]
+    pub const fn since(&self) -> &Arc<Vec<Timestamp>> {
+        &self.since
+    }
+
+    /// Returns the number of findings, their cap, and how many were omitted so far.
+    #[must_use]
+    pub fn size(&self) -> (usize, usize, u64) {
+        let limit = PER_KIND * Diagnosis::KINDS.len();
+        (self.current.list.len(), limit, self.left_out)
+    }
+
+    /// Forces the next examination, even if discovery has not changed.
+    pub fn forget(&mut self) {
+        self.revision = None;
+    }
+
+    /// Examines the graph if anything has changed since the last time.
+    pub fn examine(
+        &mut self,
+        discovery: &Discovery,
+        topics: &Topics,
+        services: &Services,
+        (inside, chains): (&Inside, &Chains),
+        now: Timestamp,
+    ) {
+        let graph = (discovery.revision(), services.revision());
+        let revision = Some((graph.0, graph.1, inside.revision(), chains.revision()));
+        let is_due = self.due.is_some_and(|due| due <= now);
+        if self.revision == revision && !is_due {
+            return;
+        }
+        self.revision = revision;
+        let mut findings = Findings::new();
+        let endpoints = EndpointExaminer::new(discovery);
+        let mut alone = HashMap::new();
+        let mut due = None;
+        for (_, topic) in topics.iter() {
+            for unmatched in endpoints.examine(topic, &mut findings) {
+                let UnmatchedEndpoint { guid, diagnosis } = unmatched;
+                let since = self.alone.get(&guid).copied().unwrap_or(now);
+                alone.insert(guid, since);
+                let end = since + MATCH_TIMEOUT;
+                if end <= now {
+                    findings.add(diagnosis);
+                } else {
+                    due = Some(due.map_or(end, |due: Timestamp| due.min(end)));
+                }
+            }
+        }
+        nodes::examine(discovery, &mut findings);
+        for (topic, writer) in services.hanging() {
+            findings.add(Diagnosis::HangingCall { topic, writer });
+        }
+        for finding in inside.findings() {
+            findings.add(finding);
+        }
+        for finding in chains.findings() {
+            findings.add(finding.clone());
+        }
+        (self.alone, self.due) = (alone, due);
+        let found = findings.finish();
+        let more = found.left_out.saturating_sub(self.current.left_out);
+        self.left_out += more;
+        if *self.current != found {
+            self.since = Arc::new(since(&self.current.list, &self.since, &found.list, now));
+            self.current = Arc::new(found);
+        }
+    }
+}
+
+/// Returns the time at which each finding in `after` appeared; known findings keep theirs.
+fn since(
+    before: &[Diagnosis],
+    times: &[Timestamp],
+    after: &[Diagnosis],
+    now: Timestamp,
+) -> Vec<Timestamp> {
+    let mut before = before.iter().zip(times).peekable();
+    let mut found = Vec::with_capacity(after.len());
+    for finding in after {
+        while before
+            .next_if(|(old, _)| old.cmp_identity(finding) == Ordering::Less)
+            .is_some()
+        {}
+        let same = before.next_if(|(old, _)| old.cmp_identity(finding) == Ordering::Equal);
+        found.push(same.map_or(now, |(_, time)| *time));
+    }
+    found
+}
+
+impl Findings {
+    fn new() -> Self {
+        Self {
+            list: Vec::new(),
+            counts: [0; Diagnosis::KINDS.len()],
+            qos_pairs: Vec::new(),
+            left_out: 0,
+            unexamined: 0,
+            steps: STEPS,
+            steps_here: 0,
+        }
+    }
+
+    /// Adds a finding if its kind has room.
+    fn add(&mut self, diagnosis: Diagnosis) {
+        let kinds = Diagnosis::KINDS.iter().zip(&mut self.counts);
+        let mut own = kinds.filter(|(kind, _)| **kind == diagnosis.kind());
+        match own.next() {
+            Some((_, count)) if *count < PER_KIND => {
+                *count += 1;
+                self.list.push(diagnosis);
+            }
+            _ => self.left_out += 1,
+        }
+    }
+
+    /// Counts findings that are omitted.
+    const fn leave_out(&mut self, count: u64) {
+        self.left_out += count;
+    }
+
+    /// Starts the step budget of the next topic.
+    const fn turn(&mut self) {
+        self.steps_here = STEPS_PER_TOPIC;
+    }
+
+    /// Spends steps; returns false if the budget is exhausted.
+    const fn spend(&mut self, steps: usize) -> bool {
+        let may = steps <= self.steps && steps <= self.steps_here;
+        if may {
+            self.steps -= steps;
+            self.steps_here -= steps;
+        }
+        may
+    }
+
+    fn finish(mut self) -> Diagnoses {
+        self.list.sort_unstable();
+        self.list.dedup();
+        let more = self.qos_pairs.len().saturating_sub(MAX_QOS_PAIRS);
+        self.qos_pairs.truncate(MAX_QOS_PAIRS);
+        Diagnoses {
+            list: self.list,
+            qos_pairs: self.qos_pairs,
+            left_out: self.left_out + more as u64,
+            unexamined: self.unexamined,
+        }
+    }
+}
+
+/// Returns the domains that are known only in part: a ROS participant there has no announced
+/// endpoint, although each has some.
+fn half_known(discovery: &Discovery) -> BTreeSet<DomainId> {
+    let participants = discovery.participants().values();
+    let silent = participants.filter(|participant| {
+        participant.proxy.enclave.is_some() && participant.endpoints.is_empty()
+    });
+    silent.map(|participant| participant.domain_id).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_finding_keeps_its_time_when_its_text_changes() {
+        let duplicate = |node: &str, participants: Vec<Guid>| Diagnosis::DuplicateNode {
+            domain_id: DomainId(0),
+            node: node.into(),
+            participants,
+        };
+        let [a, b, c] = ["/a", "/b", "/c"].map(|node| duplicate(node, Vec::new()));
+        let (one, two) = (Timestamp(1), Timestamp(2));
+        let first = since(&[], &[], std::slice::from_ref(&b), one);
+        assert_eq!(first, [one]);
+        let changed = duplicate("/b", vec![Guid::default()]);
+        let second = since(
+            std::slice::from_ref(&b),
+            &first,
+            &[a, changed, c.clone()],
+            two,
+        );
+        assert_eq!(second, [two, one, two]);
+        assert_eq!(
+            since(&[b, c.clone()], &[one, two], &[c], Timestamp(3)),
+            [two]
+        );
+    }
+}

@@ -1,0 +1,260 @@
+//! Examines one topic: which of its writers and readers match, and which have no counterpart.
+
+use std::collections::hash_map::Entry;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+use ros2probe_wire::discovery::{Role, TypeHash};
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::{DomainId, Guid};
+
+use super::Findings;
+use super::half_known;
+use crate::facts::diagnosis::{
+    self, Diagnosis, Offer, Policies, Policy, QosPairs, TopicKey, Unmatched, Verdict,
+};
+use crate::facts::names::TypeName;
+use crate::facts::topic_kind::TopicKind;
+use crate::graph::discovery::{Discovery, Endpoint};
+use crate::measure::topic::Topic;
+
+/// Largest number of incompatible pairs listed per topic.
+const PAIRS_PER_TOPIC: usize = 32;
+/// Largest number of types and hashes listed in one finding.
+const MAX_NAMED: usize = 16;
+
+/// Examines topics, with the context that it needs.
+#[derive(Debug)]
+pub(super) struct EndpointExaminer<'a> {
+    discovery: &'a Discovery,
+    half_known: BTreeSet<DomainId>,
+}
+
+/// An endpoint without a counterpart; it becomes a finding if that lasts.
+#[derive(Debug)]
+pub(super) struct UnmatchedEndpoint {
+    pub(super) guid: Guid,
+    pub(super) diagnosis: Diagnosis,
+}
+
+/// Endpoints of one role that have the same verdict against any endpoint.
+#[derive(Debug)]
+struct Group<'a> {
+    message_type: &'a TypeName,
+    offer: Offer<'a>,
+    members: Vec<Guid>,
+    /// Why the group has no counterpart; `None` if it has one or may have one.
+    unmatched: Option<Unmatched>,
+}
+
+impl<'a> EndpointExaminer<'a> {
+    pub(super) fn new(discovery: &'a Discovery) -> Self {
+        let half_known = half_known(discovery);
+        Self {
+            discovery,
+            half_known,
+        }
+    }
+
+    /// Adds findings and returns the endpoints without a counterpart.
+    pub(super) fn examine(&self, topic: &Topic, findings: &mut Findings) -> Vec<UnmatchedEndpoint> {
+        let naming = &topic.naming;
+        let key = || TopicKey {
+            domain_id: topic.domain_id,
+            dds_name: naming.dds_name.clone(),
+            name: naming.name.clone(),
+            kind: naming.kind,
+        };
+        let mut writers = self.groups(&topic.writers);
+        let mut readers = self.groups(&topic.readers);
+        self.types(topic, &key, findings);
+        compare(&mut writers, &mut readers, &key, findings);
+        if !is_about_hearing(topic) || self.half_known.contains(&topic.domain_id) {
+            return Vec::new();
+        }
+        let groups = writers.iter().map(|group| (Role::Writer, group));
+        let groups = groups.chain(readers.iter().map(|group| (Role::Reader, group)));
+        let mut unmatched = Vec::new();
+        for (role, group) in groups {
+            let Some(reason) = group.unmatched else {
+                continue;
+            };
+            for guid in &group.members {
+                let topic = key();
+                let diagnosis = match role {
+                    Role::Writer => Diagnosis::UnmatchedPublisher {
+                        topic,
+                        writer: *guid,
+                        reason,
+                    },
+                    Role::Reader => Diagnosis::UnmatchedSubscription {
+                        topic,
+                        reader: *guid,
+                        reason,
+                    },
+                };
+                unmatched.push(UnmatchedEndpoint {
+                    guid: *guid,
+                    diagnosis,
+                });
+            }
+        }
+        unmatched
+    }
+
+    fn endpoint(&self, guid: Guid) -> Option<(&'a Endpoint, VendorId)> {
+        let endpoint = self.discovery.endpoints().get(&guid)?;
+        let participant = self.discovery.participants().get(&guid.prefix)?;
+        Some((endpoint, participant.proxy.vendor))
+    }
+
+    fn groups(&self, guids: &[Guid]) -> Vec<Group<'a>> {
+        let mut groups: Vec<Group<'a>> = Vec::new();
+        let mut places: HashMap<_, usize> = HashMap::new();
+        for guid in guids {
+            let Some((endpoint, vendor)) = self.endpoint(*guid) else {
+                continue;
+            };
+            let qos = &endpoint.qos;
+            let (message_type, offer) = (&endpoint.message_type, Offer { qos, vendor });
+            match places.entry((message_type, offer)) {
+                Entry::Occupied(place) => {
+                    if let Some(group) = groups.get_mut(*place.get()) {
+                        group.members.push(*guid);
+                    }
+                }
+                Entry::Vacant(place) => {
+                    place.insert(groups.len());
+                    groups.push(Group {
+                        message_type,
+                        offer,
+                        members: vec![*guid],
+                        unmatched: Some(Unmatched::NoEndpoint),
+                    });
+                }
+            }
+        }
+        groups
+    }
+
+    /// Adds findings for several types, or several definitions of one type.
+    fn types(&self, topic: &Topic, key: &impl Fn() -> TopicKey, findings: &mut Findings) {
+        let mut types: BTreeMap<&TypeName, BTreeSet<TypeHash>> = BTreeMap::new();
+        for guid in topic.writers.iter().chain(&topic.readers) {
+            if let Some((endpoint, _)) = self.endpoint(*guid) {
+                let hashes = types.entry(&endpoint.message_type).or_default();
+                hashes.extend(endpoint.type_hash);
+            }
+        }
+        if types.len() > 1 {
+            findings.add(Diagnosis::TypeConflict {
+                topic: key(),
+                types: types.keys().take(MAX_NAMED).copied().cloned().collect(),
+            });
+        }
+        for (message_type, hashes) in types.into_iter().filter(|(_, hashes)| hashes.len() > 1) {
+            findings.add(Diagnosis::TypeHashConflict {
+                topic: key(),
+                message_type: message_type.clone(),
+                hashes: hashes.into_iter().take(MAX_NAMED).collect(),
+            });
+        }
+    }
+}
+
+/// Compares each group of writers with each group of readers.
+fn compare<'a>(
+    writers: &mut [Group<'a>],
+    readers: &mut [Group<'a>],
+    key: &impl Fn() -> TopicKey,
+    findings: &mut Findings,
+) {
+    findings.turn();
+    let mut counts = [0_u64; Policy::ALL.len()];
+    let mut listed = 0;
+    let mut open = writers.len() as u64 * readers.len() as u64;
+    'all: for writer in &mut *writers {
+        for reader in &mut *readers {
+            if !findings.spend(diagnosis::effort(writer.offer.qos, reader.offer.qos)) {
+                break 'all;
+            }
+            open -= 1;
+            if !writer.offer.shares_protocol(reader.offer) {
+                continue;
+            }
+            let hindrance = if writer.message_type != reader.message_type {
+                Some(Unmatched::Type)
+            } else {
+                match diagnosis::verdict(writer.offer, reader.offer) {
+                    Verdict::Match => None,
+                    Verdict::Partition => Some(Unmatched::Partition),
+                    Verdict::Incompatible(policies) => {
+                        let pairs = writer.members.len() as u64 * reader.members.len() as u64;
+                        for (count, policy) in counts.iter_mut().zip(Policy::ALL) {
+                            *count += pairs * u64::from(policies.contains(policy));
+                        }
+                        let room = PAIRS_PER_TOPIC - listed;
+                        let new = list(writer, reader, policies, room, key, findings);
+                        findings.leave_out(pairs - new as u64);
+                        listed += new;
+                        Some(Unmatched::Qos)
+                    }
+                }
+            };
+            for unmatched in [&mut writer.unmatched, &mut reader.unmatched] {
+                *unmatched = unmatched.and_then(|before| Some(before.min(hindrance?)));
+            }
+        }
+    }
+    if open > 0 {
+        // Groups that were not compared may have a counterpart.
+        let groups = writers.iter_mut().chain(readers);
+        groups.for_each(|group| group.unmatched = None);
+        findings.unexamined += open;
+    }
+    for (policy, pairs) in Policy::ALL.into_iter().zip(counts) {
+        if pairs > 0 {
+            findings.qos_pairs.push(QosPairs {
+                topic: key(),
+                policy,
+                pairs,
+            });
+        }
+    }
+}
+
+/// Lists pairs of these two groups while the list has room; returns their number.
+fn list(
+    writers: &Group<'_>,
+    readers: &Group<'_>,
+    policies: Policies,
+    room: usize,
+    key: &impl Fn() -> TopicKey,
+    findings: &mut Findings,
+) -> usize {
+    let pairs = writers.members.iter().flat_map(|writer| {
+        let readers = readers.members.iter();
+        readers.map(move |reader| (*writer, *reader))
+    });
+    let mut count = 0;
+    for (writer, reader) in pairs.take(room) {
+        count += 1;
+        findings.add(Diagnosis::QosIncompatible {
+            topic: key(),
+            writer,
+            reader,
+            policies,
+        });
+    }
+    count
+}
+
+/// Returns whether an endpoint without a counterpart is a problem on this topic. It is not on
+/// topics that every node has anyway: `/rosout`, `/parameter_events`, a lifecycle node's
+/// `transition_event`, hidden topics, and topics of services and actions.
+fn is_about_hearing(topic: &Topic) -> bool {
+    let naming = &topic.naming;
+    naming.kind == TopicKind::Topic
+        && !naming.hidden
+        && !matches!(&*naming.name, "/rosout" | "/parameter_events")
+        && !naming.name.ends_with("/transition_event")
+}

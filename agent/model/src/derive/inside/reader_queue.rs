@@ -1,0 +1,241 @@
+//! Messages that arrived at a process and that its subscription never took: the middleware dropped
+//! them from the subscription's queue, because the process takes too slowly.
+//!
+//! Arrivals are those of the deliveries, takes are those of the calls. All subscriptions of a
+//! process with the same topic are one queue, as a delivery belongs to a participant. A message
+//! that was not taken may still wait, so a loss needs proof:
+//!
+//! - More messages wait than the queues hold, if their depth is announced.
+//! - A message that was published later has been taken. Queues keep the order, and the latency of a
+//!   take shows when its message was published.
+//! - Takes followed the last arrival, and for long there was neither.
+//!
+//! Arrivals are compared with the takes of the next report, so a message under way is never lost.
+//! Messages within the process cannot be compared, and are not judged.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use ros2probe_wire::{Guid, Timestamp};
+
+use super::findings::{Alarm, GRACE, is_many};
+use super::tracked::HALF_WINDOW;
+use crate::facts::bounded::Bounded;
+use crate::facts::tables::QueueTotals;
+
+/// Writers of one queue; a queue with more is not judged.
+const WRITERS: usize = 256;
+/// Time without arrivals and takes after which nothing waits.
+const QUIET: Duration = Duration::from_secs(10);
+/// Arrivals may be counted so long before the clock reaches their time.
+const AHEAD: Duration = Duration::from_millis(100);
+
+/// What has arrived at the subscriptions of a process.
+#[derive(Clone, Debug, Default)]
+pub struct Arrivals {
+    /// The readers of the topic in that process, sorted.
+    pub readers: Vec<Guid>,
+    /// The writers that these readers match, sorted.
+    pub writers: Vec<ArrivalsOf>,
+    /// Messages that all readers together keep; `None` if that is not announced or unbounded.
+    pub depth: Option<u64>,
+    /// Time of the last one, or later.
+    pub last: Option<Timestamp>,
+    /// Whether timestamps of a writer are ahead of this host's clock.
+    pub is_ahead: bool,
+}
+
+/// What has arrived from one writer.
+#[derive(Clone, Copy, Debug)]
+pub struct ArrivalsOf {
+    /// The writer.
+    pub writer: Guid,
+    /// Time since which all arrivals are counted; `None` if earlier ones may be missing.
+    pub since: Option<Timestamp>,
+    /// Messages, once for each matched reader.
+    pub messages: u64,
+}
+
+/// What the subscriptions of a process have taken.
+#[derive(Clone, Debug)]
+pub(super) struct Takes {
+    /// The subscriptions, sorted.
+    pub(super) handles: Vec<u64>,
+    /// Messages that they have taken.
+    pub(super) taken: u64,
+    /// Time since which all takes are counted; `None` if earlier ones may be missing.
+    pub(super) since: Option<Timestamp>,
+    /// Time of publication of the last message that each of them has taken, or before.
+    pub(super) published: Option<Timestamp>,
+    /// Time of the last take of each of them.
+    pub(super) last: Timestamp,
+}
+
+/// The subscriptions of one process with one topic.
+#[derive(Debug)]
+pub(super) struct ReaderQueue {
+    handles: Vec<u64>,
+    readers: Vec<Guid>,
+    writers: Vec<ArrivalsOf>,
+    depth: Option<u64>,
+    /// Takes, and those that do not count: of messages whose arrival is not counted.
+    taken: u64,
+    excluded: u64,
+    /// Messages that arrived, now and at earlier reports.
+    arrived: u64,
+    past: Bounded<QueueTotals, VecDeque<(Timestamp, u64)>>,
+    lost: u64,
+    /// Whether the begin of the arrivals is known: a report after that of the takes.
+    has_begun: bool,
+    /// Time of the last change, and the longest time between takes.
+    changed: Timestamp,
+    took: Timestamp,
+    longest_gap: Duration,
+    since: Timestamp,
+    /// The earlier and the later begin of a window: time, arrivals and losses.
+    marks: [(Timestamp, u64, u64); 2],
+    pub(super) alarm: Alarm,
+}
+
+impl ReaderQueue {
+    /// Begins to compare.
+    pub(super) fn new(arrivals: &Arrivals, takes: &Takes, now: Timestamp) -> Self {
+        // The whole life of the queue is known: all takes count, and all arrivals.
+        let is_whole = takes.since.is_some_and(|observed| {
+            let mut begins = arrivals.writers.iter().map(|each| each.since);
+            begins.all(|since| since.is_some_and(|since| since >= observed))
+        });
+        let arrived = match is_whole {
+            true => sum(&arrivals.writers),
+            false => 0,
+        };
+        Self {
+            handles: takes.handles.clone(),
+            readers: arrivals.readers.clone(),
+            writers: arrivals.writers.clone(),
+            depth: arrivals.depth,
+            taken: takes.taken,
+            excluded: if is_whole { 0 } else { takes.taken },
+            arrived,
+            past: [(now + AHEAD, arrived)].into_iter().collect(),
+            lost: 0,
+            has_begun: is_whole,
+            changed: now,
+            took: now,
+            longest_gap: Duration::ZERO,
+            since: now,
+            marks: [(now, arrived, 0); 2],
+            alarm: Alarm::default(),
+        }
+    }
+
+    /// Returns whether the subscriptions are still the same.
+    pub(super) fn is_of(&self, arrivals: &Arrivals, takes: &Takes) -> bool {
+        self.handles == takes.handles
+            && self.readers == arrivals.readers
+            && self.taken <= takes.taken
+    }
+
+    /// Compares arrivals with takes. Returns the messages that were lost in the meantime.
+    pub(super) fn compare(&mut self, arrivals: &Arrivals, takes: &Takes, now: Timestamp) -> u64 {
+        let before = (self.arrived, self.taken);
+        self.arrive(arrivals);
+        // All of these takes are older than the arrivals counted now, so more takes than arrivals
+        // are takes of messages whose arrival is not counted.
+        let counted = self.taken.saturating_sub(self.excluded);
+        self.excluded += counted.saturating_sub(self.arrived);
+        if takes.taken > self.taken {
+            self.longest_gap = self.longest_gap.max(now - self.took);
+            (self.taken, self.took) = (takes.taken, now);
+        }
+        if before != (self.arrived, self.taken) {
+            self.changed = now;
+        }
+        let taken = self.taken.saturating_sub(self.excluded);
+        let mut gone = match self.depth {
+            Some(depth) => before.0.saturating_sub(depth),
+            None => 0,
+        };
+        if let Some(published) = takes.published.filter(|_| !arrivals.is_ahead) {
+            let is_before = |(at, _): &&(Timestamp, u64)| *at <= published;
+            let known = self.past.iter().rev().find(is_before);
+            gone = gone.max(known.map_or(0, |(_, arrived)| *arrived));
+        }
+        let quiet = QUIET.max(self.longest_gap.saturating_mul(3));
+        let is_after = arrivals.last.is_some_and(|arrival| takes.last > arrival);
+        if is_after && now - self.changed >= quiet {
+            gone = self.arrived;
+        }
+        let lost = gone.saturating_sub(taken).saturating_sub(self.lost);
+        self.lost += lost;
+        self.past.push_back((now + AHEAD, self.arrived));
+        lost
+    }
+
+    /// Evaluates the rule of the finding. Returns whether it appeared, went or changed.
+    pub(super) fn judge(&mut self, now: Timestamp) -> bool {
+        let [(_, arrived, lost), (middle, ..)] = self.marks;
+        let (arrived, lost) = (self.arrived - arrived, self.lost - lost);
+        let found = (arrived > 0 && is_many(lost, arrived) && now - self.since >= GRACE)
+            .then(|| (lost.saturating_mul(1000) / arrived.max(1), arrived));
+        if now - middle >= HALF_WINDOW {
+            self.marks = [self.marks[1], (now, self.arrived, self.lost)];
+        }
+        let found = found.map(|(permille, arrived)| (permille.min(1000), arrived));
+        self.alarm.judge(found)
+    }
+
+    /// Returns the numbers of messages that arrived, were taken, and were lost.
+    pub(super) fn counts(&self) -> (u64, u64, u64) {
+        let taken = self.taken.saturating_sub(self.excluded);
+        (self.arrived, taken, self.lost)
+    }
+
+    /// Returns the messages that all subscriptions together keep, if that is announced.
+    pub(super) const fn depth(&self) -> Option<u64> {
+        self.depth
+    }
+
+    /// Returns the subscriptions.
+    pub(super) fn handles(&self) -> &[u64] {
+        &self.handles
+    }
+
+    /// Returns the only writer, or `None` if there are several.
+    pub(super) const fn writer(&self) -> Option<Guid> {
+        match self.writers.as_slice() {
+            [only] => Some(only.writer),
+            _ => None,
+        }
+    }
+
+    /// Adds what has arrived. Of a writer that is new, only what is certainly new counts.
+    fn arrive(&mut self, arrivals: &Arrivals) {
+        let has_begun = std::mem::replace(&mut self.has_begun, true);
+        for each in &arrivals.writers {
+            let known = self
+                .writers
+                .iter()
+                .find(|known| known.writer == each.writer);
+            let before = match known {
+                Some(known) if has_begun => known.messages,
+                None if each.since.is_some_and(|since| since >= self.since) => 0,
+                _ => each.messages,
+            };
+            self.arrived += each.messages.saturating_sub(before);
+        }
+        self.writers.clone_from(&arrivals.writers);
+        self.depth = arrivals.depth;
+    }
+}
+
+impl Arrivals {
+    /// Returns whether the arrivals at this number of subscriptions can be compared.
+    pub(super) fn is_comparable(&self, subscriptions: usize) -> bool {
+        self.readers.len() == subscriptions && self.writers.len() <= WRITERS
+    }
+}
+
+fn sum(writers: &[ArrivalsOf]) -> u64 {
+    writers.iter().map(|each| each.messages).sum()
+}

@@ -1,0 +1,7 @@
+//! What follows from measurements: chains, services, calls inside processes, findings.
+
+pub mod chain;
+pub mod examiner;
+pub mod inside;
+pub mod services;
+pub mod trace;

@@ -1,0 +1,495 @@
+//! Spans of traced messages: when each was on the network, and when its reliable readers
+//! acknowledged it.
+//!
+//! Spans contain only what was observed, not when a message was published or processed. Whether a
+//! message is traced follows from its identity, so all agents that see it decide alike without
+//! communication. The number of open messages is bounded, and dropped ones are counted.
+
+pub mod share;
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::record::{AckNack, Body, Sample, flag};
+use ros2probe_wire::rtps::StatusInfo;
+use ros2probe_wire::{DomainId, Guid, Record, RtpsTime, SequenceNumber, Timestamp};
+
+use crate::facts::bounded::TableFacts;
+use crate::facts::bounded::{Bounded, Counted, Sum};
+use crate::facts::identity::Identity;
+use crate::facts::names::{TopicName, TypeName};
+use crate::facts::route::Destination;
+use crate::facts::tables::{
+    FinishedMessages, FinishedSpans, MessagesUnderWay, OpenMessages, OpenSpans, SettledReaders,
+    TracedWriters,
+};
+use crate::measure::samples::{Budget, Progress, Samples};
+use share::Share;
+
+/// Memory for bitmaps of fragments in bytes.
+const BITMAP_BYTES: usize = 1 << 18;
+/// Acknowledgements after this time have no span.
+const ACKNACK_TIMEOUT: Duration = Duration::from_secs(10);
+/// An arriving message is not a copy of one sent from here if no record shows that within this
+/// time.
+const LOCAL_COPY_DELAY: Duration = Duration::from_millis(500);
+/// Index of the loopback interface in every network namespace.
+pub(crate) const LOOPBACK: u32 = 1;
+
+/// The stage that a span covers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SpanStage {
+    /// The message leaves this host, or is on the wire if the direction is unknown: from the first
+    /// to the last fragment. On a gateway with a wire source, forwarded messages leave, too. In
+    /// shared memory, the time at which the agent sees the message.
+    Send,
+    /// The message arrives from another host: from the first to the last fragment.
+    Receive,
+    /// From the message's last fragment to the first ACKNACK of this reader that covers it.
+    Settle(Guid),
+}
+
+/// A span.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Span {
+    /// The stage.
+    pub stage: SpanStage,
+    /// The message.
+    pub message: Message,
+    /// Begin of the span.
+    pub begin: Timestamp,
+    /// End of the span.
+    pub end: Timestamp,
+}
+
+/// A traced message.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Message {
+    /// GUID of its writer.
+    pub writer: Guid,
+    /// Its sequence number.
+    pub sequence_number: SequenceNumber,
+    /// Trace id, derived from both.
+    pub trace_id: u128,
+    /// Its topic and type.
+    pub description: Arc<WriterDescription>,
+    /// Source timestamp, by the writer's clock.
+    pub source: RtpsTime,
+    /// Size of the payload in bytes.
+    pub size: u32,
+    /// Number of fragments; 1 for an unfragmented message.
+    pub fragments: u32,
+    /// Destination of its first datagram.
+    pub destination: Destination,
+}
+
+/// Properties shared by all messages of a writer.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct WriterDescription {
+    /// Domain.
+    pub domain_id: DomainId,
+    /// ROS name.
+    pub topic: TopicName,
+    /// Type.
+    pub message_type: TypeName,
+    /// Whether its readers may acknowledge.
+    pub reliable: bool,
+}
+
+/// Spans completed since the last call.
+#[derive(Debug, Default)]
+pub struct Spans {
+    /// Spans in the order in which they ended.
+    pub spans: Bounded<FinishedSpans, Vec<Span>>,
+    /// Number of spans dropped because the list was full.
+    pub lost: u64,
+}
+
+/// State of all traced writers.
+#[derive(Debug)]
+pub struct Tracer {
+    wanted: bool,
+    directed: bool,
+    /// Traced writers; `None` for a writer that is not traced.
+    writers: Bounded<TracedWriters, HashMap<Guid, Option<Box<WriterTrace>>>>,
+    shared: Shared,
+}
+
+/// Budgets that all writers share.
+#[derive(Debug)]
+struct Shared {
+    budget: Budget,
+    open: Sum<Counted<OpenSpans>>,
+    finished: Spans,
+}
+
+/// A writer that is traced.
+#[derive(Debug)]
+struct WriterTrace {
+    description: Arc<WriterDescription>,
+    /// Identity of its messages, before the sequence number is added.
+    identity: Identity,
+    share: Share,
+    samples: Samples,
+    /// Whether it sends from this host. The kernel shows a multicast's local copies before its
+    /// departure, so the first message arrives before this is known.
+    is_local: bool,
+    under_way: Bounded<MessagesUnderWay, VecDeque<Message>>,
+    /// Spans of arrivals, until it is certain that they were not sent from this host.
+    arrived: Bounded<OpenMessages, VecDeque<Span>>,
+    waiting: Bounded<OpenMessages, VecDeque<Unacknowledged>>,
+    done: Bounded<FinishedMessages, VecDeque<SequenceNumber>>,
+}
+
+/// A message that was sent and that some readers have not acknowledged.
+#[derive(Debug)]
+struct Unacknowledged {
+    message: Message,
+    at: Timestamp,
+    readers: Bounded<SettledReaders, Vec<Guid>>,
+}
+
+/// Where a sample was seen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Place {
+    /// Where it leaves its writer's host, or in that host's shared memory.
+    Departure,
+    /// At a receiver on its writer's host.
+    LocalCopy,
+    /// At a receiver; its writer is not known to run on this host.
+    Arrival,
+}
+
+impl Tracer {
+    /// Creates a tracer without writers. In a capture file the direction is unknown: `directed` is
+    /// then false, and all messages count as sent.
+    #[must_use]
+    pub fn new(directed: bool) -> Self {
+        Self {
+            wanted: false,
+            directed,
+            writers: Bounded::default(),
+            shared: Shared {
+                budget: Budget::new(BITMAP_BYTES),
+                open: Sum::default(),
+                finished: Spans::default(),
+            },
+        }
+    }
+
+    /// Returns whether any topic is traced.
+    #[must_use]
+    pub const fn is_wanted(&self) -> bool {
+        self.wanted
+    }
+
+    /// Restarts after a change of the traced topics.
+    pub fn restart(&mut self, wanted: bool) {
+        self.wanted = wanted;
+        self.writers.take();
+        self.shared.budget = Budget::new(BITMAP_BYTES);
+        self.shared.open.clear();
+    }
+
+    /// Removes a writer.
+    pub fn forget(&mut self, writer: Guid) {
+        if let Some(Some(traced)) = self.writers.remove(&writer) {
+            traced.close(&mut self.shared);
+        }
+    }
+
+    /// Processes a record. `is_local` states whether the writer is known to run on this host, so
+    /// that no message of it arrives from another one. `about` returns the description and traced share of a new writer, or
+    /// `None` if they are not known yet.
+    pub fn record(
+        &mut self,
+        record: &Record,
+        is_local: bool,
+        about: impl FnOnce() -> Option<(WriterDescription, Option<Share>)>,
+    ) {
+        const UNDELIVERED: u16 = flag::SOCKET_FULL | flag::NOT_REASSEMBLED;
+        let writer = record.writer();
+        if !self.writers.contains_key(&writer) {
+            let Some((description, share)) = about() else {
+                return;
+            };
+            let traced = share.map(|share| WriterTrace::new(writer, description, share).into());
+            if self.writers.insert(writer, traced).is_some() {
+                self.shared.open.refuse();
+                return;
+            }
+        }
+        let Some(Some(traced)) = self.writers.get_mut(&writer) else {
+            return;
+        };
+        match record.body() {
+            Body::AckNack(acknack) => traced.acknowledged(acknack, &mut self.shared),
+            Body::Sample(sample)
+                if record.flags & UNDELIVERED == 0 && sample.status_info() == StatusInfo::ALIVE =>
+            {
+                let place = match self.directed {
+                    true => Place::of(record, is_local),
+                    false => Some(Place::Departure),
+                };
+                if let Some(place) = place {
+                    traced.sample(sample, place, &mut self.shared);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// Drops messages whose acknowledgements are overdue.
+    pub fn advance(&mut self, now: Timestamp) {
+        for traced in self.writers.values_mut().flatten() {
+            traced.release(now, &mut self.shared);
+            while let Some(first) = traced.waiting.front()
+                && now - first.at > ACKNACK_TIMEOUT
+            {
+                traced.waiting.pop_front();
+                self.shared.open.sub(1);
+            }
+        }
+    }
+
+    /// Removes and returns the spans completed since the last call.
+    pub fn take(&mut self) -> Spans {
+        std::mem::take(&mut self.shared.finished)
+    }
+
+    /// Returns the row of the metrics: the open messages of all writers.
+    #[must_use]
+    pub fn table(&self) -> TableFacts {
+        self.shared.open.facts()
+    }
+}
+
+impl Message {
+    /// Returns the identity of a message, equal for every agent that sees it.
+    #[must_use]
+    pub fn identity(writer: Guid, sequence_number: SequenceNumber) -> u128 {
+        numbered(of_writer(writer), sequence_number)
+    }
+}
+
+fn of_writer(writer: Guid) -> Identity {
+    let mut identity = Identity::of(b"ros2 message");
+    identity.add(&writer.to_bytes());
+    identity
+}
+
+fn numbered(mut identity: Identity, sequence_number: SequenceNumber) -> u128 {
+    identity.add(&sequence_number.0.to_be_bytes());
+    identity.bits()
+}
+
+impl WriterTrace {
+    fn new(writer: Guid, description: WriterDescription, share: Share) -> Self {
+        Self {
+            description: Arc::new(description),
+            identity: of_writer(writer),
+            share,
+            samples: Samples::default(),
+            is_local: false,
+            under_way: Bounded::default(),
+            arrived: Bounded::default(),
+            waiting: Bounded::default(),
+            done: Bounded::default(),
+        }
+    }
+
+    fn sample(&mut self, sample: Sample<'_>, place: Place, shared: &mut Shared) {
+        let (record, number) = (sample.record(), sample.sequence_number());
+        let trace_id = numbered(self.identity, number);
+        if !self.share.takes(trace_id) {
+            return;
+        }
+        if place != Place::Arrival && !self.is_local {
+            self.forget_arrivals(shared);
+        }
+        // Copies that arrive do not belong to the departure.
+        let is_copy = place == Place::LocalCopy || self.is_local && place == Place::Arrival;
+        if is_copy || self.done.contains(&number) {
+            return;
+        }
+        let known = |message: &Message| message.sequence_number == number;
+        let index = match self.under_way.iter().position(known) {
+            // The wire shows its fragments.
+            Some(_) if record.flags & flag::SHM != 0 => return,
+            Some(index) => index,
+            None => match self.begin(self.message(sample, trace_id), shared) {
+                Some(index) => index,
+                None => return,
+            },
+        };
+        let at = Timestamp(record.time);
+        let (begin, source) = match sample {
+            Sample::Data(_) => (record.began(), sample.source_timestamp()),
+            Sample::DataFrag(fragments) => {
+                match self.samples.fragment(fragments, at, &mut shared.budget) {
+                    Progress::Partial | Progress::Duplicate => return,
+                    Progress::Complete(facts) => (facts.began, facts.source),
+                    Progress::Rejected | Progress::TooMany => {
+                        self.under_way.remove(index);
+                        shared.give_up();
+                        return;
+                    }
+                }
+            }
+        };
+        let Some(mut message) = self.under_way.remove(index) else {
+            return;
+        };
+        message.source = source;
+        self.done.push_back(number);
+        self.whole(message, begin, at, shared);
+    }
+
+    /// Processes a message that was seen whole.
+    fn whole(&mut self, message: Message, begin: Timestamp, at: Timestamp, shared: &mut Shared) {
+        if self.waiting.len() + self.arrived.len() >= OpenMessages::CAP {
+            self.waiting.refuse();
+            self.arrived
+                .pop_front()
+                .map_or_else(|| drop(self.waiting.pop_front()), drop);
+            shared.give_up();
+        }
+        let mut span = Span {
+            stage: SpanStage::Receive,
+            message,
+            begin,
+            end: at,
+        };
+        if !self.is_local {
+            self.arrived.push_back(span);
+            return self.release(at, shared);
+        }
+        span.stage = SpanStage::Send;
+        let message = span.message.clone();
+        shared.finish(span);
+        if !self.description.reliable {
+            shared.open.sub(1);
+            return;
+        }
+        self.waiting.push_back(Unacknowledged {
+            message,
+            at,
+            readers: Bounded::default(),
+        });
+    }
+
+    /// Completes the spans of arrivals that are old enough to be from another host.
+    fn release(&mut self, now: Timestamp, shared: &mut Shared) {
+        while let Some(first) = self.arrived.front()
+            && now - first.end > LOCAL_COPY_DELAY
+            && let Some(span) = self.arrived.pop_front()
+        {
+            shared.open.sub(1);
+            shared.finish(span);
+        }
+    }
+
+    /// Drops the spans of arrivals, because the writer sends from this host.
+    fn forget_arrivals(&mut self, shared: &mut Shared) {
+        self.is_local = true;
+        let open = self.under_way.len() + self.arrived.len();
+        shared.open.sub(open);
+        self.under_way.clear();
+        self.arrived.clear();
+        self.done.clear();
+        self.samples.clear(&mut shared.budget);
+    }
+
+    /// Adds a message, dropping another if necessary, and returns its index.
+    fn begin(&mut self, message: Message, shared: &mut Shared) -> Option<usize> {
+        if self.under_way.is_full() {
+            self.under_way.pop_front();
+            self.under_way.refuse();
+            shared.give_up();
+        }
+        if shared.open.is_full() {
+            if self.waiting.pop_front().is_none() {
+                shared.open.refuse();
+                return None;
+            }
+            shared.give_up();
+        }
+        shared.open.add(1);
+        self.under_way.push_back(message);
+        self.under_way.len().checked_sub(1)
+    }
+
+    fn message(&self, sample: Sample<'_>, trace_id: u128) -> Message {
+        let record = sample.record();
+        Message {
+            writer: record.writer(),
+            sequence_number: sample.sequence_number(),
+            trace_id,
+            description: Arc::clone(&self.description),
+            source: sample.source_timestamp(),
+            size: sample.size(),
+            fragments: match sample {
+                Sample::Data(_) => 1,
+                Sample::DataFrag(fragments) => fragments.total(),
+            },
+            destination: Destination::of(record),
+        }
+    }
+
+    fn acknowledged(&mut self, acknack: AckNack<'_>, shared: &mut Shared) {
+        let record = acknack.record();
+        let (reader, at) = (record.reader(), Timestamp(record.time));
+        let covered = |waiting: &&mut Unacknowledged| {
+            waiting.message.sequence_number < acknack.base()
+                && !waiting.readers.contains(&reader)
+                && !waiting.readers.is_full()
+        };
+        for waiting in self.waiting.iter_mut().filter(covered) {
+            waiting.readers.push(reader);
+            shared.finish(Span {
+                stage: SpanStage::Settle(reader),
+                message: waiting.message.clone(),
+                begin: waiting.at,
+                end: at.max(waiting.at),
+            });
+        }
+    }
+
+    fn close(mut self, shared: &mut Shared) {
+        self.release(Timestamp(u64::MAX), shared);
+        let open = self.under_way.len() + self.waiting.len();
+        shared.open.sub(open);
+        self.samples.clear(&mut shared.budget);
+    }
+}
+
+impl Place {
+    /// Returns the place; `None` for a message that a router of this host passes on.
+    const fn of(record: &Record, is_local: bool) -> Option<Self> {
+        let on_wire = record.flags & flag::HOST == 0;
+        let leaves = record.flags & (flag::OUTGOING | flag::SHM) != 0
+            || on_wire && record.interface == LOOPBACK;
+        let by_router = record.flags & flag::STREAM != 0 && !on_wire && !is_local;
+        match (leaves, is_local) {
+            (true, _) if by_router => None,
+            (true, _) => Some(Self::Departure),
+            (false, true) => Some(Self::LocalCopy),
+            (false, false) => Some(Self::Arrival),
+        }
+    }
+}
+
+impl Shared {
+    fn finish(&mut self, span: Span) {
+        self.finished.lost += u64::from(self.finished.spans.push(span).is_some());
+    }
+
+    fn give_up(&mut self) {
+        self.open.sub(1);
+        self.open.refuse();
+    }
+}
+
+#[cfg(test)]
+mod tests;

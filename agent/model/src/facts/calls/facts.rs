@@ -1,0 +1,302 @@
+//! Facts from inside processes in a snapshot.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::{DomainId, Guid, Timestamp};
+
+use super::report::{Durations, Trigger};
+use crate::facts::names::{NodeName, TopicName};
+
+/// Facts from inside processes. Lists are sorted by process and handle.
+#[derive(Clone, Debug, Default)]
+pub struct InsideFacts {
+    /// Time of the last report.
+    pub at: Timestamp,
+    /// Whether callbacks are observed, and not only messages.
+    pub has_callbacks: bool,
+    /// Observed processes.
+    pub processes: Vec<ObservedProcess>,
+    /// Publishers.
+    pub publishers: Vec<Publisher>,
+    /// Subscriptions that take from the middleware.
+    pub subscriptions: Vec<Subscription>,
+    /// Queues of these subscriptions, as far as their arrivals are known.
+    pub reader_queues: Vec<ReaderQueue>,
+    /// Ring buffers of intra-process subscriptions.
+    pub buffers: Vec<Buffer>,
+    /// Callbacks.
+    pub callbacks: Vec<Callback>,
+    /// Last lifecycle state of each managed node.
+    pub states: Vec<LifecycleState>,
+}
+
+/// An observed process.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ObservedProcess {
+    /// Process id in the initial namespace.
+    pub id: u32,
+    /// Its name.
+    pub name: Option<Arc<str>>,
+    /// Its domain.
+    pub domain_id: DomainId,
+    /// CPU time per second over the last window; 1 is one CPU. `None` before the second report.
+    pub cpu: Option<f64>,
+    /// Observed calls per second over the same window.
+    pub calls_hz: Option<f64>,
+    /// Observed calls so far.
+    pub calls: u64,
+    /// Calls that were not counted because of too many handles.
+    pub refused: u64,
+    /// Its calls exceed the budget and are not counted.
+    pub is_suspended: bool,
+    /// Its library reports every step of intra-process messages.
+    pub shows_intra_process: bool,
+    /// Its nodes, as far as they are known.
+    pub nodes: Vec<NodeName>,
+}
+
+/// Identity of a publisher, subscription, buffer or callback.
+#[derive(Clone, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Owner {
+    /// Process id.
+    pub process: u32,
+    /// Address in the process.
+    pub handle: u64,
+    /// Domain.
+    pub domain_id: DomainId,
+    /// Its node, if known.
+    pub node: Option<NodeName>,
+}
+
+/// Durations of the last window.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Quantiles {
+    /// Number of durations.
+    pub count: u64,
+    /// Median.
+    pub p50: Duration,
+    /// 99th percentile.
+    pub p99: Duration,
+    /// Largest duration; that of its bucket if an earlier one was larger.
+    pub maximum: Duration,
+}
+
+/// A publisher.
+#[derive(Clone, Debug)]
+pub struct Publisher {
+    /// Identity and node.
+    pub owner: Owner,
+    /// Its topic.
+    pub topic: TopicName,
+    /// Identifier of its middleware.
+    pub middleware: Option<Arc<str>>,
+    /// Messages published.
+    pub published: u64,
+    /// Messages among them passed directly to subscriptions in the same process.
+    pub within_process: u64,
+    /// Publications per second over the last window.
+    pub rate_hz: Option<f64>,
+    /// Time of the last one.
+    pub last: Timestamp,
+    /// Time between consecutive ones, over the last window.
+    pub interval: Quantiles,
+}
+
+/// A subscription.
+#[derive(Clone, Debug)]
+pub struct Subscription {
+    /// Identity and node.
+    pub owner: Owner,
+    /// Its topic.
+    pub topic: TopicName,
+    /// Identifier of its middleware.
+    pub middleware: Option<Arc<str>>,
+    /// Messages taken.
+    pub taken: u64,
+    /// Attempts that returned no message.
+    pub failed: u64,
+    /// Messages taken per second over the last window.
+    pub rate_hz: Option<f64>,
+    /// Time of the last message.
+    pub last: Timestamp,
+    /// Time from the source timestamp to the take, over the last window.
+    pub latency: Quantiles,
+}
+
+/// The ring buffer of an intra-process subscription.
+#[derive(Clone, Debug)]
+pub struct Buffer {
+    /// Identity and node.
+    pub owner: Owner,
+    /// Its topic, if known.
+    pub topic: Option<TopicName>,
+    /// Messages put into the buffer.
+    pub enqueued: u64,
+    /// Messages overwritten before they were taken.
+    pub overwritten: u64,
+    /// Messages taken.
+    pub dequeued: u64,
+    /// Share of the messages of the last window that were overwritten.
+    pub overwritten_ratio: Option<f64>,
+    /// Messages in the buffer after the last entry.
+    pub depth: u32,
+    /// The largest of these.
+    pub max_depth: u32,
+    /// Capacity, if known.
+    pub capacity: Option<u32>,
+    /// Messages put into the buffer per second over the last window.
+    pub rate_hz: Option<f64>,
+    /// Time of the last entry.
+    pub last: Timestamp,
+    /// Time that messages spent in the buffer, over the last window.
+    pub waiting: Quantiles,
+}
+
+/// The queue of a process's subscriptions with one topic, between the network and the call that
+/// takes.
+#[derive(Clone, Debug)]
+pub struct ReaderQueue {
+    /// Process, the first of its subscriptions, and the node of all.
+    pub owner: Owner,
+    /// Its topic.
+    pub topic: TopicName,
+    /// The only writer whose messages arrive; `None` if there are several.
+    pub writer: Option<Guid>,
+    /// Messages that it keeps, if that is announced.
+    pub depth: Option<u64>,
+    /// Messages that arrived since the agent compares.
+    pub arrived: u64,
+    /// Messages among them that were taken.
+    pub taken: u64,
+    /// Messages among them that were lost.
+    pub lost: u64,
+}
+
+/// A callback.
+#[derive(Clone, Debug)]
+pub struct Callback {
+    /// Identity and node.
+    pub owner: Owner,
+    /// What triggers it.
+    pub trigger: Trigger,
+    /// Thread of its last call.
+    pub thread: u32,
+    /// Completed calls.
+    pub calls: u64,
+    /// Periods in which a timer was not called.
+    pub skipped: u64,
+    /// Calls per second over the last window.
+    pub rate_hz: Option<f64>,
+    /// Share of the last window that its calls took.
+    pub busy: Option<f64>,
+    /// End of the last call.
+    pub last: Timestamp,
+    /// Duration of calls, over the last window.
+    pub duration: Quantiles,
+    /// Time from being ready to the start, over the last window.
+    pub wait: Quantiles,
+    /// Durations of all calls.
+    pub durations: Arc<Durations>,
+    /// Waits of all calls.
+    pub waits: Arc<Durations>,
+}
+
+/// The last lifecycle state of a managed node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LifecycleState {
+    /// Process id.
+    pub process: u32,
+    /// Domain.
+    pub domain_id: DomainId,
+    /// The node, if known.
+    pub node: Option<NodeName>,
+    /// Label of the state.
+    pub state: Arc<str>,
+    /// Label of the state before.
+    pub before: Arc<str>,
+    /// Time of the transition.
+    pub at: Timestamp,
+}
+
+/// Sums of a topic over all processes, also those that have ended. No count ever decreases.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct TopicCounts {
+    /// Messages published. Humble does not report messages within a process: there it is at least
+    /// the number of receptions of one callback.
+    pub published: u64,
+    /// Messages among them passed directly to subscriptions in the same process.
+    pub within_process: u64,
+    /// Messages taken from the middleware, by all subscriptions.
+    pub taken: u64,
+    /// Attempts to take that returned no message.
+    pub failed: u64,
+    /// Messages put into buffers of intra-process subscriptions.
+    pub enqueued: u64,
+    /// Messages among them overwritten before they were taken.
+    pub overwritten: u64,
+    /// Messages taken from these buffers.
+    pub dequeued: u64,
+    /// Calls of callbacks for messages of the same process.
+    pub receptions: u64,
+}
+
+/// What processes show of a topic.
+#[derive(Clone, Debug, Default)]
+pub struct TopicInside {
+    /// Sums.
+    pub counts: TopicCounts,
+    /// Messages of the topic: those published in observed processes, or those that one subscription
+    /// took, if more.
+    pub messages: u64,
+    /// These messages per second over the last window.
+    pub rate_hz: f64,
+    /// Time of the last message.
+    pub last: Option<Timestamp>,
+    /// Live publishers in observed processes.
+    pub publishers: usize,
+    /// Live subscriptions and buffers in observed processes.
+    pub subscriptions: usize,
+    /// Messages in the buffers after the last entries.
+    pub depth: u64,
+    /// Time from the source timestamp to the take, of all messages.
+    pub latency: Arc<Durations>,
+    /// Time that messages spent in buffers.
+    pub waiting: Arc<Durations>,
+    /// Messages that arrived at observed processes and were never taken; `None` if arrivals and
+    /// takes of no process can be compared.
+    pub lost_in_queues: Option<u64>,
+}
+
+impl InsideFacts {
+    /// Converts all times.
+    pub fn convert(&mut self, convert: impl Fn(Timestamp) -> Timestamp) {
+        self.at = convert(self.at);
+        for state in &mut self.states {
+            state.at = convert(state.at);
+        }
+        let publishers = self.publishers.iter_mut().map(|each| &mut each.last);
+        let subscriptions = self.subscriptions.iter_mut().map(|each| &mut each.last);
+        let buffers = self.buffers.iter_mut().map(|each| &mut each.last);
+        let callbacks = self.callbacks.iter_mut().map(|each| &mut each.last);
+        let all = publishers.chain(subscriptions);
+        for last in all.chain(buffers).chain(callbacks) {
+            *last = convert(*last);
+        }
+    }
+}
+
+impl Quantiles {
+    /// Returns the quantiles of these durations.
+    #[must_use]
+    pub fn of(durations: &Durations) -> Self {
+        let quantile = |part| durations.quantile(part).unwrap_or_default();
+        let range = durations.range();
+        Self {
+            count: durations.count(),
+            p50: quantile(0.5),
+            p99: quantile(0.99),
+            maximum: range.map_or(Duration::ZERO, |(_, largest)| largest),
+        }
+    }
+}

@@ -1,0 +1,247 @@
+//! What a source reports about calls inside processes: cumulative figures, once a second.
+
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::{DomainId, Timestamp};
+
+pub use super::durations::Durations;
+use crate::facts::names::{NodeName, TopicName};
+
+/// A report about calls inside processes. Handles that have not changed since the last report are
+/// left out.
+#[derive(Clone, Debug, Default)]
+pub struct Report {
+    /// Time at which the figures were read.
+    pub at: Timestamp,
+    /// Whether callbacks are observed, and not only messages.
+    pub has_callbacks: bool,
+    /// Processes with changes, and those that have ended since.
+    pub processes: Vec<ProcessReport>,
+    /// Lifecycle transitions since the last report.
+    pub transitions: Vec<Transition>,
+}
+
+impl Report {
+    /// Converts all times.
+    pub fn convert(&mut self, convert: impl Fn(Timestamp) -> Timestamp) {
+        self.at = convert(self.at);
+        for transition in &mut self.transitions {
+            transition.at = convert(transition.at);
+        }
+        for process in &mut self.processes {
+            let publishers = process.publishers.iter_mut().map(|each| &mut each.last);
+            let subscriptions = process.subscriptions.iter_mut().map(|each| &mut each.last);
+            let buffers = process.buffers.iter_mut().map(|each| &mut each.last);
+            let callbacks = process.callbacks.iter_mut().map(|each| &mut each.last);
+            let all = publishers.chain(subscriptions);
+            for last in all.chain(buffers).chain(callbacks) {
+                *last = convert(*last);
+            }
+        }
+    }
+}
+
+/// One process.
+#[derive(Clone, Debug, Default)]
+pub struct ProcessReport {
+    /// Process id in the initial namespace.
+    pub id: u32,
+    /// Name of the process.
+    pub name: Option<Arc<str>>,
+    /// Its domain, from `ROS_DOMAIN_ID` of its environment.
+    pub domain_id: DomainId,
+    /// CPU time so far, user and system.
+    pub cpu: Duration,
+    /// Calls observed.
+    pub hits: u64,
+    /// Calls that were not counted because there were too many handles.
+    pub refused: u64,
+    /// The process exceeds its budget, and its calls are no longer counted.
+    pub is_suspended: bool,
+    /// The process has ended; these are its last figures.
+    pub has_ended: bool,
+    /// Its library reports every step of intra-process messages (rclcpp of Iron and later), not
+    /// only their callbacks.
+    pub shows_intra_process: bool,
+    /// Nodes that it created while it was observed.
+    pub nodes: Vec<NodeName>,
+    /// Publishers.
+    pub publishers: Vec<PublisherReport>,
+    /// Subscriptions that take from the middleware.
+    pub subscriptions: Vec<SubscriptionReport>,
+    /// Ring buffers of intra-process subscriptions.
+    pub buffers: Vec<BufferReport>,
+    /// Callbacks.
+    pub callbacks: Vec<CallbackReport>,
+}
+
+/// One publisher.
+#[derive(Clone, Debug)]
+pub struct PublisherReport {
+    /// Its address, which identifies it in its process.
+    pub handle: u64,
+    /// Its node, if the process created it while it was observed.
+    pub node: Option<NodeName>,
+    /// ROS name of its topic.
+    pub topic: TopicName,
+    /// Identifier of its middleware, such as `rmw_fastrtps_cpp`.
+    pub middleware: Option<Arc<str>>,
+    /// Messages published.
+    pub published: u64,
+    /// Messages among them passed directly to subscriptions in the same process.
+    pub within_process: u64,
+    /// Time of the last one.
+    pub last: Timestamp,
+    /// Time between consecutive ones.
+    pub intervals: Durations,
+}
+
+/// One subscription.
+#[derive(Clone, Debug)]
+pub struct SubscriptionReport {
+    /// Its address.
+    pub handle: u64,
+    /// Its node, if the process created it while it was observed.
+    pub node: Option<NodeName>,
+    /// ROS name of its topic.
+    pub topic: TopicName,
+    /// Identifier of its middleware.
+    pub middleware: Option<Arc<str>>,
+    /// Messages taken from the middleware.
+    pub taken: u64,
+    /// Attempts that returned no message.
+    pub failed: u64,
+    /// Time of the last message.
+    pub last: Timestamp,
+    /// Time between consecutive messages.
+    pub intervals: Durations,
+    /// Time from the source timestamp to the take.
+    pub latency: Durations,
+}
+
+/// The ring buffer of one intra-process subscription.
+#[derive(Clone, Debug)]
+pub struct BufferReport {
+    /// Its address.
+    pub handle: u64,
+    /// The subscription's node, if known.
+    pub node: Option<NodeName>,
+    /// ROS name of its topic; `None` until a publication shows it.
+    pub topic: Option<TopicName>,
+    /// Messages put into the buffer.
+    pub enqueued: u64,
+    /// Messages overwritten before they were taken: lost.
+    pub overwritten: u64,
+    /// Messages taken.
+    pub dequeued: u64,
+    /// Messages in the buffer after the last entry.
+    pub depth: u32,
+    /// The largest of these so far.
+    pub max_depth: u32,
+    /// Capacity, if the process created the buffer while it was observed.
+    pub capacity: Option<u32>,
+    /// Time of the last entry.
+    pub last: Timestamp,
+    /// Time that messages spent in the buffer.
+    pub waiting: Durations,
+}
+
+/// One callback of rclcpp.
+#[derive(Clone, Debug)]
+pub struct CallbackReport {
+    /// Its address.
+    pub handle: u64,
+    /// Its node, if known.
+    pub node: Option<NodeName>,
+    /// What triggers it.
+    pub trigger: Trigger,
+    /// Thread of its last call.
+    pub thread: u32,
+    /// Completed calls.
+    pub calls: u64,
+    /// End of the last one.
+    pub last: Timestamp,
+    /// Duration of the calls.
+    pub durations: Durations,
+    /// Time from being ready to the start: since a timer was due, since a message entered its ring
+    /// buffer, or since its source timestamp beyond the least such time seen.
+    pub waits: Durations,
+    /// Periods in which a timer was not called.
+    pub skipped: u64,
+}
+
+/// What triggers a callback.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Trigger {
+    /// Messages from the middleware.
+    Subscription(TopicName),
+    /// Messages from the same process; the topic is unknown if the process was started before.
+    IntraProcess(Option<TopicName>),
+    /// A timer; the period is unknown if its structure cannot be read.
+    Timer(Option<Duration>),
+    /// A service with its name, or another callback without one.
+    Service(Option<Arc<str>>),
+}
+
+impl Trigger {
+    /// Returns the label value.
+    #[must_use]
+    pub const fn label(&self) -> &'static str {
+        match self {
+            Self::Subscription(_) => "subscription",
+            Self::IntraProcess(_) => "intra_process",
+            Self::Timer(_) => "timer",
+            Self::Service(_) => "service",
+        }
+    }
+
+    /// Returns the topic or service, if it is known.
+    #[must_use]
+    pub fn name(&self) -> Option<&str> {
+        match self {
+            Self::Subscription(topic) | Self::IntraProcess(Some(topic)) => Some(topic),
+            Self::Service(name) => name.as_deref(),
+            Self::IntraProcess(None) | Self::Timer(_) => None,
+        }
+    }
+
+    /// Returns the timer's period, if it is known.
+    #[must_use]
+    pub const fn period(&self) -> Option<Duration> {
+        match self {
+            Self::Timer(period) => *period,
+            _ => None,
+        }
+    }
+}
+
+/// Describes the trigger: `/scan`, `timer of 50 ms`, `service /reset`.
+impl fmt::Display for Trigger {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Subscription(topic) | Self::IntraProcess(Some(topic)) => f.write_str(topic),
+            Self::IntraProcess(None) => f.write_str("messages of the same process"),
+            Self::Timer(Some(period)) => write!(f, "timer of {period:?}"),
+            Self::Timer(None) => f.write_str("timer"),
+            Self::Service(Some(name)) => write!(f, "service {name}"),
+            Self::Service(None) => f.write_str("service"),
+        }
+    }
+}
+
+/// A transition of a managed node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Transition {
+    /// Process of the node.
+    pub process: u32,
+    /// The node, if the process created it while it was observed.
+    pub node: Option<NodeName>,
+    /// Label of the state before.
+    pub start: Arc<str>,
+    /// Label of the state after.
+    pub goal: Arc<str>,
+    /// Time of the transition.
+    pub at: Timestamp,
+}

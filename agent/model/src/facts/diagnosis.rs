@@ -1,0 +1,481 @@
+//! Problems of the graph that discovery shows: incompatible endpoints, duplicate names, endpoints
+//! without a counterpart.
+//!
+//! Findings are computed when discovery changes, topic by topic. Endpoints with equal properties
+//! are grouped. Both the computing steps and the list of findings are bounded, and omitted findings
+//! are counted. A finding is a value, so comparing two lists yields the changes ([`changes`]). The
+//! severity of a finding is decided elsewhere.
+
+mod matching;
+
+use std::cmp::Ordering;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::{DomainId, Guid};
+
+use crate::facts::calls::facts::Owner;
+use crate::facts::calls::report::Trigger;
+use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
+use crate::facts::topic_kind::TopicKind;
+pub(crate) use matching::effort;
+pub use matching::{Offer, Policies, Policy, Verdict, verdict};
+
+/// The topic of a finding.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct TopicKey {
+    /// Domain of the topic.
+    pub domain_id: DomainId,
+    /// DDS name; together with the domain it identifies the topic.
+    pub dds_name: DdsName,
+    /// ROS name, or the DDS name if the topic has none.
+    pub name: TopicName,
+    /// Role of the topic in ROS.
+    pub kind: TopicKind,
+}
+
+/// A finding. The first fields of a variant identify it; the last one may change.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Diagnosis {
+    /// A writer and a reader of one topic and type do not match because of their QoS.
+    QosIncompatible {
+        /// Topic.
+        topic: TopicKey,
+        /// GUID of the writer, which offers less.
+        writer: Guid,
+        /// GUID of the reader, which requests more.
+        reader: Guid,
+        /// Incompatible policies.
+        policies: Policies,
+    },
+    /// A topic has several types; endpoints of different types do not match.
+    TypeConflict {
+        /// Topic.
+        topic: TopicKey,
+        /// ROS types, sorted.
+        types: Vec<TypeName>,
+    },
+    /// A type has several definitions; endpoints match but misread each other's messages.
+    TypeHashConflict {
+        /// Topic.
+        topic: TopicKey,
+        /// ROS type.
+        message_type: TypeName,
+        /// RIHS01 hashes, sorted.
+        hashes: Vec<TypeHash>,
+    },
+    /// Several nodes in one domain have the same name.
+    DuplicateNode {
+        /// Domain.
+        domain_id: DomainId,
+        /// Fully qualified name.
+        node: NodeName,
+        /// The participant of each node, sorted; a participant with several such nodes is repeated.
+        participants: Vec<Guid>,
+    },
+    /// A writer without a matching reader.
+    UnmatchedPublisher {
+        /// Topic.
+        topic: TopicKey,
+        /// GUID of the writer.
+        writer: Guid,
+        /// The nearest mismatch.
+        reason: Unmatched,
+    },
+    /// A reader without a matching writer.
+    UnmatchedSubscription {
+        /// Topic.
+        topic: TopicKey,
+        /// GUID of the reader.
+        reader: Guid,
+        /// The nearest mismatch.
+        reason: Unmatched,
+    },
+    /// A client has called a service and received no reply within the timeout.
+    HangingCall {
+        /// Topic of the requests.
+        topic: TopicKey,
+        /// GUID of the client's writer.
+        writer: Guid,
+    },
+    /// A node whose endpoints or names are in several domains, so nodes of one domain miss some.
+    NodeInSeveralDomains {
+        /// Fully qualified name.
+        node: NodeName,
+        /// The lowest GUID among its participants.
+        participant: Guid,
+        /// Domains, sorted.
+        domains: Vec<DomainId>,
+    },
+    /// A callback runs longer than the period of its timer, or of a timer in the same thread.
+    SlowCallback {
+        /// Its topic, if messages trigger it.
+        topic: Option<TopicKey>,
+        /// The callback.
+        callback: Owner,
+        /// What triggers it.
+        trigger: Trigger,
+        /// 99th percentile of its duration.
+        duration: Duration,
+        /// The period.
+        period: Duration,
+        /// Whether the period is that of its own timer.
+        is_own_period: bool,
+    },
+    /// A callback waits longer than its interval until the executor calls it.
+    ExecutorWait {
+        /// Its topic, if messages trigger it.
+        topic: Option<TopicKey>,
+        /// The callback.
+        callback: Owner,
+        /// What triggers it.
+        trigger: Trigger,
+        /// 99th percentile of its wait.
+        wait: Duration,
+    },
+    /// Messages within a process are overwritten before the subscription takes them.
+    IntraProcessOverflow {
+        /// Topic.
+        topic: TopicKey,
+        /// The subscription's queue.
+        queue: Owner,
+        /// Overwritten messages of 1000 that entered the queue.
+        overwritten_permille: u64,
+    },
+    /// A process takes its messages so slowly that the middleware drops some from the queue of its
+    /// subscription.
+    ReaderQueueOverflow {
+        /// Topic.
+        topic: TopicKey,
+        /// The subscription.
+        queue: Owner,
+        /// Lost messages of 1000 that arrived.
+        lost_permille: u64,
+        /// Messages that the queue keeps, if that is announced.
+        depth: Option<u64>,
+    },
+    /// A process makes more calls than its budget allows, and they are no longer counted.
+    ObservationSuspended {
+        /// Domain of the process.
+        domain_id: DomainId,
+        /// Process id.
+        process: u32,
+        /// Its name.
+        name: Option<Arc<str>>,
+    },
+    /// A node that publishes at the rate of an input, but with new stamps: chains end there.
+    RestampingNode {
+        /// Topic that it publishes.
+        topic: TopicKey,
+        /// Fully qualified name.
+        node: NodeName,
+        /// Input with the same rate, whose stamps are older.
+        input: TopicName,
+    },
+    /// A configured chain takes longer than it may.
+    SlowChain {
+        /// Last topic of the chain.
+        topic: TopicKey,
+        /// First topic of the chain.
+        from: TopicName,
+        /// Longest time that it may take.
+        max_latency: Duration,
+    },
+}
+
+/// Why an endpoint has no counterpart: the mismatch that is nearest to a match.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Unmatched {
+    /// A counterpart exists, but its quality of service does not match.
+    Qos,
+    /// A counterpart exists, but with another type.
+    Type,
+    /// A counterpart exists, but in another partition.
+    Partition,
+    /// No counterpart exists.
+    NoEndpoint,
+}
+
+/// The pairs of a topic that one policy makes incompatible.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct QosPairs {
+    /// Topic.
+    pub topic: TopicKey,
+    /// The incompatible policy.
+    pub policy: Policy,
+    /// Number of pairs, including those that the list omits.
+    pub pairs: u64,
+}
+
+/// All findings.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Diagnoses {
+    /// Findings, sorted and without duplicates.
+    pub list: Vec<Diagnosis>,
+    /// Complete counts of incompatible pairs, sorted by topic and policy.
+    pub qos_pairs: Vec<QosPairs>,
+    /// Findings omitted because the list is full.
+    pub left_out: u64,
+    /// Pairs of endpoint groups that were not compared because there are too many.
+    pub unexamined: u64,
+}
+
+/// A difference between two lists of findings.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Change<'a> {
+    /// The finding is new.
+    Appeared(&'a Diagnosis),
+    /// The finding has the same identity but other details.
+    Changed(&'a Diagnosis),
+    /// The finding is gone; this is its last value.
+    Resolved(&'a Diagnosis),
+}
+
+impl Diagnosis {
+    /// All kinds, as label values.
+    pub const KINDS: [&'static str; 15] = [
+        "qos_incompatible",
+        "type_conflict",
+        "type_hash_conflict",
+        "duplicate_node",
+        "unmatched_publisher",
+        "unmatched_subscription",
+        "hanging_call",
+        "node_in_several_domains",
+        "slow_callback",
+        "executor_wait",
+        "intra_process_overflow",
+        "reader_queue_overflow",
+        "observation_suspended",
+        "restamping_node",
+        "slow_chain",
+    ];
+
+    /// Returns the kind as a label value.
+    #[must_use]
+    pub const fn kind(&self) -> &'static str {
+        match self {
+            Self::QosIncompatible { .. } => "qos_incompatible",
+            Self::TypeConflict { .. } => "type_conflict",
+            Self::TypeHashConflict { .. } => "type_hash_conflict",
+            Self::DuplicateNode { .. } => "duplicate_node",
+            Self::UnmatchedPublisher { .. } => "unmatched_publisher",
+            Self::UnmatchedSubscription { .. } => "unmatched_subscription",
+            Self::HangingCall { .. } => "hanging_call",
+            Self::NodeInSeveralDomains { .. } => "node_in_several_domains",
+            Self::SlowCallback { .. } => "slow_callback",
+            Self::ExecutorWait { .. } => "executor_wait",
+            Self::IntraProcessOverflow { .. } => "intra_process_overflow",
+            Self::ReaderQueueOverflow { .. } => "reader_queue_overflow",
+            Self::ObservationSuspended { .. } => "observation_suspended",
+            Self::RestampingNode { .. } => "restamping_node",
+            Self::SlowChain { .. } => "slow_chain",
+        }
+    }
+
+    /// Returns the topic of the finding, if it concerns a topic.
+    #[must_use]
+    pub const fn topic(&self) -> Option<&TopicKey> {
+        match self {
+            Self::QosIncompatible { topic, .. }
+            | Self::TypeConflict { topic, .. }
+            | Self::TypeHashConflict { topic, .. }
+            | Self::UnmatchedPublisher { topic, .. }
+            | Self::UnmatchedSubscription { topic, .. }
+            | Self::HangingCall { topic, .. }
+            | Self::IntraProcessOverflow { topic, .. }
+            | Self::ReaderQueueOverflow { topic, .. }
+            | Self::RestampingNode { topic, .. }
+            | Self::SlowChain { topic, .. } => Some(topic),
+            Self::SlowCallback { topic, .. } | Self::ExecutorWait { topic, .. } => topic.as_ref(),
+            Self::DuplicateNode { .. }
+            | Self::NodeInSeveralDomains { .. }
+            | Self::ObservationSuspended { .. } => None,
+        }
+    }
+
+    /// Compares identities only, without details. Consistent with the order of the list.
+    #[must_use]
+    pub fn cmp_identity(&self, other: &Self) -> Ordering {
+        let place = |diagnosis: &Self| {
+            let mut kinds = Self::KINDS.iter();
+            kinds.position(|kind| *kind == diagnosis.kind())
+        };
+        let topics = || self.topic().cmp(&other.topic());
+        place(self)
+            .cmp(&place(other))
+            .then_with(topics)
+            .then_with(|| self.within_topic().cmp(&other.within_topic()))
+            .then_with(|| self.handle().cmp(&other.handle()))
+    }
+
+    /// Returns the publisher, subscription or callback that the finding concerns, if any.
+    #[must_use]
+    pub const fn owner(&self) -> Option<&Owner> {
+        match self {
+            Self::SlowCallback { callback, .. } | Self::ExecutorWait { callback, .. } => {
+                Some(callback)
+            }
+            Self::IntraProcessOverflow { queue, .. } | Self::ReaderQueueOverflow { queue, .. } => {
+                Some(queue)
+            }
+            _ => None,
+        }
+    }
+
+    /// Returns the process and handle of a finding from inside processes.
+    fn handle(&self) -> Option<(u32, u64)> {
+        match self {
+            Self::ObservationSuspended { process, .. } => Some((*process, 0)),
+            _ => self.owner().map(|owner| (owner.process, owner.handle)),
+        }
+    }
+
+    /// Returns the key that distinguishes findings of one kind and topic.
+    fn within_topic(&self) -> (DomainId, &str, Option<Guid>, Option<Guid>) {
+        match self {
+            Self::QosIncompatible { writer, reader, .. } => {
+                (DomainId(0), "", Some(*writer), Some(*reader))
+            }
+            Self::TypeConflict { .. } => (DomainId(0), "", None, None),
+            Self::TypeHashConflict { message_type, .. } => (DomainId(0), message_type, None, None),
+            Self::DuplicateNode {
+                domain_id, node, ..
+            } => (*domain_id, node, None, None),
+            Self::UnmatchedPublisher { writer, .. } | Self::HangingCall { writer, .. } => {
+                (DomainId(0), "", Some(*writer), None)
+            }
+            Self::UnmatchedSubscription { reader, .. } => (DomainId(0), "", Some(*reader), None),
+            Self::NodeInSeveralDomains {
+                node, participant, ..
+            } => (DomainId(0), node, Some(*participant), None),
+            Self::ObservationSuspended { domain_id, .. } => (*domain_id, "", None, None),
+            Self::SlowCallback { .. }
+            | Self::ExecutorWait { .. }
+            | Self::IntraProcessOverflow { .. }
+            | Self::ReaderQueueOverflow { .. } => (DomainId(0), "", None, None),
+            Self::RestampingNode { node, .. } => (DomainId(0), node, None, None),
+            Self::SlowChain { from, .. } => (DomainId(0), from, None, None),
+        }
+    }
+}
+
+impl Unmatched {
+    /// Returns the label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Qos => "qos",
+            Self::Type => "type",
+            Self::Partition => "partition",
+            Self::NoEndpoint => "no_endpoint",
+        }
+    }
+}
+
+/// Returns the differences between two sorted lists, in their order.
+pub fn changes<'a>(
+    before: &'a [Diagnosis],
+    after: &'a [Diagnosis],
+) -> impl Iterator<Item = Change<'a>> {
+    let (mut before, mut after) = (before.iter().peekable(), after.iter().peekable());
+    std::iter::from_fn(move || {
+        loop {
+            let order = match (before.peek(), after.peek()) {
+                (None, None) => return None,
+                (Some(_), None) => Ordering::Less,
+                (None, Some(_)) => Ordering::Greater,
+                (Some(old), Some(new)) => old.cmp_identity(new),
+            };
+            match order {
+                Ordering::Less => return before.next().map(Change::Resolved),
+                Ordering::Greater => return after.next().map(Change::Appeared),
+                Ordering::Equal => {
+                    let (old, new) = (before.next(), after.next());
+                    if let Some(new) = new.filter(|new| old != Some(*new)) {
+                        return Some(Change::Changed(new));
+                    }
+                }
+            }
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::{EntityId, GuidPrefix};
+
+    use super::*;
+
+    fn guid(number: u8) -> Guid {
+        Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, number, 3]))
+    }
+
+    fn unmatched(name: &str, writer: u8, reason: Unmatched) -> Diagnosis {
+        Diagnosis::UnmatchedPublisher {
+            topic: TopicKey {
+                domain_id: DomainId(0),
+                dds_name: format!("rt{name}").into(),
+                name: name.into(),
+                kind: TopicKind::Topic,
+            },
+            writer: guid(writer),
+            reason,
+        }
+    }
+
+    fn duplicate(node: &str) -> Diagnosis {
+        Diagnosis::DuplicateNode {
+            domain_id: DomainId(3),
+            node: node.into(),
+            participants: vec![guid(1), guid(2)],
+        }
+    }
+
+    #[test]
+    fn two_lists_tell_what_came_changed_and_went() {
+        let before = [
+            duplicate("/b"),
+            unmatched("/a", 1, Unmatched::NoEndpoint),
+            unmatched("/a", 2, Unmatched::NoEndpoint),
+        ];
+        let after = [
+            duplicate("/a"),
+            duplicate("/b"),
+            unmatched("/a", 2, Unmatched::Qos),
+            unmatched("/c", 1, Unmatched::NoEndpoint),
+        ];
+        assert!(before.is_sorted() && after.is_sorted());
+        let seen: Vec<_> = changes(&before, &after).collect();
+        let expected = [
+            Change::Appeared(&after[0]),
+            Change::Resolved(&before[1]),
+            Change::Changed(&after[2]),
+            Change::Appeared(&after[3]),
+        ];
+        assert_eq!(seen, expected);
+        assert_eq!(changes(&after, &after).count(), 0);
+    }
+
+    #[test]
+    fn identity_agrees_with_the_order_of_the_list() {
+        let mut all = [
+            unmatched("/b", 1, Unmatched::NoEndpoint),
+            unmatched("/a", 2, Unmatched::Qos),
+            unmatched("/a", 1, Unmatched::Type),
+            duplicate("/x"),
+            Diagnosis::NodeInSeveralDomains {
+                node: "/a".into(),
+                participant: guid(1),
+                domains: vec![DomainId(0), DomainId(5)],
+            },
+        ];
+        all.sort();
+        let ordered = all.is_sorted_by(|one, other| one.cmp_identity(other) == Ordering::Less);
+        assert!(ordered);
+        for kind in all.iter().map(Diagnosis::kind) {
+            assert!(Diagnosis::KINDS.contains(&kind));
+        }
+    }
+}

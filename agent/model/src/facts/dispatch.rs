@@ -1,0 +1,131 @@
+//! Samples, and reasons for missing ones, as subscriptions receive them.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::qos::Qos;
+use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
+
+use crate::facts::names::{DdsName, TopicName, TypeName};
+
+/// The topic of a sample.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Topic {
+    /// Domain.
+    pub domain_id: DomainId,
+    /// ROS name, or the DDS name if it follows no ROS convention.
+    pub name: TopicName,
+    /// DDS name.
+    pub dds_name: DdsName,
+    /// ROS name of the type, as in `sensor_msgs/msg/PointCloud2`.
+    pub message_type: TypeName,
+    /// Properties that the writer announced.
+    pub offered: Option<Arc<Offered>>,
+}
+
+/// Properties that a writer announced with its topic.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Offered {
+    /// RIHS01 hash of its type; announced since Iron.
+    pub type_hash: Option<TypeHash>,
+    /// Quality of service.
+    pub qos: Arc<Qos>,
+}
+
+/// A message. It is immutable and shared by all subscriptions.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Sample {
+    /// Its topic.
+    pub topic: Arc<Topic>,
+    /// Capture time of the completing datagram. If the sample waited for a lower number, the time
+    /// at which that arrived or was given up. It never decreases for one writer.
+    pub time: Timestamp,
+    /// GUID of its writer.
+    pub writer: Guid,
+    /// Its sequence number, counted by the writer.
+    pub sequence_number: SequenceNumber,
+    /// INFO_TS: time of writing, by the writer's clock.
+    pub source_timestamp: Option<Timestamp>,
+    /// Seconds and nanoseconds of its header, if the type begins with one.
+    pub header_stamp: Option<(i32, u32)>,
+    /// Size of the serialized payload in bytes, including encapsulation and padding.
+    pub size: u32,
+    /// Sampled from shared memory: missing numbers before it may still have been sent.
+    pub sampled: bool,
+    /// The payload, including encapsulation; `None` if the request excludes payloads.
+    pub payload: Option<Bytes>,
+}
+
+/// Samples that were sent but are missing from the subscription.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Missed {
+    /// Their topic.
+    pub topic: Arc<Topic>,
+    /// GUID of their writer.
+    pub writer: Guid,
+    /// First sequence number.
+    pub first: SequenceNumber,
+    /// Last sequence number.
+    pub last: SequenceNumber,
+    /// Number of missing samples in this range.
+    pub samples: u64,
+    /// Reason.
+    pub reason: MissedReason,
+}
+
+/// Why a sample is missing from a subscription.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum MissedReason {
+    /// Some of its fragments were never seen.
+    Incomplete,
+    /// No part of it was seen, and it is lost.
+    Lost,
+    /// It arrived before its writer's announcement and was not sent again.
+    Unannounced,
+    /// It was counted, but its bytes were not captured or found no memory.
+    NotCaptured,
+    /// The subscription's reader was too slow.
+    QueueFull,
+}
+
+impl MissedReason {
+    /// All reasons.
+    pub const ALL: [Self; 5] = [
+        Self::Incomplete,
+        Self::Lost,
+        Self::Unannounced,
+        Self::NotCaptured,
+        Self::QueueFull,
+    ];
+
+    /// Returns the label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Incomplete => "incomplete",
+            Self::Lost => "lost",
+            Self::Unannounced => "unannounced",
+            Self::NotCaptured => "not_captured",
+            Self::QueueFull => "queue_full",
+        }
+    }
+}
+
+/// An outcome and the subscriptions that receive it.
+#[derive(Clone, Debug)]
+pub struct Dispatch {
+    /// Ids of the requests.
+    pub to: Arc<[u64]>,
+    /// The sample, or why it is missing.
+    pub outcome: SampleOutcome,
+}
+
+/// A sample, or the reason why it is missing.
+#[derive(Clone, Debug)]
+pub enum SampleOutcome {
+    /// The sample was counted.
+    Sample(Arc<Sample>),
+    /// The sample will not arrive.
+    Missed(Missed),
+}

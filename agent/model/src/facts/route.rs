@@ -1,0 +1,188 @@
+//! The route of a record: direction, receiving socket and destination address.
+
+use std::net::{IpAddr, Ipv6Addr, SocketAddr};
+
+use ros2probe_wire::record::flag;
+use ros2probe_wire::{GuidPrefix, Record};
+
+/// The direction of a delivery.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub enum Direction {
+    /// The samples left this host. Losses are not counted, because unsent samples have no receiver.
+    Sent,
+    /// The samples arrived at a receiver.
+    Received,
+}
+
+impl Direction {
+    /// Returns the label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Sent => "sent",
+            Self::Received => "received",
+        }
+    }
+}
+
+/// A UDP destination.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug, Default)]
+pub struct Destination {
+    /// Address, IPv4-mapped for IPv4.
+    pub address: [u8; 16],
+    /// Port.
+    pub port: u16,
+}
+
+impl Destination {
+    /// Returns the destination of the record's datagram.
+    #[must_use]
+    pub fn of(record: &Record) -> Self {
+        let [a, b, c, d] = record.destination.map(u32::to_ne_bytes);
+        let mut address = [0; 16];
+        for (into, from) in address.iter_mut().zip([a, b, c, d].as_flattened()) {
+            *into = *from;
+        }
+        Self {
+            address,
+            port: record.destination_port,
+        }
+    }
+
+    /// Returns whether its datagrams may reach several receivers.
+    #[must_use]
+    pub fn is_multicast(&self) -> bool {
+        self.socket_address().ip().is_multicast()
+    }
+
+    /// Returns the address in its usual form, with mapped IPv4 addresses converted.
+    #[must_use]
+    pub fn socket_address(&self) -> SocketAddr {
+        let address = Ipv6Addr::from(self.address).to_canonical();
+        SocketAddr::new(address, self.port)
+    }
+}
+
+impl From<SocketAddr> for Destination {
+    fn from(address: SocketAddr) -> Self {
+        let mapped = match address.ip() {
+            IpAddr::V4(ip) => ip.to_ipv6_mapped(),
+            IpAddr::V6(ip) => ip,
+        };
+        Self {
+            address: mapped.octets(),
+            port: address.port(),
+        }
+    }
+}
+
+/// A route of a writer's samples.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub struct Route {
+    /// Outgoing or incoming.
+    pub direction: Direction,
+    /// Cookie of the receiving socket; 0 for outgoing samples and on a wire source.
+    pub socket: u64,
+    /// Destination of the samples.
+    pub destination: Destination,
+}
+
+impl Route {
+    /// Returns the route of the record's datagram.
+    #[must_use]
+    pub fn of(record: &Record) -> Self {
+        let destination = Destination::of(record);
+        if record.flags & flag::OUTGOING != 0 {
+            return Self {
+                direction: Direction::Sent,
+                socket: 0,
+                destination,
+            };
+        }
+        Self {
+            direction: Direction::Received,
+            socket: if record.flags & flag::HOST != 0 {
+                record.socket
+            } else {
+                0
+            },
+            destination,
+        }
+    }
+}
+
+impl Route {
+    /// Returns whether the route is outgoing.
+    #[must_use]
+    pub fn is_sent(&self) -> bool {
+        self.direction == Direction::Sent
+    }
+
+    /// Returns whether it is an incoming multicast route, whose receiver is not evident.
+    #[must_use]
+    pub fn is_open(&self) -> bool {
+        !self.is_sent() && self.destination.is_multicast()
+    }
+}
+
+/// The receiver of the samples.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
+pub enum Receiver {
+    /// A participant, on any route.
+    Participant(GuidPrefix),
+    /// The receivers at the end of this route.
+    Route(Route),
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn destination(address: &str) -> Destination {
+        Destination::from(address.parse::<SocketAddr>().unwrap())
+    }
+
+    #[test]
+    fn a_place_is_written_as_it_was_read() {
+        for text in ["10.0.0.2:7411", "239.255.0.1:7401", "[fe80::1]:7411"] {
+            assert_eq!(destination(text).socket_address().to_string(), text);
+        }
+        assert!(
+            destination("239.255.0.1:7401").is_multicast()
+                && destination("[ff02::1]:1").is_multicast()
+        );
+        assert!(
+            !destination("10.0.0.2:7411").is_multicast()
+                && !destination("[fe80::1]:1").is_multicast()
+        );
+    }
+
+    #[test]
+    fn a_socket_distinguishes_paths_only_where_it_receives() {
+        let record = Record {
+            destination: [
+                0,
+                0,
+                u32::from_be(0xffff),
+                u32::from_ne_bytes([10, 0, 0, 2]),
+            ],
+            destination_port: 7411,
+            socket: 77,
+            flags: flag::HOST,
+            ..Record::default()
+        };
+        let received = Route::of(&record);
+        assert_eq!(
+            (received.direction, received.socket),
+            (Direction::Received, 77)
+        );
+        assert_eq!(received.destination, destination("10.0.0.2:7411"));
+        let sent = Route::of(&Record {
+            flags: flag::HOST | flag::OUTGOING,
+            ..record
+        });
+        assert_eq!((sent.direction, sent.socket), (Direction::Sent, 0));
+        let on_the_wire = Route::of(&Record { flags: 0, ..record });
+        assert_eq!(on_the_wire.socket, 0);
+    }
+}

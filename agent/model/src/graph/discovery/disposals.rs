@@ -1,0 +1,50 @@
+//! Recent disposals: delayed copies of an announcement or samples must not bring the entity back.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
+
+use super::facts::Origin;
+use crate::facts::bounded::Bounded;
+use crate::facts::tables::LatestDisposals;
+
+/// Announcements older than a disposal are ignored for this long after it.
+const STALE_WITHIN: Duration = Duration::from_millis(500);
+/// Samples that were already sent arrive within this time.
+const UNDER_WAY: Duration = Duration::from_secs(2);
+
+/// The latest disposals, oldest first.
+#[derive(Debug, Default)]
+pub(super) struct Disposals {
+    /// The GUID, the time, and the sender and sequence number of the disposal.
+    latest: Bounded<LatestDisposals, VecDeque<(Guid, Timestamp, GuidPrefix, SequenceNumber)>>,
+}
+
+impl Disposals {
+    pub(super) fn add(&mut self, guid: Guid, origin: &Origin) {
+        let disposal = (guid, origin.at, origin.sender, origin.sequence_number);
+        self.latest.push_back(disposal);
+    }
+
+    /// Returns whether the entity was disposed so recently that its samples may still arrive.
+    pub(super) fn is_recent(&self, guid: Guid, now: Timestamp) -> bool {
+        let fresh = |at: Timestamp| at + UNDER_WAY > now;
+        self.latest
+            .iter()
+            .any(|(disposed, at, ..)| *disposed == guid && fresh(*at))
+    }
+
+    /// Returns whether an announcement is a delayed copy from before the entity's disposal.
+    pub(super) fn is_stale(&self, guid: Guid, origin: &Origin) -> bool {
+        self.latest
+            .iter()
+            .rev()
+            .any(|(disposed, at, sender, number)| {
+                *disposed == guid
+                    && *sender == origin.sender
+                    && *number > origin.sequence_number
+                    && *at + STALE_WITHIN > origin.at
+            })
+    }
+}

@@ -1,0 +1,283 @@
+//! State of participants, endpoints and nodes, and how a participant's domain is determined.
+
+use std::collections::BTreeSet;
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use ros2probe_wire::discovery::{ParticipantAnnouncement, Role, TypeHash};
+use ros2probe_wire::entities::NodeEntities;
+use ros2probe_wire::names::DdsTopic;
+use ros2probe_wire::qos::Qos;
+use ros2probe_wire::rtps::{Locator, VendorId};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix, RtpsDuration, SequenceNumber, Timestamp};
+use serde::{Deserialize, Serialize};
+
+use super::eviction::MAX_SILENCE;
+use super::priority::Priority;
+use crate::facts::bounded::Bounded;
+use crate::facts::names::{DdsName, NodeName, TypeName};
+use crate::facts::naming::Naming;
+use crate::facts::tables::ParticipantEndpoints;
+
+/// Largest number of addresses kept per participant and kind.
+pub(super) const ADDRESSES: usize = 16;
+
+/// Source of a participant's domain, from the least to the most reliable.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DomainSource {
+    /// No source; domain 0 is assumed.
+    Assumed,
+    /// A unicast port in the range of discovery ports.
+    UnicastPort,
+    /// The multicast port of its announcements.
+    MulticastPort,
+    /// The announcement itself.
+    Announced,
+}
+
+/// Origin of an announcement.
+#[derive(Clone, Copy, Debug)]
+pub struct Origin {
+    /// Time of capture.
+    pub at: Timestamp,
+    /// GUID prefix of the sender, which may relay another participant's announcement.
+    pub sender: GuidPrefix,
+    /// Sequence number, counted by the sender's writer.
+    pub sequence_number: SequenceNumber,
+    /// Destination address, IPv4-mapped for IPv4.
+    pub destination: [u8; 16],
+    /// Destination port.
+    pub port: u16,
+}
+
+/// Properties that a participant announces.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ParticipantProxy {
+    /// Implementation.
+    pub vendor: VendorId,
+    /// ROS enclave.
+    pub enclave: Option<Arc<str>>,
+    /// Host name.
+    pub host: Option<Arc<str>>,
+    /// Process name.
+    pub process_name: Option<Arc<str>>,
+    /// Process id, or its low 16 bits.
+    pub process_id: Option<u32>,
+    /// Lease.
+    pub lease: RtpsDuration,
+    /// Whether it announces DDS security.
+    pub secured: bool,
+    /// Whether its endpoints accept shared memory, unless they announce otherwise.
+    pub shared_memory: bool,
+}
+
+/// Unicast UDP addresses of a participant.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Addresses {
+    /// Addresses of its discovery endpoints.
+    pub metatraffic: Box<[SocketAddr]>,
+    /// Addresses of its other endpoints.
+    pub default: Box<[SocketAddr]>,
+}
+
+/// A participant.
+#[derive(Debug)]
+pub struct Participant {
+    /// Announced properties.
+    pub proxy: ParticipantProxy,
+    /// Unicast addresses.
+    pub addresses: Addresses,
+    /// Time of restoration from saved state, until its first packet.
+    pub restored: Option<Timestamp>,
+    /// Its domain.
+    pub domain_id: DomainId,
+    /// First announcement.
+    pub first_seen: Timestamp,
+    /// Time of its last packet.
+    pub last_seen: Timestamp,
+    /// Its endpoints.
+    pub endpoints: Bounded<ParticipantEndpoints, BTreeSet<Guid>>,
+    /// Its nodes.
+    pub nodes: Vec<Node>,
+    /// Number of its endpoints whose topics are watched by exact name.
+    pub(super) watched: usize,
+    /// Whether a socket on this host sends for it.
+    pub(super) local: bool,
+    /// Whether it has sent user data.
+    pub(super) sends: bool,
+    pub(super) domain_source: DomainSource,
+    /// Writer and number of the `ros_discovery_info` sample that announced the nodes.
+    pub(super) nodes_from: Option<(Guid, SequenceNumber)>,
+}
+
+/// A node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Node {
+    /// Fully qualified name.
+    pub name: NodeName,
+    /// Its writers.
+    pub writers: Vec<Guid>,
+    /// Its readers.
+    pub readers: Vec<Guid>,
+}
+
+/// A writer or reader.
+#[derive(Clone, Debug)]
+pub struct Endpoint {
+    /// Identity that ROS prints: the GUID, or with Zenoh the hash of the liveliness token.
+    pub gid: [u8; 16],
+    /// Writer or reader.
+    pub role: Role,
+    /// Domain of its participant.
+    pub domain_id: DomainId,
+    /// DDS topic.
+    pub topic: DdsName,
+    /// ROS type.
+    pub message_type: TypeName,
+    /// RIHS01 hash.
+    pub type_hash: Option<TypeHash>,
+    /// Quality of service.
+    pub qos: Arc<Qos>,
+    /// First announcement.
+    pub first_seen: Timestamp,
+    /// Whether it accepts shared memory; `None` if it announces nothing, as its participant does.
+    pub shared_memory: Option<bool>,
+    /// Whether it supports data sharing with endpoints on its host.
+    pub data_sharing: bool,
+    /// Whether its topic is watched by exact name.
+    pub(super) watched: bool,
+}
+
+impl ParticipantProxy {
+    pub(super) fn of(announcement: &ParticipantAnnouncement) -> Self {
+        let low_bits = || announcement.process_id_low_bits().map(u32::from);
+        Self {
+            vendor: announcement.vendor,
+            enclave: announcement.enclave.as_deref().map(Into::into),
+            host: announcement.host_name().map(Into::into),
+            process_name: announcement.process_name().map(Into::into),
+            process_id: announcement.process_id().or_else(low_bits),
+            lease: announcement.lease,
+            secured: announcement.is_secured,
+            shared_memory: announcement
+                .default_unicast
+                .iter()
+                .any(Locator::is_shared_memory),
+        }
+    }
+}
+
+impl Addresses {
+    pub(super) fn of(announcement: &ParticipantAnnouncement) -> Self {
+        let udp = |locators: &[Locator]| {
+            let addresses = locators.iter().filter_map(Locator::udp);
+            addresses.take(ADDRESSES).collect()
+        };
+        Self {
+            metatraffic: udp(&announcement.metatraffic_unicast),
+            default: udp(&announcement.default_unicast),
+        }
+    }
+}
+
+impl Participant {
+    /// Records a packet of this participant.
+    pub(super) fn seen(&mut self, at: Timestamp) {
+        if self.restored.is_some_and(|restored| at > restored) {
+            self.restored = None;
+        }
+        self.last_seen = self.last_seen.max(at);
+    }
+
+    /// Returns the end of its lease, unless it is heard before; `None` = never.
+    pub(super) fn lease_end(&self) -> Option<Timestamp> {
+        let lease = match self.proxy.lease {
+            RtpsDuration::Finite(lease) => lease,
+            // It may have stopped while no agent ran, so its infinite lease is limited.
+            RtpsDuration::Infinite => self.restored.map(|_| MAX_SILENCE)?,
+        };
+        Some(self.last_seen + lease)
+    }
+
+    /// Returns its priority in a full table.
+    pub(super) const fn priority(&self) -> Priority {
+        Priority {
+            watched: self.watched > 0,
+            local: self.local,
+            sends: self.sends,
+        }
+    }
+}
+
+impl Node {
+    pub(super) fn of(node: &NodeEntities) -> Self {
+        Self {
+            name: node.fully_qualified_name().into(),
+            writers: node.writers.clone(),
+            readers: node.readers.clone(),
+        }
+    }
+
+    /// Truncates its writers and readers to `left` entries; returns whether any were removed.
+    pub(super) fn cut(&mut self, left: &mut usize) -> bool {
+        let mut is_cut = false;
+        for list in [&mut self.writers, &mut self.readers] {
+            is_cut |= list.len() > *left;
+            list.truncate(*left);
+            *left -= list.len();
+        }
+        is_cut
+    }
+
+    /// Returns its size in bytes.
+    pub(super) fn bytes(&self) -> usize {
+        let guids = self.writers.len() + self.readers.len();
+        size_of::<Self>() + self.name.len() + guids * size_of::<Guid>()
+    }
+}
+
+/// Returns the number of writers and readers that these nodes list.
+pub(super) fn named(nodes: &[Node]) -> usize {
+    let named = |node: &Node| {
+        let Node {
+            name: _,
+            writers,
+            readers,
+        } = node;
+        writers.len() + readers.len()
+    };
+    nodes.iter().map(named).sum()
+}
+
+/// Returns the participant's domain and its source. Without an announced domain, it follows from
+/// the destination port (RTPS 2.5, 9.6.1.1: 7400 + 250 d, multicast + 0, unicast + 10 + 2 p). Ports
+/// from 32768 on are mostly ephemeral, so the domain is then assumed to be 0.
+pub(super) fn domain(announced: Option<DomainId>, origin: &Origin) -> (DomainId, DomainSource) {
+    const EPHEMERAL: u16 = 32_768;
+    if let Some(domain_id) = announced.filter(|domain_id| *domain_id <= DomainId::MAX) {
+        return (domain_id, DomainSource::Announced);
+    }
+    let Some(offset) = origin.port.checked_sub(7400) else {
+        return (DomainId(0), DomainSource::Assumed);
+    };
+    let (domain_id, rest) = (DomainId(u32::from(offset / 250)), offset % 250);
+    let [first, .., a, _, _, _] = origin.destination;
+    let is_multicast = first == 0xff || first == 0 && a & 0xf0 == 0xe0;
+    if is_multicast && rest == 0 && domain_id <= DomainId::MAX {
+        return (domain_id, DomainSource::MulticastPort);
+    }
+    if rest >= 10 && rest % 2 == 0 && origin.port < EPHEMERAL {
+        return (domain_id, DomainSource::UnicastPort);
+    }
+    (DomainId(0), DomainSource::Assumed)
+}
+
+impl Endpoint {
+    /// Returns the names of its topic; `None` if that is no valid name.
+    #[must_use]
+    pub fn naming(&self) -> Option<Naming> {
+        let topic = DdsTopic::parse(&self.topic).ok()?;
+        Some(Naming::of(&topic))
+    }
+}

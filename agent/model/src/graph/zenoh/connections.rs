@@ -1,0 +1,187 @@
+//! Begin and end of connections, with the tokens and sessions that end with them.
+
+use std::collections::HashMap;
+use std::time::Duration;
+
+use ros2probe_wire::zenoh::ZenohId;
+use ros2probe_wire::{GuidPrefix, Timestamp};
+
+use super::Zenoh;
+use super::stream::{Flow, StreamId, Unseen};
+use super::stream_state::StreamState;
+
+/// Lease that rmw_zenoh configures.
+const LEASE: Duration = Duration::from_secs(60);
+/// Part of its lease after which a sender is silent. It sends several times in each lease, and the
+/// other end closes the connection after all of it.
+const SILENT: f64 = 0.9;
+
+impl Zenoh {
+    /// Returns the other direction, seen at the same place or, on the loopback interface, at the
+    /// other socket.
+    pub(super) fn opposite(&self, stream: &StreamId) -> Option<&StreamState> {
+        let known = self.directions.get(&stream.reversed());
+        let known = known.map(|direction| &**direction);
+        known.or_else(|| self.elsewhere(stream).map(|(_, direction)| direction))
+    }
+
+    /// Returns the other direction, and the place at which it was seen last.
+    fn elsewhere(&self, stream: &StreamId) -> Option<(&StreamId, &StreamState)> {
+        let place = self.flows.get(&stream.flow.reversed())?;
+        Some((place, self.directions.get(place)?))
+    }
+
+    /// Returns the socket to which a direction of the loopback interface leads, if its session is
+    /// known; else 0.
+    pub(super) fn receiving_socket(&self, stream: &StreamId) -> u64 {
+        let other = self.elsewhere(stream).filter(|_| stream.is_loopback());
+        let owned = other.filter(|(place, direction)| direction.owner(place).is_some());
+        owned.map_or(0, |(place, _)| place.socket)
+    }
+
+    /// Returns the sockets of this host that a session owns, as far as is known.
+    pub fn sockets(&self, session: GuidPrefix) -> impl Iterator<Item = u64> + '_ {
+        let owned = self.directions.iter().filter(move |(stream, direction)| {
+            let owner = direction.owner(stream);
+            owner.is_some_and(|owner| owner.guid_prefix() == session)
+        });
+        owned.map(|(stream, _)| stream.socket)
+    }
+
+    pub(super) fn direction(&mut self, stream: &StreamId) -> Option<&mut StreamState> {
+        if !self.directions.contains_key(stream) {
+            if self.directions.is_full() {
+                self.directions.refuse();
+                let oldest = self.directions.iter();
+                let oldest = oldest.min_by_key(|(id, direction)| (direction.last_seen, **id));
+                let oldest = oldest.map(|(id, _)| *id)?;
+                self.begin(&oldest);
+            }
+            let sender = self.remembered.take(stream.flow);
+            self.numbered += 1;
+            let direction = Box::new(StreamState::new(self.numbered, stream, sender));
+            self.directions.insert(*stream, direction);
+            self.flows.insert(stream.flow, *stream);
+        }
+        self.directions
+            .get_mut(stream)
+            .map(|direction| &mut **direction)
+    }
+
+    pub(super) fn begin(&mut self, stream: &StreamId) {
+        for flow in [stream.flow, stream.flow.reversed()] {
+            self.remembered.take(flow);
+        }
+        self.remove(stream);
+        let connection = stream.flow.connection();
+        self.unseen.retain(|(_, other)| *other != connection);
+    }
+
+    /// Records that the sender leaves the connection. If it is the first to do so and has no other
+    /// connection, its session has ended. Its declarations end with the connection. If the other end
+    /// has been silent for its lease, that one has left first.
+    pub(super) fn leave(&mut self, stream: &StreamId, now: Timestamp) {
+        if let Some(silent) = self.silent_end(stream, now)
+            && let Some(direction) = self.directions.get_mut(&silent)
+        {
+            // Nothing will be seen of it.
+            direction.has_ended = true;
+            self.leave_now(&silent, now);
+        }
+        self.leave_now(stream, now);
+    }
+
+    /// As [`Self::leave`], whether or not the other end has been silent.
+    fn leave_now(&mut self, stream: &StreamId, now: Timestamp) {
+        if self.remembered.sender(stream.flow).is_some() {
+            self.direction(stream);
+        }
+        self.note_cut(stream, now);
+        let Some(direction) = self.directions.get_mut(stream) else {
+            return;
+        };
+        self.revision += 1;
+        if std::mem::replace(&mut direction.has_left, true) {
+            return;
+        }
+        let session = direction.session();
+        if self.opposite(stream).is_some_and(|other| other.has_left) {
+            return;
+        }
+        if let Some(session) = session {
+            let mut others = self.directions.iter();
+            let is_open = others.any(|(id, direction)| {
+                direction.session() == Some(session) && self.is_open(id, direction)
+            });
+            if !is_open && !self.remembered.has(session) {
+                self.graph.end(session);
+            }
+        }
+        if let Some(direction) = self.directions.get(stream) {
+            self.graph.leave(direction.number);
+        }
+    }
+
+    /// Returns the other direction if its sender has been silent for its lease.
+    fn silent_end(&self, stream: &StreamId, now: Timestamp) -> Option<StreamId> {
+        if self.directions.get(stream)?.has_left {
+            return None;
+        }
+        let (place, other) = match self.directions.get_key_value(&stream.reversed()) {
+            Some((place, other)) => (place, &**other),
+            None => self.elsewhere(stream)?,
+        };
+        let lease = other.lease.unwrap_or(LEASE);
+        let is_silent = other.last_seen + lease.mul_f64(SILENT) <= now;
+        (is_silent && !other.has_left).then_some(*place)
+    }
+
+    /// Records that the sender has closed the connection.
+    pub(super) fn end(&mut self, stream: &StreamId, now: Timestamp) {
+        let connection = stream.flow.connection();
+        self.unseen.retain(|(_, other)| *other != connection);
+        self.leave(stream, now);
+        let Some(direction) = self.directions.get_mut(stream) else {
+            return;
+        };
+        self.chain_bytes.sub(direction.held());
+        direction.interrupt();
+        direction.has_ended = true;
+        if self.opposite(stream).is_none_or(|other| other.has_ended) {
+            let elsewhere = self.flows.get(&stream.flow.reversed()).copied();
+            let ids = [Some(*stream), Some(stream.reversed()), elsewhere];
+            for id in ids.into_iter().flatten() {
+                self.remove(&id);
+            }
+        }
+    }
+
+    pub(super) fn note_unseen(&mut self, reason: Unseen, flow: Flow) {
+        self.unseen.insert((reason, flow.connection()));
+    }
+
+    /// Forgets a direction with what it declares. A token lives on until it is undeclared or its
+    /// session ends.
+    fn remove(&mut self, stream: &StreamId) {
+        let Some(known) = self.directions.remove(stream) else {
+            return;
+        };
+        self.chain_bytes.sub(known.held());
+        if self.flows.get(&stream.flow) == Some(stream) {
+            self.flows.remove(&stream.flow);
+        }
+        drop(self.aliases.remove_owner(known.number));
+        self.graph.disconnect(known.number);
+    }
+}
+
+/// Returns the lease of a session that a connection shows.
+pub(super) fn lease(
+    directions: &HashMap<StreamId, Box<StreamState>>,
+    session: ZenohId,
+) -> Option<Duration> {
+    let own = directions
+        .values()
+        .filter(|direction| direction.sender.is_some_and(|side| side.zid == session));
+    own.filter_map(|direction| direction.lease).max()
+}

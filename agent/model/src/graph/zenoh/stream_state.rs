@@ -1,0 +1,286 @@
+//! State of one direction of a connection: who sends, its aliases, its tokens, and the messages in
+//! FRAGMENTs.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::zenoh::{
+    Fragment, Key, Lane, PORT, Resolution, Side, WhatAmI, WireExpr, ZenohId,
+};
+use ros2probe_wire::{DomainId, Timestamp};
+
+use super::stream::StreamId;
+use crate::facts::bounded::{Bounded, ByOwner, HeapBytes};
+use crate::facts::tables::{ZenohAliases, ZenohChains};
+
+/// Longest key that is kept. A token of ROS with the longest names has 1.4 KiB.
+pub(super) const MAX_KEY: usize = 2048;
+/// Most bytes of one message in FRAGMENTs.
+const MAX_MESSAGE: usize = 32 << 20;
+/// Bytes kept of a message whose payload is not requested: everything before the payload.
+const HEAD: usize = 8192;
+/// Publications of one source after which the sender is taken for that source.
+const PRESUMED: u32 = 3;
+
+/// Number of a direction, never used again.
+pub(super) type DirectionNumber = u64;
+/// Aliases by direction and number.
+pub(super) type Aliases = ByOwner<ZenohAliases, DirectionNumber, u16, Alias>;
+
+/// A key with its meaning.
+#[derive(Clone, Debug)]
+pub(super) struct Alias {
+    pub(super) key: Arc<str>,
+    /// Whether it is of a topic or service of ROS.
+    pub(super) is_topic: bool,
+}
+
+/// A message of which some FRAGMENTs have arrived.
+#[derive(Debug)]
+pub(super) struct Chain {
+    lane: Lane,
+    /// Number of the next FRAGMENT.
+    next: u32,
+    /// Time of the first.
+    pub(super) began: Timestamp,
+    /// Time of the last.
+    last: Timestamp,
+    /// The beginning of the message, or all of it.
+    pub(super) bytes: Vec<u8>,
+    /// Bytes that have arrived.
+    pub(super) length: usize,
+    is_wanted: bool,
+}
+
+/// One direction of a connection.
+#[derive(Debug, Default)]
+pub(super) struct StreamState {
+    pub(super) number: DirectionNumber,
+    /// The sender, from its INIT.
+    pub(super) sender: Option<Side>,
+    /// The session of the process that sends, if the INIT was missed.
+    pub(super) linked: Option<ZenohId>,
+    /// Source of all publications so far, and their number, if the INIT was missed.
+    presumed: Option<(ZenohId, u32)>,
+    is_ambiguous: bool,
+    /// Whether the addresses are those of a router, which passes on publications of others.
+    may_be_router: bool,
+    /// Whether the sender is a router, if the INIT was missed and its id is unknown.
+    pub(super) is_router: bool,
+    /// Whether a router holds the socket that receives.
+    pub(super) is_for_router: bool,
+    /// That router, if its id is known.
+    pub(super) receiver: Option<Side>,
+    /// The last INTEREST of the sender in the graph of a domain, with its number.
+    pub(super) asked: Option<(u32, DomainId)>,
+    pub(super) lease: Option<Duration>,
+    pub(super) chains: Bounded<ZenohChains, Vec<Chain>>,
+    /// Whether the sender has sent CLOSE, or closed it.
+    pub(super) has_left: bool,
+    /// Whether the sender has closed it.
+    pub(super) has_ended: bool,
+    /// Time of the last batch.
+    pub(super) last_seen: Timestamp,
+}
+
+impl Chain {
+    /// Returns the bytes that it holds.
+    pub(super) fn held(&self) -> usize {
+        // The destructuring makes a new list fail to compile until it is listed here.
+        let Self {
+            lane: _,
+            next: _,
+            began: _,
+            last: _,
+            bytes,
+            length: _,
+            is_wanted: _,
+        } = self;
+        bytes.capacity()
+    }
+}
+
+impl Chain {
+    /// Adds bytes to the message, as far as `room` bytes of further memory suffice.
+    fn keep(&mut self, bytes: &[u8], room: usize) {
+        let (length, capacity) = (self.bytes.len(), self.bytes.capacity());
+        let bytes = bytes.get(..capacity - length + room).unwrap_or(bytes);
+        let needed = length + bytes.len();
+        if needed > capacity {
+            let larger = needed.max(2 * capacity).min(capacity + room);
+            self.bytes.reserve_exact(larger - length);
+        }
+        self.bytes.extend_from_slice(bytes);
+    }
+}
+
+impl HeapBytes for Alias {
+    fn heap_bytes(&self) -> usize {
+        self.key.heap_bytes()
+    }
+}
+
+impl Alias {
+    fn new(key: &str) -> Self {
+        let is_topic = match Key::parse(key) {
+            Ok(Key::Topic(topic)) => topic.buffer.is_none(),
+            _ => false,
+        };
+        Self {
+            key: key.into(),
+            is_topic,
+        }
+    }
+}
+
+impl StreamState {
+    /// Creates the state of a direction of which nothing was seen; `sender` is from saved state.
+    pub(super) fn new(number: DirectionNumber, stream: &StreamId, sender: Option<Side>) -> Self {
+        let (from, to) = (stream.flow.source.port, stream.flow.destination.port);
+        Self {
+            number,
+            sender,
+            may_be_router: from == PORT || to == PORT && !stream.is_loopback(),
+            ..Self::default()
+        }
+    }
+
+    /// Returns the session that sends, as far as is known.
+    pub(super) fn session(&self) -> Option<ZenohId> {
+        let presumed = self.presumed.filter(|(_, count)| *count >= PRESUMED);
+        let is_certain = !self.is_ambiguous && !self.may_be_router && !self.is_router;
+        let presumed = presumed.filter(|_| is_certain);
+        self.sender
+            .map(|side| side.zid)
+            .or(self.linked)
+            .or(presumed.map(|(zid, _)| zid))
+    }
+
+    /// Returns whether the sender is a router, as far as the direction shows.
+    pub(super) fn is_of_router(&self, stream: &StreamId) -> bool {
+        match (self.sender, self.linked) {
+            (Some(side), _) => side.whatami == WhatAmI::Router,
+            (None, Some(_)) => false,
+            (None, None) => self.is_router || self.is_ambiguous || stream.flow.source.port == PORT,
+        }
+    }
+
+    /// Returns the source of the first publication, if the INIT was missed.
+    pub(super) fn source(&self) -> Option<ZenohId> {
+        self.presumed.map(|(source, _)| source)
+    }
+
+    /// Returns whether no other session's publication was seen.
+    pub(super) fn sends_only_for(&self, session: ZenohId) -> bool {
+        !self.is_ambiguous && self.presumed.is_none_or(|(zid, _)| zid == session)
+    }
+
+    /// Returns the session that owns the socket at which the direction was seen, if it sends there
+    /// and its process is on this host.
+    pub(super) fn owner(&self, stream: &StreamId) -> Option<ZenohId> {
+        if stream.socket == 0 || !stream.outgoing {
+            return None;
+        }
+        // A router that passes on publications of one session looks like that session. It sends from
+        // its port to the sessions of its host, and to other hosts.
+        let is_certain = self.sender.is_some()
+            || self.linked.is_some()
+            || stream.is_loopback() && stream.flow.source.port != PORT;
+        self.session().filter(|_| is_certain)
+    }
+
+    /// Notes the source of a publication. A sender of several sources' is a router.
+    pub(super) fn note_source(&mut self, source: ZenohId) {
+        match &mut self.presumed {
+            Some((known, count)) if *known == source => *count = count.saturating_add(1),
+            Some(_) => self.is_ambiguous = true,
+            None => self.presumed = Some((source, 1)),
+        }
+    }
+
+    /// Adds a FRAGMENT. Returns the message if it is complete; its bytes may be the beginning only.
+    pub(super) fn fragment(
+        &mut self,
+        fragment: &Fragment<'_>,
+        time: Timestamp,
+        begins: impl FnOnce(&[u8]) -> Option<bool>,
+        room: usize,
+    ) -> Option<Chain> {
+        let place = self
+            .chains
+            .iter()
+            .position(|chain| chain.lane == fragment.lane);
+        let number = fragment.sequence_number;
+        let known = place.map(|place| self.chains.swap_remove(place));
+        if fragment.is_dropped {
+            return None;
+        }
+        let known = known.filter(|known| known.next == number && !fragment.is_first);
+        let mut chain = match known {
+            Some(chain) => chain,
+            None => {
+                let is_wanted = begins(fragment.bytes.captured)?;
+                Chain {
+                    lane: fragment.lane,
+                    next: number,
+                    began: time,
+                    last: time,
+                    bytes: Vec::new(),
+                    length: 0,
+                    is_wanted,
+                }
+            }
+        };
+        let captured = fragment.bytes.captured;
+        let is_whole_so_far = chain.bytes.len() == chain.length;
+        chain.length += fragment.bytes.length;
+        let most = if chain.is_wanted { MAX_MESSAGE } else { HEAD };
+        if is_whole_so_far {
+            let kept = most.saturating_sub(chain.bytes.len());
+            chain.keep(captured.get(..kept).unwrap_or(captured), room);
+        }
+        chain.last = time;
+        chain.next = Resolution::DEFAULT.next(number);
+        if !fragment.has_more {
+            return Some(chain);
+        }
+        self.chains.push(chain);
+        None
+    }
+
+    /// Gives up messages without a FRAGMENT since `before`, and returns their number.
+    pub(super) fn give_up(&mut self, before: Timestamp) -> usize {
+        let all = self.chains.len();
+        self.chains.retain(|chain| chain.last >= before);
+        all - self.chains.len()
+    }
+
+    /// Forgets the unfinished messages: bytes are missing.
+    pub(super) fn interrupt(&mut self) {
+        self.chains.clear();
+    }
+
+    /// Returns the bytes of unfinished messages.
+    pub(super) fn held(&self) -> usize {
+        self.chains.iter().map(Chain::held).sum()
+    }
+}
+
+/// Returns the alias or the own key of an expression.
+pub(super) fn resolve(
+    expression: WireExpr<'_>,
+    aliases: &Aliases,
+    direction: Option<DirectionNumber>,
+) -> Option<Alias> {
+    if let Some(key) = expression.key() {
+        return (key.len() <= MAX_KEY).then(|| Alias::new(key));
+    }
+    let alias = aliases.get(direction?, &expression.scope)?;
+    if expression.suffix.is_empty() {
+        return Some(alias.clone());
+    }
+    if alias.key.len() + expression.suffix.len() > MAX_KEY {
+        return None;
+    }
+    Some(Alias::new(&format!("{}{}", alias.key, expression.suffix)))
+}

@@ -1,0 +1,573 @@
+//! Samples of one writer that one receiver got, or that left for one destination.
+//!
+//! A delivery begins with the first sample that the receiver sees. A gap counts as lost if it is
+//! below the highest number that the receiver knows from a sample or HEARTBEAT. A sample that left
+//! this host for the receiver's address and did not arrive counts as lost, too. A receiver
+//! therefore loses nothing before it joins or after it leaves. Each loss has one cause, which never
+//! changes. Outgoing deliveries have no losses: samples that were never sent belong to no receiver.
+
+mod accounting;
+mod departed;
+mod shares;
+mod withheld;
+
+use std::collections::{BTreeSet, VecDeque};
+use std::time::Duration;
+
+use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
+use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber, Timestamp};
+
+use crate::facts::bounded::Bounded;
+use crate::facts::journal::Journal;
+use crate::facts::loss::{DeliveryLoss, LossCause};
+use crate::facts::loss_share::RecentLoss;
+use crate::facts::measurement::Delivered;
+use crate::facts::route::Direction;
+use crate::facts::route::{Receiver, Route};
+use crate::facts::tables::WithheldLosses;
+use crate::measure::loss_causes::{LossCauses, REASSEMBLY};
+use crate::measure::reception::{CompleteSample, Outcome, Reception};
+use crate::measure::samples::Budget;
+use crate::measure::sequence::REACH;
+use crate::measure::undelivered::Undelivered;
+use crate::measure::writer::{BEST_EFFORT_WINDOW, settle_window};
+use accounting::Accounting;
+pub use accounting::Totals;
+
+/// Number of samples missed while no reader listened that are excused one by one. Above it, the
+/// delivery restarts.
+const EXCUSED: u64 = 512;
+/// Samples that left this host less than this ago may still arrive.
+const UNDER_WAY: Duration = Duration::from_secs(1);
+/// A receiver without any sign of life counts samples that left for it as lost after this silence.
+/// Socket diagnostics of the kernel report a closed socket earlier.
+const SILENCE: Duration = Duration::from_secs(18);
+const FIRST_MOMENTS: Duration = Duration::from_secs(5);
+/// A run of lost samples at least this long keeps its pending cause when two deliveries merge.
+const LONG_RUN: u64 = 256;
+
+/// State outside the delivery that a record changes.
+#[derive(Debug)]
+pub struct DeliveryContext<'a> {
+    /// Time of the record, or of the tick.
+    pub now: Timestamp,
+    /// Writer of the samples.
+    pub writer: Guid,
+    /// Whether the writer is reliable and retransmits samples.
+    pub reliable: bool,
+    /// Whether its datagrams may need IP reassembly on this host.
+    pub reassembled: bool,
+    /// Memory budget for fragmented samples.
+    pub budget: &'a mut Budget,
+    /// Journal that receives the losses.
+    pub journal: &'a mut Journal,
+    /// Sums over all deliveries of the writer.
+    pub totals: &'a mut Totals,
+}
+
+/// One delivery.
+#[derive(Debug)]
+pub struct Delivery {
+    receiver: Receiver,
+    /// Route by which new samples arrive.
+    main: Route,
+    reception: Reception,
+    tally: Delivered,
+    undelivered: Undelivered,
+    loss_causes: LossCauses,
+    first_seen: Timestamp,
+    last_seen: Timestamp,
+    /// Time at which a matching reader appeared, if that is after the last sample.
+    opened: Timestamp,
+    /// Time at which the oldest sample that has not arrived left this host for the receiver.
+    waiting: Option<Timestamp>,
+    /// Whether samples that left since then are already counted as lost.
+    presumed_lost: bool,
+    /// Number of samples that left this host for the receiver a while ago and have not arrived.
+    under_way: u64,
+    /// Losses of the last seconds.
+    recent: RecentLoss,
+    /// Whether all readers are best effort: they get no retransmissions and no HEARTBEATs.
+    best_effort: bool,
+    /// Whether samples use the network, at least for some readers, rather than only shared memory.
+    uses_network: bool,
+    /// The latest losses, while the delivery is withheld.
+    withheld: Option<Bounded<WithheldLosses, VecDeque<DeliveryLoss>>>,
+}
+
+impl Delivery {
+    /// Creates a delivery that has seen nothing yet.
+    #[must_use]
+    pub fn new(receiver: Receiver, main: Route, now: Timestamp) -> Self {
+        Self {
+            receiver,
+            main,
+            reception: Reception::default(),
+            tally: Delivered::default(),
+            undelivered: Undelivered::default(),
+            loss_causes: LossCauses::default(),
+            first_seen: now,
+            last_seen: now,
+            opened: Timestamp(0),
+            waiting: None,
+            presumed_lost: false,
+            under_way: 0,
+            recent: RecentLoss::default(),
+            best_effort: false,
+            uses_network: false,
+            withheld: None,
+        }
+    }
+
+    /// Allows fragmented samples that begin before `until` to be incomplete without a loss.
+    pub const fn allow_incomplete(&mut self, until: Timestamp) {
+        self.reception.allow_incomplete(until);
+    }
+
+    /// Returns the receiver of the samples.
+    #[must_use]
+    pub const fn receiver(&self) -> Receiver {
+        self.receiver
+    }
+
+    /// Sets the participant of the receiver, once it is known.
+    pub const fn identify(&mut self, prefix: GuidPrefix) {
+        self.receiver = Receiver::Participant(prefix);
+    }
+
+    /// Sets the route of a receiver whose socket was unknown.
+    pub const fn lead_to(&mut self, route: Route) {
+        self.receiver = Receiver::Route(route);
+    }
+
+    /// Returns the route by which new samples arrive.
+    #[must_use]
+    pub const fn main(&self) -> Route {
+        self.main
+    }
+
+    /// Changes the route by which new samples arrive.
+    pub const fn move_to(&mut self, route: Route) {
+        self.main = route;
+    }
+
+    /// Returns the direction, outgoing or incoming.
+    #[must_use]
+    pub const fn direction(&self) -> Direction {
+        self.main.direction
+    }
+
+    /// Returns the counts of samples.
+    #[must_use]
+    pub const fn tally(&self) -> &Delivered {
+        &self.tally
+    }
+
+    /// Returns the times of the first and last record.
+    #[must_use]
+    pub const fn seen(&self) -> (Timestamp, Timestamp) {
+        (self.first_seen, self.last_seen)
+    }
+
+    /// Returns the highest sequence number known to exist, plus one.
+    #[must_use]
+    pub const fn next(&self) -> SequenceNumber {
+        self.reception.sequence().next()
+    }
+
+    /// Returns whether this sample is known to exist but has not arrived.
+    #[must_use]
+    pub fn misses(&self, number: SequenceNumber) -> bool {
+        let sequence = self.reception.sequence();
+        sequence.started()
+            && number >= sequence.first()
+            && number < sequence.next()
+            && !sequence.has(number)
+    }
+
+    /// Returns whether this sample has arrived.
+    #[must_use]
+    pub fn has(&self, number: SequenceNumber) -> bool {
+        self.reception.sequence().has(number)
+    }
+
+    /// Records that this sample arrived by another route that may lead to the same receiver.
+    pub fn know(&mut self, number: SequenceNumber, totals: &mut Totals) {
+        self.reception.sequence_mut().know(number);
+        if self.loss_causes.resolve(number) {
+            self.tally.pending = self.tally.pending.saturating_sub(1);
+            if self.withheld.is_none() {
+                totals.received.pending = totals.received.pending.saturating_sub(1);
+            }
+        }
+    }
+
+    /// Records that a reader appeared. Earlier samples were for other readers.
+    pub fn open(&mut self, at: Timestamp) {
+        self.opened = self.opened.max(at);
+    }
+
+    /// Sets whether all readers are best effort.
+    pub const fn learn(&mut self, best_effort: bool) {
+        self.best_effort = best_effort;
+    }
+
+    /// Records that the last reader is gone: samples after its last one do not count as lost.
+    pub fn close(&mut self, budget: &mut Budget) {
+        (self.waiting, self.presumed_lost, self.under_way) = (None, false, 0);
+        self.reception.close(budget);
+    }
+
+    /// Counts a sample that arrived although the receiver has no reader.
+    pub const fn ignore(&mut self, totals: &mut Totals) {
+        self.tally.unmatched += 1;
+        totals.received.unmatched += 1;
+    }
+
+    /// Records a DATA or DATA_FRAG. Returns whether it is a duplicate, and the sample it completes.
+    pub fn sample(
+        &mut self,
+        sample: Sample<'_>,
+        context: &mut DeliveryContext<'_>,
+    ) -> (bool, Option<CompleteSample>) {
+        self.touch(sample.record());
+        (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
+        if self.undelivered.is_empty() {
+            return self.take(sample, context);
+        }
+        let (mut again, mut whole) = (false, None);
+        let parts = self
+            .undelivered
+            .delivered(sample, &mut context.budget.evictions);
+        for part in parts.iter().filter_map(Record::sample) {
+            let (came_again, completed) = self.take(part, context);
+            again |= came_again;
+            whole = completed.or(whole);
+        }
+        (again, whole)
+    }
+
+    /// Records that the socket's buffer was full for this DATA or DATA_FRAG.
+    pub fn socket_full(&mut self, sample: Sample<'_>, context: &mut DeliveryContext<'_>) {
+        self.touch(sample.record());
+        (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
+        if self.undelivered.note(sample) {
+            context.budget.evictions += 1;
+        }
+        let number = sample.sequence_number();
+        let is_tail = !sample.is_start() && number.0 > 1;
+        let (reception, budget, mut accounting) = self.split(context);
+        let is_confirmed =
+            reception.recognise(sample, budget, &mut |decision| accounting.take(decision));
+        if !is_confirmed {
+            // The cause is kept in case later records confirm the number.
+            let is_full = self
+                .loss_causes
+                .note(number, LossCause::SocketBuffer, context.now);
+            context.budget.evictions += u64::from(is_full);
+            return;
+        }
+        let sequence = self.reception.sequence_mut();
+        sequence.begin(number.saturating_add(u64::from(is_tail)));
+        self.record_cause(number, LossCause::SocketBuffer, context);
+    }
+
+    /// Records that the kernel failed to reassemble some IP fragments of this sample.
+    pub fn not_reassembled(&mut self, number: SequenceNumber, context: &mut DeliveryContext<'_>) {
+        self.uses_network = true;
+        let sequence = self.reception.sequence();
+        if !sequence.started() || number > sequence.next().saturating_add(REACH) {
+            return;
+        }
+        if self.loss_causes.resolve(number) {
+            self.split(context).2.explain(LossCause::Reassembly, number);
+            return;
+        }
+        self.record_cause(number, LossCause::Reassembly, context);
+    }
+
+    /// Records a HEARTBEAT for this receiver. A delivery without samples begins with it. While no
+    /// sample arrives and none is requested, the samples may use shared memory.
+    pub fn heartbeat(&mut self, heartbeat: Heartbeat<'_>, context: &mut DeliveryContext<'_>) {
+        self.touch(heartbeat.record());
+        let end = heartbeat.last().next();
+        self.reception.sequence_mut().begin(end);
+        if !self.uses_network {
+            return;
+        }
+        let sequence = self.reception.sequence();
+        let before = (sequence.next(), sequence.last_advance());
+        let (reception, budget, mut accounting) = self.split(context);
+        reception.heartbeat(heartbeat, budget, &mut |decision| accounting.take(decision));
+        self.excuse_unheard(before);
+    }
+
+    /// Records a GAP for this receiver.
+    pub fn gap(&mut self, gap: Gap<'_>, context: &mut DeliveryContext<'_>) {
+        self.touch(gap.record());
+        let (reception, budget, mut accounting) = self.split(context);
+        reception.gap(gap, budget, &mut |decision| accounting.take(decision));
+    }
+
+    /// Records an ACKNACK in which a reader requests samples again.
+    pub fn requested(&mut self, acknack: AckNack<'_>) {
+        let missing = acknack.missing();
+        let sequence = self.reception.sequence_mut();
+        let first = sequence.first();
+        self.uses_network |= sequence.started() && missing.iter().any(|number| number >= first);
+        sequence.requested(missing.iter());
+    }
+
+    /// Records that all readers have every sample below `base`.
+    pub fn acknowledged(&mut self, base: SequenceNumber) {
+        self.reception.sequence_mut().acknowledged(base);
+    }
+
+    /// Settles samples whose waiting time is over.
+    pub fn advance(&mut self, context: &mut DeliveryContext<'_>) {
+        let (now, window) = (context.now, settle_window(self.is_reliable(context)));
+        let (reception, budget, mut accounting) = self.split(context);
+        // A sample that the writer withdrew is not retransmitted.
+        let windows = (window, BEST_EFFORT_WINDOW);
+        reception.advance(now, windows, budget, &mut |decision| {
+            accounting.take(decision);
+        });
+        self.conclude(now, context);
+        self.loss_causes
+            .settled(self.reception.sequence().settled());
+        self.undelivered.expire(now);
+    }
+
+    /// Settles all samples, including pending ones: the input has ended.
+    pub fn settle(&mut self, context: &mut DeliveryContext<'_>) {
+        let (reception, budget, mut accounting) = self.split(context);
+        reception.settle(budget, &mut |decision| accounting.take(decision));
+        self.conclude(Timestamp(u64::MAX), context);
+    }
+
+    /// Merges `other`, which turned out to be the same receiver.
+    pub fn absorb(&mut self, mut other: Self, context: &mut DeliveryContext<'_>) {
+        let mut runs = self.loss_causes.due(Timestamp(u64::MAX));
+        runs.extend(other.loss_causes.due(Timestamp(u64::MAX)));
+        // Long runs are not caused by single fragments, and no retransmission repairs them.
+        let (long, short): (Vec<_>, Vec<_>) = runs
+            .into_iter()
+            .partition(|(first, last)| *last - *first > LONG_RUN);
+        let pending: BTreeSet<SequenceNumber> = short
+            .into_iter()
+            .flat_map(|(first, last)| first.until(last.next()))
+            .filter(|number| !self.has(*number) && !other.has(*number))
+            .collect();
+        self.tally.add(&other.tally);
+        self.recent.absorb(&other.recent);
+        let total = &mut context.totals.received.pending;
+        *total = total.saturating_sub(std::mem::take(&mut self.tally.pending));
+        self.loss_causes.absorb(other.loss_causes);
+        self.first_seen = self.first_seen.min(other.first_seen);
+        self.last_seen = self.last_seen.max(other.last_seen);
+        self.opened = self.opened.max(other.opened);
+        self.uses_network |= other.uses_network;
+        let now = context.now;
+        let settled = other.reception.sequence().settled();
+        let (reception, budget, mut accounting) = self.split(context);
+        for (first, last) in long {
+            accounting.lose(LossCause::BeforeHost, first, last);
+        }
+        for number in pending {
+            accounting.wait(number, number);
+        }
+        reception.absorb(other.reception, now, budget, &mut |decision| {
+            accounting.take(decision);
+        });
+        // Decisions of the other delivery are final.
+        let sequence = self.reception.sequence_mut();
+        let settled = settled.min(sequence.next());
+        sequence
+            .settled()
+            .until(settled)
+            .for_each(|number| sequence.know(number));
+    }
+
+    const fn is_reliable(&self, context: &DeliveryContext<'_>) -> bool {
+        context.reliable && !self.best_effort
+    }
+
+    fn touch(&mut self, record: &Record) {
+        self.last_seen = self.last_seen.max(Timestamp(record.time));
+    }
+
+    fn take(
+        &mut self,
+        sample: Sample<'_>,
+        context: &mut DeliveryContext<'_>,
+    ) -> (bool, Option<CompleteSample>) {
+        let (number, reliable) = (sample.sequence_number(), self.is_reliable(context));
+        self.begin_anew(number, context);
+        let sequence = self.reception.sequence();
+        let is_sent = self.direction() == Direction::Sent;
+        let source = sample.source_timestamp().timestamp();
+        let is_late = self.misses(number) && number < sequence.settled();
+        if !is_sent && is_late && !sequence.is_unconfirmed(number, source, REACH) {
+            return self.late(sample, context);
+        }
+        let before = (sequence.next(), sequence.last_advance());
+        let (reception, budget, mut accounting) = self.split(context);
+        let outcome = reception.sample(sample, reliable, budget, &mut |decision| {
+            accounting.take(decision);
+        });
+        self.excuse_unheard(before);
+        match outcome {
+            Outcome::Open => (false, None),
+            Outcome::Duplicate => {
+                // Several interfaces may show the same outgoing multicast.
+                if !is_sent || !self.main.destination.is_multicast() {
+                    self.count(context, |tally| tally.duplicates += 1);
+                }
+                (true, None)
+            }
+            Outcome::Complete(whole) => {
+                self.whole(&whole, context);
+                (false, Some(whole))
+            }
+        }
+    }
+
+    fn whole(&mut self, whole: &CompleteSample, context: &mut DeliveryContext<'_>) {
+        let sequence = self.reception.sequence();
+        let is_history = whole.number < sequence.first() && !whole.unconfirmed;
+        let missed = sequence.missed_since(whole.number);
+        let known_loss = self.loss_causes.forget(whole.number);
+        let recovered = (whole.recovered || known_loss.is_some()) && !is_history;
+        if !whole.is_message {
+            return;
+        }
+        let mut waited = 0.0;
+        if recovered && self.direction() == Direction::Received {
+            let noticed = known_loss.map(|known_loss| known_loss.at).or(missed);
+            let waited_for = noticed.map_or(whole.repaired_after, |noticed| {
+                context.now.nanoseconds_since(noticed)
+            });
+            waited = seconds(waited_for);
+            if self.withheld.is_none() {
+                let breakdown = context.totals.breakdown.get_or_insert_default();
+                breakdown.retransmission.observe(waited);
+            }
+        }
+        self.count(context, |tally| {
+            tally.messages += 1;
+            tally.bytes += whole.bytes;
+            tally.history += u64::from(is_history);
+            tally.recovered += u64::from(recovered);
+            tally.recovery_seconds += waited;
+        });
+    }
+
+    /// Handles a sample that arrives after it was settled as lost. It changes the counters only if
+    /// its cause was still pending.
+    fn late(
+        &mut self,
+        sample: Sample<'_>,
+        context: &mut DeliveryContext<'_>,
+    ) -> (bool, Option<CompleteSample>) {
+        let number = sample.sequence_number();
+        let is_whole = matches!(sample, Sample::Data(_));
+        if is_whole && self.loss_causes.resolve(number) {
+            self.count(context, |tally| {
+                tally.pending = tally.pending.saturating_sub(1);
+                tally.messages += 1;
+                tally.bytes += u64::from(sample.size());
+                tally.recovered += 1;
+            });
+            self.reception.sequence_mut().know(number);
+            return (false, None);
+        }
+        if is_whole {
+            self.reception.sequence_mut().know(number);
+        }
+        self.count(context, |tally| tally.duplicates += 1);
+        (true, None)
+    }
+
+    /// Restarts the delivery after a long range of numbers that were not for this receiver.
+    fn begin_anew(&mut self, number: SequenceNumber, context: &mut DeliveryContext<'_>) {
+        let sequence = self.reception.sequence();
+        let is_far = number.steps_since(sequence.next()) > EXCUSED;
+        if sequence.started() && is_far && sequence.last_advance() < self.opened {
+            let (reception, budget, mut accounting) = self.split(context);
+            reception.settle(budget, &mut |decision| accounting.take(decision));
+            self.reception = Reception::default();
+        }
+    }
+
+    fn record_cause(
+        &mut self,
+        number: SequenceNumber,
+        cause: LossCause,
+        context: &mut DeliveryContext<'_>,
+    ) {
+        let sequence = self.reception.sequence();
+        if sequence.has(number) || number < sequence.settled().max(sequence.first()) {
+            return;
+        }
+        let now = context.now;
+        self.exists(number, context);
+        if self.loss_causes.note(number, cause, now) {
+            context.budget.evictions += 1;
+        }
+    }
+
+    fn exists(&mut self, number: SequenceNumber, context: &mut DeliveryContext<'_>) {
+        let now = context.now;
+        let (reception, budget, mut accounting) = self.split(context);
+        reception.exists(number, now, budget, &mut |decision| {
+            accounting.take(decision);
+        });
+    }
+
+    /// Settles samples pending until `now` as lost before this host.
+    fn conclude(&mut self, now: Timestamp, context: &mut DeliveryContext<'_>) {
+        for (first, last) in self.loss_causes.due(now) {
+            let (_, _, mut accounting) = self.split(context);
+            accounting.conclude(first, last);
+        }
+    }
+
+    fn count(&mut self, context: &mut DeliveryContext<'_>, change: impl Fn(&mut Delivered)) {
+        change(&mut self.tally);
+        if self.withheld.is_none() {
+            change(context.totals.of(self.main.direction));
+        }
+    }
+
+    /// Splits the borrow into the reception, its memory budget, and the accounting of decisions.
+    fn split<'a>(
+        &'a mut self,
+        context: &'a mut DeliveryContext<'_>,
+    ) -> (&'a mut Reception, &'a mut Budget, Accounting<'a>) {
+        let window = settle_window(self.is_reliable(context));
+        let until = context
+            .reassembled
+            .then(|| context.now + REASSEMBLY.saturating_sub(window));
+        let accounting = Accounting {
+            tally: &mut self.tally,
+            loss_causes: &mut self.loss_causes,
+            totals: &mut context.totals.received,
+            journal: context.journal,
+            withheld: self.withheld.as_mut(),
+            writer: context.writer,
+            receiver: self.receiver,
+            main: self.main,
+            at: context.now,
+            until,
+        };
+        (&mut self.reception, context.budget, accounting)
+    }
+}
+
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "nanoseconds of a delay stay exact to 104 days"
+)]
+pub(crate) fn seconds(nanoseconds: i64) -> f64 {
+    nanoseconds.max(0) as f64 / 1e9
+}

@@ -1,0 +1,55 @@
+//! Samples that left this host for a receiver on the same host: whether they arrive or are lost.
+
+use ros2probe_wire::{SequenceNumber, Timestamp};
+
+use super::Delivery;
+use super::DeliveryContext;
+use super::FIRST_MOMENTS;
+use super::SILENCE;
+use super::UNDER_WAY;
+
+impl Delivery {
+    /// Records that samples up to `newest` have left for this receiver; `left_by` returns the
+    /// highest number that had left at a time. Samples that do not arrive are lost if the receiver
+    /// was `alive` afterwards.
+    pub fn expect(
+        &mut self,
+        newest: SequenceNumber,
+        alive: Option<Timestamp>,
+        left_by: impl Fn(Timestamp) -> Option<SequenceNumber>,
+        context: &mut DeliveryContext<'_>,
+    ) {
+        if !self.reception.sequence().started() || newest < self.next() {
+            (self.waiting, self.presumed_lost, self.under_way) = (None, false, 0);
+            return;
+        }
+        let since = *self.waiting.get_or_insert(context.now);
+        let mut until = alive.map_or(Timestamp(0), |alive| alive.min(context.now - UNDER_WAY));
+        if !self.presumed_lost && since + SILENCE <= context.now {
+            self.presumed_lost = true;
+            until = until.max(since + FIRST_MOMENTS);
+        }
+        let due = left_by(context.now - UNDER_WAY).filter(|_| !self.presumed_lost);
+        let lost = left_by(until).filter(|number| *number >= self.next());
+        if let Some(number) = lost.filter(|_| until >= since) {
+            self.exists(number, context);
+        }
+        self.under_way = due.map_or(0, |due| due.next().steps_since(self.next()));
+    }
+
+    /// Settles samples up to `newest`, which have left for this receiver and will not arrive.
+    pub fn expect_no_more(&mut self, newest: SequenceNumber, context: &mut DeliveryContext<'_>) {
+        if self.reception.sequence().started() && !self.presumed_lost {
+            self.exists(newest, context);
+        }
+    }
+
+    /// Excuses samples that were written before the receiver's reader appeared. `next` and the time
+    /// of its last rise are the values from before the current record.
+    pub(super) fn excuse_unheard(&mut self, (next, advanced): (SequenceNumber, Timestamp)) {
+        let sequence = self.reception.sequence_mut();
+        if next > SequenceNumber::ZERO && advanced < self.opened && sequence.next() > next {
+            sequence.excuse(next, sequence.next());
+        }
+    }
+}

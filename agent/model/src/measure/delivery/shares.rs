@@ -1,0 +1,46 @@
+//! What a delivery expected and lost, in total and in the last seconds.
+
+use super::Delivered;
+use super::Delivery;
+use crate::facts::loss_share::{LossShare, RecentLoss};
+use crate::facts::route::Direction;
+
+impl Delivery {
+    /// Returns the counts, with the samples that are neither delivered nor lost at present.
+    #[must_use]
+    pub fn facts(&self) -> Delivered {
+        let awaited = match self.direction() {
+            Direction::Sent => 0,
+            Direction::Received => self.reception.sequence().undecided() + self.under_way,
+        };
+        Delivered {
+            awaited,
+            ..self.tally
+        }
+    }
+
+    /// Returns the losses of the last seconds.
+    #[must_use]
+    pub const fn recent(&self) -> &RecentLoss {
+        &self.recent
+    }
+
+    /// Ends a second of the losses.
+    pub fn end_second(&mut self) {
+        self.recent.end_second(self.share());
+    }
+
+    /// Returns the losses since the last second ended.
+    #[must_use]
+    pub fn last_share(&self) -> LossShare {
+        self.recent.since(self.share())
+    }
+
+    const fn share(&self) -> LossShare {
+        let lost = self.tally.lost();
+        LossShare {
+            lost,
+            expected: self.tally.messages - self.tally.history + lost,
+        }
+    }
+}

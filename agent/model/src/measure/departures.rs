@@ -1,0 +1,82 @@
+//! Times at which one writer's samples left this host, for the send delay and, if one clock sees
+//! both ends, the transit time.
+
+use std::collections::VecDeque;
+
+use ros2probe_wire::{SequenceNumber, Timestamp};
+
+use crate::facts::bounded::Bounded;
+use crate::facts::route::Destination;
+use crate::facts::tables::LatestDepartures;
+
+/// The latest departures of one writer.
+#[derive(Debug, Default)]
+pub struct Departures {
+    latest: Bounded<LatestDepartures, VecDeque<Departure>>,
+    /// Source timestamp of the newest sample that began to leave.
+    newest: Timestamp,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Departure {
+    number: SequenceNumber,
+    destination: Destination,
+    at: Timestamp,
+}
+
+impl Departures {
+    /// Returns whether no datagram of the sample with this source timestamp has left before, to any
+    /// destination or as a retransmission.
+    pub fn is_first(&mut self, source: Timestamp) -> bool {
+        let is_first = source > self.newest;
+        self.newest = self.newest.max(source);
+        is_first
+    }
+
+    /// Records that the sample left completely for this destination.
+    pub fn note(&mut self, number: SequenceNumber, destination: Destination, at: Timestamp) {
+        self.latest.push_back(Departure {
+            number,
+            destination,
+            at,
+        });
+    }
+
+    /// Returns the time at which the sample left for this destination, if it is remembered.
+    #[must_use]
+    pub fn find(&self, number: SequenceNumber, destination: Destination) -> Option<Timestamp> {
+        let mut latest = self.latest.iter().rev();
+        let found = latest.find(|each| each.number == number && each.destination == destination);
+        found.map(|departure| departure.at)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn departures_for_several_places_are_separate_and_bounded() {
+        let mut departures = Departures::default();
+        let destination = |port| Destination {
+            port,
+            ..Destination::default()
+        };
+        for number in 1..=1000 {
+            let source = Timestamp(number);
+            assert!(departures.is_first(source) && !departures.is_first(source));
+            departures.note(SequenceNumber(number), destination(1), Timestamp(number));
+            departures.note(
+                SequenceNumber(number),
+                destination(2),
+                Timestamp(number + 5),
+            );
+        }
+        assert_eq!(
+            departures.find(SequenceNumber(1000), destination(2)),
+            Some(Timestamp(1005))
+        );
+        assert_eq!(departures.find(SequenceNumber(1), destination(1)), None);
+        assert!(departures.latest.len() <= LatestDepartures::CAP);
+    }
+}

@@ -1,0 +1,569 @@
+//! Evaluates the expectations of watchlist entries on their topics.
+//!
+//! Evaluation takes place once per second of the source's clock. A topic becomes violated after
+//! `BAD` bad evaluations in a row and recovers after `GOOD` good ones. Rates are evaluated over a
+//! window of at least three expected messages (1 to 10 s), or over the window of the entry. One
+//! message of tolerance at the window's edges keeps a healthy periodic topic stable. Silence has
+//! its own time and no hysteresis. The end of a window counts for `min_rate_hz` only as far as its
+//! messages are known: those of a sampled topic are known with the next one that polling sees.
+//!
+//! Windows and silence begin when the agent can see the messages, at the earliest: after its own
+//! start, the first publisher or subscriber, and a time in which the source saw nothing. A topic
+//! that was silent before such a time stays silent until its next message.
+//!
+//! Numbers of publishers and subscribers are evaluated from `GRACE` after the topic has its first
+//! publisher on, because a robot needs time to start. A writer without a reader mostly sends
+//! nothing. A quiet topic without a subscriber therefore violates neither `min_rate_hz` nor
+//! `max_silence_s`, but it may violate `publishers` and `subscribers`.
+
+use std::time::Duration;
+
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
+
+use crate::facts::loss_share::LossShare;
+use crate::facts::rate::{SECONDS, Slot};
+use crate::facts::watch::{Expectations, WatchState};
+
+/// Bad evaluations in a row until a topic is violated.
+const BAD: u8 = 2;
+/// Good evaluations in a row until it recovers.
+const GOOD: u8 = 3;
+/// Seconds from a topic's first publisher until the numbers of its endpoints are evaluated.
+pub const GRACE: u64 = 10;
+const NAMES: [&str; 7] = [
+    "min_rate_hz",
+    "max_rate_hz",
+    "max_loss_ratio",
+    "max_latency_ms",
+    "max_silence_s",
+    "publishers",
+    "subscribers",
+];
+const MIN_RATE: u8 = 1 << 0;
+const MAX_RATE: u8 = 1 << 1;
+const MAX_LOSS: u8 = 1 << 2;
+const MAX_LATENCY: u8 = 1 << 3;
+const MAX_SILENCE: u8 = 1 << 4;
+const PUBLISHERS: u8 = 1 << 5;
+const SUBSCRIBERS: u8 = 1 << 6;
+
+/// The facts that an evaluation uses.
+pub struct Evidence<'a> {
+    /// Time of the evaluation.
+    pub now: Timestamp,
+    /// Number of live writers.
+    pub publishers: usize,
+    /// Number of live readers.
+    pub subscriptions: usize,
+    /// Time of the last message of any writer.
+    pub last_message: Option<Timestamp>,
+    /// Returns how long the topic may seem silent while messages are sent, at this interval if none
+    /// is known.
+    pub seeming_silence: &'a dyn Fn(Duration) -> Duration,
+    /// Time since which the topic has a writer and is watched.
+    pub since: Timestamp,
+    /// Time since which messages are expected and would be seen; at least `since`.
+    pub observed: Timestamp,
+    /// Returns counts of the last whole seconds and the number of these seconds.
+    pub recent: &'a dyn Fn(u64) -> (Slot, u64),
+    /// Loss of the worst subscriber in the last ten seconds.
+    pub loss: LossShare,
+}
+
+/// State of one topic under one entry.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Judgement {
+    /// Whether no evaluation has taken place.
+    fresh: bool,
+    state: WatchState,
+    violated: bool,
+    broken: u8,
+    bad: u8,
+    good: u8,
+}
+
+impl Evidence<'_> {
+    /// Returns the number of whole seconds in which messages would have been seen.
+    fn observed_seconds(&self) -> u64 {
+        let first = self.observed.0.div_ceil(SECOND);
+        self.now.whole_seconds().saturating_sub(first)
+    }
+
+    /// Returns how much of the last whole seconds is not known yet, in seconds. Messages are expected
+    /// at this rate.
+    fn unknown_seconds(&self, rate: f64) -> f64 {
+        let interval = Duration::try_from_secs_f64(1.0 / rate).unwrap_or(Duration::MAX);
+        let seeming = (self.seeming_silence)(interval);
+        let last = self.last_message.unwrap_or_default().max(self.observed);
+        if seeming.is_zero() || self.now - last > seeming {
+            return 0.0;
+        }
+        let end = Timestamp(self.now.whole_seconds().saturating_mul(SECOND));
+        (end - last).as_secs_f64()
+    }
+}
+
+impl Default for Judgement {
+    fn default() -> Self {
+        Self {
+            fresh: true,
+            state: WatchState::Ok,
+            violated: false,
+            broken: 0,
+            bad: 0,
+            good: 0,
+        }
+    }
+}
+
+impl Judgement {
+    /// Returns the state.
+    #[must_use]
+    pub const fn state(&self) -> WatchState {
+        self.state
+    }
+
+    /// Returns the keys of the violated expectations.
+    #[must_use]
+    pub fn violations(&self) -> Vec<&'static str> {
+        let broken = |bit: &usize| self.broken & 1 << bit != 0;
+        (0..NAMES.len())
+            .filter(broken)
+            .filter_map(|bit| NAMES.get(bit).copied())
+            .collect()
+    }
+
+    /// Evaluates the topic. Returns the new state if it differs from the previous one. At the first
+    /// evaluation, any state but `Ok` counts as a change.
+    pub fn judge(
+        &mut self,
+        expectations: &Expectations,
+        evidence: &Evidence<'_>,
+    ) -> Option<Option<WatchState>> {
+        let before = (!self.fresh).then_some(self.state);
+        let is_silent = self.state == WatchState::Silent;
+        let broken = broken(expectations, evidence, is_silent);
+        let quiet = broken & MAX_SILENCE != 0 || evidence.last_message.is_none();
+        let broken = without_consequences(broken, quiet, evidence);
+        let silent = broken & MAX_SILENCE != 0;
+        if broken & !MAX_SILENCE == 0 {
+            (self.bad, self.good) = (0, self.good.saturating_add(1));
+        } else {
+            (self.bad, self.good) = (self.bad.saturating_add(1), 0);
+        }
+        if self.bad >= BAD {
+            self.violated = true;
+        } else if self.good >= GOOD {
+            self.violated = false;
+        }
+        let lacks_endpoints = self.violated && broken & (PUBLISHERS | SUBSCRIBERS) != 0;
+        self.state = if evidence.publishers == 0 {
+            WatchState::NotPublished
+        } else if evidence.subscriptions == 0 && quiet && !lacks_endpoints {
+            WatchState::NoSubscriber
+        } else if silent {
+            WatchState::Silent
+        } else if self.violated {
+            WatchState::Violated
+        } else {
+            WatchState::Ok
+        };
+        match self.state {
+            WatchState::Silent => self.broken = broken,
+            // In a violated state without a currently violated expectation, the last ones stay
+            // listed.
+            WatchState::Violated if broken != 0 => self.broken = broken,
+            WatchState::Violated => {}
+            _ => self.broken = 0,
+        }
+        self.fresh = false;
+        (before.unwrap_or(WatchState::Ok) != self.state).then_some(before)
+    }
+}
+
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "counts of ten seconds are far below 2^52"
+)]
+fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool) -> u8 {
+    let mut broken = 0;
+    let rates = |rate: f64| {
+        let window = expectations
+            .window_s
+            .map_or_else(|| window(rate), u64::from);
+        (evidence.recent)(window.min(evidence.observed_seconds()))
+    };
+    if let Some(minimum) = expectations.min_rate_hz {
+        let (slot, seconds) = rates(minimum);
+        let known = seconds as f64 - evidence.unknown_seconds(minimum).min(seconds as f64);
+        if known > 0.0 && (slot.messages + 1) as f64 <= minimum * known {
+            broken |= MIN_RATE;
+        }
+    }
+    if let Some(maximum) = expectations.max_rate_hz {
+        let (slot, seconds) = rates(maximum);
+        if seconds > 0 && slot.messages as f64 >= maximum * seconds as f64 + 1.0 {
+            broken |= MAX_RATE;
+        }
+    }
+    if let Some(maximum) = expectations.max_loss_ratio
+        && evidence.loss.exceeds(maximum)
+    {
+        broken |= MAX_LOSS;
+    }
+    if let Some(maximum) = expectations.max_latency {
+        let (slot, _) = (evidence.recent)(1);
+        if slot.delayed > 0 && slot.delay > maximum.as_secs_f64() * slot.delayed as f64 {
+            broken |= MAX_LATENCY;
+        }
+    }
+    if let Some(maximum) = expectations.max_silence {
+        let last = evidence.last_message.unwrap_or_default();
+        let begin = match is_silent {
+            true => last,
+            false => last.max(evidence.observed),
+        };
+        if evidence.now - begin > maximum.max((evidence.seeming_silence)(maximum)) {
+            broken |= MAX_SILENCE;
+        }
+    }
+    if evidence.now - evidence.since >= Duration::from_secs(GRACE) {
+        let lacks = |expected: Option<u32>, there: usize| {
+            expected.is_some_and(|expected| there < usize::try_from(expected).unwrap_or(usize::MAX))
+        };
+        if lacks(expectations.publishers, evidence.publishers) {
+            broken |= PUBLISHERS;
+        }
+        if lacks(expectations.subscribers, evidence.subscriptions) {
+            broken |= SUBSCRIBERS;
+        }
+    }
+    broken
+}
+
+/// Removes the violations that follow from the lack of every subscriber.
+const fn without_consequences(broken: u8, quiet: bool, evidence: &Evidence<'_>) -> u8 {
+    let is_expected = broken & SUBSCRIBERS != 0;
+    if evidence.subscriptions == 0 && (quiet || is_expected) {
+        broken & !(MIN_RATE | MAX_SILENCE)
+    } else {
+        broken
+    }
+}
+
+/// Returns the number of whole seconds in which three messages at this rate are due, from 1 to 10.
+#[must_use]
+pub fn window(rate: f64) -> u64 {
+    let seconds = (3.0 / rate.max(0.01)).ceil();
+    (1..SECONDS)
+        .find(|window| seconds <= f64::from(u32::try_from(*window).unwrap_or(1)))
+        .unwrap_or(SECONDS)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Bench {
+        judgement: Judgement,
+        expectations: Expectations,
+        now: u64,
+        last_message: Option<Timestamp>,
+        seeming_silence: Duration,
+        /// Time before an evaluation of which polling has seen nothing.
+        unseen: Duration,
+        subscriptions: usize,
+        publishers: usize,
+        observed: Timestamp,
+    }
+
+    impl Bench {
+        fn new(expectations: Expectations) -> Self {
+            Self {
+                judgement: Judgement::default(),
+                expectations,
+                now: 1000 * SECOND,
+                last_message: None,
+                seeming_silence: Duration::ZERO,
+                unseen: Duration::ZERO,
+                subscriptions: 1,
+                publishers: 1,
+                observed: Timestamp(1000 * SECOND),
+            }
+        }
+
+        /// Evaluates one second with these counts.
+        fn second(&mut self, slot: Slot) -> WatchState {
+            self.now += SECOND;
+            if slot.messages > 0 {
+                let unseen = u64::try_from(self.unseen.as_nanos()).unwrap();
+                self.last_message = Some(Timestamp(self.now - unseen));
+            }
+            let recent = |seconds: u64| {
+                let mut sum = Slot::default();
+                (0..seconds).for_each(|_| sum.add(&slot));
+                (sum, seconds)
+            };
+            self.judgement.judge(
+                &self.expectations,
+                &Evidence {
+                    now: Timestamp(self.now),
+                    publishers: self.publishers,
+                    subscriptions: self.subscriptions,
+                    last_message: self.last_message,
+                    seeming_silence: &|_| self.seeming_silence,
+                    since: Timestamp(1000 * SECOND),
+                    observed: self.observed,
+                    recent: &recent,
+                    loss: LossShare {
+                        lost: 10 * slot.lost,
+                        expected: 10 * (slot.messages + slot.lost),
+                    },
+                },
+            );
+            self.judgement.state()
+        }
+    }
+
+    fn rate(messages: u64) -> Slot {
+        Slot {
+            messages,
+            ..Slot::default()
+        }
+    }
+
+    #[test]
+    fn one_bad_second_is_no_violation_and_one_good_one_no_recovery() {
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(10.0),
+            ..Expectations::default()
+        });
+        let states: Vec<_> = [10, 4, 10, 4, 4, 10, 10, 10]
+            .map(|messages| bench.second(rate(messages)))
+            .into();
+        let (ok, bad) = (WatchState::Ok, WatchState::Violated);
+        assert_eq!(states, [ok, ok, ok, ok, bad, bad, bad, ok]);
+    }
+
+    #[test]
+    fn a_periodic_topic_at_its_limit_does_not_waver() {
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(20.0),
+            max_rate_hz: Some(20.0),
+            ..Expectations::default()
+        });
+        for messages in [20, 19, 21, 20, 20, 19] {
+            // With jitter, the window contains 19 to 21 messages instead of 20.
+            let state = bench.second(rate(messages));
+            assert!(matches!(state, WatchState::Ok | WatchState::Violated));
+        }
+        assert_eq!(window(0.5), 6);
+        assert_eq!((window(200.0), window(0.01)), (1, 10));
+    }
+
+    #[test]
+    fn violations_are_named() {
+        let mut bench = Bench::new(Expectations {
+            max_rate_hz: Some(5.0),
+            max_loss_ratio: Some(0.01),
+            max_latency: Some(Duration::from_millis(50)),
+            ..Expectations::default()
+        });
+        let slot = Slot {
+            messages: 10,
+            lost: 1,
+            delayed: 10,
+            delay: 1.0,
+            bytes: 0,
+        };
+        bench.second(slot);
+        assert_eq!(bench.second(slot), WatchState::Violated);
+        let violations = bench.judgement.violations();
+        assert_eq!(
+            violations,
+            ["max_rate_hz", "max_loss_ratio", "max_latency_ms"]
+        );
+    }
+
+    #[test]
+    fn silence_counts_from_the_first_publisher() {
+        let mut bench = Bench::new(Expectations {
+            max_silence: Some(Duration::from_secs(2)),
+            ..Expectations::default()
+        });
+        let states: Vec<_> = [0, 0, 0, 5]
+            .map(|messages| bench.second(rate(messages)))
+            .into();
+        let (ok, silent) = (WatchState::Ok, WatchState::Silent);
+        assert_eq!(states, [ok, ok, silent, ok]);
+    }
+
+    #[test]
+    fn silence_counts_from_the_time_at_which_the_agent_sees_again() {
+        let expectations = Expectations {
+            max_silence: Some(Duration::from_secs(2)),
+            ..Expectations::default()
+        };
+        let mut bench = Bench::new(expectations);
+        let (ok, silent) = (WatchState::Ok, WatchState::Silent);
+        assert_eq!(bench.second(rate(5)), ok);
+        // Five seconds are not seen.
+        bench.now += 5 * SECOND;
+        bench.observed = Timestamp(bench.now);
+        let states = [(); 3].map(|()| bench.second(rate(0)));
+        assert_eq!(states, [ok, ok, silent]);
+        // What was silent before stays silent.
+        bench.now += 5 * SECOND;
+        bench.observed = Timestamp(bench.now);
+        assert_eq!([0, 1].map(|count| bench.second(rate(count))), [silent, ok]);
+    }
+
+    #[test]
+    fn a_topic_that_is_sampled_is_silent_when_unseen_messages_no_longer_explain_it() {
+        let mut bench = Bench::new(Expectations {
+            max_silence: Some(Duration::from_secs(2)),
+            ..Expectations::default()
+        });
+        bench.seeming_silence = Duration::from_secs(4);
+        assert_eq!(bench.second(rate(5)), WatchState::Ok);
+        let states = [(); 5].map(|()| bench.second(rate(0)));
+        let (ok, silent) = (WatchState::Ok, WatchState::Silent);
+        assert_eq!(states, [ok, ok, ok, ok, silent]);
+    }
+
+    #[test]
+    fn a_rate_of_a_sampled_topic_counts_up_to_the_last_message_that_polling_saw() {
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(40.0),
+            ..Expectations::default()
+        });
+        bench.seeming_silence = Duration::from_secs(1);
+        bench.unseen = Duration::from_millis(400);
+        // 50 Hz, the last 0.4 s of each second unseen.
+        let states = [(); 4].map(|()| bench.second(rate(30)));
+        assert_eq!(states, [WatchState::Ok; 4]);
+        // 30 Hz: too few up to the last message.
+        let states = [(); 2].map(|()| bench.second(rate(18)));
+        let (ok, bad) = (WatchState::Ok, WatchState::Violated);
+        assert_eq!(states, [ok, bad]);
+        // It recovers, and ends.
+        (0..3).for_each(|_| assert_ne!(bench.second(rate(30)), WatchState::Silent));
+        let states = [(); 3].map(|()| bench.second(rate(0)));
+        assert_eq!(states, [ok, bad, bad]);
+        // Without sampling, all messages are known at once.
+        (0..3).for_each(|_| assert_ne!(bench.second(rate(50)), WatchState::Silent));
+        bench.seeming_silence = Duration::ZERO;
+        let states = [(); 2].map(|()| bench.second(rate(30)));
+        assert_eq!(states, [ok, bad]);
+    }
+
+    #[test]
+    fn a_rate_counts_from_the_time_at_which_the_agent_sees_again() {
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(0.5),
+            ..Expectations::default()
+        });
+        // Messages of the window before the view began are unknown.
+        bench.now += 20 * SECOND;
+        bench.observed = Timestamp(bench.now);
+        let states = [(); 7].map(|()| bench.second(rate(0)));
+        let (ok, bad) = (WatchState::Ok, WatchState::Violated);
+        assert_eq!(states, [ok, ok, bad, bad, bad, bad, bad]);
+    }
+
+    #[test]
+    fn without_subscriber_or_publisher_nothing_is_expected() {
+        let mut bench = Bench::new(Expectations {
+            max_silence: Some(Duration::from_secs(1)),
+            ..Expectations::default()
+        });
+        bench.subscriptions = 0;
+        assert_eq!(bench.second(rate(0)), WatchState::NoSubscriber);
+        bench.publishers = 0;
+        assert_eq!(bench.second(rate(0)), WatchState::NotPublished);
+        assert!(bench.judgement.violations().is_empty());
+    }
+
+    /// Returns a bench after its grace, with ten messages each second.
+    fn counted(publishers: Option<u32>, subscribers: Option<u32>) -> Bench {
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(8.0),
+            max_silence: Some(Duration::from_secs(1)),
+            publishers,
+            subscribers,
+            ..Expectations::default()
+        });
+        bench.publishers = publishers.map_or(1, |count| count as usize);
+        bench.subscriptions = subscribers.map_or(1, |count| count as usize);
+        for _ in 0..GRACE {
+            assert_eq!(bench.second(rate(10)), WatchState::Ok);
+        }
+        bench
+    }
+
+    #[test]
+    fn too_few_publishers_violate_after_two_seconds() {
+        let mut bench = counted(Some(2), None);
+        bench.publishers = 1;
+        let states = [(); 2].map(|()| bench.second(rate(10)));
+        assert_eq!(states, [WatchState::Ok, WatchState::Violated]);
+        assert_eq!(bench.judgement.violations(), ["publishers"]);
+        bench.publishers = 3;
+        let states = [(); 3].map(|()| bench.second(rate(10)));
+        let (ok, bad) = (WatchState::Ok, WatchState::Violated);
+        assert_eq!(states, [bad, bad, ok]);
+        bench.publishers = 0;
+        assert_eq!(bench.second(rate(0)), WatchState::NotPublished);
+        assert_eq!(bench.second(rate(0)), WatchState::NotPublished);
+        assert!(bench.judgement.violations().is_empty());
+    }
+
+    #[test]
+    fn a_missing_subscriber_is_the_only_violation_of_a_writer_that_stops_for_it() {
+        let mut bench = counted(None, Some(1));
+        bench.subscriptions = 0;
+        let states = [(); 5].map(|()| bench.second(rate(0)));
+        assert_eq!(states[1..], [WatchState::Violated; 4]);
+        assert_eq!(bench.judgement.violations(), ["subscribers"]);
+        let silent = &mut counted(None, Some(2));
+        silent.subscriptions = 1;
+        let states = [(); 5].map(|()| silent.second(rate(0)));
+        assert_eq!(states[4], WatchState::Silent);
+        let violations = silent.judgement.violations();
+        assert_eq!(violations, ["min_rate_hz", "max_silence_s", "subscribers"]);
+    }
+
+    #[test]
+    fn too_few_publishers_violate_without_a_subscriber_too() {
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(8.0),
+            max_silence: Some(Duration::from_secs(1)),
+            publishers: Some(2),
+            ..Expectations::default()
+        });
+        bench.subscriptions = 0;
+        bench.publishers = 2;
+        for _ in 0..=GRACE {
+            assert_eq!(bench.second(rate(0)), WatchState::NoSubscriber);
+        }
+        bench.publishers = 1;
+        let states = [(); 3].map(|()| bench.second(rate(0)));
+        let (alone, bad) = (WatchState::NoSubscriber, WatchState::Violated);
+        assert_eq!(states, [alone, bad, bad]);
+        assert_eq!(bench.judgement.violations(), ["publishers"]);
+    }
+
+    #[test]
+    fn a_robot_has_time_to_start_its_subscribers() {
+        let mut bench = Bench::new(Expectations {
+            subscribers: Some(1),
+            ..Expectations::default()
+        });
+        bench.subscriptions = 0;
+        for _ in 0..GRACE {
+            assert_eq!(bench.second(rate(0)), WatchState::NoSubscriber);
+        }
+        assert_eq!(bench.second(rate(0)), WatchState::Violated);
+    }
+}

@@ -1,0 +1,217 @@
+//! Puts one writer's samples into the order in which a reliable subscriber receives them.
+//!
+//! A reader delivers a sample once all lower numbers have arrived or will not arrive (RTPS 2.5,
+//! 8.4.12). A counted sample therefore waits after a gap until one of these closes it: a
+//! retransmission, a GAP or HEARTBEAT of the writer, ACKNACKs of the readers, or its loss. The
+//! sample then gets the time of that moment. The waiting samples are bounded in number, bytes and
+//! time; beyond, they are dispatched, and a late retransmission follows out of order. Samples never
+//! wait without a gap, without a reliable reader, or if all readers are on other hosts, whose
+//! ACKNACKs are not seen.
+//!
+//! Samples of every writer also wait while uprobes take over from polling: a message that both views
+//! may have seen last arrives behind later ones. The readers do not wait for it, so these samples
+//! keep their own times.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::{SequenceNumber, Timestamp};
+
+use crate::facts::bounded::Bounded;
+use crate::facts::dispatch::{Dispatch, Sample};
+use crate::facts::tables::{self, OrderedSamples};
+
+/// Longest time that a gap is waited for. Fast DDS requests retransmissions after a HEARTBEAT,
+/// which follows within three seconds.
+const GAP_TIMEOUT: Duration = Duration::from_secs(4);
+/// Samples from before the announcement are retransmitted within this time, or not at all.
+const RETRANSMISSION_TIMEOUT: Duration = Duration::from_secs(10);
+/// Memory per sample in addition to its payload.
+const OVERHEAD: usize = size_of::<QueuedSample>() + 64;
+/// Longest time from the announcement to the first ACKNACK.
+const FIRST_ACKNACK_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// How far the samples of a writer are decided.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub struct Progress {
+    /// Increases when the writer restarts its sequence numbers under the same GUID.
+    pub incarnation: u32,
+    /// All samples below arrived, or no reader waits for them.
+    pub complete: SequenceNumber,
+    /// No reader waits for any sample below this number.
+    pub awaited: SequenceNumber,
+    /// Whether the writer retransmits.
+    pub reliable: bool,
+    /// Whether the writer has readers that acknowledge, or new ones that may.
+    pub acknowledged: bool,
+    /// Whether the first missing sample is one that this host did not see, and that readers may
+    /// have.
+    pub unseen: bool,
+}
+
+/// A sample and the subscriptions that receive it.
+#[derive(Debug)]
+pub struct QueuedSample {
+    /// Ids of the requests.
+    pub to: Arc<[u64]>,
+    /// The sample.
+    pub sample: Sample,
+    /// The outcome for subscriptions that miss its bytes.
+    pub missed: Option<Dispatch>,
+}
+
+/// Numbers of a writer that is not announced yet.
+pub(crate) type UnannouncedNumbers = Bounded<tables::UnannouncedNumbers, BTreeSet<SequenceNumber>>;
+
+/// Samples that wait for lower numbers.
+#[derive(Debug, Default)]
+pub struct InOrder {
+    waiting: Bounded<OrderedSamples, BTreeMap<SequenceNumber, QueuedSample>>,
+    bytes: usize,
+    incarnation: Option<u32>,
+    /// The missing number, and since when it is waited for.
+    hole: (SequenceNumber, Timestamp),
+    /// Whether readers may have the missing number.
+    is_hole_unseen: bool,
+    /// Time of the last dispatched sample.
+    last: Timestamp,
+    /// Numbers that were counted before the writer's announcement but not dispatched.
+    earlier: UnannouncedNumbers,
+    announced: Timestamp,
+}
+
+impl QueuedSample {
+    /// Returns the size of its payload in bytes.
+    pub fn bytes(&self) -> usize {
+        self.sample.payload.as_ref().map_or(0, bytes::Bytes::len)
+    }
+
+    /// Returns the memory that it needs while it waits.
+    pub fn cost(&self) -> usize {
+        OVERHEAD + self.bytes()
+    }
+}
+
+impl InOrder {
+    /// Returns whether no sample waits or may still be retransmitted.
+    #[must_use]
+    pub fn is_idle(&self) -> bool {
+        self.waiting.is_empty() && self.earlier.is_empty()
+    }
+
+    /// Returns the bytes of the waiting samples.
+    #[must_use]
+    pub const fn bytes(&self) -> usize {
+        self.bytes
+    }
+
+    /// Sets the numbers that were counted before the writer's announcement at `now`.
+    pub fn announced(&mut self, earlier: UnannouncedNumbers, now: Timestamp) {
+        (self.earlier, self.announced) = (earlier, now);
+    }
+
+    /// Returns whether this sample was counted before the announcement and is not dispatched yet.
+    #[must_use]
+    pub fn lacks(&self, number: SequenceNumber) -> bool {
+        self.earlier.contains(&number)
+    }
+
+    /// Begins a new incarnation after all samples of the previous one are dispatched.
+    pub fn begin(&mut self, incarnation: u32, now: Timestamp, give: &mut impl FnMut(QueuedSample)) {
+        if self.incarnation.replace(incarnation) != Some(incarnation) {
+            self.give_all(now, give);
+        }
+    }
+
+    /// Returns the sample for immediate dispatch; no other sample waits.
+    pub fn pass(&mut self, mut queued: QueuedSample, now: Timestamp) -> QueuedSample {
+        queued.sample.time = now.max(self.last);
+        self.last = queued.sample.time;
+        queued
+    }
+
+    /// Adds a sample that is dispatched in its turn.
+    pub fn put(&mut self, queued: QueuedSample) {
+        let number = queued.sample.sequence_number;
+        self.earlier.remove(&number);
+        self.bytes += queued.cost();
+        if let Some(before) = self.waiting.remove(&number) {
+            self.bytes -= before.cost();
+        }
+        self.waiting.insert(number, queued);
+    }
+
+    /// Returns samples from before the announcement that will not be retransmitted.
+    pub fn forgone(&mut self, progress: &Progress, now: Timestamp) -> Vec<SequenceNumber> {
+        if self.earlier.is_empty() {
+            return Vec::new();
+        }
+        let is_late = self.announced + RETRANSMISSION_TIMEOUT <= now;
+        if is_late || !progress.reliable {
+            return self.earlier.take().into_iter().collect();
+        }
+        let gone = self.earlier.take_below(&progress.awaited);
+        gone.into_iter().collect()
+    }
+
+    /// Dispatches the samples whose turn has come at `now`; at most `room` bytes may continue to
+    /// wait. If the order was given up, returns the number below which no sample is waited for.
+    pub fn turn(
+        &mut self,
+        progress: &Progress,
+        now: Timestamp,
+        room: usize,
+        give: &mut impl FnMut(QueuedSample),
+    ) -> Option<SequenceNumber> {
+        self.begin(progress.incarnation, now, give);
+        let first = self
+            .earlier
+            .first()
+            .filter(|_| progress.acknowledged || self.announced + FIRST_ACKNACK_TIMEOUT > now);
+        let complete = first.map_or(progress.complete, |first| progress.complete.min(*first));
+        while let Some(entry) = self.waiting.first_entry()
+            && *entry.key() < complete
+        {
+            let queued = entry.remove();
+            self.give(queued, now, give);
+        }
+        if self.waiting.is_empty() {
+            return None;
+        }
+        if self.hole.0 != complete {
+            self.hole = (complete, now);
+        }
+        self.is_hole_unseen = progress.unseen;
+        let is_late = self.hole.1 + GAP_TIMEOUT <= now;
+        if is_late || self.waiting.is_full() || self.bytes > room {
+            let last = self.waiting.last_key_value().map(|(number, _)| *number);
+            self.give_all(now, give);
+            return last.map(|last| last.next());
+        }
+        None
+    }
+
+    /// Dispatches all waiting samples at the end of the input.
+    pub fn give_all(&mut self, now: Timestamp, give: &mut impl FnMut(QueuedSample)) {
+        while let Some((_, queued)) = self.waiting.pop_first() {
+            self.give(queued, now, give);
+        }
+    }
+
+    fn give(&mut self, queued: QueuedSample, now: Timestamp, give: &mut impl FnMut(QueuedSample)) {
+        self.bytes -= queued.cost();
+        let came = queued.sample.time;
+        // Its reader may have received the lower number through unobserved shared memory, and then
+        // it did not wait.
+        let is_own = queued.sample.sampled || self.is_hole_unseen;
+        let now = if is_own { came } else { now };
+        // Players sort by time, so samples that waited for the same retransmission are one
+        // nanosecond apart.
+        let after = match came < now.max(self.last) {
+            true => Timestamp(self.last.0.saturating_add(1)),
+            false => came,
+        };
+        give(self.pass(queued, now.max(after)));
+    }
+}

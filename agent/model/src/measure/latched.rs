@@ -1,0 +1,414 @@
+//! The last message of each transient-local writer, for clients that begin later: the agent does not
+//! subscribe, so it cannot request what was sent before.
+//!
+//! It changes no figure. Payloads are captured within an allowance of each writer and of all
+//! together. A writer that exceeds it is paused: the kernel only meters it, which shows whether the
+//! kept message is still the last. Messages, their bytes and the writers have caps.
+
+mod allowance;
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use ros2probe_wire::record::{self, Verdict};
+use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber, Timestamp};
+
+use crate::facts::bounded::{Bounded, Counted, Sum, TableFacts};
+use crate::facts::dispatch::{Sample, Topic};
+use crate::facts::tables::{RetainedBytes, RetainedWriters};
+use crate::measure::assembly::Assembly;
+use allowance::Allowance;
+
+/// What became of the last message of a transient-local writer. Sizes are in bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LatchedFacts {
+    /// No message was seen whole.
+    Unseen,
+    /// It is kept.
+    Kept(u32),
+    /// It is larger than what is kept.
+    TooLarge(u32),
+    /// The writer sent more than what is captured for this purpose.
+    Paused,
+    /// It was dropped for others, or had no room beside them.
+    NoRoom(u32),
+}
+
+/// Largest message that is kept by default, in bytes.
+pub const MESSAGE_BYTES: usize = 1 << 20;
+/// Bytes of unfinished messages.
+const ASSEMBLY_BYTES: usize = 4 << 20;
+/// Bytes that may be captured of one writer at once, and in a second.
+const WRITER: Allowance = Allowance::new(8 << 20, 16 << 10);
+/// The same of all writers together.
+const ALL_WRITERS: Allowance = Allowance::new(64 << 20, 256 << 10);
+/// A paused writer is captured again once this much is allowed: a whole message.
+const RESUME_BYTES: u64 = MESSAGE_BYTES as u64;
+
+/// Writers whose last message is kept.
+#[derive(Debug)]
+pub struct Latched {
+    writers: Bounded<Counted<RetainedWriters>, HashMap<Guid, LatchedWriter>>,
+    bytes: Sum<Counted<RetainedBytes>>,
+    assembly: Assembly,
+    allowance: Allowance,
+    /// Number of paused writers.
+    paused: usize,
+}
+
+/// A writer, as far as its messages need it.
+#[derive(Clone, Debug)]
+pub struct LatchedTopic {
+    /// Its topic.
+    pub topic: Arc<Topic>,
+    /// Whether its type begins with a header.
+    pub has_header: bool,
+    /// Whether a watch requests its last message, whatever its size.
+    pub is_watched: bool,
+}
+
+#[derive(Debug)]
+struct LatchedWriter {
+    about: LatchedTopic,
+    allowance: Allowance,
+    is_paused: bool,
+    /// Number and source timestamp of the last message.
+    newest: Option<(SequenceNumber, Option<Timestamp>)>,
+    last: Last,
+}
+
+/// The last message of a writer.
+#[derive(Debug)]
+enum Last {
+    /// None was seen whole.
+    Unseen,
+    Kept(Arc<Sample>),
+    TooLarge(u32),
+    /// The writer was paused when it came.
+    Paused,
+    NoRoom(u32),
+}
+
+impl Default for Latched {
+    fn default() -> Self {
+        Self {
+            writers: Bounded::default(),
+            bytes: Sum::default(),
+            assembly: Assembly::new(ASSEMBLY_BYTES),
+            allowance: ALL_WRITERS,
+            paused: 0,
+        }
+    }
+}
+
+impl Latched {
+    /// Keeps the last message of this writer from now on, if there is room for the writer.
+    pub fn follow(&mut self, writer: Guid, about: LatchedTopic) {
+        let new = || LatchedWriter {
+            about: about.clone(),
+            allowance: WRITER,
+            is_paused: false,
+            newest: None,
+            last: Last::Unseen,
+        };
+        let Some(known) = self.writers.get_or_insert_with(writer, new) else {
+            return;
+        };
+        known.about = about;
+        // A message that a watch requested may be too large without it.
+        if let Last::Kept(sample) = &known.last
+            && size(sample) > known.most()
+        {
+            let last = Last::TooLarge(sized(size(sample)));
+            self.replace(writer, last);
+        }
+    }
+
+    /// Drops a writer and its message.
+    pub fn forget(&mut self, writer: Guid) {
+        self.replace(writer, Last::Unseen);
+        if let Some(known) = self.writers.remove(&writer) {
+            self.paused -= usize::from(known.is_paused);
+            self.assembly.release(writer);
+        }
+    }
+
+    /// Returns the verdict that the kernel needs for this writer; `None` if none of its messages is
+    /// kept.
+    #[must_use]
+    pub fn verdict(&self, writer: Guid) -> Option<Verdict> {
+        let known = self.writers.get(&writer)?;
+        Some(match known.is_paused {
+            true => Verdict::Meter,
+            false => Verdict::Capture,
+        })
+    }
+
+    /// Returns whether messages of any writer are kept.
+    #[must_use]
+    pub fn is_used(&self) -> bool {
+        !self.writers.is_empty()
+    }
+
+    /// Adds a DATA or DATA_FRAG that no client requests. Returns whether the verdict has changed.
+    pub fn put(&mut self, sample: record::Sample<'_>, payload: &[u8]) -> bool {
+        let record = sample.record();
+        let (writer, now) = (record.writer(), Timestamp(record.time));
+        let Some(known) = self.writers.get_mut(&writer) else {
+            return false;
+        };
+        // Until the kernel knows of a pause, it captures more.
+        let own = known.allowance.spend(payload.len(), now);
+        let is_allowed = self.allowance.spend(payload.len(), now) && own;
+        if known.is_paused || !sample.is_message() {
+            return false;
+        }
+        let bytes = usize::try_from(sample.size()).unwrap_or(usize::MAX);
+        if bytes > known.most() {
+            // Its next message may be as large.
+            known.allowance.exhaust();
+        }
+        if !is_allowed || bytes > known.most() {
+            self.pause(writer);
+            self.seen(record);
+            return true;
+        }
+        let number = sample.sequence_number();
+        let source = record.source_timestamp().timestamp();
+        if !known.lacks((number, source)) {
+            return false;
+        }
+        if known.newest.is_none_or(|(newest, _)| newest != number) {
+            known.newest = Some((number, source));
+            self.assembly.release(writer);
+            // The kept message is no longer the last.
+            self.replace(writer, Last::Unseen);
+        }
+        self.assembly.put(sample, payload, 0);
+        if !self.assembly.is_whole(writer, number) {
+            return false;
+        }
+        let payload = self.assembly.take(writer, number);
+        let Some(known) = self.writers.get(&writer).filter(|_| payload.is_some()) else {
+            return false;
+        };
+        let has_stamp = known.about.has_header && matches!(sample, record::Sample::Data(_));
+        let sample = Sample {
+            topic: Arc::clone(&known.about.topic),
+            time: now,
+            writer,
+            sequence_number: number,
+            source_timestamp: source,
+            header_stamp: sample.header_stamp().filter(|_| has_stamp),
+            size: sample.size(),
+            sampled: false,
+            payload,
+        };
+        self.keep(Arc::new(sample));
+        false
+    }
+
+    /// Keeps a message that a client received.
+    pub fn dispatched(&mut self, sample: &Arc<Sample>) {
+        let Some(known) = self.writers.get_mut(&sample.writer) else {
+            return;
+        };
+        let about = (sample.sequence_number, sample.source_timestamp);
+        if sample.payload.is_none() || !known.lacks(about) {
+            return;
+        }
+        known.newest = Some(about);
+        self.assembly.release(sample.writer);
+        if size(sample) > known.most() {
+            let last = Last::TooLarge(sized(size(sample)));
+            self.replace(sample.writer, last);
+        } else {
+            self.keep(Arc::clone(sample));
+        }
+    }
+
+    /// Drops the message of a paused writer, if this record shows that it is no longer the last.
+    pub fn seen(&mut self, record: &Record) {
+        if self.paused == 0 {
+            return;
+        }
+        let writer = record.writer();
+        let known = self.writers.get_mut(&writer);
+        let Some(known) = known.filter(|known| known.is_paused) else {
+            return;
+        };
+        let sample = record.sample().filter(|sample| sample.is_message());
+        let Some(sample) = sample else {
+            return;
+        };
+        let source = record.source_timestamp().timestamp();
+        let about = (sample.sequence_number(), source);
+        if !known.lacks(about) {
+            return;
+        }
+        known.newest = Some(about);
+        let bytes = usize::try_from(sample.size()).unwrap_or(usize::MAX);
+        let last = match bytes > known.most() {
+            true => Last::TooLarge(sample.size()),
+            false => Last::Paused,
+        };
+        self.replace(writer, last);
+    }
+
+    /// Drops unfinished messages that wait for too long. Returns the writers that are captured
+    /// again.
+    pub fn advance(&mut self, now: Timestamp) -> Vec<Guid> {
+        self.assembly.expire(now);
+        if self.paused == 0 || self.allowance.left(now) < RESUME_BYTES {
+            return Vec::new();
+        }
+        let mut resumed = Vec::new();
+        for (writer, known) in &mut self.writers {
+            if known.is_paused && known.allowance.left(now) >= RESUME_BYTES {
+                known.is_paused = false;
+                resumed.push(*writer);
+            }
+        }
+        self.paused -= resumed.len();
+        resumed
+    }
+
+    /// Returns the kept messages, the oldest first.
+    #[must_use]
+    pub fn samples(&self) -> Vec<Arc<Sample>> {
+        let kept = self.writers.values().filter_map(|known| match &known.last {
+            Last::Kept(sample) => Some(Arc::clone(sample)),
+            _ => None,
+        });
+        let mut kept: Vec<_> = kept.collect();
+        kept.sort_by_key(|sample| (sample.time, sample.writer));
+        kept
+    }
+
+    /// Returns what became of the last message of this writer; `None` if none is kept.
+    #[must_use]
+    pub fn facts(&self, writer: Guid) -> Option<LatchedFacts> {
+        let known = self.writers.get(&writer)?;
+        Some(match &known.last {
+            Last::Unseen => LatchedFacts::Unseen,
+            Last::Kept(sample) => LatchedFacts::Kept(sized(size(sample))),
+            Last::TooLarge(bytes) => LatchedFacts::TooLarge(*bytes),
+            Last::Paused => LatchedFacts::Paused,
+            Last::NoRoom(bytes) => LatchedFacts::NoRoom(*bytes),
+        })
+    }
+
+    /// Returns the bytes of kept messages.
+    #[must_use]
+    pub const fn bytes(&self) -> usize {
+        self.bytes.used()
+    }
+
+    /// Returns the rows of the metrics: writers, and bytes.
+    #[must_use]
+    pub fn tables(&self) -> [TableFacts; 2] {
+        [self.writers.facts(), self.bytes.facts()]
+    }
+
+    fn pause(&mut self, writer: Guid) {
+        if let Some(known) = self.writers.get_mut(&writer) {
+            known.is_paused = true;
+            self.paused += 1;
+            self.assembly.release(writer);
+        }
+    }
+
+    /// Keeps a message, if it finds room.
+    fn keep(&mut self, sample: Arc<Sample>) {
+        let (writer, bytes) = (sample.writer, size(&sample));
+        self.replace(writer, Last::Unseen);
+        let known = self.writers.get(&writer);
+        let is_watched = known.is_some_and(|known| known.about.is_watched);
+        while bytes > self.bytes.room() {
+            self.bytes.refuse();
+            let Some((other, size)) = self.largest(is_watched, (writer.prefix, bytes)) else {
+                self.replace(writer, Last::NoRoom(sized(bytes)));
+                return;
+            };
+            self.replace(other, Last::NoRoom(sized(size)));
+        }
+        self.replace(writer, Last::Kept(sample));
+    }
+
+    /// Returns the writer whose message makes room, and its size: the oldest of the participant with
+    /// the most bytes, so that no participant can take the room of the others. Messages that a watch
+    /// requests stay, unless the newcomer is one, too.
+    fn largest(
+        &self,
+        is_watched: bool,
+        (newcomer, bytes): (GuidPrefix, usize),
+    ) -> Option<(Guid, usize)> {
+        let kept = || {
+            self.writers.iter().filter_map(|(writer, known)| {
+                let Last::Kept(sample) = &known.last else {
+                    return None;
+                };
+                (is_watched || !known.about.is_watched).then_some((writer, sample))
+            })
+        };
+        let mut sums: HashMap<GuidPrefix, usize> = HashMap::from([(newcomer, bytes)]);
+        for (writer, sample) in kept() {
+            *sums.entry(writer.prefix).or_default() += size(sample);
+        }
+        let having = |prefix: &GuidPrefix| kept().any(|(writer, _)| writer.prefix == *prefix);
+        let largest = sums.iter().filter(|(prefix, _)| having(prefix));
+        let (largest, _) = largest.max_by_key(|(prefix, sum)| (**sum, **prefix))?;
+        let own = kept().filter(|(writer, _)| writer.prefix == *largest);
+        let (writer, sample) = own.min_by_key(|(writer, sample)| (sample.time, **writer))?;
+        Some((*writer, size(sample)))
+    }
+
+    /// Replaces what became of a writer's last message.
+    fn replace(&mut self, writer: Guid, last: Last) {
+        let Some(known) = self.writers.get_mut(&writer) else {
+            return;
+        };
+        if let Last::Kept(sample) = &last {
+            self.bytes.add(size(sample));
+        }
+        if let Last::Kept(sample) = std::mem::replace(&mut known.last, last) {
+            self.bytes.sub(size(&sample));
+        }
+    }
+}
+
+impl LatchedWriter {
+    /// Returns the size of the largest message to keep.
+    const fn most(&self) -> usize {
+        match self.about.is_watched {
+            true => RetainedBytes::CAP,
+            false => MESSAGE_BYTES,
+        }
+    }
+
+    /// Returns whether a message is later than the last one, or the last one and not seen whole.
+    fn lacks(&self, about: (SequenceNumber, Option<Timestamp>)) -> bool {
+        let is_last = self.newest.is_some_and(|(number, _)| number == about.0);
+        is_last && matches!(self.last, Last::Unseen | Last::Paused) || self.is_newer(about)
+    }
+
+    /// Returns whether a message is later than the last one. A lower number is later only if its
+    /// source timestamp is, as after a restart of the writer.
+    fn is_newer(&self, (number, source): (SequenceNumber, Option<Timestamp>)) -> bool {
+        let Some((newest, newest_source)) = self.newest else {
+            return true;
+        };
+        let is_restarted = source
+            .zip(newest_source)
+            .is_some_and(|(new, old)| new > old);
+        number > newest || number < newest && is_restarted
+    }
+}
+
+fn size(sample: &Sample) -> usize {
+    sample.payload.as_ref().map_or(0, bytes::Bytes::len)
+}
+
+fn sized(bytes: usize) -> u32 {
+    u32::try_from(bytes).unwrap_or(u32::MAX)
+}

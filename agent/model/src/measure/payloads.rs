@@ -1,0 +1,574 @@
+//! Samples for subscriptions: one per writer and sequence number, as soon as the profiler counts
+//! it. Samples of a reliable writer are in the order of their numbers ([`crate::measure::in_order`]).
+//!
+//! The output queue is bounded; samples without room are counted and reported. Requests for samples
+//! never change a measurement.
+
+mod request_begin;
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::{Guid, SequenceNumber, Timestamp, record};
+
+use crate::facts::bounded::Bounded;
+use crate::facts::dispatch::{Dispatch, Missed, MissedReason, Sample, SampleOutcome, Topic};
+use crate::facts::journal::Missing;
+use crate::facts::selection::RequestIds;
+use crate::facts::tables::WaitingDispatches;
+use crate::measure::assembly::Assembly;
+use crate::measure::in_order::{InOrder, Progress, QueuedSample, UnannouncedNumbers};
+use crate::measure::writer::Counted;
+use request_begin::RequestBegin;
+
+/// Longest time until the kernel captures payloads after a request, and the model has processed
+/// what was captured before.
+pub const PAYLOAD_DELAY: Duration = Duration::from_millis(400);
+
+/// Requests for the samples of one writer.
+#[derive(Debug)]
+struct WantedWriter {
+    topic: Arc<Topic>,
+    /// Ids of all requests, of those for payloads, and of the others.
+    to: Arc<[u64]>,
+    payloads: Arc<[u64]>,
+    arrivals: Arc<[u64]>,
+    /// Where each request begins.
+    begins: Vec<RequestBegin>,
+    /// Time since which payloads are requested.
+    since: Timestamp,
+    /// Number of the first sample that was dispatched with its payload.
+    first_whole: Option<SequenceNumber>,
+    order: InOrder,
+}
+
+/// Numbers of a writer that is not announced yet.
+#[derive(Debug, Default)]
+struct UnannouncedSamples {
+    numbers: UnannouncedNumbers,
+    /// Ids of the requests, and the first number that was counted during each.
+    begins: Vec<(u64, SequenceNumber)>,
+    /// Lower numbers that are not remembered: the first, the last, and their count.
+    before: Option<(SequenceNumber, SequenceNumber, u64)>,
+}
+
+/// Requested writers and the output queue.
+#[derive(Debug)]
+pub struct Payloads {
+    writers: HashMap<Guid, WantedWriter>,
+    payload_delay: Duration,
+    /// Number of writers whose payloads are requested.
+    deep: usize,
+    assembly: Assembly,
+    /// Counted samples of writers without an announcement, while samples are requested.
+    unknown_writers: HashMap<Guid, UnannouncedSamples>,
+    dispatches: Bounded<WaitingDispatches, Vec<Dispatch>>,
+    dispatch_bytes: usize,
+    /// Bytes of samples that wait for lower numbers.
+    waiting_bytes: usize,
+    refused: u64,
+}
+
+impl Payloads {
+    /// Creates the state without requests. At most `limit` bytes are held; payloads arrive at most
+    /// `payload_delay` after they are requested.
+    #[must_use]
+    pub fn new(limit: usize, payload_delay: Duration) -> Self {
+        Self {
+            writers: HashMap::new(),
+            payload_delay,
+            deep: 0,
+            assembly: Assembly::new(limit),
+            unknown_writers: HashMap::new(),
+            dispatches: Bounded::default(),
+            dispatch_bytes: 0,
+            waiting_bytes: 0,
+            refused: 0,
+        }
+    }
+
+    /// Returns the bytes held, their cap, and the number of samples without room.
+    #[must_use]
+    pub const fn size(&self) -> (usize, usize, u64) {
+        let (bytes, limit, evictions) = self.assembly.size();
+        let bytes = bytes + self.dispatch_bytes + self.waiting_bytes;
+        (bytes, limit, evictions + self.refused)
+    }
+
+    /// Returns whether payloads of any writer are requested.
+    #[must_use]
+    pub const fn wants_any_bytes(&self) -> bool {
+        self.deep > 0
+    }
+
+    /// Returns whether payloads of this writer are requested.
+    #[must_use]
+    pub fn wants_bytes(&self, writer: Guid) -> bool {
+        let is_deep = |interested: &WantedWriter| !interested.payloads.is_empty();
+        self.deep > 0 && self.writers.get(&writer).is_some_and(is_deep)
+    }
+
+    /// Returns the writers whose samples are requested.
+    pub fn wanted(&self) -> impl Iterator<Item = &Guid> {
+        self.writers.keys()
+    }
+
+    /// Returns whether any writer's samples are dispatched for this request.
+    #[must_use]
+    pub fn serves(&self, request: u64) -> bool {
+        self.writers
+            .values()
+            .any(|known| known.to.contains(&request))
+    }
+
+    /// Dispatches the samples of this writer from `now` on; the next one has the number `next`.
+    pub fn want(
+        &mut self,
+        writer: Guid,
+        topic: Topic,
+        requested: &RequestIds,
+        (next, now): (SequenceNumber, Timestamp),
+    ) {
+        let before = self.writers.remove(&writer);
+        let known = before.as_ref().filter(|known| *known.topic == topic);
+        let topic = known.map_or_else(|| Arc::new(topic), |known| Arc::clone(&known.topic));
+        let begins = |id: &u64| {
+            let known = before.iter().flat_map(|before| &before.begins);
+            let known = known.copied().find(|known| known.id == *id);
+            let earlier = self.unknown_writers.get(&writer);
+            let mut earlier = earlier.iter().flat_map(|earlier| &earlier.begins);
+            let earlier = earlier.find(|(known, _)| known == id);
+            let number = earlier.map_or(next, |(_, number)| *number);
+            known.unwrap_or_else(|| RequestBegin::new(*id, number, now))
+        };
+        let begins = requested.ids.iter().map(begins).collect();
+        let was_deep = before.as_ref().filter(|before| !before.payloads.is_empty());
+        self.deep -= usize::from(was_deep.is_some());
+        self.deep += usize::from(!requested.payloads.is_empty());
+        let since = was_deep.map_or(now, |before| before.since);
+        let first_whole = was_deep.and_then(|before| before.first_whole);
+        if was_deep.is_some() && requested.payloads.is_empty() {
+            self.assembly.release(writer);
+        }
+        let arrivals = requested.ids.iter();
+        let arrivals = arrivals.filter(|id| !requested.payloads.contains(id));
+        let interested = WantedWriter {
+            topic,
+            to: Arc::clone(&requested.ids),
+            payloads: Arc::clone(&requested.payloads),
+            arrivals: arrivals.copied().collect(),
+            begins,
+            since,
+            first_whole,
+            order: before.map_or_else(InOrder::default, |before| before.order),
+        };
+        self.writers.insert(writer, interested);
+        self.announced(writer, now);
+    }
+
+    /// Stops dispatching samples of this writer, after those that wait.
+    pub fn release(&mut self, writer: Guid, now: Timestamp) {
+        self.unknown_writers.remove(&writer);
+        self.give_all(writer, now);
+        let before = self.writers.remove(&writer);
+        if before.is_some_and(|before| !before.payloads.is_empty()) {
+            self.deep -= 1;
+            self.assembly.release(writer);
+        }
+    }
+
+    /// Keeps the payload of a DATA or DATA_FRAG whose sample is not counted yet.
+    pub fn keep(&mut self, sample: record::Sample<'_>, payload: &[u8]) {
+        let other_bytes = self.dispatch_bytes + self.waiting_bytes;
+        self.assembly.put(sample, payload, other_bytes);
+    }
+
+    /// Returns whether samples of this writer are requested.
+    #[must_use]
+    pub fn wants(&self, writer: Guid) -> bool {
+        self.writers.contains_key(&writer)
+    }
+
+    /// Dispatches a counted sample. Returns the same as [`Self::turn`].
+    pub fn counted(
+        &mut self,
+        writer: Guid,
+        counted: &Counted,
+        progress: &Progress,
+    ) -> Option<SequenceNumber> {
+        let interested = self.writers.get_mut(&writer)?;
+        let payload = match interested.payloads.is_empty() {
+            true => None,
+            false => self.assembly.take(writer, counted.number),
+        };
+        // A sample that began before the request is incomplete.
+        let is_expected = counted.began >= interested.since + self.payload_delay
+            || interested
+                .first_whole
+                .is_some_and(|first| first < counted.number);
+        if payload.is_some() {
+            let first = interested.first_whole.get_or_insert(counted.number);
+            *first = counted.number.min(*first);
+        }
+        let missed = (payload.is_none() && is_expected && !interested.payloads.is_empty())
+            .then(|| interested.not_captured(writer, counted.number));
+        let to = match &payload {
+            Some(_) => &interested.to,
+            None => &interested.arrivals,
+        };
+        let to = interested.without_repeats(to, counted.number);
+        for begin in &mut interested.begins {
+            begin.arrived(&to, counted.number);
+        }
+        let queued = QueuedSample {
+            to,
+            sample: Sample {
+                topic: Arc::clone(&interested.topic),
+                time: counted.at,
+                writer,
+                sequence_number: counted.number,
+                source_timestamp: counted.source.timestamp(),
+                header_stamp: counted.stamp,
+                size: u32::try_from(counted.bytes).unwrap_or(u32::MAX),
+                sampled: counted.sampled,
+                payload,
+            },
+            missed,
+        };
+        let mut before = Vec::new();
+        let order = &mut interested.order;
+        order.begin(progress.incarnation, counted.at, &mut |queued| {
+            before.push(queued);
+        });
+        self.waiting_bytes += queued.cost();
+        if counted.unconfirmed || order.is_idle() && counted.number < progress.complete {
+            let queued = order.pass(queued, counted.at);
+            before.push(queued);
+            before
+                .into_iter()
+                .for_each(|queued| self.give_queued(queued));
+            return None;
+        }
+        order.put(queued);
+        before
+            .into_iter()
+            .for_each(|queued| self.give_queued(queued));
+        self.turn(writer, progress, counted.at)
+    }
+
+    /// Returns whether a request receives this sample from before it, which is then not dispatched
+    /// when the writer repeats it. A recent sample may have been dispatched to it.
+    pub fn give_before(
+        &mut self,
+        writer: Guid,
+        (id, number): (u64, SequenceNumber),
+        is_recent: bool,
+    ) -> bool {
+        let interested = self.writers.get_mut(&writer);
+        let mut begins = interested.into_iter().flat_map(|known| &mut known.begins);
+        let Some(begin) = begins.find(|begin| begin.id == id) else {
+            return true;
+        };
+        if is_recent && begin.has(number) {
+            return false;
+        }
+        begin.before = Some(number);
+        true
+    }
+
+    /// Dispatches a retransmitted sample from before the announcement. Returns the same as
+    /// [`Self::turn`].
+    pub fn came_again(
+        &mut self,
+        writer: Guid,
+        counted: &Counted,
+        progress: &Progress,
+    ) -> Option<SequenceNumber> {
+        let is_whole = self.assembly.is_whole(writer, counted.number);
+        if self.wants_bytes(writer) && !is_whole {
+            return None;
+        }
+        self.counted(writer, counted, progress)
+    }
+
+    /// Returns whether this sample was counted before its writer's announcement and is dispatched
+    /// if it is retransmitted.
+    #[must_use]
+    pub fn lacks(&self, writer: Guid, number: SequenceNumber) -> bool {
+        let interested = self.writers.get(&writer);
+        interested.is_some_and(|interested| interested.order.lacks(number))
+    }
+
+    /// Records a counted sample of a writer without an announcement, with the current requests.
+    pub fn counted_of_unknown_writer(
+        &mut self,
+        writer: Guid,
+        number: SequenceNumber,
+        sample_requests: impl Iterator<Item = u64>,
+    ) {
+        let earlier = self.unknown_writers.entry(writer).or_default();
+        let ids: Vec<_> = sample_requests.collect();
+        earlier.begins.retain(|(known, _)| ids.contains(known));
+        for id in ids {
+            if !earlier.begins.iter().any(|(known, _)| *known == id) {
+                earlier.begins.push((id, number));
+            }
+        }
+        if let Some(lowest) = earlier.numbers.add(number) {
+            let (first, _, count) = earlier.before.unwrap_or((lowest, lowest, 0));
+            earlier.before = Some((first.min(lowest), lowest, count + 1));
+        }
+    }
+
+    /// Gives an unknown writer the GUID by which it is announced.
+    pub fn rename(&mut self, before: Guid, guid: Guid) {
+        if let Some(samples) = self.unknown_writers.remove(&before) {
+            self.unknown_writers.insert(guid, samples);
+        }
+    }
+
+    /// Returns the number of unknown writers remembered.
+    #[must_use]
+    pub fn unknown_writers(&self) -> usize {
+        self.unknown_writers.len()
+    }
+
+    /// Removes unknown writers for which `is_there` returns false.
+    pub fn retain_unknown_writers(&mut self, is_there: impl Fn(Guid) -> bool) {
+        self.unknown_writers.retain(|writer, _| is_there(*writer));
+    }
+
+    /// Returns the writers with waiting or possibly retransmitted samples, sorted by GUID.
+    #[must_use]
+    pub fn unsettled(&self) -> Vec<Guid> {
+        let is_unsettled = |interested: &WantedWriter| !interested.order.is_idle();
+        let writers = self.writers.iter();
+        let mut writers: Vec<_> = writers
+            .filter(|(_, interested)| is_unsettled(interested))
+            .map(|(writer, _)| *writer)
+            .collect();
+        writers.sort_unstable();
+        writers
+    }
+
+    /// Returns whether this writer has waiting or possibly retransmitted samples.
+    #[must_use]
+    pub fn is_unsettled(&self, writer: Guid) -> bool {
+        let interested = self.writers.get(&writer);
+        interested.is_some_and(|interested| !interested.order.is_idle())
+    }
+
+    /// Dispatches the samples of this writer whose turn has come. If the order was given up,
+    /// returns the number below which no sample is waited for.
+    pub fn turn(
+        &mut self,
+        writer: Guid,
+        progress: &Progress,
+        now: Timestamp,
+    ) -> Option<SequenceNumber> {
+        let (_, limit, _) = self.assembly.size();
+        let room = (limit / 2).saturating_sub(self.waiting_bytes);
+        let interested = self.writers.get_mut(&writer)?;
+        let order = &mut interested.order;
+        let room = room + order.bytes();
+        let forgone = order.forgone(progress, now);
+        let mut queued = Vec::new();
+        let skip = order.turn(progress, now, room, &mut |each| queued.push(each));
+        self.unannounced(writer, &forgone, now);
+        queued
+            .into_iter()
+            .for_each(|queued| self.give_queued(queued));
+        skip
+    }
+
+    /// Dispatches all waiting samples of a writer that has ended, and reports those that never
+    /// arrived again.
+    pub fn give_all(&mut self, writer: Guid, now: Timestamp) {
+        let nothing_awaited = Progress::default();
+        let Some(interested) = self.writers.get_mut(&writer) else {
+            return;
+        };
+        let forgone = interested.order.forgone(&nothing_awaited, now);
+        let mut queued = Vec::new();
+        interested
+            .order
+            .give_all(now, &mut |each| queued.push(each));
+        self.unannounced(writer, &forgone, now);
+        queued
+            .into_iter()
+            .for_each(|queued| self.give_queued(queued));
+    }
+
+    /// Reports samples that will not arrive, at `now`.
+    pub fn missing(&mut self, missing: &Missing, now: Timestamp) {
+        let Missing {
+            writer,
+            first,
+            last,
+            reason,
+        } = *missing;
+        let Some(interested) = self.writers.get(&writer) else {
+            return;
+        };
+        if reason == MissedReason::Incomplete {
+            self.assembly.forget(writer, first);
+        }
+        for missed in interested.missed(writer, (first, last), (reason, now), self.payload_delay) {
+            self.give(missed, 0);
+        }
+    }
+
+    /// Drops samples that will not become complete.
+    pub fn expire(&mut self, now: Timestamp) {
+        self.assembly.expire(now);
+    }
+
+    /// Removes and returns the output queue.
+    pub fn take(&mut self) -> Vec<Dispatch> {
+        self.dispatch_bytes = 0;
+        self.dispatches.take()
+    }
+
+    /// Returns whether the output queue should be taken before further input.
+    #[must_use]
+    pub fn is_full(&self) -> bool {
+        let (_, limit, _) = self.assembly.size();
+        self.dispatches.len() >= WaitingDispatches::CAP / 4 || self.dispatch_bytes > limit / 4
+    }
+
+    /// Prepares samples counted before the announcement for dispatch if they are retransmitted.
+    fn announced(&mut self, writer: Guid, now: Timestamp) {
+        let Some(earlier) = self.unknown_writers.remove(&writer) else {
+            return;
+        };
+        let Some(interested) = self.writers.get_mut(&writer) else {
+            return;
+        };
+        interested.order.announced(earlier.numbers, now);
+        if let Some((first, last, samples)) = earlier.before {
+            let reason = (MissedReason::Unannounced, now);
+            let mut missed = interested.missed(writer, (first, last), reason, self.payload_delay);
+            for dispatches in &mut missed {
+                if let SampleOutcome::Missed(missed) = &mut dispatches.outcome {
+                    missed.samples = missed.samples.min(samples);
+                }
+            }
+            missed.into_iter().for_each(|missed| self.give(missed, 0));
+        }
+    }
+
+    /// Reports samples that will not be retransmitted.
+    fn unannounced(&mut self, writer: Guid, numbers: &[SequenceNumber], now: Timestamp) {
+        let Some(interested) = self.writers.get(&writer) else {
+            return;
+        };
+        let (reason, delay) = ((MissedReason::Unannounced, now), self.payload_delay);
+        let runs = numbers.chunk_by(|before, after| before.precedes(*after));
+        let missed: Vec<_> = runs
+            .filter_map(|run| Some((*run.first()?, *run.last()?)))
+            .flat_map(|run| interested.missed(writer, run, reason, delay))
+            .collect();
+        missed.into_iter().for_each(|missed| self.give(missed, 0));
+    }
+
+    fn give_queued(&mut self, queued: QueuedSample) {
+        let bytes = queued.bytes();
+        self.waiting_bytes -= queued.cost();
+        if !queued.to.is_empty() {
+            let sample = Dispatch {
+                to: queued.to,
+                outcome: SampleOutcome::Sample(Arc::new(queued.sample)),
+            };
+            self.give(sample, bytes);
+        }
+        if let Some(missed) = queued.missed {
+            self.give(missed, 0);
+        }
+    }
+
+    fn give(&mut self, dispatches: Dispatch, bytes: usize) {
+        let (used, limit, _) = self.size();
+        if self.dispatches.len() < WaitingDispatches::CAP / 2
+            && (bytes == 0 || used + bytes <= limit)
+        {
+            self.dispatch_bytes += bytes;
+            self.dispatches.push(dispatches);
+            return;
+        }
+        self.refused += 1;
+        if let SampleOutcome::Sample(sample) = &dispatches.outcome
+            && let Some(interested) = self.writers.get(&sample.writer)
+        {
+            let (writer, number) = (sample.writer, sample.sequence_number);
+            let mut missed = interested.not_captured(writer, number);
+            missed.to = dispatches.to;
+            self.dispatches.push(missed);
+        }
+    }
+}
+
+impl WantedWriter {
+    /// Reports missing samples to each subscription, limited to the numbers that concern it.
+    fn missed(
+        &self,
+        writer: Guid,
+        (first, last): (SequenceNumber, SequenceNumber),
+        (reason, now): (MissedReason, Timestamp),
+        payload_delay: Duration,
+    ) -> Vec<Dispatch> {
+        let mut missed: Vec<(SequenceNumber, Vec<u64>)> = Vec::new();
+        for begin in &self.begins {
+            let Some(from) = begin.misses_from(reason, now, payload_delay) else {
+                continue;
+            };
+            let first = first.max(from);
+            match missed.iter_mut().find(|(known, _)| *known == first) {
+                Some((_, to)) => to.push(begin.id),
+                None if first <= last => missed.push((first, vec![begin.id])),
+                None => {}
+            }
+        }
+        let dispatches = |(first, to): (SequenceNumber, Vec<u64>)| Dispatch {
+            to: to.into(),
+            outcome: SampleOutcome::Missed(Missed {
+                topic: Arc::clone(&self.topic),
+                writer,
+                first,
+                last,
+                samples: last - first + 1,
+                reason,
+            }),
+        };
+        missed.into_iter().map(dispatches).collect()
+    }
+
+    /// Returns the ids without those whose readers received this sample as the one from before.
+    fn without_repeats(&self, to: &Arc<[u64]>, number: SequenceNumber) -> Arc<[u64]> {
+        let is_repeat = |begin: &&RequestBegin| begin.before == Some(number);
+        if !self.begins.iter().any(|begin| is_repeat(&begin)) {
+            return Arc::clone(to);
+        }
+        let repeats: Vec<u64> =
+            (self.begins.iter().filter(is_repeat).map(|begin| begin.id)).collect();
+        to.iter()
+            .copied()
+            .filter(|id| !repeats.contains(id))
+            .collect()
+    }
+
+    /// Returns the report that a counted sample is missing for requests of its payload.
+    fn not_captured(&self, writer: Guid, number: SequenceNumber) -> Dispatch {
+        Dispatch {
+            to: Arc::clone(&self.payloads),
+            outcome: SampleOutcome::Missed(Missed {
+                topic: Arc::clone(&self.topic),
+                writer,
+                first: number,
+                last: number,
+                samples: 1,
+                reason: MissedReason::NotCaptured,
+            }),
+        }
+    }
+}

@@ -1,0 +1,70 @@
+//! Where the samples of one writer begin for one request.
+
+use std::time::Duration;
+
+use ros2probe_wire::{SequenceNumber, Timestamp};
+
+use crate::facts::dispatch::MissedReason;
+
+/// Longest time until samples that polling missed are reported: they may arrive from another view.
+const UNSEEN_DELAY: Duration = Duration::from_millis(400);
+
+/// A request for the samples of one writer.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct RequestBegin {
+    /// Id of the request.
+    pub(super) id: u64,
+    /// The next number when the request began.
+    number: SequenceNumber,
+    since: Timestamp,
+    /// The lowest number that arrived for it.
+    first: Option<SequenceNumber>,
+    /// Number of the sample from before the request that its reader received first.
+    pub(super) before: Option<SequenceNumber>,
+}
+
+impl RequestBegin {
+    /// Creates the begin of request `id` at `since`, before the sample `number`.
+    pub(super) const fn new(id: u64, number: SequenceNumber, since: Timestamp) -> Self {
+        Self {
+            id,
+            number,
+            since,
+            first: None,
+            before: None,
+        }
+    }
+
+    /// Returns whether this sample arrived for it.
+    pub(super) fn has(&self, number: SequenceNumber) -> bool {
+        self.first.is_some_and(|first| first <= number)
+    }
+
+    /// Records a sample that arrived for the requests `to`.
+    pub(super) fn arrived(&mut self, to: &[u64], number: SequenceNumber) {
+        if self.first.is_none_or(|first| number < first) && to.contains(&self.id) {
+            self.first = Some(number);
+        }
+    }
+
+    /// Returns the first number that the request can miss for this reason; `None` if it can miss no
+    /// sample yet.
+    ///
+    /// Polling shared memory notices numbers late, perhaps after the request for samples that were
+    /// sent before it. So numbers that polling missed count from the first sample on, or if none
+    /// arrives, once one should have.
+    pub(super) fn misses_from(
+        &self,
+        reason: MissedReason,
+        now: Timestamp,
+        payload_delay: Duration,
+    ) -> Option<SequenceNumber> {
+        if reason != MissedReason::NotCaptured {
+            return Some(self.number);
+        }
+        match self.first {
+            Some(first) => Some(self.number.max(first)),
+            None => (self.since + payload_delay + UNSEEN_DELAY <= now).then_some(self.number),
+        }
+    }
+}

@@ -1,0 +1,563 @@
+//! Measured writers: those of watched topics, and unknown writers, whose announcement was missed.
+//!
+//! The number of unknown writers is capped: a new one is refused until a known one is silent for a
+//! while. Writers from before a flood of forged GUIDs stay.
+
+mod unknown_writers;
+
+use std::collections::{BTreeSet, HashMap};
+use std::time::Duration;
+
+use ros2probe_wire::qos::Reliability;
+use ros2probe_wire::record::{Body, flag};
+use ros2probe_wire::{Guid, Record, SequenceNumber, Timestamp};
+
+use crate::facts::bounded::TableFacts;
+use crate::facts::bounded::{self, Bounded};
+use crate::facts::journal::Journal;
+use crate::facts::loss_share::LossShare;
+use crate::facts::measurement::Measurement;
+use crate::facts::route::Destination;
+use crate::facts::tables;
+use crate::facts::wall_clock::WallClock;
+use crate::measure::delivery::Totals;
+use crate::measure::in_order::Progress;
+use crate::measure::receivers::GraphView;
+use crate::measure::samples::Budget;
+use crate::measure::subscribers::{DeliveryQuota, RecordNovelty, Subscribers, WriterContext};
+use crate::measure::topic::TopicId;
+use crate::measure::writer::{Counted, MeasurementContext, Traits, Writer};
+pub use unknown_writers::UnknownWriters;
+
+/// An unknown writer is shown and metered after this time; announcements usually arrive within a
+/// second.
+const UNKNOWN_AFTER: Duration = Duration::from_secs(3);
+/// An unknown writer is dropped after this silence, or earlier if it sent little.
+const UNKNOWN_WRITER_TIMEOUT: Duration = Duration::from_secs(30);
+const EVICTABLE_AFTER: Duration = Duration::from_secs(3);
+/// Number of messages from which on an unknown writer is not evicted.
+const ESTABLISHED_MESSAGES: u64 = 10;
+/// Longest time until the kernel knows a writer: a round of the capture thread on a busy machine.
+/// Until then the kernel limits captures as for an unknown writer, and a point cloud exceeds that
+/// limit.
+const KERNEL_UPDATE_TIME: Duration = Duration::from_millis(200);
+/// Unknown writers may use one part in this many of the memory for fragmented samples.
+const UNKNOWN_WRITERS_SHARE: usize = 4;
+/// Deliveries that may be dropped for new ones: minimum silence, and largest number at once.
+const DELIVERY_TIMEOUT: Duration = Duration::from_secs(10);
+const GIVEN_UP: usize = 64;
+/// Flags of records that report undelivered datagrams; they are no transmissions.
+pub(crate) const UNDELIVERED: u16 = flag::SOCKET_FULL | flag::NOT_REASSEMBLED;
+
+/// A measured writer.
+#[derive(Debug)]
+pub struct Measured {
+    /// Its measurement.
+    pub writer: Box<Writer>,
+    /// Its receivers; only for a writer of a known topic.
+    pub subscribers: Option<Box<Subscribers>>,
+    /// Its topic; `None` for an unknown writer.
+    pub topic: Option<TopicId>,
+    /// Time of the first record or announcement.
+    pub first_seen: Timestamp,
+    /// Time of the last record.
+    pub last_seen: Timestamp,
+    /// Whether an unknown writer has existed long enough to be metered.
+    pub metered: bool,
+    /// Cookie of the socket by which an unknown writer sends; 0 if not known.
+    pub sent_from: u64,
+    opened: Timestamp,
+    /// Whether a gap was waited for and no ACKNACK arrived.
+    unacknowledged: bool,
+    /// Time from which the kernel captures all of its fragments.
+    sure_from: Timestamp,
+}
+
+/// All measured writers.
+#[derive(Debug)]
+pub struct Profiler {
+    writers: HashMap<Guid, Measured>,
+    unknown_writers: Bounded<bounded::Counted<tables::UnknownWriters>, BTreeSet<Guid>>,
+    shared: SharedBudgets,
+    search_after: Timestamp,
+}
+
+/// Budgets that all writers share.
+#[derive(Debug)]
+struct SharedBudgets {
+    budget: Budget,
+    unknown_writers_budget: Budget,
+    deliveries_budget: Budget,
+    quota: DeliveryQuota,
+}
+
+/// The writer that a record belongs to.
+#[derive(Clone, Copy)]
+struct WriterRef {
+    writer: Guid,
+    reliable: bool,
+    topic: Option<TopicId>,
+    has_receivers: bool,
+}
+
+/// Counts of a writer that is no longer measured.
+#[derive(Debug)]
+pub struct Retired {
+    /// Its topic.
+    pub topic: TopicId,
+    /// Its measurement.
+    pub measurement: Measurement,
+    /// Sums over its deliveries.
+    pub totals: Option<Totals>,
+    /// Losses of its worst receiver in this second.
+    pub departed: LossShare,
+}
+
+/// The result of a record.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RecordOutcome {
+    /// Its writer is not measured.
+    Unmeasured,
+    /// Its writer is measured.
+    Measured,
+    /// It completed a message, which was counted.
+    Counted(Counted),
+}
+
+impl Profiler {
+    /// Creates a profiler without writers.
+    #[must_use]
+    pub fn new(unknown_writer_limit: usize, sample_bytes: usize, deliveries: usize) -> Self {
+        Self {
+            writers: HashMap::new(),
+            unknown_writers: Bounded::capped(unknown_writer_limit),
+            shared: SharedBudgets {
+                budget: Budget::new(sample_bytes),
+                unknown_writers_budget: Budget::new(sample_bytes / UNKNOWN_WRITERS_SHARE),
+                deliveries_budget: Budget::new(sample_bytes),
+                quota: DeliveryQuota {
+                    used: 0,
+                    limit: deliveries,
+                    evictions: 0,
+                    wanted: false,
+                },
+            },
+            search_after: Timestamp(0),
+        }
+    }
+
+    /// Returns a measured writer.
+    #[must_use]
+    pub fn get(&self, guid: Guid) -> Option<&Measured> {
+        self.writers.get(&guid)
+    }
+
+    /// Returns a measured writer.
+    pub fn get_mut(&mut self, guid: Guid) -> Option<&mut Measured> {
+        self.writers.get_mut(&guid)
+    }
+
+    /// Returns all measured writers.
+    pub fn iter(&self) -> impl Iterator<Item = (&Guid, &Measured)> {
+        self.writers.iter()
+    }
+
+    /// Returns how far the samples of this writer are decided; `None` if it is not measured.
+    pub fn progress(
+        &mut self,
+        guid: Guid,
+        now: Timestamp,
+        graph: GraphView<'_>,
+    ) -> Option<Progress> {
+        let measured = self.writers.get_mut(&guid)?;
+        let acknowledged = measured.is_acknowledged()
+            || !measured.unacknowledged && measured.has_reliable_reader(graph);
+        Some(measured.writer.progress(acknowledged, now))
+    }
+
+    /// Stops waiting for samples of this writer below `number`.
+    pub fn skip(&mut self, guid: Guid, number: SequenceNumber) {
+        if let Some(measured) = self.writers.get_mut(&guid) {
+            measured.unacknowledged = !measured.is_acknowledged();
+            measured.writer.skip(number);
+        }
+    }
+
+    /// Returns the number of writers with a topic, and the row of the metrics for unknown writers.
+    #[must_use]
+    pub fn size(&self) -> (usize, TableFacts) {
+        let known = self.writers.len() - self.unknown_writers.len();
+        (known, self.unknown_writers.facts())
+    }
+
+    /// Returns the memory budgets for fragmented samples: for writers with a topic, unknown
+    /// writers, and deliveries.
+    #[must_use]
+    pub const fn budgets(&self) -> [&Budget; 3] {
+        [
+            &self.shared.budget,
+            &self.shared.unknown_writers_budget,
+            &self.shared.deliveries_budget,
+        ]
+    }
+
+    /// Returns the quota of deliveries.
+    #[must_use]
+    pub const fn quota(&self) -> &DeliveryQuota {
+        &self.shared.quota
+    }
+
+    /// Processes a record if its writer is measured.
+    pub fn record(
+        &mut self,
+        guid: Guid,
+        record: &Record,
+        journal: &mut Journal,
+        graph: GraphView<'_>,
+    ) -> RecordOutcome {
+        let Some(measured) = self.writers.get_mut(&guid) else {
+            return RecordOutcome::Unmeasured;
+        };
+        let now = Timestamp(record.time);
+        measured.last_seen = measured.last_seen.max(now);
+        if measured.topic.is_none() && !measured.metered {
+            // The kernel filter's budget for unknown writers may omit samples, so a gap is no loss.
+            measured.opened = now;
+        }
+        const LEFT: u16 = flag::HOST | flag::OUTGOING;
+        if measured.topic.is_none() && record.flags & LEFT == LEFT {
+            measured.sent_from = record.socket;
+        }
+        if let Body::AckNack(acknack) = record.body()
+            && measured.writer.refuses(acknack)
+        {
+            return RecordOutcome::Measured;
+        }
+        let writer_ref = measured.writer_ref(guid);
+        let mut novelty = RecordNovelty::New;
+        // HEARTBEATs in shared memory do not show which readers receive the samples.
+        if measured.topic.is_some() && record.flags & (flag::SHM | flag::RELAYED) == 0 {
+            let mut context = self.shared.writer_context(writer_ref, now, journal, graph);
+            let subscribers = measured
+                .subscribers
+                .get_or_insert_with(|| Box::new(Subscribers::new(measured.sure_from)));
+            novelty = subscribers.record(record, &mut context);
+            if record.is_acknack()
+                && let Some(below) = subscribers.acknowledged_below()
+            {
+                measured.writer.acknowledged(below);
+            }
+        }
+        if record.flags & UNDELIVERED != 0 || novelty == RecordNovelty::SeenAtSocket {
+            return RecordOutcome::Measured;
+        }
+        let next = measured.writer.next();
+        let counted = measured.writer.record(
+            record,
+            measured.opened,
+            &mut self
+                .shared
+                .measurement_context(writer_ref, now, journal, graph.wall_clock),
+        );
+        if novelty == RecordNovelty::Duplicate && record.flags & (flag::HOST | flag::STREAM) != 0 {
+            measured.writer.came_again();
+        }
+        if let Some(subscribers) = &mut measured.subscribers
+            && measured.writer.next() > next
+        {
+            subscribers.wrote(measured.writer.next().previous(), now);
+        }
+        counted.map_or(RecordOutcome::Measured, RecordOutcome::Counted)
+    }
+
+    /// Records that samples in shared memory before `now` may have been missed.
+    pub fn uncertain(&mut self, now: Timestamp) {
+        for measured in self.writers.values_mut() {
+            measured.writer.uncertain(now);
+        }
+    }
+
+    /// Records that bytes for this destination were not captured.
+    pub fn missed(&mut self, destination: Destination, at: Timestamp) {
+        for measured in self.writers.values_mut() {
+            if let Some(subscribers) = &mut measured.subscribers
+                && subscribers.missed(destination, at)
+            {
+                measured.opened = at;
+            }
+        }
+    }
+
+    /// Records that uprobes no longer observe writers.
+    pub fn end_exact_view(&mut self) {
+        for measured in self.writers.values_mut() {
+            measured.writer.end_exact_view();
+        }
+    }
+
+    /// Begins to measure a writer with a topic, keeping what was measured before its announcement.
+    pub fn measure(
+        &mut self,
+        guid: Guid,
+        topic: TopicId,
+        traits: Traits,
+        opened: Timestamp,
+        now: Timestamp,
+    ) {
+        if let Some(known) = self.writers.get_mut(&guid) {
+            known.writer.learn(traits);
+            known.opened = opened;
+            if known.topic.is_none() {
+                known.opened = opened.max(now);
+                known.writer.begin_window(now);
+                // The other budget accounts for its unfinished samples from now on.
+                known.writer.transfer(
+                    &mut self.shared.unknown_writers_budget,
+                    &mut self.shared.budget,
+                );
+                self.unknown_writers.remove(&guid);
+                known.allow_incomplete(now);
+            }
+            known.topic = Some(topic);
+            return;
+        }
+        let mut measured = Measured::new(Writer::new(guid, traits), Some(topic), now);
+        measured.opened = opened;
+        measured.allow_incomplete(now);
+        self.writers.insert(guid, measured);
+    }
+
+    /// Gives an unknown writer the GUID by which it is announced.
+    pub fn rename(&mut self, before: Guid, guid: Guid) {
+        if self.unknown_writers.contains(&before)
+            && !self.writers.contains_key(&guid)
+            && let Some(mut measured) = self.writers.remove(&before)
+        {
+            measured.writer.rename(guid);
+            self.unknown_writers.remove(&before);
+            self.unknown_writers.insert(guid);
+            self.writers.insert(guid, measured);
+        }
+    }
+
+    /// Updates the properties of a writer from discovery.
+    pub fn learn(&mut self, guid: Guid, traits: Traits) {
+        if let Some(measured) = self.writers.get_mut(&guid) {
+            measured.writer.learn(traits);
+        }
+    }
+
+    /// Records that a new reader makes samples of this writer visible.
+    pub fn open(&mut self, guid: Guid, at: Timestamp) {
+        if let Some(measured) = self.writers.get_mut(&guid) {
+            measured.opened = at;
+        }
+    }
+
+    /// Stops measuring a writer; returns its counts if it belonged to a topic.
+    pub fn stop(
+        &mut self,
+        guid: Guid,
+        now: Timestamp,
+        journal: &mut Journal,
+        graph: GraphView<'_>,
+    ) -> Option<Retired> {
+        let mut measured = self.writers.remove(&guid)?;
+        let writer_ref = measured.writer_ref(guid);
+        measured.writer.settle(&mut self.shared.measurement_context(
+            writer_ref,
+            now,
+            journal,
+            graph.wall_clock,
+        ));
+        self.unknown_writers.remove(&guid);
+        let subscribers = measured.subscribers.take();
+        let stopped = subscribers.map(|subscribers| {
+            subscribers.stop(&mut self.shared.writer_context(writer_ref, now, journal, graph))
+        });
+        let (totals, departed) = stopped.unzip();
+        Some(Retired {
+            topic: writer_ref.topic?,
+            measurement: measured.writer.measurement(now),
+            totals,
+            departed: departed.unwrap_or_default(),
+        })
+    }
+
+    /// Settles samples whose waiting time is over.
+    pub fn advance(
+        &mut self,
+        now: Timestamp,
+        journal: &mut Journal,
+        graph: GraphView<'_>,
+    ) -> UnknownWriters {
+        let mut unknown_writers = UnknownWriters::default();
+        for (guid, measured) in &mut self.writers {
+            let writer_ref = measured.writer_ref(*guid);
+            measured
+                .writer
+                .advance(&mut self.shared.measurement_context(
+                    writer_ref,
+                    now,
+                    journal,
+                    graph.wall_clock,
+                ));
+            if measured.topic.is_some() {
+                if let Some(subscribers) = &mut measured.subscribers {
+                    subscribers
+                        .advance(&mut self.shared.writer_context(writer_ref, now, journal, graph));
+                }
+                continue;
+            }
+            if measured.last_seen + UNKNOWN_WRITER_TIMEOUT <= now {
+                unknown_writers.forgotten.push(*guid);
+            } else if !measured.metered && measured.first_seen + UNKNOWN_AFTER <= now {
+                (measured.metered, measured.opened) = (true, now);
+                unknown_writers.metered.push(*guid);
+            }
+        }
+        unknown_writers.metered.sort_unstable();
+        unknown_writers.forgotten.sort_unstable();
+        for guid in &unknown_writers.forgotten {
+            self.stop(*guid, now, journal, graph);
+        }
+        if std::mem::take(&mut self.shared.quota.wanted) {
+            self.give_up_silent(now, journal, graph);
+        }
+        unknown_writers
+    }
+
+    /// Settles all samples at the end of the input.
+    pub fn settle(&mut self, now: Timestamp, journal: &mut Journal, graph: GraphView<'_>) {
+        let mut guids: Vec<_> = self.writers.keys().copied().collect();
+        guids.sort_unstable();
+        for guid in guids {
+            let Some(measured) = self.writers.get_mut(&guid) else {
+                continue;
+            };
+            let writer_ref = measured.writer_ref(guid);
+            measured.writer.settle(&mut self.shared.measurement_context(
+                writer_ref,
+                now,
+                journal,
+                graph.wall_clock,
+            ));
+            if let Some(subscribers) = &mut measured.subscribers {
+                subscribers
+                    .settle(&mut self.shared.writer_context(writer_ref, now, journal, graph));
+                subscribers.end_second();
+            }
+            // A writer that sent more than once and was never announced is an unknown writer.
+            measured.metered |= measured.topic.is_none() && measured.writer.messages() > 1;
+        }
+    }
+
+    /// Drops the deliveries that have been silent longest, since a new one was refused.
+    fn give_up_silent(&mut self, now: Timestamp, journal: &mut Journal, graph: GraphView<'_>) {
+        let mut silent: Vec<_> = self
+            .writers
+            .iter()
+            .filter_map(|(guid, measured)| Some((guid, measured.subscribers.as_ref()?)))
+            .flat_map(|(guid, subscribers)| subscribers.silent_since().map(|at| (at, *guid)))
+            .filter(|(at, _)| *at + DELIVERY_TIMEOUT <= now)
+            .collect();
+        silent.sort_unstable();
+        for (at, guid) in silent.into_iter().take(GIVEN_UP) {
+            let Some(measured) = self.writers.get_mut(&guid) else {
+                continue;
+            };
+            let writer_ref = measured.writer_ref(guid);
+            if let Some(subscribers) = &mut measured.subscribers {
+                let mut context = self.shared.writer_context(writer_ref, now, journal, graph);
+                subscribers.give_up(at, 1, &mut context);
+            }
+        }
+    }
+}
+
+impl SharedBudgets {
+    fn measurement_context<'a>(
+        &'a mut self,
+        writer_ref: WriterRef,
+        now: Timestamp,
+        journal: &'a mut Journal,
+        wall_clock: WallClock,
+    ) -> MeasurementContext<'a> {
+        let budget = match writer_ref.topic {
+            Some(_) => &mut self.budget,
+            None => &mut self.unknown_writers_budget,
+        };
+        MeasurementContext {
+            now,
+            budget,
+            journal,
+            wall_clock,
+            has_receivers: writer_ref.has_receivers,
+        }
+    }
+
+    fn writer_context<'a>(
+        &'a mut self,
+        writer_ref: WriterRef,
+        now: Timestamp,
+        journal: &'a mut Journal,
+        graph: GraphView<'a>,
+    ) -> WriterContext<'a> {
+        WriterContext {
+            now,
+            writer: writer_ref.writer,
+            reliable: writer_ref.reliable,
+            topic: writer_ref.topic,
+            budget: &mut self.deliveries_budget,
+            journal,
+            quota: &mut self.quota,
+            graph,
+        }
+    }
+}
+
+impl Measured {
+    fn writer_ref(&self, writer: Guid) -> WriterRef {
+        let subscribers = self.subscribers.as_ref();
+        WriterRef {
+            writer,
+            reliable: self.writer.traits().reliable,
+            topic: self.topic,
+            has_receivers: subscribers.is_some_and(|subscribers| subscribers.has_receivers()),
+        }
+    }
+
+    fn is_acknowledged(&self) -> bool {
+        let subscribers = self.subscribers.as_ref();
+        subscribers.is_some_and(|subscribers| subscribers.acknowledged_below().is_some())
+    }
+
+    /// Returns whether discovery knows a reliable reader of its topic.
+    fn has_reliable_reader(&self, graph: GraphView<'_>) -> bool {
+        let topic = self.topic.and_then(|topic| graph.topics.get(topic));
+        let readers = topic.into_iter().flat_map(|topic| &topic.readers);
+        let mut known = readers.filter_map(|guid| graph.discovery.endpoints().get(guid));
+        known.any(|reader| reader.qos.reliability == Reliability::RELIABLE)
+    }
+
+    fn new(writer: Writer, topic: Option<TopicId>, now: Timestamp) -> Self {
+        Self {
+            writer: Box::new(writer),
+            subscribers: None,
+            topic,
+            first_seen: now,
+            last_seen: now,
+            metered: false,
+            sent_from: 0,
+            opened: Timestamp(0),
+            unacknowledged: false,
+            sure_from: Timestamp(0),
+        }
+    }
+
+    /// Marks the writer as metered once the kernel knows it.
+    fn allow_incomplete(&mut self, now: Timestamp) {
+        self.sure_from = now + KERNEL_UPDATE_TIME;
+        self.writer.allow_incomplete(self.sure_from);
+    }
+}

@@ -1,0 +1,81 @@
+//! Writers whose announcement was missed: their cap and eviction.
+
+use std::ops::RangeInclusive;
+use std::time::Duration;
+
+use ros2probe_wire::{Guid, Record, Timestamp};
+
+use super::ESTABLISHED_MESSAGES;
+use super::EVICTABLE_AFTER;
+use super::Measured;
+use super::Profiler;
+use super::RecordOutcome;
+use super::UNDELIVERED;
+use crate::facts::journal::Journal;
+use crate::measure::receivers::GraphView;
+use crate::measure::writer::{Traits, Writer};
+
+/// Minimum time between two searches for writers to evict.
+const SEARCH_INTERVAL: Duration = Duration::from_millis(100);
+
+/// Changes of unknown writers.
+#[derive(Debug, Default)]
+pub struct UnknownWriters {
+    /// Writers to meter from now on.
+    pub metered: Vec<Guid>,
+    /// Writers that were dropped.
+    pub forgotten: Vec<Guid>,
+}
+
+impl Profiler {
+    /// Returns whether one of these writers sends without an announcement.
+    #[must_use]
+    pub fn has_unknown_writer(&self, writers: RangeInclusive<Guid>) -> bool {
+        self.unknown_writers.range(writers).next().is_some()
+    }
+
+    /// Processes a record of a writer without an announcement.
+    pub fn unknown_writer(
+        &mut self,
+        guid: Guid,
+        record: &Record,
+        journal: &mut Journal,
+        graph: GraphView<'_>,
+    ) -> RecordOutcome {
+        if !record.is_sample() || record.flags & UNDELIVERED != 0 {
+            return RecordOutcome::Unmeasured;
+        }
+        let now = Timestamp(record.time);
+        if self.unknown_writers.is_full() && !self.evict_unknown_writer(now, graph) {
+            self.unknown_writers.refuse();
+            return RecordOutcome::Unmeasured;
+        }
+        self.unknown_writers.insert(guid);
+        self.writers.insert(
+            guid,
+            Measured::new(Writer::new(guid, Traits::default()), None, now),
+        );
+        self.record(guid, record, journal, graph)
+    }
+
+    /// Drops the unknown writer with the longest silence, unless it is established. Returns whether
+    /// one was dropped.
+    fn evict_unknown_writer(&mut self, now: Timestamp, graph: GraphView<'_>) -> bool {
+        if now < self.search_after {
+            return false;
+        }
+        let evictable = self.writers.iter().filter(|(_, measured)| {
+            measured.topic.is_none()
+                && measured.writer.messages() < ESTABLISHED_MESSAGES
+                && measured.last_seen + EVICTABLE_AFTER <= now
+        });
+        let oldest = evictable.min_by_key(|(guid, measured)| (measured.last_seen, **guid));
+        let Some(guid) = oldest.map(|(guid, _)| *guid) else {
+            self.search_after = now + SEARCH_INTERVAL;
+            return false;
+        };
+        self.unknown_writers.refuse();
+        self.stop(guid, now, &mut Journal::default(), graph);
+        true
+    }
+}

@@ -1,0 +1,137 @@
+//! The readers for which a writer's samples are, as far as discovery knows them.
+//!
+//! A process that shares a multicast group or a port with a reader receives the samples, too. Only
+//! a reader that matches the writer makes it a subscriber.
+
+use ros2probe_wire::qos::Reliability;
+use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
+
+use super::GraphView;
+use crate::facts::diagnosis::{Offer, Verdict, effort, verdict};
+use crate::graph::discovery::Endpoint;
+use crate::measure::topic::Topic;
+
+/// Largest effort of one comparison; longer lists of partitions count as a match.
+const EFFORT: usize = 4096;
+/// Largest number of readers that are compared in the search for any match.
+const COMPARED: usize = 64;
+
+/// The readers of one writer's topic.
+#[derive(Clone, Copy, Debug)]
+pub struct MatchedReaders<'a> {
+    graph: GraphView<'a>,
+    topic: Option<&'a Topic>,
+    writer: Guid,
+}
+
+/// Whether a receiver has a reader that matches the writer.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Matched {
+    /// The receiver has such a reader.
+    Yes,
+    /// No such reader of the receiver is known.
+    No,
+    /// The receiver is not known.
+    Unknown,
+}
+
+impl<'a> MatchedReaders<'a> {
+    /// Creates a view of the readers that match `writer`, a writer of `topic`.
+    #[must_use]
+    pub const fn new(graph: GraphView<'a>, topic: Option<&'a Topic>, writer: Guid) -> Self {
+        Self {
+            graph,
+            topic,
+            writer,
+        }
+    }
+
+    /// Returns the graph.
+    #[must_use]
+    pub const fn graph(&self) -> GraphView<'a> {
+        self.graph
+    }
+
+    /// Returns the topic of the writer.
+    #[must_use]
+    pub const fn topic(&self) -> Option<&'a Topic> {
+        self.topic
+    }
+
+    /// Returns this participant's readers that match the writer, sorted within each kind of topic.
+    pub fn of(self, prefix: GuidPrefix) -> impl Iterator<Item = Guid> + 'a {
+        let readers = self.topic.into_iter();
+        readers
+            .flat_map(move |topic| topic.readers_of(prefix))
+            .filter(move |guid| self.matches(*guid))
+    }
+
+    /// Returns whether this participant has a reader that matches the writer.
+    #[must_use]
+    pub fn matched(self, prefix: GuidPrefix) -> Matched {
+        match self.of(prefix).next() {
+            Some(_) => Matched::Yes,
+            None => Matched::No,
+        }
+    }
+
+    /// Returns whether any participant has a reader that matches the writer.
+    #[must_use]
+    pub fn any(self) -> bool {
+        let lists = self
+            .topic
+            .map(|topic| [&topic.readers, &topic.buffer_endpoints]);
+        let mut readers = lists.into_iter().flatten().flatten();
+        readers
+            .by_ref()
+            .filter(|guid| !guid.entity.is_writer())
+            .take(COMPARED)
+            .any(|guid| self.matches(*guid))
+            || readers.next().is_some()
+    }
+
+    /// Returns the time at which this participant's first matching reader was announced.
+    #[must_use]
+    pub fn since(self, prefix: GuidPrefix) -> Option<Timestamp> {
+        let endpoints = self.graph.discovery.endpoints();
+        let readers = self.of(prefix);
+        readers
+            .filter_map(|guid| Some(endpoints.get(&guid)?.first_seen))
+            .min()
+    }
+
+    /// Returns whether this participant has matching readers, all of them best effort.
+    #[must_use]
+    pub fn are_best_effort(self, prefix: GuidPrefix) -> bool {
+        let endpoints = self.graph.discovery.endpoints();
+        let known = self.of(prefix).filter_map(|guid| endpoints.get(&guid));
+        let mut known = known.map(|endpoint| endpoint.qos.reliability == Reliability::RELIABLE);
+        known.next() == Some(false) && !known.any(|is_reliable| is_reliable)
+    }
+
+    fn matches(self, reader: Guid) -> bool {
+        let endpoints = self.graph.discovery.endpoints();
+        let (Some(one), Some(other)) = (endpoints.get(&self.writer), endpoints.get(&reader)) else {
+            return true;
+        };
+        let (Some(writer), Some(reader)) =
+            (self.offer(self.writer, one), self.offer(reader, other))
+        else {
+            return true;
+        };
+        // The types of a buffer topic differ from those of its base topic.
+        let has_type = one.topic != other.topic || one.message_type == other.message_type;
+        has_type
+            && writer.shares_protocol(reader)
+            && (effort(writer.qos, reader.qos) > EFFORT
+                || verdict(writer, reader) == Verdict::Match)
+    }
+
+    fn offer(self, guid: Guid, endpoint: &'a Endpoint) -> Option<Offer<'a>> {
+        let participant = self.graph.discovery.participants().get(&guid.prefix)?;
+        Some(Offer {
+            qos: &endpoint.qos,
+            vendor: participant.proxy.vendor,
+        })
+    }
+}

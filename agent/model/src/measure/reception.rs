@@ -1,0 +1,425 @@
+//! Samples of one writer that arrived whole at one point: this host, or one receiver.
+//!
+//! Combines sequence numbers and fragments: a fragmented sample is complete with its last fragment,
+//! a late fragment does not reopen it, and each missing sample is decided once. The caller counts
+//! the results.
+
+use std::time::Duration;
+
+use ros2probe_wire::record::{self, DataFrag, Gap, Heartbeat};
+use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
+
+use crate::measure::samples::{Budget, Facts, Progress, Samples};
+use crate::measure::sequence::{Arrival, REACH, RepairMode, RunMembership, Sequence, Settled};
+
+/// A fragment that completes its sample this long after the sample's last fragment was
+/// retransmitted.
+const REPAIR: i64 = 5_000_000;
+/// Numbers below the newest for whose fragments a sampled view still waits.
+const UNDER_WAY: u64 = 8;
+
+/// State of one writer's samples at one point.
+#[derive(Debug, Default)]
+pub struct Reception {
+    sequence: Sequence,
+    samples: Samples,
+}
+
+/// A complete sample.
+#[derive(Clone, Copy, Debug)]
+pub struct CompleteSample {
+    /// Its sequence number.
+    pub number: SequenceNumber,
+    /// Payload bytes, including encapsulation.
+    pub bytes: u64,
+    /// False for a disposal, which has a sequence number but is no message.
+    pub is_message: bool,
+    /// Whether it was retransmitted.
+    pub recovered: bool,
+    /// Whether it is the newest so far; otherwise its delay includes a retransmission.
+    pub newest: bool,
+    /// Whether its number is not confirmed as the writer's.
+    pub unconfirmed: bool,
+    /// INFO_TS of the sample.
+    pub source: RtpsTime,
+    /// The bytes at the position of a header's stamp.
+    pub stamp: Option<(i32, u32)>,
+    /// Time of its first datagram.
+    pub began: Timestamp,
+    /// Nanoseconds from its last fragment number to its last missing fragment.
+    pub repaired_after: i64,
+}
+
+/// Result of a record.
+#[derive(Clone, Copy, Debug)]
+pub enum Outcome {
+    /// The record completed a sample.
+    Complete(CompleteSample),
+    /// The record is a duplicate.
+    Duplicate,
+    /// The sample is still incomplete, or the record was not usable.
+    Open,
+}
+
+/// A decision about missing samples.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Decision {
+    /// The samples never arrived.
+    Lost {
+        /// First sequence number.
+        first: SequenceNumber,
+        /// Last sequence number.
+        last: SequenceNumber,
+        /// Whether fragments of it arrived; it is then a single sample.
+        incomplete: bool,
+    },
+    /// The writer will not send the sample.
+    Irrelevant(SequenceNumber),
+}
+
+impl Reception {
+    /// Returns the sequence numbers.
+    #[must_use]
+    pub const fn sequence(&self) -> &Sequence {
+        &self.sequence
+    }
+
+    /// Returns the sequence numbers.
+    pub const fn sequence_mut(&mut self) -> &mut Sequence {
+        &mut self.sequence
+    }
+
+    /// Returns whether this sample has some but not all of its fragments.
+    #[must_use]
+    pub fn is_partial(&self, number: SequenceNumber) -> bool {
+        self.samples.is_partial(number)
+    }
+
+    /// Adds a DATA_FRAG of a sampled view. Returns whether it completes its sample. Samples far
+    /// below it are no longer waited for, unless it is `unconfirmed`.
+    pub fn assemble(
+        &mut self,
+        fragments: DataFrag<'_>,
+        unconfirmed: bool,
+        budget: &mut Budget,
+    ) -> bool {
+        if !unconfirmed {
+            let oldest = fragments.sequence_number().saturating_sub(UNDER_WAY);
+            self.samples.forget_below(oldest, budget);
+        }
+        let now = Timestamp(fragments.record().time);
+        let progress = self.samples.fragment(fragments, now, budget);
+        matches!(progress, Progress::Complete(_))
+    }
+
+    /// Moves the memory of unfinished samples from one budget to another.
+    pub fn transfer(&self, from: &mut Budget, to: &mut Budget) {
+        self.samples.transfer(from, to);
+    }
+
+    /// Allows fragmented samples that begin before this to be incomplete without a loss: the kernel
+    /// did not know the writer yet and limits captures of unknown writers.
+    pub const fn allow_incomplete(&mut self, until: Timestamp) {
+        self.samples.allow_incomplete(until);
+    }
+
+    /// Processes a DATA or DATA_FRAG of a writer that is `reliable` or not.
+    pub fn sample(
+        &mut self,
+        sample: record::Sample<'_>,
+        reliable: bool,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) -> Outcome {
+        if !self.recognise(sample, budget, decide) {
+            return self.unconfirmed(sample, budget);
+        }
+        match sample {
+            record::Sample::Data(_) => self.data(sample, reliable, budget, decide),
+            record::Sample::DataFrag(fragments) => {
+                self.fragment(fragments, reliable, budget, decide)
+            }
+        }
+    }
+
+    /// Returns whether the number of this DATA or DATA_FRAG is confirmed as the writer's.
+    pub fn recognise(
+        &mut self,
+        sample: record::Sample<'_>,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) -> bool {
+        let number = sample.sequence_number();
+        let now = Timestamp(sample.record().time);
+        let source = sample.source_timestamp().timestamp();
+        let Self { sequence, samples } = self;
+        match sequence.recognise(number, source, REACH, now) {
+            RunMembership::Live => true,
+            RunMembership::Unconfirmed { .. } => false,
+            RunMembership::Confirmed(run) => {
+                sequence.accept(&run, now, &mut |settled| {
+                    decide(decision(settled, samples, budget));
+                });
+                true
+            }
+        }
+    }
+
+    /// Processes a HEARTBEAT.
+    pub fn heartbeat(
+        &mut self,
+        heartbeat: Heartbeat<'_>,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) {
+        let (first, last) = (heartbeat.first(), heartbeat.last());
+        let now = Timestamp(heartbeat.record().time);
+        let Self { sequence, samples } = self;
+        sequence.heartbeat(first, last, now, &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+    }
+
+    /// Processes a GAP.
+    pub fn gap(&mut self, gap: Gap<'_>, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
+        let (start, list) = (gap.start(), gap.list());
+        let now = Timestamp(gap.record().time);
+        let Self { sequence, samples } = self;
+        sequence.gap(start, list.base, list.iter(), now, &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+    }
+
+    /// Records that this sample exists, whether it arrived or not.
+    pub fn exists(
+        &mut self,
+        number: SequenceNumber,
+        now: Timestamp,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) {
+        let Self { sequence, samples } = self;
+        sequence.exists(number, now, &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+    }
+
+    /// Merges what `other` received; its unfinished samples are dropped.
+    pub fn absorb(
+        &mut self,
+        mut other: Self,
+        now: Timestamp,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) {
+        other.samples.clear(budget);
+        let Self { sequence, samples } = self;
+        sequence.absorb(&other.sequence, now, &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+    }
+
+    /// Hands over to another view: returns the numbers of unfinished samples, which are no losses
+    /// here.
+    pub fn abandon(&mut self) -> Vec<SequenceNumber> {
+        let mut partial = Vec::new();
+        for number in self.sequence.settled().until(self.sequence.next()) {
+            if self.samples.is_partial(number) && !self.sequence.has(number) {
+                self.sequence.know(number);
+                partial.push(number);
+            }
+        }
+        partial
+    }
+
+    /// Drops all unfinished samples.
+    pub fn discard(&mut self, budget: &mut Budget) {
+        self.samples.clear(budget);
+    }
+
+    /// Excuses all samples after the last one that arrived, because the receiver is gone.
+    pub fn close(&mut self, budget: &mut Budget) {
+        let sequence = &mut self.sequence;
+        for number in sequence.settled().until(sequence.next()).rev() {
+            if sequence.has(number) {
+                return;
+            }
+            self.samples.forget(number, budget);
+            sequence.excuse(number, number.next());
+        }
+    }
+
+    /// Decides samples that have been open for `window`, and those that the writer withdrew `grace` ago.
+    pub fn advance(
+        &mut self,
+        now: Timestamp,
+        (window, grace): (Duration, Duration),
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) {
+        let Self { sequence, samples } = self;
+        let hold = samples.growing(now, window, sequence.settled());
+        sequence.advance(now, (window, grace), hold, &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+        samples.expire(now, 2 * window, budget);
+    }
+
+    /// Decides all samples at the end of the input.
+    pub fn settle(&mut self, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
+        let Self { sequence, samples } = self;
+        sequence.settle_all(&mut |settled| decide(decision(settled, samples, budget)));
+        samples.clear(budget);
+    }
+
+    fn data(
+        &mut self,
+        sample: record::Sample<'_>,
+        reliable: bool,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) -> Outcome {
+        let number = sample.sequence_number();
+        let repair_mode = if reliable {
+            RepairMode::Reliable
+        } else {
+            RepairMode::BestEffort
+        };
+        let now = Timestamp(sample.record().time);
+        let Self { sequence, samples } = self;
+        let arrival = sequence.receive(number, repair_mode, now, &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+        samples.forget(number, budget);
+        let Arrival::New { recovered, newest } = arrival else {
+            return Outcome::Duplicate;
+        };
+        Outcome::Complete(CompleteSample {
+            recovered,
+            newest,
+            ..whole_data(sample)
+        })
+    }
+
+    /// Processes a DATA or DATA_FRAG whose number is not confirmed.
+    fn unconfirmed(&mut self, sample: record::Sample<'_>, budget: &mut Budget) -> Outcome {
+        let number = sample.sequence_number();
+        let now = Timestamp(sample.record().time);
+        if self.sequence.has_unconfirmed(number) {
+            return Outcome::Duplicate;
+        }
+        let whole = match sample {
+            record::Sample::DataFrag(fragments) => {
+                match self.samples.fragment(fragments, now, budget) {
+                    Progress::Complete(facts) => whole_fragments(sample, &facts),
+                    Progress::Duplicate => return Outcome::Duplicate,
+                    _ => return Outcome::Open,
+                }
+            }
+            record::Sample::Data(_) => whole_data(sample),
+        };
+        self.sequence.complete_unconfirmed(number);
+        Outcome::Complete(CompleteSample {
+            newest: false,
+            unconfirmed: true,
+            ..whole
+        })
+    }
+
+    fn fragment(
+        &mut self,
+        fragments: DataFrag<'_>,
+        reliable: bool,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) -> Outcome {
+        let number = fragments.sequence_number();
+        let now = Timestamp(fragments.record().time);
+        // Sequence numbers are signed (RTPS 2.5, 9.3.2), so larger values are invalid.
+        if self.sequence.has(number) || number > SequenceNumber::MAX {
+            return Outcome::Duplicate;
+        }
+        let progress = self.samples.fragment(fragments, now, budget);
+        match progress {
+            Progress::Rejected => return Outcome::Open,
+            Progress::Duplicate => return Outcome::Duplicate,
+            Progress::TooMany => {
+                self.sequence.begin(number);
+                self.exists(number, now, budget, decide);
+                self.sequence.excuse(number, number.next());
+                return Outcome::Open;
+            }
+            Progress::Partial | Progress::Complete(_) => {}
+        }
+        // The first captured sample does not count as sent if its first fragments were missed,
+        // except for number 1.
+        let joined = u64::from(fragments.starting() != 1 && number.0 > 1);
+        self.sequence.begin(number.saturating_add(joined));
+        self.exists(number, now, budget, decide);
+        let Progress::Complete(facts) = progress else {
+            return Outcome::Open;
+        };
+        let repair_mode = if reliable {
+            RepairMode::ReliableFragments
+        } else {
+            RepairMode::BestEffort
+        };
+        let Self { sequence, samples } = self;
+        let arrival = sequence.receive(number, repair_mode, now, &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+        let Arrival::New { recovered, .. } = arrival else {
+            return Outcome::Open;
+        };
+        let repaired = reliable && facts.repaired_after >= REPAIR;
+        Outcome::Complete(CompleteSample {
+            recovered: recovered || repaired,
+            ..whole_fragments(record::Sample::DataFrag(fragments), &facts)
+        })
+    }
+}
+
+const fn whole_data(sample: record::Sample<'_>) -> CompleteSample {
+    CompleteSample {
+        number: sample.sequence_number(),
+        bytes: sample.size() as u64,
+        is_message: sample.is_message(),
+        recovered: false,
+        newest: true,
+        unconfirmed: false,
+        source: sample.source_timestamp(),
+        stamp: sample.header_stamp(),
+        began: sample.record().began(),
+        repaired_after: 0,
+    }
+}
+
+const fn whole_fragments(sample: record::Sample<'_>, facts: &Facts) -> CompleteSample {
+    CompleteSample {
+        bytes: facts.size as u64,
+        source: facts.source,
+        stamp: facts.stamp,
+        began: facts.began,
+        repaired_after: facts.repaired_after,
+        ..whole_data(sample)
+    }
+}
+
+fn decision(settled: Settled, samples: &mut Samples, budget: &mut Budget) -> Decision {
+    let (first, last) = match settled {
+        Settled::Lost(number) | Settled::Irrelevant(number) if samples.is_doubtful(number) => {
+            samples.forget(number, budget);
+            return Decision::Irrelevant(number);
+        }
+        Settled::Lost(number) => (number, number),
+        Settled::LostRun(start, end) => (start, end.previous()),
+        // A sample with fragments was sent, so no excuse applies.
+        Settled::Irrelevant(number) if samples.is_partial(number) => (number, number),
+        Settled::Irrelevant(number) => return Decision::Irrelevant(number),
+    };
+    Decision::Lost {
+        first,
+        last,
+        incomplete: samples.forget(first, budget),
+    }
+}

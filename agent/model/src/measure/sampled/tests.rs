@@ -1,0 +1,363 @@
+use super::*;
+use crate::measure::sequence::{FAR, REACH, Settled};
+use ros2probe_wire::time::{SECOND, nanoseconds};
+
+struct View {
+    sampled: Sampled,
+    sequence: Sequence,
+    now: u64,
+}
+
+impl View {
+    fn new() -> Self {
+        Self {
+            sampled: Sampled::new(Timestamp(SECOND)),
+            sequence: Sequence::default(),
+            now: SECOND,
+        }
+    }
+
+    fn see(&mut self, number: u64) -> SampledUpdate {
+        self.part(number, Completeness::Complete)
+    }
+
+    fn part(&mut self, number: u64, seen: Completeness) -> SampledUpdate {
+        self.now += SECOND / 100;
+        let now = Timestamp(self.now);
+        self.sampled.sample(
+            (SequenceNumber(number), seen, Some(now)),
+            FAR,
+            now,
+            &mut self.sequence,
+        )
+    }
+
+    fn counts(&self) -> (u64, u64) {
+        let SampledFacts { seen, span, .. } = self.sampled.facts();
+        (seen, span)
+    }
+
+    fn losses(&mut self) -> Vec<Settled> {
+        let mut losses = Vec::new();
+        self.sequence
+            .settle_all(&mut |settled| losses.push(settled));
+        losses
+    }
+}
+
+#[test]
+fn what_was_not_seen_was_sent_and_is_no_loss() {
+    let mut view = View::new();
+    for number in [1, 2, 5, 6, 100] {
+        view.see(number);
+    }
+    assert_eq!(view.counts(), (5, 100));
+    assert_eq!(view.losses(), []);
+}
+
+#[test]
+fn a_sample_is_seen_once_in_however_many_fragments_and_copies() {
+    let mut view = View::new();
+    let parts = [
+        Completeness::Partial,
+        Completeness::Partial,
+        Completeness::Complete,
+        Completeness::Complete,
+    ];
+    let update = parts.map(|seen| view.part(1, seen));
+    assert_eq!(update.map(|update| update.samples), [1, 0, 0, 0]);
+    assert_eq!(
+        update.map(|update| update.arrived),
+        [false, false, true, false]
+    );
+    assert_eq!(
+        update.map(|update| update.finished),
+        [false, false, true, false]
+    );
+    view.see(3);
+    // The sample is late but was seen after all.
+    let late = SampledUpdate {
+        finished: true,
+        ..SampledUpdate::default()
+    };
+    assert_eq!(view.see(2), late);
+    assert_eq!(view.see(2), SampledUpdate::default());
+    assert_eq!(view.counts(), (3, 3));
+}
+
+#[test]
+fn a_sample_needs_its_later_fragments_although_its_number_is_known() {
+    let mut view = View::new();
+    view.see(1);
+    let has = |view: &View, number| view.sampled.has(number, view.sequence.next());
+    view.part(2, Completeness::Partial);
+    assert_eq!(
+        [1, 2, 3].map(|number| has(&view, SequenceNumber(number))),
+        [true, false, false]
+    );
+    // The next sample begins before this one is whole.
+    view.part(3, Completeness::Partial);
+    view.part(2, Completeness::Complete);
+    assert_eq!(
+        [2, 3].map(|number| has(&view, SequenceNumber(number))),
+        [true, false]
+    );
+    view.part(3, Completeness::LastFragment);
+    view.see(500);
+    // 300 is too old to be waited for, and numbers skipped by a GAP are not waited for either.
+    assert!(has(&view, SequenceNumber(300)) && !has(&view, SequenceNumber(499)));
+    let now = Timestamp(view.now);
+    view.sampled.skip(
+        (SequenceNumber(501), SequenceNumber(503)),
+        FAR,
+        now,
+        &mut view.sequence,
+    );
+    assert!(has(&view, SequenceNumber(502)) && !has(&view, SequenceNumber(499)));
+}
+
+#[test]
+fn an_interval_is_that_between_neighbours_that_both_were_seen() {
+    let mut view = View::new();
+    assert_eq!(view.see(1).interval, None);
+    assert_eq!(view.see(2).interval, Some(10_000_000));
+    assert_eq!(view.see(4).interval, None);
+    assert_eq!(view.see(5).interval, Some(10_000_000));
+}
+
+#[test]
+fn a_heartbeat_shows_lost_last_samples_and_a_gap_those_never_written() {
+    let mut view = View::new();
+    let now = Timestamp(view.now);
+    assert_eq!(
+        view.sampled
+            .exist(SequenceNumber(7), FAR, now, &mut view.sequence),
+        0
+    );
+    view.see(5);
+    assert_eq!(
+        view.sampled
+            .exist(SequenceNumber(7), FAR, now, &mut view.sequence),
+        2
+    );
+    assert_eq!(
+        view.sampled
+            .exist(SequenceNumber(6), FAR, now, &mut view.sequence),
+        0
+    );
+    assert_eq!(view.counts(), (1, 3));
+    // Sample 8 was sent, 9 to 11 were not.
+    assert_eq!(
+        view.sampled.skip(
+            (SequenceNumber(9), SequenceNumber(12)),
+            FAR,
+            now,
+            &mut view.sequence
+        ),
+        1
+    );
+    assert_eq!(view.counts(), (1, 4));
+    let update = view.see(12);
+    // The update includes 6, 7 and 8, whose sizes are not known either.
+    assert_eq!((update.samples, update.alike), (1, 4));
+    view.see(7);
+    assert_eq!(view.counts(), (3, 5));
+    let forged = view
+        .sampled
+        .exist(SequenceNumber(1 << 40), FAR, now, &mut view.sequence);
+    assert_eq!((forged, view.counts()), (0, (3, 5)));
+    assert_eq!(view.losses(), []);
+}
+
+#[test]
+fn a_writer_that_begins_anew_under_its_old_name_counts_from_there() {
+    let mut view = View::new();
+    view.see(1);
+    view.see(1000);
+    view.now += 60 * SECOND;
+    assert_eq!(view.see(1).samples, 1);
+    assert_eq!(view.see(2).samples, 1);
+    assert_eq!(view.counts(), (4, 1002));
+}
+
+#[test]
+fn a_sample_announced_by_a_heartbeat_and_seen_late_is_no_restart() {
+    let mut view = View::new();
+    view.see(1);
+    let now = Timestamp(view.now);
+    assert_eq!(
+        view.sampled
+            .exist(SequenceNumber(5), FAR, now, &mut view.sequence),
+        4
+    );
+    view.now += SECOND;
+    for seen in [
+        Completeness::Partial,
+        Completeness::Partial,
+        Completeness::Complete,
+    ] {
+        assert_eq!(view.part(4, seen).samples, 0);
+    }
+    assert_eq!(view.counts(), (2, 5));
+}
+
+#[test]
+fn what_was_not_seen_is_left_out_once_when_it_has_waited() {
+    let mut view = View::new();
+    let settle = |view: &mut View| {
+        view.now += nanoseconds(ARRIVAL_TIMEOUT);
+        view.sampled.tick(Timestamp(view.now));
+        view.sampled.take_unseen()
+    };
+    view.see(1);
+    assert_eq!(settle(&mut view), []);
+    view.see(5);
+    assert!(view.sampled.unseen_since().is_some());
+    // The sample may still arrive until the next tick.
+    assert_eq!(settle(&mut view), []);
+    assert!(view.see(3).finished);
+    assert_eq!(settle(&mut view), runs(&[(2, 2), (4, 4)]));
+    assert_eq!(view.sampled.unseen_since(), None);
+    assert!(!view.see(4).finished, "given after it was left out");
+    // Neither a part of a sample nor a HEARTBEAT makes it seen.
+    view.part(6, Completeness::Partial);
+    let now = Timestamp(view.now);
+    view.sampled
+        .exist(SequenceNumber(8), FAR, now, &mut view.sequence);
+    // Numbers skipped by a GAP are not missing.
+    view.sampled.skip(
+        (SequenceNumber(9), SequenceNumber(200)),
+        FAR,
+        now,
+        &mut view.sequence,
+    );
+    assert_eq!(settle(&mut view), runs(&[(6, 8)]));
+    assert_eq!(settle(&mut view), []);
+    assert_eq!(
+        (view.see(200).finished, view.see(1000).finished),
+        (true, true)
+    );
+    view.sampled.settle_all();
+    assert_eq!(view.sampled.take_unseen(), runs(&[(201, 999)]));
+}
+
+#[test]
+fn what_was_counted_otherwise_meanwhile_is_not_left_out() {
+    let mut view = View::new();
+    view.see(1);
+    view.see(3);
+    view.sampled.end();
+    // The sample may still arrive; it is skipped when the view begins again.
+    assert_eq!(view.sampled.take_unseen(), []);
+    assert!(view.sampled.awaits(SequenceNumber(2)) && !view.sampled.awaits(SequenceNumber(3)));
+    let now = Timestamp(view.now);
+    for number in 4..500 {
+        view.sequence
+            .exists(SequenceNumber(number), now, &mut |_| {});
+    }
+    view.see(500);
+    view.see(502);
+    view.sampled.settle_all();
+    assert_eq!(view.sampled.take_unseen(), runs(&[(2, 2), (501, 501)]));
+}
+
+#[test]
+fn a_jump_beyond_all_windows_is_bounded_work_and_no_loss() {
+    let mut view = View::new();
+    for number in 1..=6 {
+        view.see(number);
+    }
+    // Each counts alone until the jump is confirmed; then the skipped numbers count, too.
+    let samples: Vec<_> = (1..=6).map(|n| view.see(1_000_000 + n).samples).collect();
+    assert_eq!(samples, [1, 1, 1, 1, 999_995, 1]);
+    assert_eq!(view.losses(), []);
+    view.see(u64::MAX);
+    view.see(0);
+    assert_eq!(view.counts(), (12, 1_000_006));
+    assert!((1..=6).all(|n| {
+        view.sampled
+            .has(SequenceNumber(1_000_000 + n), view.sequence.next())
+    }));
+}
+
+#[test]
+fn a_forged_number_far_ahead_counts_as_one_message_and_ends_no_other() {
+    let mut view = View::new();
+    for number in 1..=5 {
+        view.see(number);
+    }
+    view.part(6, Completeness::Partial);
+    let forged = view.part(1 << 40, Completeness::Partial);
+    assert_eq!((forged.samples, forged.finished), (1, false));
+    assert!(view.part(1 << 40, Completeness::Complete).finished);
+    assert!(!view.part(1 << 40, Completeness::Complete).finished);
+    assert!(view.part(6, Completeness::Complete).finished);
+    assert_eq!(view.see(7).samples, 1);
+    let now = Timestamp(view.now);
+    let messages = view
+        .sampled
+        .exist(SequenceNumber(3000), REACH, now, &mut view.sequence);
+    let passed = view.sampled.skip(
+        (SequenceNumber(2000), SequenceNumber(3000)),
+        REACH,
+        now,
+        &mut view.sequence,
+    );
+    assert_eq!((messages, passed, view.counts()), (0, 0, (8, 8)));
+}
+
+#[test]
+fn it_is_sampled_until_shared_memory_has_been_silent_for_a_while() {
+    let mut sampled = Sampled::new(Timestamp(SECOND));
+    assert!(sampled.is_current(Timestamp(10 * SECOND)));
+    assert!(!sampled.is_current(Timestamp(11 * SECOND)));
+    sampled.touch(Timestamp(5 * SECOND));
+    assert!(sampled.is_current(Timestamp(11 * SECOND)));
+}
+
+#[test]
+fn the_stamp_of_a_first_fragment_is_that_of_the_sample() {
+    let mut sampled = Sampled::new(Timestamp(SECOND));
+    assert_eq!(sampled.stamp(SequenceNumber(1), Some((5, 6))), Some((5, 6)));
+    assert_eq!(sampled.stamp(SequenceNumber(1), None), Some((5, 6)));
+    assert_eq!(sampled.stamp(SequenceNumber(2), None), None);
+}
+
+/// Returns the runs, given as their first and last numbers.
+fn runs(runs: &[(u64, u64)]) -> Vec<(SequenceNumber, SequenceNumber)> {
+    let numbered = |(first, last): &(u64, u64)| (SequenceNumber(*first), SequenceNumber(*last));
+    runs.iter().map(numbered).collect()
+}
+
+/// Messages in a row that polling may have missed after these numbers were seen.
+fn possibly_missed(seen: impl Iterator<Item = u64>) -> u64 {
+    let mut view = View::new();
+    seen.for_each(|number| {
+        view.see(number);
+    });
+    let interval = Duration::from_secs(100);
+    view.sampled.seeming_silence(interval).as_secs() / interval.as_secs()
+}
+
+#[test]
+fn messages_that_hide_one_after_the_other_explain_a_longer_silence() {
+    assert_eq!(possibly_missed(std::iter::empty()), 131);
+    assert!((80..100).contains(&possibly_missed(1..=100)));
+    // Every other one, which never misses two in a row, and half of them at random.
+    assert!((4..8).contains(&possibly_missed((1..=100).step_by(2))));
+    let at_random = (1..=400_u64).filter(|number| (number * number).count_ones() % 2 == 0);
+    assert!((15..30).contains(&possibly_missed(at_random)));
+    // As many are missed, all in one row.
+    assert!(possibly_missed((1..=50).chain(100..=101)) > 400);
+    // A busy machine does not poll for seconds.
+    let mut view = View::new();
+    view.see(1);
+    let short = view.sampled.seeming_silence(Duration::from_millis(1));
+    assert_eq!(short, POLLING_HOLE);
+    view.sampled.end();
+    assert!(
+        view.sampled
+            .seeming_silence(Duration::from_secs(1))
+            .is_zero()
+    );
+}

@@ -1,0 +1,490 @@
+//! Sequence numbers of one writer: which samples arrived, and which never will.
+//!
+//! A gap is not a loss at once: it stays open for the settle window, so that reordering and
+//! retransmission can fill it. Numbers excused by a GAP, an ACKNACK or the start of observation are
+//! never lost. The firstSN of a HEARTBEAT excuses nothing: a missing sample that the writer no
+//! longer has is lost (RTPS 2.5, 8.4.10.4, `lost_changes_update`). Memory is two bitmaps that grow
+//! with the undecided numbers, up to [`MAX_WINDOW`]. The module sees no payloads and only the times
+//! that callers pass in.
+
+mod bitmap;
+mod runs;
+mod submessages;
+mod unconfirmed;
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use ros2probe_wire::{SequenceNumber, Timestamp};
+
+use crate::facts::bounded::Bounded;
+use crate::facts::tables::{Checkpoints, SequenceGaps};
+use bitmap::Bitmap;
+pub use unconfirmed::Run;
+use unconfirmed::{CONFIRMATIONS, UnconfirmedRun};
+
+/// Initial number of undecided and recently decided numbers that are remembered.
+const MIN_WINDOW: u64 = 512;
+/// Largest such number: 8 KiB of bitmaps, or about 3000 messages per second over the reliable
+/// settle window.
+pub const MAX_WINDOW: u64 = 32_768;
+/// A larger jump is a new incarnation or a forgery, not a million losses.
+const MAX_JUMP: u64 = 1 << 20;
+/// HEARTBEAT and GAP may exceed the received numbers by at most this, even if two agree.
+pub const FAR: u64 = 4096;
+/// A number further ahead is unconfirmed, as is a claim about it in a single HEARTBEAT or GAP.
+pub const REACH: u64 = 64;
+/// A gap that fills within this time without a request was reordering. Retransmissions take longer
+/// even if their ACKNACK was not seen: readers wait 5 ms (Fast DDS) to 100 ms (Cyclone DDS) before
+/// they answer a HEARTBEAT.
+const REORDERING: Duration = Duration::from_millis(5);
+/// A lower number with a source time later by this much begins a new incarnation of the writer.
+const INCARNATION: Duration = Duration::from_millis(100);
+/// This many consecutive samples below the window also begin a new incarnation, whatever their
+/// source times.
+const STALE: u32 = 1024;
+/// Number of steps per window in which settling advances.
+const STEPS: u32 = 16;
+
+/// State of one writer's sequence numbers.
+#[derive(Debug, Default)]
+pub struct Sequence {
+    /// The first number seen; earlier ones do not count. 0 before the first.
+    first: SequenceNumber,
+    /// All numbers below are decided.
+    settled: SequenceNumber,
+    /// One more than the highest number known to exist.
+    next: SequenceNumber,
+    /// The lowest number that the writer still has: the highest firstSN of its HEARTBEATs.
+    available: SequenceNumber,
+    /// An earlier value of `available`, and its time.
+    withdrawn: Option<(Timestamp, SequenceNumber)>,
+    /// All readers that acknowledge have every number below, or will not get it.
+    acknowledged: SequenceNumber,
+    /// Every number below, as far as checked, has arrived or is not waited for.
+    complete: SequenceNumber,
+    /// Number of restarts.
+    incarnation: u32,
+    received: Bitmap,
+    excused: Bitmap,
+    /// `next` at some times, oldest first.
+    checkpoints: Bounded<Checkpoints, VecDeque<(Timestamp, SequenceNumber)>>,
+    gaps: Bounded<SequenceGaps, VecDeque<Gap>>,
+    newest_source: Timestamp,
+    /// The number with the newest source time.
+    newest: SequenceNumber,
+    /// Consecutive samples after it with an older source time.
+    older: u8,
+    stale: u32,
+    /// Time of the last increase of `next`.
+    last_advance: Timestamp,
+    /// Samples that continued this incarnation, counted up to a small number.
+    followed: u8,
+    unconfirmed: Option<Box<UnconfirmedRun>>,
+    /// Number of runs, HEARTBEATs, GAPs and ACKNACKs that were unconfirmed.
+    jumps: u64,
+}
+
+/// Whether a sample's number belongs to the writer's run.
+#[derive(Debug)]
+pub enum RunMembership {
+    /// The number belongs to the live run.
+    Live,
+    /// The sample counts as a message but affects no other number.
+    Unconfirmed {
+        /// Whether no part of this sample was seen before.
+        new: bool,
+    },
+    /// The number confirms a run, which is live from here on, with its earlier samples.
+    Confirmed(Run),
+}
+
+/// A run of missing numbers, to distinguish reordering from retransmission.
+#[derive(Clone, Copy, Debug)]
+struct Gap {
+    start: SequenceNumber,
+    end: SequenceNumber,
+    noticed: Timestamp,
+    requested: bool,
+}
+
+/// Relation of a sample's number to earlier ones.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Arrival {
+    /// Not seen before.
+    New {
+        /// Whether it filled a gap by retransmission.
+        recovered: bool,
+        /// Whether it is the newest so far; otherwise its delay includes a retransmission.
+        newest: bool,
+    },
+    /// Seen before, or too old to decide.
+    Duplicate,
+}
+
+/// Whether a late sample may be a retransmission.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum RepairMode {
+    /// The writer never retransmits.
+    BestEffort,
+    /// The writer retransmits samples that a reader misses.
+    Reliable,
+    /// The writer retransmits, but a fragmented sample may be late without a loss.
+    ReliableFragments,
+}
+
+/// A decision about one or several numbers.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Settled {
+    /// The number never arrived.
+    Lost(SequenceNumber),
+    /// The writer excused the number.
+    Irrelevant(SequenceNumber),
+    /// Lost numbers from the first to the last, beyond the capacity of the window.
+    LostRun(SequenceNumber, SequenceNumber),
+}
+
+impl Sequence {
+    /// Returns whether any sample was seen.
+    #[must_use]
+    pub const fn started(&self) -> bool {
+        self.first.0 != 0
+    }
+
+    /// Returns the highest number known to exist, plus one.
+    #[must_use]
+    pub const fn next(&self) -> SequenceNumber {
+        self.next
+    }
+
+    /// Returns the time at which the highest number last increased.
+    #[must_use]
+    pub const fn last_advance(&self) -> Timestamp {
+        self.last_advance
+    }
+
+    /// Returns whether this sample was received whole before.
+    #[must_use]
+    pub fn has(&self, number: SequenceNumber) -> bool {
+        self.started() && (number < self.floor() || number < self.next && self.received.get(number))
+    }
+
+    /// Processes a whole sample, after [`Self::recognise`].
+    pub fn receive(
+        &mut self,
+        number: SequenceNumber,
+        repair_mode: RepairMode,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) -> Arrival {
+        if !number.is_valid() {
+            return Arrival::Duplicate;
+        }
+        if !self.started() {
+            self.restart(number);
+        }
+        if number >= self.next {
+            self.stale = 0;
+            self.extend(number, number + 1, now, settled);
+            self.received.set(number);
+            return Arrival::New {
+                recovered: false,
+                newest: true,
+            };
+        }
+        if number < self.floor() {
+            self.stale += 1;
+            return Arrival::Duplicate;
+        }
+        self.stale = 0;
+        if self.received.get(number) {
+            return Arrival::Duplicate;
+        }
+        self.received.set(number);
+        let recovered = number >= self.first && self.was_retransmitted(number, repair_mode, now);
+        Arrival::New {
+            recovered,
+            newest: false,
+        }
+    }
+
+    /// Returns how often a number was unconfirmed.
+    #[must_use]
+    pub const fn jumps(&self) -> u64 {
+        self.jumps
+    }
+
+    /// Records the source time of a sample.
+    pub fn sourced(&mut self, number: SequenceNumber, source: Timestamp) {
+        if number <= self.newest {
+            return;
+        }
+        self.older += 1;
+        // After many older source times, the newest one was forged or the writer's clock was set
+        // back.
+        if source >= self.newest_source || self.older >= CONFIRMATIONS {
+            (self.newest_source, self.newest, self.older) = (source, number, 0);
+        }
+    }
+
+    /// Records that a sample exists, because some of its fragments arrived.
+    pub fn exists(
+        &mut self,
+        number: SequenceNumber,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) {
+        let is_ahead = number >= self.next && number - self.next <= MAX_JUMP;
+        if self.started() && is_ahead && number.is_valid() {
+            self.extend(number, number + 1, now, settled);
+        }
+    }
+
+    /// Begins to count at this number; does nothing after the beginning.
+    pub fn begin(&mut self, number: SequenceNumber) {
+        if !self.started() && number > SequenceNumber::ZERO && number < SequenceNumber::MAX {
+            self.restart(number);
+        }
+    }
+
+    /// Returns the number below which everything is decided.
+    #[must_use]
+    pub const fn settled(&self) -> SequenceNumber {
+        self.settled
+    }
+
+    /// Returns the number of missing samples that may still arrive.
+    #[must_use]
+    pub fn undecided(&self) -> u64 {
+        let mut number = self.settled.max(self.floor());
+        let mut undecided = 0;
+        while number < self.next {
+            let first = number.0 % 64;
+            let bits = (self.next - number).min(64 - first);
+            let mask = (u64::MAX >> (64 - bits)) << first;
+            let decided = self.received.word(number) | self.excused.word(number);
+            undecided += u64::from((!decided & mask).count_ones());
+            number += bits;
+        }
+        undecided
+    }
+
+    /// Returns the time at which this number was detected as missing, if remembered.
+    #[must_use]
+    pub fn missed_since(&self, number: SequenceNumber) -> Option<Timestamp> {
+        let mut gaps = self.gaps.iter().rev();
+        let gap = gaps.find(|gap| gap.start <= number && number < gap.end);
+        gap.map(|gap| gap.noticed)
+    }
+
+    /// Records that this number arrived elsewhere: here it is neither a loss nor a sample.
+    pub fn know(&mut self, number: SequenceNumber) {
+        if self.started() && number >= self.floor() && number < self.next {
+            self.received.set(number);
+        }
+    }
+
+    /// Merges the numbers of the same writer that `other` received. The beginning of this one
+    /// applies.
+    pub fn absorb(&mut self, other: &Self, now: Timestamp, settled: &mut impl FnMut(Settled)) {
+        if !self.started() || !other.started() {
+            return;
+        }
+        if other.next > self.next && other.next - self.next <= FAR {
+            self.extend(other.next.previous(), other.next, now, settled);
+        }
+        for number in self
+            .floor()
+            .max(other.floor())
+            .until(self.next.min(other.next))
+        {
+            if other.received.get(number) {
+                self.received.set(number);
+            }
+        }
+    }
+
+    /// Returns the lowest number that counts.
+    #[must_use]
+    pub const fn first(&self) -> SequenceNumber {
+        self.first
+    }
+
+    /// Returns the number below which every sample has arrived or is not waited for: the writer
+    /// skipped or dropped it, readers acknowledged it, or it is settled.
+    pub fn complete(&mut self) -> SequenceNumber {
+        let decided = self.settled.max(self.available).max(self.floor());
+        self.complete = self.complete.max(decided);
+        while self.complete < self.next
+            && (self.received.get(self.complete) || self.excused.get(self.complete))
+        {
+            self.complete += 1;
+        }
+        self.complete
+    }
+
+    /// Stops waiting for numbers below this one.
+    pub fn skip(&mut self, number: SequenceNumber) {
+        self.complete = self.complete.max(number.min(self.next));
+    }
+
+    /// Returns the number below which the writer sends no sample again.
+    #[must_use]
+    pub fn awaited(&self) -> SequenceNumber {
+        self.available.max(self.acknowledged)
+    }
+
+    /// Returns the number of restarts.
+    #[must_use]
+    pub const fn incarnation(&self) -> u32 {
+        self.incarnation
+    }
+
+    /// Decides numbers that have been open for `window`, and those that the writer withdrew `grace`
+    /// ago. Numbers from `hold` on stay open.
+    pub fn advance(
+        &mut self,
+        now: Timestamp,
+        (window, grace): (Duration, Duration),
+        hold: Option<SequenceNumber>,
+        settled: &mut impl FnMut(Settled),
+    ) {
+        if !self.started() {
+            return;
+        }
+        let mut limit = None;
+        if let Some((at, available)) = self.withdrawn
+            && at + grace <= now
+        {
+            limit = Some(available);
+            let later = self.available > available;
+            self.withdrawn = later.then_some((now, self.available));
+        }
+        while let Some((at, next)) = self.checkpoints.front().copied()
+            && at + window <= now
+        {
+            limit = limit.max(Some(next));
+            let later = self.checkpoints.get(1);
+            let is_last = later.is_none_or(|(at, _)| *at + window > now);
+            if is_last && hold.is_some_and(|hold| hold < next) {
+                break;
+            }
+            self.checkpoints.pop_front();
+        }
+        if let Some(limit) = limit {
+            self.settle(hold.map_or(limit, |hold| hold.min(limit)), settled);
+        }
+        let due = self
+            .checkpoints
+            .back()
+            .is_none_or(|(at, next)| *next < self.next && *at + window / STEPS <= now);
+        if due && self.settled < self.next {
+            self.checkpoints.push_back((now, self.next));
+        }
+    }
+
+    /// Decides all open numbers.
+    pub fn settle_all(&mut self, settled: &mut impl FnMut(Settled)) {
+        self.settle(self.next, settled);
+        self.checkpoints.clear();
+    }
+
+    /// Returns the lowest number that is remembered.
+    fn floor(&self) -> SequenceNumber {
+        self.next.saturating_sub(self.received.len())
+    }
+
+    fn restart(&mut self, number: SequenceNumber) {
+        *self = Self {
+            first: number,
+            settled: number,
+            next: number,
+            newest_source: self.newest_source,
+            last_advance: self.last_advance,
+            jumps: self.jumps,
+            complete: number,
+            incarnation: self.incarnation.wrapping_add(1),
+            received: Bitmap::with_len(MIN_WINDOW),
+            excused: Bitmap::with_len(MIN_WINDOW),
+            ..Self::default()
+        };
+    }
+
+    /// Raises `next` to `end`: `start..end` arrived, and the numbers before are a gap.
+    fn extend(
+        &mut self,
+        start: SequenceNumber,
+        end: SequenceNumber,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) {
+        if start > self.next {
+            self.note_gap(self.next, start, now);
+        }
+        let undecided = end - self.settled;
+        if undecided > self.received.len() && self.received.len() < MAX_WINDOW {
+            let len = undecided.next_power_of_two().min(MAX_WINDOW);
+            self.received.grow(len, self.floor(), self.next);
+            self.excused.grow(len, self.floor(), self.next);
+        }
+        let keep = end.saturating_sub(self.received.len());
+        if keep > self.settled {
+            // The window cannot keep so many numbers open, so they are decided now.
+            self.settle(keep.min(self.next), settled);
+            if keep > self.settled {
+                settled(Settled::LostRun(self.settled, keep));
+                self.settled = keep;
+            }
+        }
+        self.received.clear(self.next, end);
+        self.excused.clear(self.next, end);
+        self.next = end;
+        self.last_advance = now;
+    }
+
+    fn note_gap(&mut self, start: SequenceNumber, end: SequenceNumber, now: Timestamp) {
+        self.gaps.push_back(Gap {
+            start,
+            end,
+            noticed: now,
+            requested: false,
+        });
+    }
+
+    fn was_retransmitted(
+        &self,
+        number: SequenceNumber,
+        repair_mode: RepairMode,
+        now: Timestamp,
+    ) -> bool {
+        let gap = self
+            .gaps
+            .iter()
+            .rev()
+            .find(|gap| gap.start <= number && number < gap.end);
+        let late = |gap: &Gap| gap.requested || now - gap.noticed >= REORDERING;
+        match repair_mode {
+            RepairMode::BestEffort => false,
+            // A gap that is no longer remembered is an old one.
+            RepairMode::Reliable => gap.is_none_or(late),
+            RepairMode::ReliableFragments => gap.is_some_and(late),
+        }
+    }
+
+    fn settle(&mut self, limit: SequenceNumber, settled: &mut impl FnMut(Settled)) {
+        for number in self.settled.until(limit.min(self.next)) {
+            if !self.received.get(number) {
+                let excused = self.excused.get(number);
+                settled(if excused {
+                    Settled::Irrelevant(number)
+                } else {
+                    Settled::Lost(number)
+                });
+            }
+        }
+        self.settled = self.settled.max(limit.min(self.next));
+    }
+}
+
+#[cfg(test)]
+mod tests;

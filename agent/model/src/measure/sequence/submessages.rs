@@ -1,0 +1,144 @@
+//! HEARTBEAT, GAP and ACKNACK: existing numbers, and those that readers miss (RTPS 2.5, 8.3.8).
+
+use ros2probe_wire::{SequenceNumber, Timestamp};
+
+use super::FAR;
+use super::MAX_JUMP;
+use super::REACH;
+use super::Sequence;
+use super::Settled;
+use super::unconfirmed::Run;
+
+impl Sequence {
+    /// Processes a HEARTBEAT: the writer has `first..=last`. It sends nothing below `first` again,
+    /// and all numbers up to `last` exist.
+    pub fn heartbeat(
+        &mut self,
+        first: SequenceNumber,
+        last: SequenceNumber,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) {
+        if !self.started() || first == SequenceNumber::ZERO || first > last.next() {
+            return;
+        }
+        let next = last.next();
+        let (is_confirmed, run) = self.claim(next, REACH, now);
+        if let Some(run) = run {
+            self.accept(&run, now, settled);
+        }
+        if !is_confirmed {
+            return;
+        }
+        if next > self.next {
+            self.note_gap(self.next, next, now);
+            self.extend(next.previous(), next, now, settled);
+        }
+        let available = first.min(self.next);
+        if available > self.available {
+            self.available = available;
+            self.withdrawn.get_or_insert((now, available));
+        }
+    }
+
+    /// Processes a HEARTBEAT's lastSN, `next - 1`. Returns whether it is confirmed, and the run
+    /// that it confirms.
+    pub fn claim(
+        &mut self,
+        next: SequenceNumber,
+        reach: u64,
+        now: Timestamp,
+    ) -> (bool, Option<Run>) {
+        let live = self.next;
+        let unconfirmed = self.unconfirmed.as_mut();
+        if unconfirmed.is_some_and(|unconfirmed| unconfirmed.agrees(next, live, now)) {
+            return (true, Some(self.confirm()));
+        }
+        let ahead = next.steps_since(live);
+        if ahead <= reach {
+            if next >= live {
+                self.contradict();
+            }
+            return (true, None);
+        }
+        let unconfirmed = self.unconfirmed.get_or_insert_default();
+        if ahead <= FAR && unconfirmed.is_claimed(next, reach, now) {
+            return (true, None);
+        }
+        self.jumps += 1;
+        (false, None)
+    }
+
+    /// Returns whether an ACKNACK acknowledges numbers that are not known to exist.
+    pub const fn refuses(&mut self, base: SequenceNumber) -> bool {
+        let refuses = self.started() && base.steps_since(self.next) > FAR;
+        self.jumps += refuses as u64;
+        refuses
+    }
+
+    /// Processes an ACKNACK: the readers have all numbers below `base`, even unseen ones, except
+    /// samples that the writer had withdrawn before.
+    pub fn acknowledged(&mut self, base: SequenceNumber) {
+        if self.started() {
+            self.excuse(self.available, base);
+            self.acknowledged = self.acknowledged.max(base);
+        }
+    }
+
+    /// Processes a GAP: `start..base` and some numbers after it will never arrive.
+    pub fn gap(
+        &mut self,
+        start: SequenceNumber,
+        base: SequenceNumber,
+        set: impl Iterator<Item = SequenceNumber>,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) {
+        if !self.started() || start == SequenceNumber::ZERO || base < start {
+            return;
+        }
+        let ahead = base.steps_since(self.next);
+        if ahead > REACH {
+            self.jumps += 1;
+            if ahead <= MAX_JUMP {
+                self.unconfirmed
+                    .get_or_insert_default()
+                    .pass_over(start, base);
+            }
+            return;
+        }
+        let mut one = |sequence: &mut Self, start: SequenceNumber, end: SequenceNumber| {
+            if end > sequence.next {
+                if end - sequence.next > REACH {
+                    return;
+                }
+                sequence.extend(end.previous(), end, now, settled);
+            }
+            sequence.excuse(start.max(sequence.settled), end);
+        };
+        one(self, start, base);
+        for number in set {
+            one(self, number, number.next());
+        }
+    }
+
+    /// Processes an ACKNACK in which a reader requests these numbers again.
+    pub fn requested(&mut self, mut set: impl Iterator<Item = SequenceNumber>) {
+        if self.gaps.is_empty() {
+            return;
+        }
+        let (Some(low), high) = (set.next(), set.last()) else {
+            return;
+        };
+        let high = high.unwrap_or(low);
+        for gap in &mut self.gaps {
+            gap.requested |= gap.start <= high && low < gap.end;
+        }
+    }
+
+    /// Excuses `start..end`, so that no number in it is lost.
+    pub fn excuse(&mut self, start: SequenceNumber, end: SequenceNumber) {
+        let start = start.max(self.floor()).max(self.settled);
+        self.excused.set_all(start, end.min(self.next));
+    }
+}

@@ -1,0 +1,175 @@
+//! Numbers outside a writer's live run: a jump, a restart, or a forgery.
+//!
+//! One datagram proves nothing. Two things confirm a run. Several datagrams continue it while the
+//! live run stands still, or a HEARTBEAT in a later datagram agrees with it.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use ros2probe_wire::{SequenceNumber, Timestamp};
+
+use super::FAR;
+use crate::facts::bounded::Bounded;
+use crate::facts::tables::UnconfirmedNumbers;
+
+/// Number of datagrams that confirm a run.
+pub(super) const CONFIRMATIONS: u8 = 5;
+/// Copies of one datagram arrive at several sockets within this time.
+const COPIES: Duration = Duration::from_millis(5);
+
+/// The run, and unconfirmed claims of HEARTBEATs and GAPs.
+#[derive(Debug, Default)]
+pub(super) struct UnconfirmedRun {
+    run: Run,
+    /// Number of datagrams that continued the run since the live run last did.
+    evidence: u8,
+    /// Times of the first and last of them.
+    since: Timestamp,
+    latest: Timestamp,
+    /// The number after lastSN of a HEARTBEAT, and its time.
+    claim: (SequenceNumber, Timestamp),
+}
+
+/// Samples that were counted before their numbers were confirmed.
+#[derive(Clone, Debug, Default)]
+pub struct Run {
+    /// Numbers, and whether each sample is whole; sorted once confirmed.
+    pub numbers: Bounded<UnconfirmedNumbers, VecDeque<(SequenceNumber, bool)>>,
+    /// Numbers that a GAP skipped before the run.
+    pub(super) gap: (SequenceNumber, SequenceNumber),
+}
+
+impl UnconfirmedRun {
+    /// Records the number of a sample. Returns whether it begins a run, and whether it is new.
+    pub(super) fn note(&mut self, number: SequenceNumber, now: Timestamp) -> (bool, bool) {
+        let numbers = &self.run.numbers;
+        if numbers.iter().any(|(known, _)| *known == number) {
+            return (false, false);
+        }
+        let last = numbers.back().map(|(last, _)| *last);
+        let opens = last.is_none_or(|last| last.distance(number) > FAR);
+        if opens {
+            self.run.numbers.clear();
+            self.evidence = 0;
+        }
+        self.run.numbers.push_back((number, false));
+        if self.evidence == 0 {
+            self.since = now;
+        }
+        if self.evidence == 0 || now != self.latest {
+            self.evidence += 1;
+            self.latest = now;
+        }
+        (opens, true)
+    }
+
+    /// Marks a sample as whole. Returns whether that is new.
+    pub(super) fn complete(&mut self, number: SequenceNumber) -> bool {
+        let mut numbers = self.run.numbers.iter_mut();
+        let Some((_, is_whole)) = numbers.find(|(known, _)| *known == number) else {
+            return false;
+        };
+        !std::mem::replace(is_whole, true)
+    }
+
+    /// Returns whether this number continues a run below `live`.
+    pub(super) fn is_continued(&self, number: SequenceNumber, live: SequenceNumber) -> bool {
+        let last = self.run.numbers.back().filter(|_| self.evidence > 0);
+        last.is_some_and(|(last, _)| *last < live && last.distance(number) <= FAR)
+    }
+
+    pub(super) fn is_whole(&self, number: SequenceNumber) -> bool {
+        self.run.numbers.contains(&(number, true))
+    }
+
+    pub(super) const fn is_confirmed(&self) -> bool {
+        self.evidence >= CONFIRMATIONS
+    }
+
+    /// Resets the evidence, because the live run continued.
+    pub(super) const fn contradict(&mut self) {
+        self.evidence = 0;
+        self.claim = (SequenceNumber::ZERO, Timestamp(0));
+    }
+
+    /// Returns whether a HEARTBEAT with lastSN `next - 1` confirms the run, where `live` is the
+    /// live run's next number. A HEARTBEAT that reaches `live` never confirms a run below it.
+    pub(super) fn agrees(
+        &self,
+        next: SequenceNumber,
+        live: SequenceNumber,
+        now: Timestamp,
+    ) -> bool {
+        let end = self.end();
+        let is_ahead = end > live;
+        self.evidence > 0
+            && now > self.since
+            && (end..=end.saturating_add(FAR)).contains(&next)
+            && (is_ahead || next < live)
+    }
+
+    /// Returns whether an earlier HEARTBEAT had the same lastSN, or one lower by at most `reach`.
+    pub(super) fn is_claimed(&mut self, next: SequenceNumber, reach: u64, now: Timestamp) -> bool {
+        let (claimed, at) = self.claim;
+        let is_same = claimed > SequenceNumber::ZERO
+            && (claimed..=claimed.saturating_add(reach)).contains(&next);
+        if !is_same {
+            self.claim = (next, now);
+        }
+        is_same && now - at >= COPIES
+    }
+
+    /// Records the numbers that a GAP skips.
+    pub(super) const fn pass_over(&mut self, start: SequenceNumber, end: SequenceNumber) {
+        self.run.gap = (start, end);
+    }
+
+    /// Returns the samples that arrived, in ascending order.
+    pub(super) fn into_run(self) -> Run {
+        let mut run = self.run;
+        run.numbers.make_contiguous().sort_unstable();
+        if run
+            .numbers
+            .front()
+            .is_none_or(|(first, _)| run.gap.1 > *first)
+        {
+            // The GAP contradicts the samples that arrived.
+            run.gap = Default::default();
+        }
+        run
+    }
+
+    /// Returns the highest number of the run, plus one.
+    fn end(&self) -> SequenceNumber {
+        let numbers = self.run.numbers.iter();
+        let ends = numbers.map(|(number, _)| number.next());
+        ends.max().unwrap_or_default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_oldest_numbers_of_a_long_run_are_forgotten() {
+        let mut unconfirmed = UnconfirmedRun::default();
+        for number in 1..=100 {
+            assert_eq!(
+                unconfirmed.note(SequenceNumber(number), Timestamp(1)),
+                (number == 1, true)
+            );
+        }
+        assert!(unconfirmed.run.numbers.is_full());
+        // The evidence counts again.
+        assert_eq!(
+            unconfirmed.note(SequenceNumber(1), Timestamp(1)),
+            (false, true)
+        );
+        assert_eq!(
+            unconfirmed.note(SequenceNumber(100), Timestamp(1)),
+            (false, false)
+        );
+        assert_eq!(unconfirmed.evidence, 1);
+    }
+}

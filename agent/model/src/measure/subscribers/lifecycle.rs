@@ -1,0 +1,366 @@
+//! Effects of time and discovery on deliveries: gaps settle, sockets get owners, receivers appear
+//! and vanish.
+
+use std::time::Duration;
+
+use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{GuidPrefix, SequenceNumber, Timestamp};
+
+use super::Subscribers;
+use super::WriterContext;
+use super::delivery_context;
+use super::is_best_effort;
+use super::is_reader;
+use super::is_unknown;
+use crate::facts::loss_share::LossShare;
+use crate::facts::route::Receiver;
+use crate::facts::route::Route;
+use crate::measure::delivery::{Delivery, Totals};
+use crate::measure::receivers::Matched;
+
+/// A route is dropped after this long without a record, unless it leads to a known reader.
+const ROUTE_TIMEOUT: Duration = Duration::from_secs(60);
+
+impl Subscribers {
+    /// Settles samples whose waiting time is over, and drops routes that have been silent for long.
+    pub fn advance(&mut self, context: &mut WriterContext<'_>) {
+        self.refresh(context);
+        let now = context.now;
+        for delivery in &mut self.deliveries {
+            delivery.advance(&mut delivery_context(
+                &mut self.totals,
+                self.reassembled,
+                context,
+            ));
+        }
+        self.expect(context, false);
+        if now.0.is_multiple_of(SECOND) {
+            self.deliveries.iter_mut().for_each(Delivery::end_second);
+            self.routes.retain(|known| {
+                known.matched == Matched::Yes || known.last_seen + ROUTE_TIMEOUT > now
+            });
+            self.drop_orphans(context);
+        }
+    }
+
+    /// Settles all samples at the end of the input.
+    pub fn settle(&mut self, context: &mut WriterContext<'_>) {
+        self.expect(context, true);
+        for delivery in &mut self.deliveries {
+            delivery.settle(&mut delivery_context(
+                &mut self.totals,
+                self.reassembled,
+                context,
+            ));
+        }
+    }
+
+    /// Ends a second at the end of the input.
+    pub fn end_second(&mut self) {
+        self.deliveries.iter_mut().for_each(Delivery::end_second);
+    }
+
+    /// Settles all samples, returns the quota, and returns the counts and the losses of the worst
+    /// receiver in this second.
+    pub fn stop(mut self, context: &mut WriterContext<'_>) -> (Totals, LossShare) {
+        self.settle(context);
+        for delivery in &mut self.deliveries {
+            if delivery.is_withheld() {
+                delivery.discard(context.budget, &mut self.totals);
+            }
+        }
+        context.quota.used = context.quota.used.saturating_sub(self.deliveries.len());
+        let shares = self.received().map(Delivery::last_share);
+        let worst = shares.chain([self.departed]).max_by_key(|share| share.lost);
+        (self.totals, worst.unwrap_or_default())
+    }
+
+    /// Returns the time of the last record of each delivery that can be dropped for a new one.
+    pub fn silent_since(&self) -> impl Iterator<Item = Timestamp> + '_ {
+        self.deliveries.iter().map(|delivery| delivery.seen().1)
+    }
+
+    /// Drops at most `count` deliveries whose last record is not after this time; returns how many.
+    pub fn give_up(
+        &mut self,
+        until: Timestamp,
+        count: usize,
+        context: &mut WriterContext<'_>,
+    ) -> usize {
+        let mut left = count;
+        self.remove(context, |delivery| {
+            let goes = left > 0 && delivery.seen().1 <= until;
+            left -= usize::from(goes);
+            goes
+        });
+        context.quota.evictions += (count - left) as u64;
+        count - left
+    }
+
+    /// Checks whether samples that left this host for a local receiver have arrived.
+    fn expect(&mut self, context: &mut WriterContext<'_>, no_more: bool) {
+        if !self.totals.seen[1] || !self.totals.seen[0] {
+            return;
+        }
+        for index in 0..self.deliveries.len() {
+            let Some(delivery) = self.deliveries.get(index) else {
+                return;
+            };
+            let (main, next) = (delivery.main(), delivery.next());
+            let Some(at) = self.routes.find(&main) else {
+                continue;
+            };
+            if main.is_sent() {
+                if let Some(known) = self
+                    .routes
+                    .get_mut(at)
+                    .filter(|_| next > SequenceNumber::ZERO)
+                {
+                    known.mark(next.previous(), context.now);
+                }
+                continue;
+            }
+            let known = self.routes.get(at);
+            let is_wire = main.socket == 0 && !self.has_readers;
+            if is_wire || known.is_none_or(|known| known.matched == Matched::No) {
+                continue;
+            }
+            let Some(leaving) = self.routes.leaving(main.destination) else {
+                continue;
+            };
+            let left = self.find(Receiver::Route(leaving.route));
+            let Some(left) = left.and_then(|left| self.deliveries.get(left)) else {
+                continue;
+            };
+            if left.next() == SequenceNumber::ZERO {
+                continue;
+            }
+            let newest = left.next().previous();
+            let alive = match delivery.receiver() {
+                Receiver::Participant(prefix) => {
+                    let participant = context.graph.discovery.participants().get(&prefix);
+                    participant.map(|participant| participant.last_seen)
+                }
+                Receiver::Route(_) => None,
+            };
+            let mut context = delivery_context(&mut self.totals, self.reassembled, context);
+            let Some(delivery) = self.deliveries.get_mut(index) else {
+                return;
+            };
+            if no_more {
+                delivery.expect_no_more(newest, &mut context);
+            } else {
+                delivery.expect(newest, alive, |at| leaving.left_by(at), &mut context);
+            }
+        }
+    }
+
+    /// Begins to observe a route at a socket that was observed on a wire so far.
+    pub(super) fn uncover(&mut self, route: Route, context: &mut WriterContext<'_>) {
+        self.at_socket = true;
+        let destination = route.destination;
+        let before = self.routes.iter().count();
+        self.routes
+            .retain(|known| known.at_socket || known.route.destination != destination);
+        if self.routes.iter().count() < before {
+            self.drop_orphans(context);
+        }
+    }
+
+    /// Updates the receivers of all routes if the facts have changed.
+    pub(super) fn refresh(&mut self, context: &mut WriterContext<'_>) {
+        let (graph, topic, readers) = (context.graph, context.topic(), context.readers());
+        if self.generation == graph.receivers.generation() {
+            return;
+        }
+        self.generation = graph.receivers.generation();
+        self.has_readers = readers.any();
+        let before = self.routes.iter().count();
+        self.routes
+            .retain(|known| !graph.receivers.is_closed(known.route.socket));
+        let closed = before > self.routes.iter().count();
+        for known in self.routes.iter_mut() {
+            known.resolve(readers);
+        }
+        self.identify(context);
+        if closed {
+            self.drop_orphans(context);
+        }
+        for delivery in &mut self.deliveries {
+            let is_left = match delivery.receiver() {
+                Receiver::Participant(prefix) => readers.matched(prefix) != Matched::Yes,
+                Receiver::Route(route) => !route.is_sent() && !self.has_readers,
+            };
+            if is_left {
+                delivery.close(context.budget);
+            }
+            delivery.learn(is_best_effort(delivery.receiver(), readers));
+            let appeared = match delivery.receiver() {
+                Receiver::Participant(prefix) => readers.since(prefix),
+                Receiver::Route(_) => topic.map(|topic| topic.reader_appeared),
+            };
+            if let Some(at) = appeared.filter(|at| *at > delivery.seen().1) {
+                delivery.open(at);
+            }
+        }
+        self.acknowledgements
+            .retain(|guid| topic.is_some_and(|topic| is_reader(topic, guid)));
+    }
+
+    /// Gives deliveries the participants to which their routes lead, and merges those of one
+    /// participant. Samples from before the announcement of its reader were not for it.
+    fn identify(&mut self, context: &mut WriterContext<'_>) {
+        let readers = context.readers();
+        let mut index = 0;
+        while let Some(delivery) = self.deliveries.get_mut(index) {
+            index += 1;
+            let Receiver::Route(route) = delivery.receiver() else {
+                continue;
+            };
+            let known = self.routes.find(&route).and_then(|at| self.routes.get(at));
+            let Some(known) = known.filter(|_| !route.is_sent()) else {
+                continue;
+            };
+            let Some(owner) = known.owner else {
+                if known.is_shared {
+                    delivery.publish(context.journal, &mut self.totals);
+                }
+                continue;
+            };
+            let place = index - 1;
+            if is_unknown(delivery.receiver()) {
+                let since = readers.since(owner);
+                if since.is_none_or(|since| since > delivery.seen().0) {
+                    self.discard(place, context);
+                    index = 0;
+                    continue;
+                }
+                delivery.publish(context.journal, &mut self.totals);
+            }
+            if self.name_delivery(place, owner, context) {
+                index = 0;
+            }
+        }
+        self.count_open();
+    }
+
+    /// Records the participant of a delivery, and merges it with another one of that participant.
+    /// Returns whether they were merged.
+    fn name_delivery(
+        &mut self,
+        place: usize,
+        owner: GuidPrefix,
+        context: &mut WriterContext<'_>,
+    ) -> bool {
+        let Some(other) = self.find(Receiver::Participant(owner)) else {
+            if let Some(delivery) = self.deliveries.get_mut(place) {
+                delivery.identify(owner);
+            }
+            return false;
+        };
+        let messages = |place: usize| {
+            let delivery = self.deliveries.get(place);
+            delivery.map_or(0, |delivery| delivery.tally().messages)
+        };
+        let (keeps, goes) = if messages(place) > messages(other) {
+            (place, other)
+        } else {
+            (other, place)
+        };
+        let gone = self.deliveries.remove(goes);
+        let keeps = keeps - usize::from(goes < keeps);
+        context.quota.used = context.quota.used.saturating_sub(1);
+        if let Some(delivery) = self.deliveries.get_mut(keeps) {
+            delivery.identify(owner);
+            delivery.absorb(
+                gone,
+                &mut delivery_context(&mut self.totals, self.reassembled, context),
+            );
+        }
+        true
+    }
+
+    /// Continues the delivery at an unknown socket as that of this route, which has the same
+    /// destination. The receiving socket of a connection of Zenoh is known once its session is.
+    pub(super) fn learn_socket(&mut self, route: Route, context: &mut WriterContext<'_>) {
+        let Some(unknown) = self.routes.learn_socket(route, context.readers()) else {
+            return;
+        };
+        self.routes
+            .iter_mut()
+            .for_each(|known| known.delivery = None);
+        let owner = self.routes.find(&route).and_then(|at| self.routes.get(at));
+        let owner = owner.and_then(|known| known.owner);
+        for delivery in &mut self.deliveries {
+            if delivery.main() == unknown {
+                delivery.move_to(route);
+            }
+        }
+        let Some(place) = self.find(Receiver::Route(unknown)) else {
+            return;
+        };
+        match owner {
+            Some(owner) => {
+                self.name_delivery(place, owner, context);
+            }
+            None => {
+                if let Some(delivery) = self.deliveries.get_mut(place) {
+                    delivery.lead_to(route);
+                }
+            }
+        }
+        self.count_open();
+    }
+
+    /// Drops a delivery that turned out to be of a participant without a reader.
+    fn discard(&mut self, place: usize, context: &mut WriterContext<'_>) {
+        let mut delivery = self.deliveries.remove(place);
+        delivery.discard(context.budget, &mut self.totals);
+        context.quota.used = context.quota.used.saturating_sub(1);
+        self.routes
+            .iter_mut()
+            .for_each(|known| known.delivery = None);
+    }
+
+    /// Drops deliveries without a route.
+    fn drop_orphans(&mut self, context: &mut WriterContext<'_>) {
+        let led_to: Vec<_> = self
+            .with_routes()
+            .map(|(_, routes)| !routes.is_empty())
+            .collect();
+        for (delivery, is_led_to) in self.deliveries.iter_mut().zip(&led_to) {
+            if !is_led_to {
+                delivery.close(context.budget);
+            }
+        }
+        let mut led_to = led_to.into_iter();
+        self.remove(context, |_| !led_to.next().unwrap_or(false));
+    }
+
+    fn remove(&mut self, context: &mut WriterContext<'_>, mut goes: impl FnMut(&Delivery) -> bool) {
+        let before = self.deliveries.len();
+        let (totals, reassembled) = (&mut self.totals, self.reassembled);
+        let departed = &mut self.departed;
+        self.deliveries.retain_mut(|delivery| {
+            let goes = goes(delivery);
+            if goes && delivery.is_withheld() {
+                delivery.discard(context.budget, totals);
+            } else if goes {
+                delivery.settle(&mut delivery_context(totals, reassembled, context));
+                let share = delivery.last_share();
+                if !delivery.main().is_sent() && share.lost > departed.lost {
+                    *departed = share;
+                }
+            }
+            !goes
+        });
+        let gone = before - self.deliveries.len();
+        if gone > 0 {
+            context.quota.used = context.quota.used.saturating_sub(gone);
+            self.routes
+                .iter_mut()
+                .for_each(|known| known.delivery = None);
+            self.count_open();
+        }
+    }
+}

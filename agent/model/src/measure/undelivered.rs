@@ -1,0 +1,293 @@
+//! Arrivals that never reached the reader, because the socket's buffer was full.
+//!
+//! The host hook reports a datagram when it reaches a socket, and shortly afterwards the kernel may
+//! report that the socket's buffer was full. The second report arrives here first and is
+//! subtracted, once, from the arrival that it names: a retransmission of the same fragments is
+//! another arrival. An arrival may cover several datagrams; only drops between its first and last
+//! are subtracted.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use crate::facts::bounded::Bounded;
+use crate::facts::tables::UndeliveredParts;
+use ros2probe_wire::record::Sample;
+use ros2probe_wire::{Record, SequenceNumber, Timestamp};
+
+/// Largest difference between the clock conversions of the two reports.
+const SLACK: Duration = Duration::from_micros(100);
+/// Arrivals follow within this time, or their record was lost.
+const LIFETIME: Duration = Duration::from_secs(60);
+
+/// Drops that wait for their arrival at one receiver.
+#[derive(Debug, Default)]
+pub struct Undelivered {
+    waiting: Bounded<UndeliveredParts, VecDeque<UndeliveredPart>>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct UndeliveredPart {
+    socket: u64,
+    number: SequenceNumber,
+    /// Fragments from `start` to before `end`; 0 and 1 for an unfragmented sample.
+    start: u32,
+    end: u32,
+    first: Timestamp,
+    last: Timestamp,
+}
+
+impl Undelivered {
+    /// Returns whether no drop waits.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
+    }
+
+    /// Records that this DATA or DATA_FRAG was dropped. Returns whether an older entry was evicted.
+    pub fn note(&mut self, sample: Sample<'_>) -> bool {
+        let record = sample.record();
+        let (start, end) = range(sample);
+        let (first, last) = span(record);
+        if let Some(back) = self.waiting.back_mut()
+            && back.socket == record.socket
+            && back.number == sample.sequence_number()
+            && back.end == start
+            && matches!(sample, Sample::DataFrag(_))
+        {
+            (back.end, back.last) = (end, last);
+            return false;
+        }
+        let evicted = self.waiting.push_back(UndeliveredPart {
+            socket: record.socket,
+            number: sample.sequence_number(),
+            start,
+            end,
+            first,
+            last,
+        });
+        evicted.is_some()
+    }
+
+    /// Returns the delivered parts of an arrival, in order. Adds evicted entries to `evictions`.
+    pub fn delivered(&mut self, sample: Sample<'_>, evictions: &mut u64) -> Vec<Record> {
+        let record = sample.record();
+        let mut parts = vec![range(sample)];
+        let (begin, end) = span(record);
+        let mut left = Vec::new();
+        self.waiting.retain_mut(|each| {
+            let is_meant = each.socket == record.socket
+                && each.number == sample.sequence_number()
+                && each.last + SLACK >= begin
+                && each.first <= end + SLACK;
+            if !is_meant {
+                return true;
+            }
+            let (start, end) = range(sample);
+            let (from, to) = (each.start.max(start), each.end.min(end));
+            if from >= to {
+                return true;
+            }
+            parts = take_out(&parts, from, to);
+            if each.start < from && to < each.end {
+                left.push(UndeliveredPart { start: to, ..*each });
+                each.end = from;
+                return true;
+            }
+            if each.start < from {
+                each.end = from;
+            } else {
+                each.start = to;
+            }
+            each.start < each.end
+        });
+        for part in left {
+            *evictions += u64::from(self.waiting.push_back(part).is_some());
+        }
+        let Sample::DataFrag(fragments) = sample else {
+            return if parts.is_empty() {
+                Vec::new()
+            } else {
+                vec![*record]
+            };
+        };
+        let part = |(start, end): (u32, u32)| fragments.part(start, end);
+        parts.into_iter().map(part).collect()
+    }
+
+    /// Removes entries whose arrival did not follow.
+    pub fn expire(&mut self, now: Timestamp) {
+        while let Some(oldest) = self.waiting.front()
+            && oldest.last + LIFETIME <= now
+        {
+            self.waiting.pop_front();
+        }
+        if self.waiting.is_empty() && self.waiting.capacity() > 0 {
+            self.waiting.take();
+        }
+    }
+}
+
+/// Returns the fragments, as a half-open range.
+const fn range(sample: Sample<'_>) -> (u32, u32) {
+    match sample {
+        Sample::Data(_) => (0, 1),
+        Sample::DataFrag(fragments) => {
+            let start = fragments.starting();
+            (start, start.saturating_add(fragments.count()))
+        }
+    }
+}
+
+/// Returns the times of its first and last datagram.
+fn span(record: &Record) -> (Timestamp, Timestamp) {
+    let end = Timestamp(record.time);
+    let begin = match record.elapsed {
+        u32::MAX => Timestamp(0),
+        elapsed => end - Duration::from_nanos(elapsed.into()),
+    };
+    (begin, end)
+}
+
+fn take_out(parts: &[(u32, u32)], from: u32, to: u32) -> Vec<(u32, u32)> {
+    let mut rest = Vec::with_capacity(parts.len() + 1);
+    for (start, end) in parts {
+        rest.extend([(*start, (*end).min(from)), ((*start).max(to), *end)]);
+    }
+    rest.retain(|(start, end)| start < end);
+    rest
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::record::kind;
+
+    use super::*;
+    use ros2probe_wire::time::MILLISECOND;
+
+    fn fragments(start: u32, count: u32, time: u64, elapsed: u32) -> Record {
+        Record {
+            kind: kind::DATA_FRAG,
+            sequence_number: 7,
+            socket: 1,
+            fragment_start: start,
+            fragments: count << 16 | 1344,
+            time,
+            elapsed,
+            ..Record::default()
+        }
+    }
+
+    fn note(undelivered: &mut Undelivered, record: &Record) -> bool {
+        undelivered.note(record.sample().unwrap())
+    }
+
+    fn delivered(
+        undelivered: &mut Undelivered,
+        record: &Record,
+        evictions: &mut u64,
+    ) -> Vec<Record> {
+        undelivered.delivered(record.sample().unwrap(), evictions)
+    }
+
+    fn ranges(parts: &[Record]) -> Vec<(u32, u32)> {
+        let samples = parts.iter().filter_map(Record::sample);
+        samples.map(range).collect()
+    }
+
+    #[test]
+    fn what_had_no_room_is_taken_out_of_the_run_that_covers_it_once() {
+        let mut undelivered = Undelivered::default();
+        note(&mut undelivered, &fragments(3, 1, 12 * MILLISECOND, 0));
+        note(&mut undelivered, &fragments(4, 1, 13 * MILLISECOND, 0));
+        note(&mut undelivered, &fragments(8, 2, 17 * MILLISECOND, 0));
+        let run = fragments(1, 10, 20 * MILLISECOND, 10_000_000);
+        assert_eq!(
+            ranges(&delivered(&mut undelivered, &run, &mut 0)),
+            [(1, 3), (5, 8), (10, 11)]
+        );
+        assert!(undelivered.is_empty());
+        let again = fragments(3, 2, 40 * MILLISECOND, 0);
+        assert_eq!(
+            ranges(&delivered(&mut undelivered, &again, &mut 0)),
+            [(3, 5)]
+        );
+    }
+
+    #[test]
+    fn a_retransmission_is_not_taken_for_the_arrival_that_got_lost_on_its_way_here() {
+        let mut undelivered = Undelivered::default();
+        note(&mut undelivered, &fragments(3, 1, 12 * MILLISECOND, 0));
+        let later = fragments(3, 1, 40 * MILLISECOND, 0);
+        assert_eq!(
+            ranges(&delivered(&mut undelivered, &later, &mut 0)),
+            [(3, 4)]
+        );
+        undelivered.expire(Timestamp(13 * MILLISECOND) + LIFETIME);
+        assert!(undelivered.is_empty());
+    }
+
+    #[test]
+    fn a_run_may_end_within_what_had_no_room() {
+        let mut undelivered = Undelivered::default();
+        for fragment in 4..8 {
+            let time = u64::from(10 + fragment) * MILLISECOND;
+            note(&mut undelivered, &fragments(fragment, 1, time, 0));
+        }
+        let first = fragments(1, 5, 15 * MILLISECOND, 4_000_000);
+        assert_eq!(
+            ranges(&delivered(&mut undelivered, &first, &mut 0)),
+            [(1, 4)]
+        );
+        let second = fragments(6, 5, 20 * MILLISECOND, 4_000_000);
+        assert_eq!(
+            ranges(&delivered(&mut undelivered, &second, &mut 0)),
+            [(8, 11)]
+        );
+        assert!(undelivered.is_empty());
+    }
+
+    #[test]
+    fn a_whole_sample_for_which_there_was_no_room_did_not_arrive() {
+        let mut undelivered = Undelivered::default();
+        let data = Record {
+            kind: kind::DATA,
+            ..fragments(0, 0, MILLISECOND, 0)
+        };
+        note(&mut undelivered, &data);
+        let elsewhere = Record { socket: 2, ..data };
+        assert_eq!(delivered(&mut undelivered, &elsewhere, &mut 0).len(), 1);
+        assert!(delivered(&mut undelivered, &data, &mut 0).is_empty());
+        assert_eq!(delivered(&mut undelivered, &data, &mut 0).len(), 1);
+    }
+
+    #[test]
+    fn a_storm_stays_bounded() {
+        let mut undelivered = Undelivered::default();
+        for number in 0..10_000 {
+            let data = Record {
+                kind: kind::DATA,
+                sequence_number: number,
+                ..Record::default()
+            };
+            note(&mut undelivered, &data);
+        }
+        assert!(undelivered.waiting.len() <= UndeliveredParts::CAP);
+    }
+
+    #[test]
+    fn arrivals_that_take_out_the_middle_of_what_had_no_room_stay_bounded() {
+        let mut undelivered = Undelivered::default();
+        let mut evictions = 0;
+        let time = 20 * MILLISECOND;
+        note(&mut undelivered, &fragments(1, 60_000, time, 0));
+        for fragment in 1..20_000 {
+            delivered(
+                &mut undelivered,
+                &fragments(3 * fragment, 1, time, 0),
+                &mut evictions,
+            );
+        }
+        assert!(undelivered.waiting.is_full());
+        assert_eq!(evictions, 20_000 - UndeliveredParts::CAP as u64);
+    }
+}

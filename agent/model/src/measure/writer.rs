@@ -1,0 +1,614 @@
+//! Measurement of one writer: samples, bytes, losses, intervals, latencies.
+//!
+//! Its input is records from any source. A sample counts once, at the record that completes it. An
+//! idle writer needs less than 2 KiB; bitmaps, which grow with traffic, are bounded in
+//! [`crate::measure::sequence`] and [`crate::measure::samples`].
+
+mod latency;
+mod sampled_view;
+
+use std::time::Duration;
+
+use ros2probe_wire::record::{AckNack, Body, Sample, flag};
+use ros2probe_wire::{Guid, Record, RtpsTime, SequenceNumber, Timestamp};
+
+use crate::facts::dispatch::MissedReason;
+use crate::facts::histogram::Histogram;
+use crate::facts::journal::{Journal, Missing};
+use crate::facts::loss::Loss;
+use crate::facts::loss_share::LossShare;
+use crate::facts::measurement::{EarlierCounts, Measurement};
+use crate::facts::rate::{SECONDS, Slot, Window};
+use crate::facts::wall_clock::WallClock;
+use crate::measure::in_order::Progress;
+use crate::measure::reception::{Decision, Outcome, Reception};
+use crate::measure::sampled::Sampled;
+use crate::measure::samples::Budget;
+use crate::measure::sequence::{FAR, REACH};
+
+/// Time in which reordering may fill a gap of a best-effort writer.
+pub const BEST_EFFORT_WINDOW: Duration = Duration::from_secs(1);
+/// Time in which a reliable writer may retransmit: three HEARTBEAT periods of Fast DDS.
+pub const RELIABLE_WINDOW: Duration = Duration::from_secs(10);
+/// A first sample older than this is history that a late joiner requested.
+const HISTORY: Duration = Duration::from_secs(10);
+
+/// A uprobe's view of a writer stays exact for this long after its last record: samples read from
+/// shared memory in that time were seen already.
+const EXACT_FOR: Duration = Duration::from_secs(10);
+
+/// Properties of the writer from discovery; all false if it is unknown.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Traits {
+    /// Whether it retransmits; also concluded from its HEARTBEATs.
+    pub reliable: bool,
+    /// Whether it sends old samples to late joiners.
+    pub keeps_history: bool,
+    /// Whether its messages begin with a `std_msgs/Header`.
+    pub has_header: bool,
+}
+
+/// State outside the writer that a record changes.
+#[derive(Debug)]
+pub struct MeasurementContext<'a> {
+    /// Time of the record, or of the tick.
+    pub now: Timestamp,
+    /// Memory budget for fragmented samples.
+    pub budget: &'a mut Budget,
+    /// Journal that receives the losses.
+    pub journal: &'a mut Journal,
+    /// Difference between model time and calendar time, for the writer's timestamps.
+    pub wall_clock: WallClock,
+    /// Whether the samples of any receiver are counted, so that losses are reported per receiver.
+    pub has_receivers: bool,
+}
+
+/// A counted message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Counted {
+    /// Its sequence number.
+    pub number: SequenceNumber,
+    /// Payload bytes, including encapsulation.
+    pub bytes: u64,
+    /// INFO_TS of the message.
+    pub source: RtpsTime,
+    /// Stamp of its header, if the type begins with one.
+    pub stamp: Option<(i32, u32)>,
+    /// Time of the datagram that completed it.
+    pub at: Timestamp,
+    /// Time of its first datagram.
+    pub began: Timestamp,
+    /// Whether it was sampled, so that others may have been missed.
+    pub sampled: bool,
+    /// Whether its number is not confirmed as the writer's; it then has no place in an order.
+    pub unconfirmed: bool,
+}
+
+/// A measured writer.
+#[derive(Debug)]
+pub struct Writer {
+    guid: Guid,
+    traits: Traits,
+    reception: Reception,
+    tally: Tally,
+    interarrival: Histogram,
+    source_latency: Histogram,
+    header_latency: Histogram,
+    last_message: Option<Timestamp>,
+    negative_latency: u64,
+    implausible_latency: u64,
+    /// State of a writer that was sampled in shared memory.
+    sampled: Option<Box<Sampled>>,
+    /// Time of the last record from a uprobe in the writer's own process.
+    exact: Option<Timestamp>,
+}
+
+/// Counters that settling changes.
+#[derive(Debug, Default)]
+struct Tally {
+    messages: u64,
+    bytes: u64,
+    lost: u64,
+    recovered: u64,
+    duplicates: u64,
+    incomplete: u64,
+    irrelevant: u64,
+    earlier: EarlierCounts,
+    window: Window,
+}
+
+impl Writer {
+    /// Creates a writer without measurements.
+    #[must_use]
+    pub fn new(guid: Guid, traits: Traits) -> Self {
+        Self {
+            guid,
+            traits,
+            reception: Reception::default(),
+            tally: Tally::default(),
+            interarrival: Histogram::default(),
+            source_latency: Histogram::default(),
+            header_latency: Histogram::default(),
+            last_message: None,
+            negative_latency: 0,
+            implausible_latency: 0,
+            sampled: None,
+            exact: None,
+        }
+    }
+
+    /// Updates the properties from discovery.
+    pub const fn learn(&mut self, traits: Traits) {
+        self.traits = traits;
+    }
+
+    /// Begins the figures per second at `now`, when the kernel captures all samples of the writer.
+    /// What was counted before stays in the totals.
+    pub fn begin_window(&mut self, now: Timestamp) {
+        let tally = &mut self.tally;
+        tally.earlier = EarlierCounts {
+            messages: tally.messages,
+            bytes: tally.bytes,
+            lost: tally.lost,
+        };
+        tally.window.begin(now);
+    }
+
+    /// Moves the memory of unfinished samples from one budget to another.
+    pub fn transfer(&self, from: &mut Budget, to: &mut Budget) {
+        self.reception.transfer(from, to);
+    }
+
+    /// Allows fragmented samples that begin before `until` to be incomplete without a loss.
+    pub const fn allow_incomplete(&mut self, until: Timestamp) {
+        self.reception.allow_incomplete(until);
+    }
+
+    /// Sets the GUID by which the writer is announced.
+    pub const fn rename(&mut self, guid: Guid) {
+        self.guid = guid;
+    }
+
+    /// Returns the properties from discovery and HEARTBEATs.
+    #[must_use]
+    pub const fn traits(&self) -> Traits {
+        self.traits
+    }
+
+    /// Returns the highest sequence number known to exist, plus one.
+    #[must_use]
+    pub const fn next(&self) -> SequenceNumber {
+        self.reception.sequence().next()
+    }
+
+    /// Counts a sample or fragment that arrived again on the same route.
+    pub const fn came_again(&mut self) {
+        self.tally.duplicates += 1;
+    }
+
+    /// Returns whether this sample is counted or settled.
+    #[must_use]
+    pub fn has(&self, sample: Sample<'_>) -> bool {
+        let record = sample.record();
+        let (number, at) = (sample.sequence_number(), record_time(record));
+        let sequence = self.reception.sequence();
+        if self.is_under_way(sample) {
+            return false;
+        }
+        if is_polled(record) && self.is_exact(at) {
+            return true;
+        }
+        if self.is_unconfirmed(sample) {
+            return sequence.has_unconfirmed(number);
+        }
+        match &self.sampled {
+            Some(sampled) if sampled.is_current(at) => sampled.has(number, sequence.next()),
+            _ => sequence.has(number),
+        }
+    }
+
+    /// Returns whether this ACKNACK acknowledges samples that are not known to exist.
+    pub const fn refuses(&mut self, acknack: AckNack<'_>) -> bool {
+        let sequence = self.reception.sequence_mut();
+        sequence.refuses(acknack.base())
+    }
+
+    /// Returns the number of messages counted.
+    #[must_use]
+    pub const fn messages(&self) -> u64 {
+        self.tally.messages
+    }
+
+    /// Returns the samples that did not reach this host among all.
+    #[must_use]
+    pub const fn share(&self) -> LossShare {
+        LossShare {
+            lost: self.tally.lost,
+            expected: self.tally.messages + self.tally.lost,
+        }
+    }
+
+    /// Returns the time of the last message.
+    #[must_use]
+    pub const fn last_message(&self) -> Option<Timestamp> {
+        self.last_message
+    }
+
+    /// Returns how long the writer may seem silent while it sends, as polling misses messages. Its
+    /// intervals are at most `slowest`, unless they are known.
+    #[must_use]
+    pub fn seeming_silence(&self, slowest: Duration) -> Duration {
+        let sampled = self.sampled.as_ref();
+        sampled.map_or(Duration::ZERO, |sampled| sampled.seeming_silence(slowest))
+    }
+
+    /// Returns whether no view has shown any of its samples.
+    #[must_use]
+    pub const fn is_unseen(&self) -> bool {
+        self.last_message.is_none() && self.sampled.is_none() && self.exact.is_none()
+    }
+
+    /// Records that samples in shared memory before `now` may have been missed.
+    pub fn uncertain(&mut self, now: Timestamp) {
+        if let Some(sampled) = self.sampled.as_mut().filter(|each| each.is_current(now)) {
+            sampled.uncertain();
+        }
+    }
+
+    /// Ends the exact view of the writer by uprobes.
+    pub const fn end_exact_view(&mut self) {
+        self.exact = None;
+    }
+
+    /// Processes a record of this writer and returns the message that it completed. `opened` is the
+    /// time at which this host last gained a view of its samples: those missing before it went
+    /// elsewhere.
+    pub fn record(
+        &mut self,
+        record: &Record,
+        opened: Timestamp,
+        context: &mut MeasurementContext<'_>,
+    ) -> Option<Counted> {
+        let at = record_time(record);
+        let is_exact = record.flags & flag::EXACT != 0;
+        let is_sampled = is_polled(record);
+        if is_exact {
+            self.exact = self.exact.max(Some(at));
+        }
+        let body = record.body();
+        if let Body::Sample(sample) = body
+            && self.is_under_way(sample)
+        {
+            return self.catch_up(sample, context);
+        }
+        if is_sampled && self.is_exact(at) {
+            // The sample has been seen already, or will be.
+            return None;
+        }
+        let takes = self.sampled.as_mut().is_some_and(|sampled| match body {
+            Body::Sample(_) | Body::Heartbeat(_) => sampled.takes(at),
+            _ => sampled.is_current(at),
+        });
+        if is_sampled || takes {
+            let counted = self.sampled_record(record, is_sampled, context);
+            self.leave_unseen(context.journal);
+            if let Some(sampled) = self.sampled.as_mut().filter(|_| is_exact) {
+                // From here on every message is seen.
+                sampled.end();
+            }
+            return counted;
+        }
+        let sequence = self.reception.sequence();
+        let before = (sequence.next(), sequence.last_advance());
+        let mut counted = None;
+        match body {
+            Body::Sample(sample) => counted = self.sample(sample, context),
+            Body::Heartbeat(heartbeat) => {
+                self.traits.reliable = true;
+                let (reception, mut settling) =
+                    self.parts(context.journal, (context.now, context.has_receivers));
+                reception.heartbeat(heartbeat, context.budget, &mut |decision| {
+                    settling.take(decision);
+                });
+            }
+            Body::Gap(gap) => {
+                let (reception, mut settling) =
+                    self.parts(context.journal, (context.now, context.has_receivers));
+                reception.gap(gap, context.budget, &mut |decision| {
+                    settling.take(decision);
+                });
+            }
+            Body::AckNack(acknack) => {
+                let sequence = self.reception.sequence_mut();
+                sequence.requested(acknack.missing().iter());
+            }
+            Body::Complete | Body::Handover | Body::Undelivered | Body::Unknown => {}
+        }
+        let (next, advanced) = before;
+        let sequence = self.reception.sequence_mut();
+        if next > SequenceNumber::ZERO && advanced < opened && sequence.next() > next {
+            // The newest sample is excused too, which has no effect once it is received.
+            sequence.excuse(next, sequence.next());
+        }
+        counted
+    }
+
+    /// Records that all readers have every sample below `base`.
+    pub fn acknowledged(&mut self, base: SequenceNumber) {
+        self.reception.sequence_mut().acknowledged(base);
+    }
+
+    /// Returns how far its samples are decided. `acknowledged` states whether readers acknowledge.
+    pub fn progress(&mut self, acknowledged: bool, now: Timestamp) -> Progress {
+        let waits = self.traits.reliable && acknowledged;
+        let is_sampled = self.is_sampled(now);
+        let reliable = self.traits.reliable && !is_sampled;
+        // While a sample is waited for in shared memory, its retransmission may pass there, too.
+        // After the sampled view ended, samples of any writer may arrive behind later ones.
+        let unseen = self.sampled.as_ref().and_then(|sampled| sampled.unseen());
+        let unseen = unseen.filter(|_| waits || !is_sampled);
+        let unseen = unseen.unwrap_or(SequenceNumber(u64::MAX));
+        let sequence = self.reception.sequence_mut();
+        if !waits {
+            sequence.skip(sequence.next());
+        }
+        let complete = sequence.complete();
+        Progress {
+            incarnation: sequence.incarnation(),
+            complete: complete.min(unseen),
+            awaited: sequence.awaited(),
+            reliable,
+            acknowledged,
+            unseen: unseen < complete,
+        }
+    }
+
+    /// Stops waiting for samples below `number`.
+    pub fn skip(&mut self, number: SequenceNumber) {
+        self.reception.sequence_mut().skip(number);
+    }
+
+    /// Returns the time since which a sent but unseen sample is waited for.
+    #[must_use]
+    pub fn unseen_since(&self) -> Option<Timestamp> {
+        self.sampled.as_ref()?.unseen_since()
+    }
+
+    /// Settles samples whose waiting time is over.
+    pub fn advance(&mut self, context: &mut MeasurementContext<'_>) {
+        if let Some(sampled) = &mut self.sampled {
+            sampled.tick(context.now);
+            self.leave_unseen(context.journal);
+        }
+        let (now, window) = (context.now, settle_window(self.traits.reliable));
+        let (reception, mut settling) =
+            self.parts(context.journal, (context.now, context.has_receivers));
+        let windows = (window, BEST_EFFORT_WINDOW);
+        reception.advance(now, windows, context.budget, &mut |decision| {
+            settling.take(decision);
+        });
+    }
+
+    /// Settles all samples at the end of the input.
+    pub fn settle(&mut self, context: &mut MeasurementContext<'_>) {
+        if let Some(sampled) = &mut self.sampled {
+            sampled.settle_all();
+            self.leave_unseen(context.journal);
+        }
+        let (reception, mut settling) =
+            self.parts(context.journal, (context.now, context.has_receivers));
+        reception.settle(context.budget, &mut |decision| settling.take(decision));
+    }
+
+    /// Returns all counts so far.
+    #[must_use]
+    #[expect(
+        clippy::cast_precision_loss,
+        reason = "counts of ten seconds are far below 2^52"
+    )]
+    pub fn measurement(&self, now: Timestamp) -> Measurement {
+        let (slot, seconds) = self.recent(now, SECONDS);
+        let per_second = |count: u64| {
+            if seconds == 0 {
+                0.0
+            } else {
+                count as f64 / seconds as f64
+            }
+        };
+        Measurement {
+            messages: self.tally.messages,
+            bytes: self.tally.bytes,
+            lost: self.tally.lost,
+            loss: self.share(),
+            recovered: self.tally.recovered,
+            duplicates: self.tally.duplicates,
+            incomplete: self.tally.incomplete,
+            irrelevant: self.tally.irrelevant,
+            last_message: self.last_message,
+            rate_hz: per_second(slot.messages),
+            bandwidth: per_second(slot.bytes),
+            interarrival: self.interarrival,
+            source_latency: self.source_latency,
+            header_latency: self.header_latency,
+            negative_latency: self.negative_latency,
+            implausible_latency: self.implausible_latency,
+            sequence_jumps: self.reception.sequence().jumps(),
+            earlier: self.tally.earlier,
+            sampled: self.sampled.as_ref().map(|sampled| sampled.facts()),
+        }
+    }
+
+    /// Returns the counts of the last whole seconds, and the number of these seconds.
+    #[must_use]
+    pub fn recent(&self, now: Timestamp, seconds: u64) -> (Slot, u64) {
+        self.tally.window.sum(now, seconds)
+    }
+
+    /// Splits the borrow into the reception and the accounting of its decisions.
+    const fn parts<'a>(
+        &'a mut self,
+        journal: &'a mut Journal,
+        (at, has_receivers): (Timestamp, bool),
+    ) -> (&'a mut Reception, Settling<'a>) {
+        let settling = Settling {
+            tally: &mut self.tally,
+            journal,
+            writer: self.guid,
+            at,
+            has_receivers,
+        };
+        (&mut self.reception, settling)
+    }
+
+    fn sample(
+        &mut self,
+        sample: Sample<'_>,
+        context: &mut MeasurementContext<'_>,
+    ) -> Option<Counted> {
+        let record = sample.record();
+        let now = record_time(record);
+        let reliable = self.traits.reliable;
+        let (reception, mut settling) =
+            self.parts(context.journal, (context.now, context.has_receivers));
+        let outcome = reception.sample(sample, reliable, context.budget, &mut |decision| {
+            settling.take(decision);
+        });
+        match outcome {
+            Outcome::Open => {}
+            // A copy at another socket is no retransmission; the caller can distinguish them.
+            Outcome::Duplicate => {
+                let elsewhere = flag::HOST | flag::SHM | flag::STREAM;
+                self.tally.duplicates += u64::from(record.flags & elsewhere == 0);
+            }
+            Outcome::Complete(whole) if whole.is_message => {
+                self.count(now, whole.bytes, whole.recovered);
+                let wall_clock = context.wall_clock.wall_time(now);
+                let (source, stamp) = (whole.source, whole.stamp);
+                if !whole.unconfirmed {
+                    self.delays(
+                        whole.number,
+                        whole.newest,
+                        (source, stamp),
+                        (now, wall_clock),
+                    );
+                }
+                return Some(Counted {
+                    number: whole.number,
+                    bytes: whole.bytes,
+                    source: whole.source,
+                    stamp: whole.stamp.filter(|_| self.traits.has_header),
+                    at: now,
+                    began: whole.began,
+                    sampled: false,
+                    unconfirmed: whole.unconfirmed,
+                });
+            }
+            Outcome::Complete(_) => {}
+        }
+        None
+    }
+
+    /// Returns whether the number of this DATA or DATA_FRAG is outside the writer's live run.
+    fn is_unconfirmed(&self, sample: Sample<'_>) -> bool {
+        let source = sample.source_timestamp().timestamp();
+        let sequence = self.reception.sequence();
+        sequence.is_unconfirmed(sample.sequence_number(), source, reach(sample.record()))
+    }
+
+    fn is_exact(&self, now: Timestamp) -> bool {
+        let last = self.exact;
+        last.is_some_and(|last| last + EXACT_FOR > now)
+    }
+
+    fn count(&mut self, now: Timestamp, bytes: u64, recovered: bool) {
+        self.tally.messages += 1;
+        self.tally.bytes += bytes;
+        self.tally.recovered += u64::from(recovered);
+        let slot = self.tally.window.second(now);
+        slot.messages += 1;
+        slot.bytes += bytes;
+        if let Some(previous) = self.last_message {
+            self.interarrival
+                .observe(seconds(now.nanoseconds_since(previous).max(0)));
+        }
+        self.last_message = self.last_message.max(Some(now));
+    }
+}
+
+/// Returns the time in which a gap may fill, for a writer that is `reliable` or not.
+#[must_use]
+pub const fn settle_window(reliable: bool) -> Duration {
+    if reliable {
+        RELIABLE_WINDOW
+    } else {
+        BEST_EFFORT_WINDOW
+    }
+}
+
+/// Effects of settling on the counters.
+struct Settling<'a> {
+    tally: &'a mut Tally,
+    journal: &'a mut Journal,
+    writer: Guid,
+    at: Timestamp,
+    has_receivers: bool,
+}
+
+impl Settling<'_> {
+    fn take(&mut self, decision: Decision) {
+        let Decision::Lost {
+            first,
+            last,
+            incomplete,
+        } = decision
+        else {
+            self.tally.irrelevant += 1;
+            return;
+        };
+        self.tally.incomplete += u64::from(incomplete);
+        self.journal.leave_missing(Missing {
+            writer: self.writer,
+            first,
+            last,
+            reason: match incomplete {
+                true => MissedReason::Incomplete,
+                false => MissedReason::Lost,
+            },
+        });
+        let count = last - first + 1;
+        self.tally.lost += count;
+        self.tally.window.second(self.at).lost += count;
+        let loss = Loss {
+            at: self.at,
+            writer: self.writer,
+            first,
+            last,
+        };
+        self.journal.lose(loss, self.has_receivers);
+    }
+}
+
+/// Returns how far the numbers of a record may be ahead; polling shared memory misses more.
+const fn reach(record: &Record) -> u64 {
+    if is_polled(record) { FAR } else { REACH }
+}
+
+/// Returns whether it was read by polling shared memory, where others may have been missed.
+const fn is_polled(record: &Record) -> bool {
+    record.flags & (flag::SHM | flag::EXACT) == flag::SHM
+}
+
+const fn record_time(record: &Record) -> Timestamp {
+    Timestamp(record.time)
+}
+
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "nanoseconds of a delay stay exact to 104 days"
+)]
+fn seconds(nanoseconds: i64) -> f64 {
+    nanoseconds as f64 / 1e9
+}
+
+#[cfg(test)]
+mod tests;

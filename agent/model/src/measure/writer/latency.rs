@@ -1,0 +1,51 @@
+//! Latencies of a writer's samples since INFO_TS and since their header's stamp.
+
+use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
+
+use super::HISTORY;
+use super::Writer;
+use super::seconds;
+use crate::facts::header::{PLAUSIBLE, stamp_time};
+
+impl Writer {
+    pub(super) fn delays(
+        &mut self,
+        number: SequenceNumber,
+        newest: bool,
+        (source, stamp): (RtpsTime, Option<(i32, u32)>),
+        (now, wall_clock): (Timestamp, Timestamp),
+    ) {
+        let source = source.timestamp();
+        if self.traits.keeps_history {
+            let old = source.is_none_or(|source| source + HISTORY < wall_clock);
+            let first = self.reception.sequence().first();
+            if !newest || number < first || number == first && old {
+                return;
+            }
+        }
+        let stamp = stamp
+            .filter(|_| self.traits.has_header)
+            .and_then(|stamp| stamp_time(stamp, wall_clock));
+        let mut negative = false;
+        if let Some(source) = source {
+            let delay = wall_clock.nanoseconds_since(source);
+            let is_plausible = source.distance(wall_clock) <= PLAUSIBLE;
+            self.implausible_latency += u64::from(!is_plausible);
+            negative |= delay < 0;
+            if delay >= 0 && is_plausible {
+                self.source_latency.observe(seconds(delay));
+                let slot = self.tally.window.second(now);
+                slot.delayed += 1;
+                slot.delay += seconds(delay);
+            }
+        }
+        if let Some(stamp) = stamp {
+            let delay = wall_clock.nanoseconds_since(stamp);
+            negative |= delay < 0;
+            if delay >= 0 {
+                self.header_latency.observe(seconds(delay));
+            }
+        }
+        self.negative_latency += u64::from(negative);
+    }
+}

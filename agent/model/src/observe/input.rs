@@ -1,0 +1,128 @@
+//! Inputs and outputs of the model.
+
+use std::sync::Arc;
+
+use ros2probe_wire::record::{Handover, Verdict};
+use ros2probe_wire::walk::Envelope;
+use ros2probe_wire::{Guid, GuidPrefix, Reason, Record, Timestamp};
+
+use crate::derive::chain::causality::CausalPublication;
+use crate::derive::chain::expected::ExpectedChain;
+use crate::derive::chain::spans::ChainSpans;
+use crate::derive::trace::Spans;
+use crate::facts::calls::report::Report;
+use crate::facts::dispatch::Dispatch;
+use crate::facts::event::Taken;
+use crate::facts::selection::SampleRequest;
+use crate::facts::watch::Watchlist;
+use crate::graph::discovery::Memory;
+use crate::graph::sockets::SocketFacts;
+use crate::graph::zenoh::StreamReport;
+
+/// An input of the model. Times are in nanoseconds since the Unix epoch.
+#[derive(Debug)]
+pub enum Input<'a> {
+    /// The time has reached this value: leases expire, gaps settle, expectations are evaluated.
+    Time(Timestamp),
+    /// The wall clock was set forward by this many nanoseconds (backward if negative), without
+    /// elapsed time.
+    ClockSet(i64),
+    /// The source sees the traffic from this time on. It saw none, or not all, for a time before.
+    ViewBegan(Timestamp),
+    /// A datagram that was captured in full.
+    Datagram {
+        /// Its addresses and time.
+        envelope: &'a Envelope,
+        /// The RTPS message.
+        payload: &'a [u8],
+        /// Where the kernel filter stopped; it has reported the submessages before that.
+        handover: Option<&'a Handover>,
+    },
+    /// A datagram that the capture file truncated. Its payloads are not read.
+    CutDatagram {
+        /// Its addresses and time.
+        envelope: &'a Envelope,
+        /// The captured part of the RTPS message.
+        payload: &'a [u8],
+        /// Length of the whole RTPS message in bytes.
+        length: u32,
+    },
+    /// A captured datagram that is read for discovery only.
+    Announcements {
+        /// Its addresses and time.
+        envelope: &'a Envelope,
+        /// The RTPS message.
+        payload: &'a [u8],
+        /// Flags of its records that the bytes do not contain.
+        flags: u16,
+        /// Receives the records of user data, which the caller sorts among others.
+        records: &'a mut Vec<Record>,
+    },
+    /// A message that was sampled from shared memory, where others may have been missed.
+    SharedMemory {
+        /// Its source and time.
+        envelope: &'a Envelope,
+        /// The RTPS message.
+        payload: &'a [u8],
+    },
+    /// The polling gap exceeds the shared-memory ring; loss before this time is unknown.
+    SharedMemoryGap(Timestamp),
+    /// Uprobes no longer observe writes to shared memory, so sampled messages count again.
+    ProbesDetached,
+    /// A report about one direction of a Zenoh connection.
+    Zenoh(&'a StreamReport<'a>),
+    /// A record of a complete datagram, from the kernel filter.
+    Record(&'a Record),
+    /// The time at which a participant last sent a packet, from the kernel filter.
+    ParticipantAlive(GuidPrefix, Timestamp),
+    /// Facts about a socket; repeated when they change.
+    Socket(SocketFacts),
+    /// The socket with this cookie was closed.
+    SocketClosed(u64),
+    /// The kernel's table dropped the socket with this cookie, which may still be open.
+    SocketForgotten(u64),
+    /// Figures from inside processes, with times of this host's clock.
+    Inside(Report),
+    /// Calls inside processes are no longer observed; later figures begin at zero.
+    InsideDetached,
+    /// A source failed to parse captured bytes.
+    DecodeError {
+        /// The stage of parsing.
+        stage: &'static str,
+        /// The reason.
+        reason: Reason,
+    },
+    /// The topics to measure from now on.
+    Watchlist(Arc<Watchlist>),
+    /// The samples to dispatch from now on. Their topics are measured as long as they are
+    /// requested.
+    SampleRequests(Arc<Vec<SampleRequest>>),
+    /// The chains with a limit for their latency. The topics between their ends are measured.
+    ExpectedChains(Arc<Vec<ExpectedChain>>),
+    /// A publication within the callback that processes an input, from inside a process.
+    CausalPublication(&'a CausalPublication),
+    /// State from before a restart, valid for at most one lease from `now` on.
+    Restored {
+        /// The saved state.
+        memory: &'a Memory,
+        /// Time at which the model starts.
+        now: Timestamp,
+    },
+    /// The input has ended: open decisions are made without elapsed time.
+    End,
+}
+
+/// Outputs of the model since they were last drained.
+#[derive(Debug, Default)]
+pub struct Output {
+    /// Changed verdicts for the kernel filter; `None` removes the entry.
+    pub interest: Vec<(Guid, Option<Verdict>)>,
+    /// Events, and how many were dropped.
+    pub events: Taken,
+    /// Requested samples, and reports of missing ones.
+    pub samples: Vec<Dispatch>,
+    /// Completed spans of traced samples.
+    pub spans: Spans,
+    /// Completed spans of traced chains.
+    pub chain_spans: ChainSpans,
+}

@@ -1,0 +1,5 @@
+//! The entry: one input, one drain.
+
+pub mod input;
+pub mod interest;
+pub mod observer;

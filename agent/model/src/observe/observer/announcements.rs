@@ -1,0 +1,215 @@
+//! Parses SPDP, SEDP and `ros_discovery_info` samples for discovery.
+
+use ros2probe_wire::discovery::{self, EndpointAnnouncement, ParticipantAnnouncement, Role};
+use ros2probe_wire::entities::ParticipantEntities;
+use ros2probe_wire::record::Sample;
+use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
+use ros2probe_wire::walk::{Envelope, Found};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp, WireError};
+
+use super::Observer;
+use crate::facts::route::Destination;
+use crate::graph::discovery::{Origin, Priority, endpoints_of};
+
+impl Observer {
+    pub(super) fn announced(
+        &mut self,
+        found: &Found<'_>,
+        vendor: Option<VendorId>,
+        envelope: &Envelope,
+    ) {
+        let record = &found.record;
+        if let Some(sample) = record.sample() {
+            let prefix = record.writer().prefix;
+            let [first, second, ..] = prefix.0;
+            let vendor = vendor.unwrap_or(VendorId([first, second]));
+            let origin = Origin {
+                at: self.wall_clock.model_time(Timestamp(envelope.time)),
+                sender: prefix,
+                sequence_number: sample.sequence_number(),
+                destination: envelope.destination,
+                port: envelope.destination_port,
+            };
+            self.read(found, sample, vendor, &origin);
+            self.follow_up(origin.at);
+            self.identify_call(found, sample, vendor, origin.at);
+            self.keep(found);
+        }
+    }
+
+    /// Parses a sample if it is relevant to discovery.
+    fn read(&mut self, found: &Found<'_>, sample: Sample<'_>, vendor: VendorId, origin: &Origin) {
+        let writer = found.record.writer();
+        let stage = match writer.entity {
+            EntityId::SPDP_WRITER | EntityId::SPDP_SECURE_WRITER => "spdp",
+            EntityId::SEDP_PUBLICATIONS_WRITER
+            | EntityId::SEDP_SUBSCRIPTIONS_WRITER
+            | EntityId::SEDP_PUBLICATIONS_SECURE_WRITER
+            | EntityId::SEDP_SUBSCRIPTIONS_SECURE_WRITER => "sedp",
+            entity if !entity.is_builtin() && self.may_be_entities(found, sample) => "entities",
+            _ => return,
+        };
+        let whole;
+        let (payload, inline_qos) = if let Sample::DataFrag(fragments) = sample {
+            let Some(bytes) = self.discovery_fragments.put(fragments, found.payload) else {
+                return;
+            };
+            whole = bytes;
+            let status_info = sample.status_info();
+            (
+                Payload::Data(&whole),
+                Ok(InlineQos {
+                    status_info,
+                    ..InlineQos::default()
+                }),
+            )
+        } else {
+            (found.payload(), found.inline_qos(vendor))
+        };
+        let processed = inline_qos.and_then(|inline_qos| match stage {
+            "spdp" => self.participant(vendor, payload, &inline_qos, origin),
+            "sedp" => self.endpoint(writer.entity, vendor, payload, &inline_qos, origin),
+            _ => self.entities(writer, payload, origin),
+        });
+        if let Err(error) = processed {
+            self.decode_error(stage, error.reason);
+        }
+    }
+
+    /// Returns whether a sample is on `ros_discovery_info`, or on an unannounced topic and of the
+    /// same form. It is sent once, perhaps before its writer's announcement is processed.
+    fn may_be_entities(&self, found: &Found<'_>, sample: Sample<'_>) -> bool {
+        let writer = found.record.writer();
+        if sample.status_info() != StatusInfo::ALIVE {
+            return false;
+        }
+        if let Some(endpoint) = self.discovery.endpoints().get(&writer) {
+            return &*endpoint.topic == "ros_discovery_info";
+        }
+        let own = Guid::new(writer.prefix, EntityId::PARTICIPANT).to_bytes();
+        let begins = found.payload.get(4..20).is_some_and(|gid| *gid == own);
+        match sample {
+            Sample::Data(_) => begins,
+            Sample::DataFrag(fragments) => {
+                sample.is_start() && begins || self.discovery_fragments.holds(fragments)
+            }
+        }
+    }
+
+    pub(super) fn participant(
+        &mut self,
+        vendor: VendorId,
+        payload: Payload<'_>,
+        inline_qos: &InlineQos,
+        origin: &Origin,
+    ) -> Result<(), WireError> {
+        match discovery::participant(vendor, payload, inline_qos)? {
+            discovery::Discovery::Alive(announcement) => {
+                self.learn_participant(&announcement, origin);
+                self.announce(announcement.guid.prefix);
+            }
+            discovery::Discovery::Gone { guid, .. } => {
+                self.discovery
+                    .participant_gone(guid, origin, &mut self.journal);
+            }
+        }
+        Ok(())
+    }
+
+    pub(super) fn endpoint(
+        &mut self,
+        entity: EntityId,
+        vendor: VendorId,
+        payload: Payload<'_>,
+        inline_qos: &InlineQos,
+        origin: &Origin,
+    ) -> Result<(), WireError> {
+        let role = match entity {
+            EntityId::SEDP_PUBLICATIONS_WRITER | EntityId::SEDP_PUBLICATIONS_SECURE_WRITER => {
+                Role::Writer
+            }
+            _ => Role::Reader,
+        };
+        match discovery::endpoint(role, vendor, payload, inline_qos)? {
+            discovery::Discovery::Alive(announcement) => {
+                let prefix = announcement.guid.prefix;
+                if self.learn_endpoint(announcement, origin) {
+                    self.announce(prefix);
+                }
+            }
+            discovery::Discovery::Gone { guid, .. } => {
+                self.discovery
+                    .endpoint_gone(guid, origin, &mut self.journal);
+            }
+        }
+        Ok(())
+    }
+
+    pub(super) fn entities(
+        &mut self,
+        writer: Guid,
+        payload: Payload<'_>,
+        origin: &Origin,
+    ) -> Result<(), WireError> {
+        let entities = ParticipantEntities::parse(payload.bytes())?;
+        self.learn_entities(&entities, writer, origin);
+        Ok(())
+    }
+
+    /// Records a participant that is announced.
+    pub(super) fn learn_participant(
+        &mut self,
+        announcement: &ParticipantAnnouncement,
+        origin: &Origin,
+    ) {
+        let evidence = self.evidence(announcement.guid.prefix);
+        let journal = &mut self.journal;
+        self.discovery
+            .participant(announcement, origin, evidence, journal);
+    }
+
+    /// Records an endpoint that is announced. Returns whether its participant is admitted because
+    /// of it.
+    pub(super) fn learn_endpoint(
+        &mut self,
+        announcement: EndpointAnnouncement,
+        origin: &Origin,
+    ) -> bool {
+        let evidence = self.evidence(announcement.guid.prefix);
+        let journal = &mut self.journal;
+        self.discovery
+            .endpoint(announcement, origin, evidence, journal)
+    }
+
+    /// Records the nodes of a participant.
+    pub(super) fn learn_entities(
+        &mut self,
+        entities: &ParticipantEntities,
+        writer: Guid,
+        origin: &Origin,
+    ) {
+        let evidence = self.evidence(writer.prefix);
+        let journal = &mut self.journal;
+        self.discovery
+            .entities(entities, writer, origin, evidence, journal);
+    }
+
+    /// Returns the known priority of a participant that is announced.
+    fn evidence(&self, prefix: GuidPrefix) -> Priority {
+        Priority {
+            watched: false,
+            local: self.receivers.is_local(&prefix),
+            sends: self.profiler.has_unknown_writer(endpoints_of(prefix)),
+        }
+    }
+
+    /// Records the announced addresses of a known participant.
+    pub(super) fn announce(&mut self, prefix: GuidPrefix) {
+        if let Some(participant) = self.discovery.participants().get(&prefix) {
+            let addresses = &participant.addresses;
+            let addresses = addresses.default.iter().chain(&addresses.metatraffic);
+            self.receivers
+                .announce(prefix, addresses.copied().map(Destination::from));
+        }
+    }
+}

@@ -1,0 +1,70 @@
+//! Calls of services: captured requests and replies, and their further copies.
+
+use ros2probe_wire::record::{Sample, Verdict};
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::walk::Found;
+use ros2probe_wire::{Guid, Record, Timestamp};
+
+use super::Observer;
+use crate::facts::route::Route;
+
+impl Observer {
+    /// Reads the identity of a captured request or reply.
+    pub(super) fn identify_call(
+        &mut self,
+        found: &Found<'_>,
+        sample: Sample<'_>,
+        vendor: VendorId,
+        at: Timestamp,
+    ) {
+        let writer = found.record.writer();
+        match self.services.identify(found, sample, vendor, at) {
+            Ok(is_over_budget) => self.follow_call(writer, is_over_budget),
+            Err(error) => self.decode_error("request", error.reason),
+        }
+    }
+
+    /// Stops capturing a writer of requests or replies that has exceeded its budget.
+    pub(super) fn follow_call(&mut self, writer: Guid, is_over_budget: bool) {
+        if is_over_budget && !self.payloads.wants_bytes(writer) {
+            let is_measured = self.profiler.get(writer).is_some();
+            let verdict = match is_measured {
+                true => Verdict::Meter,
+                false => Verdict::Ignore,
+            };
+            self.interest.set(writer, verdict);
+        }
+    }
+
+    /// Counts a copy of a request or reply.
+    pub(super) fn call_seen(&mut self, record: &Record) {
+        if let Some(sample) = record.sample()
+            && self.services.follows(record.writer())
+        {
+            let (receivers, discovery) = (&self.receivers, &self.discovery);
+            self.services.seen(record, sample, || {
+                receivers.owner(&Route::of(record), discovery)
+            });
+        }
+    }
+
+    /// Marks hanging calls, and captures writers again that had exceeded their budget.
+    pub(super) fn advance_calls(&mut self, now: Timestamp) {
+        let topics = &self.topics;
+        let timeout = self.settings.service_timeout;
+        let resumed = self.services.advance(timeout, now, |domain_id, name| {
+            let halves = [format!("rq{name}Request"), format!("rr{name}Reply")];
+            halves
+                .iter()
+                .any(|dds_name| topics.knows(domain_id, dds_name))
+        });
+        for guid in resumed {
+            let endpoint = self.discovery.endpoints().get(&guid);
+            let id = endpoint
+                .and_then(|endpoint| self.topics.find(endpoint.domain_id, &endpoint.naming()?));
+            if let Some(id) = id {
+                self.apply(id, guid, now);
+            }
+        }
+    }
+}

@@ -1,0 +1,98 @@
+//! Messages with stamps, which chains consist of.
+
+use ros2probe_wire::names::DdsTopic;
+use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
+
+use super::Observer;
+use super::lists::traced_share;
+use crate::derive::chain::causality::{CausalPublication, Origin};
+use crate::derive::chain::graph::publisher;
+use crate::facts::names::{NodeName, TopicName};
+use crate::facts::naming::Naming;
+use crate::facts::route::Route;
+use crate::measure::topic::Topic;
+use crate::measure::writer::Counted;
+
+impl Observer {
+    /// Adds a counted message to the chains.
+    pub(super) fn chain_counted(&mut self, writer: Guid, counted: &Counted) {
+        if self.chains.follows(writer) {
+            let is_local = !self.settings.directed || self.receivers.is_local(&writer.prefix);
+            self.chains
+                .counted(writer, counted, is_local, self.wall_clock);
+        }
+    }
+
+    /// Notes where a copy of a message arrived.
+    pub(super) fn chain_seen(&mut self, record: &Record) {
+        if let Some(sample) = record.sample()
+            && self.chains.follows(record.writer())
+        {
+            let (receivers, discovery) = (&self.receivers, &self.discovery);
+            self.chains.seen(record, sample, self.wall_clock, || {
+                receivers.owner(&Route::of(record), discovery)
+            });
+        }
+    }
+
+    /// Adds a publication within a callback to the chains.
+    pub(super) fn chain_published(&mut self, publication: &CausalPublication) {
+        let Self {
+            topics,
+            tracer,
+            watchlist,
+            discovery,
+            inside,
+            ..
+        } = self;
+        let topic = |name: &TopicName| {
+            let name = DdsTopic::parse(&format!("rt{name}")).ok()?;
+            topics.get(topics.find(publication.domain_id, &Naming::of(&name))?)
+        };
+        // A process that is older than the agent has announced its nodes to discovery only.
+        let named = publication.node.is_none().then(|| {
+            let is_of_process = |node: &NodeName| inside.has_node(publication.process, node);
+            let node = publisher(discovery, topic(&publication.output)?, is_of_process);
+            Some(CausalPublication {
+                node: Some(node?),
+                ..publication.clone()
+            })
+        });
+        let named = named.flatten();
+        let publication = named.as_ref().unwrap_or(publication);
+        let origin = || {
+            let input = topic(&publication.input);
+            let share = input.filter(|_| tracer.is_wanted());
+            Origin {
+                node: input.and_then(|input| publisher(discovery, input, |_| false)),
+                share: share.and_then(|input| traced_share(input, watchlist)),
+            }
+        };
+        self.chains.publication(publication, self.clock, origin);
+    }
+
+    /// Evaluates the chains, and measures the topics that configured chains need.
+    pub(super) fn advance_chains(&mut self, now: Timestamp) {
+        let graph = (&self.discovery, &self.topics, &self.profiler);
+        let watchlist = &self.watchlist;
+        let share = |topic: &Topic| traced_share(topic, watchlist);
+        let (is_directed, receivers) = (self.settings.directed, &self.receivers);
+        let is_local = |prefix: &GuidPrefix| !is_directed || receivers.is_local(prefix);
+        let times = (now, self.wall_clock);
+        let changed = self.chains.advance(graph, times, share, is_local);
+        for (domain_id, dds_name) in changed {
+            let id = DdsTopic::parse(&dds_name)
+                .ok()
+                .and_then(|topic| self.topics.find(domain_id, &Naming::of(&topic)));
+            if let Some(id) = id {
+                self.apply_lists(id, now);
+            }
+        }
+    }
+
+    /// Evaluates the chains at the end of the input.
+    pub(super) fn settle_chains(&mut self) {
+        let graph = (&self.topics, &self.profiler);
+        self.chains.settle(graph, (self.clock, self.wall_clock));
+    }
+}

@@ -1,0 +1,294 @@
+//! Decisions that depend on time: leases, windows, gaps, expectations and diagnosis.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::record::Verdict;
+use ros2probe_wire::time::{SECOND, nanoseconds};
+use ros2probe_wire::{Guid, Timestamp};
+
+use super::JUMP;
+use super::Observer;
+use super::TICK;
+use super::graph;
+use crate::facts::diagnosis;
+use crate::facts::event::{EventKind, TEXT, bounded, bounded_finding};
+use crate::facts::loss_share::LossShare;
+use crate::facts::measurement::Measurement;
+use crate::facts::rate::Slot;
+use crate::facts::route::Receiver;
+use crate::facts::watch::WatchState;
+use crate::measure::expectation::Evidence;
+use crate::measure::sampled::Sampled;
+use crate::report::transport::is_polled;
+
+impl Observer {
+    /// Advances the time: expires leases, settles gaps, evaluates expectations.
+    pub(super) fn advance(&mut self, now: Timestamp) {
+        let now = self.wall_clock.model_time(now);
+        if self.clock.0 == 0 || now - self.clock > JUMP {
+            self.clock = Timestamp(now.0 - now.0 % nanoseconds(TICK));
+            self.tick(self.clock);
+        }
+        while now - self.clock >= TICK {
+            self.clock = self.clock + TICK;
+            self.tick(self.clock);
+        }
+    }
+
+    /// Returns when the next decision is due that may become an event: at a whole second, or when
+    /// a lease ends.
+    #[must_use]
+    pub fn next_decision(&self) -> Timestamp {
+        let second = Timestamp(self.clock.0 - self.clock.0 % SECOND + SECOND);
+        let second = self.wall_clock.wall_time(second);
+        self.next_expiry().map_or(second, |end| end.min(second))
+    }
+
+    /// Returns when the lease of a participant ends, unless it is heard before; the first one's.
+    /// Leases are checked at multiples of an interval, also those that end at once.
+    #[must_use]
+    pub fn next_expiry(&self) -> Option<Timestamp> {
+        let end = self.discovery.next_expiry()?;
+        let tick = nanoseconds(TICK);
+        let end = Timestamp(end.0.div_ceil(tick).saturating_mul(tick));
+        Some(self.wall_clock.wall_time(end.max(self.clock + TICK)))
+    }
+
+    /// Makes all open decisions at the end of the input, without elapsed time.
+    pub(super) fn settle(&mut self) {
+        let graph = graph!(self);
+        self.profiler.settle(self.clock, &mut self.journal, graph);
+        self.report_missing();
+        for writer in self.payloads.unsettled() {
+            self.payloads.give_all(writer, self.clock);
+        }
+        self.end_second_of_losses();
+        self.report_losses();
+        self.settle_chains();
+        self.examine(self.clock);
+    }
+
+    /// Determines what the worst subscriber of each measured topic lost in the last second.
+    fn end_second_of_losses(&mut self) {
+        for id in self.topics.ids() {
+            let Some(topic) = self.topics.get_mut(id) else {
+                continue;
+            };
+            let Some(retired) = &topic.retired else {
+                continue;
+            };
+            let mut unreached = retired.loss;
+            let mut subscribers: BTreeMap<Receiver, (LossShare, LossShare)> = BTreeMap::new();
+            for writer in topic.writers.iter().chain(&topic.buffer_endpoints) {
+                let Some(measured) = self.profiler.get_mut(*writer) else {
+                    continue;
+                };
+                unreached.add(measured.writer.share());
+                let Some(receivers) = &mut measured.subscribers else {
+                    continue;
+                };
+                topic.loss.leave(receivers.take_departed());
+                for (receiver, recent) in receivers.losses() {
+                    let (window, last) = subscribers.entry(receiver).or_default();
+                    window.add(recent.window());
+                    last.add(recent.last());
+                }
+            }
+            let mut counted = Measurement {
+                messages: unreached.expected - unreached.lost,
+                ..Measurement::default()
+            };
+            self.inside
+                .apply(topic.domain_id, &topic.naming, &mut counted);
+            unreached.expected = unreached.lost + counted.messages;
+            topic.loss.end_second(subscribers.into_values(), unreached);
+        }
+    }
+
+    /// Reports the losses of the last second.
+    fn report_losses(&mut self) {
+        let discovery = &self.discovery;
+        self.journal.events.end_bursts(|burst| {
+            if let Some(endpoint) = discovery.endpoints().get(&burst.writer) {
+                burst.topic = Some((endpoint.domain_id, endpoint.topic.bounded(TEXT)));
+            }
+            let participant = discovery.participants().get(&burst.writer.prefix);
+            let mut nodes = participant.into_iter().flat_map(|known| &known.nodes);
+            let node = nodes.find(|node| node.writers.contains(&burst.writer));
+            burst.node = node.map(|node| node.name.bounded(TEXT));
+        });
+    }
+
+    pub(super) fn tick(&mut self, now: Timestamp) {
+        self.discovery.advance(now, &mut self.journal);
+        self.follow_up(now);
+        let graph = graph!(self);
+        let unknown_writers = self.profiler.advance(now, &mut self.journal, graph);
+        for guid in unknown_writers.metered {
+            self.interest.set(guid, Verdict::Meter);
+        }
+        for guid in unknown_writers.forgotten {
+            self.interest.remove(guid);
+        }
+        self.report_missing();
+        for writer in self.payloads.unsettled() {
+            self.turn(writer, now);
+        }
+        if now.0.is_multiple_of(SECOND) {
+            self.payloads.expire(now);
+            for writer in self.latched.advance(now) {
+                self.apply_again(writer, now);
+            }
+            let profiler = &self.profiler;
+            self.payloads.retain_unknown_writers(|writer| {
+                let known = profiler.get(writer);
+                known.is_some_and(|known| known.topic.is_none())
+            });
+            self.topics.expire(now, self.settings.topic_grace);
+            self.link_sessions();
+            self.end_unreachable_sessions(now);
+            self.receivers.tidy(&self.discovery);
+            self.discovery
+                .locate(|prefix| self.receivers.is_local(prefix));
+            self.settle_inside(now);
+            self.promote();
+            self.end_second_of_losses();
+            self.judge(now);
+            self.advance_calls(now);
+            self.advance_chains(now);
+            self.report_losses();
+            self.examine(now);
+            self.tracer.advance(now);
+        }
+    }
+
+    pub(super) fn examine(&mut self, now: Timestamp) {
+        let before = Arc::clone(self.examiner.current());
+        self.examiner.examine(
+            &self.discovery,
+            &self.topics,
+            &self.services,
+            (&self.inside, &self.chains),
+            now,
+        );
+        let after = self.examiner.current();
+        if Arc::ptr_eq(&before, after) {
+            return;
+        }
+        for change in diagnosis::changes(&before.list, &after.list) {
+            let (resolved, finding) = match change {
+                diagnosis::Change::Appeared(finding) | diagnosis::Change::Changed(finding) => {
+                    (false, finding)
+                }
+                diagnosis::Change::Resolved(finding) => (true, finding),
+            };
+            let finding = bounded_finding(finding);
+            let kind = EventKind::Diagnosis { resolved, finding };
+            self.journal.events.push(now, kind);
+        }
+    }
+
+    /// Evaluates every watched topic under every entry that covers it.
+    pub(super) fn judge(&mut self, now: Timestamp) {
+        for id in self.topics.ids() {
+            let Some(topic) = self.topics.get(id) else {
+                continue;
+            };
+            if topic.judgements.is_empty() {
+                continue;
+            }
+            let writers: Vec<_> = topic
+                .writers
+                .iter()
+                .chain(&topic.buffer_endpoints)
+                .filter_map(|guid| self.profiler.get(*guid))
+                .collect();
+            let last_message = writers
+                .iter()
+                .filter_map(|each| each.writer.last_message())
+                .max();
+            let retired = topic
+                .retired
+                .as_ref()
+                .and_then(|retired| retired.last_message);
+            let recent = |seconds: u64| {
+                writers
+                    .iter()
+                    .fold((Slot::default(), 0), |(mut sum, longest), each| {
+                        let (slot, seconds) = each.writer.recent(now, seconds);
+                        sum.add(&slot);
+                        (sum, seconds.max(longest))
+                    })
+            };
+            let inside = self.inside.evidence(topic.domain_id, &topic.naming);
+            let (publishers, subscriptions) = inside.map_or((0, 0), |inside| inside.endpoints());
+            let seen_inside = inside.and_then(|inside| inside.last_message());
+            let recent: &dyn Fn(u64) -> (Slot, u64) = match &inside {
+                Some(inside) => &|seconds| inside.recent(seconds),
+                None => &recent,
+            };
+            let seeming_silence = |slowest| {
+                let polled = writers.iter();
+                let longest = polled.map(|each| each.writer.seeming_silence(slowest));
+                let longest = longest.max().unwrap_or_default();
+                let is_unseen = |guid: &&Guid| {
+                    let known = self.profiler.get(**guid);
+                    known.is_none_or(|each| each.writer.is_unseen())
+                };
+                let mut unseen = topic.writers.iter().filter(is_unseen);
+                match unseen.any(|guid| is_polled(&self.discovery, *guid, &topic.readers)) {
+                    true => longest.max(Sampled::seeming_silence_of_unseen(slowest)),
+                    false => longest,
+                }
+            };
+            let seeming_silence: &dyn Fn(Duration) -> Duration = match &inside {
+                Some(_) => &|_| Duration::ZERO,
+                None => &seeming_silence,
+            };
+            let evidence = Evidence {
+                now,
+                publishers: topic.writers.len().max(publishers),
+                subscriptions: topic.readers.len().max(subscriptions),
+                last_message: last_message.max(retired).max(seen_inside),
+                seeming_silence,
+                since: topic.published,
+                observed: topic.published.max(topic.subscribed).max(self.view_began),
+                recent,
+                loss: topic.loss.window,
+            };
+            let mut judgements = topic.judgements.clone();
+            for (index, judgement) in &mut judgements {
+                let Some(watch) = self.watchlist.watches().get(*index) else {
+                    continue;
+                };
+                let changed = judgement.judge(&watch.expectations, &evidence);
+                let Some(from) = changed else { continue };
+                let to = judgement.state();
+                let (domain_id, name) = (topic.domain_id, &topic.naming.name);
+                let kind = EventKind::Expectation {
+                    domain_id,
+                    topic: name.bounded(TEXT),
+                    watch: bounded(&watch.pattern).into(),
+                    from,
+                    to,
+                    violations: judgement.violations(),
+                };
+                self.journal.events.push(now, kind);
+                if to == WatchState::Silent {
+                    let kind = EventKind::Silence {
+                        domain_id,
+                        topic: name.bounded(TEXT),
+                        watch: bounded(&watch.pattern).into(),
+                        last_message: evidence.last_message,
+                    };
+                    self.journal.events.push(now, kind);
+                }
+            }
+            if let Some(topic) = self.topics.get_mut(id) {
+                topic.judgements = judgements;
+            }
+        }
+    }
+}

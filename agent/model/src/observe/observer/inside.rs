@@ -1,0 +1,73 @@
+//! Figures from inside processes: their topics, and whether the network or they decide the counts.
+
+use ros2probe_wire::Timestamp;
+
+use super::Observer;
+use crate::derive::inside::source::Seen;
+use crate::facts::calls::report::Report;
+use crate::facts::event::EventKind;
+use crate::facts::topic_kind::TopicKind;
+use crate::measure::topic::{TopicId, Watched};
+
+impl Observer {
+    /// Takes a report about calls inside processes.
+    pub(super) fn report_inside(&mut self, mut report: Report) {
+        let clock = self.wall_clock;
+        report.convert(|time| clock.model_time(time));
+        let at = report.at;
+        let transitions = self.inside.report(report, &self.discovery, &self.receivers);
+        for state in transitions {
+            let events = &mut self.journal.events;
+            events.push(state.at, EventKind::Lifecycle(state));
+        }
+        self.compare_queues(at);
+    }
+
+    /// Lists the topics of observed processes, and chooses the source of their counts.
+    pub(super) fn settle_inside(&mut self, now: Timestamp) {
+        let mut changed = Vec::new();
+        let (topics, limit) = (&mut self.topics, self.settings.endpoints);
+        for (domain_id, naming, is_live, id) in self.inside.topics() {
+            if naming.kind.is_service() || naming.kind == TopicKind::Discovery {
+                continue;
+            }
+            if is_live {
+                let (place, is_new) = match topics.hold(domain_id, naming, limit, now) {
+                    Some(held) => held,
+                    None => continue,
+                };
+                *id = Some(place);
+                changed.extend(is_new.then_some(place));
+            } else {
+                *id = topics.find(domain_id, naming);
+                if let Some(id) = *id {
+                    topics.release(id, now);
+                }
+            }
+        }
+        self.inside.advance(now, self.settings.topic_grace);
+        for id in changed {
+            self.apply_lists(id, now);
+        }
+        let (topics, profiler) = (&self.topics, &self.profiler);
+        self.inside.choose(|id: Option<TopicId>| {
+            let topic = topics.get(id?)?;
+            if topic.watched != Watched::Yes {
+                return None;
+            }
+            let retired = topic.retired.as_deref();
+            let mut seen = Seen {
+                messages: retired.map_or(0, |retired| retired.messages),
+                last: retired.and_then(|retired| retired.last_message),
+            };
+            for guid in topic.writers.iter().chain(&topic.buffer_endpoints) {
+                let Some(measured) = profiler.get(*guid) else {
+                    continue;
+                };
+                seen.messages += measured.writer.messages();
+                seen.last = seen.last.max(measured.writer.last_message());
+            }
+            Some(seen)
+        });
+    }
+}

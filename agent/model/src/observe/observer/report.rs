@@ -1,0 +1,426 @@
+//! Creates a [`Snapshot`] from the core's state: sorted copies of values that are already settled.
+
+mod deliveries;
+
+use std::collections::{BTreeSet, HashMap};
+use std::sync::Arc;
+
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::{DomainId, EntityId, Guid, Timestamp};
+
+use super::Observer;
+use crate::facts::measurement::Measurement;
+use crate::facts::names::{DdsName, NodeName};
+use crate::facts::watch::WatchState;
+use crate::graph::discovery::{Discovery, Endpoint, ParticipantProxy};
+use crate::graph::sockets::SocketFacts;
+use crate::measure::topic::{Topic, Watched};
+use crate::report::snapshot::{
+    DecodeErrorCount, EndpointFacts, LatchedFacts, NodeFacts, ParticipantFacts, ProcessFacts,
+    Snapshot, TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchedTopicFacts,
+};
+use crate::report::transport::transports;
+
+pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
+    let nodes = nodes_of_endpoints(&observer.discovery);
+    Snapshot {
+        at: now,
+        participants: participants(observer),
+        nodes: node_facts(&observer.discovery),
+        topics: observer
+            .topics
+            .iter()
+            .map(|(_, topic)| self::topic(observer, topic, &nodes, now))
+            .collect(),
+        unknown_writers: unknown_writers(observer, now),
+        sockets: deliveries::sockets(observer),
+        watches: watches(observer),
+        services: observer.services.facts(),
+        actions: observer.services.action_facts(),
+        inside: observer.inside.facts().map(Arc::new),
+        zenoh: observer.zenoh.is_used().then(|| observer.zenoh.facts()),
+        chains: observer.chains.facts(observer.wall_clock.wall_time(now)),
+        diagnoses: Arc::clone(observer.examiner.current()),
+        diagnosed: Arc::clone(observer.examiner.since()),
+        churn: observer.discovery.churn.facts(),
+        decode_errors: decode_errors(observer),
+        tables: tables(observer),
+        datagrams: observer.datagrams,
+        records: observer.records,
+        topics_measured: observer.topics.watched() as u64,
+        topics_rejected: observer.topics.rejected,
+    }
+}
+
+fn participants(observer: &Observer) -> Vec<ParticipantFacts> {
+    let holders = observer.receivers.holders();
+    let mut facts: Vec<_> = observer
+        .discovery
+        .participants()
+        .iter()
+        .map(|(prefix, participant)| {
+            let proxy = &participant.proxy;
+            ParticipantFacts {
+                guid: Guid::new(*prefix, EntityId::PARTICIPANT),
+                domain_id: participant.domain_id,
+                vendor: proxy.vendor,
+                enclave: proxy.enclave.clone(),
+                process: process(Some(proxy), holders.get(prefix).copied()),
+                first_seen: participant.first_seen,
+                last_seen: participant.last_seen,
+                lease: proxy.lease,
+                secured: proxy.secured,
+                restored: participant.restored.is_some(),
+                addresses: participant.addresses.clone(),
+            }
+        })
+        .collect();
+    facts.sort_unstable_by_key(|fact| (fact.domain_id, fact.guid));
+    facts
+}
+
+fn node_facts(discovery: &Discovery) -> Vec<NodeFacts> {
+    let mut facts = Vec::new();
+    for (prefix, participant) in discovery.participants() {
+        for node in &participant.nodes {
+            facts.push(NodeFacts {
+                domain_id: participant.domain_id,
+                name: node.name.clone(),
+                participant: Guid::new(*prefix, EntityId::PARTICIPANT),
+                writers: node.writers.clone(),
+                readers: node.readers.clone(),
+            });
+        }
+    }
+    facts.sort_by(|one, other| {
+        (one.domain_id, &one.name, one.participant).cmp(&(
+            other.domain_id,
+            &other.name,
+            other.participant,
+        ))
+    });
+    facts
+}
+
+/// Returns the node of each endpoint.
+fn nodes_of_endpoints(discovery: &Discovery) -> HashMap<Guid, &NodeName> {
+    let mut nodes = HashMap::with_capacity(discovery.endpoints().len());
+    for participant in discovery.participants().values() {
+        for node in &participant.nodes {
+            for guid in node.writers.iter().chain(&node.readers) {
+                nodes.insert(*guid, &node.name);
+            }
+        }
+    }
+    nodes
+}
+
+fn topic(
+    observer: &Observer,
+    topic: &Topic,
+    nodes: &HashMap<Guid, &NodeName>,
+    now: Timestamp,
+) -> TopicFacts {
+    let endpoint = |guid: &Guid| {
+        let endpoint = observer.discovery.endpoints().get(guid)?;
+        let measured = observer
+            .profiler
+            .get(*guid)
+            .filter(|measured| measured.topic.is_some());
+        let measurement = measured.map(|measured| Box::new(measured.writer.measurement(now)));
+        Some(endpoint_facts(
+            *guid,
+            endpoint,
+            nodes.get(guid).copied(),
+            measurement,
+            observer.latched.facts(*guid),
+        ))
+    };
+    let mut publishers = fitting(
+        topic.writers.len(),
+        topic.writers.iter().filter_map(endpoint),
+    );
+    let mut subscriptions = fitting(
+        topic.readers.len(),
+        topic.readers.iter().filter_map(endpoint),
+    );
+    let inside = observer.inside.topic(topic.domain_id, &topic.naming);
+    let is_observed = |guid: Guid| inside.is_some() && observer.inside.observes(guid.prefix);
+    let (transports, observed_pairs) = transports(
+        &observer.discovery,
+        &mut publishers,
+        &mut subscriptions,
+        is_observed,
+    );
+    let all = || publishers.iter().chain(&subscriptions);
+    let mut message_types: BTreeSet<_> = all().map(|each| each.message_type.clone()).collect();
+    if topic.is_vanished() {
+        message_types.extend(topic.last_type.clone());
+    }
+    let type_hashes: BTreeSet<_> = all().filter_map(|each| each.type_hash).collect();
+    let mut measurement = apart(observer, topic, now);
+    if let Some(sum) = &mut measurement {
+        let own = publishers
+            .iter()
+            .filter_map(|each| each.measurement.as_ref());
+        own.for_each(|own| sum.add(own));
+        observer.inside.apply(topic.domain_id, &topic.naming, sum);
+        sum.loss = topic.loss.total;
+    }
+    let totals = deliveries::totals(observer, topic);
+    TopicFacts {
+        domain_id: topic.domain_id,
+        name: topic.naming.name.clone(),
+        dds_name: topic.naming.dds_name.clone(),
+        kind: topic.naming.kind,
+        hidden: topic.naming.hidden,
+        message_types: message_types.into_iter().collect(),
+        type_hashes: type_hashes.into_iter().collect(),
+        publishers,
+        subscriptions,
+        measurement,
+        received: totals.seen[0].then(|| Box::new(totals.received)),
+        sent: totals.seen[1].then(|| Box::new(totals.sent)),
+        breakdown: totals.breakdown,
+        deliveries: deliveries::deliveries(observer, topic, nodes),
+        acknowledgements: deliveries::acknowledgements(observer, topic, nodes, now),
+        vanished: topic.is_vanished(),
+        transports,
+        is_read: topic.requested.is_some(),
+        source: observer.inside.source(topic.domain_id, &topic.naming),
+        inside: inside.map(Box::new),
+        observed_pairs,
+    }
+}
+
+/// Returns all counts of each measured topic.
+pub(super) fn measured(
+    observer: &Observer,
+    now: Timestamp,
+) -> impl Iterator<Item = (DomainId, &DdsName, Measurement)> {
+    let topics = observer.topics.iter().map(|(_, topic)| topic);
+    let topics = topics.filter(|topic| topic.watched == Watched::Yes);
+    topics.filter_map(move |topic| {
+        let mut sum = *apart(observer, topic, now)?;
+        for guid in &topic.writers {
+            let measured = observer.profiler.get(*guid);
+            if let Some(own) = measured.filter(|measured| measured.topic.is_some()) {
+                sum.add(&own.writer.measurement(now));
+            }
+        }
+        let inside = &observer.inside;
+        inside.apply(topic.domain_id, &topic.naming, &mut sum);
+        sum.loss = topic.loss.total;
+        Some((topic.domain_id, &topic.naming.dds_name, sum))
+    })
+}
+
+/// Returns the counts of vanished writers and of buffer topics; `None` for a topic that is not
+/// measured.
+fn apart(observer: &Observer, topic: &Topic, now: Timestamp) -> Option<Box<Measurement>> {
+    let mut sum = topic.retired.clone()?;
+    for guid in &topic.buffer_endpoints {
+        if let Some(buffer_endpoints) = observer.profiler.get(*guid) {
+            sum.add(&buffer_endpoints.writer.measurement(now));
+        }
+    }
+    Some(sum)
+}
+
+/// Collects with exact capacity: most topics have one endpoint, and `collect` would allocate four.
+fn fitting<T>(length: usize, items: impl Iterator<Item = T>) -> Vec<T> {
+    let mut list = Vec::with_capacity(length);
+    list.extend(items);
+    list
+}
+
+fn endpoint_facts(
+    guid: Guid,
+    endpoint: &Endpoint,
+    node: Option<&NodeName>,
+    measurement: Option<Box<Measurement>>,
+    latched: Option<LatchedFacts>,
+) -> EndpointFacts {
+    EndpointFacts {
+        guid,
+        gid: endpoint.gid,
+        node: node.cloned(),
+        qos: Arc::clone(&endpoint.qos),
+        message_type: endpoint.message_type.clone(),
+        type_hash: endpoint.type_hash,
+        first_seen: endpoint.first_seen,
+        measurement,
+        transports: 0,
+        latched,
+    }
+}
+
+fn unknown_writers(observer: &Observer, now: Timestamp) -> Vec<UnknownWriterFacts> {
+    let unknown_writers = observer
+        .profiler
+        .iter()
+        .filter(|(_, measured)| measured.metered && measured.topic.is_none());
+    let mut facts: Vec<_> = unknown_writers
+        .map(|(guid, measured)| {
+            let participant = observer.discovery.participants().get(&guid.prefix);
+            let proxy = participant.map(|participant| &participant.proxy);
+            let holder = observer.receivers.sockets().get(measured.sent_from);
+            UnknownWriterFacts {
+                guid: *guid,
+                vendor: vendor(*guid, proxy),
+                process: process(proxy, holder),
+                first_seen: measured.first_seen,
+                measurement: measured.writer.measurement(now),
+            }
+        })
+        .collect();
+    facts.sort_unstable_by_key(|fact| fact.guid);
+    facts
+}
+
+/// Combines what a participant announces about its process with the owner of its socket.
+fn process(proxy: Option<&ParticipantProxy>, holder: Option<&SocketFacts>) -> ProcessFacts {
+    let announced = |text: fn(&ParticipantProxy) -> &Option<Arc<str>>| {
+        proxy.and_then(|proxy| text(proxy).clone())
+    };
+    let held = |text: fn(&SocketFacts) -> &Option<Arc<str>>| holder.and_then(|it| text(it).clone());
+    let id = holder.and_then(|holder| holder.process_id);
+    ProcessFacts {
+        host: announced(|proxy| &proxy.host),
+        id: id.or_else(|| proxy.and_then(|proxy| proxy.process_id)),
+        name: announced(|proxy| &proxy.process_name).or_else(|| held(|holder| &holder.process)),
+        cgroup: held(|holder| &holder.cgroup),
+    }
+}
+
+/// Returns the vendor. Without an announcement it follows from the first bytes of the GUID, as RTPS
+/// 2.5, 9.3.1.5 requires and Fast DDS and Cyclone DDS 0.10 implement.
+fn vendor(guid: Guid, proxy: Option<&ParticipantProxy>) -> Option<VendorId> {
+    let [first, second, ..] = guid.prefix.0;
+    let marked = VendorId([first, second]);
+    match proxy {
+        Some(proxy) => Some(proxy.vendor),
+        None => marked.name().is_some().then_some(marked),
+    }
+}
+
+fn watches(observer: &Observer) -> Vec<WatchFacts> {
+    let mut facts: Vec<_> = observer
+        .watchlist
+        .watches()
+        .iter()
+        .map(|watch| WatchFacts {
+            watch: Arc::clone(watch),
+            topics: Vec::new(),
+        })
+        .collect();
+    for (_, topic) in observer.topics.iter() {
+        for (index, judgement) in &topic.judgements {
+            let Some(fact) = facts.get_mut(*index) else {
+                continue;
+            };
+            fact.topics.push(WatchedTopicFacts {
+                domain_id: topic.domain_id,
+                topic: topic.naming.name.clone(),
+                state: judgement.state(),
+                violations: judgement.violations(),
+            });
+        }
+    }
+    let rejected = observer
+        .topics
+        .iter()
+        .filter(|(_, topic)| topic.watched == Watched::Rejected);
+    let rejected: BTreeSet<_> = rejected.map(|(_, topic)| &*topic.naming.name).collect();
+    let is_rejected = |name: &str| rejected.contains(name);
+    for (watch, fact) in observer.watchlist.watches().iter().zip(&mut facts) {
+        if watch.is_literal() && fact.topics.is_empty() && !is_rejected(&watch.pattern) {
+            fact.topics.push(WatchedTopicFacts {
+                domain_id: watch.domain_id.unwrap_or(DomainId(0)),
+                topic: watch.pattern.as_str().into(),
+                state: WatchState::NotPublished,
+                violations: Vec::new(),
+            });
+        }
+    }
+    facts
+}
+
+fn decode_errors(observer: &Observer) -> Vec<DecodeErrorCount> {
+    let fact = |((stage, reason), count): (&(&'static str, &'static str), &u64)| DecodeErrorCount {
+        stage,
+        reason,
+        count: *count,
+    };
+    observer.decode_errors.iter().map(fact).collect()
+}
+
+fn tables(observer: &Observer) -> Vec<TableFacts> {
+    let Observer {
+        settings,
+        discovery,
+        topics,
+        profiler,
+        ..
+    } = observer;
+    let [participants, endpoints, nodes] = discovery.tables();
+    let table = |table, size: usize, limit: usize, evictions| TableFacts {
+        table,
+        size: size as u64,
+        limit: limit as u64,
+        bytes: None,
+        evictions,
+    };
+    let (writers, unknown_writers) = profiler.size();
+    let (interest, interest_limit, interest_evictions) = observer.interest.size();
+    let [sockets, addresses] = observer.receivers.tables();
+    let (diagnoses, diagnoses_limit, diagnoses_left_out) = observer.examiner.size();
+    let (payloads, payloads_limit, payloads_evictions) = observer.payloads.size();
+    let [chains, messages] = observer.chains.tables();
+    let quota = profiler.quota();
+    let refused = profiler.iter().filter_map(|(_, measured)| {
+        let subscribers = measured.subscribers.as_ref()?;
+        Some(subscribers.refused())
+    });
+    let refused: u64 = refused.sum();
+    let budgets = profiler.budgets();
+    let samples: usize = budgets.iter().map(|budget| budget.bytes).sum();
+    let samples_limit: usize = budgets.iter().map(|budget| budget.limit).sum();
+    let samples_evictions: u64 = budgets
+        .iter()
+        .map(|budget| budget.evictions + budget.rejected)
+        .sum();
+    let mut tables = vec![
+        participants,
+        endpoints,
+        nodes,
+        table("topics", topics.len(), settings.endpoints, topics.evictions),
+        table("writers", writers, settings.endpoints, 0),
+        unknown_writers,
+        table(
+            "samples",
+            samples,
+            samples_limit,
+            samples_evictions + observer.discovery_fragments.evictions(),
+        ),
+        table("interest", interest, interest_limit, interest_evictions),
+        table(
+            "deliveries",
+            quota.used,
+            quota.limit,
+            quota.evictions + refused,
+        ),
+        sockets,
+        addresses,
+        table("diagnoses", diagnoses, diagnoses_limit, diagnoses_left_out),
+        observer.tracer.table(),
+        observer.services.table(),
+        observer.inside.table(),
+        chains,
+        messages,
+        table("payloads", payloads, payloads_limit, payloads_evictions),
+    ];
+    tables.extend(observer.latched.tables());
+    tables.extend(observer.zenoh.tables());
+    tables
+}

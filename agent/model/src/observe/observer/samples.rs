@@ -1,0 +1,197 @@
+//! Samples for subscriptions: in order, once each, or reported as missing.
+
+use std::sync::Arc;
+
+use ros2probe_wire::record::Sample;
+use ros2probe_wire::walk::Found;
+use ros2probe_wire::{Guid, Record, SequenceNumber, Timestamp};
+
+use ros2probe_wire::names::DdsTopic;
+
+use super::Observer;
+use super::graph;
+use crate::facts::dispatch::{self, Dispatch, SampleOutcome};
+use crate::facts::naming::Naming;
+use crate::facts::selection::SampleRequest;
+use crate::measure::profiler::{Measured, UNDELIVERED};
+use crate::measure::writer::Counted;
+
+impl Observer {
+    /// Replaces the sample requests. They take effect once [`Self::apply_more_lists`] has visited
+    /// all topics. Requested topics are measured even without a watch; existing counts stay.
+    pub(super) fn set_sample_requests(&mut self, sample_requests: Arc<Vec<SampleRequest>>) {
+        self.sample_requests = sample_requests;
+        self.requests_changed = self.clock;
+        if self.sample_requests.is_empty() {
+            self.payloads.retain_unknown_writers(|_| false);
+        }
+        self.apply_lists_to_all();
+    }
+
+    /// Returns the time up to which all samples have been dispatched or reported as missing at
+    /// `now`.
+    #[must_use]
+    pub fn dispatched_until(&self, now: Timestamp) -> Timestamp {
+        let writers = self.payloads.wanted();
+        let writers = writers.filter_map(|writer| self.profiler.get(*writer));
+        let unseen = writers.filter_map(|measured| measured.writer.unseen_since());
+        unseen.fold(now, |until, since| {
+            until.min(self.wall_clock.wall_time(since))
+        })
+    }
+
+    /// Dispatches a sample in its turn, or remembers its number if the writer is unknown.
+    pub(super) fn counted(&mut self, writer: Guid, counted: &Counted) {
+        if self.sample_requests.is_empty() {
+            return;
+        }
+        if !self.payloads.wants(writer) {
+            let known = self.profiler.get(writer);
+            if known.is_some_and(|known| known.topic.is_none()) {
+                let sample_requests = self.sample_requests.iter().map(|request| request.id);
+                let number = counted.number;
+                // Unknown writers that the profiler has dropped since the last second free their
+                // entries.
+                if self.payloads.unknown_writers() >= self.settings.unknown_writers {
+                    let profiler = &self.profiler;
+                    self.payloads.retain_unknown_writers(|writer| {
+                        let known = profiler.get(writer);
+                        known.is_some_and(|known| known.topic.is_none())
+                    });
+                }
+                self.payloads
+                    .counted_of_unknown_writer(writer, number, sample_requests);
+            }
+            return;
+        }
+        let progress = self.profiler.progress(writer, counted.at, graph!(self));
+        if let Some(progress) = progress {
+            let skip = self.payloads.counted(writer, counted, &progress);
+            self.skip(writer, skip);
+        }
+    }
+
+    /// Dispatches a retransmitted sample that was first counted before its writer's announcement.
+    pub(super) fn came_again(&mut self, writer: Guid, record: &Record) {
+        let Some(sample) = record.sample() else {
+            return;
+        };
+        let (number, at) = (sample.sequence_number(), Timestamp(record.time));
+        let stamp = match sample {
+            Sample::Data(_) => sample.header_stamp(),
+            Sample::DataFrag(_) => None,
+        };
+        if record.flags & UNDELIVERED != 0 || !self.payloads.lacks(writer, number) {
+            return;
+        }
+        let has_header = |known: &Measured| known.writer.traits().has_header;
+        let counted = Counted {
+            number,
+            bytes: sample.size().into(),
+            source: record.source_timestamp(),
+            stamp: stamp.filter(|_| self.profiler.get(writer).is_some_and(has_header)),
+            at,
+            began: at,
+            sampled: false,
+            unconfirmed: false,
+        };
+        let progress = self.profiler.progress(writer, at, graph!(self));
+        if let Some(progress) =
+            progress.filter(|_| sample.is_end() || self.payloads.wants_bytes(writer))
+        {
+            let skip = self.payloads.came_again(writer, &counted, &progress);
+            self.skip(writer, skip);
+        }
+    }
+
+    /// Dispatches the samples of this writer whose turn has come.
+    pub(super) fn turn(&mut self, writer: Guid, now: Timestamp) {
+        let progress = self.profiler.progress(writer, now, graph!(self));
+        if let Some(progress) = progress {
+            let skip = self.payloads.turn(writer, &progress, now);
+            self.skip(writer, skip);
+        }
+    }
+
+    pub(super) fn skip(&mut self, writer: Guid, number: Option<SequenceNumber>) {
+        if let Some(number) = number {
+            self.profiler.skip(writer, number);
+        }
+    }
+
+    /// Keeps the payload of a requested sample that is not counted yet.
+    pub(super) fn keep(&mut self, found: &Found<'_>) {
+        self.keep_payload(&found.record, found.payload);
+    }
+
+    /// Keeps the payload of a record that is not counted yet, if it is requested.
+    pub(super) fn keep_payload(&mut self, record: &Record, payload: &[u8]) {
+        let writer = record.writer();
+        if self.payloads.wants_bytes(writer) {
+            let moved = self.wall_clock.model_record(record);
+            let record = moved.as_ref().unwrap_or(record);
+            let known = self.profiler.get(writer);
+            let Some(sample) = record.sample() else {
+                return;
+            };
+            let lacks = self.payloads.lacks(writer, sample.sequence_number());
+            if lacks || known.is_some_and(|known| !known.writer.has(sample)) {
+                self.payloads.keep(sample, payload);
+            }
+        } else if self.latched.verdict(writer).is_some() {
+            let moved = self.wall_clock.model_record(record);
+            let record = moved.as_ref().unwrap_or(record);
+            let sample = record.sample();
+            if sample.is_some_and(|sample| self.latched.put(sample, payload)) {
+                self.apply_again(writer, Timestamp(record.time));
+            }
+        }
+    }
+
+    /// Keeps dispatched samples of transient-local writers.
+    pub(super) fn keep_dispatched(&mut self, samples: &[Dispatch]) {
+        for each in samples {
+            if let SampleOutcome::Sample(sample) = &each.outcome {
+                self.latched.dispatched(sample);
+            }
+        }
+    }
+
+    /// Returns the last messages of transient-local writers that this request covers, the oldest
+    /// first, for a reader of which it is new. Those that it received since the requests changed are
+    /// left out.
+    pub fn latched(&mut self, request: &SampleRequest) -> Vec<Arc<dispatch::Sample>> {
+        let covers = |sample: &Arc<dispatch::Sample>| {
+            let topic = &sample.topic;
+            DdsTopic::parse(&topic.dds_name)
+                .is_ok_and(|name| request.covers(topic.domain_id, &Naming::of(&name)))
+        };
+        let mut samples = self.latched.samples();
+        samples.retain(|sample| {
+            let number = sample.sequence_number;
+            let is_recent = sample.time >= self.requests_changed;
+            let writer = sample.writer;
+            covers(sample) && (self.payloads).give_before(writer, (request.id, number), is_recent)
+        });
+        for sample in &mut samples {
+            if self.wall_clock.is_set() {
+                let time = self.wall_clock.wall_time(sample.time);
+                Arc::make_mut(sample).time = time;
+            }
+        }
+        samples
+    }
+
+    /// Returns the bytes of the kept last messages.
+    #[must_use]
+    pub const fn latched_bytes(&self) -> usize {
+        self.latched.bytes()
+    }
+
+    /// Reports missing samples to the subscriptions.
+    pub(super) fn report_missing(&mut self) {
+        for missing in self.journal.take_missing() {
+            self.payloads.missing(&missing, self.clock);
+        }
+    }
+}

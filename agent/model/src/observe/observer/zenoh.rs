@@ -1,0 +1,270 @@
+//! Connections of Zenoh: announcements for discovery, and records for everything else.
+
+use ros2probe_wire::discovery::{EndpointAnnouncement, Role};
+use ros2probe_wire::record::{Verdict, flag, guid_words, kind};
+use ros2probe_wire::rtps::SubmessageFlags;
+use ros2probe_wire::zenoh::Gid;
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, RtpsTime, SequenceNumber, Timestamp};
+
+use super::Observer;
+use crate::derive::services::service::CallId;
+use crate::graph::discovery::{Origin, Priority};
+use crate::graph::zenoh::{
+    GraphChange, Holder, Shown, StreamId, StreamReport, ZenohSample, unknown_guid,
+};
+
+/// Bytes of the payload in which a header's stamp ends, behind the encapsulation.
+const STAMP_END: usize = 12;
+
+impl Observer {
+    pub(super) fn zenoh_report(&mut self, report: &StreamReport<'_>) {
+        // The state is apart while it calls back.
+        let mut zenoh = std::mem::take(&mut self.zenoh);
+        let mut alive = None;
+        let wants_bytes = self.payloads.wants_any_bytes() || self.latched.is_used();
+        // A sample may precede its announcement in a batch, as that of an unknown writer.
+        zenoh.report(report, wants_bytes, &mut |shown| match shown {
+            Shown::Sample(sample) => self.zenoh_sample(report.stream, report.time, sample),
+            Shown::Owner(socket, prefix) => self.receivers.sends(socket, prefix),
+            Shown::Disowned(socket, prefix) => self.receivers.sends_no_longer(socket, prefix),
+            Shown::Alive(session) => alive = Some(session),
+            Shown::Relayed(session) => {
+                let at = self.wall_clock.model_time(report.time);
+                self.discovery
+                    .seen(session.guid_prefix(), at, Priority::NOTHING);
+            }
+            Shown::Missed(destination) => {
+                let at = self.wall_clock.model_time(report.time);
+                self.profiler.missed(destination, at);
+            }
+            Shown::Malformed(reason) => self.decode_error("zenoh", reason),
+        });
+        let at = self.wall_clock.model_time(report.time);
+        if let Some(session) = alive {
+            let prefix = session.guid_prefix();
+            match self.discovery.knows(prefix) {
+                true => {
+                    self.discovery.seen(prefix, at, Priority::NOTHING);
+                }
+                false => zenoh.graph.repeat(session, at),
+            }
+        }
+        self.zenoh = zenoh;
+        self.change_zenoh_graph(at);
+    }
+
+    /// Returns whether a connection of Zenoh has begun since [`Self::link_sessions`]. It may be short,
+    /// so the process that holds its socket should be looked up soon.
+    #[must_use]
+    pub const fn awaits_holders(&self) -> bool {
+        self.zenoh.has_begun
+    }
+
+    /// Learns from the processes that hold the sockets which sessions of Zenoh send.
+    pub fn link_sessions(&mut self) {
+        self.zenoh.has_begun = false;
+        let receivers = &self.receivers;
+        let holder = |socket| {
+            let process_id = receivers.sockets().get(socket)?.process_id?;
+            Some(Holder {
+                process_id,
+                session: receivers.session_in(process_id),
+            })
+        };
+        for change in self.zenoh.link(holder) {
+            if let Some(before) = change.before {
+                self.receivers
+                    .sends_no_longer(change.socket, before.guid_prefix());
+            }
+            if let Some(after) = change.after {
+                self.receivers.sends(change.socket, after.guid_prefix());
+            }
+        }
+    }
+
+    /// Ends the sessions of Zenoh that a router no longer reaches.
+    pub(super) fn end_unreachable_sessions(&mut self, now: Timestamp) {
+        self.zenoh.end_unreachable(self.wall_clock.wall_time(now));
+        self.change_zenoh_graph(now);
+    }
+
+    /// Names writers of Zenoh in changed verdicts as the wire does, by their gid. Readers have no
+    /// place there.
+    pub(super) fn zenoh_interest(&mut self, interest: &mut Vec<(Guid, Option<Verdict>)>) {
+        let (keys, discovery) = (&mut self.zenoh_keys, &self.discovery);
+        interest.retain_mut(|(guid, verdict)| {
+            if !guid.prefix.is_zenoh() {
+                return true;
+            }
+            let endpoint = discovery.endpoints().get(guid);
+            let key = match endpoint.filter(|_| verdict.is_some() && guid.entity.is_writer()) {
+                Some(endpoint) => {
+                    let key = Guid::from_bytes(endpoint.gid);
+                    keys.insert(*guid, key);
+                    Some(key)
+                }
+                None => keys.remove(guid),
+            };
+            if let Some(key) = key {
+                *guid = key;
+            }
+            key.is_some()
+        });
+    }
+
+    /// Applies changes of the graph.
+    fn change_zenoh_graph(&mut self, at: Timestamp) {
+        let changes = self.zenoh.graph.take();
+        if changes.is_empty() {
+            return;
+        }
+        for change in changes {
+            // A counter, so that a token that comes back is no delayed copy.
+            self.zenoh_changes = self.zenoh_changes.next();
+            let origin = |prefix: GuidPrefix| Origin {
+                at,
+                sender: prefix,
+                sequence_number: self.zenoh_changes,
+                destination: [0; 16],
+                port: 0,
+            };
+            match change {
+                GraphChange::Participant(announcement) => {
+                    let origin = origin(announcement.guid.prefix);
+                    self.learn_participant(&announcement, &origin);
+                    // The sockets of a session without tokens are not remembered.
+                    for socket in self.zenoh.sockets(announcement.guid.prefix) {
+                        self.receivers.sends(socket, announcement.guid.prefix);
+                    }
+                }
+                GraphChange::ParticipantGone(guid) => {
+                    let origin = origin(guid.prefix);
+                    self.discovery
+                        .participant_gone(guid, &origin, &mut self.journal);
+                }
+                GraphChange::Endpoint(announcement) => {
+                    let origin = origin(announcement.guid.prefix);
+                    self.name_writer(&announcement);
+                    self.learn_endpoint(*announcement, &origin);
+                }
+                GraphChange::EndpointGone(guid) => {
+                    let origin = origin(guid.prefix);
+                    self.discovery
+                        .endpoint_gone(guid, &origin, &mut self.journal);
+                }
+                GraphChange::Nodes(entities) => {
+                    let origin = origin(entities.participant.prefix);
+                    self.learn_entities(&entities, entities.participant, &origin);
+                }
+            }
+        }
+        self.follow_up(at);
+    }
+
+    /// Renames what an announced writer sent while its token was unknown.
+    fn name_writer(&mut self, announcement: &EndpointAnnouncement) {
+        if announcement.role == Role::Writer {
+            let before = unknown_guid(Gid(announcement.gid));
+            self.profiler.rename(before, announcement.guid);
+            self.payloads.rename(before, announcement.guid);
+            self.interest.remove(before);
+        }
+    }
+
+    /// Counts a sample, request or reply.
+    fn zenoh_sample(&mut self, stream: &StreamId, time: Timestamp, sample: &ZenohSample<'_>) {
+        let record = record(stream, time, sample);
+        if let Some((client, number)) = sample.call {
+            let call = CallId {
+                client: client.0,
+                number,
+            };
+            let at = self.wall_clock.model_time(time);
+            let captured = sample.payload.captured;
+            let is_over =
+                self.services
+                    .identified(record.writer(), sample.number, call, captured, at);
+            self.follow_call(record.writer(), is_over);
+        }
+        if let Some(payload) = sample.payload.whole() {
+            self.keep_payload(&record, payload);
+        }
+        self.count(&record);
+        if stream.outgoing && stream.is_loopback() {
+            // Nothing is read at the receiver's socket: TCP brings it what was sent.
+            self.count(&Record {
+                flags: record.flags & !flag::OUTGOING,
+                socket: sample.receiving_socket,
+                ..record
+            });
+        }
+    }
+}
+
+/// Returns the record of a sample that has arrived whole.
+fn record(stream: &StreamId, time: Timestamp, sample: &ZenohSample<'_>) -> Record {
+    let mut flags = flag::STREAM;
+    for (is_set, bit) in [
+        (sample.is_relayed, flag::RELAYED),
+        (stream.outgoing, flag::OUTGOING),
+        (stream.socket != 0, flag::HOST),
+        (!is_ipv4(stream), flag::IPV6),
+    ] {
+        flags |= if is_set { bit } else { 0 };
+    }
+    let head: Option<&[u8; STAMP_END]> = sample.payload.captured.first_chunk();
+    let (mut encapsulation, mut seconds, mut nanoseconds) = (0, 0, 0);
+    if let Some([a, b, c, d, s @ .., e, f, g, h]) = head
+        && let [s0, s1, s2, s3] = *s
+    {
+        encapsulation = u32::from_be_bytes([*a, *b, *c, *d]);
+        // The lowest bit of the identifier is the byte order (RTPS 2.5, 10.5).
+        let word = |bytes: [u8; 4]| match b & 1 {
+            0 => u32::from_be_bytes(bytes),
+            _ => u32::from_le_bytes(bytes),
+        };
+        (seconds, nanoseconds) = (word([s0, s1, s2, s3]), word([*e, *f, *g, *h]));
+        flags |= flag::STAMP;
+    }
+    let receiver = Guid::new(
+        sample.receiver.unwrap_or(GuidPrefix::UNKNOWN),
+        EntityId::UNKNOWN,
+    );
+    let flow = stream.flow;
+    let elapsed = time.0.saturating_sub(sample.began.0);
+    Record {
+        time: time.0,
+        writer: guid_words(sample.writer),
+        reader: guid_words(receiver),
+        sequence_number: sample.number.0,
+        source_timestamp: sample
+            .source_timestamp
+            .map_or(0, |time| RtpsTime::of(time).0),
+        destination: words(flow.destination.address),
+        destination_port: flow.destination.port,
+        source_port: flow.source.port,
+        interface: stream.interface,
+        kind: kind::DATA,
+        submessage_flags: SubmessageFlags::DATA.0,
+        flags,
+        payload_len: u32::try_from(sample.payload.length).unwrap_or(u32::MAX),
+        encapsulation,
+        stamp_seconds: seconds,
+        stamp_nanoseconds: nanoseconds,
+        socket: stream.socket,
+        elapsed: u32::try_from(elapsed).unwrap_or(u32::MAX),
+        ..Record::default()
+    }
+}
+
+/// Returns the words of an address in a record, which hold its bytes.
+fn words(address: [u8; 16]) -> [u32; 4] {
+    guid_words(Guid::from_bytes(address))
+}
+
+fn is_ipv4(stream: &StreamId) -> bool {
+    stream.flow.destination.socket_address().is_ipv4()
+}
+
+/// Number of the first change.
+pub(super) const FIRST_CHANGE: SequenceNumber = SequenceNumber(1);

@@ -1,0 +1,213 @@
+//! Transports between a writer and a reader, as far as both announce them: the network, or a
+//! transport within their host that the network does not show.
+//!
+//! The result is the transport that they would use; whether they match is decided elsewhere.
+
+use std::time::Duration;
+
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
+
+use crate::graph::discovery::{Discovery, Endpoint};
+use crate::report::snapshot::{EndpointFacts, Transport, TransportCount};
+
+/// Largest number of pairs examined per topic; the others are assumed to be alike.
+const MAX_PAIRS: usize = 1024;
+/// A participant without announced nodes for this long does not use ROS, and its endpoints have no
+/// node.
+const NODES_WITHIN: Duration = Duration::from_secs(30);
+const NODE_WITHIN: Duration = Duration::from_secs(10);
+
+/// Counts the pairs of these writers and readers by transport: all pairs, and those with both ends
+/// in observed processes. Passes each endpoint its transports.
+pub(crate) fn transports(
+    discovery: &Discovery,
+    writers: &mut [EndpointFacts],
+    readers: &mut [EndpointFacts],
+    is_observed: impl Fn(Guid) -> bool,
+) -> (Vec<TransportCount>, Vec<TransportCount>) {
+    let none = Transport::ALL.map(|transport| TransportCount {
+        transport,
+        pairs: 0,
+    });
+    let (mut counts, mut observed) = (none, none);
+    let mut left = MAX_PAIRS;
+    for writer in writers.iter_mut() {
+        for reader in readers.iter_mut().take(left) {
+            left -= 1;
+            let Some(transport) = transport(discovery, writer.guid, reader.guid) else {
+                continue;
+            };
+            writer.transports |= transport.bit();
+            reader.transports |= transport.bit();
+            let both = is_observed(writer.guid) && is_observed(reader.guid);
+            for (list, counts_here) in [(&mut counts, true), (&mut observed, both)] {
+                let count = list.iter_mut().find(|count| count.transport == transport);
+                if let Some(count) = count.filter(|_| counts_here) {
+                    count.pairs += 1;
+                }
+            }
+        }
+    }
+    if left == 0 {
+        let all = readers
+            .iter()
+            .fold(0, |all, reader| all | reader.transports);
+        let unseen = writers.iter_mut().chain(readers);
+        for endpoint in unseen.filter(|endpoint| endpoint.transports == 0) {
+            endpoint.transports = all;
+        }
+    }
+    let shown =
+        |counts: [TransportCount; 5]| counts.into_iter().filter(|count| count.pairs > 0).collect();
+    (shown(counts), shown(observed))
+}
+
+/// Returns whether a participant on this writer's host may receive its samples through Fast DDS's
+/// shared memory. The participant need not be a known reader.
+pub(crate) fn may_share_memory(discovery: &Discovery, writer: Guid) -> bool {
+    let participants = discovery.participants();
+    let own = participants.get(&writer.prefix);
+    if vendor(discovery, writer.prefix) != VendorId::EPROSIMA {
+        return false;
+    }
+    own.is_none_or(|own| own.proxy.shared_memory)
+        && participants.iter().any(|(prefix, other)| {
+            *prefix != writer.prefix
+                && other.proxy.shared_memory
+                && is_one_host(VendorId::EPROSIMA, *prefix, writer.prefix)
+        })
+}
+
+/// Returns whether all samples of this writer pass through Fast DDS's shared memory, which is polled:
+/// some of these readers receive there, and none on the network.
+pub(crate) fn is_polled(discovery: &Discovery, writer: Guid, readers: &[Guid]) -> bool {
+    let mut is_shared = false;
+    for reader in readers.iter().take(MAX_PAIRS) {
+        match transport(discovery, writer, *reader) {
+            Some(Transport::SharedMemory) => is_shared = true,
+            Some(Transport::Network) => return false,
+            _ => {}
+        }
+    }
+    is_shared
+}
+
+/// Returns whether names are missing that shared memory may contain at present: nodes of a
+/// participant, or the node of an endpoint.
+pub(crate) fn lacks_names(discovery: &Discovery, now: Timestamp) -> bool {
+    let is_new = |first_seen: Timestamp, within: Duration| first_seen + within > now;
+    let participants = discovery.participants();
+    participants.values().any(|participant| {
+        participant.proxy.shared_memory
+            && participant.nodes.is_empty()
+            && is_new(participant.first_seen, NODES_WITHIN)
+    }) || discovery.endpoints().iter().any(|(guid, endpoint)| {
+        is_new(endpoint.first_seen, NODE_WITHIN)
+            && participants
+                .get(&guid.prefix)
+                .is_some_and(|participant| participant.proxy.shared_memory)
+    })
+}
+
+/// Returns the transport between this writer and this reader; `None` if one is unknown, or if they
+/// have no protocol in common.
+pub(crate) fn transport(discovery: &Discovery, writer: Guid, reader: Guid) -> Option<Transport> {
+    let endpoints = discovery.endpoints();
+    let (of_writer, of_reader) = (endpoints.get(&writer)?, endpoints.get(&reader)?);
+    if writer.prefix.is_zenoh() != reader.prefix.is_zenoh() {
+        return None;
+    }
+    if is_one_process(discovery, writer.prefix, reader.prefix) {
+        return Some(Transport::SameProcess);
+    }
+    let (vendor, other) = (
+        vendor(discovery, writer.prefix),
+        vendor(discovery, reader.prefix),
+    );
+    if vendor != other || !is_one_host(vendor, writer.prefix, reader.prefix) {
+        return Some(Transport::Network);
+    }
+    let shared_memory = |guid: Guid, endpoint: &Endpoint| {
+        let participant = discovery.participants().get(&guid.prefix);
+        let default = participant.is_some_and(|known| known.proxy.shared_memory);
+        endpoint.shared_memory.unwrap_or(default)
+    };
+    Some(if of_writer.data_sharing && of_reader.data_sharing {
+        Transport::DataSharing
+    } else if !(shared_memory(writer, of_writer) && shared_memory(reader, of_reader)) {
+        Transport::Network
+    } else if vendor == VendorId::EPROSIMA {
+        Transport::SharedMemory
+    } else {
+        Transport::Iceoryx
+    })
+}
+
+/// Returns the implementation of a participant.
+pub(crate) fn vendor(discovery: &Discovery, prefix: GuidPrefix) -> VendorId {
+    let participant = discovery.participants().get(&prefix);
+    let [first, second, ..] = prefix.0;
+    participant.map_or(VendorId([first, second]), |known| known.proxy.vendor)
+}
+
+/// Returns whether both are one participant or in one process. Fast DDS stores vendor, host and
+/// process in the first eight bytes: the process id in the fifth and sixth, random bits in the next
+/// two.
+fn is_one_process(discovery: &Discovery, one: GuidPrefix, other: GuidPrefix) -> bool {
+    one == other
+        || vendor(discovery, one) == VendorId::EPROSIMA
+            && vendor(discovery, other) == VendorId::EPROSIMA
+            && one.0.first_chunk::<8>() == other.0.first_chunk::<8>()
+}
+
+/// Returns whether both are on one host. Fast DDS stores vendor and host in the first four bytes;
+/// only participants that announce shared memory are compared.
+fn is_one_host(vendor: VendorId, one: GuidPrefix, other: GuidPrefix) -> bool {
+    vendor != VendorId::EPROSIMA || one.0.first_chunk::<4>() == other.0.first_chunk::<4>()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::graph::discovery::Caps;
+
+    fn prefix(bytes: [u8; 12]) -> GuidPrefix {
+        GuidPrefix(bytes)
+    }
+
+    #[test]
+    fn a_fast_dds_prefix_contains_host_and_process_and_others_do_not() {
+        let discovery = Discovery::new(Caps {
+            participants: 1,
+            endpoints: 1,
+            nodes: 1,
+        });
+        let one = prefix([1, 15, 13, 4, 9, 9, 7, 7, 0, 0, 0, 0]);
+        let sibling = prefix([1, 15, 13, 4, 9, 9, 7, 7, 1, 0, 0, 0]);
+        let neighbour = prefix([1, 15, 13, 4, 8, 9, 7, 7, 0, 0, 0, 0]);
+        let unknown_writer = prefix([1, 15, 14, 4, 9, 9, 7, 7, 0, 0, 0, 0]);
+        assert!(is_one_process(&discovery, one, one));
+        assert!(is_one_process(&discovery, one, sibling));
+        assert!(!is_one_process(&discovery, one, neighbour));
+        assert!(is_one_host(VendorId::EPROSIMA, one, neighbour));
+        assert!(!is_one_host(VendorId::EPROSIMA, one, unknown_writer));
+        let (cyclone, other) = (
+            prefix([1, 16, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1]),
+            prefix([1, 16, 0, 0, 1, 1, 1, 1, 2, 1, 1, 1]),
+        );
+        assert!(is_one_process(&discovery, cyclone, cyclone));
+        assert!(!is_one_process(&discovery, cyclone, other));
+    }
+
+    #[test]
+    fn endpoints_that_are_not_known_are_no_pair() {
+        let discovery = Discovery::new(Caps {
+            participants: 1,
+            endpoints: 1,
+            nodes: 1,
+        });
+        let guid = Guid::default();
+        assert_eq!(transport(&discovery, guid, guid), None);
+    }
+}
