@@ -72,6 +72,8 @@ fn is_accessible(how: &str) -> Result<()> {
     let place = Place::new()?;
     let _agent = place.agent(&format!("{SENSORS}{}", place.recordings()))?;
     let _robot = Robot::start(&place.host)?;
+    // The topic with the longest badge.
+    let _unmatched = place.publisher("/unmatched", "/alone")?;
     watch(&place.inside(), "access", &[PAGE, how])
 }
 

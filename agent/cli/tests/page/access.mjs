@@ -115,7 +115,9 @@ async function themes(open) {
 
 async function small(open, width, height, scale) {
   const tab = await open({ width, height, scale });
-  await tab.live();
+  await tab.go('#/topics');
+  // The longest word of a topic's state.
+  await tab.page.locator('.badge', { hasText: 'unmatched pub' }).first().waitFor();
   for (const [fragment, ready] of VIEWS) {
     await tab.go(fragment);
     await tab.page.locator(ready).first().waitFor({ state: 'attached' });
