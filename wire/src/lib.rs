@@ -44,6 +44,7 @@ pub mod time;
 pub mod walk;
 #[cfg(feature = "alloc")]
 pub mod zenoh;
+pub mod zenoh_stream;
 
 pub use cursor::{Cursor, Endianness, Reason, WireError};
 pub use domain::{DomainId, InvalidDomainId};

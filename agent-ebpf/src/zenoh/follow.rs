@@ -7,7 +7,7 @@
 
 use aya_ebpf::bindings::__sk_buff;
 use core::mem::swap;
-use ros2probe_wire::{filter::Counter, host::chunk as part};
+use ros2probe_wire::{filter::Counter, host::chunk as part, zenoh_stream::PREFIX};
 
 use crate::maps::{copy, count};
 
@@ -26,8 +26,6 @@ const GAP_BYTES: u32 = 16 << 20;
 const ALIVE_NANOSECONDS: u64 = 1_000_000_000;
 /// Bytes of a batch that is passed on for that reason only.
 const ALIVE_BYTES: u32 = 256;
-/// Bytes of the length before a batch.
-const PREFIX: u32 = 2;
 /// Marks a known first byte of a length.
 const SPLIT: u32 = 0x100;
 

@@ -1,18 +1,11 @@
 //! Reads the header of a batch: which bytes of it are needed, and whether it may be one at all.
 
+use ros2probe_wire::zenoh_stream::{Lanes, PREFIX, message};
+
 use super::{
     push,
     state::{WINDOW, Window, chain, segment},
 };
-
-/// Transport messages (`zenoh-protocol`, `transport/`).
-pub mod id {
-    pub const INIT: u32 = 1;
-    pub const KEEP_ALIVE: u32 = 4;
-    pub const FRAME: u32 = 5;
-    pub const FRAGMENT: u32 = 6;
-    pub const JOIN: u32 = 7;
-}
 
 /// Everything of a batch is needed.
 pub const WHOLE: u32 = u32::MAX;
@@ -21,10 +14,13 @@ const CONTINUATION: u32 = 16;
 /// Priority of data without another one, and of declarations.
 const DATA: u32 = 5;
 const CONTROL: u32 = 0;
-/// The least id of a network message.
-const LEAST_NETWORK: u32 = 0x19;
-/// Bytes of a length before a batch.
-const PREFIX: u32 = 2;
+/// Transport messages.
+const ID: u32 = message::ID as u32;
+const KEEP_ALIVE: u32 = message::KEEP_ALIVE as u32;
+const FRAME: u32 = message::FRAME as u32;
+const FRAGMENT: u32 = message::FRAGMENT as u32;
+const JOIN: u32 = message::JOIN as u32;
+const LEAST_NETWORK: u32 = message::LEAST_NETWORK as u32;
 /// Most bytes of a number.
 const NUMBER: u32 = 9;
 /// Most extensions of a message.
@@ -55,12 +51,12 @@ fn batch(slot: u32) -> Option<()> {
         // The segment ends before it.
         return Some(());
     };
-    let kind = header & 0x1f;
-    if kind > id::JOIN {
+    let kind = header & ID;
+    if kind > JOIN {
         return None;
     }
-    this.wakes = u32::from(kind != id::KEEP_ALIVE && kind < id::FRAME);
-    if kind != id::FRAME && kind != id::FRAGMENT {
+    this.wakes = u32::from(kind != KEEP_ALIVE && kind < FRAME);
+    if kind != FRAME && kind != FRAGMENT {
         return Some(());
     }
     this.at = PREFIX + 1;
@@ -72,13 +68,13 @@ fn batch(slot: u32) -> Option<()> {
         return is_cut(slot, kind);
     }
     this.message = this.at;
-    this.lane = 1 << 16 | this.priority << 8 | header & 0x20;
+    this.lane = Lanes::key(this.priority, header & 0x20);
     let is_control = this.priority == CONTROL;
     this.wakes = u32::from(is_control);
     if this.is_judged != 0 {
         return Some(());
     }
-    let in_frame = kind == id::FRAME;
+    let in_frame = kind == FRAME;
     let is_first = in_frame || this.is_first != 0 || this.state.chain & chain::OPEN == 0;
     if is_first && !in_frame {
         this.state.chain = 0;
@@ -109,7 +105,7 @@ fn is_cut(slot: u32, kind: u32) -> Option<()> {
     if this.end == WINDOW || this.end == this.total {
         return None;
     }
-    if kind == id::FRAGMENT && this.state.chain & chain::OPEN == 0 {
+    if kind == FRAGMENT && this.state.chain & chain::OPEN == 0 {
         // Whose sample it is, is not known: all of it is passed on.
         this.state.chain = chain::OPEN | chain::WHOLE;
     }
@@ -126,19 +122,19 @@ pub fn is_plausible(slot: u32) -> bool {
     let Some(header) = window.byte(PREFIX, this.end) else {
         return false;
     };
-    if header & 0x1f == id::KEEP_ALIVE {
-        return header == id::KEEP_ALIVE && this.total == PREFIX + 1;
+    if header & ID == KEEP_ALIVE {
+        return header == KEEP_ALIVE && this.total == PREFIX + 1;
     }
     if this.lane == 0 {
         return false;
     }
-    if header & 0x1f == id::FRAGMENT {
+    if header & ID == FRAGMENT {
         return true;
     }
     let Some(next) = window.byte(this.message, this.end) else {
         return false;
     };
-    header & 0x40 == 0 && next & 0x1f >= LEAST_NETWORK
+    header & 0x40 == 0 && next & ID >= LEAST_NETWORK
 }
 
 /// Reads a number of variable length at the reader's position into `value`, whose upper bits are

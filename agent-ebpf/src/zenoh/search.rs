@@ -5,7 +5,11 @@
 //! continue the sequence numbers of their lane. All of this stays in the kernel.
 
 use aya_ebpf::bindings::__sk_buff;
-use ros2probe_wire::{filter::Counter, host::chunk as part};
+use ros2probe_wire::{
+    filter::Counter,
+    host::chunk as part,
+    zenoh_stream::{Beginning, HEAD, Lanes, PREFIX},
+};
 
 use crate::{
     maps::{copy, count},
@@ -14,83 +18,34 @@ use crate::{
 
 use super::{
     chunk::{self, WAKE},
-    is_zenoh_port,
-    message::{self, id},
+    is_zenoh_port, message,
     state::{CANDIDATES, CONNECTIONS, Current, Direction, Key, Window, body, mode, note, segment},
 };
 
-/// Batches that continue the numbers of their lane and make a boundary certain.
-const CERTAIN: u32 = 2;
 /// Most batches of one packet that are read for it.
 const BATCHES: u32 = 32;
-/// Version of the wire format.
-const VERSION: u32 = 9;
-/// Largest version that is another version of Zenoh rather than something else.
-const PLAUSIBLE_VERSION: u32 = 0x3f;
-/// A KEEP_ALIVE alone in its batch, which is alone in its packet.
-const KEEP_ALIVE: [u8; 3] = [1, 0, 4];
-/// A record of TLS with a handshake, whose version begins with 3.
-const TLS: u32 = 0x0316;
 /// Bytes of TLS that are passed on, once.
 const TLS_BYTES: u32 = 16;
-
-/// What a packet begins with.
-mod first {
-    pub const OTHER: u32 = 0;
-    pub const INIT: u32 = 1;
-    pub const OTHER_VERSION: u32 = 2;
-    pub const KEEP_ALIVE: u32 = 3;
-    pub const TLS: u32 = 4;
-    pub const BATCH: u32 = 5;
-}
 
 /// Returns whether the payload may belong to a connection of Zenoh that is not known yet.
 #[inline(always)]
 pub fn may_be(skb: *mut __sk_buff, body: u32, len: u32, key: &Key, is_noted: bool) -> bool {
     len != 0
-        && (begins_with(skb, body, len, key.ports) != first::OTHER
+        && (begins_with(skb, body, len, key.ports) != Beginning::Other
             || is_noted && CANDIDATES.get_ptr_mut(key).is_some())
 }
 
-/// Returns what a payload begins with, one of [`first`].
+/// Returns what a payload begins with.
 #[inline(always)]
-fn begins_with(skb: *mut __sk_buff, at: u32, len: u32, ports: u32) -> u32 {
-    if len < 8 {
-        let is_alive = len == 3 && load::<[u8; 3]>(skb, at) == Some(KEEP_ALIVE);
-        return if is_alive {
-            first::KEEP_ALIVE
-        } else {
-            first::OTHER
-        };
-    }
-    let Some([one, two]): Option<[u32; 2]> = load(skb, at) else {
-        return first::OTHER;
+fn begins_with(skb: *mut __sk_buff, at: u32, len: u32, ports: u32) -> Beginning {
+    let beginning = if len >= HEAD as u32 {
+        load(skb, at).map(|head| Beginning::of(head, len, is_zenoh_port(ports)))
+    } else if len == 3 {
+        load(skb, at).map(Beginning::of_three)
+    } else {
+        None
     };
-    let (one, two) = (u32::from_le(one), u32::from_le(two));
-    let (length, header, next) = (one & 0xffff, one >> 16 & 0xff, one >> 24);
-    if length == TLS && header <= 4 {
-        // The handshake's first message: of the client or the server.
-        let kind = two >> 8 & 0xff;
-        return if (kind == 1 || kind == 2) && is_zenoh_port(ports) {
-            first::TLS
-        } else {
-            first::OTHER
-        };
-    }
-    if length == 0 {
-        return first::OTHER;
-    }
-    match header & 0x1f {
-        id::INIT if length + 2 <= len && next == VERSION && two & 0x0c == 0 && two & 3 != 3 => {
-            first::INIT
-        }
-        id::INIT if length + 2 <= len && next <= PLAUSIBLE_VERSION && is_zenoh_port(ports) => {
-            first::OTHER_VERSION
-        }
-        id::FRAME if header & 0x40 == 0 => first::BATCH,
-        id::FRAGMENT => first::BATCH,
-        _ => first::OTHER,
-    }
+    beginning.unwrap_or(Beginning::Other)
 }
 
 /// Looks for a boundary in a direction that is not known; returns 1 if it is known now, and the
@@ -103,17 +58,17 @@ pub extern "C" fn at_socket(skb: *mut __sk_buff, slot: u32) -> u32 {
     };
     let begins = begins_with(skb, this.body, this.len, this.key.ports);
     match begins {
-        first::INIT => {
+        Beginning::Init => {
             begin(slot, u32::from(part::SYN));
             know(slot, this, mode::FOLLOWED)
         }
-        first::KEEP_ALIVE => {
+        Beginning::KeepAlive => {
             begin(slot, u32::from(part::LOST));
             know(slot, this, mode::FOLLOWED)
         }
-        first::OTHER_VERSION | first::TLS => {
+        Beginning::OtherVersion | Beginning::Tls => {
             begin(slot, u32::from(part::SYN));
-            let all = if begins == first::TLS {
+            let all = if begins == Beginning::Tls {
                 TLS_BYTES
             } else {
                 this.len
@@ -148,7 +103,7 @@ pub extern "C" fn on_interface(skb: *mut __sk_buff, slot: u32) -> u32 {
         return 0;
     };
     let begins = begins_with(skb, this.body, this.len, this.key.ports);
-    if begins != first::INIT && begins != first::KEEP_ALIVE && guess(skb, slot) == 0 {
+    if !matches!(begins, Beginning::Init | Beginning::KeepAlive) && guess(skb, slot) == 0 {
         return 0;
     }
     begin(slot, 0);
@@ -189,12 +144,8 @@ extern "C" fn close(slot: u32) -> u32 {
     let guess = &mut this.state.guess;
     guess.boundary = number;
     guess.next = number;
-    guess.proofs = 0;
     guess.is_open = 0;
-    guess.lanes[0] = 0;
-    guess.lanes[1] = 0;
-    guess.expected[0] = 0;
-    guess.expected[1] = 0;
+    guess.lanes = Lanes::new();
     0
 }
 
@@ -251,12 +202,12 @@ pub extern "C" fn judge(skb: *mut __sk_buff, slot: u32, to_end: u32) -> u32 {
         let offset = this.state.guess.boundary.wrapping_sub(this.sequence_number);
         if offset >= this.len {
             this.state.guess.next = this.sequence_number.wrapping_add(this.len);
-            return u32::from(this.state.guess.proofs >= CERTAIN);
+            return u32::from(this.state.guess.lanes.are_certain());
         }
         if fits(skb, slot, offset) == 0 {
             break;
         }
-        if to_end == 0 && this.state.guess.proofs >= CERTAIN {
+        if to_end == 0 && this.state.guess.lanes.are_certain() {
             return 1;
         }
         this.state.guess.boundary = this.state.guess.boundary.wrapping_add(this.total);
@@ -277,37 +228,19 @@ extern "C" fn fits(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
     let (Some(low), Some(high)) = (window.byte(0, read), window.byte(1, read)) else {
         return 0;
     };
-    this.total = (low | high << 8) + 2;
+    this.total = (low | high << 8) + PREFIX;
     if this.end > this.total {
         this.end = this.total;
     }
     this.is_judged = 1;
-    if this.total == 2 || message::read(slot) == 0 || !message::is_plausible(slot) {
+    if this.total == PREFIX || message::read(slot) == 0 || !message::is_plausible(slot) {
         return 0;
     }
     let (lane, number) = (this.lane, this.number);
-    let guess = &mut this.state.guess;
+    let lanes = &mut this.state.guess.lanes;
     if lane == 0 {
-        guess.proofs += 1;
+        lanes.keep_alive();
         return 1;
     }
-    let index = if guess.lanes[0] == 0 || guess.lanes[0] == lane {
-        0
-    } else {
-        1
-    };
-    if guess.lanes[index] == 0 {
-        guess.lanes[index] = lane;
-    } else if guess.lanes[index] != lane {
-        return 1;
-    } else {
-        // One number is left out behind the FRAGMENTs of a message.
-        let ahead = number.wrapping_sub(guess.expected[index]);
-        if ahead > 1 {
-            return 0;
-        }
-        guess.proofs += 1;
-    }
-    guess.expected[index] = number.wrapping_add(1);
-    1
+    u32::from(lanes.continues(lane, number))
 }

@@ -7,7 +7,10 @@ use aya_ebpf::{
     macros::map,
     maps::{Array, LruHashMap, PerCpuArray},
 };
-use ros2probe_wire::filter::{CANDIDATE_CAPACITY, CONNECTION_CAPACITY, PORT_CAPACITY};
+use ros2probe_wire::{
+    filter::{CANDIDATE_CAPACITY, CONNECTION_CAPACITY, PORT_CAPACITY},
+    zenoh_stream::Lanes,
+};
 
 use crate::{
     instructions::opaque,
@@ -83,7 +86,7 @@ pub struct Key {
     pub outgoing: u32,
 }
 
-/// Numbers of up to two lanes of a direction that may be of Zenoh.
+/// Batches of a direction that may be of Zenoh.
 // Aligned, so that it is copied in few steps: the stack is small.
 #[repr(C, align(8))]
 #[derive(Clone, Copy)]
@@ -92,12 +95,10 @@ pub struct Guess {
     pub boundary: u32,
     /// Sequence number of the next byte.
     pub next: u32,
-    /// Batches that continued the numbers of their lane.
-    pub proofs: u32,
     /// Whether the other fields hold anything.
     pub is_open: u32,
-    pub lanes: [u32; 2],
-    pub expected: [u32; 2],
+    /// Numbers of their lanes.
+    pub lanes: Lanes,
 }
 
 /// State of one direction.

@@ -36,7 +36,7 @@ mod vectors;
 
 /// TCP port of routers: the default of `rmw_zenohd`.
 pub const PORT: u16 = 7447;
-
+pub use crate::zenoh_stream::VERSION;
 pub use attachment::{Attachment, Gid};
 pub use batch::{Batch, Close, Fragment, Frame, Lane, Message, Priority};
 pub use body::{Del, Encoding, Put, Query, Response as ResponseBody, Sample};
@@ -51,6 +51,6 @@ pub use network::{
 pub use reader::{Bytes, vle};
 pub use session::{
     Features, Init, Join, NextSequenceNumbers, Open, Resolution, Session, Side, Unobservable,
-    VERSION, WhatAmI,
+    WhatAmI,
 };
 pub use token::{BridgeToken, EndpointKind, EndpointToken, NodeToken, Token};

@@ -5,14 +5,12 @@ use core::fmt;
 use core::time::Duration;
 
 use crate::cursor::{Reason, WireError};
+use crate::zenoh_stream::VERSION;
 
 use super::batch::Priority;
 use super::extension::Extensions;
 use super::identity::ZenohId;
 use super::reader::{Bytes, Reader};
-
-/// Version of the wire format since Zenoh 1.0.
-pub const VERSION: u8 = 0x09;
 
 /// Role of a session in the topology.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]

@@ -1,18 +1,14 @@
 //! Searches for the boundary of a batch, at the beginning of a connection or inside it.
 //!
 //! Segments of small messages begin with a batch. From such a place on, bytes are collected as long
-//! as they can be read as batches. Two messages that continue the numbers of a lane are proof. A
-//! KEEP_ALIVE alone in its batch, or an INIT, needs no other one.
+//! as they can be read as batches. The rules are those of the kernel programs
+//! ([`ros2probe_wire::zenoh_stream`]).
 
 use ros2probe_model::facts::bounded::Bounded;
-use ros2probe_wire::zenoh::{Batch, Lane, Message, Resolution, VERSION};
+use ros2probe_wire::zenoh::{Batch, Lane, Message};
+use ros2probe_wire::zenoh_stream::{Beginning, Lanes, message};
 
 use crate::tables::SearchedBytes;
-
-/// Messages of a lane that continue its numbers and so make a boundary certain.
-const CERTAIN: u32 = 2;
-/// Largest version that is another version of Zenoh rather than something else.
-const PLAUSIBLE_VERSION: u8 = 0x3f;
 
 /// What the bytes look like.
 pub enum Looks {
@@ -20,6 +16,8 @@ pub enum Looks {
     Zenoh(Vec<u8>),
     /// More bytes are needed.
     Undecided,
+    /// A handshake of TLS on a port of Zenoh.
+    Tls,
     /// Something else.
     Other,
 }
@@ -36,31 +34,34 @@ impl Search {
         self.held.capacity()
     }
 
-    /// Returns whether nothing is collected.
-    pub fn is_empty(&self) -> bool {
-        self.held.is_empty()
-    }
-
     /// Adds the bytes of a segment. If `begins`, the connection begins with the first of them all.
-    pub fn add(&mut self, bytes: &[u8], length: usize, begins: bool) -> Looks {
+    pub fn add(&mut self, bytes: &[u8], length: usize, begins: bool, is_port: bool) -> Looks {
         let was_empty = self.held.is_empty();
-        if bytes.len() < length || !self.held.extend_from_slice(bytes) {
+        let is_whole = bytes.len() >= length;
+        if begins {
+            // The first bytes suffice for TLS, of which the programs pass on no more.
+            let looks = match self.held.extend_from_slice(bytes) {
+                true => self.begin(is_port),
+                false => Looks::Other,
+            };
+            return self.settled(match looks {
+                Looks::Zenoh(_) | Looks::Undecided if !is_whole => Looks::Other,
+                looks => looks,
+            });
+        }
+        if !is_whole || !self.held.extend_from_slice(bytes) {
             // Without all bytes no boundary can be found.
             self.held.take();
-            return if begins {
-                Looks::Other
-            } else {
-                Looks::Undecided
-            };
+            return Looks::Undecided;
         }
-        let looks = self.judge(begins);
-        if begins || was_empty || !matches!(looks, Looks::Other) {
+        let looks = self.judge(is_port);
+        if was_empty || !matches!(looks, Looks::Other) {
             return self.settled(looks);
         }
         // The collected bytes began within a batch: this segment may begin with one.
         self.held.take();
         self.held.extend_from_slice(bytes);
-        let looks = self.judge(false);
+        let looks = self.judge(is_port);
         self.settled(looks)
     }
 
@@ -71,105 +72,86 @@ impl Search {
         looks
     }
 
-    fn judge(&mut self, begins: bool) -> Looks {
+    /// Judges the first bytes of a connection.
+    fn begin(&mut self, is_port: bool) -> Looks {
+        let Some(head) = self.held.first_chunk() else {
+            return match self.held.get(2) {
+                Some(header) if header & message::ID != message::INIT => Looks::Other,
+                _ => Looks::Undecided,
+            };
+        };
+        // The segments that follow have the rest of an INIT.
+        match Beginning::of(*head, u32::MAX, is_port) {
+            Beginning::Init | Beginning::OtherVersion => Looks::Zenoh(self.held.take()),
+            Beginning::Tls => Looks::Tls,
+            _ => Looks::Other,
+        }
+    }
+
+    fn judge(&mut self, is_port: bool) -> Looks {
         let mut rest = &self.held[..];
-        let mut lanes = Lanes::default();
-        let mut is_first = begins;
+        let beginning = match (rest.first_chunk(), rest.as_array()) {
+            (Some(head), _) => Beginning::of(
+                *head,
+                u32::try_from(rest.len()).unwrap_or(u32::MAX),
+                is_port,
+            ),
+            (None, Some(three)) => Beginning::of_three(*three),
+            (None, None) => Beginning::Other,
+        };
+        if matches!(beginning, Beginning::Init | Beginning::KeepAlive) {
+            return Looks::Zenoh(self.held.take());
+        }
+        let mut lanes = Lanes::new();
         while rest.len() > 2 {
             let Some((batch, after)) = Batch::split(rest) else {
-                return match plausible_start(rest, is_first) {
+                return match may_be_batch(rest) {
                     true => Looks::Undecided,
                     false => Looks::Other,
                 };
             };
-            let plausible = match is_first {
-                true => lanes.is_beginning(batch),
-                false => lanes.continues(batch),
-            };
-            if !plausible {
+            if !continues(&mut lanes, batch) {
                 return Looks::Other;
             }
-            if lanes.certain >= CERTAIN {
+            if lanes.are_certain() {
                 return Looks::Zenoh(self.held.take());
             }
-            (rest, is_first) = (after, false);
+            rest = after;
         }
         Looks::Undecided
     }
 }
 
-/// Numbers of the lanes in some batches.
-#[derive(Default)]
-struct Lanes {
-    next: Vec<(Lane, u32)>,
-    certain: u32,
-}
-
-impl Lanes {
-    /// Returns whether a connection may begin with this batch, which is certain then.
-    fn is_beginning(&mut self, batch: &[u8]) -> bool {
-        self.certain = CERTAIN;
-        let is_init = matches!(Batch::whole(batch).next(), Some(Ok(Message::Init(_))));
-        // Another version may have another INIT.
-        let is_other_version = matches!(batch, [header, version, ..] if header & 0x1f == 1
-            && *version != VERSION
-            && *version <= PLAUSIBLE_VERSION);
-        is_init || is_other_version
-    }
-
-    /// Returns whether this batch may follow those before.
-    fn continues(&mut self, batch: &[u8]) -> bool {
-        let mut is_empty = true;
-        for message in Batch::whole(batch) {
-            is_empty = false;
-            let (lane, number) = match message {
-                Err(_) => return false,
-                Ok(Message::Init(init)) if init.version == VERSION => {
-                    self.certain = CERTAIN;
-                    continue;
-                }
-                Ok(Message::KeepAlive) if batch.len() == 1 => {
-                    self.certain = CERTAIN;
-                    continue;
-                }
-                Ok(Message::Frame(frame)) => (frame.lane, frame.sequence_number),
-                Ok(Message::Fragment(fragment)) => (fragment.lane, fragment.sequence_number),
-                Ok(_) => continue,
-            };
-            let following = Resolution::DEFAULT.next(number);
-            match self.next.iter_mut().find(|(other, _)| *other == lane) {
-                Some((_, expected)) if follows(*expected, number) => {
-                    *expected = following;
-                    self.certain += 1;
-                }
-                Some(_) => return false,
-                None => self.next.push((lane, following)),
-            }
+/// Returns whether this batch may follow those before.
+fn continues(lanes: &mut Lanes, batch: &[u8]) -> bool {
+    let mut is_empty = true;
+    let mut follows = |lane: Lane, number| {
+        let key = Lanes::key(lane.priority.0.into(), lane.is_reliable.into());
+        lanes.continues(key, number)
+    };
+    for message in Batch::whole(batch) {
+        is_empty = false;
+        let is_plausible = match message {
+            Err(_) => false,
+            Ok(Message::Frame(frame)) => follows(frame.lane, frame.sequence_number),
+            Ok(Message::Fragment(fragment)) => follows(fragment.lane, fragment.sequence_number),
+            Ok(_) => true,
+        };
+        if !is_plausible {
+            return false;
         }
-        !is_empty
     }
-}
-
-/// Returns whether a lane may number its messages so. One number is left out behind fragments.
-fn follows(expected: u32, number: u32) -> bool {
-    number == expected || number == Resolution::DEFAULT.next(expected)
-}
-
-/// Returns whether a segment begins as TLS does: a record with a handshake.
-pub fn begins_tls(bytes: &[u8]) -> bool {
-    matches!(bytes, [0x16, 0x03, 0..=4, ..])
+    if batch == [message::KEEP_ALIVE] {
+        lanes.keep_alive();
+    }
+    !is_empty
 }
 
 /// Returns whether an unfinished batch may be one of Zenoh, by its first bytes.
-fn plausible_start(bytes: &[u8], begins: bool) -> bool {
-    let [low, high, header, rest @ ..] = bytes else {
+fn may_be_batch(bytes: &[u8]) -> bool {
+    let [low, high, header, ..] = bytes else {
         return true;
     };
     let is_empty = *low == 0 && *high == 0;
-    let is_known = match header & 0x1f {
-        _ if begins => header & 0x1f == 1 && rest.first().is_none_or(|it| *it <= PLAUSIBLE_VERSION),
-        1..=6 => true,
-        _ => false,
-    };
-    !is_empty && is_known
+    !is_empty && matches!(header & message::ID, message::INIT..=message::FRAGMENT)
 }

@@ -7,7 +7,7 @@ use ros2probe_model::facts::bounded::{Bounded, Sum};
 use ros2probe_model::graph::zenoh::StreamEvent;
 use ros2probe_wire::Timestamp;
 
-use super::search::{Looks, Search, begins_tls};
+use super::search::{Looks, Search};
 use super::{Before, Chunk, Counters};
 use crate::tables::{SegmentsAhead, SegmentsAheadBytes};
 
@@ -319,17 +319,14 @@ impl Stream {
                 Took::Chunk
             }
             Position::Beginning(search) => {
-                if search.is_empty() && begins_tls(bytes) {
-                    self.position = Position::Other;
-                    self.was_zenoh |= self.is_zenoh_port;
-                    return match self.is_zenoh_port {
-                        true => Took::Tls,
-                        false => Took::NotZenoh,
-                    };
-                }
-                match search.add(bytes, length, true) {
+                match search.add(bytes, length, true, self.is_zenoh_port) {
                     Looks::Zenoh(held) => self.found(&held, counters, report),
                     Looks::Undecided => {}
+                    Looks::Tls => {
+                        self.position = Position::Other;
+                        self.was_zenoh = true;
+                        return Took::Tls;
+                    }
                     Looks::Other => {
                         self.position = Position::Other;
                         return Took::NotZenoh;
@@ -339,7 +336,7 @@ impl Stream {
             }
             Position::Searching(search) => {
                 counters.unsynchronized_bytes += length as u64;
-                if let Looks::Zenoh(held) = search.add(bytes, length, false) {
+                if let Looks::Zenoh(held) = search.add(bytes, length, false, self.is_zenoh_port) {
                     counters.unsynchronized_bytes = counters
                         .unsynchronized_bytes
                         .saturating_sub(held.len() as u64);
