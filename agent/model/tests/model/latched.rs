@@ -201,10 +201,10 @@ fn a_kept_message_follows_a_clock_that_is_set_and_a_received_one_has_its_time() 
         robot.domain.observer.input(Input::ClockSet(step));
         robot.domain.now = sent;
         robot.domain.wait(1_000);
-        let request = request(7);
-        let requests = Arc::new(vec![request.clone()]);
+        let first = request(7);
+        let requests = Arc::new(vec![first.clone()]);
         robot.domain.observer.input(Input::SampleRequests(requests));
-        let kept = robot.domain.observer.latched(&request);
+        let kept = robot.domain.observer.latched(&first);
         assert_eq!(kept[0].time, Timestamp(sent));
         robot.domain.wait(1_000);
         robot.send(guid, 2, 500);
@@ -214,7 +214,9 @@ fn a_kept_message_follows_a_clock_that_is_set_and_a_received_one_has_its_time() 
         };
         assert_eq!(sample.time, Timestamp(robot.domain.now));
         // A message that a client received is kept as well.
-        let kept = robot.domain.observer.latched(&request);
+        let (later, observer) = (request(8), &mut robot.domain.observer);
+        observer.input(Input::SampleRequests(Arc::new(vec![first, later.clone()])));
+        let kept = observer.latched(&later);
         assert_eq!(kept.last().unwrap().time, sample.time);
     }
 }
