@@ -20,7 +20,9 @@ use ros2probe_model::facts::diagnosis::{
 };
 use ros2probe_model::facts::histogram::Histogram;
 use ros2probe_model::facts::loss_share::LossShare;
+use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::facts::watch::Watch;
 use ros2probe_model::graph::discovery::Addresses;
 use ros2probe_model::graph::zenoh::{Counters, ZenohFacts};
@@ -118,15 +120,16 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
         violations: vec!["min_rate_hz"],
     };
     Snapshot {
-        at: Timestamp(1_700_000_000_000_000_000),
+        at: ModelTime::from_nanoseconds(1_700_000_000_000_000_000),
+        wall_clock: WallClock::default(),
         participants: vec![ParticipantFacts {
             guid,
             domain_id: DomainId(0),
             vendor: VendorId::EPROSIMA,
             enclave: Some("/".into()),
             process: process(),
-            first_seen: Timestamp(1),
-            last_seen: Timestamp(2),
+            first_seen: ModelTime::from_nanoseconds(1),
+            last_seen: ModelTime::from_nanoseconds(2),
             lease: ros2probe_wire::RtpsDuration::Finite(Duration::from_secs(20)),
             secured: false,
             restored: false,
@@ -156,7 +159,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             guid,
             vendor: None,
             process: process(),
-            first_seen: Timestamp(3),
+            first_seen: ModelTime::from_nanoseconds(3),
             measurement: measurement(),
         }],
         services: vec![service()],
@@ -174,7 +177,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             unseen: [1, 0, 0, 0, 0, 0],
         }),
         chains: chains(),
-        diagnosed: Arc::new(vec![Timestamp(5); diagnoses().list.len()]),
+        diagnosed: Arc::new(vec![ModelTime::from_nanoseconds(5); diagnoses().list.len()]),
         diagnoses: Arc::new(diagnoses()),
         churn: vec![ChurnCount {
             domain_id: DomainId(0),
@@ -378,7 +381,7 @@ pub fn topic(name: &str) -> TopicFacts {
         }),
         message_type: "sensor_msgs/msg/PointCloud2".into(),
         type_hash: None,
-        first_seen: Timestamp(4),
+        first_seen: ModelTime::from_nanoseconds(4),
         measurement: Some(Box::new(measurement())),
         transports: 1,
         latched: None,
@@ -408,7 +411,7 @@ pub fn topic(name: &str) -> TopicFacts {
             acknacks: 1_000,
             lag_samples: 56,
             lag_seconds: Some(2.75),
-            last_seen: Timestamp(1_700_000_000_000_000_000),
+            last_seen: ModelTime::from_nanoseconds(1_700_000_000_000_000_000),
         }],
         vanished: false,
         transports: vec![TransportCount {
@@ -444,8 +447,8 @@ pub fn delivery(direction: Direction) -> DeliveryFacts {
         process_id: Some(42),
         process: Some("mapper".into()),
         cgroup: Some("/robot.slice".into()),
-        first_seen: Timestamp(5),
-        last_seen: Timestamp(6),
+        first_seen: ModelTime::from_nanoseconds(5),
+        last_seen: ModelTime::from_nanoseconds(6),
         delivered: if received { delivered() } else { sent() },
         lost_in_reader_queue: received.then_some(7),
     }
@@ -504,7 +507,7 @@ fn measurement() -> Measurement {
         duplicates: 4,
         incomplete: 1,
         irrelevant: 0,
-        last_message: Some(Timestamp(1_700_000_000_123_456_789)),
+        last_message: Some(ModelTime::from_nanoseconds(1_700_000_000_123_456_789)),
         rate_hz: 19.98,
         bandwidth: 12_867_120.5,
         interarrival: histogram,

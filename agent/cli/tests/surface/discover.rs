@@ -10,6 +10,7 @@ use ros2probe_daemon::discover::Refusal;
 use ros2probe_daemon::discover::message::{LocalParticipant, Message};
 use ros2probe_daemon::discover::session::{MOST_PACKETS, Outgoing, Session, Target};
 use ros2probe_model::facts::bounded::ledger;
+use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::graph::discovery::{Addresses, hexadecimal};
 use ros2probe_model::report::snapshot::{ParticipantFacts, ProcessFacts};
 use ros2probe_testing::model::forge::{self, SEDP_WRITERS};
@@ -294,8 +295,8 @@ fn participants_with_dds_security_or_without_an_address_are_not_contacted() {
         vendor: VendorId::UNKNOWN,
         enclave: None,
         process: ProcessFacts::default(),
-        first_seen: Timestamp(1),
-        last_seen: Timestamp(1),
+        first_seen: ModelTime::ZERO,
+        last_seen: ModelTime::ZERO,
         lease: ros2probe_wire::RtpsDuration::Infinite,
         secured,
         restored: false,

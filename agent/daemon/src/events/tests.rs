@@ -1,5 +1,6 @@
 //! Log of events under bursts, slow readers and restarts.
 
+use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_wire::{DomainId, Guid};
 
 use super::*;
@@ -74,7 +75,7 @@ fn a_transition_of_a_managed_node_warns_of_errors_only() {
             node: name.map(Into::into),
             state: to.into(),
             before: from.into(),
-            at: Timestamp(1),
+            at: ModelTime::ZERO,
         }),
         ..node(1)
     };

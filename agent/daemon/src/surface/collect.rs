@@ -104,7 +104,7 @@ pub(super) fn collect(
     let has_traces = sources.has_traces();
     chain_metrics::chains(sink, snapshot, &settings, has_traces)?;
     let deliveries = Deliveries::new(&rows.shown);
-    ros2_metrics::topics(sink, &rows.shown, &settings)?;
+    ros2_metrics::topics(sink, snapshot, &rows.shown, &settings)?;
     delivery_metrics::sums(sink, &rows.shown, &settings)?;
     inside_metrics::topics(sink, snapshot, &rows.shown, &settings)?;
     inside_metrics::callbacks(sink, &callbacks, known, &settings)?;

@@ -283,7 +283,7 @@ impl CallbackSum {
 mod tests {
     use super::*;
     use ros2probe_model::facts::calls::facts::{Owner, Quantiles};
-    use ros2probe_wire::Timestamp;
+    use ros2probe_model::facts::model_time::ModelTime;
 
     fn callback(number: usize) -> Callback {
         Callback {
@@ -294,7 +294,7 @@ mod tests {
             skipped: 0,
             rate_hz: None,
             busy: None,
-            last: Timestamp(1),
+            last: ModelTime::ZERO,
             duration: Quantiles::default(),
             wait: Quantiles::default(),
             durations: std::sync::Arc::default(),

@@ -273,6 +273,7 @@ fn nodes(family: &mut Family<'_>, snapshot: &Snapshot) -> fmt::Result {
 /// Writes the metrics of topics.
 pub(super) fn topics(
     sink: &mut MetricSink<'_>,
+    snapshot: &Snapshot,
     rows: &[TopicRow<'_>],
     settings: &Settings,
 ) -> fmt::Result {
@@ -321,7 +322,7 @@ pub(super) fn topics(
     sink.family(&metric::TOPIC_LAST_MESSAGE, |family| {
         rows.iter().try_for_each(|row| {
             match row.measurement().and_then(|measured| measured.last_message) {
-                Some(time) => family.sample(&row.labels(), time.seconds()),
+                Some(at) => family.sample(&row.labels(), snapshot.wall_time(at).seconds()),
                 None => Ok(()),
             }
         })

@@ -31,6 +31,7 @@ use crate::derive::trace::share::Share;
 use crate::facts::bounded::Bounded;
 use crate::facts::bounded::TableFacts;
 use crate::facts::diagnosis::Diagnosis;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::DdsName;
 use crate::facts::tables::ChainOwners;
 use crate::facts::wall_clock::WallClock;
@@ -142,7 +143,6 @@ impl Chains {
         &mut self,
         record: &Record,
         sample: Sample<'_>,
-        wall_clock: WallClock,
         owner: impl FnOnce() -> Option<GuidPrefix>,
     ) {
         const PLACE: u16 = flag::HOST | flag::OUTGOING | flag::SHM | UNDELIVERED;
@@ -170,7 +170,7 @@ impl Chains {
             }
         };
         if let Some(owner) = owner {
-            let at = wall_clock.wall_time(Timestamp(record.time));
+            let at = Timestamp(record.time);
             self.messages
                 .arrived((writer, sample.sequence_number()), owner, at);
         }
@@ -181,7 +181,7 @@ impl Chains {
     pub fn publication(
         &mut self,
         publication: &CausalPublication,
-        now: Timestamp,
+        now: ModelTime,
         origin: impl FnOnce() -> Origin,
     ) {
         self.causality
@@ -199,7 +199,7 @@ impl Chains {
     pub fn advance(
         &mut self,
         (discovery, topics, profiler): (&Discovery, &Topics, &Profiler),
-        (now, wall_clock): (Timestamp, WallClock),
+        (now, wall_clock): (ModelTime, WallClock),
         share: impl Fn(&Topic) -> Option<Share>,
         is_local: impl Fn(&GuidPrefix) -> bool,
     ) -> BTreeSet<(DomainId, DdsName)> {
@@ -224,7 +224,7 @@ impl Chains {
     pub fn settle(
         &mut self,
         (topics, profiler): (&Topics, &Profiler),
-        (now, wall_clock): (Timestamp, WallClock),
+        (now, wall_clock): (ModelTime, WallClock),
     ) {
         for due in self.messages.settle() {
             self.conclude(due);
@@ -233,7 +233,7 @@ impl Chains {
         self.find((topics, profiler), (now, wall_clock));
     }
 
-    /// Returns all chains at calendar time `now`.
+    /// Returns all chains at wall time `now`.
     #[must_use]
     pub fn facts(&self, now: Timestamp) -> ChainsFacts {
         self.paths.facts(&self.expected, now)
@@ -256,7 +256,7 @@ impl Chains {
     fn find(
         &mut self,
         (topics, profiler): (&Topics, &Profiler),
-        (now, wall_clock): (Timestamp, WallClock),
+        (now, wall_clock): (ModelTime, WallClock),
     ) {
         let rates = rates::Rates::new(topics, profiler, now);
         let mut findings = self.evidence.restamping(&rates);

@@ -9,12 +9,13 @@ use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_wire::{DomainId, Guid, Timestamp};
+use ros2probe_wire::{DomainId, Guid};
 
 use crate::derive::chain::Chains;
 use crate::derive::inside::Inside;
 use crate::derive::services::Services;
 use crate::facts::diagnosis::{Diagnoses, Diagnosis, QosPairs};
+use crate::facts::model_time::ModelTime;
 use crate::graph::discovery::Discovery;
 use crate::measure::topic::Topics;
 use endpoints::{EndpointExaminer, UnmatchedEndpoint};
@@ -36,12 +37,12 @@ pub struct Examiner {
     /// chains at the last examination.
     revision: Option<(u64, u64, u64, u64)>,
     /// Time at which the first unmatched endpoint becomes a finding.
-    due: Option<Timestamp>,
+    due: Option<ModelTime>,
     /// Time since which each endpoint is unmatched.
-    alone: HashMap<Guid, Timestamp>,
+    alone: HashMap<Guid, ModelTime>,
     current: Arc<Diagnoses>,
     /// Time at which each finding appeared.
-    since: Arc<Vec<Timestamp>>,
+    since: Arc<Vec<ModelTime>>,
     left_out: u64,
 }
 
@@ -67,7 +68,7 @@ impl Examiner {
 
     /// Returns the time at which each finding appeared, in the order of the findings.
     #[must_use]
-    pub const fn since(&self) -> &Arc<Vec<Timestamp>> {
+    pub const fn since(&self) -> &Arc<Vec<ModelTime>> {
         &self.since
     }
 
@@ -90,7 +91,7 @@ impl Examiner {
         topics: &Topics,
         services: &Services,
         (inside, chains): (&Inside, &Chains),
-        now: Timestamp,
+        now: ModelTime,
     ) {
         let graph = (discovery.revision(), services.revision());
         let revision = Some((graph.0, graph.1, inside.revision(), chains.revision()));
@@ -112,7 +113,7 @@ impl Examiner {
                 if end <= now {
                     findings.add(diagnosis);
                 } else {
-                    due = Some(due.map_or(end, |due: Timestamp| due.min(end)));
+                    due = Some(due.map_or(end, |due: ModelTime| due.min(end)));
                 }
             }
         }
@@ -140,10 +141,10 @@ impl Examiner {
 /// Returns the time at which each finding in `after` appeared; known findings keep theirs.
 fn since(
     before: &[Diagnosis],
-    times: &[Timestamp],
+    times: &[ModelTime],
     after: &[Diagnosis],
-    now: Timestamp,
-) -> Vec<Timestamp> {
+    now: ModelTime,
+) -> Vec<ModelTime> {
     let mut before = before.iter().zip(times).peekable();
     let mut found = Vec::with_capacity(after.len());
     for finding in after {
@@ -239,7 +240,10 @@ mod tests {
             participants,
         };
         let [a, b, c] = ["/a", "/b", "/c"].map(|node| duplicate(node, Vec::new()));
-        let (one, two) = (Timestamp(1), Timestamp(2));
+        let (one, two) = (
+            ModelTime::from_nanoseconds(1),
+            ModelTime::from_nanoseconds(2),
+        );
         let first = since(&[], &[], std::slice::from_ref(&b), one);
         assert_eq!(first, [one]);
         let changed = duplicate("/b", vec![Guid::default()]);
@@ -251,7 +255,12 @@ mod tests {
         );
         assert_eq!(second, [two, one, two]);
         assert_eq!(
-            since(&[b, c.clone()], &[one, two], &[c], Timestamp(3)),
+            since(
+                &[b, c.clone()],
+                &[one, two],
+                &[c],
+                ModelTime::from_nanoseconds(3)
+            ),
             [two]
         );
     }

@@ -23,11 +23,12 @@ use ros2probe_wire::names::{ActionPart, RosName};
 use ros2probe_wire::record::{Sample, flag};
 use ros2probe_wire::rtps::{RequestHeader, VendorId};
 use ros2probe_wire::walk::Found;
-use ros2probe_wire::{DomainId, Guid, GuidPrefix, Record, SequenceNumber, Timestamp, WireError};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix, Record, SequenceNumber, WireError};
 
 use self::facts::{ActionFacts, ServiceFacts};
 use crate::facts::bounded::{Bounded, Counted, Sum, TableFacts};
 use crate::facts::diagnosis::TopicKey;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::TopicName;
 use crate::facts::naming::Naming;
 use crate::facts::tables::{CallIdentities, OpenCalls, ServiceFigures, ServiceWriters};
@@ -66,7 +67,7 @@ struct ServiceWriter {
     /// Second of the source's clock in which `bytes` were captured.
     second: u64,
     bytes: usize,
-    suspended: Option<Timestamp>,
+    suspended: Option<ModelTime>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -175,7 +176,7 @@ impl Services {
         found: &Found<'_>,
         sample: Sample<'_>,
         vendor: VendorId,
-        at: Timestamp,
+        at: ModelTime,
     ) -> Result<bool, WireError> {
         let guid = found.record.writer();
         let Some(half) = self.writers.get(&guid).map(|writer| writer.half) else {
@@ -201,7 +202,7 @@ impl Services {
         number: SequenceNumber,
         call: CallId,
         payload: &[u8],
-        at: Timestamp,
+        at: ModelTime,
     ) -> bool {
         if !self.writers.contains_key(&guid) {
             return false;
@@ -215,7 +216,7 @@ impl Services {
     }
 
     /// Charges captured bytes of a writer; returns whether it has exceeded its budget.
-    fn charge(&mut self, guid: Guid, bytes: usize, at: Timestamp) -> bool {
+    fn charge(&mut self, guid: Guid, bytes: usize, at: ModelTime) -> bool {
         let Some(writer) = self.writers.get_mut(&guid) else {
             return false;
         };
@@ -229,10 +230,11 @@ impl Services {
         true
     }
 
-    /// Records a copy of a request or reply; `receiver` determines which participant receives it.
+    /// Records a copy of a request or reply, seen at `at`; `receiver` determines which participant
+    /// receives it.
     pub fn seen(
         &mut self,
-        record: &Record,
+        (record, at): (&Record, ModelTime),
         sample: Sample<'_>,
         receiver: impl FnOnce() -> Option<GuidPrefix>,
     ) {
@@ -250,7 +252,7 @@ impl Services {
         let service = Arc::clone(&writer.service);
         let position = position(record);
         let mut sighting = Sighting {
-            at: Timestamp(record.time),
+            at,
             socket: record.socket,
             position,
             receiver: None,
@@ -258,7 +260,7 @@ impl Services {
         match writer.half {
             Half::Requests => {
                 // A fragmented request begins with its first fragment.
-                sighting.at = record.began();
+                sighting.at = at.began(record);
                 self.requested(&service, guid, identity, sighting);
                 if record.flags & flag::EXACT != 0
                     && let Some(service) = self.services.get_mut(&service.key)
@@ -280,7 +282,7 @@ impl Services {
     pub fn advance(
         &mut self,
         timeout: Duration,
-        now: Timestamp,
+        now: ModelTime,
         is_known: impl Fn(DomainId, &str) -> bool,
     ) -> Vec<Guid> {
         let mut changed = false;
@@ -444,7 +446,7 @@ impl Services {
 
     /// Returns whether one more service has room: if necessary, the one with the oldest request
     /// and without open calls is dropped.
-    fn has_place(&mut self, at: Timestamp) -> bool {
+    fn has_place(&mut self, at: ModelTime) -> bool {
         if !self.services.is_full() {
             return true;
         }
@@ -458,7 +460,7 @@ impl Services {
     }
 
     /// Drops the open calls of a service, since one of its writers is no longer captured.
-    fn suspend(&mut self, key: &Key, until: Timestamp, at: Timestamp) {
+    fn suspend(&mut self, key: &Key, until: ModelTime, at: ModelTime) {
         self.open.refuse();
         if !self.services.contains_key(key) && !self.has_place(at) {
             return;
@@ -475,7 +477,7 @@ impl Services {
 
 impl ServiceWriter {
     /// Charges captured bytes; returns whether they exceed the budget of this second.
-    const fn is_over_budget(&mut self, bytes: usize, at: Timestamp) -> bool {
+    const fn is_over_budget(&mut self, bytes: usize, at: ModelTime) -> bool {
         let second = at.whole_seconds();
         if second != self.second {
             (self.second, self.bytes) = (second, 0);

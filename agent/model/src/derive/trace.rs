@@ -18,12 +18,14 @@ use ros2probe_wire::{DomainId, Guid, Record, RtpsTime, SequenceNumber, Timestamp
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, Counted, Sum};
 use crate::facts::identity::Identity;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::{TopicName, TypeName};
 use crate::facts::route::Destination;
 use crate::facts::tables::{
     FinishedMessages, FinishedSpans, MessagesUnderWay, OpenMessages, OpenSpans, SettledReaders,
     TracedWriters,
 };
+use crate::facts::wall_clock::WallClock;
 use crate::measure::samples::{Budget, Progress, Samples};
 use share::Share;
 
@@ -50,17 +52,17 @@ pub enum SpanStage {
     Settle(Guid),
 }
 
-/// A span.
+/// A span. Its times are a [`ModelTime`] until it is taken.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Span {
+pub struct Span<T = Timestamp> {
     /// The stage.
     pub stage: SpanStage,
     /// The message.
     pub message: Message,
     /// Begin of the span.
-    pub begin: Timestamp,
+    pub begin: T,
     /// End of the span.
-    pub end: Timestamp,
+    pub end: T,
 }
 
 /// A traced message.
@@ -121,7 +123,9 @@ pub struct Tracer {
 struct Shared {
     budget: Budget,
     open: Sum<Counted<OpenSpans>>,
-    finished: Spans,
+    finished: Bounded<FinishedSpans, Vec<Span<ModelTime>>>,
+    /// Finished spans dropped because there were too many.
+    lost: u64,
 }
 
 /// A writer that is traced.
@@ -137,7 +141,7 @@ struct WriterTrace {
     is_local: bool,
     under_way: Bounded<MessagesUnderWay, VecDeque<Message>>,
     /// Spans of arrivals, until it is certain that they were not sent from this host.
-    arrived: Bounded<OpenMessages, VecDeque<Span>>,
+    arrived: Bounded<OpenMessages, VecDeque<Span<ModelTime>>>,
     waiting: Bounded<OpenMessages, VecDeque<Unacknowledged>>,
     done: Bounded<FinishedMessages, VecDeque<SequenceNumber>>,
 }
@@ -146,7 +150,7 @@ struct WriterTrace {
 #[derive(Debug)]
 struct Unacknowledged {
     message: Message,
-    at: Timestamp,
+    at: ModelTime,
     readers: Bounded<SettledReaders, Vec<Guid>>,
 }
 
@@ -173,7 +177,8 @@ impl Tracer {
             shared: Shared {
                 budget: Budget::new(BITMAP_BYTES),
                 open: Sum::default(),
-                finished: Spans::default(),
+                finished: Bounded::default(),
+                lost: 0,
             },
         }
     }
@@ -199,12 +204,12 @@ impl Tracer {
         }
     }
 
-    /// Processes a record. `is_local` states whether the writer is known to run on this host, so
+    /// Processes a record, seen at `at`. `is_local` states whether the writer is known to run on this host, so
     /// that no message of it arrives from another one. `about` returns the description and traced share of a new writer, or
     /// `None` if they are not known yet.
     pub fn record(
         &mut self,
-        record: &Record,
+        (record, at): (&Record, ModelTime),
         is_local: bool,
         about: impl FnOnce() -> Option<(WriterDescription, Option<Share>)>,
     ) {
@@ -224,7 +229,7 @@ impl Tracer {
             return;
         };
         match record.body() {
-            Body::AckNack(acknack) => traced.acknowledged(acknack, &mut self.shared),
+            Body::AckNack(acknack) => traced.acknowledged(acknack, at, &mut self.shared),
             Body::Sample(sample)
                 if record.flags & UNDELIVERED == 0 && sample.status_info() == StatusInfo::ALIVE =>
             {
@@ -233,7 +238,7 @@ impl Tracer {
                     false => Some(Place::Departure),
                 };
                 if let Some(place) = place {
-                    traced.sample(sample, place, &mut self.shared);
+                    traced.sample((sample, at), place, &mut self.shared);
                 }
             }
             _ => {}
@@ -241,7 +246,7 @@ impl Tracer {
     }
 
     /// Drops messages whose acknowledgements are overdue.
-    pub fn advance(&mut self, now: Timestamp) {
+    pub fn advance(&mut self, now: ModelTime) {
         for traced in self.writers.values_mut().flatten() {
             traced.release(now, &mut self.shared);
             while let Some(first) = traced.waiting.front()
@@ -253,15 +258,30 @@ impl Tracer {
         }
     }
 
-    /// Removes and returns the spans completed since the last call.
-    pub fn take(&mut self) -> Spans {
-        std::mem::take(&mut self.shared.finished)
+    /// Removes and returns the spans completed since the last call, with wall times.
+    pub fn take(&mut self, clock: WallClock) -> Spans {
+        let finished = self.shared.finished.take().into_iter();
+        Spans {
+            spans: finished.map(|span| span.at_wall_time(clock)).collect(),
+            lost: std::mem::take(&mut self.shared.lost),
+        }
     }
 
     /// Returns the row of the metrics: the open messages of all writers.
     #[must_use]
     pub fn table(&self) -> TableFacts {
         self.shared.open.facts()
+    }
+}
+
+impl Span<ModelTime> {
+    fn at_wall_time(self, clock: WallClock) -> Span {
+        Span {
+            stage: self.stage,
+            message: self.message,
+            begin: clock.wall_time(self.begin),
+            end: clock.wall_time(self.end),
+        }
     }
 }
 
@@ -299,7 +319,7 @@ impl WriterTrace {
         }
     }
 
-    fn sample(&mut self, sample: Sample<'_>, place: Place, shared: &mut Shared) {
+    fn sample(&mut self, (sample, at): (Sample<'_>, ModelTime), place: Place, shared: &mut Shared) {
         let (record, number) = (sample.record(), sample.sequence_number());
         let trace_id = numbered(self.identity, number);
         if !self.share.takes(trace_id) {
@@ -323,9 +343,8 @@ impl WriterTrace {
                 None => return,
             },
         };
-        let at = Timestamp(record.time);
         let (begin, source) = match sample {
-            Sample::Data(_) => (record.began(), sample.source_timestamp()),
+            Sample::Data(_) => (at.began(record), sample.source_timestamp()),
             Sample::DataFrag(fragments) => {
                 match self.samples.fragment(fragments, at, &mut shared.budget) {
                     Progress::Partial | Progress::Duplicate => return,
@@ -347,7 +366,7 @@ impl WriterTrace {
     }
 
     /// Processes a message that was seen whole.
-    fn whole(&mut self, message: Message, begin: Timestamp, at: Timestamp, shared: &mut Shared) {
+    fn whole(&mut self, message: Message, begin: ModelTime, at: ModelTime, shared: &mut Shared) {
         if self.waiting.len() + self.arrived.len() >= OpenMessages::CAP {
             self.waiting.refuse();
             self.arrived
@@ -380,7 +399,7 @@ impl WriterTrace {
     }
 
     /// Completes the spans of arrivals that are old enough to be from another host.
-    fn release(&mut self, now: Timestamp, shared: &mut Shared) {
+    fn release(&mut self, now: ModelTime, shared: &mut Shared) {
         while let Some(first) = self.arrived.front()
             && now - first.end > LOCAL_COPY_DELAY
             && let Some(span) = self.arrived.pop_front()
@@ -437,9 +456,8 @@ impl WriterTrace {
         }
     }
 
-    fn acknowledged(&mut self, acknack: AckNack<'_>, shared: &mut Shared) {
-        let record = acknack.record();
-        let (reader, at) = (record.reader(), Timestamp(record.time));
+    fn acknowledged(&mut self, acknack: AckNack<'_>, at: ModelTime, shared: &mut Shared) {
+        let reader = acknack.record().reader();
         let covered = |waiting: &&mut Unacknowledged| {
             waiting.message.sequence_number < acknack.base()
                 && !waiting.readers.contains(&reader)
@@ -457,7 +475,7 @@ impl WriterTrace {
     }
 
     fn close(mut self, shared: &mut Shared) {
-        self.release(Timestamp(u64::MAX), shared);
+        self.release(ModelTime::MAX, shared);
         let open = self.under_way.len() + self.waiting.len();
         shared.open.sub(open);
         self.samples.clear(&mut shared.budget);
@@ -481,8 +499,8 @@ impl Place {
 }
 
 impl Shared {
-    fn finish(&mut self, span: Span) {
-        self.finished.lost += u64::from(self.finished.spans.push(span).is_some());
+    fn finish(&mut self, span: Span<ModelTime>) {
+        self.lost += u64::from(self.finished.push(span).is_some());
     }
 
     fn give_up(&mut self) {

@@ -7,7 +7,9 @@ use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
 
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::{DdsName, TopicName, TypeName};
+use crate::facts::wall_clock::WallClock;
 
 /// The topic of a sample.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -33,14 +35,15 @@ pub struct Offered {
     pub qos: Arc<Qos>,
 }
 
-/// A message. It is immutable and shared by all subscriptions.
+/// A message. It is immutable and shared by all subscriptions. Its time is a [`ModelTime`] until it
+/// is dispatched.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Sample {
+pub struct Sample<T = Timestamp> {
     /// Its topic.
     pub topic: Arc<Topic>,
     /// Capture time of the completing datagram. If the sample waited for a lower number, the time
     /// at which that arrived or was given up. It never decreases for one writer.
-    pub time: Timestamp,
+    pub time: T,
     /// GUID of its writer.
     pub writer: Guid,
     /// Its sequence number, counted by the writer.
@@ -55,6 +58,24 @@ pub struct Sample {
     pub sampled: bool,
     /// The payload, including encapsulation; `None` if the request excludes payloads.
     pub payload: Option<Bytes>,
+}
+
+impl Sample<ModelTime> {
+    /// Returns the sample with the wall time.
+    #[must_use]
+    pub fn at_wall_time(self, clock: WallClock) -> Sample {
+        Sample {
+            topic: self.topic,
+            time: clock.wall_time(self.time),
+            writer: self.writer,
+            sequence_number: self.sequence_number,
+            source_timestamp: self.source_timestamp,
+            header_stamp: self.header_stamp,
+            size: self.size,
+            sampled: self.sampled,
+            payload: self.payload,
+        }
+    }
 }
 
 /// Samples that were sent but are missing from the subscription.
@@ -114,18 +135,38 @@ impl MissedReason {
 
 /// An outcome and the subscriptions that receive it.
 #[derive(Clone, Debug)]
-pub struct Dispatch {
+pub struct Dispatch<S = Arc<Sample>> {
     /// Ids of the requests.
     pub to: Arc<[u64]>,
     /// The sample, or why it is missing.
-    pub outcome: SampleOutcome,
+    pub outcome: SampleOutcome<S>,
+}
+
+/// A dispatch within the model.
+pub type QueuedDispatch = Dispatch<Sample<ModelTime>>;
+
+impl QueuedDispatch {
+    /// Returns the dispatch with the wall time.
+    #[must_use]
+    pub fn at_wall_time(self, clock: WallClock) -> Dispatch {
+        let outcome = match self.outcome {
+            SampleOutcome::Sample(sample) => {
+                SampleOutcome::Sample(Arc::new(sample.at_wall_time(clock)))
+            }
+            SampleOutcome::Missed(missed) => SampleOutcome::Missed(missed),
+        };
+        Dispatch {
+            to: self.to,
+            outcome,
+        }
+    }
 }
 
 /// A sample, or the reason why it is missing.
 #[derive(Clone, Debug)]
-pub enum SampleOutcome {
+pub enum SampleOutcome<S = Arc<Sample>> {
     /// The sample was counted.
-    Sample(Arc<Sample>),
+    Sample(S),
     /// The sample will not arrive.
     Missed(Missed),
 }

@@ -17,9 +17,11 @@ use crate::facts::calls::facts::LifecycleState;
 use crate::facts::churn;
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::loss::Loss;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
 use crate::facts::route::Receiver;
 use crate::facts::tables::{LosingReceivers, LossBursts, WaitingEvents};
+use crate::facts::wall_clock::WallClock;
 use crate::facts::watch::WatchState;
 
 /// Largest number of events per class and second of the source's clock.
@@ -169,7 +171,7 @@ pub struct Taken {
 /// Events that wait to be taken, and losses that are being combined.
 #[derive(Debug, Default)]
 pub struct Events {
-    waiting: Bounded<WaitingEvents, Vec<Event>>,
+    waiting: Bounded<WaitingEvents, Vec<(ModelTime, EventKind)>>,
     classes: BTreeMap<Class, ClassQuota>,
     bursts: Bounded<LossBursts, BTreeMap<Guid, Burst>>,
 }
@@ -185,7 +187,7 @@ struct ClassQuota {
 /// A burst of losses that is still growing.
 #[derive(Debug)]
 struct Burst {
-    at: Timestamp,
+    at: ModelTime,
     losses: LossBurst,
     /// Number of samples that each receiver lost.
     losers: Bounded<LosingReceivers, Vec<(Receiver, u64)>>,
@@ -220,7 +222,7 @@ impl EventKind {
 
 impl Events {
     /// Adds an event if its class has quota left.
-    pub fn push(&mut self, at: Timestamp, kind: EventKind) {
+    pub fn push(&mut self, at: ModelTime, kind: EventKind) {
         let quota = self.classes.entry(kind.class()).or_default();
         let second = at.whole_seconds();
         // A late decision may belong to the second before. An earlier second means that the clock
@@ -233,7 +235,7 @@ impl Events {
             return;
         }
         quota.in_second += 1;
-        let is_full = self.waiting.push(Event { at, kind }).is_some();
+        let is_full = self.waiting.push((at, kind)).is_some();
         quota.overflow += u64::from(is_full);
     }
 
@@ -257,7 +259,7 @@ impl Events {
         &mut self,
         writer: Guid,
         receiver: Receiver,
-        at: Timestamp,
+        at: ModelTime,
         (first, last): (SequenceNumber, SequenceNumber),
     ) {
         let count = last.steps_since(first).saturating_add(1);
@@ -281,7 +283,7 @@ impl Events {
     fn burst(
         &mut self,
         writer: Guid,
-        at: Timestamp,
+        at: ModelTime,
         (first, last): (SequenceNumber, SequenceNumber),
     ) -> Option<&mut Burst> {
         let new = || Burst {
@@ -321,13 +323,17 @@ impl Events {
         }
     }
 
-    /// Removes and returns all events since the last call.
-    pub fn take(&mut self) -> Taken {
+    /// Removes and returns all events since the last call, with wall times.
+    pub fn take(&mut self, clock: WallClock) -> Taken {
         let classes = self.classes.iter_mut();
         let overflow = classes.map(|(class, quota)| (*class, std::mem::take(&mut quota.overflow)));
+        let events = self.waiting.take().into_iter().map(|(at, kind)| Event {
+            at: clock.wall_time(at),
+            kind,
+        });
         Taken {
             overflow: overflow.filter(|(_, count)| *count > 0).collect(),
-            events: self.waiting.take(),
+            events: events.collect(),
         }
     }
 }
@@ -376,7 +382,7 @@ mod tests {
 
     fn loss(writer: Guid, at: u64, first: u64, last: u64) -> Loss {
         Loss {
-            at: Timestamp(at),
+            at: ModelTime::from_nanoseconds(at),
             writer,
             first: SequenceNumber(first),
             last: SequenceNumber(last),
@@ -398,7 +404,7 @@ mod tests {
         events.lose(&loss(guid(1), 10, 5, 7));
         events.lose(&loss(guid(2), 11, 1, 1));
         events.lose(&loss(guid(1), 12, 9, 9));
-        assert!(events.take().events.is_empty());
+        assert!(events.take(WallClock::default()).events.is_empty());
         events.name(guid(2), DomainId(3), &"rt/points".into());
         events.end_bursts(|burst| {
             if burst.topic.is_none() {
@@ -406,7 +412,7 @@ mod tests {
             }
         });
         let losses: Vec<_> = events
-            .take()
+            .take(WallClock::default())
             .events
             .into_iter()
             .map(|event| event.kind)
@@ -430,25 +436,28 @@ mod tests {
             ]
         );
         events.end_bursts(|_| {});
-        assert!(events.take().events.is_empty());
+        assert!(events.take(WallClock::default()).events.is_empty());
     }
 
     #[test]
     fn a_storm_of_one_class_leaves_room_for_the_others_and_is_counted() {
         let mut events = Events::default();
         for number in 0..MOST + 7 {
-            events.push(Timestamp(number.into()), node("/a"));
+            events.push(ModelTime::from_nanoseconds(number.into()), node("/a"));
         }
         events.lose(&loss(guid(1), 10, 5, 7));
         events.end_bursts(|_| {});
-        let taken = events.take();
+        let taken = events.take(WallClock::default());
         assert_eq!(taken.events.len(), usize::from(MOST) + 1);
         assert_eq!(taken.overflow, [(Class::Node, 7)]);
         // Taking events does not renew the quota of a second; the next second has its own.
-        events.push(Timestamp(SECOND - 1), node("/b"));
-        assert_eq!(events.take().overflow, [(Class::Node, 1)]);
-        events.push(Timestamp(SECOND), node("/b"));
-        let taken = events.take();
+        events.push(ModelTime::from_nanoseconds(SECOND - 1), node("/b"));
+        assert_eq!(
+            events.take(WallClock::default()).overflow,
+            [(Class::Node, 1)]
+        );
+        events.push(ModelTime::from_nanoseconds(SECOND), node("/b"));
+        let taken = events.take(WallClock::default());
         assert_eq!((taken.events.len(), taken.overflow.len()), (1, 0));
     }
 
@@ -457,11 +466,26 @@ mod tests {
         let mut events = Events::default();
         let receiver = |number| Receiver::Participant(GuidPrefix([number; 12]));
         let run = |first, last| (SequenceNumber(first), SequenceNumber(last));
-        events.lose_delivery(guid(1), receiver(1), Timestamp(10), run(5, 7));
-        events.lose_delivery(guid(1), receiver(2), Timestamp(10), run(6, 7));
-        events.lose_delivery(guid(1), receiver(2), Timestamp(11), run(9, 10));
+        events.lose_delivery(
+            guid(1),
+            receiver(1),
+            ModelTime::from_nanoseconds(10),
+            run(5, 7),
+        );
+        events.lose_delivery(
+            guid(1),
+            receiver(2),
+            ModelTime::from_nanoseconds(10),
+            run(6, 7),
+        );
+        events.lose_delivery(
+            guid(1),
+            receiver(2),
+            ModelTime::from_nanoseconds(11),
+            run(9, 10),
+        );
         events.end_bursts(|_| {});
-        let EventKind::Loss(burst) = &events.take().events[0].kind else {
+        let EventKind::Loss(burst) = &events.take(WallClock::default()).events[0].kind else {
             panic!("a loss")
         };
         assert_eq!((burst.count, burst.first.0, burst.last.0), (4, 5, 10));
@@ -473,7 +497,7 @@ mod tests {
         for number in 0..100 {
             let receiver = Receiver::Participant(GuidPrefix([number; 12]));
             let run = (SequenceNumber(1), SequenceNumber(2));
-            events.lose_delivery(guid(1), receiver, Timestamp(10), run);
+            events.lose_delivery(guid(1), receiver, ModelTime::from_nanoseconds(10), run);
         }
         assert!(events.bursts[&guid(1)].losers.is_full());
     }

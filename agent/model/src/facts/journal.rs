@@ -3,12 +3,13 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
+use ros2probe_wire::{DomainId, Guid, SequenceNumber};
 
 use crate::facts::bounded::Bounded;
 use crate::facts::dispatch::MissedReason;
 use crate::facts::event::Events;
 use crate::facts::loss::{DeliveryLoss, Loss};
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{DiscoveryEvents, LatestDeliveryLosses, LatestLosses, MissingSamples};
 
 /// Number of the latest entries that a new loss may extend.
@@ -18,7 +19,7 @@ const RECENT: usize = 16;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DiscoveryEvent {
     /// Time of the event.
-    pub at: Timestamp,
+    pub at: ModelTime,
     /// Domain of the entity.
     pub domain_id: DomainId,
     /// `participant`, `writer`, `reader`, `node`.

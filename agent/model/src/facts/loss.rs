@@ -5,8 +5,9 @@
 
 use std::net::SocketAddr;
 
-use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber};
 
+use crate::facts::model_time::ModelTime;
 /// Where a sample was lost.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum LossCause {
@@ -22,7 +23,7 @@ pub enum LossCause {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Loss {
     /// Time at which they were settled.
-    pub at: Timestamp,
+    pub at: ModelTime,
     /// GUID of the writer.
     pub writer: Guid,
     /// First lost sequence number.
@@ -35,7 +36,7 @@ pub struct Loss {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DeliveryLoss {
     /// Time at which the cause was settled.
-    pub at: Timestamp,
+    pub at: ModelTime,
     /// GUID of the writer.
     pub writer: Guid,
     /// The participant that missed them, if known.

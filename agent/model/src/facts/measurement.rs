@@ -1,11 +1,10 @@
 //! Counts of a writer, a topic and a delivery, and the time that samples spent in each stage. These
 //! are plain values that can be added; the measuring modules fill them.
 
-use ros2probe_wire::Timestamp;
-
 use crate::facts::histogram::Histogram;
 use crate::facts::loss::LossCause;
 use crate::facts::loss_share::LossShare;
+use crate::facts::model_time::ModelTime;
 
 /// Counts and times while the topic was watched. Counters never decrease while the topic exists.
 #[derive(Clone, Debug, Default)]
@@ -29,7 +28,7 @@ pub struct Measurement {
     /// know their writer yet.
     pub irrelevant: u64,
     /// Time of the last new sample.
-    pub last_message: Option<Timestamp>,
+    pub last_message: Option<ModelTime>,
     /// Messages per second over the last window, for display only; rules use counters.
     pub rate_hz: f64,
     /// Payload bytes per second over the same window.

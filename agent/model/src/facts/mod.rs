@@ -15,6 +15,7 @@ pub mod limits;
 pub mod loss;
 pub mod loss_share;
 pub mod measurement;
+pub mod model_time;
 pub mod names;
 pub mod naming;
 pub mod rate;

@@ -3,9 +3,7 @@
 //! Only whole seconds contribute to a rate, so a periodic topic neither flickers nor reads high at
 //! its start. Exact counters are elsewhere; this module forgets after [`SECONDS`].
 
-use ros2probe_wire::Timestamp;
-use ros2probe_wire::time::SECOND;
-
+use crate::facts::model_time::ModelTime;
 /// Length of the window in seconds, one slot each.
 pub const SECONDS: u64 = 10;
 const SLOTS: usize = SECONDS as usize + 1;
@@ -46,9 +44,9 @@ pub struct Sum {
 
 impl Sum {
     /// Returns the part that is sent from `since` to `until`, if all is sent evenly until `now`.
-    fn part(self, since: Timestamp, until: Timestamp, now: Timestamp) -> Self {
-        let span = u128::from(now.0.saturating_sub(since.0));
-        let elapsed = u128::from(until.0.saturating_sub(since.0)).min(span);
+    fn part(self, since: ModelTime, until: ModelTime, now: ModelTime) -> Self {
+        let span = (now - since).as_nanos();
+        let elapsed = (until - since).as_nanos().min(span);
         let share = |count: u64, part: u128, whole: u128| {
             let part = (u128::from(count) * part).checked_div(whole);
             part.map_or(0, |part| u64::try_from(part).unwrap_or(count))
@@ -81,7 +79,7 @@ impl Slot {
 impl Window {
     /// Returns the counts of the second that contains `at`, or of the oldest second if `at` is
     /// earlier.
-    pub fn second(&mut self, at: Timestamp) -> &mut Slot {
+    pub fn second(&mut self, at: ModelTime) -> &mut Slot {
         self.turn(at);
         let oldest = self.second.saturating_sub(SECONDS);
         let second = at.whole_seconds().clamp(oldest, self.second);
@@ -93,24 +91,24 @@ impl Window {
     }
 
     /// Begins to count at `now`: what was counted before contributes to no rate.
-    pub fn begin(&mut self, now: Timestamp) {
+    pub fn begin(&mut self, now: ModelTime) {
         *self = Self::default();
         self.turn(now);
     }
 
     /// Adds what was sent evenly after `since`, the last message at `now`. Returns the part that
     /// belongs to seconds before the last one.
-    pub fn spread(&mut self, sent: Sum, since: Timestamp, now: Timestamp) -> Sum {
+    pub fn spread(&mut self, sent: Sum, since: ModelTime, now: ModelTime) -> Sum {
         self.turn(now);
         let current = now.whole_seconds();
         let first = since.whole_seconds();
         let first = first.max(current.saturating_sub(SECONDS)).min(current);
-        let mut counted = sent.part(since, Timestamp(first.saturating_mul(SECOND)), now);
+        let mut counted = sent.part(since, ModelTime::of_second(first), now);
         let mut earlier = counted;
         for second in first..current {
-            let end = Timestamp((second + 1).saturating_mul(SECOND));
+            let end = ModelTime::of_second(second + 1);
             let until = sent.part(since, end, now);
-            self.second(Timestamp(second.saturating_mul(SECOND)))
+            self.second(ModelTime::of_second(second))
                 .send(until, counted);
             counted = until;
             if second + 1 < current {
@@ -124,7 +122,7 @@ impl Window {
     /// Returns the sum over the last `seconds` whole seconds, and their number, which is lower if
     /// counting began later.
     #[must_use]
-    pub fn sum(&self, now: Timestamp, seconds: u64) -> (Slot, u64) {
+    pub fn sum(&self, now: ModelTime, seconds: u64) -> (Slot, u64) {
         let current = now.whole_seconds();
         let end = current.max(self.second);
         let start = end.saturating_sub(seconds.min(SECONDS));
@@ -148,7 +146,7 @@ impl Window {
     }
 
     /// Clears the slots of seconds without counts.
-    fn turn(&mut self, now: Timestamp) {
+    fn turn(&mut self, now: ModelTime) {
         let second = now.whole_seconds();
         if self.began == 0 {
             (self.began, self.second) = (second, second);
@@ -169,17 +167,19 @@ impl Window {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
 
-    fn fill(window: &mut Window, start_ms: u64, step_ms: u64, count: u64) -> Timestamp {
+    fn fill(window: &mut Window, start_ms: u64, step_ms: u64, count: u64) -> ModelTime {
         let mut at = start_ms;
         for _ in 0..count {
-            let slot = window.second(Timestamp(at * 1_000_000));
+            let slot = window.second(ModelTime::from_nanoseconds(at * 1_000_000));
             slot.messages += 1;
             slot.bytes += 100;
             at += step_ms;
         }
-        Timestamp(at * 1_000_000)
+        ModelTime::from_nanoseconds(at * 1_000_000)
     }
 
     #[test]
@@ -203,7 +203,9 @@ mod tests {
         let mut window = Window::default();
         let now = fill(&mut window, 100_000, 100, 50);
         for late in [102_500, 102_600, 50_000] {
-            window.second(Timestamp(late * 1_000_000)).messages += 1;
+            window
+                .second(ModelTime::from_nanoseconds(late * 1_000_000))
+                .messages += 1;
         }
         let (sum, seconds) = window.sum(now, 2);
         assert_eq!((sum.messages, seconds), (20, 2));
@@ -214,7 +216,7 @@ mod tests {
     #[test]
     fn messages_of_a_long_time_are_no_spike_in_one_second() {
         let mut window = Window::default();
-        let at = |milliseconds: u64| Timestamp(milliseconds * 1_000_000);
+        let at = |milliseconds: u64| ModelTime::from_nanoseconds(milliseconds * 1_000_000);
         window.second(at(100_000)).messages += 1;
         // 50 Hz, of which nothing is seen for 14 s.
         let sent = |messages| Sum {
@@ -233,7 +235,7 @@ mod tests {
         // The first message of a writer.
         let mut first = Window::default();
         assert_eq!(
-            first.spread(sent(1), Timestamp(0), at(114_040)),
+            first.spread(sent(1), ModelTime::ZERO, at(114_040)),
             Sum::default()
         );
         assert_eq!(first.sum(at(116_000), SECONDS), (Slot::default(), 1));
@@ -249,7 +251,7 @@ mod tests {
         let mut window = Window::default();
         let now = fill(&mut window, 100_000, 10, 1000);
         window.begin(now);
-        assert_eq!(window.sum(Timestamp(now.0 + SECOND), SECONDS).1, 0);
+        assert_eq!(window.sum(now + Duration::from_secs(1), SECONDS).1, 0);
         let later = fill(&mut window, 110_000, 20, 150);
         let (sum, seconds) = window.sum(later, SECONDS);
         assert_eq!((sum.messages, seconds), (100, 2));
@@ -259,20 +261,20 @@ mod tests {
     fn silence_empties_the_window() {
         let mut window = Window::default();
         let now = fill(&mut window, 100_000, 10, 1000);
-        let later = Timestamp(now.0 + 5 * SECOND);
+        let later = now + Duration::from_secs(5);
         assert_eq!(window.sum(later, SECONDS), window.sum(later, SECONDS));
         assert!(window.sum(later, SECONDS).0.messages < 600);
         assert_eq!(
             window
-                .sum(Timestamp(now.0 + 30 * SECOND), SECONDS)
+                .sum(now + Duration::from_secs(30), SECONDS)
                 .0
                 .messages,
             0
         );
-        window.second(Timestamp(now.0 + 30 * SECOND)).messages += 1;
+        window.second(now + Duration::from_secs(30)).messages += 1;
         assert_eq!(
             window
-                .sum(Timestamp(now.0 + 31 * SECOND), SECONDS)
+                .sum(now + Duration::from_secs(31), SECONDS)
                 .0
                 .messages,
             1

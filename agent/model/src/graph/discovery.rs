@@ -22,12 +22,13 @@ use std::time::Duration;
 
 use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement};
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber};
 
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, Counted, Sum};
 use crate::facts::churn::{Churn, Event};
 use crate::facts::journal::{DiscoveryEvent, Journal};
+use crate::facts::model_time::ModelTime;
 use crate::facts::naming::Naming;
 use crate::facts::tables::{
     Applicants, Endpoints, Nodes, Participants, PendingEndpoints, PendingNodeLists,
@@ -72,14 +73,14 @@ pub enum Change {
 /// An endpoint that waits for its participant or for a free entry.
 #[derive(Debug)]
 struct PendingEndpoint {
-    at: Timestamp,
+    at: ModelTime,
     announcement: Box<EndpointAnnouncement>,
 }
 
 /// Samples of `ros_discovery_info` that wait for their participant.
 #[derive(Debug)]
 struct PendingNodes {
-    at: Timestamp,
+    at: ModelTime,
     priority: Priority,
     writer: Guid,
     sequence_number: SequenceNumber,
@@ -166,7 +167,7 @@ impl Discovery {
 
     /// Returns whether this endpoint was disposed so recently that its samples may still arrive.
     #[must_use]
-    pub fn was_disposed(&self, guid: Guid, now: Timestamp) -> bool {
+    pub fn was_disposed(&self, guid: Guid, now: ModelTime) -> bool {
         self.disposals.is_recent(guid, now)
     }
 
@@ -203,7 +204,7 @@ impl Discovery {
 
     /// Records a packet of this participant and renews its lease. Returns whether its priority
     /// increased, as [`Self::learn`] does.
-    pub fn seen(&mut self, prefix: GuidPrefix, at: Timestamp, evidence: Priority) -> bool {
+    pub fn seen(&mut self, prefix: GuidPrefix, at: ModelTime, evidence: Priority) -> bool {
         let priority = match self.participants.get_mut(&prefix) {
             Some(participant) => {
                 participant.seen(at);
@@ -220,7 +221,7 @@ impl Discovery {
         &mut self,
         prefix: GuidPrefix,
         evidence: Priority,
-        at: Timestamp,
+        at: ModelTime,
         journal: &mut Journal,
     ) -> bool {
         if let Some(participant) = self.participants.get_mut(&prefix) {
@@ -308,7 +309,7 @@ impl Discovery {
     }
 
     /// Returns the end of the lease that ends first, as far as participants were heard.
-    pub fn next_expiry(&self) -> Option<Timestamp> {
+    pub fn next_expiry(&self) -> Option<ModelTime> {
         let participants = self.participants.values();
         participants
             .filter_map(|participant| participant.lease_end())
@@ -316,7 +317,7 @@ impl Discovery {
     }
 
     /// Removes participants whose lease has expired at `now`.
-    pub fn advance(&mut self, now: Timestamp, journal: &mut Journal) {
+    pub fn advance(&mut self, now: ModelTime, journal: &mut Journal) {
         let mut expired: Vec<_> = self
             .participants
             .iter()
@@ -327,7 +328,7 @@ impl Discovery {
         for (end, prefix) in expired {
             self.remove(prefix, end, Some(Event::Expired), journal);
         }
-        let fresh = |at: Timestamp| at + PENDING_FOR > now;
+        let fresh = |at: ModelTime| at + PENDING_FOR > now;
         let participants = &self.participants;
         self.pending_endpoints
             .retain(|guid, pending| fresh(pending.at) || participants.contains_key(&guid.prefix));
@@ -342,7 +343,7 @@ impl Discovery {
         prefix: GuidPrefix,
         mut participant: Box<Participant>,
         priority: Priority,
-        at: Timestamp,
+        at: ModelTime,
         journal: &mut Journal,
     ) -> bool {
         let guid = Guid::new(prefix, EntityId::PARTICIPANT);
@@ -365,7 +366,7 @@ impl Discovery {
     fn remove(
         &mut self,
         prefix: GuidPrefix,
-        at: Timestamp,
+        at: ModelTime,
         event: Option<Event>,
         journal: &mut Journal,
     ) {
@@ -443,7 +444,7 @@ impl Discovery {
         &mut self,
         entity: &DiscoveredEntity<'_>,
         event: Event,
-        at: Timestamp,
+        at: ModelTime,
         journal: &mut Journal,
     ) {
         self.revision += 1;

@@ -7,9 +7,10 @@
 use std::collections::VecDeque;
 
 use ros2probe_wire::record::{AckNack, SequenceNumberSet, flag};
-use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
+use ros2probe_wire::{Guid, SequenceNumber};
 
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::NodeName;
 use crate::facts::tables::{AcknowledgingReaders, SampleTimes};
 
@@ -35,7 +36,7 @@ pub struct AcknowledgementFacts {
     /// Age in seconds of the oldest such sample; 0 without one, `None` if it is no longer known.
     pub lag_seconds: Option<f64>,
     /// Time of the last ACKNACK.
-    pub last_seen: Timestamp,
+    pub last_seen: ModelTime,
 }
 
 /// All readers that send ACKNACKs to one writer.
@@ -44,7 +45,7 @@ pub struct Acknowledgements {
     /// Readers, sorted by GUID.
     readers: Bounded<AcknowledgingReaders, Vec<Reader>>,
     /// Sequence numbers and the times at which they were first seen, sorted by number.
-    times: Bounded<SampleTimes, VecDeque<(SequenceNumber, Timestamp)>>,
+    times: Bounded<SampleTimes, VecDeque<(SequenceNumber, ModelTime)>>,
     /// Readers that were not added because the list was full.
     pub refused: u64,
 }
@@ -57,7 +58,7 @@ struct Reader {
     missing: u64,
     requested: u64,
     acknacks: u64,
-    last_seen: Timestamp,
+    last_seen: ModelTime,
     /// The last ACKNACK that was seen leaving this host but not yet arriving.
     leaving: Option<SequenceNumberSet>,
 }
@@ -70,7 +71,7 @@ impl Acknowledgements {
     }
 
     /// Records an ACKNACK.
-    pub fn acknack(&mut self, acknack: AckNack<'_>) {
+    pub fn acknack(&mut self, acknack: AckNack<'_>, now: ModelTime) {
         let guid = acknack.record().reader();
         let place = self.readers.binary_search_by_key(&guid, |each| each.guid);
         let index = match place {
@@ -84,7 +85,7 @@ impl Acknowledgements {
             }
         };
         if let Some(reader) = self.readers.get_mut(index) {
-            reader.acknack(acknack);
+            reader.acknack(acknack, now);
         }
         self.trim();
     }
@@ -97,7 +98,7 @@ impl Acknowledgements {
     }
 
     /// Records the writer's newest sample and its time.
-    pub fn wrote(&mut self, number: SequenceNumber, at: Timestamp) {
+    pub fn wrote(&mut self, number: SequenceNumber, at: ModelTime) {
         if self.readers.is_empty() {
             return;
         }
@@ -129,7 +130,7 @@ impl Acknowledgements {
         &self,
         writer: Guid,
         next: SequenceNumber,
-        now: Timestamp,
+        now: ModelTime,
     ) -> impl Iterator<Item = AcknowledgementFacts> + '_ {
         self.readers.iter().map(move |reader| AcknowledgementFacts {
             writer,
@@ -149,7 +150,7 @@ impl Acknowledgements {
         clippy::cast_precision_loss,
         reason = "nanoseconds of a delay stay exact to 104 days"
     )]
-    fn lag(&self, base: SequenceNumber, next: SequenceNumber, now: Timestamp) -> Option<f64> {
+    fn lag(&self, base: SequenceNumber, next: SequenceNumber, now: ModelTime) -> Option<f64> {
         if base >= next {
             return Some(0.0);
         }
@@ -189,15 +190,15 @@ impl Reader {
             missing: 0,
             requested: 0,
             acknacks: 0,
-            last_seen: Timestamp(0),
+            last_seen: ModelTime::ZERO,
             leaving: None,
         }
     }
 
-    fn acknack(&mut self, acknack: AckNack<'_>) {
+    fn acknack(&mut self, acknack: AckNack<'_>, now: ModelTime) {
         let record = acknack.record();
         let content = acknack.missing();
-        self.last_seen = self.last_seen.max(Timestamp(record.time));
+        self.last_seen = self.last_seen.max(now);
         self.base = acknack.base();
         self.missing = content.iter().count() as u64;
         // If both ends are on this host, the ACKNACK is seen leaving and then arriving.
@@ -227,7 +228,7 @@ mod tests {
         let Body::AckNack(acknack) = record.body() else {
             panic!("{record:?}")
         };
-        all.acknack(acknack);
+        all.acknack(acknack, ModelTime::from_nanoseconds(record.time));
     }
 
     fn acknack(reader: u8, base: u64, bits: u32, bitmap: u32) -> Record {
@@ -243,7 +244,7 @@ mod tests {
     }
 
     fn facts(all: &Acknowledgements, next: u64, seconds: u64) -> Vec<AcknowledgementFacts> {
-        let now = Timestamp(seconds * 1_000_000_000);
+        let now = ModelTime::from_nanoseconds(seconds * 1_000_000_000);
         all.facts(guid(9), SequenceNumber(next), now).collect()
     }
 
@@ -253,7 +254,10 @@ mod tests {
         put(&mut all, &acknack(1, 1, 0, 0));
         put(&mut all, &acknack(2, 1, 0, 0));
         for number in 1..=100 {
-            all.wrote(SequenceNumber(number), Timestamp(number * 1_000_000_000));
+            all.wrote(
+                SequenceNumber(number),
+                ModelTime::from_nanoseconds(number * 1_000_000_000),
+            );
         }
         put(&mut all, &acknack(2, 101, 0, 0));
         put(&mut all, &acknack(1, 41, 3, 0b101 << 29));
@@ -271,7 +275,10 @@ mod tests {
         let mut all = Acknowledgements::default();
         put(&mut all, &acknack(1, 1, 0, 0));
         for number in 1..=360_000 {
-            all.wrote(SequenceNumber(number), Timestamp(number * 10_000_000));
+            all.wrote(
+                SequenceNumber(number),
+                ModelTime::from_nanoseconds(number * 10_000_000),
+            );
         }
         assert!(all.times.len() <= SampleTimes::CAP);
         put(&mut all, &acknack(1, 180_001, 0, 0));

@@ -9,10 +9,11 @@ use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
 
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::AssembledSamples;
 use bytes::Bytes;
 use ros2probe_wire::record::{Sample, flag};
-use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
+use ros2probe_wire::{Guid, SequenceNumber};
 
 /// Memory per sample, and per fragment that arrived early, in addition to its bytes.
 const OVERHEAD: usize = 128;
@@ -46,7 +47,7 @@ struct Part {
     ahead: BTreeMap<u32, Box<[u8]>>,
     /// Bytes of `ahead`, including the overhead of each entry.
     ahead_bytes: usize,
-    touched: Timestamp,
+    touched: ModelTime,
 }
 
 impl Assembly {
@@ -69,13 +70,12 @@ impl Assembly {
         (self.bytes, self.limit, self.evictions)
     }
 
-    /// Adds the bytes of a DATA or DATA_FRAG. `other_bytes` bytes of the budget are used elsewhere.
-    pub fn put(&mut self, sample: Sample<'_>, payload: &[u8], other_bytes: usize) {
+    /// Adds the bytes of a DATA or DATA_FRAG that arrived at `now`. `other_bytes` bytes of the budget are used elsewhere.
+    pub fn put(&mut self, sample: Sample<'_>, now: ModelTime, payload: &[u8], other_bytes: usize) {
         let Some((size, fragment_size)) = sizes(sample, payload) else {
             return;
         };
         let key = (sample.record().writer(), sample.sequence_number());
-        let now = Timestamp(sample.record().time);
         if !self.parts.contains_key(&key) {
             if self.parts.is_full() {
                 self.parts.refuse();
@@ -139,7 +139,7 @@ impl Assembly {
     }
 
     /// Drops samples that have received no fragment for a long time.
-    pub fn expire(&mut self, now: Timestamp) {
+    pub fn expire(&mut self, now: ModelTime) {
         self.retain(|_, part| part.touched + FRAGMENT_TIMEOUT > now);
     }
 
@@ -164,7 +164,7 @@ impl Assembly {
 }
 
 impl Part {
-    const fn new(age: u64, size: usize, fragment_size: usize, now: Timestamp) -> Self {
+    const fn new(age: u64, size: usize, fragment_size: usize, now: ModelTime) -> Self {
         Self {
             age,
             size,
@@ -261,7 +261,8 @@ mod tests {
 
     /// Passes the sample of a record to [`Assembly::put`].
     fn put(assembly: &mut Assembly, record: &Record, payload: &[u8], other_bytes: usize) {
-        assembly.put(record.sample().unwrap(), payload, other_bytes);
+        let now = ModelTime::from_nanoseconds(record.time);
+        assembly.put(record.sample().unwrap(), now, payload, other_bytes);
     }
 
     fn fragment(of: Guid, number: u64, start: u32, count: u32, size: u32, of_size: u32) -> Record {
@@ -361,7 +362,7 @@ mod tests {
             &[0; 1000],
             0,
         );
-        assembly.expire(Timestamp(2) + FRAGMENT_TIMEOUT);
+        assembly.expire(ModelTime::from_nanoseconds(2) + FRAGMENT_TIMEOUT);
         assert_eq!((assembly.bytes, assembly.parts.len()), (0, 0));
     }
 

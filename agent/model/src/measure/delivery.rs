@@ -15,13 +15,14 @@ use std::collections::{BTreeSet, VecDeque};
 use std::time::Duration;
 
 use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
-use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber};
 
 use crate::facts::bounded::Bounded;
 use crate::facts::journal::Journal;
 use crate::facts::loss::{DeliveryLoss, LossCause};
 use crate::facts::loss_share::RecentLoss;
 use crate::facts::measurement::Delivered;
+use crate::facts::model_time::ModelTime;
 use crate::facts::route::Direction;
 use crate::facts::route::{Receiver, Route};
 use crate::facts::tables::WithheldLosses;
@@ -50,7 +51,7 @@ const LONG_RUN: u64 = 256;
 #[derive(Debug)]
 pub struct DeliveryContext<'a> {
     /// Time of the record, or of the tick.
-    pub now: Timestamp,
+    pub now: ModelTime,
     /// Writer of the samples.
     pub writer: Guid,
     /// Whether the writer is reliable and retransmits samples.
@@ -75,12 +76,12 @@ pub struct Delivery {
     tally: Delivered,
     undelivered: Undelivered,
     loss_causes: LossCauses,
-    first_seen: Timestamp,
-    last_seen: Timestamp,
+    first_seen: ModelTime,
+    last_seen: ModelTime,
     /// Time at which a matching reader appeared, if that is after the last sample.
-    opened: Timestamp,
+    opened: ModelTime,
     /// Time at which the oldest sample that has not arrived left this host for the receiver.
-    waiting: Option<Timestamp>,
+    waiting: Option<ModelTime>,
     /// Whether samples that left since then are already counted as lost.
     presumed_lost: bool,
     /// Number of samples that left this host for the receiver a while ago and have not arrived.
@@ -98,7 +99,7 @@ pub struct Delivery {
 impl Delivery {
     /// Creates a delivery that has seen nothing yet.
     #[must_use]
-    pub fn new(receiver: Receiver, main: Route, now: Timestamp) -> Self {
+    pub fn new(receiver: Receiver, main: Route, now: ModelTime) -> Self {
         Self {
             receiver,
             main,
@@ -108,7 +109,7 @@ impl Delivery {
             loss_causes: LossCauses::default(),
             first_seen: now,
             last_seen: now,
-            opened: Timestamp(0),
+            opened: ModelTime::ZERO,
             waiting: None,
             presumed_lost: false,
             under_way: 0,
@@ -120,7 +121,7 @@ impl Delivery {
     }
 
     /// Allows fragmented samples that begin before `until` to be incomplete without a loss.
-    pub const fn allow_incomplete(&mut self, until: Timestamp) {
+    pub const fn allow_incomplete(&mut self, until: ModelTime) {
         self.reception.allow_incomplete(until);
     }
 
@@ -165,7 +166,7 @@ impl Delivery {
 
     /// Returns the times of the first and last record.
     #[must_use]
-    pub const fn seen(&self) -> (Timestamp, Timestamp) {
+    pub const fn seen(&self) -> (ModelTime, ModelTime) {
         (self.first_seen, self.last_seen)
     }
 
@@ -203,7 +204,7 @@ impl Delivery {
     }
 
     /// Records that a reader appeared. Earlier samples were for other readers.
-    pub fn open(&mut self, at: Timestamp) {
+    pub fn open(&mut self, at: ModelTime) {
         self.opened = self.opened.max(at);
     }
 
@@ -230,7 +231,7 @@ impl Delivery {
         sample: Sample<'_>,
         context: &mut DeliveryContext<'_>,
     ) -> (bool, Option<CompleteSample>) {
-        self.touch(sample.record());
+        self.touch(context.now);
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
         if self.undelivered.is_empty() {
             return self.take(sample, context);
@@ -238,7 +239,7 @@ impl Delivery {
         let (mut again, mut whole) = (false, None);
         let parts = self
             .undelivered
-            .delivered(sample, &mut context.budget.evictions);
+            .delivered(sample, context.now, &mut context.budget.evictions);
         for part in parts.iter().filter_map(Record::sample) {
             let (came_again, completed) = self.take(part, context);
             again |= came_again;
@@ -249,16 +250,18 @@ impl Delivery {
 
     /// Records that the socket's buffer was full for this DATA or DATA_FRAG.
     pub fn socket_full(&mut self, sample: Sample<'_>, context: &mut DeliveryContext<'_>) {
-        self.touch(sample.record());
+        self.touch(context.now);
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
-        if self.undelivered.note(sample) {
+        if self.undelivered.note(sample, context.now) {
             context.budget.evictions += 1;
         }
         let number = sample.sequence_number();
         let is_tail = !sample.is_start() && number.0 > 1;
+        let now = context.now;
         let (reception, budget, mut accounting) = self.split(context);
-        let is_confirmed =
-            reception.recognise(sample, budget, &mut |decision| accounting.take(decision));
+        let is_confirmed = reception.recognise(sample, now, budget, &mut |decision| {
+            accounting.take(decision);
+        });
         if !is_confirmed {
             // The cause is kept in case later records confirm the number.
             let is_full = self
@@ -289,7 +292,7 @@ impl Delivery {
     /// Records a HEARTBEAT for this receiver. A delivery without samples begins with it. While no
     /// sample arrives and none is requested, the samples may use shared memory.
     pub fn heartbeat(&mut self, heartbeat: Heartbeat<'_>, context: &mut DeliveryContext<'_>) {
-        self.touch(heartbeat.record());
+        self.touch(context.now);
         let end = heartbeat.last().next();
         self.reception.sequence_mut().begin(end);
         if !self.uses_network {
@@ -297,16 +300,20 @@ impl Delivery {
         }
         let sequence = self.reception.sequence();
         let before = (sequence.next(), sequence.last_advance());
+        let now = context.now;
         let (reception, budget, mut accounting) = self.split(context);
-        reception.heartbeat(heartbeat, budget, &mut |decision| accounting.take(decision));
+        reception.heartbeat(heartbeat, now, budget, &mut |decision| {
+            accounting.take(decision);
+        });
         self.excuse_unheard(before);
     }
 
     /// Records a GAP for this receiver.
     pub fn gap(&mut self, gap: Gap<'_>, context: &mut DeliveryContext<'_>) {
-        self.touch(gap.record());
+        self.touch(context.now);
+        let now = context.now;
         let (reception, budget, mut accounting) = self.split(context);
-        reception.gap(gap, budget, &mut |decision| accounting.take(decision));
+        reception.gap(gap, now, budget, &mut |decision| accounting.take(decision));
     }
 
     /// Records an ACKNACK in which a reader requests samples again.
@@ -342,13 +349,13 @@ impl Delivery {
     pub fn settle(&mut self, context: &mut DeliveryContext<'_>) {
         let (reception, budget, mut accounting) = self.split(context);
         reception.settle(budget, &mut |decision| accounting.take(decision));
-        self.conclude(Timestamp(u64::MAX), context);
+        self.conclude(ModelTime::MAX, context);
     }
 
     /// Merges `other`, which turned out to be the same receiver.
     pub fn absorb(&mut self, mut other: Self, context: &mut DeliveryContext<'_>) {
-        let mut runs = self.loss_causes.due(Timestamp(u64::MAX));
-        runs.extend(other.loss_causes.due(Timestamp(u64::MAX)));
+        let mut runs = self.loss_causes.due(ModelTime::MAX);
+        runs.extend(other.loss_causes.due(ModelTime::MAX));
         // Long runs are not caused by single fragments, and no retransmission repairs them.
         let (long, short): (Vec<_>, Vec<_>) = runs
             .into_iter()
@@ -392,8 +399,8 @@ impl Delivery {
         context.reliable && !self.best_effort
     }
 
-    fn touch(&mut self, record: &Record) {
-        self.last_seen = self.last_seen.max(Timestamp(record.time));
+    fn touch(&mut self, now: ModelTime) {
+        self.last_seen = self.last_seen.max(now);
     }
 
     fn take(
@@ -411,8 +418,9 @@ impl Delivery {
             return self.late(sample, context);
         }
         let before = (sequence.next(), sequence.last_advance());
+        let now = context.now;
         let (reception, budget, mut accounting) = self.split(context);
-        let outcome = reception.sample(sample, reliable, budget, &mut |decision| {
+        let outcome = reception.sample(sample, now, reliable, budget, &mut |decision| {
             accounting.take(decision);
         });
         self.excuse_unheard(before);
@@ -525,7 +533,7 @@ impl Delivery {
     }
 
     /// Settles samples pending until `now` as lost before this host.
-    fn conclude(&mut self, now: Timestamp, context: &mut DeliveryContext<'_>) {
+    fn conclude(&mut self, now: ModelTime, context: &mut DeliveryContext<'_>) {
         for (first, last) in self.loss_causes.due(now) {
             let (_, _, mut accounting) = self.split(context);
             accounting.conclude(first, last);

@@ -6,6 +6,7 @@ use std::collections::VecDeque;
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::route::Destination;
 use crate::facts::tables::LatestDepartures;
 
@@ -21,7 +22,7 @@ pub struct Departures {
 struct Departure {
     number: SequenceNumber,
     destination: Destination,
-    at: Timestamp,
+    at: ModelTime,
 }
 
 impl Departures {
@@ -34,7 +35,7 @@ impl Departures {
     }
 
     /// Records that the sample left completely for this destination.
-    pub fn note(&mut self, number: SequenceNumber, destination: Destination, at: Timestamp) {
+    pub fn note(&mut self, number: SequenceNumber, destination: Destination, at: ModelTime) {
         self.latest.push_back(Departure {
             number,
             destination,
@@ -44,7 +45,7 @@ impl Departures {
 
     /// Returns the time at which the sample left for this destination, if it is remembered.
     #[must_use]
-    pub fn find(&self, number: SequenceNumber, destination: Destination) -> Option<Timestamp> {
+    pub fn find(&self, number: SequenceNumber, destination: Destination) -> Option<ModelTime> {
         let mut latest = self.latest.iter().rev();
         let found = latest.find(|each| each.number == number && each.destination == destination);
         found.map(|departure| departure.at)
@@ -65,16 +66,20 @@ mod tests {
         for number in 1..=1000 {
             let source = Timestamp(number);
             assert!(departures.is_first(source) && !departures.is_first(source));
-            departures.note(SequenceNumber(number), destination(1), Timestamp(number));
+            departures.note(
+                SequenceNumber(number),
+                destination(1),
+                ModelTime::from_nanoseconds(number),
+            );
             departures.note(
                 SequenceNumber(number),
                 destination(2),
-                Timestamp(number + 5),
+                ModelTime::from_nanoseconds(number + 5),
             );
         }
         assert_eq!(
             departures.find(SequenceNumber(1000), destination(2)),
-            Some(Timestamp(1005))
+            Some(ModelTime::from_nanoseconds(1005))
         );
         assert_eq!(departures.find(SequenceNumber(1), destination(1)), None);
         assert!(departures.latest.len() <= LatestDepartures::CAP);

@@ -18,10 +18,10 @@
 
 use std::time::Duration;
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
 
 use crate::facts::loss_share::LossShare;
+use crate::facts::model_time::ModelTime;
 use crate::facts::rate::{SECONDS, Slot};
 use crate::facts::watch::{Expectations, WatchState};
 
@@ -51,20 +51,20 @@ const SUBSCRIBERS: u8 = 1 << 6;
 /// The facts that an evaluation uses.
 pub struct Evidence<'a> {
     /// Time of the evaluation.
-    pub now: Timestamp,
+    pub now: ModelTime,
     /// Number of live writers.
     pub publishers: usize,
     /// Number of live readers.
     pub subscriptions: usize,
     /// Time of the last message of any writer.
-    pub last_message: Option<Timestamp>,
+    pub last_message: Option<ModelTime>,
     /// Returns how long the topic may seem silent while messages are sent, at this interval if none
     /// is known.
     pub seeming_silence: &'a dyn Fn(Duration) -> Duration,
     /// Time since which the topic has a writer and is watched.
-    pub since: Timestamp,
+    pub since: ModelTime,
     /// Time since which messages are expected and would be seen; at least `since`.
-    pub observed: Timestamp,
+    pub observed: ModelTime,
     /// Returns counts of the last whole seconds and the number of these seconds.
     pub recent: &'a dyn Fn(u64) -> (Slot, u64),
     /// Loss of the worst subscriber in the last ten seconds.
@@ -86,7 +86,7 @@ pub struct Judgement {
 impl Evidence<'_> {
     /// Returns the number of whole seconds in which messages would have been seen.
     fn observed_seconds(&self) -> u64 {
-        let first = self.observed.0.div_ceil(SECOND);
+        let first = self.observed.nanoseconds().div_ceil(SECOND);
         self.now.whole_seconds().saturating_sub(first)
     }
 
@@ -99,7 +99,7 @@ impl Evidence<'_> {
         if seeming.is_zero() || self.now - last > seeming {
             return 0.0;
         }
-        let end = Timestamp(self.now.whole_seconds().saturating_mul(SECOND));
+        let end = ModelTime::of_second(self.now.whole_seconds());
         (end - last).as_secs_f64()
     }
 }
@@ -269,13 +269,13 @@ mod tests {
         judgement: Judgement,
         expectations: Expectations,
         now: u64,
-        last_message: Option<Timestamp>,
+        last_message: Option<ModelTime>,
         seeming_silence: Duration,
         /// Time before an evaluation of which polling has seen nothing.
         unseen: Duration,
         subscriptions: usize,
         publishers: usize,
-        observed: Timestamp,
+        observed: ModelTime,
     }
 
     impl Bench {
@@ -289,7 +289,7 @@ mod tests {
                 unseen: Duration::ZERO,
                 subscriptions: 1,
                 publishers: 1,
-                observed: Timestamp(1000 * SECOND),
+                observed: ModelTime::from_nanoseconds(1000 * SECOND),
             }
         }
 
@@ -298,7 +298,7 @@ mod tests {
             self.now += SECOND;
             if slot.messages > 0 {
                 let unseen = u64::try_from(self.unseen.as_nanos()).unwrap();
-                self.last_message = Some(Timestamp(self.now - unseen));
+                self.last_message = Some(ModelTime::from_nanoseconds(self.now - unseen));
             }
             let recent = |seconds: u64| {
                 let mut sum = Slot::default();
@@ -308,12 +308,12 @@ mod tests {
             self.judgement.judge(
                 &self.expectations,
                 &Evidence {
-                    now: Timestamp(self.now),
+                    now: ModelTime::from_nanoseconds(self.now),
                     publishers: self.publishers,
                     subscriptions: self.subscriptions,
                     last_message: self.last_message,
                     seeming_silence: &|_| self.seeming_silence,
-                    since: Timestamp(1000 * SECOND),
+                    since: ModelTime::from_nanoseconds(1000 * SECOND),
                     observed: self.observed,
                     recent: &recent,
                     loss: LossShare {
@@ -410,12 +410,12 @@ mod tests {
         assert_eq!(bench.second(rate(5)), ok);
         // Five seconds are not seen.
         bench.now += 5 * SECOND;
-        bench.observed = Timestamp(bench.now);
+        bench.observed = ModelTime::from_nanoseconds(bench.now);
         let states = [(); 3].map(|()| bench.second(rate(0)));
         assert_eq!(states, [ok, ok, silent]);
         // What was silent before stays silent.
         bench.now += 5 * SECOND;
-        bench.observed = Timestamp(bench.now);
+        bench.observed = ModelTime::from_nanoseconds(bench.now);
         assert_eq!([0, 1].map(|count| bench.second(rate(count))), [silent, ok]);
     }
 
@@ -466,7 +466,7 @@ mod tests {
         });
         // Messages of the window before the view began are unknown.
         bench.now += 20 * SECOND;
-        bench.observed = Timestamp(bench.now);
+        bench.observed = ModelTime::from_nanoseconds(bench.now);
         let states = [(); 7].map(|()| bench.second(rate(0)));
         let (ok, bad) = (WatchState::Ok, WatchState::Violated);
         assert_eq!(states, [ok, ok, bad, bad, bad, bad, bad]);

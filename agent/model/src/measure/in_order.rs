@@ -16,10 +16,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_wire::{SequenceNumber, Timestamp};
+use ros2probe_wire::SequenceNumber;
 
 use crate::facts::bounded::Bounded;
-use crate::facts::dispatch::{Dispatch, Sample};
+use crate::facts::dispatch::{QueuedDispatch, Sample};
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{self, OrderedSamples};
 
 /// Longest time that a gap is waited for. Fast DDS requests retransmissions after a HEARTBEAT,
@@ -56,9 +57,9 @@ pub struct QueuedSample {
     /// Ids of the requests.
     pub to: Arc<[u64]>,
     /// The sample.
-    pub sample: Sample,
+    pub sample: Sample<ModelTime>,
     /// The outcome for subscriptions that miss its bytes.
-    pub missed: Option<Dispatch>,
+    pub missed: Option<QueuedDispatch>,
 }
 
 /// Numbers of a writer that is not announced yet.
@@ -71,14 +72,14 @@ pub struct InOrder {
     bytes: usize,
     incarnation: Option<u32>,
     /// The missing number, and since when it is waited for.
-    hole: (SequenceNumber, Timestamp),
+    hole: (SequenceNumber, ModelTime),
     /// Whether readers may have the missing number.
     is_hole_unseen: bool,
     /// Time of the last dispatched sample.
-    last: Timestamp,
+    last: ModelTime,
     /// Numbers that were counted before the writer's announcement but not dispatched.
     earlier: UnannouncedNumbers,
-    announced: Timestamp,
+    announced: ModelTime,
 }
 
 impl QueuedSample {
@@ -107,7 +108,7 @@ impl InOrder {
     }
 
     /// Sets the numbers that were counted before the writer's announcement at `now`.
-    pub fn announced(&mut self, earlier: UnannouncedNumbers, now: Timestamp) {
+    pub fn announced(&mut self, earlier: UnannouncedNumbers, now: ModelTime) {
         (self.earlier, self.announced) = (earlier, now);
     }
 
@@ -118,14 +119,14 @@ impl InOrder {
     }
 
     /// Begins a new incarnation after all samples of the previous one are dispatched.
-    pub fn begin(&mut self, incarnation: u32, now: Timestamp, give: &mut impl FnMut(QueuedSample)) {
+    pub fn begin(&mut self, incarnation: u32, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
         if self.incarnation.replace(incarnation) != Some(incarnation) {
             self.give_all(now, give);
         }
     }
 
     /// Returns the sample for immediate dispatch; no other sample waits.
-    pub fn pass(&mut self, mut queued: QueuedSample, now: Timestamp) -> QueuedSample {
+    pub fn pass(&mut self, mut queued: QueuedSample, now: ModelTime) -> QueuedSample {
         queued.sample.time = now.max(self.last);
         self.last = queued.sample.time;
         queued
@@ -143,7 +144,7 @@ impl InOrder {
     }
 
     /// Returns samples from before the announcement that will not be retransmitted.
-    pub fn forgone(&mut self, progress: &Progress, now: Timestamp) -> Vec<SequenceNumber> {
+    pub fn forgone(&mut self, progress: &Progress, now: ModelTime) -> Vec<SequenceNumber> {
         if self.earlier.is_empty() {
             return Vec::new();
         }
@@ -160,7 +161,7 @@ impl InOrder {
     pub fn turn(
         &mut self,
         progress: &Progress,
-        now: Timestamp,
+        now: ModelTime,
         room: usize,
         give: &mut impl FnMut(QueuedSample),
     ) -> Option<SequenceNumber> {
@@ -193,13 +194,13 @@ impl InOrder {
     }
 
     /// Dispatches all waiting samples at the end of the input.
-    pub fn give_all(&mut self, now: Timestamp, give: &mut impl FnMut(QueuedSample)) {
+    pub fn give_all(&mut self, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
         while let Some((_, queued)) = self.waiting.pop_first() {
             self.give(queued, now, give);
         }
     }
 
-    fn give(&mut self, queued: QueuedSample, now: Timestamp, give: &mut impl FnMut(QueuedSample)) {
+    fn give(&mut self, queued: QueuedSample, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
         self.bytes -= queued.cost();
         let came = queued.sample.time;
         // Its reader may have received the lower number through unobserved shared memory, and then
@@ -209,7 +210,7 @@ impl InOrder {
         // Players sort by time, so samples that waited for the same retransmission are one
         // nanosecond apart.
         let after = match came < now.max(self.last) {
-            true => Timestamp(self.last.0.saturating_add(1)),
+            true => self.last + Duration::from_nanos(1),
             false => came,
         };
         give(self.pass(queued, now.max(after)));

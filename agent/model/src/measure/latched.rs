@@ -15,6 +15,7 @@ use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber, Timestamp};
 
 use crate::facts::bounded::{Bounded, Counted, Sum, TableFacts};
 use crate::facts::dispatch::{Sample, Topic};
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{RetainedBytes, RetainedWriters};
 use crate::measure::assembly::Assembly;
 use allowance::Allowance;
@@ -82,7 +83,8 @@ struct LatchedWriter {
 enum Last {
     /// None was seen whole.
     Unseen,
-    Kept(Arc<Sample>),
+    /// The message, and the time at which it came.
+    Kept(Arc<Sample>, ModelTime),
     TooLarge(u32),
     /// The writer was paused when it came.
     Paused,
@@ -116,7 +118,7 @@ impl Latched {
         };
         known.about = about;
         // A message that a watch requested may be too large without it.
-        if let Last::Kept(sample) = &known.last
+        if let Last::Kept(sample, _) = &known.last
             && size(sample) > known.most()
         {
             let last = Last::TooLarge(sized(size(sample)));
@@ -151,9 +153,9 @@ impl Latched {
     }
 
     /// Adds a DATA or DATA_FRAG that no client requests. Returns whether the verdict has changed.
-    pub fn put(&mut self, sample: record::Sample<'_>, payload: &[u8]) -> bool {
+    pub fn put(&mut self, sample: record::Sample<'_>, now: ModelTime, payload: &[u8]) -> bool {
         let record = sample.record();
-        let (writer, now) = (record.writer(), Timestamp(record.time));
+        let writer = record.writer();
         let Some(known) = self.writers.get_mut(&writer) else {
             return false;
         };
@@ -184,7 +186,7 @@ impl Latched {
             // The kept message is no longer the last.
             self.replace(writer, Last::Unseen);
         }
-        self.assembly.put(sample, payload, 0);
+        self.assembly.put(sample, now, payload, 0);
         if !self.assembly.is_whole(writer, number) {
             return false;
         }
@@ -195,7 +197,7 @@ impl Latched {
         let has_stamp = known.about.has_header && matches!(sample, record::Sample::Data(_));
         let sample = Sample {
             topic: Arc::clone(&known.about.topic),
-            time: now,
+            time: Timestamp(record.time),
             writer,
             sequence_number: number,
             source_timestamp: source,
@@ -204,12 +206,12 @@ impl Latched {
             sampled: false,
             payload,
         };
-        self.keep(Arc::new(sample));
+        self.keep(Arc::new(sample), now);
         false
     }
 
-    /// Keeps a message that a client received.
-    pub fn dispatched(&mut self, sample: &Arc<Sample>) {
+    /// Keeps a message that a client received, and that came at `at`.
+    pub fn dispatched(&mut self, sample: &Arc<Sample>, at: ModelTime) {
         let Some(known) = self.writers.get_mut(&sample.writer) else {
             return;
         };
@@ -223,7 +225,7 @@ impl Latched {
             let last = Last::TooLarge(sized(size(sample)));
             self.replace(sample.writer, last);
         } else {
-            self.keep(Arc::clone(sample));
+            self.keep(Arc::clone(sample), at);
         }
     }
 
@@ -257,7 +259,7 @@ impl Latched {
 
     /// Drops unfinished messages that wait for too long. Returns the writers that are captured
     /// again.
-    pub fn advance(&mut self, now: Timestamp) -> Vec<Guid> {
+    pub fn advance(&mut self, now: ModelTime) -> Vec<Guid> {
         self.assembly.expire(now);
         if self.paused == 0 || self.allowance.left(now) < RESUME_BYTES {
             return Vec::new();
@@ -273,15 +275,15 @@ impl Latched {
         resumed
     }
 
-    /// Returns the kept messages, the oldest first.
+    /// Returns the kept messages with the times at which they came, the oldest first.
     #[must_use]
-    pub fn samples(&self) -> Vec<Arc<Sample>> {
+    pub fn samples(&self) -> Vec<(ModelTime, Arc<Sample>)> {
         let kept = self.writers.values().filter_map(|known| match &known.last {
-            Last::Kept(sample) => Some(Arc::clone(sample)),
+            Last::Kept(sample, at) => Some((*at, Arc::clone(sample))),
             _ => None,
         });
         let mut kept: Vec<_> = kept.collect();
-        kept.sort_by_key(|sample| (sample.time, sample.writer));
+        kept.sort_by_key(|(at, sample)| (*at, sample.writer));
         kept
     }
 
@@ -291,7 +293,7 @@ impl Latched {
         let known = self.writers.get(&writer)?;
         Some(match &known.last {
             Last::Unseen => LatchedFacts::Unseen,
-            Last::Kept(sample) => LatchedFacts::Kept(sized(size(sample))),
+            Last::Kept(sample, _) => LatchedFacts::Kept(sized(size(sample))),
             Last::TooLarge(bytes) => LatchedFacts::TooLarge(*bytes),
             Last::Paused => LatchedFacts::Paused,
             Last::NoRoom(bytes) => LatchedFacts::NoRoom(*bytes),
@@ -319,7 +321,7 @@ impl Latched {
     }
 
     /// Keeps a message, if it finds room.
-    fn keep(&mut self, sample: Arc<Sample>) {
+    fn keep(&mut self, sample: Arc<Sample>, at: ModelTime) {
         let (writer, bytes) = (sample.writer, size(&sample));
         self.replace(writer, Last::Unseen);
         let known = self.writers.get(&writer);
@@ -332,7 +334,7 @@ impl Latched {
             };
             self.replace(other, Last::NoRoom(sized(size)));
         }
-        self.replace(writer, Last::Kept(sample));
+        self.replace(writer, Last::Kept(sample, at));
     }
 
     /// Returns the writer whose message makes room, and its size: the oldest of the participant with
@@ -345,21 +347,21 @@ impl Latched {
     ) -> Option<(Guid, usize)> {
         let kept = || {
             self.writers.iter().filter_map(|(writer, known)| {
-                let Last::Kept(sample) = &known.last else {
+                let Last::Kept(sample, at) = &known.last else {
                     return None;
                 };
-                (is_watched || !known.about.is_watched).then_some((writer, sample))
+                (is_watched || !known.about.is_watched).then_some((writer, sample, *at))
             })
         };
         let mut sums: HashMap<GuidPrefix, usize> = HashMap::from([(newcomer, bytes)]);
-        for (writer, sample) in kept() {
+        for (writer, sample, _) in kept() {
             *sums.entry(writer.prefix).or_default() += size(sample);
         }
-        let having = |prefix: &GuidPrefix| kept().any(|(writer, _)| writer.prefix == *prefix);
+        let having = |prefix: &GuidPrefix| kept().any(|(writer, ..)| writer.prefix == *prefix);
         let largest = sums.iter().filter(|(prefix, _)| having(prefix));
         let (largest, _) = largest.max_by_key(|(prefix, sum)| (**sum, **prefix))?;
-        let own = kept().filter(|(writer, _)| writer.prefix == *largest);
-        let (writer, sample) = own.min_by_key(|(writer, sample)| (sample.time, **writer))?;
+        let own = kept().filter(|(writer, ..)| writer.prefix == *largest);
+        let (writer, sample, _) = own.min_by_key(|(writer, _, at)| (*at, **writer))?;
         Some((*writer, size(sample)))
     }
 
@@ -368,10 +370,10 @@ impl Latched {
         let Some(known) = self.writers.get_mut(&writer) else {
             return;
         };
-        if let Last::Kept(sample) = &last {
+        if let Last::Kept(sample, _) = &last {
             self.bytes.add(size(sample));
         }
-        if let Last::Kept(sample) = std::mem::replace(&mut known.last, last) {
+        if let Last::Kept(sample, _) = std::mem::replace(&mut known.last, last) {
             self.bytes.sub(size(&sample));
         }
     }

@@ -7,10 +7,11 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use ros2probe_wire::{SequenceNumber, Timestamp};
+use ros2probe_wire::SequenceNumber;
 
 use crate::facts::bounded::Bounded;
 use crate::facts::loss::LossCause;
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{KnownLosses, OpenLosses};
 
 /// The kernel waits 30 s for IP fragments (`net.ipv4.ipfrag_time`).
@@ -30,18 +31,18 @@ pub struct KnownLoss {
     /// Cause nearest to the reader.
     pub cause: LossCause,
     /// Time at which its first part was lost.
-    pub at: Timestamp,
+    pub at: ModelTime,
 }
 
 #[derive(Clone, Copy, Debug)]
 struct Run {
     last: SequenceNumber,
-    until: Timestamp,
+    until: ModelTime,
 }
 
 impl LossCauses {
     /// Records the loss of some or all of this sample. Returns whether an older one was dropped.
-    pub fn note(&mut self, number: SequenceNumber, cause: LossCause, at: Timestamp) -> bool {
+    pub fn note(&mut self, number: SequenceNumber, cause: LossCause, at: ModelTime) -> bool {
         if let Some(known_loss) = self.known.get_mut(&number) {
             known_loss.cause = known_loss.cause.max(cause);
             return false;
@@ -98,7 +99,7 @@ impl LossCauses {
         &mut self,
         first: SequenceNumber,
         last: SequenceNumber,
-        until: Timestamp,
+        until: ModelTime,
     ) -> Option<(SequenceNumber, SequenceNumber)> {
         if let Some((_, run)) = self.pending.range_mut(..first).next_back()
             && run.last.precedes(first)
@@ -134,7 +135,7 @@ impl LossCauses {
     }
 
     /// Removes and returns the runs whose waiting time is over.
-    pub fn due(&mut self, now: Timestamp) -> Vec<(SequenceNumber, SequenceNumber)> {
+    pub fn due(&mut self, now: ModelTime) -> Vec<(SequenceNumber, SequenceNumber)> {
         let mut due = Vec::new();
         self.pending.retain(|first, run| {
             let is_due = run.until <= now;
@@ -158,8 +159,8 @@ impl LossCauses {
 mod tests {
     use super::*;
 
-    fn at(seconds: u64) -> Timestamp {
-        Timestamp(seconds * 1_000_000_000)
+    fn at(seconds: u64) -> ModelTime {
+        ModelTime::from_nanoseconds(seconds * 1_000_000_000)
     }
 
     fn explained(

@@ -10,13 +10,17 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_wire::{Guid, SequenceNumber, Timestamp, record};
+use ros2probe_wire::{Guid, SequenceNumber, record};
 
 use crate::facts::bounded::Bounded;
-use crate::facts::dispatch::{Dispatch, Missed, MissedReason, Sample, SampleOutcome, Topic};
+use crate::facts::dispatch::{
+    Dispatch, Missed, MissedReason, QueuedDispatch, Sample, SampleOutcome, Topic,
+};
 use crate::facts::journal::Missing;
+use crate::facts::model_time::ModelTime;
 use crate::facts::selection::RequestIds;
 use crate::facts::tables::WaitingDispatches;
+use crate::facts::wall_clock::WallClock;
 use crate::measure::assembly::Assembly;
 use crate::measure::in_order::{InOrder, Progress, QueuedSample, UnannouncedNumbers};
 use crate::measure::writer::Counted;
@@ -37,7 +41,7 @@ struct WantedWriter {
     /// Where each request begins.
     begins: Vec<RequestBegin>,
     /// Time since which payloads are requested.
-    since: Timestamp,
+    since: ModelTime,
     /// Number of the first sample that was dispatched with its payload.
     first_whole: Option<SequenceNumber>,
     order: InOrder,
@@ -63,7 +67,7 @@ pub struct Payloads {
     assembly: Assembly,
     /// Counted samples of writers without an announcement, while samples are requested.
     unknown_writers: HashMap<Guid, UnannouncedSamples>,
-    dispatches: Bounded<WaitingDispatches, Vec<Dispatch>>,
+    dispatches: Bounded<WaitingDispatches, Vec<QueuedDispatch>>,
     dispatch_bytes: usize,
     /// Bytes of samples that wait for lower numbers.
     waiting_bytes: usize,
@@ -128,7 +132,7 @@ impl Payloads {
         writer: Guid,
         topic: Topic,
         requested: &RequestIds,
-        (next, now): (SequenceNumber, Timestamp),
+        (next, now): (SequenceNumber, ModelTime),
     ) {
         let before = self.writers.remove(&writer);
         let known = before.as_ref().filter(|known| *known.topic == topic);
@@ -168,7 +172,7 @@ impl Payloads {
     }
 
     /// Stops dispatching samples of this writer, after those that wait.
-    pub fn release(&mut self, writer: Guid, now: Timestamp) {
+    pub fn release(&mut self, writer: Guid, now: ModelTime) {
         self.unknown_writers.remove(&writer);
         self.give_all(writer, now);
         let before = self.writers.remove(&writer);
@@ -179,9 +183,9 @@ impl Payloads {
     }
 
     /// Keeps the payload of a DATA or DATA_FRAG whose sample is not counted yet.
-    pub fn keep(&mut self, sample: record::Sample<'_>, payload: &[u8]) {
+    pub fn keep(&mut self, sample: record::Sample<'_>, now: ModelTime, payload: &[u8]) {
         let other_bytes = self.dispatch_bytes + self.waiting_bytes;
-        self.assembly.put(sample, payload, other_bytes);
+        self.assembly.put(sample, now, payload, other_bytes);
     }
 
     /// Returns whether samples of this writer are requested.
@@ -365,7 +369,7 @@ impl Payloads {
         &mut self,
         writer: Guid,
         progress: &Progress,
-        now: Timestamp,
+        now: ModelTime,
     ) -> Option<SequenceNumber> {
         let (_, limit, _) = self.assembly.size();
         let room = (limit / 2).saturating_sub(self.waiting_bytes);
@@ -384,7 +388,7 @@ impl Payloads {
 
     /// Dispatches all waiting samples of a writer that has ended, and reports those that never
     /// arrived again.
-    pub fn give_all(&mut self, writer: Guid, now: Timestamp) {
+    pub fn give_all(&mut self, writer: Guid, now: ModelTime) {
         let nothing_awaited = Progress::default();
         let Some(interested) = self.writers.get_mut(&writer) else {
             return;
@@ -401,7 +405,7 @@ impl Payloads {
     }
 
     /// Reports samples that will not arrive, at `now`.
-    pub fn missing(&mut self, missing: &Missing, now: Timestamp) {
+    pub fn missing(&mut self, missing: &Missing, now: ModelTime) {
         let Missing {
             writer,
             first,
@@ -420,14 +424,15 @@ impl Payloads {
     }
 
     /// Drops samples that will not become complete.
-    pub fn expire(&mut self, now: Timestamp) {
+    pub fn expire(&mut self, now: ModelTime) {
         self.assembly.expire(now);
     }
 
-    /// Removes and returns the output queue.
-    pub fn take(&mut self) -> Vec<Dispatch> {
+    /// Removes and returns the output queue, with wall times.
+    pub fn take(&mut self, clock: WallClock) -> Vec<Dispatch> {
         self.dispatch_bytes = 0;
-        self.dispatches.take()
+        let dispatches = self.dispatches.take().into_iter();
+        dispatches.map(|each| each.at_wall_time(clock)).collect()
     }
 
     /// Returns whether the output queue should be taken before further input.
@@ -438,7 +443,7 @@ impl Payloads {
     }
 
     /// Prepares samples counted before the announcement for dispatch if they are retransmitted.
-    fn announced(&mut self, writer: Guid, now: Timestamp) {
+    fn announced(&mut self, writer: Guid, now: ModelTime) {
         let Some(earlier) = self.unknown_writers.remove(&writer) else {
             return;
         };
@@ -459,7 +464,7 @@ impl Payloads {
     }
 
     /// Reports samples that will not be retransmitted.
-    fn unannounced(&mut self, writer: Guid, numbers: &[SequenceNumber], now: Timestamp) {
+    fn unannounced(&mut self, writer: Guid, numbers: &[SequenceNumber], now: ModelTime) {
         let Some(interested) = self.writers.get(&writer) else {
             return;
         };
@@ -478,7 +483,7 @@ impl Payloads {
         if !queued.to.is_empty() {
             let sample = Dispatch {
                 to: queued.to,
-                outcome: SampleOutcome::Sample(Arc::new(queued.sample)),
+                outcome: SampleOutcome::Sample(queued.sample),
             };
             self.give(sample, bytes);
         }
@@ -487,7 +492,7 @@ impl Payloads {
         }
     }
 
-    fn give(&mut self, dispatches: Dispatch, bytes: usize) {
+    fn give(&mut self, dispatches: QueuedDispatch, bytes: usize) {
         let (used, limit, _) = self.size();
         if self.dispatches.len() < WaitingDispatches::CAP / 2
             && (bytes == 0 || used + bytes <= limit)
@@ -514,9 +519,9 @@ impl WantedWriter {
         &self,
         writer: Guid,
         (first, last): (SequenceNumber, SequenceNumber),
-        (reason, now): (MissedReason, Timestamp),
+        (reason, now): (MissedReason, ModelTime),
         payload_delay: Duration,
-    ) -> Vec<Dispatch> {
+    ) -> Vec<QueuedDispatch> {
         let mut missed: Vec<(SequenceNumber, Vec<u64>)> = Vec::new();
         for begin in &self.begins {
             let Some(from) = begin.misses_from(reason, now, payload_delay) else {
@@ -558,7 +563,7 @@ impl WantedWriter {
     }
 
     /// Returns the report that a counted sample is missing for requests of its payload.
-    fn not_captured(&self, writer: Guid, number: SequenceNumber) -> Dispatch {
+    fn not_captured(&self, writer: Guid, number: SequenceNumber) -> QueuedDispatch {
         Dispatch {
             to: Arc::clone(&self.payloads),
             outcome: SampleOutcome::Missed(Missed {

@@ -10,13 +10,14 @@ use std::time::Duration;
 
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::record::{Body, flag};
-use ros2probe_wire::{Guid, Record, SequenceNumber, Timestamp};
+use ros2probe_wire::{Guid, Record, SequenceNumber};
 
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{self, Bounded};
 use crate::facts::journal::Journal;
 use crate::facts::loss_share::LossShare;
 use crate::facts::measurement::Measurement;
+use crate::facts::model_time::ModelTime;
 use crate::facts::route::Destination;
 use crate::facts::tables;
 use crate::facts::wall_clock::WallClock;
@@ -59,18 +60,18 @@ pub struct Measured {
     /// Its topic; `None` for an unknown writer.
     pub topic: Option<TopicId>,
     /// Time of the first record or announcement.
-    pub first_seen: Timestamp,
+    pub first_seen: ModelTime,
     /// Time of the last record.
-    pub last_seen: Timestamp,
+    pub last_seen: ModelTime,
     /// Whether an unknown writer has existed long enough to be metered.
     pub metered: bool,
     /// Cookie of the socket by which an unknown writer sends; 0 if not known.
     pub sent_from: u64,
-    opened: Timestamp,
+    opened: ModelTime,
     /// Whether a gap was waited for and no ACKNACK arrived.
     unacknowledged: bool,
     /// Time from which the kernel captures all of its fragments.
-    sure_from: Timestamp,
+    sure_from: ModelTime,
 }
 
 /// All measured writers.
@@ -79,7 +80,7 @@ pub struct Profiler {
     writers: HashMap<Guid, Measured>,
     unknown_writers: Bounded<bounded::Counted<tables::UnknownWriters>, BTreeSet<Guid>>,
     shared: SharedBudgets,
-    search_after: Timestamp,
+    search_after: ModelTime,
 }
 
 /// Budgets that all writers share.
@@ -142,7 +143,7 @@ impl Profiler {
                     wanted: false,
                 },
             },
-            search_after: Timestamp(0),
+            search_after: ModelTime::ZERO,
         }
     }
 
@@ -166,7 +167,7 @@ impl Profiler {
     pub fn progress(
         &mut self,
         guid: Guid,
-        now: Timestamp,
+        now: ModelTime,
         graph: GraphView<'_>,
     ) -> Option<Progress> {
         let measured = self.writers.get_mut(&guid)?;
@@ -207,18 +208,17 @@ impl Profiler {
         &self.shared.quota
     }
 
-    /// Processes a record if its writer is measured.
+    /// Processes a record, seen at `now`, if its writer is measured.
     pub fn record(
         &mut self,
         guid: Guid,
-        record: &Record,
+        (record, now): (&Record, ModelTime),
         journal: &mut Journal,
         graph: GraphView<'_>,
     ) -> RecordOutcome {
         let Some(measured) = self.writers.get_mut(&guid) else {
             return RecordOutcome::Unmeasured;
         };
-        let now = Timestamp(record.time);
         measured.last_seen = measured.last_seen.max(now);
         if measured.topic.is_none() && !measured.metered {
             // The kernel filter's budget for unknown writers may omit samples, so a gap is no loss.
@@ -271,14 +271,14 @@ impl Profiler {
     }
 
     /// Records that samples in shared memory before `now` may have been missed.
-    pub fn uncertain(&mut self, now: Timestamp) {
+    pub fn uncertain(&mut self, now: ModelTime) {
         for measured in self.writers.values_mut() {
             measured.writer.uncertain(now);
         }
     }
 
     /// Records that bytes for this destination were not captured.
-    pub fn missed(&mut self, destination: Destination, at: Timestamp) {
+    pub fn missed(&mut self, destination: Destination, at: ModelTime) {
         for measured in self.writers.values_mut() {
             if let Some(subscribers) = &mut measured.subscribers
                 && subscribers.missed(destination, at)
@@ -301,8 +301,8 @@ impl Profiler {
         guid: Guid,
         topic: TopicId,
         traits: Traits,
-        opened: Timestamp,
-        now: Timestamp,
+        opened: ModelTime,
+        now: ModelTime,
     ) {
         if let Some(known) = self.writers.get_mut(&guid) {
             known.writer.learn(traits);
@@ -348,7 +348,7 @@ impl Profiler {
     }
 
     /// Records that a new reader makes samples of this writer visible.
-    pub fn open(&mut self, guid: Guid, at: Timestamp) {
+    pub fn open(&mut self, guid: Guid, at: ModelTime) {
         if let Some(measured) = self.writers.get_mut(&guid) {
             measured.opened = at;
         }
@@ -358,7 +358,7 @@ impl Profiler {
     pub fn stop(
         &mut self,
         guid: Guid,
-        now: Timestamp,
+        now: ModelTime,
         journal: &mut Journal,
         graph: GraphView<'_>,
     ) -> Option<Retired> {
@@ -387,7 +387,7 @@ impl Profiler {
     /// Settles samples whose waiting time is over.
     pub fn advance(
         &mut self,
-        now: Timestamp,
+        now: ModelTime,
         journal: &mut Journal,
         graph: GraphView<'_>,
     ) -> UnknownWriters {
@@ -428,7 +428,7 @@ impl Profiler {
     }
 
     /// Settles all samples at the end of the input.
-    pub fn settle(&mut self, now: Timestamp, journal: &mut Journal, graph: GraphView<'_>) {
+    pub fn settle(&mut self, now: ModelTime, journal: &mut Journal, graph: GraphView<'_>) {
         let mut guids: Vec<_> = self.writers.keys().copied().collect();
         guids.sort_unstable();
         for guid in guids {
@@ -453,7 +453,7 @@ impl Profiler {
     }
 
     /// Drops the deliveries that have been silent longest, since a new one was refused.
-    fn give_up_silent(&mut self, now: Timestamp, journal: &mut Journal, graph: GraphView<'_>) {
+    fn give_up_silent(&mut self, now: ModelTime, journal: &mut Journal, graph: GraphView<'_>) {
         let mut silent: Vec<_> = self
             .writers
             .iter()
@@ -479,7 +479,7 @@ impl SharedBudgets {
     fn measurement_context<'a>(
         &'a mut self,
         writer_ref: WriterRef,
-        now: Timestamp,
+        now: ModelTime,
         journal: &'a mut Journal,
         wall_clock: WallClock,
     ) -> MeasurementContext<'a> {
@@ -499,7 +499,7 @@ impl SharedBudgets {
     fn writer_context<'a>(
         &'a mut self,
         writer_ref: WriterRef,
-        now: Timestamp,
+        now: ModelTime,
         journal: &'a mut Journal,
         graph: GraphView<'a>,
     ) -> WriterContext<'a> {
@@ -540,7 +540,7 @@ impl Measured {
         known.any(|reader| reader.qos.reliability == Reliability::RELIABLE)
     }
 
-    fn new(writer: Writer, topic: Option<TopicId>, now: Timestamp) -> Self {
+    fn new(writer: Writer, topic: Option<TopicId>, now: ModelTime) -> Self {
         Self {
             writer: Box::new(writer),
             subscribers: None,
@@ -549,14 +549,14 @@ impl Measured {
             last_seen: now,
             metered: false,
             sent_from: 0,
-            opened: Timestamp(0),
+            opened: ModelTime::ZERO,
             unacknowledged: false,
-            sure_from: Timestamp(0),
+            sure_from: ModelTime::ZERO,
         }
     }
 
     /// Marks the writer as metered once the kernel knows it.
-    fn allow_incomplete(&mut self, now: Timestamp) {
+    fn allow_incomplete(&mut self, now: ModelTime) {
         self.sure_from = now + KERNEL_UPDATE_TIME;
         self.writer.allow_incomplete(self.sure_from);
     }

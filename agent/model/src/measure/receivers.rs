@@ -61,7 +61,7 @@ pub struct GraphView<'a> {
     pub discovery: &'a Discovery,
     /// Readers and writers of each topic.
     pub topics: &'a Topics,
-    /// Difference between model time and calendar time, for timestamps of writers.
+    /// Difference between model time and wall time, for timestamps of writers.
     pub wall_clock: WallClock,
 }
 

@@ -7,8 +7,9 @@
 use std::time::Duration;
 
 use ros2probe_wire::record::{self, DataFrag, Gap, Heartbeat};
-use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
+use ros2probe_wire::{RtpsTime, SequenceNumber};
 
+use crate::facts::model_time::ModelTime;
 use crate::measure::samples::{Budget, Facts, Progress, Samples};
 use crate::measure::sequence::{Arrival, REACH, RepairMode, RunMembership, Sequence, Settled};
 
@@ -45,7 +46,7 @@ pub struct CompleteSample {
     /// The bytes at the position of a header's stamp.
     pub stamp: Option<(i32, u32)>,
     /// Time of its first datagram.
-    pub began: Timestamp,
+    pub began: ModelTime,
     /// Nanoseconds from its last fragment number to its last missing fragment.
     pub repaired_after: i64,
 }
@@ -101,13 +102,13 @@ impl Reception {
         &mut self,
         fragments: DataFrag<'_>,
         unconfirmed: bool,
+        now: ModelTime,
         budget: &mut Budget,
     ) -> bool {
         if !unconfirmed {
             let oldest = fragments.sequence_number().saturating_sub(UNDER_WAY);
             self.samples.forget_below(oldest, budget);
         }
-        let now = Timestamp(fragments.record().time);
         let progress = self.samples.fragment(fragments, now, budget);
         matches!(progress, Progress::Complete(_))
     }
@@ -119,7 +120,7 @@ impl Reception {
 
     /// Allows fragmented samples that begin before this to be incomplete without a loss: the kernel
     /// did not know the writer yet and limits captures of unknown writers.
-    pub const fn allow_incomplete(&mut self, until: Timestamp) {
+    pub const fn allow_incomplete(&mut self, until: ModelTime) {
         self.samples.allow_incomplete(until);
     }
 
@@ -127,17 +128,18 @@ impl Reception {
     pub fn sample(
         &mut self,
         sample: record::Sample<'_>,
+        now: ModelTime,
         reliable: bool,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) -> Outcome {
-        if !self.recognise(sample, budget, decide) {
-            return self.unconfirmed(sample, budget);
+        if !self.recognise(sample, now, budget, decide) {
+            return self.unconfirmed(sample, now, budget);
         }
         match sample {
-            record::Sample::Data(_) => self.data(sample, reliable, budget, decide),
+            record::Sample::Data(_) => self.data(sample, now, reliable, budget, decide),
             record::Sample::DataFrag(fragments) => {
-                self.fragment(fragments, reliable, budget, decide)
+                self.fragment(fragments, now, reliable, budget, decide)
             }
         }
     }
@@ -146,11 +148,11 @@ impl Reception {
     pub fn recognise(
         &mut self,
         sample: record::Sample<'_>,
+        now: ModelTime,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) -> bool {
         let number = sample.sequence_number();
-        let now = Timestamp(sample.record().time);
         let source = sample.source_timestamp().timestamp();
         let Self { sequence, samples } = self;
         match sequence.recognise(number, source, REACH, now) {
@@ -169,11 +171,11 @@ impl Reception {
     pub fn heartbeat(
         &mut self,
         heartbeat: Heartbeat<'_>,
+        now: ModelTime,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) {
         let (first, last) = (heartbeat.first(), heartbeat.last());
-        let now = Timestamp(heartbeat.record().time);
         let Self { sequence, samples } = self;
         sequence.heartbeat(first, last, now, &mut |settled| {
             decide(decision(settled, samples, budget));
@@ -181,9 +183,14 @@ impl Reception {
     }
 
     /// Processes a GAP.
-    pub fn gap(&mut self, gap: Gap<'_>, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
+    pub fn gap(
+        &mut self,
+        gap: Gap<'_>,
+        now: ModelTime,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) {
         let (start, list) = (gap.start(), gap.list());
-        let now = Timestamp(gap.record().time);
         let Self { sequence, samples } = self;
         sequence.gap(start, list.base, list.iter(), now, &mut |settled| {
             decide(decision(settled, samples, budget));
@@ -194,7 +201,7 @@ impl Reception {
     pub fn exists(
         &mut self,
         number: SequenceNumber,
-        now: Timestamp,
+        now: ModelTime,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) {
@@ -208,7 +215,7 @@ impl Reception {
     pub fn absorb(
         &mut self,
         mut other: Self,
-        now: Timestamp,
+        now: ModelTime,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) {
@@ -252,7 +259,7 @@ impl Reception {
     /// Decides samples that have been open for `window`, and those that the writer withdrew `grace` ago.
     pub fn advance(
         &mut self,
-        now: Timestamp,
+        now: ModelTime,
         (window, grace): (Duration, Duration),
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
@@ -275,6 +282,7 @@ impl Reception {
     fn data(
         &mut self,
         sample: record::Sample<'_>,
+        now: ModelTime,
         reliable: bool,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
@@ -285,7 +293,6 @@ impl Reception {
         } else {
             RepairMode::BestEffort
         };
-        let now = Timestamp(sample.record().time);
         let Self { sequence, samples } = self;
         let arrival = sequence.receive(number, repair_mode, now, &mut |settled| {
             decide(decision(settled, samples, budget));
@@ -297,26 +304,30 @@ impl Reception {
         Outcome::Complete(CompleteSample {
             recovered,
             newest,
-            ..whole_data(sample)
+            ..whole_data(sample, now)
         })
     }
 
     /// Processes a DATA or DATA_FRAG whose number is not confirmed.
-    fn unconfirmed(&mut self, sample: record::Sample<'_>, budget: &mut Budget) -> Outcome {
+    fn unconfirmed(
+        &mut self,
+        sample: record::Sample<'_>,
+        now: ModelTime,
+        budget: &mut Budget,
+    ) -> Outcome {
         let number = sample.sequence_number();
-        let now = Timestamp(sample.record().time);
         if self.sequence.has_unconfirmed(number) {
             return Outcome::Duplicate;
         }
         let whole = match sample {
             record::Sample::DataFrag(fragments) => {
                 match self.samples.fragment(fragments, now, budget) {
-                    Progress::Complete(facts) => whole_fragments(sample, &facts),
+                    Progress::Complete(facts) => whole_fragments(sample, now, &facts),
                     Progress::Duplicate => return Outcome::Duplicate,
                     _ => return Outcome::Open,
                 }
             }
-            record::Sample::Data(_) => whole_data(sample),
+            record::Sample::Data(_) => whole_data(sample, now),
         };
         self.sequence.complete_unconfirmed(number);
         Outcome::Complete(CompleteSample {
@@ -329,12 +340,12 @@ impl Reception {
     fn fragment(
         &mut self,
         fragments: DataFrag<'_>,
+        now: ModelTime,
         reliable: bool,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) -> Outcome {
         let number = fragments.sequence_number();
-        let now = Timestamp(fragments.record().time);
         // Sequence numbers are signed (RTPS 2.5, 9.3.2), so larger values are invalid.
         if self.sequence.has(number) || number > SequenceNumber::MAX {
             return Outcome::Duplicate;
@@ -374,12 +385,12 @@ impl Reception {
         let repaired = reliable && facts.repaired_after >= REPAIR;
         Outcome::Complete(CompleteSample {
             recovered: recovered || repaired,
-            ..whole_fragments(record::Sample::DataFrag(fragments), &facts)
+            ..whole_fragments(record::Sample::DataFrag(fragments), now, &facts)
         })
     }
 }
 
-const fn whole_data(sample: record::Sample<'_>) -> CompleteSample {
+fn whole_data(sample: record::Sample<'_>, now: ModelTime) -> CompleteSample {
     CompleteSample {
         number: sample.sequence_number(),
         bytes: sample.size() as u64,
@@ -389,19 +400,19 @@ const fn whole_data(sample: record::Sample<'_>) -> CompleteSample {
         unconfirmed: false,
         source: sample.source_timestamp(),
         stamp: sample.header_stamp(),
-        began: sample.record().began(),
+        began: now.began(sample.record()),
         repaired_after: 0,
     }
 }
 
-const fn whole_fragments(sample: record::Sample<'_>, facts: &Facts) -> CompleteSample {
+fn whole_fragments(sample: record::Sample<'_>, now: ModelTime, facts: &Facts) -> CompleteSample {
     CompleteSample {
         bytes: facts.size as u64,
         source: facts.source,
         stamp: facts.stamp,
         began: facts.began,
         repaired_after: facts.repaired_after,
-        ..whole_data(sample)
+        ..whole_data(sample, now)
     }
 }
 

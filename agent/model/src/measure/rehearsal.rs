@@ -3,10 +3,10 @@
 
 use std::time::Duration;
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
 
 use crate::facts::loss_share::{self, LossShare};
+use crate::facts::model_time::ModelTime;
 use crate::facts::rate::Slot;
 use crate::facts::watch::Expectations;
 use crate::facts::watch::WatchState;
@@ -117,8 +117,8 @@ fn loss(seconds: &[Second], end: usize) -> LossShare {
     sum
 }
 
-fn instant(place: usize) -> Timestamp {
-    Timestamp((BEGIN + place as u64) * SECOND)
+fn instant(place: usize) -> ModelTime {
+    ModelTime::from_nanoseconds((BEGIN + place as u64) * SECOND)
 }
 
 fn duration(seconds: f32) -> Duration {

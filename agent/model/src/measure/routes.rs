@@ -6,9 +6,10 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use ros2probe_wire::{GuidPrefix, SequenceNumber, Timestamp};
+use ros2probe_wire::{GuidPrefix, SequenceNumber};
 
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::route::Direction;
 use crate::facts::route::{Destination, Route};
 use crate::facts::tables::{DepartureTimes, WriterRoutes};
@@ -44,7 +45,7 @@ pub struct KnownRoute {
     /// Index of its delivery, if resolved.
     pub delivery: Option<usize>,
     /// Time of the last record.
-    pub last_seen: Timestamp,
+    pub last_seen: ModelTime,
     /// Number of new samples that arrived on it.
     pub brought: u64,
     /// Whether it is observed at a socket rather than on a wire.
@@ -52,7 +53,7 @@ pub struct KnownRoute {
     /// Whether samples, rather than only control messages, have used it.
     pub has_data: bool,
     /// Highest number that had left, at each remembered time.
-    left: Bounded<DepartureTimes, VecDeque<(Timestamp, SequenceNumber)>>,
+    left: Bounded<DepartureTimes, VecDeque<(ModelTime, SequenceNumber)>>,
 }
 
 impl Routes {
@@ -102,7 +103,7 @@ impl Routes {
     pub fn find_or_insert(
         &mut self,
         route: Route,
-        now: Timestamp,
+        now: ModelTime,
         readers: MatchedReaders<'_>,
     ) -> usize {
         if let Some(index) = self.find(&route) {
@@ -216,7 +217,7 @@ impl KnownRoute {
     }
 
     /// Records that all samples up to this number have left by `now`.
-    pub fn mark(&mut self, number: SequenceNumber, now: Timestamp) {
+    pub fn mark(&mut self, number: SequenceNumber, now: ModelTime) {
         let is_due = self
             .left
             .back()
@@ -228,7 +229,7 @@ impl KnownRoute {
 
     /// Returns the highest number that had left by this time.
     #[must_use]
-    pub fn left_by(&self, at: Timestamp) -> Option<SequenceNumber> {
+    pub fn left_by(&self, at: ModelTime) -> Option<SequenceNumber> {
         let mut left = self.left.iter().rev();
         left.find(|(moment, _)| *moment <= at)
             .map(|(_, number)| *number)
@@ -254,13 +255,13 @@ mod tests {
             matched: Matched::Unknown,
             is_shared: false,
             delivery: None,
-            last_seen: Timestamp(0),
+            last_seen: ModelTime::ZERO,
             brought: 0,
             at_socket: true,
             has_data: true,
             left: Bounded::default(),
         };
-        let at = |tenths: u64| Timestamp((1000 + tenths) * SECOND / 10);
+        let at = |tenths: u64| ModelTime::from_nanoseconds((1000 + tenths) * SECOND / 10);
         (0..1000).for_each(|tenths| known.mark(SequenceNumber(tenths * 3), at(tenths)));
         assert_eq!(known.left_by(at(500)), None);
         assert_eq!(known.left_by(at(905)), Some(SequenceNumber(2700)));

@@ -11,6 +11,7 @@ use std::time::Duration;
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use crate::facts::measurement::SampledFacts;
+use crate::facts::model_time::ModelTime;
 use crate::measure::sequence::{MAX_WINDOW, Run, RunMembership, Sequence};
 
 /// A writer that was not seen in shared memory for this long is no longer sampled.
@@ -38,7 +39,7 @@ const WINDOW: u64 = u128::BITS as u64;
 #[derive(Debug)]
 pub struct Sampled {
     /// Time of the last record from shared memory.
-    last: Timestamp,
+    last: ModelTime,
     /// Whether a network record arrived after shared memory fell silent.
     left: bool,
     span: u64,
@@ -61,11 +62,11 @@ pub struct Sampled {
     /// No sample below this number is waited for.
     settled: SequenceNumber,
     /// Time of the last [`Self::tick`] that settled, and the next number at that time.
-    last_settled: (Timestamp, SequenceNumber),
+    last_settled: (ModelTime, SequenceNumber),
     /// Runs of numbers that were settled without being seen.
     unseen: Vec<(SequenceNumber, SequenceNumber)>,
     /// The latest number that arrived, presumably whole, and its time.
-    arrived: Option<(SequenceNumber, Timestamp)>,
+    arrived: Option<(SequenceNumber, ModelTime)>,
     /// The stamp from the first fragment of a sample whose payload begins with a header.
     head: Option<(SequenceNumber, (i32, u32))>,
 }
@@ -102,7 +103,7 @@ pub enum Completeness {
 impl Sampled {
     /// Creates a view that begins at `now`.
     #[must_use]
-    pub const fn new(now: Timestamp) -> Self {
+    pub const fn new(now: ModelTime) -> Self {
         Self {
             last: now,
             left: false,
@@ -125,20 +126,20 @@ impl Sampled {
     }
 
     /// Records that the writer was seen in shared memory.
-    pub fn touch(&mut self, now: Timestamp) {
+    pub fn touch(&mut self, now: ModelTime) {
         self.last = self.last.max(now);
         self.left = false;
     }
 
     /// Returns whether the writer is still sampled.
     #[must_use]
-    pub fn is_current(&self, now: Timestamp) -> bool {
+    pub fn is_current(&self, now: ModelTime) -> bool {
         self.last + SAMPLED_TIMEOUT > now
     }
 
     /// Returns whether a record at `now` belongs to this view: while the writer is sampled, and for
     /// the first record after that, since samples missing before it may have used shared memory.
-    pub fn takes(&mut self, now: Timestamp) -> bool {
+    pub fn takes(&mut self, now: ModelTime) -> bool {
         let takes = self.is_current(now) || !self.left;
         self.left |= !self.is_current(now);
         takes
@@ -146,7 +147,7 @@ impl Sampled {
 
     /// Ends the sampled view. Pending samples may still arrive until [`Self::tick`] settles them.
     pub const fn end(&mut self) {
-        (self.last, self.left) = (Timestamp(0), true);
+        (self.last, self.left) = (ModelTime::ZERO, true);
     }
 
     /// Returns whether this sample was sent and is still waited for.
@@ -166,7 +167,7 @@ impl Sampled {
 
     /// Takes over counted samples that another view saw in part. `next` is the number after the
     /// newest.
-    pub fn take_over(&mut self, partial: &[SequenceNumber], next: SequenceNumber, now: Timestamp) {
+    pub fn take_over(&mut self, partial: &[SequenceNumber], next: SequenceNumber, now: ModelTime) {
         self.follow(next, now);
         for &number in partial {
             match self.bit(number, next) {
@@ -180,7 +181,7 @@ impl Sampled {
     }
 
     /// Stops waiting for samples that were already missing at the previous tick.
-    pub fn tick(&mut self, now: Timestamp) {
+    pub fn tick(&mut self, now: ModelTime) {
         let (then, next) = self.last_settled;
         if now - then >= ARRIVAL_TIMEOUT {
             self.settle(next.min(self.next));
@@ -195,7 +196,7 @@ impl Sampled {
 
     /// Returns the time since which a sample is waited for; `None` if no sample is.
     #[must_use]
-    pub fn unseen_since(&self) -> Option<Timestamp> {
+    pub fn unseen_since(&self) -> Option<ModelTime> {
         self.unseen().map(|_| self.last_settled.0)
     }
 
@@ -225,8 +226,8 @@ impl Sampled {
         clippy::cast_precision_loss,
         reason = "counts of samples are far below 2^52"
     )]
-    pub fn pace(&mut self, samples: u64, since: Timestamp, now: Timestamp) {
-        if samples > 0 && since != Timestamp(0) {
+    pub fn pace(&mut self, samples: u64, since: ModelTime, now: ModelTime) {
+        if samples > 0 && since != ModelTime::ZERO {
             let newest = (now - since).as_secs_f64() / samples as f64;
             let mean = self.interval.unwrap_or(newest);
             self.interval = Some(mean + NEWEST * (newest - mean));
@@ -242,7 +243,7 @@ impl Sampled {
         reason = "counts of samples are far below 2^52"
     )]
     pub fn seeming_silence(&self, slowest: Duration) -> Duration {
-        if self.last == Timestamp(0) {
+        if self.last == ModelTime::ZERO {
             return Duration::ZERO;
         }
         let interval = self.interval.unwrap_or(slowest.as_secs_f64());
@@ -261,7 +262,7 @@ impl Sampled {
     /// As [`Self::seeming_silence`], for a writer that polling has not seen yet.
     #[must_use]
     pub fn seeming_silence_of_unseen(slowest: Duration) -> Duration {
-        Self::new(Timestamp(1)).seeming_silence(slowest)
+        Self::new(ModelTime::from_nanoseconds(1)).seeming_silence(slowest)
     }
 
     /// Returns the counts so far.
@@ -290,7 +291,7 @@ impl Sampled {
         &mut self,
         (number, seen, source): (SequenceNumber, Completeness, Option<Timestamp>),
         reach: u64,
-        now: Timestamp,
+        now: ModelTime,
         sequence: &mut Sequence,
     ) -> SampledUpdate {
         if !number.is_valid() {
@@ -357,7 +358,7 @@ impl Sampled {
         &mut self,
         last: SequenceNumber,
         reach: u64,
-        now: Timestamp,
+        now: ModelTime,
         sequence: &mut Sequence,
     ) -> u64 {
         let end = last.next();
@@ -388,7 +389,7 @@ impl Sampled {
         &mut self,
         (start, end): (SequenceNumber, SequenceNumber),
         reach: u64,
-        now: Timestamp,
+        now: ModelTime,
         sequence: &mut Sequence,
     ) -> u64 {
         if start == SequenceNumber::ZERO {
@@ -480,7 +481,7 @@ impl Sampled {
         &mut self,
         end: SequenceNumber,
         sent: bool,
-        now: Timestamp,
+        now: ModelTime,
         sequence: &mut Sequence,
     ) -> u64 {
         let next = sequence.next();
@@ -508,7 +509,7 @@ impl Sampled {
     }
 
     /// Takes over numbers that were counted elsewhere.
-    fn follow(&mut self, next: SequenceNumber, now: Timestamp) {
+    fn follow(&mut self, next: SequenceNumber, now: ModelTime) {
         if self.next != next {
             self.settle_all();
             self.begin(next, now);
@@ -516,7 +517,7 @@ impl Sampled {
     }
 
     /// Marks all numbers below `next` as seen or not needed.
-    const fn begin(&mut self, next: SequenceNumber, now: Timestamp) {
+    const fn begin(&mut self, next: SequenceNumber, now: ModelTime) {
         (self.sighted, self.finished) = (u128::MAX, u128::MAX);
         (self.next, self.settled, self.last_settled) = (next, next, (now, next));
     }

@@ -8,9 +8,10 @@
 use std::time::Duration;
 
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::PartialSamples;
 use ros2probe_wire::record::DataFrag;
-use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
+use ros2probe_wire::{RtpsTime, SequenceNumber};
 
 /// Largest number of fragments per sample: 88 MB of Cyclone DDS, 4 GB of Fast DDS.
 pub const MAX_FRAGMENTS: u32 = 65_536;
@@ -49,7 +50,7 @@ impl Budget {
 pub struct Samples {
     partial: Bounded<PartialSamples, Vec<Partial>>,
     /// Time from which samples have all fragments captured; earlier ones may lack some.
-    sure_from: Timestamp,
+    sure_from: ModelTime,
     /// The last sample that began before that time.
     last_uncertain: SequenceNumber,
 }
@@ -63,8 +64,8 @@ struct Partial {
     seen: u32,
     bitmap: Vec<u64>,
     /// Time at which the last fragment number was first seen.
-    tail: Option<Timestamp>,
-    latest: Timestamp,
+    tail: Option<ModelTime>,
+    latest: ModelTime,
     facts: Facts,
 }
 
@@ -78,7 +79,7 @@ pub struct Facts {
     /// Size in bytes.
     pub size: u32,
     /// Time of the first datagram of the first record.
-    pub began: Timestamp,
+    pub began: ModelTime,
     /// Nanoseconds from its last fragment number to its last missing fragment.
     pub repaired_after: i64,
 }
@@ -103,7 +104,7 @@ impl Samples {
     pub fn fragment(
         &mut self,
         fragments: DataFrag<'_>,
-        now: Timestamp,
+        now: ModelTime,
         budget: &mut Budget,
     ) -> Progress {
         let (start, count) = (fragments.starting(), fragments.count());
@@ -165,7 +166,7 @@ impl Samples {
     }
 
     /// Allows samples that begin before this to lack fragments that the kernel did not capture.
-    pub const fn allow_incomplete(&mut self, until: Timestamp) {
+    pub const fn allow_incomplete(&mut self, until: ModelTime) {
         self.sure_from = until;
     }
 
@@ -180,7 +181,7 @@ impl Samples {
     #[must_use]
     pub fn growing(
         &self,
-        now: Timestamp,
+        now: ModelTime,
         window: Duration,
         first: SequenceNumber,
     ) -> Option<SequenceNumber> {
@@ -208,7 +209,7 @@ impl Samples {
     }
 
     /// Drops samples without a fragment for `window`; returns their number.
-    pub fn expire(&mut self, now: Timestamp, window: Duration, budget: &mut Budget) -> u64 {
+    pub fn expire(&mut self, now: ModelTime, window: Duration, budget: &mut Budget) -> u64 {
         let mut expired = 0;
         while let Some(index) = self
             .partial
@@ -241,15 +242,14 @@ impl Samples {
         self.partial.iter().position(|each| each.number == number)
     }
 
-    fn open(&mut self, fragments: DataFrag<'_>, now: Timestamp, budget: &mut Budget) -> usize {
+    fn open(&mut self, fragments: DataFrag<'_>, now: ModelTime, budget: &mut Budget) -> usize {
         let number = fragments.sequence_number();
         if self.partial.is_full() {
             self.partial.refuse();
             self.evict(number, budget);
         }
         budget.samples += 1;
-        let elapsed = fragments.record().elapsed;
-        let began = Timestamp(now.0.saturating_sub(elapsed.into()));
+        let began = now.began(fragments.record());
         if began < self.sure_from {
             self.last_uncertain = self.last_uncertain.max(number);
         }
@@ -335,7 +335,7 @@ mod tests {
                 seen: 0,
                 bitmap: Vec::new(),
                 tail: None,
-                latest: Timestamp(0),
+                latest: ModelTime::ZERO,
                 facts: Facts::default(),
             };
             let (mut range, mut single) = (partial(), partial());
@@ -358,7 +358,7 @@ mod tests {
         let Some(Sample::DataFrag(fragments)) = record.sample() else {
             panic!("{record:?}")
         };
-        samples.fragment(fragments, Timestamp(at), budget)
+        samples.fragment(fragments, ModelTime::from_nanoseconds(at), budget)
     }
 
     fn fragment(number: u64, start: u32, count: u32, size: u32) -> Record {
@@ -464,15 +464,27 @@ mod tests {
         let (mut samples, mut budget) = (Samples::default(), budget());
         put(&mut samples, &fragment(4, 1, 1, 9000), 100, &mut budget);
         assert_eq!(
-            samples.growing(Timestamp(150), Duration::from_nanos(100), SequenceNumber(0)),
+            samples.growing(
+                ModelTime::from_nanoseconds(150),
+                Duration::from_nanos(100),
+                SequenceNumber(0)
+            ),
             Some(SequenceNumber(4))
         );
         assert_eq!(
-            samples.growing(Timestamp(250), Duration::from_nanos(100), SequenceNumber(0)),
+            samples.growing(
+                ModelTime::from_nanoseconds(250),
+                Duration::from_nanos(100),
+                SequenceNumber(0)
+            ),
             None
         );
         assert_eq!(
-            samples.expire(Timestamp(250), Duration::from_nanos(100), &mut budget),
+            samples.expire(
+                ModelTime::from_nanoseconds(250),
+                Duration::from_nanos(100),
+                &mut budget
+            ),
             1
         );
         assert_eq!(budget.bytes, 0);

@@ -18,6 +18,7 @@ use std::time::Duration;
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{Checkpoints, SequenceGaps};
 use bitmap::Bitmap;
 pub use unconfirmed::Run;
@@ -58,7 +59,7 @@ pub struct Sequence {
     /// The lowest number that the writer still has: the highest firstSN of its HEARTBEATs.
     available: SequenceNumber,
     /// An earlier value of `available`, and its time.
-    withdrawn: Option<(Timestamp, SequenceNumber)>,
+    withdrawn: Option<(ModelTime, SequenceNumber)>,
     /// All readers that acknowledge have every number below, or will not get it.
     acknowledged: SequenceNumber,
     /// Every number below, as far as checked, has arrived or is not waited for.
@@ -68,7 +69,7 @@ pub struct Sequence {
     received: Bitmap,
     excused: Bitmap,
     /// `next` at some times, oldest first.
-    checkpoints: Bounded<Checkpoints, VecDeque<(Timestamp, SequenceNumber)>>,
+    checkpoints: Bounded<Checkpoints, VecDeque<(ModelTime, SequenceNumber)>>,
     gaps: Bounded<SequenceGaps, VecDeque<Gap>>,
     newest_source: Timestamp,
     /// The number with the newest source time.
@@ -77,7 +78,7 @@ pub struct Sequence {
     older: u8,
     stale: u32,
     /// Time of the last increase of `next`.
-    last_advance: Timestamp,
+    last_advance: ModelTime,
     /// Samples that continued this incarnation, counted up to a small number.
     followed: u8,
     unconfirmed: Option<Box<UnconfirmedRun>>,
@@ -104,7 +105,7 @@ pub enum RunMembership {
 struct Gap {
     start: SequenceNumber,
     end: SequenceNumber,
-    noticed: Timestamp,
+    noticed: ModelTime,
     requested: bool,
 }
 
@@ -159,7 +160,7 @@ impl Sequence {
 
     /// Returns the time at which the highest number last increased.
     #[must_use]
-    pub const fn last_advance(&self) -> Timestamp {
+    pub const fn last_advance(&self) -> ModelTime {
         self.last_advance
     }
 
@@ -174,7 +175,7 @@ impl Sequence {
         &mut self,
         number: SequenceNumber,
         repair_mode: RepairMode,
-        now: Timestamp,
+        now: ModelTime,
         settled: &mut impl FnMut(Settled),
     ) -> Arrival {
         if !number.is_valid() {
@@ -231,7 +232,7 @@ impl Sequence {
     pub fn exists(
         &mut self,
         number: SequenceNumber,
-        now: Timestamp,
+        now: ModelTime,
         settled: &mut impl FnMut(Settled),
     ) {
         let is_ahead = number >= self.next && number - self.next <= MAX_JUMP;
@@ -271,7 +272,7 @@ impl Sequence {
 
     /// Returns the time at which this number was detected as missing, if remembered.
     #[must_use]
-    pub fn missed_since(&self, number: SequenceNumber) -> Option<Timestamp> {
+    pub fn missed_since(&self, number: SequenceNumber) -> Option<ModelTime> {
         let mut gaps = self.gaps.iter().rev();
         let gap = gaps.find(|gap| gap.start <= number && number < gap.end);
         gap.map(|gap| gap.noticed)
@@ -286,7 +287,7 @@ impl Sequence {
 
     /// Merges the numbers of the same writer that `other` received. The beginning of this one
     /// applies.
-    pub fn absorb(&mut self, other: &Self, now: Timestamp, settled: &mut impl FnMut(Settled)) {
+    pub fn absorb(&mut self, other: &Self, now: ModelTime, settled: &mut impl FnMut(Settled)) {
         if !self.started() || !other.started() {
             return;
         }
@@ -344,7 +345,7 @@ impl Sequence {
     /// ago. Numbers from `hold` on stay open.
     pub fn advance(
         &mut self,
-        now: Timestamp,
+        now: ModelTime,
         (window, grace): (Duration, Duration),
         hold: Option<SequenceNumber>,
         settled: &mut impl FnMut(Settled),
@@ -415,7 +416,7 @@ impl Sequence {
         &mut self,
         start: SequenceNumber,
         end: SequenceNumber,
-        now: Timestamp,
+        now: ModelTime,
         settled: &mut impl FnMut(Settled),
     ) {
         if start > self.next {
@@ -442,7 +443,7 @@ impl Sequence {
         self.last_advance = now;
     }
 
-    fn note_gap(&mut self, start: SequenceNumber, end: SequenceNumber, now: Timestamp) {
+    fn note_gap(&mut self, start: SequenceNumber, end: SequenceNumber, now: ModelTime) {
         self.gaps.push_back(Gap {
             start,
             end,
@@ -455,7 +456,7 @@ impl Sequence {
         &self,
         number: SequenceNumber,
         repair_mode: RepairMode,
-        now: Timestamp,
+        now: ModelTime,
     ) -> bool {
         let gap = self
             .gaps

@@ -21,12 +21,13 @@ mod receivers;
 mod submessages;
 
 use ros2probe_wire::record::{Body, Sample, flag};
-use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber};
 
 use crate::facts::header::PLAUSIBLE;
 use crate::facts::journal::Journal;
 use crate::facts::loss_share::LossShare;
 use crate::facts::measurement::Breakdown;
+use crate::facts::model_time::ModelTime;
 use crate::facts::route::Receiver;
 use crate::facts::route::{Destination, Route};
 use crate::measure::acknowledgement::{AcknowledgementFacts, Acknowledgements};
@@ -64,7 +65,7 @@ pub struct Subscribers {
     /// Generation of the results in `routes`.
     generation: u64,
     /// See [`Delivery::allow_incomplete`].
-    sure_from: Timestamp,
+    sure_from: ModelTime,
 }
 
 /// Result of a record for the deliveries.
@@ -95,7 +96,7 @@ pub struct DeliveryQuota {
 #[derive(Debug)]
 pub struct WriterContext<'a> {
     /// Time of the record, or of the tick.
-    pub now: Timestamp,
+    pub now: ModelTime,
     /// The writer.
     pub writer: Guid,
     /// Whether the writer retransmits.
@@ -115,7 +116,7 @@ pub struct WriterContext<'a> {
 impl Subscribers {
     /// Creates an empty state for a writer that the kernel meters from `sure_from` on.
     #[must_use]
-    pub fn new(sure_from: Timestamp) -> Self {
+    pub fn new(sure_from: ModelTime) -> Self {
         Self {
             sure_from,
             ..Self::default()
@@ -124,7 +125,7 @@ impl Subscribers {
 
     /// Records that bytes for this destination were not captured: what is missing before `at` may
     /// have arrived.
-    pub fn missed(&mut self, destination: Destination, at: Timestamp) -> bool {
+    pub fn missed(&mut self, destination: Destination, at: ModelTime) -> bool {
         let mut is_affected = false;
         for delivery in &mut self.deliveries {
             if delivery.main().destination == destination {
@@ -152,7 +153,7 @@ impl Subscribers {
         &self,
         writer: Guid,
         next: SequenceNumber,
-        now: Timestamp,
+        now: ModelTime,
     ) -> impl Iterator<Item = AcknowledgementFacts> + '_ {
         self.acknowledgements.facts(writer, next, now)
     }
@@ -165,7 +166,7 @@ impl Subscribers {
             self.requested(acknack);
             let is_reader = |topic: &Topic| is_reader(topic, record.reader());
             if context.topic().is_some_and(is_reader) {
-                self.acknowledgements.acknack(acknack);
+                self.acknowledgements.acknack(acknack, context.now);
                 self.acknowledged(acknack);
             }
             return RecordNovelty::New;
@@ -219,7 +220,7 @@ impl Subscribers {
     }
 
     /// Records the writer's newest sample and its time.
-    pub fn wrote(&mut self, number: SequenceNumber, at: Timestamp) {
+    pub fn wrote(&mut self, number: SequenceNumber, at: ModelTime) {
         self.acknowledgements.wrote(number, at);
     }
 
@@ -231,8 +232,8 @@ impl Subscribers {
         };
         self.totals.seen[1] = true;
         let source = sample.source_timestamp().timestamp();
-        let began = context.graph.wall_clock.wall_time(sample.record().began());
-        // Both times are from one clock. A sample that leaves before its timestamp, or hours after
+        let began = sample.record().began();
+        // Both are wall time of one clock. A sample that leaves before its timestamp, or hours after
         // it, is no measure of the send delay.
         if let Some(source) = source.filter(|_| sample.is_start())
             && (source..=source + PLAUSIBLE).contains(&began)
@@ -392,7 +393,7 @@ impl Subscribers {
     }
 
     /// Processes a sample that arrived whole on this route.
-    fn came(&mut self, index: usize, place: usize, whole: &CompleteSample, now: Timestamp) {
+    fn came(&mut self, index: usize, place: usize, whole: &CompleteSample, now: ModelTime) {
         let withheld = self.deliveries.get(place).map(Delivery::is_withheld);
         let is_counted = withheld == Some(false);
         if is_counted {
@@ -543,7 +544,7 @@ impl Subscribers {
         self.totals.breakdown.get_or_insert_default()
     }
 
-    fn transfer(&mut self, whole: &CompleteSample, now: Timestamp) {
+    fn transfer(&mut self, whole: &CompleteSample, now: ModelTime) {
         if now > whole.began {
             let transfer = now.nanoseconds_since(whole.began);
             self.breakdown().transfer.observe(seconds(transfer));

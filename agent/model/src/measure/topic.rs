@@ -8,10 +8,11 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::time::Duration;
 
 use ros2probe_wire::discovery::Role;
-use ros2probe_wire::{DomainId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
 use crate::facts::loss_share::{LossShare, TopicLoss};
 use crate::facts::measurement::Measurement;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::{DdsName, TypeName};
 use crate::facts::naming::Naming;
 use crate::facts::selection::{RequestIds, SampleRequest};
@@ -62,13 +63,13 @@ pub struct Topic {
     /// What its worst subscriber lost.
     pub loss: TopicLoss,
     /// Time at which a reader last appeared.
-    pub reader_appeared: Timestamp,
+    pub reader_appeared: ModelTime,
     /// Time at which its first reader appeared, since it last had none.
-    pub subscribed: Timestamp,
+    pub subscribed: ModelTime,
     /// Time since which it is both published and watched.
-    pub published: Timestamp,
+    pub published: ModelTime,
     /// Time at which its last endpoint vanished.
-    pub vanished: Option<Timestamp>,
+    pub vanished: Option<ModelTime>,
     /// Whether an observed process has a publisher or subscription of it, also without an
     /// announced endpoint.
     pub is_held: bool,
@@ -82,9 +83,9 @@ pub struct Topics {
     topics: HashMap<TopicId, Box<Topic>>,
     index: BTreeMap<(DomainId, DdsName), TopicId>,
     /// Topics without endpoints, by the time at which the last one vanished.
-    vanished: BTreeSet<(Timestamp, TopicId)>,
+    vanished: BTreeSet<(ModelTime, TopicId)>,
     /// Topics among `vanished` that hold a measuring slot.
-    vanished_watched: BTreeSet<(Timestamp, TopicId)>,
+    vanished_watched: BTreeSet<(ModelTime, TopicId)>,
     /// Measured topics that are not watched by exact name.
     yielding: BTreeSet<TopicId>,
     created: u64,
@@ -196,7 +197,7 @@ impl Topics {
         naming: &Naming,
         guid: Guid,
         role: Role,
-        now: Timestamp,
+        now: ModelTime,
     ) -> (TopicId, bool) {
         let (id, is_new) = match self.find(domain_id, naming) {
             Some(id) => (id, false),
@@ -230,7 +231,7 @@ impl Topics {
     }
 
     /// Removes an endpoint.
-    pub fn leave(&mut self, id: TopicId, guid: Guid, now: Timestamp) {
+    pub fn leave(&mut self, id: TopicId, guid: Guid, now: ModelTime) {
         let Some(topic) = self.topics.get_mut(&id) else {
             return;
         };
@@ -260,7 +261,7 @@ impl Topics {
         domain_id: DomainId,
         naming: &Naming,
         cap: usize,
-        now: Timestamp,
+        now: ModelTime,
     ) -> Option<(TopicId, bool)> {
         let (id, is_new) = match self.find(domain_id, naming) {
             Some(id) => (id, false),
@@ -285,7 +286,7 @@ impl Topics {
     }
 
     /// Ends [`Self::hold`]: the topic vanishes if it has no endpoint.
-    pub fn release(&mut self, id: TopicId, now: Timestamp) {
+    pub fn release(&mut self, id: TopicId, now: ModelTime) {
         let Some(topic) = self.topics.get_mut(&id).filter(|topic| topic.is_held) else {
             return;
         };
@@ -313,7 +314,7 @@ impl Topics {
         id: TopicId,
         (watchlist, sample_requests, is_needed): (&Watchlist, &[SampleRequest], bool),
         cap: usize,
-        now: Timestamp,
+        now: ModelTime,
     ) -> Option<TopicId> {
         let topic = self.topics.get(&id)?;
         let is_named = topic.naming.is_named_by(Some(topic.domain_id), watchlist);
@@ -384,7 +385,7 @@ impl Topics {
     }
 
     /// Removes topics that vanished more than `grace` ago.
-    pub fn expire(&mut self, now: Timestamp, grace: Duration) {
+    pub fn expire(&mut self, now: ModelTime, grace: Duration) {
         while let Some((at, id)) = self.vanished.first().copied()
             && at + grace <= now
         {
@@ -426,9 +427,9 @@ impl Topics {
                 retired: None,
                 retired_totals: None,
                 loss: TopicLoss::default(),
-                reader_appeared: Timestamp(0),
-                subscribed: Timestamp(0),
-                published: Timestamp(0),
+                reader_appeared: ModelTime::ZERO,
+                subscribed: ModelTime::ZERO,
+                published: ModelTime::ZERO,
                 vanished: None,
                 is_held: false,
             }),

@@ -10,9 +10,10 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::UndeliveredParts;
 use ros2probe_wire::record::Sample;
-use ros2probe_wire::{Record, SequenceNumber, Timestamp};
+use ros2probe_wire::{Record, SequenceNumber};
 
 /// Largest difference between the clock conversions of the two reports.
 const SLACK: Duration = Duration::from_micros(100);
@@ -32,8 +33,8 @@ struct UndeliveredPart {
     /// Fragments from `start` to before `end`; 0 and 1 for an unfragmented sample.
     start: u32,
     end: u32,
-    first: Timestamp,
-    last: Timestamp,
+    first: ModelTime,
+    last: ModelTime,
 }
 
 impl Undelivered {
@@ -43,11 +44,11 @@ impl Undelivered {
         self.waiting.is_empty()
     }
 
-    /// Records that this DATA or DATA_FRAG was dropped. Returns whether an older entry was evicted.
-    pub fn note(&mut self, sample: Sample<'_>) -> bool {
+    /// Records that this DATA or DATA_FRAG was dropped at `now`. Returns whether an older entry was evicted.
+    pub fn note(&mut self, sample: Sample<'_>, now: ModelTime) -> bool {
         let record = sample.record();
         let (start, end) = range(sample);
-        let (first, last) = span(record);
+        let (first, last) = span(record, now);
         if let Some(back) = self.waiting.back_mut()
             && back.socket == record.socket
             && back.number == sample.sequence_number()
@@ -68,11 +69,16 @@ impl Undelivered {
         evicted.is_some()
     }
 
-    /// Returns the delivered parts of an arrival, in order. Adds evicted entries to `evictions`.
-    pub fn delivered(&mut self, sample: Sample<'_>, evictions: &mut u64) -> Vec<Record> {
+    /// Returns the delivered parts of an arrival at `now`, in order. Adds evicted entries to `evictions`.
+    pub fn delivered(
+        &mut self,
+        sample: Sample<'_>,
+        now: ModelTime,
+        evictions: &mut u64,
+    ) -> Vec<Record> {
         let record = sample.record();
         let mut parts = vec![range(sample)];
-        let (begin, end) = span(record);
+        let (begin, end) = span(record, now);
         let mut left = Vec::new();
         self.waiting.retain_mut(|each| {
             let is_meant = each.socket == record.socket
@@ -115,7 +121,7 @@ impl Undelivered {
     }
 
     /// Removes entries whose arrival did not follow.
-    pub fn expire(&mut self, now: Timestamp) {
+    pub fn expire(&mut self, now: ModelTime) {
         while let Some(oldest) = self.waiting.front()
             && oldest.last + LIFETIME <= now
         {
@@ -139,11 +145,10 @@ const fn range(sample: Sample<'_>) -> (u32, u32) {
 }
 
 /// Returns the times of its first and last datagram.
-fn span(record: &Record) -> (Timestamp, Timestamp) {
-    let end = Timestamp(record.time);
+fn span(record: &Record, end: ModelTime) -> (ModelTime, ModelTime) {
     let begin = match record.elapsed {
-        u32::MAX => Timestamp(0),
-        elapsed => end - Duration::from_nanos(elapsed.into()),
+        u32::MAX => ModelTime::ZERO,
+        _ => end.began(record),
     };
     (begin, end)
 }
@@ -178,7 +183,10 @@ mod tests {
     }
 
     fn note(undelivered: &mut Undelivered, record: &Record) -> bool {
-        undelivered.note(record.sample().unwrap())
+        undelivered.note(
+            record.sample().unwrap(),
+            ModelTime::from_nanoseconds(record.time),
+        )
     }
 
     fn delivered(
@@ -186,7 +194,11 @@ mod tests {
         record: &Record,
         evictions: &mut u64,
     ) -> Vec<Record> {
-        undelivered.delivered(record.sample().unwrap(), evictions)
+        undelivered.delivered(
+            record.sample().unwrap(),
+            ModelTime::from_nanoseconds(record.time),
+            evictions,
+        )
     }
 
     fn ranges(parts: &[Record]) -> Vec<(u32, u32)> {
@@ -222,7 +234,7 @@ mod tests {
             ranges(&delivered(&mut undelivered, &later, &mut 0)),
             [(3, 4)]
         );
-        undelivered.expire(Timestamp(13 * MILLISECOND) + LIFETIME);
+        undelivered.expire(ModelTime::from_nanoseconds(13 * MILLISECOND) + LIFETIME);
         assert!(undelivered.is_empty());
     }
 

@@ -10,7 +10,7 @@ mod sampled_view;
 use std::time::Duration;
 
 use ros2probe_wire::record::{AckNack, Body, Sample, flag};
-use ros2probe_wire::{Guid, Record, RtpsTime, SequenceNumber, Timestamp};
+use ros2probe_wire::{Guid, Record, RtpsTime, SequenceNumber};
 
 use crate::facts::dispatch::MissedReason;
 use crate::facts::histogram::Histogram;
@@ -18,6 +18,7 @@ use crate::facts::journal::{Journal, Missing};
 use crate::facts::loss::Loss;
 use crate::facts::loss_share::LossShare;
 use crate::facts::measurement::{EarlierCounts, Measurement};
+use crate::facts::model_time::ModelTime;
 use crate::facts::rate::{SECONDS, Slot, Window};
 use crate::facts::wall_clock::WallClock;
 use crate::measure::in_order::Progress;
@@ -52,12 +53,12 @@ pub struct Traits {
 #[derive(Debug)]
 pub struct MeasurementContext<'a> {
     /// Time of the record, or of the tick.
-    pub now: Timestamp,
+    pub now: ModelTime,
     /// Memory budget for fragmented samples.
     pub budget: &'a mut Budget,
     /// Journal that receives the losses.
     pub journal: &'a mut Journal,
-    /// Difference between model time and calendar time, for the writer's timestamps.
+    /// Difference between model time and wall time, for the writer's timestamps.
     pub wall_clock: WallClock,
     /// Whether the samples of any receiver are counted, so that losses are reported per receiver.
     pub has_receivers: bool,
@@ -75,9 +76,9 @@ pub struct Counted {
     /// Stamp of its header, if the type begins with one.
     pub stamp: Option<(i32, u32)>,
     /// Time of the datagram that completed it.
-    pub at: Timestamp,
+    pub at: ModelTime,
     /// Time of its first datagram.
-    pub began: Timestamp,
+    pub began: ModelTime,
     /// Whether it was sampled, so that others may have been missed.
     pub sampled: bool,
     /// Whether its number is not confirmed as the writer's; it then has no place in an order.
@@ -94,13 +95,13 @@ pub struct Writer {
     interarrival: Histogram,
     source_latency: Histogram,
     header_latency: Histogram,
-    last_message: Option<Timestamp>,
+    last_message: Option<ModelTime>,
     negative_latency: u64,
     implausible_latency: u64,
     /// State of a writer that was sampled in shared memory.
     sampled: Option<Box<Sampled>>,
     /// Time of the last record from a uprobe in the writer's own process.
-    exact: Option<Timestamp>,
+    exact: Option<ModelTime>,
 }
 
 /// Counters that settling changes.
@@ -144,7 +145,7 @@ impl Writer {
 
     /// Begins the figures per second at `now`, when the kernel captures all samples of the writer.
     /// What was counted before stays in the totals.
-    pub fn begin_window(&mut self, now: Timestamp) {
+    pub fn begin_window(&mut self, now: ModelTime) {
         let tally = &mut self.tally;
         tally.earlier = EarlierCounts {
             messages: tally.messages,
@@ -160,7 +161,7 @@ impl Writer {
     }
 
     /// Allows fragmented samples that begin before `until` to be incomplete without a loss.
-    pub const fn allow_incomplete(&mut self, until: Timestamp) {
+    pub const fn allow_incomplete(&mut self, until: ModelTime) {
         self.reception.allow_incomplete(until);
     }
 
@@ -186,13 +187,12 @@ impl Writer {
         self.tally.duplicates += 1;
     }
 
-    /// Returns whether this sample is counted or settled.
+    /// Returns whether this sample, seen at `at`, is counted or settled.
     #[must_use]
-    pub fn has(&self, sample: Sample<'_>) -> bool {
-        let record = sample.record();
-        let (number, at) = (sample.sequence_number(), record_time(record));
+    pub fn has(&self, sample: Sample<'_>, at: ModelTime) -> bool {
+        let (record, number) = (sample.record(), sample.sequence_number());
         let sequence = self.reception.sequence();
-        if self.is_under_way(sample) {
+        if self.is_under_way(sample, at) {
             return false;
         }
         if is_polled(record) && self.is_exact(at) {
@@ -230,7 +230,7 @@ impl Writer {
 
     /// Returns the time of the last message.
     #[must_use]
-    pub const fn last_message(&self) -> Option<Timestamp> {
+    pub const fn last_message(&self) -> Option<ModelTime> {
         self.last_message
     }
 
@@ -249,7 +249,7 @@ impl Writer {
     }
 
     /// Records that samples in shared memory before `now` may have been missed.
-    pub fn uncertain(&mut self, now: Timestamp) {
+    pub fn uncertain(&mut self, now: ModelTime) {
         if let Some(sampled) = self.sampled.as_mut().filter(|each| each.is_current(now)) {
             sampled.uncertain();
         }
@@ -266,10 +266,10 @@ impl Writer {
     pub fn record(
         &mut self,
         record: &Record,
-        opened: Timestamp,
+        opened: ModelTime,
         context: &mut MeasurementContext<'_>,
     ) -> Option<Counted> {
-        let at = record_time(record);
+        let at = context.now;
         let is_exact = record.flags & flag::EXACT != 0;
         let is_sampled = is_polled(record);
         if is_exact {
@@ -277,7 +277,7 @@ impl Writer {
         }
         let body = record.body();
         if let Body::Sample(sample) = body
-            && self.is_under_way(sample)
+            && self.is_under_way(sample, at)
         {
             return self.catch_up(sample, context);
         }
@@ -307,14 +307,14 @@ impl Writer {
                 self.traits.reliable = true;
                 let (reception, mut settling) =
                     self.parts(context.journal, (context.now, context.has_receivers));
-                reception.heartbeat(heartbeat, context.budget, &mut |decision| {
+                reception.heartbeat(heartbeat, at, context.budget, &mut |decision| {
                     settling.take(decision);
                 });
             }
             Body::Gap(gap) => {
                 let (reception, mut settling) =
                     self.parts(context.journal, (context.now, context.has_receivers));
-                reception.gap(gap, context.budget, &mut |decision| {
+                reception.gap(gap, at, context.budget, &mut |decision| {
                     settling.take(decision);
                 });
             }
@@ -339,7 +339,7 @@ impl Writer {
     }
 
     /// Returns how far its samples are decided. `acknowledged` states whether readers acknowledge.
-    pub fn progress(&mut self, acknowledged: bool, now: Timestamp) -> Progress {
+    pub fn progress(&mut self, acknowledged: bool, now: ModelTime) -> Progress {
         let waits = self.traits.reliable && acknowledged;
         let is_sampled = self.is_sampled(now);
         let reliable = self.traits.reliable && !is_sampled;
@@ -370,7 +370,7 @@ impl Writer {
 
     /// Returns the time since which a sent but unseen sample is waited for.
     #[must_use]
-    pub fn unseen_since(&self) -> Option<Timestamp> {
+    pub fn unseen_since(&self) -> Option<ModelTime> {
         self.sampled.as_ref()?.unseen_since()
     }
 
@@ -406,7 +406,7 @@ impl Writer {
         clippy::cast_precision_loss,
         reason = "counts of ten seconds are far below 2^52"
     )]
-    pub fn measurement(&self, now: Timestamp) -> Measurement {
+    pub fn measurement(&self, now: ModelTime) -> Measurement {
         let (slot, seconds) = self.recent(now, SECONDS);
         let per_second = |count: u64| {
             if seconds == 0 {
@@ -440,7 +440,7 @@ impl Writer {
 
     /// Returns the counts of the last whole seconds, and the number of these seconds.
     #[must_use]
-    pub fn recent(&self, now: Timestamp, seconds: u64) -> (Slot, u64) {
+    pub fn recent(&self, now: ModelTime, seconds: u64) -> (Slot, u64) {
         self.tally.window.sum(now, seconds)
     }
 
@@ -448,7 +448,7 @@ impl Writer {
     const fn parts<'a>(
         &'a mut self,
         journal: &'a mut Journal,
-        (at, has_receivers): (Timestamp, bool),
+        (at, has_receivers): (ModelTime, bool),
     ) -> (&'a mut Reception, Settling<'a>) {
         let settling = Settling {
             tally: &mut self.tally,
@@ -465,12 +465,11 @@ impl Writer {
         sample: Sample<'_>,
         context: &mut MeasurementContext<'_>,
     ) -> Option<Counted> {
-        let record = sample.record();
-        let now = record_time(record);
+        let (record, now) = (sample.record(), context.now);
         let reliable = self.traits.reliable;
         let (reception, mut settling) =
             self.parts(context.journal, (context.now, context.has_receivers));
-        let outcome = reception.sample(sample, reliable, context.budget, &mut |decision| {
+        let outcome = reception.sample(sample, now, reliable, context.budget, &mut |decision| {
             settling.take(decision);
         });
         match outcome {
@@ -515,12 +514,12 @@ impl Writer {
         sequence.is_unconfirmed(sample.sequence_number(), source, reach(sample.record()))
     }
 
-    fn is_exact(&self, now: Timestamp) -> bool {
+    fn is_exact(&self, now: ModelTime) -> bool {
         let last = self.exact;
         last.is_some_and(|last| last + EXACT_FOR > now)
     }
 
-    fn count(&mut self, now: Timestamp, bytes: u64, recovered: bool) {
+    fn count(&mut self, now: ModelTime, bytes: u64, recovered: bool) {
         self.tally.messages += 1;
         self.tally.bytes += bytes;
         self.tally.recovered += u64::from(recovered);
@@ -550,7 +549,7 @@ struct Settling<'a> {
     tally: &'a mut Tally,
     journal: &'a mut Journal,
     writer: Guid,
-    at: Timestamp,
+    at: ModelTime,
     has_receivers: bool,
 }
 
@@ -596,10 +595,6 @@ const fn reach(record: &Record) -> u64 {
 /// Returns whether it was read by polling shared memory, where others may have been missed.
 const fn is_polled(record: &Record) -> bool {
     record.flags & (flag::SHM | flag::EXACT) == flag::SHM
-}
-
-const fn record_time(record: &Record) -> Timestamp {
-    Timestamp(record.time)
 }
 
 #[expect(

@@ -6,7 +6,6 @@
 
 mod announcements;
 mod arrivals;
-mod calendar;
 mod calls;
 mod chains;
 mod clock;
@@ -35,6 +34,7 @@ use crate::derive::trace::{LOOPBACK, Tracer, WriterDescription};
 use crate::facts::event::TEXT;
 use crate::facts::journal::Journal;
 use crate::facts::measurement::Measurement;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::DdsName;
 use crate::facts::selection::SampleRequest;
 use crate::facts::wall_clock::WallClock;
@@ -103,7 +103,7 @@ pub struct Observer {
     pub(crate) latched: Latched,
     sample_requests: Arc<Vec<SampleRequest>>,
     /// Time at which they last changed.
-    requests_changed: Timestamp,
+    requests_changed: ModelTime,
     pub(crate) receivers: Receivers,
     pub(crate) services: Services,
     pub(crate) inside: Inside,
@@ -120,9 +120,9 @@ pub struct Observer {
     pub(crate) records: u64,
     journal: Journal,
     /// Time up to which all decisions are made.
-    clock: Timestamp,
+    clock: ModelTime,
     /// Time from which on the source sees the traffic; silence before it is unknown.
-    view_began: Timestamp,
+    view_began: ModelTime,
     wall_clock: WallClock,
 }
 
@@ -151,7 +151,7 @@ impl Observer {
             payloads: Payloads::new(settings.payload_bytes, settings.payload_delay),
             latched: Latched::default(),
             sample_requests: Arc::default(),
-            requests_changed: Timestamp(0),
+            requests_changed: ModelTime::ZERO,
             receivers: Receivers::new(settings.deliveries, settings.participants),
             services: Services::default(),
             inside: Inside::default(),
@@ -165,8 +165,8 @@ impl Observer {
             datagrams: 0,
             records: 0,
             journal: Journal::default(),
-            clock: Timestamp(0),
-            view_began: Timestamp(0),
+            clock: ModelTime::ZERO,
+            view_began: ModelTime::ZERO,
             wall_clock: WallClock::default(),
         }
     }
@@ -174,7 +174,7 @@ impl Observer {
     /// Processes one input.
     pub fn input(&mut self, input: Input<'_>) {
         match input {
-            Input::Time(now) => self.advance(now),
+            Input::Time(now) => self.advance(self.wall_clock.model_time(now)),
             Input::ClockSet(step) => self.wall_clock.set(step),
             Input::ViewBegan(at) => self.view_began = self.wall_clock.model_time(at),
             Input::Datagram {
@@ -192,9 +192,9 @@ impl Observer {
                 payload,
                 flags,
                 records,
-            } => self.walk(envelope, payload, None, flags, |observer, record| {
+            } => self.walk(envelope, payload, None, flags, |observer, record, at| {
                 if record.writer().entity.is_builtin() {
-                    observer.count(record);
+                    observer.count(record, at);
                 } else {
                     records.push(*record);
                 }
@@ -205,7 +205,9 @@ impl Observer {
             Input::SharedMemoryGap(now) => self.profiler.uncertain(self.wall_clock.model_time(now)),
             Input::ProbesDetached => self.profiler.end_exact_view(),
             Input::Zenoh(report) => self.zenoh_report(report),
-            Input::Record(record) => self.count(record),
+            Input::Record(record) => {
+                self.count(record, self.wall_clock.model_time(Timestamp(record.time)));
+            }
             Input::ParticipantAlive(prefix, at) => {
                 let at = self.wall_clock.model_time(at);
                 self.discovery.seen(prefix, at, Priority::NOTHING);
@@ -220,7 +222,9 @@ impl Observer {
             Input::SampleRequests(sample_requests) => self.set_sample_requests(sample_requests),
             Input::ExpectedChains(chains) => self.chains.expect(chains),
             Input::CausalPublication(publication) => self.chain_published(publication),
-            Input::Restored { memory, now } => self.restore(memory, now),
+            Input::Restored { memory, now } => {
+                self.restore(memory, self.wall_clock.model_time(now));
+            }
             Input::End => self.settle(),
         }
     }
@@ -229,16 +233,13 @@ impl Observer {
     pub fn drain(&mut self) -> Output {
         let mut output = Output {
             interest: self.interest.changes(),
-            events: self.journal.events.take(),
-            samples: self.payloads.take(),
-            spans: self.tracer.take(),
+            events: self.journal.events.take(self.wall_clock),
+            samples: self.payloads.take(self.wall_clock),
+            spans: self.tracer.take(self.wall_clock),
             chain_spans: self.chains.take_spans(),
         };
         self.keep_dispatched(&output.samples);
         self.zenoh_interest(&mut output.interest);
-        self.wall_clock.convert_events(&mut output.events);
-        self.wall_clock.convert_dispatches(&mut output.samples);
-        self.wall_clock.convert_spans(&mut output.spans);
         output
     }
 
@@ -284,15 +285,16 @@ impl Observer {
         let length = length.min(u16::MAX.into()).try_into().unwrap_or(0);
         let mut padded = payload.to_vec();
         padded.resize(payload.len().max(length), 0);
-        walk::datagram(&padded, envelope, None, |found| self.count(&found.record));
+        let at = self.wall_clock.model_time(Timestamp(envelope.time));
+        walk::datagram(&padded, envelope, None, |found| {
+            self.count(&found.record, at);
+        });
     }
 
     /// Restores saved state, valid for at most one lease from `now` on.
-    fn restore(&mut self, memory: &Memory, now: Timestamp) {
+    fn restore(&mut self, memory: &Memory, now: ModelTime) {
         // Watches that are applied next begin at this time.
         self.advance(now);
-        let captured = now;
-        let now = self.wall_clock.model_time(now);
         self.discovery.restore(memory, now);
         self.examiner.forget();
         let prefixes: Vec<_> = self.discovery.participants().keys().copied().collect();
@@ -306,7 +308,7 @@ impl Observer {
             gid: endpoint.gid,
             topic: &endpoint.topic,
         });
-        self.zenoh.restore(&memory.zenoh, endpoints, captured);
+        self.zenoh.restore(&memory.zenoh, endpoints, now);
         self.follow_up(now);
     }
 
@@ -334,9 +336,7 @@ impl Observer {
     /// Returns all facts at `now`.
     #[must_use]
     pub fn snapshot(&self, now: Timestamp) -> Snapshot {
-        let mut snapshot = report::snapshot(self, self.wall_clock.model_time(now));
-        self.wall_clock.convert_snapshot(&mut snapshot);
-        snapshot
+        report::snapshot(self, now)
     }
 
     /// Returns the domain, DDS name and counts of each measured topic at `now`.
@@ -355,12 +355,10 @@ impl Observer {
             .or_default() += 1;
     }
 
-    fn count(&mut self, record: &Record) {
+    /// Counts a record that was captured at `at`.
+    fn count(&mut self, record: &Record, at: ModelTime) {
         self.records += 1;
-        let moved = self.wall_clock.model_record(record);
-        let record = moved.as_ref().unwrap_or(record);
-        let (writer, at) = (record.writer(), Timestamp(record.time));
-        let sender = record.sender();
+        let (writer, sender) = (record.writer(), record.sender());
         if matches!(record.body(), Body::Handover | Body::Undelivered) {
             self.discovery.seen(sender, at, Priority::NOTHING);
             return;
@@ -391,22 +389,22 @@ impl Observer {
         }
         self.latched.seen(record);
         if self.tracer.is_wanted() {
-            self.trace(record);
+            self.trace(record, at);
         }
         // Requests and replies are seldom measured: ordinary topics need no further lookup.
         let measures_calls = self.services.has_measured();
         if measures_calls {
-            self.call_seen(record);
+            self.call_seen(record, at);
         }
         let graph = graph!(self);
         let journal = &mut self.journal;
-        match self.profiler.record(writer, record, journal, graph) {
+        match self.profiler.record(writer, (record, at), journal, graph) {
             RecordOutcome::Unmeasured if measures_calls => {}
-            RecordOutcome::Unmeasured => self.call_seen(record),
+            RecordOutcome::Unmeasured => self.call_seen(record, at),
             RecordOutcome::Measured => {
                 self.chain_seen(record);
                 if self.payloads.is_unsettled(writer) {
-                    self.came_again(writer, record);
+                    self.came_again(writer, record, at);
                     self.turn(writer, at);
                 }
                 return;
@@ -425,14 +423,15 @@ impl Observer {
         if is_strange {
             let graph = graph!(self);
             let journal = &mut self.journal;
-            let outcome = self.profiler.unknown_writer(writer, record, journal, graph);
+            let seen = (record, at);
+            let outcome = self.profiler.unknown_writer(writer, seen, journal, graph);
             if let RecordOutcome::Counted(counted) = outcome {
                 self.counted(writer, &counted);
             }
         }
     }
 
-    fn trace(&mut self, record: &Record) {
+    fn trace(&mut self, record: &Record, at: ModelTime) {
         let Self {
             tracer,
             discovery,
@@ -442,7 +441,7 @@ impl Observer {
             ..
         } = self;
         let is_local = receivers.is_local(&record.writer().prefix);
-        tracer.record(record, is_local, || {
+        tracer.record((record, at), is_local, || {
             let endpoint = discovery.endpoints().get(&record.writer())?;
             let naming = endpoint.naming()?;
             let topic = topics.get(topics.find(endpoint.domain_id, &naming)?)?;
@@ -462,17 +461,18 @@ impl Observer {
         payload: &[u8],
         handover: Option<&Handover>,
         flags: u16,
-        mut count: impl FnMut(&mut Self, &Record),
+        mut count: impl FnMut(&mut Self, &Record, ModelTime),
     ) {
         self.datagrams += 1;
         let vendor = payload
             .get(6..8)
             .and_then(|bytes| <[u8; 2]>::try_from(bytes).ok());
         let vendor = vendor.filter(|vendor| *vendor != [0, 0]).map(VendorId);
+        let at = self.wall_clock.model_time(Timestamp(envelope.time));
         let outcome = walk::datagram(payload, envelope, handover, |mut found| {
             found.record.flags |= flags;
-            self.announced(&found, vendor, envelope);
-            count(self, &found.record);
+            self.announced(&found, vendor, (envelope, at));
+            count(self, &found.record, at);
         });
         if outcome == Outcome::Malformed {
             self.decode_error("rtps", Reason::BadLength);
@@ -480,7 +480,7 @@ impl Observer {
     }
 
     /// Applies changes of discovery to topics, interest and measurement.
-    fn follow_up(&mut self, now: Timestamp) {
+    fn follow_up(&mut self, now: ModelTime) {
         for change in self.discovery.changes() {
             self.receivers.changed();
             match change {
@@ -496,7 +496,7 @@ impl Observer {
         }
     }
 
-    fn appeared(&mut self, guid: Guid, now: Timestamp) {
+    fn appeared(&mut self, guid: Guid, now: ModelTime) {
         let Some(endpoint) = self.discovery.endpoints().get(&guid) else {
             return;
         };
@@ -530,7 +530,7 @@ impl Observer {
         }
     }
 
-    fn gone(&mut self, guid: Guid, endpoint: &Endpoint, now: Timestamp) {
+    fn gone(&mut self, guid: Guid, endpoint: &Endpoint, now: ModelTime) {
         self.interest.remove(guid);
         self.services.forget(guid);
         self.tracer.forget(guid);

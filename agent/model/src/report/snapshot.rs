@@ -24,10 +24,12 @@ use crate::facts::diagnosis::Diagnoses;
 pub use crate::facts::measurement::{
     Breakdown, Delivered, EarlierCounts, Measurement, SampledFacts,
 };
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
 pub use crate::facts::route::Direction;
 use crate::facts::selection::Candidate;
 use crate::facts::topic_kind::TopicKind;
+use crate::facts::wall_clock::WallClock;
 use crate::facts::watch::Watch;
 pub use crate::facts::watch::WatchState;
 use crate::graph::discovery::Addresses;
@@ -40,8 +42,11 @@ pub use delivery::{DeliveryFacts, Subscriber};
 /// All facts at the time `at`. Lists are sorted by identity.
 #[derive(Clone, Debug, Default)]
 pub struct Snapshot {
-    /// Time of the snapshot, by the source's clock (capture time in a replay).
-    pub at: Timestamp,
+    /// Time of the snapshot. All times but those of chains are model time, so that a step of the
+    /// clock leaves their distances as they are.
+    pub at: ModelTime,
+    /// Converts the times to wall time, that of the capture in a replay.
+    pub wall_clock: WallClock,
     /// Live participants.
     pub participants: Vec<ParticipantFacts>,
     /// ROS nodes of live participants.
@@ -67,7 +72,7 @@ pub struct Snapshot {
     /// Problems of the graph; the same value while nothing changes.
     pub diagnoses: Arc<Diagnoses>,
     /// Time at which each problem appeared, in the same order.
-    pub diagnosed: Arc<Vec<Timestamp>>,
+    pub diagnosed: Arc<Vec<ModelTime>>,
     /// Counters of discovery events since the start.
     pub churn: Vec<ChurnCount>,
     /// Parse failures since the start.
@@ -84,6 +89,20 @@ pub struct Snapshot {
     pub topics_rejected: u64,
 }
 
+impl Snapshot {
+    /// Returns the wall time of the snapshot.
+    #[must_use]
+    pub const fn time(&self) -> Timestamp {
+        self.wall_time(self.at)
+    }
+
+    /// Returns the wall time of one of its times.
+    #[must_use]
+    pub const fn wall_time(&self, at: ModelTime) -> Timestamp {
+        self.wall_clock.wall_time(at)
+    }
+}
+
 /// One DDS participant.
 #[derive(Clone, Debug)]
 pub struct ParticipantFacts {
@@ -98,9 +117,9 @@ pub struct ParticipantFacts {
     /// Host and process of the participant.
     pub process: ProcessFacts,
     /// Time of its first announcement.
-    pub first_seen: Timestamp,
+    pub first_seen: ModelTime,
     /// Time of its last packet.
-    pub last_seen: Timestamp,
+    pub last_seen: ModelTime,
     /// Time after which a silent participant is removed.
     pub lease: RtpsDuration,
     /// Whether it announces security: its user data may be encrypted.
@@ -262,7 +281,7 @@ pub struct EndpointFacts {
     /// RIHS01 hash.
     pub type_hash: Option<TypeHash>,
     /// Time of its first announcement.
-    pub first_seen: Timestamp,
+    pub first_seen: ModelTime,
     /// Counts and times of this writer while its topic was watched.
     pub measurement: Option<Box<Measurement>>,
     /// Set of the transports to its counterparts, as [`Transport::bit`].
@@ -317,7 +336,7 @@ impl TopicFacts {
     /// Returns whether a measured topic that was sent regularly has not been sent for long: for 10 s
     /// and five times the longest interval so far. A topic whose messages are events is not silent.
     #[must_use]
-    pub fn is_silent(&self, now: Timestamp) -> bool {
+    pub fn is_silent(&self, now: ModelTime) -> bool {
         let Some(measured) = self.measurement.as_deref() else {
             return false;
         };
@@ -366,7 +385,7 @@ pub struct UnknownWriterFacts {
     /// Host and process of the writer.
     pub process: ProcessFacts,
     /// Time of the first record.
-    pub first_seen: Timestamp,
+    pub first_seen: ModelTime,
     /// Counts and times, as for any writer.
     pub measurement: Measurement,
 }

@@ -6,8 +6,9 @@
 use std::time::Duration;
 
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix};
 
+use crate::facts::model_time::ModelTime;
 use crate::graph::discovery::{Discovery, Endpoint};
 use crate::report::snapshot::{EndpointFacts, Transport, TransportCount};
 
@@ -95,8 +96,8 @@ pub(crate) fn is_polled(discovery: &Discovery, writer: Guid, readers: &[Guid]) -
 
 /// Returns whether names are missing that shared memory may contain at present: nodes of a
 /// participant, or the node of an endpoint.
-pub(crate) fn lacks_names(discovery: &Discovery, now: Timestamp) -> bool {
-    let is_new = |first_seen: Timestamp, within: Duration| first_seen + within > now;
+pub(crate) fn lacks_names(discovery: &Discovery, now: ModelTime) -> bool {
+    let is_new = |first_seen: ModelTime, within: Duration| first_seen + within > now;
     let participants = discovery.participants();
     participants.values().any(|participant| {
         participant.proxy.shared_memory

@@ -14,6 +14,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use replayed::Replayed;
+use ros2probe_model::facts::model_time::ModelTime;
+use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot::Measurement;
 use ros2probe_testing::truth::{self, Facts, GraphLine, Scenario};
 use ros2probe_wire::names::DdsType;
@@ -128,8 +130,13 @@ fn participants(name: &str, facts: &Facts, replayed: &Replayed) {
             assert_eq!(ours.process.host.as_deref(), property("__Hostname"));
             assert_eq!(ours.process.name.as_deref(), property("__ProcessName"));
         }
-        assert!((ours.first_seen.seconds() - theirs.first_seen).abs() < ROUNDING);
+        assert!((seconds(ours.first_seen) - theirs.first_seen).abs() < ROUNDING);
     }
+}
+
+/// Returns the wall time in seconds. The clock is not set in a capture.
+fn seconds(at: ModelTime) -> f64 {
+    WallClock::default().wall_time(at).seconds()
 }
 
 fn endpoints(name: &str, facts: &Facts, replayed: &Replayed) {
@@ -242,7 +249,7 @@ fn leases(name: &str, facts: &Facts, replayed: &Replayed) {
             continue;
         }
         let lease = facts.participants[guid].lease;
-        let silent = ended.seconds() - participant.last_seen.seconds();
+        let silent = ended.seconds() - seconds(participant.last_seen);
         assert!(
             (silent - lease).abs() < 1e-6,
             "{name}: {guid} was silent for {silent} s"
@@ -277,7 +284,7 @@ fn nodes(name: &str, facts: &Facts, replayed: &Replayed) {
         .events
         .iter()
         .filter(|event| event.entity == "node" && event.event != "cascaded")
-        .map(|event| (event.name.to_string(), event.event, event.at.seconds()))
+        .map(|event| (event.name.to_string(), event.event, seconds(event.at)))
         .collect();
     assert_eq!(theirs.len(), ours.len(), "{name}: {theirs:?} {ours:?}");
     for (theirs, ours) in theirs.iter().zip(&ours) {
@@ -476,7 +483,7 @@ fn witnessed_removals(name: &str, scenario: &Scenario, replayed: &Replayed) {
                 event.entity == "node" && event.event != "appeared" && *event.name == **node
             });
             let ours = ours.unwrap_or_else(|| panic!("{name}: {node} stays"));
-            let late = after.t as f64 / 1e9 - ours.at.seconds();
+            let late = after.t as f64 / 1e9 - seconds(ours.at);
             // The witness polls every 50 ms, and later on a busy machine.
             assert!(
                 (-0.1..0.5).contains(&late),

@@ -147,13 +147,18 @@ fn payload(number: u64, bytes: usize) -> Vec<u8> {
     payload
 }
 
-fn subscribe(observer: &mut Observer, id: u64) -> Vec<(u64, usize)> {
-    let request = SampleRequest {
+/// Returns a request for everything.
+fn request(id: u64) -> SampleRequest {
+    SampleRequest {
         id,
         selection: Arc::new(Selection::all()),
         domain_id: None,
         depth: Depth::Payloads,
-    };
+    }
+}
+
+fn subscribe(observer: &mut Observer, id: u64) -> Vec<(u64, usize)> {
+    let request = request(id);
     // As the agent does before each change.
     observer.drain();
     observer.input(Input::SampleRequests(Arc::new(vec![request.clone()])));
@@ -185,6 +190,35 @@ fn the_last_message_of_an_unwatched_topic_reaches_a_subscription_that_begins_lat
     assert_eq!(robot.received(), [3]);
     assert_eq!(robot.facts(guid), Some(LatchedFacts::Kept(300)));
     assert_eq!(robot.subscribe(8), [(3, 300)]);
+}
+
+#[test]
+fn a_kept_message_follows_a_clock_that_is_set_and_a_received_one_has_its_time() {
+    for step in [3_600 * SECOND.cast_signed(), -3_600 * SECOND.cast_signed()] {
+        let (mut robot, guid) = Robot::map_server(1);
+        robot.send(guid, 1, 500);
+        let sent = robot.domain.now.saturating_add_signed(step);
+        robot.domain.observer.input(Input::ClockSet(step));
+        robot.domain.now = sent;
+        robot.domain.wait(1_000);
+        let first = request(7);
+        let requests = Arc::new(vec![first.clone()]);
+        robot.domain.observer.input(Input::SampleRequests(requests));
+        let kept = robot.domain.observer.latched(&first);
+        assert_eq!(kept[0].time, Timestamp(sent));
+        robot.domain.wait(1_000);
+        robot.send(guid, 2, 500);
+        let samples = robot.domain.observer.drain().samples;
+        let SampleOutcome::Sample(sample) = &samples[0].outcome else {
+            panic!("{samples:?}")
+        };
+        assert_eq!(sample.time, Timestamp(robot.domain.now));
+        // A message that a client received is kept as well.
+        let (later, observer) = (request(8), &mut robot.domain.observer);
+        observer.input(Input::SampleRequests(Arc::new(vec![first, later.clone()])));
+        let kept = observer.latched(&later);
+        assert_eq!(kept.last().unwrap().time, sample.time);
+    }
 }
 
 #[test]

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use proptest::prelude::*;
 use ros2probe_model::facts::event::EventKind;
+use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::facts::watch::{Expectations, Watch, Watchlist};
 use ros2probe_model::graph::discovery::Memory;
 use ros2probe_model::observe::input::Input;
@@ -93,7 +94,7 @@ fn shown(observer: &Observer, at: u64) -> String {
         ..
     } = observer.snapshot(Timestamp(at));
     for participant in &mut participants {
-        (participant.first_seen, participant.last_seen) = (Timestamp(0), Timestamp(0));
+        (participant.first_seen, participant.last_seen) = (ModelTime::ZERO, ModelTime::ZERO);
         participant.restored = false;
     }
     let endpoints: Vec<_> = topics
@@ -101,7 +102,7 @@ fn shown(observer: &Observer, at: u64) -> String {
         .flat_map(|topic| topic.publishers.iter().chain(&topic.subscriptions))
         .map(|end| {
             let mut end = end.clone();
-            (end.first_seen, end.measurement) = (Timestamp(0), None);
+            (end.first_seen, end.measurement) = (ModelTime::ZERO, None);
             end
         })
         .collect();

@@ -10,10 +10,11 @@ use ros2probe_model::facts::calls::facts::{
 };
 use ros2probe_model::facts::calls::report::{Durations, Trigger};
 use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
+use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::facts::names::TopicName;
-use ros2probe_wire::{DomainId, Timestamp};
+use ros2probe_wire::DomainId;
 
-const LAST: Timestamp = Timestamp(1_700_000_000_000_000_000);
+const LAST: ModelTime = ModelTime::from_nanoseconds(1_700_000_000_000_000_000);
 
 /// Returns the facts of one process with a publisher, a subscription, a buffer and two callbacks of
 /// `/points`.

@@ -43,7 +43,7 @@ async fn list(
     let index = Index::new(snapshot);
     let actions = actions(snapshot, scope).into_iter();
     let answer = ActionList {
-        timestamp_seconds: snapshot.at.seconds(),
+        timestamp_seconds: snapshot.time().seconds(),
         actions: actions
             .filter_map(|((domain_id, name), parts)| {
                 let goals = goals(snapshot, domain_id, &name);

@@ -70,7 +70,7 @@ async fn list(
             && named(&ends.to, &each.chain.to)
     });
     let answer = ChainList {
-        timestamp_seconds: snapshot.at.seconds(),
+        timestamp_seconds: snapshot.time().seconds(),
         chains,
         expected: configured.map(expected).collect(),
     };

@@ -6,12 +6,17 @@ use super::index::Index;
 use super::measured::measurement;
 use crate::latched::latched;
 use ros2probe_api::endpoints::{Endpoint, Process, Qos};
+use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot::{EndpointFacts, ProcessFacts};
 use ros2probe_wire::rtps::VendorId;
 
 /// Returns the answer's form of a writer or reader.
-pub(super) fn endpoint<'a>(facts: &'a EndpointFacts, index: &Index<'a>) -> Endpoint<'a> {
-    let qos = &facts.qos;
+pub(super) fn endpoint<'a>(
+    facts: &'a EndpointFacts,
+    index: &Index<'a>,
+    clock: WallClock,
+) -> Endpoint<'a> {
+    let (qos, measured) = (&facts.qos, facts.measurement.as_deref());
     let participant = index.participant(facts.guid);
     let enclave = participant.and_then(|participant| participant.enclave.as_deref());
     Endpoint {
@@ -33,8 +38,8 @@ pub(super) fn endpoint<'a>(facts: &'a EndpointFacts, index: &Index<'a>) -> Endpo
             ownership: Cow::Borrowed(qos.ownership.label()),
             partitions: texts(&qos.partitions),
         },
-        first_seen_timestamp_seconds: facts.first_seen.seconds(),
-        measurement: facts.measurement.as_deref().map(measurement),
+        first_seen_timestamp_seconds: clock.wall_time(facts.first_seen).seconds(),
+        measurement: measured.map(|facts| measurement(facts, clock)),
         latched: facts.latched.map(latched),
     }
 }

@@ -150,7 +150,7 @@ impl Drawing {
         let vertices = self.vertices.into_iter();
         let edges = self.edges.into_iter();
         Graph {
-            timestamp_seconds: snapshot.at.seconds(),
+            timestamp_seconds: snapshot.time().seconds(),
             nodes: vertices
                 .map(|(id, (kind, domain_id, name))| Vertex {
                     id,

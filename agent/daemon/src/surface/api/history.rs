@@ -41,7 +41,7 @@ pub(super) async fn show(
         topic: topic.name.to_string(),
         domain_id: topic.domain_id.0,
         interval_seconds: 1,
-        timestamp_seconds: state.known().at.seconds(),
+        timestamp_seconds: state.known().time().seconds(),
         ..History::default()
     };
     let seconds = past.topic(topic.domain_id, &topic.dds_name);

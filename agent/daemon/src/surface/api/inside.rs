@@ -22,8 +22,9 @@ use ros2probe_api::inside::{
     Buffer, Callback, Counter, Durations, Inside, Library, LifecycleState, NodeInside, Owner,
     Process, Publisher, ReaderQueue, Subscription, TopicInside, Trigger,
 };
-use ros2probe_model::facts::calls::facts::{self, InsideFacts, Quantiles};
+use ros2probe_model::facts::calls::facts::{self, Quantiles};
 use ros2probe_model::facts::calls::report;
+use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot::{Snapshot, TopicFacts};
 use ros2probe_wire::DomainId;
 
@@ -76,7 +77,7 @@ fn inside<'a>(
     admits: impl Fn(DomainId) -> bool,
 ) -> Inside<'a> {
     let mut answer = Inside {
-        timestamp_seconds: snapshot.at.seconds(),
+        timestamp_seconds: snapshot.time().seconds(),
         mode: Cow::Borrowed(source.map_or("off", |source| source.mode)),
         reason: source.and_then(|source| source.reason_off.as_deref().map(Cow::Borrowed)),
         ..Inside::default()
@@ -97,24 +98,27 @@ fn inside<'a>(
     let Some(known) = snapshot.inside.as_deref() else {
         return answer;
     };
+    let clock = snapshot.wall_clock;
     let is_here = |owner: &facts::Owner| admits(owner.domain_id);
     let processes = known.processes.iter();
     let processes = processes.filter(|each| admits(each.domain_id));
     answer.processes = processes.map(process).collect();
     let publishers = known.publishers.iter().filter(|each| is_here(&each.owner));
-    answer.publishers = publishers.map(publisher).collect();
+    answer.publishers = publishers.map(|each| publisher(each, clock)).collect();
     let subscriptions = known.subscriptions.iter();
     let subscriptions = subscriptions.filter(|each| is_here(&each.owner));
-    answer.subscriptions = subscriptions.map(subscription).collect();
+    answer.subscriptions = subscriptions
+        .map(|each| subscription(each, clock))
+        .collect();
     let queues = known.reader_queues.iter();
     let queues = queues.filter(|each| is_here(&each.owner));
     answer.reader_queues = queues.map(reader_queue).collect();
     let buffers = known.buffers.iter().filter(|each| is_here(&each.owner));
-    answer.buffers = buffers.map(buffer).collect();
+    answer.buffers = buffers.map(|each| buffer(each, clock)).collect();
     let callbacks = known.callbacks.iter().filter(|each| is_here(&each.owner));
-    answer.callbacks = callbacks.map(callback).collect();
+    answer.callbacks = callbacks.map(|each| callback(each, clock)).collect();
     let states = known.states.iter().filter(|each| admits(each.domain_id));
-    answer.lifecycle_states = states.map(lifecycle_state).collect();
+    answer.lifecycle_states = states.map(|each| lifecycle_state(each, clock)).collect();
     answer
 }
 
@@ -153,7 +157,7 @@ fn select(inside: &mut Inside<'_>, name: &str) {
 }
 
 /// Returns what processes show of a topic, without the lists.
-pub(super) fn topic(facts: &TopicFacts) -> Option<TopicInside<'_>> {
+pub(super) fn topic(facts: &TopicFacts, clock: WallClock) -> Option<TopicInside<'_>> {
     let inside = facts.inside.as_deref()?;
     let counts = inside.counts;
     Some(TopicInside {
@@ -167,7 +171,7 @@ pub(super) fn topic(facts: &TopicFacts) -> Option<TopicInside<'_>> {
         intra_process_receptions: counts.receptions,
         lost_in_reader_queue_messages: inside.lost_in_queues,
         rate_hertz: inside.rate_hz,
-        last_message_timestamp_seconds: inside.last.map(|last| last.seconds()),
+        last_message_timestamp_seconds: inside.last.map(|last| clock.wall_time(last).seconds()),
         observed_publishers: inside.publishers,
         observed_subscriptions: inside.subscriptions,
         ..TopicInside::default()
@@ -178,31 +182,34 @@ pub(super) fn topic(facts: &TopicFacts) -> Option<TopicInside<'_>> {
 /// callbacks.
 pub(super) fn topic_details<'a>(
     facts: &'a TopicFacts,
-    known: Option<&'a InsideFacts>,
+    snapshot: &'a Snapshot,
 ) -> Option<TopicInside<'a>> {
-    let (mut shown, known) = (topic(facts)?, known?);
+    let clock = snapshot.wall_clock;
+    let (mut shown, known) = (topic(facts, clock)?, snapshot.inside.as_deref()?);
     let name = &facts.name;
     let is_here = |owner: &facts::Owner| owner.domain_id == facts.domain_id;
     let own =
         |owner, topic: &ros2probe_model::facts::names::TopicName| is_here(owner) && topic == name;
     let publishers = known.publishers.iter();
     let publishers = publishers.filter(|each| own(&each.owner, &each.topic));
-    shown.publishers = publishers.map(publisher).collect();
+    shown.publishers = publishers.map(|each| publisher(each, clock)).collect();
     let subscriptions = known.subscriptions.iter();
     let subscriptions = subscriptions.filter(|each| own(&each.owner, &each.topic));
-    shown.subscriptions = subscriptions.map(subscription).collect();
+    shown.subscriptions = subscriptions
+        .map(|each| subscription(each, clock))
+        .collect();
     let queues = known.reader_queues.iter();
     let queues = queues.filter(|each| own(&each.owner, &each.topic));
     shown.reader_queues = queues.map(reader_queue).collect();
     let buffers = known.buffers.iter();
     let buffers = buffers.filter(|each| is_here(&each.owner) && each.topic.as_ref() == Some(name));
-    shown.buffers = buffers.map(buffer).collect();
+    shown.buffers = buffers.map(|each| buffer(each, clock)).collect();
     let callbacks = known.callbacks.iter();
     let callbacks = callbacks.filter(|each| {
         let is_topic = !matches!(each.trigger, report::Trigger::Service(_));
         is_topic && is_here(&each.owner) && each.trigger.name() == Some(name.as_str())
     });
-    shown.callbacks = callbacks.map(callback).collect();
+    shown.callbacks = callbacks.map(|each| callback(each, clock)).collect();
     Some(shown)
 }
 
@@ -210,9 +217,9 @@ pub(super) fn topic_details<'a>(
 pub(super) fn node<'a>(
     domain_id: DomainId,
     name: &str,
-    known: Option<&'a InsideFacts>,
+    snapshot: &'a Snapshot,
 ) -> Option<NodeInside<'a>> {
-    let known = known?;
+    let (known, clock) = (snapshot.inside.as_deref()?, snapshot.wall_clock);
     let is_own = |owner: &facts::Owner| {
         owner.domain_id == domain_id && owner.node.as_ref().is_some_and(|node| *node == *name)
     };
@@ -229,11 +236,13 @@ pub(super) fn node<'a>(
     let node = NodeInside {
         busy_ratio: activity.busy,
         lifecycle_state: activity.state.map(Cow::Borrowed),
-        publishers: publishers.map(publisher).collect(),
-        subscriptions: subscriptions.map(subscription).collect(),
+        publishers: publishers.map(|each| publisher(each, clock)).collect(),
+        subscriptions: subscriptions
+            .map(|each| subscription(each, clock))
+            .collect(),
         reader_queues: queues.map(reader_queue).collect(),
-        buffers: buffers.map(buffer).collect(),
-        callbacks: callbacks.map(callback).collect(),
+        buffers: buffers.map(|each| buffer(each, clock)).collect(),
+        callbacks: callbacks.map(|each| callback(each, clock)).collect(),
     };
     (node != NodeInside::default()).then_some(node)
 }
@@ -280,7 +289,7 @@ fn durations(quantiles: &Quantiles) -> Option<Durations> {
     })
 }
 
-fn publisher(facts: &facts::Publisher) -> Publisher<'_> {
+fn publisher(facts: &facts::Publisher, clock: WallClock) -> Publisher<'_> {
     Publisher {
         owner: owner(&facts.owner),
         topic: Cow::Borrowed(&facts.topic),
@@ -288,12 +297,12 @@ fn publisher(facts: &facts::Publisher) -> Publisher<'_> {
         published_messages: facts.published,
         within_process_messages: facts.within_process,
         rate_hertz: facts.rate_hz,
-        last_message_timestamp_seconds: facts.last.seconds(),
+        last_message_timestamp_seconds: clock.wall_time(facts.last).seconds(),
         interval: durations(&facts.interval),
     }
 }
 
-fn subscription(facts: &facts::Subscription) -> Subscription<'_> {
+fn subscription(facts: &facts::Subscription, clock: WallClock) -> Subscription<'_> {
     Subscription {
         owner: owner(&facts.owner),
         topic: Cow::Borrowed(&facts.topic),
@@ -301,7 +310,7 @@ fn subscription(facts: &facts::Subscription) -> Subscription<'_> {
         taken_messages: facts.taken,
         failed_takes: facts.failed,
         rate_hertz: facts.rate_hz,
-        last_message_timestamp_seconds: facts.last.seconds(),
+        last_message_timestamp_seconds: clock.wall_time(facts.last).seconds(),
         latency: durations(&facts.latency),
     }
 }
@@ -318,7 +327,7 @@ fn reader_queue(facts: &facts::ReaderQueue) -> ReaderQueue<'_> {
     }
 }
 
-fn buffer(facts: &facts::Buffer) -> Buffer<'_> {
+fn buffer(facts: &facts::Buffer, clock: WallClock) -> Buffer<'_> {
     Buffer {
         owner: owner(&facts.owner),
         topic: facts.topic.as_deref().map(Cow::Borrowed),
@@ -330,12 +339,12 @@ fn buffer(facts: &facts::Buffer) -> Buffer<'_> {
         maximum_depth: facts.max_depth,
         capacity: facts.capacity,
         rate_hertz: facts.rate_hz,
-        last_message_timestamp_seconds: facts.last.seconds(),
+        last_message_timestamp_seconds: clock.wall_time(facts.last).seconds(),
         waiting: durations(&facts.waiting),
     }
 }
 
-fn callback(facts: &facts::Callback) -> Callback<'_> {
+fn callback(facts: &facts::Callback, clock: WallClock) -> Callback<'_> {
     Callback {
         owner: owner(&facts.owner),
         trigger: trigger(&facts.trigger),
@@ -344,20 +353,20 @@ fn callback(facts: &facts::Callback) -> Callback<'_> {
         skipped_periods: facts.skipped,
         rate_hertz: facts.rate_hz,
         busy_ratio: facts.busy,
-        last_call_timestamp_seconds: facts.last.seconds(),
+        last_call_timestamp_seconds: clock.wall_time(facts.last).seconds(),
         duration: durations(&facts.duration),
         wait: durations(&facts.wait),
     }
 }
 
-fn lifecycle_state(facts: &facts::LifecycleState) -> LifecycleState<'_> {
+fn lifecycle_state(facts: &facts::LifecycleState, clock: WallClock) -> LifecycleState<'_> {
     LifecycleState {
         process_id: facts.process,
         domain_id: facts.domain_id.0,
         node: facts.node.as_deref().map(Cow::Borrowed),
         state: Cow::Borrowed(&facts.state),
         previous_state: Cow::Borrowed(&facts.before),
-        timestamp_seconds: facts.at.seconds(),
+        timestamp_seconds: clock.wall_time(facts.at).seconds(),
     }
 }
 
@@ -435,16 +444,15 @@ mod tests {
         let elsewhere = inside(&snapshot, None, |_| false);
         assert!(elsewhere.publishers.is_empty() && elsewhere.processes.is_empty());
 
-        let known = snapshot.inside.as_deref();
         let facts = snapshot.topics.iter().find(|topic| topic.name == "/scan");
-        let topic = topic_details(facts.unwrap(), known).unwrap();
+        let topic = topic_details(facts.unwrap(), &snapshot).unwrap();
         assert_eq!((topic.published_messages, topic.publishers.len()), (30, 1));
         assert!(topic.callbacks.is_empty(), "its timer has no topic");
 
-        let node = node(DomainId(0), "/lidar", known).unwrap();
+        let node = node(DomainId(0), "/lidar", &snapshot).unwrap();
         assert_eq!((node.callbacks.len(), node.publishers.len()), (1, 1));
         assert_eq!(node.callbacks[0].trigger.words(), "timer 100 ms");
-        assert!(super::node(DomainId(0), "/camera", known).is_none());
+        assert!(super::node(DomainId(0), "/camera", &snapshot).is_none());
     }
 
     #[test]

@@ -4,6 +4,7 @@ use ros2probe_api::measurement::{
     Breakdown, Bucket, Delivered, Distribution, Measurement, Sampled,
 };
 use ros2probe_model::facts::histogram::Histogram;
+use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot;
 
 /// Returns the buckets of a histogram; empty if the histogram is.
@@ -17,7 +18,7 @@ pub(super) fn buckets(values: &Histogram) -> Vec<Bucket> {
 }
 
 /// Returns the answer's form of a measurement.
-pub(super) fn measurement(facts: &snapshot::Measurement) -> Measurement {
+pub(super) fn measurement(facts: &snapshot::Measurement, clock: WallClock) -> Measurement {
     let last_message = facts.last_message;
     Measurement {
         messages: facts.messages,
@@ -32,7 +33,7 @@ pub(super) fn measurement(facts: &snapshot::Measurement) -> Measurement {
         loss_ratio: facts.loss.ratio(),
         rate_hertz: Some(facts.rate_hz),
         bandwidth_bytes_per_second: Some(facts.bandwidth),
-        last_message_timestamp_seconds: last_message.map(|time| time.seconds()),
+        last_message_timestamp_seconds: last_message.map(|at| clock.wall_time(at).seconds()),
         interarrival: distribution(&facts.interarrival),
         latency: distribution(&facts.source_latency),
         header_latency: distribution(&facts.header_latency),
@@ -49,11 +50,14 @@ pub(super) fn measurement(facts: &snapshot::Measurement) -> Measurement {
 }
 
 /// Returns the answer's form of a topic's measurement.
-pub(super) fn topic_measurement(facts: &snapshot::TopicFacts) -> Option<Measurement> {
+pub(super) fn topic_measurement(
+    facts: &snapshot::TopicFacts,
+    clock: WallClock,
+) -> Option<Measurement> {
     Some(Measurement {
         rate_hertz: facts.rate_hz(),
         bandwidth_bytes_per_second: facts.bandwidth(),
-        ..measurement(facts.measurement.as_deref()?)
+        ..measurement(facts.measurement.as_deref()?, clock)
     })
 }
 

@@ -71,7 +71,7 @@ fn names(snapshot: &Snapshot, scope: Scope) -> Names<'_> {
     let services =
         services.filter_map(|((domain_id, name), halves)| service(domain_id.0, name, &halves));
     Names {
-        timestamp_seconds: snapshot.at.seconds(),
+        timestamp_seconds: snapshot.time().seconds(),
         participants: participants
             .clone()
             .filter(|each| scope.admits(each.domain_id))

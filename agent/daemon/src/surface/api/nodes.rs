@@ -60,7 +60,7 @@ async fn list(
         })
     });
     let answer = NodeList {
-        timestamp_seconds: snapshot.at.seconds(),
+        timestamp_seconds: snapshot.time().seconds(),
         nodes: nodes.filter_map(|nodes| answers.node(nodes)).collect(),
     };
     Ok(Json(answer).into_response())
@@ -191,11 +191,7 @@ impl<'a> NodeAnswers<'a> {
             action_servers: action_servers.views(),
             action_clients: action_clients.views(),
             diagnoses: self.findings(first),
-            inside: inside::node(
-                first.domain_id,
-                &first.name,
-                self.snapshot.inside.as_deref(),
-            ),
+            inside: inside::node(first.domain_id, &first.name, self.snapshot),
         })
     }
 

@@ -18,6 +18,7 @@ use super::parameters::Parameters;
 use super::problem::Problem;
 use super::scope::Domain;
 use ros2probe_api::participants::{Participant, ParticipantList, UnknownWriter};
+use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot::{ParticipantFacts, Snapshot, UnknownWriterFacts};
 
 /// Nodes, writers and readers of each participant.
@@ -42,14 +43,18 @@ async fn list(
     let domain = domain.checked()?;
     let state = context.state().await;
     let snapshot = state.known();
-    let counts = counts(snapshot);
+    let (counts, clock) = (counts(snapshot), snapshot.wall_clock);
     let participants = snapshot.participants.iter();
     let participants = participants.filter(|each| domain.admits(each.domain_id));
     let unknown_writers = snapshot.unknown_writers.iter();
     let answer = ParticipantList {
-        timestamp_seconds: snapshot.at.seconds(),
-        participants: participants.map(|each| view(each, &counts)).collect(),
-        unknown_writers: unknown_writers.map(unknown_writer).collect(),
+        timestamp_seconds: snapshot.time().seconds(),
+        participants: participants
+            .map(|each| view(each, &counts, clock))
+            .collect(),
+        unknown_writers: unknown_writers
+            .map(|each| unknown_writer(each, clock))
+            .collect(),
     };
     Ok(Json(answer).into_response())
 }
@@ -71,7 +76,7 @@ fn counts(snapshot: &Snapshot) -> Counts<'_> {
     counts
 }
 
-fn view<'a>(facts: &'a ParticipantFacts, counts: &Counts<'a>) -> Participant<'a> {
+fn view<'a>(facts: &'a ParticipantFacts, counts: &Counts<'a>, clock: WallClock) -> Participant<'a> {
     let counts = counts.get(&facts.guid.prefix);
     Participant {
         guid: facts.guid.to_string(),
@@ -85,19 +90,19 @@ fn view<'a>(facts: &'a ParticipantFacts, counts: &Counts<'a>) -> Participant<'a>
         metatraffic_addresses: Cow::Borrowed(&facts.addresses.metatraffic),
         default_addresses: Cow::Borrowed(&facts.addresses.default),
         lease_seconds: facts.lease.seconds(),
-        first_seen_timestamp_seconds: facts.first_seen.seconds(),
-        last_seen_timestamp_seconds: facts.last_seen.seconds(),
+        first_seen_timestamp_seconds: clock.wall_time(facts.first_seen).seconds(),
+        last_seen_timestamp_seconds: clock.wall_time(facts.last_seen).seconds(),
         secured: facts.secured,
         restored: facts.restored,
     }
 }
 
-fn unknown_writer(facts: &UnknownWriterFacts) -> UnknownWriter<'_> {
+fn unknown_writer(facts: &UnknownWriterFacts, clock: WallClock) -> UnknownWriter<'_> {
     UnknownWriter {
         guid: facts.guid.to_string(),
         vendor: facts.vendor.map_or_else(Cow::default, vendor),
         process: process(&facts.process),
-        first_seen_timestamp_seconds: facts.first_seen.seconds(),
-        measurement: measurement(&facts.measurement),
+        first_seen_timestamp_seconds: clock.wall_time(facts.first_seen).seconds(),
+        measurement: measurement(&facts.measurement, clock),
     }
 }

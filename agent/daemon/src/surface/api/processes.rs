@@ -80,9 +80,10 @@ fn read(ids: BTreeMap<u32, Option<Arc<str>>>) -> ProcessList {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ros2probe_model::facts::model_time::ModelTime;
     use ros2probe_model::report::snapshot::{ParticipantFacts, ProcessFacts};
     use ros2probe_wire::rtps::VendorId;
-    use ros2probe_wire::{DomainId, Guid, RtpsDuration, Timestamp};
+    use ros2probe_wire::{DomainId, Guid, RtpsDuration};
 
     fn participant(id: u32, cgroup: Option<&str>) -> ParticipantFacts {
         ParticipantFacts {
@@ -96,8 +97,8 @@ mod tests {
                 name: None,
                 cgroup: cgroup.map(Into::into),
             },
-            first_seen: Timestamp(1),
-            last_seen: Timestamp(1),
+            first_seen: ModelTime::ZERO,
+            last_seen: ModelTime::ZERO,
             lease: RtpsDuration::Infinite,
             secured: false,
             restored: false,

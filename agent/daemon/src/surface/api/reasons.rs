@@ -212,7 +212,7 @@ impl<'a> Circumstances<'a> {
         match measured.last_message {
             None => "published and subscribed, and no message was seen yet".to_owned(),
             Some(last) => {
-                let age = self.snapshot.at.seconds() - last.seconds();
+                let age = (self.snapshot.at - last).as_secs_f64();
                 format!("the last message was seen {age:.1} s ago")
             }
         }

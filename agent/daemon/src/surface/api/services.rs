@@ -19,6 +19,7 @@ use super::problem::Problem;
 use super::scope::Scope;
 use ros2probe_api::services::{Calls, Service, ServiceList};
 use ros2probe_model::facts::topic_kind::TopicKind;
+use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot::{ServiceFacts, Snapshot, TopicFacts, Transport};
 use ros2probe_wire::DomainId;
 
@@ -48,13 +49,13 @@ async fn list(
     let scope = scope.checked()?;
     let state = context.state().await;
     let snapshot = state.known();
-    let index = Index::new(snapshot);
+    let (index, clock) = (Index::new(snapshot), snapshot.wall_clock);
     let answer = ServiceList {
-        timestamp_seconds: snapshot.at.seconds(),
+        timestamp_seconds: snapshot.time().seconds(),
         services: services(snapshot, scope)
             .into_iter()
             .filter_map(|((domain_id, name), halves)| {
-                let service = view(domain_id.0, name, &halves, &index)?;
+                let service = view(domain_id.0, name, &halves, &index, clock)?;
                 Some(with_calls(
                     service,
                     &halves,
@@ -154,6 +155,7 @@ fn view<'a>(
     name: &'a str,
     halves: &Halves<'a>,
     index: &Index<'a>,
+    clock: WallClock,
 ) -> Option<Service<'a>> {
     let parties = halves.parties();
     if parties.is_empty() {
@@ -162,7 +164,8 @@ fn view<'a>(
     let [servers, clients] = parties.views();
     let types = halves.topics().flat_map(|topic| &topic.message_types);
     let findings = halves.topics().flat_map(|topic| index.findings(topic));
-    let measured = |topic: Option<&'a TopicFacts>| topic?.measurement.as_deref().map(measurement);
+    let measured =
+        |topic: Option<&'a TopicFacts>| Some(measurement(topic?.measurement.as_deref()?, clock));
     Some(Service {
         domain_id,
         name: Cow::Borrowed(name),

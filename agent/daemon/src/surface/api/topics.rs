@@ -66,7 +66,7 @@ async fn list(
         scope.admits(topic.domain_id) && (is_plain || scope.shows_hidden())
     });
     let answer = TopicList {
-        timestamp_seconds: answers.snapshot.at.seconds(),
+        timestamp_seconds: answers.snapshot.time().seconds(),
         topics: topics.map(|topic| answers.topic(topic)).collect(),
     };
     Ok(Json(answer).into_response())
@@ -229,7 +229,8 @@ impl<'a> TopicAnswers<'a> {
 
     fn topic(&self, facts: &'a TopicFacts) -> Topic<'a> {
         let index = &self.circumstances.index;
-        let endpoint = |facts| endpoint(facts, index);
+        let clock = self.snapshot.wall_clock;
+        let endpoint = |facts| endpoint(facts, index, clock);
         let is_unseen = facts.measurement.is_some() && facts.rate_hz().is_none();
         let publisher = |publisher| {
             let mut shown = endpoint(publisher);
@@ -261,7 +262,7 @@ impl<'a> TopicAnswers<'a> {
             publishers: facts.publishers.iter().map(publisher).collect(),
             subscriptions: facts.subscriptions.iter().map(endpoint).collect(),
             watches: watches.map(|watching| self.watching(*watching)).collect(),
-            measurement: topic_measurement(facts),
+            measurement: topic_measurement(facts, clock),
             received: facts.received.as_deref().map(delivered),
             sent: facts.sent.as_deref().map(delivered),
             breakdown: facts.breakdown.as_deref().map(breakdown),
@@ -269,7 +270,7 @@ impl<'a> TopicAnswers<'a> {
             diagnoses: findings.map(|finding| diagnosis(finding)).collect(),
             reasons: self.circumstances.reasons(facts),
             source: facts.source.label().into(),
-            inside: inside::topic(facts),
+            inside: inside::topic(facts, clock),
         }
     }
 
@@ -291,7 +292,7 @@ impl<'a> TopicAnswers<'a> {
         let measured = facts.measurement.as_deref();
         TopicDetails {
             topic: Topic {
-                inside: inside::topic_details(facts, self.snapshot.inside.as_deref()),
+                inside: inside::topic_details(facts, self.snapshot),
                 ..self.topic(facts)
             },
             interarrival_buckets: measured.map_or_else(Vec::new, |it| buckets(&it.interarrival)),

@@ -463,7 +463,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 continue;
             };
             let message = statistics::message(topic, measured, &mut subscribed.previous);
-            self.send_data(id, snapshot.at, &message.into()).await?;
+            self.send_data(id, snapshot.time(), &message.into()).await?;
         }
         Ok(())
     }

@@ -16,6 +16,7 @@ use super::spans::causal::{Step, Traced};
 use super::trace::{Method, Path, Point, Trace};
 use crate::derive::trace::share::Share;
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName};
 use crate::facts::tables::CausalPublications;
 
@@ -30,7 +31,7 @@ const SEARCHED: usize = 2048;
 /// Largest number of hops of a chain.
 const MAX_HOPS: usize = 31;
 
-/// A publication within the callback that processes an input. Times are calendar time.
+/// A publication within the callback that processes an input. Times are wall time.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CausalPublication {
     /// Domain.
@@ -63,8 +64,8 @@ pub(super) struct Causality {
 /// A publication with the way to it.
 #[derive(Debug)]
 struct Hop {
-    /// Model time at which it was added.
-    at: Timestamp,
+    /// Time at which it was added.
+    at: ModelTime,
     domain_id: DomainId,
     topics: Vec<(TopicName, Option<NodeName>)>,
     points: Vec<Point>,
@@ -96,7 +97,7 @@ impl Causality {
     pub(super) fn add(
         &mut self,
         publication: &CausalPublication,
-        now: Timestamp,
+        now: ModelTime,
         origin: impl FnOnce() -> Origin,
         tracer: &mut ChainTracer,
     ) {
@@ -184,7 +185,7 @@ impl Causality {
     /// Ends the chains of publications that no other has continued.
     pub(super) fn advance(
         &mut self,
-        now: Timestamp,
+        now: ModelTime,
         paths: &mut Paths,
         expected: &mut ExpectedChains,
     ) {

@@ -20,7 +20,7 @@ pub struct Exemplar {
     pub seconds: f64,
     /// Id of the trace; OpenTelemetry allows none of zeros.
     pub trace_id: NonZero<u128>,
-    /// Its end, by the calendar.
+    /// Its end, by the wall clock.
     pub at: Timestamp,
 }
 

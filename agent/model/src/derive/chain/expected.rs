@@ -181,7 +181,7 @@ impl ExpectedChains {
         }
     }
 
-    /// Returns a finding for each chain that takes longer than it may, at calendar time `now`.
+    /// Returns a finding for each chain that takes longer than it may, at wall time `now`.
     pub(super) fn slow(&self, now: Timestamp) -> impl Iterator<Item = Diagnosis> {
         self.progress
             .iter()

@@ -1,7 +1,6 @@
 //! Rates of measured topics, for the comparison of a node's output with its inputs.
 
-use ros2probe_wire::Timestamp;
-
+use crate::facts::model_time::ModelTime;
 use crate::facts::rate::{SECONDS, Slot};
 use crate::measure::profiler::Profiler;
 use crate::measure::topic::{TopicId, Topics};
@@ -13,11 +12,11 @@ const FEWEST: u64 = 20;
 pub(super) struct Rates<'a> {
     topics: &'a Topics,
     profiler: &'a Profiler,
-    now: Timestamp,
+    now: ModelTime,
 }
 
 impl<'a> Rates<'a> {
-    pub(super) const fn new(topics: &'a Topics, profiler: &'a Profiler, now: Timestamp) -> Self {
+    pub(super) const fn new(topics: &'a Topics, profiler: &'a Profiler, now: ModelTime) -> Self {
         Self {
             topics,
             profiler,

@@ -55,9 +55,9 @@ pub struct ChainSpan {
     pub id: SpanId,
     /// Id of the span that caused it; `None` for the first one.
     pub parent: Option<SpanId>,
-    /// Begin, by the calendar.
+    /// Begin, by the wall clock.
     pub begin: Timestamp,
-    /// End, by the calendar.
+    /// End, by the wall clock.
     pub end: Timestamp,
     /// Domain.
     pub domain_id: DomainId,

@@ -12,6 +12,7 @@ use ros2probe_wire::{DomainId, Guid, GuidPrefix, RtpsTime, SequenceNumber, Times
 use super::graph::Output;
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, Counted, Sum};
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{
     ChainMessages, ChainStamps, RecentMessages, StampArrivals, StampMessages,
 };
@@ -30,7 +31,7 @@ pub(super) type Stamp = (i32, u32);
 /// Domain and stamp.
 pub(super) type Key = (DomainId, Stamp);
 
-/// A message. Its times are calendar time.
+/// A message. Its times are wall time.
 #[derive(Debug)]
 pub(super) struct Published {
     pub(super) output: Arc<Output>,
@@ -61,11 +62,11 @@ pub(super) struct Group {
     pub(super) is_crowded: bool,
 }
 
-/// The messages of a stamp, in model time.
+/// The messages of a stamp, and the times of the first and the last one.
 #[derive(Debug)]
 struct Waiting {
-    first: Timestamp,
-    last: Timestamp,
+    first: ModelTime,
+    last: ModelTime,
     /// `None` once evaluated.
     group: Option<Group>,
 }
@@ -104,7 +105,7 @@ impl Published {
 
 impl Messages {
     /// Adds a message. Returns a group that must be evaluated now because the table is full.
-    pub(super) fn add(&mut self, key: Key, message: Published, now: Timestamp) -> Option<Group> {
+    pub(super) fn add(&mut self, key: Key, message: Published, now: ModelTime) -> Option<Group> {
         let (writer, number) = (message.writer, message.number);
         let is_full = self.open.is_full() || self.stamps.is_full();
         let evicted = if is_full { self.evict(key) } else { None };
@@ -187,7 +188,7 @@ impl Messages {
     }
 
     /// Removes and returns the messages of all stamps that are old enough.
-    pub(super) fn due(&mut self, now: Timestamp) -> Vec<Group> {
+    pub(super) fn due(&mut self, now: ModelTime) -> Vec<Group> {
         let (stamps, open) = (&mut self.stamps, &mut self.open);
         let mut due: Vec<Group> = Vec::new();
         self.order.retain(|key| {

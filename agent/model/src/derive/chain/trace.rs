@@ -28,7 +28,7 @@ pub struct Path {
     pub topics: Vec<(TopicName, Option<NodeName>)>,
 }
 
-/// A message's times on one topic, by the calendar.
+/// A message's times on one topic, by the wall clock.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Point {
     /// Time of publication.

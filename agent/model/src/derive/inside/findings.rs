@@ -8,11 +8,11 @@
 
 use std::time::Duration;
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::inside::distribution::{DELAY, INTERVAL};
 
 use super::tracked::{Kind, Tracked};
 use crate::facts::calls::report::{Durations, Trigger};
+use crate::facts::model_time::ModelTime;
 
 /// Bad evaluations in a row until a finding appears.
 const BAD: u8 = 3;
@@ -54,7 +54,7 @@ pub(super) struct Alarms {
 pub(super) struct TimerThread {
     pub(super) handle: u64,
     pub(super) thread: u32,
-    pub(super) since: Timestamp,
+    pub(super) since: ModelTime,
     pub(super) period: Duration,
 }
 
@@ -114,7 +114,7 @@ pub(super) fn judge(
     tracked: &mut Tracked,
     timers: &[TimerThread],
     load: ThreadLoad,
-    at: Timestamp,
+    at: ModelTime,
 ) -> bool {
     let is_young = at - tracked.since < GRACE;
     let unless_young = |found: Option<(u64, u64)>| found.filter(|_| !is_young);
@@ -138,7 +138,7 @@ pub(super) fn judge(
 
 /// Returns the 99th percentile of the callback's duration, and the shortest period that it exceeds:
 /// its own timer's, or that of a timer which the same thread calls.
-fn slow(tracked: &Tracked, timers: &[TimerThread], at: Timestamp) -> Option<(u64, u64)> {
+fn slow(tracked: &Tracked, timers: &[TimerThread], at: ModelTime) -> Option<(u64, u64)> {
     let thread = tracked.figures.thread()?;
     let is_delayed = |timer: &&TimerThread| {
         let since = timer.since.max(tracked.thread_since);

@@ -16,11 +16,12 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::Guid;
 
 use super::findings::{Alarm, GRACE, is_many};
 use super::tracked::HALF_WINDOW;
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::QueueTotals;
 
 /// Writers of one queue; a queue with more is not judged.
@@ -40,7 +41,7 @@ pub struct Arrivals {
     /// Messages that all readers together keep; `None` if that is not announced or unbounded.
     pub depth: Option<u64>,
     /// Time of the last one, or later.
-    pub last: Option<Timestamp>,
+    pub last: Option<ModelTime>,
     /// Whether timestamps of a writer are ahead of this host's clock.
     pub is_ahead: bool,
 }
@@ -51,7 +52,7 @@ pub struct ArrivalsOf {
     /// The writer.
     pub writer: Guid,
     /// Time since which all arrivals are counted; `None` if earlier ones may be missing.
-    pub since: Option<Timestamp>,
+    pub since: Option<ModelTime>,
     /// Messages, once for each matched reader.
     pub messages: u64,
 }
@@ -64,11 +65,11 @@ pub(super) struct Takes {
     /// Messages that they have taken.
     pub(super) taken: u64,
     /// Time since which all takes are counted; `None` if earlier ones may be missing.
-    pub(super) since: Option<Timestamp>,
+    pub(super) since: Option<ModelTime>,
     /// Time of publication of the last message that each of them has taken, or before.
-    pub(super) published: Option<Timestamp>,
+    pub(super) published: Option<ModelTime>,
     /// Time of the last take of each of them.
-    pub(super) last: Timestamp,
+    pub(super) last: ModelTime,
 }
 
 /// The subscriptions of one process with one topic.
@@ -83,23 +84,23 @@ pub(super) struct ReaderQueue {
     excluded: u64,
     /// Messages that arrived, now and at earlier reports.
     arrived: u64,
-    past: Bounded<QueueTotals, VecDeque<(Timestamp, u64)>>,
+    past: Bounded<QueueTotals, VecDeque<(ModelTime, u64)>>,
     lost: u64,
     /// Whether the begin of the arrivals is known: a report after that of the takes.
     has_begun: bool,
     /// Time of the last change, and the longest time between takes.
-    changed: Timestamp,
-    took: Timestamp,
+    changed: ModelTime,
+    took: ModelTime,
     longest_gap: Duration,
-    since: Timestamp,
+    since: ModelTime,
     /// The earlier and the later begin of a window: time, arrivals and losses.
-    marks: [(Timestamp, u64, u64); 2],
+    marks: [(ModelTime, u64, u64); 2],
     pub(super) alarm: Alarm,
 }
 
 impl ReaderQueue {
     /// Begins to compare.
-    pub(super) fn new(arrivals: &Arrivals, takes: &Takes, now: Timestamp) -> Self {
+    pub(super) fn new(arrivals: &Arrivals, takes: &Takes, now: ModelTime) -> Self {
         // The whole life of the queue is known: all takes count, and all arrivals.
         let is_whole = takes.since.is_some_and(|observed| {
             let mut begins = arrivals.writers.iter().map(|each| each.since);
@@ -137,7 +138,7 @@ impl ReaderQueue {
     }
 
     /// Compares arrivals with takes. Returns the messages that were lost in the meantime.
-    pub(super) fn compare(&mut self, arrivals: &Arrivals, takes: &Takes, now: Timestamp) -> u64 {
+    pub(super) fn compare(&mut self, arrivals: &Arrivals, takes: &Takes, now: ModelTime) -> u64 {
         let before = (self.arrived, self.taken);
         self.arrive(arrivals);
         // All of these takes are older than the arrivals counted now, so more takes than arrivals
@@ -157,7 +158,7 @@ impl ReaderQueue {
             None => 0,
         };
         if let Some(published) = takes.published.filter(|_| !arrivals.is_ahead) {
-            let is_before = |(at, _): &&(Timestamp, u64)| *at <= published;
+            let is_before = |(at, _): &&(ModelTime, u64)| *at <= published;
             let known = self.past.iter().rev().find(is_before);
             gone = gone.max(known.map_or(0, |(_, arrived)| *arrived));
         }
@@ -173,7 +174,7 @@ impl ReaderQueue {
     }
 
     /// Evaluates the rule of the finding. Returns whether it appeared, went or changed.
-    pub(super) fn judge(&mut self, now: Timestamp) -> bool {
+    pub(super) fn judge(&mut self, now: ModelTime) -> bool {
         let [(_, arrived, lost), (middle, ..)] = self.marks;
         let (arrived, lost) = (self.arrived - arrived, self.lost - lost);
         let found = (arrived > 0 && is_many(lost, arrived) && now - self.since >= GRACE)

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use ros2probe_wire::{DomainId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
 use super::Inside;
 use super::reader_queue::{Arrivals, ReaderQueue, Takes};
@@ -10,6 +10,7 @@ use super::state::Process;
 use super::tracked::{Kind, Tracked};
 use crate::facts::calls::facts::{self, InsideFacts, Owner};
 use crate::facts::diagnosis::Diagnosis;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::TopicName;
 use crate::facts::naming::Naming;
 
@@ -19,7 +20,7 @@ impl Inside {
     /// are not known.
     pub fn compare_queues(
         &mut self,
-        now: Timestamp,
+        now: ModelTime,
         arrivals: impl Fn(&BTreeSet<GuidPrefix>, DomainId, &Naming) -> Option<Arrivals>,
     ) {
         for process in self.processes.values_mut() {

@@ -6,8 +6,7 @@
 
 use std::time::Duration;
 
-use ros2probe_wire::Timestamp;
-
+use crate::facts::model_time::ModelTime;
 /// Time by which publications may be ahead of the network's messages.
 const AHEAD: Duration = Duration::from_secs(2);
 
@@ -27,7 +26,7 @@ pub struct Seen {
     /// Messages.
     pub messages: u64,
     /// Time of the last one.
-    pub last: Option<Timestamp>,
+    pub last: Option<ModelTime>,
 }
 
 /// A topic's source, and its total over changes of the source.
@@ -117,7 +116,7 @@ mod tests {
     fn seen(messages: u64, second: u64) -> Seen {
         Seen {
             messages,
-            last: (messages > 0).then_some(Timestamp(second * SECOND)),
+            last: (messages > 0).then_some(ModelTime::from_nanoseconds(second * SECOND)),
         }
     }
 

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::time::Duration;
 
-use ros2probe_wire::{DomainId, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, GuidPrefix};
 
 use super::attribution::Attribution;
 use super::findings::{ThreadLoad, TimerThread, judge};
@@ -18,9 +18,11 @@ use crate::facts::calls::facts::{InsideFacts, LifecycleState, ObservedProcess, T
 use crate::facts::calls::report::{ProcessReport, Report, Transition, Trigger};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::measurement::Measurement;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName};
 use crate::facts::naming::Naming;
 use crate::facts::tables::{InsideHandles, LifecycleStates, ObservedProcesses, ReportedNodes};
+use crate::facts::wall_clock::WallClock;
 use crate::graph::discovery::Discovery;
 use crate::measure::receivers::Receivers;
 use crate::measure::topic::TopicId;
@@ -32,7 +34,7 @@ const STALE: Duration = Duration::from_secs(10);
 #[derive(Debug, Default)]
 pub struct Inside {
     /// Time of the last report; `None` without one, or if the source has stopped.
-    at: Option<Timestamp>,
+    at: Option<ModelTime>,
     has_callbacks: bool,
     pub(super) processes: Bounded<ObservedProcesses, BTreeMap<u32, Process>>,
     /// Handles of all processes.
@@ -53,7 +55,7 @@ pub struct Inside {
 pub(super) struct Process {
     pub(super) facts: ObservedProcess,
     /// Time of the report before its first one: all of its calls since then are counted.
-    pub(super) born: Option<Timestamp>,
+    pub(super) born: Option<ModelTime>,
     /// Its participants.
     pub(super) participants: BTreeSet<GuidPrefix>,
     /// Its domain according to its environment.
@@ -62,7 +64,7 @@ pub(super) struct Process {
     reported: Bounded<ReportedNodes, Vec<NodeName>>,
     cpu: Duration,
     /// The earlier and the later begin of a window: time, CPU time and calls.
-    marks: [(Timestamp, Duration, u64); 2],
+    marks: [(ModelTime, Duration, u64); 2],
     pub(super) handles: Bounded<InsideHandles, BTreeMap<(Kind, u64), Tracked>>,
     /// Queues of its subscriptions.
     pub(super) queues: BTreeMap<(DomainId, TopicName), ReaderQueue>,
@@ -87,10 +89,11 @@ impl Inside {
         facts
     }
 
-    /// Takes a report, with times of the model. Returns the transitions of managed nodes in it.
+    /// Takes a report, with times of the wall clock. Returns the transitions of managed nodes in it.
     pub fn report(
         &mut self,
         report: Report,
+        clock: WallClock,
         discovery: &Discovery,
         receivers: &Receivers,
     ) -> Vec<LifecycleState> {
@@ -100,6 +103,7 @@ impl Inside {
             processes,
             transitions,
         } = report;
+        let at = clock.model_time(at);
         let began = self.at.filter(|before| *before < at);
         self.at = Some(at);
         self.has_callbacks = has_callbacks;
@@ -114,12 +118,12 @@ impl Inside {
             if process.has_ended {
                 ended.push(process.id);
             }
-            self.take(process, at, began, &mut added);
+            self.take(process, (at, began), clock, &mut added);
         }
         self.attribute(discovery, receivers);
         self.add_to_topics(&added, &ended, at);
         let transitions = transitions.into_iter();
-        let transitions = transitions.map(|each| self.transit(each)).collect();
+        let transitions = transitions.map(|each| self.transit(each, clock)).collect();
         for id in ended {
             self.remove(id);
         }
@@ -130,7 +134,7 @@ impl Inside {
 
     /// Drops what has ended: topics after the grace period, and all handles if the source has
     /// stopped.
-    pub fn advance(&mut self, now: Timestamp, grace: Duration) {
+    pub fn advance(&mut self, now: ModelTime, grace: Duration) {
         self.topics.expire(now, grace);
         if self.at.is_some_and(|at| now - at >= STALE) {
             self.detach();
@@ -258,8 +262,8 @@ impl Inside {
     fn take(
         &mut self,
         report: ProcessReport,
-        at: Timestamp,
-        began: Option<Timestamp>,
+        (at, began): (ModelTime, Option<ModelTime>),
+        clock: WallClock,
         into: &mut Vec<HandleAdded>,
     ) {
         let id = report.id;
@@ -300,11 +304,14 @@ impl Inside {
                 self.graph = None;
             }
         }
-        let publishers = report.publishers.into_iter().map(Figures::of_publisher);
+        let publishers = report.publishers.into_iter();
+        let publishers = publishers.map(|each| Figures::of_publisher(each, clock));
         let subscriptions = report.subscriptions.into_iter();
-        let subscriptions = subscriptions.map(Figures::of_subscription);
-        let buffers = report.buffers.into_iter().map(Figures::of_buffer);
-        let callbacks = report.callbacks.into_iter().map(Figures::of_callback);
+        let subscriptions = subscriptions.map(|each| Figures::of_subscription(each, clock));
+        let buffers = report.buffers.into_iter();
+        let buffers = buffers.map(|each| Figures::of_buffer(each, clock));
+        let callbacks = report.callbacks.into_iter();
+        let callbacks = callbacks.map(|each| Figures::of_callback(each, clock));
         let all = publishers
             .chain(subscriptions)
             .chain(buffers)
@@ -380,7 +387,7 @@ impl Inside {
     }
 
     /// Adds what a report brought to the topics.
-    fn add_to_topics(&mut self, added: &[HandleAdded], ended: &[u32], at: Timestamp) {
+    fn add_to_topics(&mut self, added: &[HandleAdded], ended: &[u32], at: ModelTime) {
         let mut topics: BTreeMap<(DomainId, TopicName), TopicAdded> = BTreeMap::new();
         for of_process in added.chunk_by(|one, other| one.process == other.process) {
             let id = of_process.first().map(|each| each.process);
@@ -427,7 +434,7 @@ impl Inside {
     }
 
     /// Keeps the state of a managed node, and returns it.
-    fn transit(&mut self, transition: Transition) -> LifecycleState {
+    fn transit(&mut self, transition: Transition, clock: WallClock) -> LifecycleState {
         let Transition {
             process,
             node,
@@ -447,7 +454,7 @@ impl Inside {
             node: node.or(only),
             state: goal,
             before: start,
-            at,
+            at: clock.model_time(at),
         };
         if self.states.insert(key, state.clone()).is_some() {
             self.handles.refuse();
@@ -466,7 +473,7 @@ impl Inside {
     }
 
     /// Ends the window of all figures at `at`.
-    fn turn(&mut self, at: Timestamp) {
+    fn turn(&mut self, at: ModelTime) {
         let mut live: BTreeMap<(DomainId, TopicName), Live> = BTreeMap::new();
         for process in self.processes.values_mut() {
             process.turn(at);
@@ -483,7 +490,7 @@ impl Inside {
     }
 
     /// Evaluates the rules for all handles.
-    fn judge(&mut self, at: Timestamp) {
+    fn judge(&mut self, at: ModelTime) {
         for process in self.processes.values_mut() {
             let handles = process.handles.values();
             let timers: Vec<_> = handles.clone().filter_map(TimerThread::of).collect();
@@ -556,7 +563,7 @@ impl Inside {
 }
 
 impl Process {
-    fn turn(&mut self, at: Timestamp) {
+    fn turn(&mut self, at: ModelTime) {
         let [(begin, cpu, calls), (middle, ..)] = self.marks;
         let span = (at - begin).as_secs_f64();
         if span > 0.0 {

@@ -6,8 +6,8 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
+use ros2probe_wire::DomainId;
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::{DomainId, Timestamp};
 
 use super::source::{Choice, Seen, Source};
 use super::witness::Witness;
@@ -16,6 +16,7 @@ use crate::facts::calls::facts::{TopicCounts, TopicInside};
 use crate::facts::calls::report::Durations;
 use crate::facts::diagnosis::TopicKey;
 use crate::facts::measurement::Measurement;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::TopicName;
 use crate::facts::naming::Naming;
 use crate::facts::rate::{SECONDS, Slot};
@@ -37,19 +38,19 @@ pub(super) struct InsideTopic {
     counts: TopicCounts,
     messages: u64,
     witness: Witness,
-    last: Option<Timestamp>,
+    last: Option<ModelTime>,
     latency: Arc<Durations>,
     waiting: Arc<Durations>,
     /// Messages lost in queues of subscriptions; `None` before any queue could be judged.
     lost_in_queues: Option<u64>,
     /// Times and totals of the last reports.
-    past: Bounded<TopicTotals, VecDeque<(Timestamp, u64)>>,
+    past: Bounded<TopicTotals, VecDeque<(ModelTime, u64)>>,
     live: Live,
     choice: Choice,
     /// Its entry among the topics of the graph, if that is known.
     pub(super) id: Option<TopicId>,
     /// Time of the last report with a handle of this topic.
-    seen: Timestamp,
+    seen: ModelTime,
 }
 
 /// Handles of a topic at the last report.
@@ -69,7 +70,7 @@ pub(super) struct TopicAdded {
     pub(super) counts: TopicCounts,
     /// The most messages that one subscription took.
     pub(super) taken_by_one: u64,
-    pub(super) last: Option<Timestamp>,
+    pub(super) last: Option<ModelTime>,
     pub(super) latency: Option<Durations>,
     pub(super) waiting: Option<Durations>,
 }
@@ -88,7 +89,7 @@ impl InsideTopics {
     }
 
     /// Adds what a report brings. The handles of all topics are counted again afterwards.
-    pub(super) fn add(&mut self, key: &(DomainId, TopicName), added: TopicAdded, at: Timestamp) {
+    pub(super) fn add(&mut self, key: &(DomainId, TopicName), added: TopicAdded, at: ModelTime) {
         if !self.topics.contains_key(key) {
             let dds_name = match key.1.starts_with('/') {
                 true => format!("rt{}", key.1),
@@ -125,7 +126,7 @@ impl InsideTopics {
     }
 
     /// Takes the handles that are alive, and the totals of this time.
-    pub(super) fn turn(&mut self, live: &BTreeMap<(DomainId, TopicName), Live>, at: Timestamp) {
+    pub(super) fn turn(&mut self, live: &BTreeMap<(DomainId, TopicName), Live>, at: ModelTime) {
         for (key, topic) in &mut self.topics {
             topic.messages += topic.witness.turn(false);
             topic.live = live.get(key).copied().unwrap_or_default();
@@ -159,7 +160,7 @@ impl InsideTopics {
     }
 
     /// Removes topics without a handle for longer than `grace`.
-    pub(super) fn expire(&mut self, now: Timestamp, grace: Duration) {
+    pub(super) fn expire(&mut self, now: ModelTime, grace: Duration) {
         self.topics
             .retain(|_, topic| topic.is_live() || topic.seen + grace > now);
     }
@@ -268,7 +269,7 @@ impl InsideTopic {
     }
 
     /// Returns the time of the last message.
-    pub(super) const fn last(&self) -> Option<Timestamp> {
+    pub(super) const fn last(&self) -> Option<ModelTime> {
         self.last
     }
 
@@ -284,7 +285,7 @@ impl InsideTopic {
         let Some((end, total)) = self.past.back() else {
             return (Slot::default(), 0);
         };
-        let is_in = |(at, _): &&(Timestamp, u64)| *end - *at >= Duration::from_secs(seconds);
+        let is_in = |(at, _): &&(ModelTime, u64)| *end - *at >= Duration::from_secs(seconds);
         let begin = self.past.iter().rev().find(is_in).or(self.past.front());
         let Some((begin, before)) = begin else {
             return (Slot::default(), 0);
@@ -350,7 +351,7 @@ impl Evidence<'_> {
 
     /// Returns the time of the last message.
     #[must_use]
-    pub const fn last_message(&self) -> Option<Timestamp> {
+    pub const fn last_message(&self) -> Option<ModelTime> {
         self.0.last()
     }
 

@@ -4,8 +4,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use ros2probe_wire::DomainId;
 use ros2probe_wire::inside::distribution::{DELAY, INTERVAL};
-use ros2probe_wire::{DomainId, Timestamp};
 
 use super::findings::Alarms;
 use crate::facts::calls::facts::{
@@ -14,7 +14,9 @@ use crate::facts::calls::facts::{
 use crate::facts::calls::report::{
     BufferReport, CallbackReport, Durations, PublisherReport, SubscriptionReport, Trigger,
 };
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName};
+use crate::facts::wall_clock::WallClock;
 
 /// The window covers one to two times this duration.
 pub(super) const HALF_WINDOW: Duration = Duration::from_secs(5);
@@ -55,7 +57,7 @@ pub(super) struct Figures {
     pub(super) topic: Option<TopicName>,
     pub(super) detail: Detail,
     pub(super) counts: Counts,
-    pub(super) last: Timestamp,
+    pub(super) last: ModelTime,
     /// As [`ros2probe_wire::inside::distribution`] numbers them; `None` if the kind has none.
     pub(super) durations: [Option<Arc<Durations>>; 2],
 }
@@ -76,12 +78,12 @@ pub(super) struct Tracked {
     pub(super) node: Option<NodeName>,
     pub(super) domain_id: DomainId,
     /// Time since which the thread of its calls is the same.
-    pub(super) thread_since: Timestamp,
+    pub(super) thread_since: ModelTime,
     /// Time of its first report.
-    pub(super) since: Timestamp,
+    pub(super) since: ModelTime,
     /// A subscription: time of publication of the last message that it took, or before. Only
     /// increases.
-    pub(super) published: Option<Timestamp>,
+    pub(super) published: Option<ModelTime>,
     /// The earlier and the later begin of a window.
     marks: [Mark; 2],
     pub(super) recent: Recent,
@@ -91,7 +93,7 @@ pub(super) struct Tracked {
 /// Figures at an earlier time.
 #[derive(Clone, Debug)]
 struct Mark {
-    at: Timestamp,
+    at: ModelTime,
     counts: Counts,
     durations: [Option<Arc<Durations>>; 2],
 }
@@ -128,7 +130,7 @@ impl Counts {
 
 impl Figures {
     /// Returns the figures of a publisher.
-    pub(super) fn of_publisher(report: PublisherReport) -> Self {
+    pub(super) fn of_publisher(report: PublisherReport, clock: WallClock) -> Self {
         Self {
             kind: Kind::Publisher,
             handle: report.handle,
@@ -142,13 +144,13 @@ impl Figures {
                 failed: 0,
                 within: report.within_process,
             },
-            last: report.last,
+            last: clock.model_time(report.last),
             durations: [Some(report.intervals.into()), None],
         }
     }
 
     /// Returns the figures of a subscription.
-    pub(super) fn of_subscription(report: SubscriptionReport) -> Self {
+    pub(super) fn of_subscription(report: SubscriptionReport, clock: WallClock) -> Self {
         Self {
             kind: Kind::Subscription,
             handle: report.handle,
@@ -162,13 +164,13 @@ impl Figures {
                 failed: report.failed,
                 within: 0,
             },
-            last: report.last,
+            last: clock.model_time(report.last),
             durations: [None, Some(report.latency.into())],
         }
     }
 
     /// Returns the figures of a buffer.
-    pub(super) fn of_buffer(report: BufferReport) -> Self {
+    pub(super) fn of_buffer(report: BufferReport, clock: WallClock) -> Self {
         Self {
             kind: Kind::Buffer,
             handle: report.handle,
@@ -184,13 +186,13 @@ impl Figures {
                 failed: report.overwritten,
                 within: report.dequeued,
             },
-            last: report.last,
+            last: clock.model_time(report.last),
             durations: [None, Some(report.waiting.into())],
         }
     }
 
     /// Returns the figures of a callback.
-    pub(super) fn of_callback(report: CallbackReport) -> Self {
+    pub(super) fn of_callback(report: CallbackReport, clock: WallClock) -> Self {
         let topic = match &report.trigger {
             Trigger::Subscription(topic) | Trigger::IntraProcess(Some(topic)) => {
                 Some(topic.clone())
@@ -211,7 +213,7 @@ impl Figures {
                 failed: report.skipped,
                 within: 0,
             },
-            last: report.last,
+            last: clock.model_time(report.last),
             durations: [Some(report.durations.into()), Some(report.waits.into())],
         }
     }
@@ -236,7 +238,7 @@ impl Figures {
 impl Tracked {
     /// Begins to track a handle that was first reported at `at`. Its counts began at 0 after
     /// `began`, the time of the report before, if there was one.
-    pub(super) fn new(figures: Figures, at: Timestamp, began: Option<Timestamp>) -> Self {
+    pub(super) fn new(figures: Figures, at: ModelTime, began: Option<ModelTime>) -> Self {
         let mark = match began {
             Some(began) => Mark {
                 at: began,
@@ -259,7 +261,7 @@ impl Tracked {
     }
 
     /// Replaces the figures by newer ones. Returns what they add.
-    pub(super) fn update(&mut self, mut figures: Figures, at: Timestamp) -> Added {
+    pub(super) fn update(&mut self, mut figures: Figures, at: ModelTime) -> Added {
         if figures.counts.count >= self.figures.counts.count {
             figures.continue_from(&self.figures);
         }
@@ -297,7 +299,7 @@ impl Tracked {
     }
 
     /// Updates the figures of the window that ends at `at`, and begins the next half.
-    pub(super) fn turn(&mut self, at: Timestamp) {
+    pub(super) fn turn(&mut self, at: ModelTime) {
         let [begin, middle] = &self.marks;
         self.recent = self.figures.since(begin, at);
         if at - middle.at >= HALF_WINDOW {
@@ -435,7 +437,7 @@ impl Figures {
         Some(before.map_or_else(|| now.clone(), |before| now.since(before)))
     }
 
-    fn since(&self, mark: &Mark, at: Timestamp) -> Recent {
+    fn since(&self, mark: &Mark, at: ModelTime) -> Recent {
         let mut recent = Recent {
             span: at - mark.at,
             counts: self.counts.since(mark.counts),
@@ -463,7 +465,7 @@ impl Figures {
 }
 
 impl Mark {
-    fn of(figures: &Figures, at: Timestamp) -> Self {
+    fn of(figures: &Figures, at: ModelTime) -> Self {
         Self {
             at,
             counts: figures.counts,

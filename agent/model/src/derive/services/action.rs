@@ -2,10 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use ros2probe_wire::Timestamp;
-
 use super::latency::Latencies;
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::ActionGoals;
 
 /// `GoalStatus` of action_msgs: final states that a result reports.
@@ -17,7 +16,7 @@ const ABORTED: u8 = 6;
 #[derive(Debug, Default)]
 pub struct Action {
     /// Accepted goals by id (`unique_identifier_msgs/UUID`), with the time of their request.
-    goals: Bounded<ActionGoals, BTreeMap<[u8; 16], Timestamp>>,
+    goals: Bounded<ActionGoals, BTreeMap<[u8; 16], ModelTime>>,
     /// Number of goals in each state.
     pub counts: GoalCounts,
     /// Times from the request of a goal to its result.
@@ -43,7 +42,7 @@ pub struct GoalCounts {
 
 impl Action {
     /// Records the reply to a goal's request, which was sent at `sent`.
-    pub fn replied(&mut self, goal: [u8; 16], sent: Timestamp, accepted: bool) {
+    pub fn replied(&mut self, goal: [u8; 16], sent: ModelTime, accepted: bool) {
         if !accepted {
             self.counts.rejected += 1;
             return;
@@ -61,7 +60,7 @@ impl Action {
     }
 
     /// Records a result that reached a client at `at`. Only the first one of a goal counts.
-    pub fn result(&mut self, goal: [u8; 16], status: u8, at: Timestamp) {
+    pub fn result(&mut self, goal: [u8; 16], status: u8, at: ModelTime) {
         let count = match status {
             SUCCEEDED => &mut self.counts.succeeded,
             CANCELED => &mut self.counts.canceled,
@@ -91,7 +90,7 @@ mod tests {
     #[test]
     fn the_first_result_of_an_accepted_goal_counts() {
         let mut action = Action::default();
-        let at = |seconds| Timestamp(0) + Duration::from_secs(seconds);
+        let at = |seconds| ModelTime::ZERO + Duration::from_secs(seconds);
         action.replied([1; 16], at(1), true);
         action.replied([2; 16], at(2), false);
         action.result([2; 16], ABORTED, at(3));
@@ -113,10 +112,14 @@ mod tests {
     fn the_oldest_goal_is_dropped_at_the_cap() {
         let mut action = Action::default();
         for number in 0..=u8::try_from(ActionGoals::CAP).unwrap() {
-            action.replied([number; 16], Timestamp(number.into()), true);
+            action.replied(
+                [number; 16],
+                ModelTime::from_nanoseconds(number.into()),
+                true,
+            );
         }
         assert_eq!((action.open(), action.evictions), (ActionGoals::CAP, 1));
-        action.result([0; 16], SUCCEEDED, Timestamp(1000));
+        action.result([0; 16], SUCCEEDED, ModelTime::from_nanoseconds(1000));
         assert_eq!(action.counts.succeeded, 0);
     }
 }

@@ -5,10 +5,11 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use ros2probe_wire::record::Sample;
-use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber};
 
 use super::latency::Latencies;
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{ReplyRuns, ServiceClients};
 
 /// Request numbers below the highest one that are remembered per client, for late duplicates.
@@ -31,7 +32,7 @@ pub struct CallId {
 #[derive(Clone, Copy, Debug)]
 pub struct Sighting {
     /// Time.
-    pub at: Timestamp,
+    pub at: ModelTime,
     /// Cookie of the socket; 0 = not seen at a socket.
     pub socket: u64,
     /// Position relative to this host's sockets.
@@ -67,9 +68,9 @@ pub struct Service {
     /// Times from request to reply.
     pub latencies: Latencies,
     /// Time until which requests are not followed, because one of its writers is not captured.
-    pub suspended: Option<Timestamp>,
+    pub suspended: Option<ModelTime>,
     /// Time of the last request.
-    pub last_request: Timestamp,
+    pub last_request: ModelTime,
     /// Whether some of its messages were read in their senders' memory.
     pub is_exact: bool,
 }
@@ -78,7 +79,7 @@ pub struct Service {
 #[derive(Clone, Copy, Debug)]
 pub struct Answered {
     /// Time of the request.
-    pub sent: Timestamp,
+    pub sent: ModelTime,
     /// Goal that the request names.
     pub goal: Option<[u8; 16]>,
     /// Whether it was reported as hanging.
@@ -90,13 +91,13 @@ pub struct Answered {
 struct Call {
     /// Writer of the request.
     writer: Guid,
-    sent: Timestamp,
+    sent: ModelTime,
     /// Whether the request was seen leaving a socket of this host, so the reply must arrive at one.
     is_local: bool,
     is_hanging: bool,
     goal: Option<[u8; 16]>,
     /// Time and socket at which a copy of the reply was dropped.
-    dropped: Option<(Timestamp, u64)>,
+    dropped: Option<(ModelTime, u64)>,
     received: Received,
 }
 
@@ -115,7 +116,7 @@ struct Client {
     highest: u64,
     /// Bit n: the number `highest - n` was seen.
     seen: u64,
-    last: Timestamp,
+    last: ModelTime,
 }
 
 impl Service {
@@ -194,7 +195,7 @@ impl Service {
 
     /// Marks calls without a reply for `timeout` as hanging; drops very old ones. Returns whether
     /// that changes the hanging calls.
-    pub fn advance(&mut self, timeout: Duration, now: Timestamp) -> bool {
+    pub fn advance(&mut self, timeout: Duration, now: ModelTime) -> bool {
         let mut changed = false;
         let unanswered = &mut self.unanswered;
         self.calls.retain(|_, call| {
@@ -248,7 +249,7 @@ impl Service {
     }
 
     /// Returns whether the client has not sent this number before.
-    fn is_new(&mut self, id: CallId, at: Timestamp) -> bool {
+    fn is_new(&mut self, id: CallId, at: ModelTime) -> bool {
         if !self.clients.contains_key(&id.client) && self.clients.is_full() {
             self.clients.refuse();
             let oldest = self.clients.iter().min_by_key(|(_, client)| client.last);

@@ -12,6 +12,11 @@ fn size(tracer: &Tracer) -> (usize, usize, u64) {
     (facts.size as usize, facts.limit as usize, facts.evictions)
 }
 
+/// Returns the record with its time.
+fn seen(record: &Record) -> (&Record, ModelTime) {
+    (record, ModelTime::from_nanoseconds(record.time))
+}
+
 fn reader(number: u8) -> Guid {
     Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, 1, 4]))
 }
@@ -67,16 +72,18 @@ fn description() -> WriterDescription {
 
 fn take(tracer: &mut Tracer, records: &[Record], ratio: f64) -> Vec<Span> {
     for record in records {
-        tracer.record(record, false, || Some((description(), Share::of(ratio))));
+        tracer.record(seen(record), false, || {
+            Some((description(), Share::of(ratio)))
+        });
     }
-    tracer.take().spans.to_vec()
+    tracer.take(WallClock::default()).spans.to_vec()
 }
 
 /// Returns the spans of these records, including those that time completes.
 fn take_all(tracer: &mut Tracer, records: &[Record], ratio: f64) -> Vec<Span> {
     let mut spans = take(tracer, records, ratio);
-    tracer.advance(Timestamp(SECOND));
-    spans.extend(tracer.take().spans);
+    tracer.advance(ModelTime::from_nanoseconds(SECOND));
+    spans.extend(tracer.take(WallClock::default()).spans);
     spans
 }
 
@@ -123,7 +130,7 @@ fn a_message_is_sent_from_its_first_to_its_last_fragment_and_settled_by_each_rea
     assert_eq!((sent.message.size, sent.message.fragments), (10_000, 10));
     assert_eq!(sent.message.source, RtpsTime(99));
     assert_eq!(size(&tracer).0, 1);
-    tracer.advance(Timestamp(1_901) + ACKNACK_TIMEOUT);
+    tracer.advance(ModelTime::from_nanoseconds(1_901) + ACKNACK_TIMEOUT);
     assert_eq!(size(&tracer), (0, OpenSpans::CAP, 0));
     assert_eq!(take(&mut tracer, &[acknack(reader(3), 9, 9_000)], 1.0), []);
 }
@@ -196,10 +203,12 @@ fn a_writer_of_this_host_has_no_arrivals_and_a_router_sends_nothing_of_its_own()
     let taken = |records: &[Record], is_local: bool| {
         let mut tracer = tracer();
         for record in records {
-            tracer.record(record, is_local, || Some((description(), Share::of(1.0))));
+            tracer.record(seen(record), is_local, || {
+                Some((description(), Share::of(1.0)))
+            });
         }
-        tracer.advance(Timestamp(SECOND));
-        times(&tracer.take().spans)
+        tracer.advance(ModelTime::from_nanoseconds(SECOND));
+        times(&tracer.take(WallClock::default()).spans)
     };
     let copies = [data(5, 10, flag::HOST), data(6, 20, flag::HOST)];
     assert_eq!(taken(&copies, true), []);
@@ -254,15 +263,17 @@ fn what_never_completes_or_is_never_acknowledged_takes_bounded_room() {
                 writer: guid_words(other),
                 ..data(sample, SECOND, flag::OUTGOING)
             };
-            tracer.record(&record, false, || Some((description(), Share::of(1.0))));
+            tracer.record(seen(&record), false, || {
+                Some((description(), Share::of(1.0)))
+            });
         }
     }
     assert!(size(&tracer).0 <= OpenSpans::CAP, "{:?}", size(&tracer));
-    let taken = tracer.take();
+    let taken = tracer.take(WallClock::default());
     assert_eq!(taken.spans.len(), FinishedSpans::CAP);
     assert!(taken.lost > 10_000);
     tracer.forget(WRITER);
-    tracer.advance(Timestamp(SECOND + 1) + ACKNACK_TIMEOUT);
+    tracer.advance(ModelTime::from_nanoseconds(SECOND + 1) + ACKNACK_TIMEOUT);
     assert_eq!(size(&tracer).0, 0);
 }
 
@@ -271,7 +282,7 @@ fn a_known_writer_is_looked_up_only_once() {
     let mut tracer = tracer();
     let mut asked = 0;
     for number in 1..=3 {
-        tracer.record(&data(number, number, 0), false, || {
+        tracer.record(seen(&data(number, number, 0)), false, || {
             asked += 1;
             // Discovery has not announced the writer at first.
             (asked > 1).then(|| (description(), None))

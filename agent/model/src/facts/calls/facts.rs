@@ -3,16 +3,17 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_wire::{DomainId, Guid, Timestamp};
+use ros2probe_wire::{DomainId, Guid};
 
 use super::report::{Durations, Trigger};
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName};
 
 /// Facts from inside processes. Lists are sorted by process and handle.
 #[derive(Clone, Debug, Default)]
 pub struct InsideFacts {
     /// Time of the last report.
-    pub at: Timestamp,
+    pub at: ModelTime,
     /// Whether callbacks are observed, and not only messages.
     pub has_callbacks: bool,
     /// Observed processes.
@@ -98,7 +99,7 @@ pub struct Publisher {
     /// Publications per second over the last window.
     pub rate_hz: Option<f64>,
     /// Time of the last one.
-    pub last: Timestamp,
+    pub last: ModelTime,
     /// Time between consecutive ones, over the last window.
     pub interval: Quantiles,
 }
@@ -119,7 +120,7 @@ pub struct Subscription {
     /// Messages taken per second over the last window.
     pub rate_hz: Option<f64>,
     /// Time of the last message.
-    pub last: Timestamp,
+    pub last: ModelTime,
     /// Time from the source timestamp to the take, over the last window.
     pub latency: Quantiles,
 }
@@ -148,7 +149,7 @@ pub struct Buffer {
     /// Messages put into the buffer per second over the last window.
     pub rate_hz: Option<f64>,
     /// Time of the last entry.
-    pub last: Timestamp,
+    pub last: ModelTime,
     /// Time that messages spent in the buffer, over the last window.
     pub waiting: Quantiles,
 }
@@ -191,7 +192,7 @@ pub struct Callback {
     /// Share of the last window that its calls took.
     pub busy: Option<f64>,
     /// End of the last call.
-    pub last: Timestamp,
+    pub last: ModelTime,
     /// Duration of calls, over the last window.
     pub duration: Quantiles,
     /// Time from being ready to the start, over the last window.
@@ -216,7 +217,7 @@ pub struct LifecycleState {
     /// Label of the state before.
     pub before: Arc<str>,
     /// Time of the transition.
-    pub at: Timestamp,
+    pub at: ModelTime,
 }
 
 /// Sums of a topic over all processes, also those that have ended. No count ever decreases.
@@ -252,7 +253,7 @@ pub struct TopicInside {
     /// These messages per second over the last window.
     pub rate_hz: f64,
     /// Time of the last message.
-    pub last: Option<Timestamp>,
+    pub last: Option<ModelTime>,
     /// Live publishers in observed processes.
     pub publishers: usize,
     /// Live subscriptions and buffers in observed processes.
@@ -266,24 +267,6 @@ pub struct TopicInside {
     /// Messages that arrived at observed processes and were never taken; `None` if arrivals and
     /// takes of no process can be compared.
     pub lost_in_queues: Option<u64>,
-}
-
-impl InsideFacts {
-    /// Converts all times.
-    pub fn convert(&mut self, convert: impl Fn(Timestamp) -> Timestamp) {
-        self.at = convert(self.at);
-        for state in &mut self.states {
-            state.at = convert(state.at);
-        }
-        let publishers = self.publishers.iter_mut().map(|each| &mut each.last);
-        let subscriptions = self.subscriptions.iter_mut().map(|each| &mut each.last);
-        let buffers = self.buffers.iter_mut().map(|each| &mut each.last);
-        let callbacks = self.callbacks.iter_mut().map(|each| &mut each.last);
-        let all = publishers.chain(subscriptions);
-        for last in all.chain(buffers).chain(callbacks) {
-            *last = convert(*last);
-        }
-    }
 }
 
 impl Quantiles {

@@ -23,26 +23,6 @@ pub struct Report {
     pub transitions: Vec<Transition>,
 }
 
-impl Report {
-    /// Converts all times.
-    pub fn convert(&mut self, convert: impl Fn(Timestamp) -> Timestamp) {
-        self.at = convert(self.at);
-        for transition in &mut self.transitions {
-            transition.at = convert(transition.at);
-        }
-        for process in &mut self.processes {
-            let publishers = process.publishers.iter_mut().map(|each| &mut each.last);
-            let subscriptions = process.subscriptions.iter_mut().map(|each| &mut each.last);
-            let buffers = process.buffers.iter_mut().map(|each| &mut each.last);
-            let callbacks = process.callbacks.iter_mut().map(|each| &mut each.last);
-            let all = publishers.chain(subscriptions);
-            for last in all.chain(buffers).chain(callbacks) {
-                *last = convert(*last);
-            }
-        }
-    }
-}
-
 /// One process.
 #[derive(Clone, Debug, Default)]
 pub struct ProcessReport {

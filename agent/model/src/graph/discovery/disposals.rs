@@ -3,10 +3,11 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber};
 
 use super::facts::Origin;
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::LatestDisposals;
 
 /// Announcements older than a disposal are ignored for this long after it.
@@ -18,7 +19,7 @@ const UNDER_WAY: Duration = Duration::from_secs(2);
 #[derive(Debug, Default)]
 pub(super) struct Disposals {
     /// The GUID, the time, and the sender and sequence number of the disposal.
-    latest: Bounded<LatestDisposals, VecDeque<(Guid, Timestamp, GuidPrefix, SequenceNumber)>>,
+    latest: Bounded<LatestDisposals, VecDeque<(Guid, ModelTime, GuidPrefix, SequenceNumber)>>,
 }
 
 impl Disposals {
@@ -28,8 +29,8 @@ impl Disposals {
     }
 
     /// Returns whether the entity was disposed so recently that its samples may still arrive.
-    pub(super) fn is_recent(&self, guid: Guid, now: Timestamp) -> bool {
-        let fresh = |at: Timestamp| at + UNDER_WAY > now;
+    pub(super) fn is_recent(&self, guid: Guid, now: ModelTime) -> bool {
+        let fresh = |at: ModelTime| at + UNDER_WAY > now;
         self.latest
             .iter()
             .any(|(disposed, at, ..)| *disposed == guid && fresh(*at))

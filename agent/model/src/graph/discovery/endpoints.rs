@@ -6,7 +6,7 @@ use std::cmp::Reverse;
 
 use ros2probe_wire::discovery::EndpointAnnouncement;
 use ros2probe_wire::rtps::Locator;
-use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix};
 
 use super::Change;
 use super::Discovery;
@@ -21,6 +21,7 @@ use super::is_named;
 use super::priority::Priority;
 use crate::facts::churn::Event;
 use crate::facts::journal::Journal;
+use crate::facts::model_time::ModelTime;
 
 impl Discovery {
     /// Records the SEDP announcement of an endpoint. `evidence` is the priority known for its
@@ -79,7 +80,7 @@ impl Discovery {
     fn admit(
         &mut self,
         pending: PendingEndpoint,
-        at: Timestamp,
+        at: ModelTime,
         journal: &mut Journal,
     ) -> Option<PendingEndpoint> {
         let announcement = &pending.announcement;
@@ -158,7 +159,7 @@ impl Discovery {
     pub(super) fn adopt_pending(
         &mut self,
         prefix: GuidPrefix,
-        at: Timestamp,
+        at: ModelTime,
         journal: &mut Journal,
     ) {
         let waiting = self.pending_endpoints.range(endpoints_of(prefix));
@@ -188,7 +189,7 @@ impl Discovery {
         &mut self,
         guid: Guid,
         event: Option<Event>,
-        at: Timestamp,
+        at: ModelTime,
         journal: &mut Journal,
     ) {
         let Some(endpoint) = self.endpoints.remove(&guid) else {

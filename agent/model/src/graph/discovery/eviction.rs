@@ -12,12 +12,13 @@
 
 use std::time::Duration;
 
-use ros2probe_wire::{EntityId, Guid, Timestamp};
+use ros2probe_wire::{EntityId, Guid};
 
 use super::Discovery;
 use super::facts::{Participant, named};
 use super::priority::Priority;
 use crate::facts::journal::Journal;
+use crate::facts::model_time::ModelTime;
 
 /// A participant seen over at least this span is established.
 const ESTABLISHED: Duration = Duration::from_secs(2);
@@ -43,7 +44,7 @@ pub(super) struct Victims {
     claims: usize,
     /// Watched entries among `claims`.
     watched_claims: usize,
-    search_after: Timestamp,
+    search_after: ModelTime,
 }
 
 /// An entry that may be evicted.
@@ -51,7 +52,7 @@ pub(super) struct Victims {
 struct Victim {
     priority: Priority,
     is_established: bool,
-    last_seen: Timestamp,
+    last_seen: ModelTime,
     /// GUID of an endpoint, or of a participant that is evicted with all its entries.
     guid: Guid,
 }
@@ -73,7 +74,7 @@ pub(super) enum Table {
 }
 
 impl Victims {
-    fn search(&mut self, discovery: &Discovery, table: Table, now: Timestamp) {
+    fn search(&mut self, discovery: &Discovery, table: Table, now: ModelTime) {
         self.silent.clear();
         self.others.clear();
         (self.claims, self.watched_claims) = (0, 0);
@@ -167,7 +168,7 @@ impl Victim {
 
 impl Discovery {
     /// Evicts an entry for this newcomer from a full table; returns false if every entry stays.
-    pub(super) fn evict_for(&mut self, table: Table, newcomer: Newcomer, now: Timestamp) -> bool {
+    pub(super) fn evict_for(&mut self, table: Table, newcomer: Newcomer, now: ModelTime) -> bool {
         let mut victims = std::mem::take(self.victims(table));
         if now >= victims.search_after {
             victims.search(self, table, now);
@@ -230,7 +231,7 @@ impl Discovery {
 }
 
 /// Returns the priority of this participant if it is silent, otherwise `None`.
-fn silence_priority(participant: &Participant, now: Timestamp) -> Option<Priority> {
+fn silence_priority(participant: &Participant, now: ModelTime) -> Option<Priority> {
     let last = participant.last_seen;
     let is_silent_for = |silence: Duration| last + silence <= now;
     let priority = participant.priority();

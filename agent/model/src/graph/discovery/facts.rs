@@ -9,12 +9,13 @@ use ros2probe_wire::entities::NodeEntities;
 use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::rtps::{Locator, VendorId};
-use ros2probe_wire::{DomainId, Guid, GuidPrefix, RtpsDuration, SequenceNumber, Timestamp};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix, RtpsDuration, SequenceNumber};
 use serde::{Deserialize, Serialize};
 
 use super::eviction::MAX_SILENCE;
 use super::priority::Priority;
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::{DdsName, NodeName, TypeName};
 use crate::facts::naming::Naming;
 use crate::facts::tables::ParticipantEndpoints;
@@ -40,7 +41,7 @@ pub enum DomainSource {
 #[derive(Clone, Copy, Debug)]
 pub struct Origin {
     /// Time of capture.
-    pub at: Timestamp,
+    pub at: ModelTime,
     /// GUID prefix of the sender, which may relay another participant's announcement.
     pub sender: GuidPrefix,
     /// Sequence number, counted by the sender's writer.
@@ -89,13 +90,13 @@ pub struct Participant {
     /// Unicast addresses.
     pub addresses: Addresses,
     /// Time of restoration from saved state, until its first packet.
-    pub restored: Option<Timestamp>,
+    pub restored: Option<ModelTime>,
     /// Its domain.
     pub domain_id: DomainId,
     /// First announcement.
-    pub first_seen: Timestamp,
+    pub first_seen: ModelTime,
     /// Time of its last packet.
-    pub last_seen: Timestamp,
+    pub last_seen: ModelTime,
     /// Its endpoints.
     pub endpoints: Bounded<ParticipantEndpoints, BTreeSet<Guid>>,
     /// Its nodes.
@@ -140,7 +141,7 @@ pub struct Endpoint {
     /// Quality of service.
     pub qos: Arc<Qos>,
     /// First announcement.
-    pub first_seen: Timestamp,
+    pub first_seen: ModelTime,
     /// Whether it accepts shared memory; `None` if it announces nothing, as its participant does.
     pub shared_memory: Option<bool>,
     /// Whether it supports data sharing with endpoints on its host.
@@ -183,7 +184,7 @@ impl Addresses {
 
 impl Participant {
     /// Records a packet of this participant.
-    pub(super) fn seen(&mut self, at: Timestamp) {
+    pub(super) fn seen(&mut self, at: ModelTime) {
         if self.restored.is_some_and(|restored| at > restored) {
             self.restored = None;
         }
@@ -191,7 +192,7 @@ impl Participant {
     }
 
     /// Returns the end of its lease, unless it is heard before; `None` = never.
-    pub(super) fn lease_end(&self) -> Option<Timestamp> {
+    pub(super) fn lease_end(&self) -> Option<ModelTime> {
         let lease = match self.proxy.lease {
             RtpsDuration::Finite(lease) => lease,
             // It may have stopped while no agent ran, so its infinite lease is limited.

@@ -15,9 +15,7 @@ use ros2probe_wire::qos::{
     Liveliness, Ownership, Presentation, Qos, Reliability,
 };
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{
-    DomainId, EntityId, Guid, GuidPrefix, RtpsDuration, SequenceNumber, Timestamp, time,
-};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, RtpsDuration, SequenceNumber, time};
 use serde::{Deserialize, Serialize};
 
 use super::Change;
@@ -25,6 +23,7 @@ use super::Discovery;
 use super::MAX_NAME_LEN;
 use super::facts::{Addresses, DomainSource, Endpoint, Node, Participant, ParticipantProxy, named};
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::ParticipantEndpoints;
 use crate::graph::zenoh::ZenohMemory;
 
@@ -131,7 +130,7 @@ impl Discovery {
 
     /// Restores saved state for one lease. Invalid entries and entries that discovery already knows
     /// are skipped. Restoring records no discovery events.
-    pub fn restore(&mut self, memory: &Memory, now: Timestamp) {
+    pub fn restore(&mut self, memory: &Memory, now: ModelTime) {
         for remembered in &memory.participants {
             let Some((prefix, mut participant)) = remembered.participant(now) else {
                 continue;
@@ -204,7 +203,7 @@ impl Remembered {
         }
     }
 
-    fn participant(&self, now: Timestamp) -> Option<(GuidPrefix, Participant)> {
+    fn participant(&self, now: ModelTime) -> Option<(GuidPrefix, Participant)> {
         let prefix = GuidPrefix(hexadecimal(&self.prefix)?);
         let texts = [&self.enclave, &self.host, &self.process_name];
         let all_plain = texts.into_iter().flatten().all(|text| is_plain(text));
@@ -299,7 +298,7 @@ impl RememberedEndpoint {
         &self,
         prefix: GuidPrefix,
         domain_id: DomainId,
-        now: Timestamp,
+        now: ModelTime,
     ) -> Option<(Guid, Endpoint)> {
         let guid = guid(&self.guid, prefix)?;
         let role = match guid.entity {
@@ -463,14 +462,14 @@ mod tests {
             message_type: "std_msgs/msg/String".into(),
             type_hash: None,
             qos: Arc::new(qos.clone()),
-            first_seen: Timestamp(1),
+            first_seen: ModelTime::from_nanoseconds(1),
             shared_memory: None,
             data_sharing: false,
             watched: false,
         };
         let back = |kept: &serde_json::Value| {
             let kept: RememberedEndpoint = serde_json::from_value(kept.clone()).unwrap();
-            kept.endpoint(prefix, DomainId(0), Timestamp(2))
+            kept.endpoint(prefix, DomainId(0), ModelTime::from_nanoseconds(2))
                 .unwrap()
                 .1
                 .qos

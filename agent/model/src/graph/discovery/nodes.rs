@@ -1,7 +1,7 @@
 //! Nodes, from `ros_discovery_info`.
 
 use ros2probe_wire::entities::ParticipantEntities;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber};
 
 use super::Discovery;
 use super::PendingNodes;
@@ -13,6 +13,7 @@ use super::priority::Priority;
 use crate::facts::bounded;
 use crate::facts::churn::Event;
 use crate::facts::journal::Journal;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::NodeName;
 use crate::facts::tables::{ParticipantEndpoints, PendingNodeBytes};
 
@@ -137,7 +138,7 @@ impl Discovery {
         writer: Guid,
         sequence_number: SequenceNumber,
         nodes: Vec<Node>,
-        at: Timestamp,
+        at: ModelTime,
         journal: &mut Journal,
     ) {
         let Some(participant) = self.participants.get_mut(&prefix) else {

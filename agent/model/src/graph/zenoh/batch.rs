@@ -3,16 +3,17 @@
 
 use std::time::Duration;
 
+use ros2probe_wire::Reason;
 use ros2probe_wire::zenoh::{
     Batch, Fragment, Init, Message, NetworkMessage, Sample, Side, VERSION, WhatAmI,
 };
-use ros2probe_wire::{Reason, Timestamp};
 
 use super::Place;
 use super::Shown;
 use super::Zenoh;
 use super::messages::attachment;
 use super::stream::{StreamId, Unseen};
+use crate::facts::model_time::ModelTime;
 
 /// Room for the messages in FRAGMENTs below which stale ones are given up: one large message.
 const ROOM: usize = 4 << 20;
@@ -104,7 +105,7 @@ impl Zenoh {
     }
 
     /// Gives up messages whose FRAGMENTs have stopped arriving, at most once a second.
-    fn give_up_chains(&mut self, now: Timestamp) {
+    fn give_up_chains(&mut self, now: ModelTime) {
         if now < self.gave_up + GIVE_UP_INTERVAL {
             return;
         }

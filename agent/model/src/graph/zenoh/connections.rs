@@ -3,12 +3,13 @@
 use std::collections::HashMap;
 use std::time::Duration;
 
+use ros2probe_wire::GuidPrefix;
 use ros2probe_wire::zenoh::ZenohId;
-use ros2probe_wire::{GuidPrefix, Timestamp};
 
 use super::Zenoh;
 use super::stream::{Flow, StreamId, Unseen};
 use super::stream_state::StreamState;
+use crate::facts::model_time::ModelTime;
 
 /// Lease that rmw_zenoh configures.
 const LEASE: Duration = Duration::from_secs(60);
@@ -80,7 +81,7 @@ impl Zenoh {
     /// Records that the sender leaves the connection. If it is the first to do so and has no other
     /// connection, its session has ended. Its declarations end with the connection. If the other end
     /// has been silent for its lease, that one has left first.
-    pub(super) fn leave(&mut self, stream: &StreamId, now: Timestamp) {
+    pub(super) fn leave(&mut self, stream: &StreamId, now: ModelTime) {
         if let Some(silent) = self.silent_end(stream, now)
             && let Some(direction) = self.directions.get_mut(&silent)
         {
@@ -92,7 +93,7 @@ impl Zenoh {
     }
 
     /// As [`Self::leave`], whether or not the other end has been silent.
-    fn leave_now(&mut self, stream: &StreamId, now: Timestamp) {
+    fn leave_now(&mut self, stream: &StreamId, now: ModelTime) {
         if self.remembered.sender(stream.flow).is_some() {
             self.direction(stream);
         }
@@ -123,7 +124,7 @@ impl Zenoh {
     }
 
     /// Returns the other direction if its sender has been silent for its lease.
-    fn silent_end(&self, stream: &StreamId, now: Timestamp) -> Option<StreamId> {
+    fn silent_end(&self, stream: &StreamId, now: ModelTime) -> Option<StreamId> {
         if self.directions.get(stream)?.has_left {
             return None;
         }
@@ -137,7 +138,7 @@ impl Zenoh {
     }
 
     /// Records that the sender has closed the connection.
-    pub(super) fn end(&mut self, stream: &StreamId, now: Timestamp) {
+    pub(super) fn end(&mut self, stream: &StreamId, now: ModelTime) {
         let connection = stream.flow.connection();
         self.unseen.retain(|(_, other)| *other != connection);
         self.leave(stream, now);

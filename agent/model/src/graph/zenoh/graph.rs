@@ -12,7 +12,7 @@ use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement, R
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::names::{DdsTopic, Demangled};
 use ros2probe_wire::zenoh::{EndpointKind, EndpointToken, Gid, NodeToken, Token, ZenohId};
-use ros2probe_wire::{DomainId, EntityId, Guid, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid};
 
 use super::declared::{Declared, TokenNumber};
 use super::endpoints::announcements;
@@ -20,6 +20,7 @@ use super::session_state::{NodeState, SessionState};
 use super::stream_state::DirectionNumber;
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, ByOwner, HeapBytes};
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{ZenohPassages, ZenohRestored, ZenohServers, ZenohTokens, ZenohWriters};
 
 /// Bytes of a session besides its tokens: its state, and the first nodes of two trees.
@@ -186,7 +187,7 @@ impl Graph {
     }
 
     /// Announces a session again, which discovery has forgotten, at most once a second.
-    pub fn repeat(&mut self, session: ZenohId, now: Timestamp) {
+    pub fn repeat(&mut self, session: ZenohId, now: ModelTime) {
         let Some(state) = self.sessions.get_mut(&session) else {
             return;
         };
@@ -434,7 +435,7 @@ impl Graph {
             lease: lease(session),
             nodes: BTreeMap::new(),
             tokens: BTreeSet::new(),
-            repeated: Timestamp(0),
+            repeated: ModelTime::ZERO,
         };
         let Some(state) = self.sessions.get_or_insert_with(session, new) else {
             return;

@@ -31,6 +31,7 @@ use ros2probe_wire::{Guid, GuidPrefix, Reason, SequenceNumber, Timestamp};
 
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, Counted, Sum};
+use crate::facts::model_time::ModelTime;
 use crate::facts::route::Destination;
 use crate::facts::tables::{ZenohChainBytes, ZenohCut, ZenohDirections, ZenohUnseen};
 pub use endpoints::unknown_guid;
@@ -63,7 +64,7 @@ pub struct ZenohSample<'a> {
     /// else 0.
     pub receiving_socket: u64,
     /// Time of its first FRAGMENT.
-    pub began: Timestamp,
+    pub began: ModelTime,
     /// With a request or reply: gid of the client, and the number of the request.
     pub call: Option<(Gid, SequenceNumber)>,
 }
@@ -101,13 +102,13 @@ pub struct Zenoh {
     replies: Replies,
     remembered: Remembered,
     /// Routers of which a connection that may lead to another router ended, with the time.
-    cut: Bounded<ZenohCut, BTreeMap<ZenohId, Timestamp>>,
+    cut: Bounded<ZenohCut, BTreeMap<ZenohId, ModelTime>>,
     /// Time of the first report.
-    began: Timestamp,
+    began: ModelTime,
     unseen: Bounded<ZenohUnseen, BTreeSet<(Unseen, Flow)>>,
     chain_bytes: Sum<ZenohChainBytes>,
     /// When stale messages in FRAGMENTs were last searched for.
-    gave_up: Timestamp,
+    gave_up: ModelTime,
     counters: Counters,
     /// Whether a session of this host has sent an INIT since the last [`Self::link`].
     pub has_begun: bool,
@@ -120,22 +121,23 @@ pub struct Zenoh {
 struct Place<'a> {
     stream: &'a StreamId,
     /// Time of its last byte.
-    time: Timestamp,
+    time: ModelTime,
     /// Time of its first FRAGMENT, or that of the batch.
-    began: Timestamp,
+    began: ModelTime,
 }
 
 impl Zenoh {
-    /// Processes a report. With `wants_bytes`, payloads are requested.
+    /// Processes a report of the time `time`. With `wants_bytes`, payloads are requested.
     pub fn report(
         &mut self,
         report: &StreamReport<'_>,
+        time: ModelTime,
         wants_bytes: bool,
         show: &mut impl FnMut(Shown<'_>),
     ) {
-        let (stream, time) = (report.stream, report.time);
+        let stream = report.stream;
         self.remembered.expire(time);
-        if self.began == Timestamp(0) {
+        if self.began == ModelTime::ZERO {
             self.began = time;
         }
         match report.event {
@@ -228,7 +230,7 @@ impl Zenoh {
         &mut self,
         memory: &ZenohMemory,
         endpoints: impl Iterator<Item = RestoredEndpoint<'a>>,
-        now: Timestamp,
+        now: ModelTime,
     ) {
         self.remembered.restore(memory, now);
         let sessions = self.remembered.sessions().into_iter();

@@ -7,12 +7,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::zenoh::{Side, WhatAmI, ZenohId};
 use serde::{Deserialize, Serialize};
 
 use super::stream::Flow;
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{RememberedDirections, RememberedSessions};
 
 /// Longer than the interval of KEEP_ALIVE that rmw_zenoh configures, 30 s: a connection that sends
@@ -62,7 +62,7 @@ pub(super) struct Remembered {
     senders: Bounded<RememberedDirections, BTreeMap<Flow, Side>>,
     relayed: Bounded<RememberedSessions, BTreeSet<ZenohId>>,
     /// When those without a batch are forgotten.
-    end: Timestamp,
+    end: ModelTime,
 }
 
 impl ZenohMemory {
@@ -110,7 +110,7 @@ impl ZenohMemory {
 
 impl Remembered {
     /// Restores saved connections. Invalid entries are skipped.
-    pub(super) fn restore(&mut self, memory: &ZenohMemory, now: Timestamp) {
+    pub(super) fn restore(&mut self, memory: &ZenohMemory, now: ModelTime) {
         for saved in &memory.connections {
             let flow = Flow {
                 source: saved.source.into(),
@@ -159,7 +159,7 @@ impl Remembered {
     }
 
     /// Forgets what was not seen for too long.
-    pub(super) fn expire(&mut self, now: Timestamp) {
+    pub(super) fn expire(&mut self, now: ModelTime) {
         if now > self.end && !(self.senders.is_empty() && self.relayed.is_empty()) {
             self.senders.clear();
             self.relayed.clear();
@@ -220,7 +220,7 @@ mod tests {
         memory.relayed.push(zid(1).to_string());
         memory.connections.extend(memory.connections.clone());
         let mut remembered = Remembered::default();
-        remembered.restore(&memory, Timestamp(0));
+        remembered.restore(&memory, ModelTime::ZERO);
         assert!(remembered.senders.is_full() && remembered.relayed.is_full());
     }
 }

@@ -7,13 +7,14 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
+use ros2probe_wire::DomainId;
 use ros2probe_wire::zenoh::{PORT, Side, WhatAmI, ZenohId};
-use ros2probe_wire::{DomainId, Timestamp};
 
 use super::Zenoh;
 use super::processes::{Holder, OwnerChange};
 use super::stream::StreamId;
 use super::stream_state::StreamState;
+use crate::facts::model_time::ModelTime;
 
 /// Longer than the interval of KEEP_ALIVE that rmw_zenoh configures, 30 s: a connection that is older
 /// than the agent has been seen after this time.
@@ -133,7 +134,7 @@ impl Zenoh {
     }
 
     /// Records the end of a connection that may lead from a router to another one.
-    pub(super) fn note_cut(&mut self, stream: &StreamId, now: Timestamp) {
+    pub(super) fn note_cut(&mut self, stream: &StreamId, now: ModelTime) {
         for router in self.ends_of_link(stream) {
             if self.graph.passes_on(router) {
                 self.cut.insert(router, now);
@@ -142,8 +143,8 @@ impl Zenoh {
     }
 
     /// Ends the sessions that a router no longer reaches.
-    pub fn end_unreachable(&mut self, now: Timestamp) {
-        let is_due = |at: Timestamp| at + REPLACED <= now;
+    pub fn end_unreachable(&mut self, now: ModelTime) {
+        let is_due = |at: ModelTime| at + REPLACED <= now;
         if now < self.began + ALL_SEEN || !self.cut.values().any(|at| is_due(*at)) {
             return;
         }

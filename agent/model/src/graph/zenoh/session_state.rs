@@ -8,8 +8,9 @@ use ros2probe_wire::discovery::ParticipantAnnouncement;
 use ros2probe_wire::entities::{NodeEntities, ParticipantEntities};
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::zenoh::ZenohId;
-use ros2probe_wire::{DomainId, EntityId, Guid, RtpsDuration, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, RtpsDuration};
 
+use crate::facts::model_time::ModelTime;
 /// A session with tokens.
 #[derive(Debug)]
 pub(super) struct SessionState {
@@ -19,7 +20,7 @@ pub(super) struct SessionState {
     pub(super) nodes: BTreeMap<u64, NodeState>,
     pub(super) tokens: BTreeSet<Arc<str>>,
     /// When it was last announced again.
-    pub(super) repeated: Timestamp,
+    pub(super) repeated: ModelTime,
 }
 
 /// A node of a session.

@@ -4,13 +4,14 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use ros2probe_wire::DomainId;
 use ros2probe_wire::zenoh::{
     Fragment, Key, Lane, PORT, Resolution, Side, WhatAmI, WireExpr, ZenohId,
 };
-use ros2probe_wire::{DomainId, Timestamp};
 
 use super::stream::StreamId;
 use crate::facts::bounded::{Bounded, ByOwner, HeapBytes};
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{ZenohAliases, ZenohChains};
 
 /// Longest key that is kept. A token of ROS with the longest names has 1.4 KiB.
@@ -42,9 +43,9 @@ pub(super) struct Chain {
     /// Number of the next FRAGMENT.
     next: u32,
     /// Time of the first.
-    pub(super) began: Timestamp,
+    pub(super) began: ModelTime,
     /// Time of the last.
-    last: Timestamp,
+    last: ModelTime,
     /// The beginning of the message, or all of it.
     pub(super) bytes: Vec<u8>,
     /// Bytes that have arrived.
@@ -80,7 +81,7 @@ pub(super) struct StreamState {
     /// Whether the sender has closed it.
     pub(super) has_ended: bool,
     /// Time of the last batch.
-    pub(super) last_seen: Timestamp,
+    pub(super) last_seen: ModelTime,
 }
 
 impl Chain {
@@ -202,7 +203,7 @@ impl StreamState {
     pub(super) fn fragment(
         &mut self,
         fragment: &Fragment<'_>,
-        time: Timestamp,
+        time: ModelTime,
         begins: impl FnOnce(&[u8]) -> Option<bool>,
         room: usize,
     ) -> Option<Chain> {
@@ -249,7 +250,7 @@ impl StreamState {
     }
 
     /// Gives up messages without a FRAGMENT since `before`, and returns their number.
-    pub(super) fn give_up(&mut self, before: Timestamp) -> usize {
+    pub(super) fn give_up(&mut self, before: ModelTime) -> usize {
         let all = self.chains.len();
         self.chains.retain(|chain| chain.last >= before);
         all - self.chains.len()

@@ -2,13 +2,14 @@
 
 use std::collections::VecDeque;
 
-use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
+use ros2probe_wire::{Guid, SequenceNumber};
 
 use crate::facts::bounded::Bounded;
 use crate::facts::journal::Journal;
 use crate::facts::loss::DeliveryLoss;
 use crate::facts::loss::LossCause;
 use crate::facts::measurement::{Breakdown, Delivered};
+use crate::facts::model_time::ModelTime;
 use crate::facts::route::Direction;
 use crate::facts::route::Receiver;
 use crate::facts::route::Route;
@@ -62,9 +63,9 @@ pub(super) struct Accounting<'a> {
     pub(super) writer: Guid,
     pub(super) receiver: Receiver,
     pub(super) main: Route,
-    pub(super) at: Timestamp,
+    pub(super) at: ModelTime,
     /// Time until which a new loss stays pending.
-    pub(super) until: Option<Timestamp>,
+    pub(super) until: Option<ModelTime>,
 }
 
 impl Accounting<'_> {

@@ -1,12 +1,13 @@
 //! Samples that left this host for a receiver on the same host: whether they arrive or are lost.
 
-use ros2probe_wire::{SequenceNumber, Timestamp};
+use ros2probe_wire::SequenceNumber;
 
 use super::Delivery;
 use super::DeliveryContext;
 use super::FIRST_MOMENTS;
 use super::SILENCE;
 use super::UNDER_WAY;
+use crate::facts::model_time::ModelTime;
 
 impl Delivery {
     /// Records that samples up to `newest` have left for this receiver; `left_by` returns the
@@ -15,8 +16,8 @@ impl Delivery {
     pub fn expect(
         &mut self,
         newest: SequenceNumber,
-        alive: Option<Timestamp>,
-        left_by: impl Fn(Timestamp) -> Option<SequenceNumber>,
+        alive: Option<ModelTime>,
+        left_by: impl Fn(ModelTime) -> Option<SequenceNumber>,
         context: &mut DeliveryContext<'_>,
     ) {
         if !self.reception.sequence().started() || newest < self.next() {
@@ -24,7 +25,7 @@ impl Delivery {
             return;
         }
         let since = *self.waiting.get_or_insert(context.now);
-        let mut until = alive.map_or(Timestamp(0), |alive| alive.min(context.now - UNDER_WAY));
+        let mut until = alive.map_or(ModelTime::ZERO, |alive| alive.min(context.now - UNDER_WAY));
         if !self.presumed_lost && since + SILENCE <= context.now {
             self.presumed_lost = true;
             until = until.max(since + FIRST_MOMENTS);
@@ -46,7 +47,7 @@ impl Delivery {
 
     /// Excuses samples that were written before the receiver's reader appeared. `next` and the time
     /// of its last rise are the values from before the current record.
-    pub(super) fn excuse_unheard(&mut self, (next, advanced): (SequenceNumber, Timestamp)) {
+    pub(super) fn excuse_unheard(&mut self, (next, advanced): (SequenceNumber, ModelTime)) {
         let sequence = self.reception.sequence_mut();
         if next > SequenceNumber::ZERO && advanced < self.opened && sequence.next() > next {
             sequence.excuse(next, sequence.next());

@@ -1,8 +1,8 @@
 //! How many bytes may be captured for messages that no client requests yet.
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
 
+use crate::facts::model_time::ModelTime;
 /// Counts for a datagram besides its payload, so that small ones are not free.
 const OVERHEAD: usize = 64;
 
@@ -13,7 +13,7 @@ pub(super) struct Allowance {
     rate: u64,
     left: u64,
     /// Time for which the rate is included in `left`.
-    at: Timestamp,
+    at: ModelTime,
 }
 
 impl Allowance {
@@ -23,12 +23,12 @@ impl Allowance {
             most,
             rate,
             left: most,
-            at: Timestamp(0),
+            at: ModelTime::ZERO,
         }
     }
 
     /// Returns what is left at `now`.
-    pub(super) fn left(&mut self, now: Timestamp) -> u64 {
+    pub(super) fn left(&mut self, now: ModelTime) -> u64 {
         let elapsed = now - self.at;
         // A remainder below one byte waits for the next call.
         let elapsed = u64::try_from(elapsed.as_nanos()).unwrap_or(u64::MAX);
@@ -42,7 +42,7 @@ impl Allowance {
     }
 
     /// Takes a datagram with this payload. Returns whether the allowance covers it.
-    pub(super) fn spend(&mut self, payload: usize, now: Timestamp) -> bool {
+    pub(super) fn spend(&mut self, payload: usize, now: ModelTime) -> bool {
         let cost = u64::try_from(payload.saturating_add(OVERHEAD)).unwrap_or(u64::MAX);
         let left = self.left(now).checked_sub(cost);
         self.left = left.unwrap_or(0);
@@ -62,7 +62,7 @@ mod tests {
     #[test]
     fn a_burst_is_covered_and_then_the_rate() {
         let mut allowance = Allowance::new(1_000, 100);
-        let seconds = |seconds: u64| Timestamp((1_000 + seconds) * SECOND);
+        let seconds = |seconds: u64| ModelTime::from_nanoseconds((1_000 + seconds) * SECOND);
         assert!((0..5).all(|_| allowance.spend(136, seconds(0))));
         assert!(!allowance.spend(136, seconds(0)));
         assert_eq!(allowance.left(seconds(3)), 300);

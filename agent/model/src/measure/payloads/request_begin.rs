@@ -2,9 +2,10 @@
 
 use std::time::Duration;
 
-use ros2probe_wire::{SequenceNumber, Timestamp};
+use ros2probe_wire::SequenceNumber;
 
 use crate::facts::dispatch::MissedReason;
+use crate::facts::model_time::ModelTime;
 
 /// Longest time until samples that polling missed are reported: they may arrive from another view.
 const UNSEEN_DELAY: Duration = Duration::from_millis(400);
@@ -16,7 +17,7 @@ pub(super) struct RequestBegin {
     pub(super) id: u64,
     /// The next number when the request began.
     number: SequenceNumber,
-    since: Timestamp,
+    since: ModelTime,
     /// The lowest number that arrived for it.
     first: Option<SequenceNumber>,
     /// Number of the sample from before the request that its reader received first.
@@ -25,7 +26,7 @@ pub(super) struct RequestBegin {
 
 impl RequestBegin {
     /// Creates the begin of request `id` at `since`, before the sample `number`.
-    pub(super) const fn new(id: u64, number: SequenceNumber, since: Timestamp) -> Self {
+    pub(super) const fn new(id: u64, number: SequenceNumber, since: ModelTime) -> Self {
         Self {
             id,
             number,
@@ -56,7 +57,7 @@ impl RequestBegin {
     pub(super) fn misses_from(
         &self,
         reason: MissedReason,
-        now: Timestamp,
+        now: ModelTime,
         payload_delay: Duration,
     ) -> Option<SequenceNumber> {
         if reason != MissedReason::NotCaptured {

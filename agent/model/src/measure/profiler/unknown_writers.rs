@@ -3,7 +3,7 @@
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
-use ros2probe_wire::{Guid, Record, Timestamp};
+use ros2probe_wire::{Guid, Record};
 
 use super::ESTABLISHED_MESSAGES;
 use super::EVICTABLE_AFTER;
@@ -12,6 +12,7 @@ use super::Profiler;
 use super::RecordOutcome;
 use super::UNDELIVERED;
 use crate::facts::journal::Journal;
+use crate::facts::model_time::ModelTime;
 use crate::measure::receivers::GraphView;
 use crate::measure::writer::{Traits, Writer};
 
@@ -34,18 +35,17 @@ impl Profiler {
         self.unknown_writers.range(writers).next().is_some()
     }
 
-    /// Processes a record of a writer without an announcement.
+    /// Processes a record of a writer without an announcement, seen at `now`.
     pub fn unknown_writer(
         &mut self,
         guid: Guid,
-        record: &Record,
+        (record, now): (&Record, ModelTime),
         journal: &mut Journal,
         graph: GraphView<'_>,
     ) -> RecordOutcome {
         if !record.is_sample() || record.flags & UNDELIVERED != 0 {
             return RecordOutcome::Unmeasured;
         }
-        let now = Timestamp(record.time);
         if self.unknown_writers.is_full() && !self.evict_unknown_writer(now, graph) {
             self.unknown_writers.refuse();
             return RecordOutcome::Unmeasured;
@@ -55,12 +55,12 @@ impl Profiler {
             guid,
             Measured::new(Writer::new(guid, Traits::default()), None, now),
         );
-        self.record(guid, record, journal, graph)
+        self.record(guid, (record, now), journal, graph)
     }
 
     /// Drops the unknown writer with the longest silence, unless it is established. Returns whether
     /// one was dropped.
-    fn evict_unknown_writer(&mut self, now: Timestamp, graph: GraphView<'_>) -> bool {
+    fn evict_unknown_writer(&mut self, now: ModelTime, graph: GraphView<'_>) -> bool {
         if now < self.search_after {
             return false;
         }

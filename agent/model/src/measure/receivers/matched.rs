@@ -4,10 +4,11 @@
 //! a reader that matches the writer makes it a subscriber.
 
 use ros2probe_wire::qos::Reliability;
-use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix};
 
 use super::GraphView;
 use crate::facts::diagnosis::{Offer, Verdict, effort, verdict};
+use crate::facts::model_time::ModelTime;
 use crate::graph::discovery::Endpoint;
 use crate::measure::topic::Topic;
 
@@ -92,7 +93,7 @@ impl<'a> MatchedReaders<'a> {
 
     /// Returns the time at which this participant's first matching reader was announced.
     #[must_use]
-    pub fn since(self, prefix: GuidPrefix) -> Option<Timestamp> {
+    pub fn since(self, prefix: GuidPrefix) -> Option<ModelTime> {
         let endpoints = self.graph.discovery.endpoints();
         let readers = self.of(prefix);
         readers

@@ -11,7 +11,7 @@ struct View {
 impl View {
     fn new() -> Self {
         Self {
-            sampled: Sampled::new(Timestamp(SECOND)),
+            sampled: Sampled::new(ModelTime::from_nanoseconds(SECOND)),
             sequence: Sequence::default(),
             now: SECOND,
         }
@@ -23,9 +23,9 @@ impl View {
 
     fn part(&mut self, number: u64, seen: Completeness) -> SampledUpdate {
         self.now += SECOND / 100;
-        let now = Timestamp(self.now);
+        let now = ModelTime::from_nanoseconds(self.now);
         self.sampled.sample(
-            (SequenceNumber(number), seen, Some(now)),
+            (SequenceNumber(number), seen, Some(Timestamp(self.now))),
             FAR,
             now,
             &mut self.sequence,
@@ -106,7 +106,7 @@ fn a_sample_needs_its_later_fragments_although_its_number_is_known() {
     view.see(500);
     // 300 is too old to be waited for, and numbers skipped by a GAP are not waited for either.
     assert!(has(&view, SequenceNumber(300)) && !has(&view, SequenceNumber(499)));
-    let now = Timestamp(view.now);
+    let now = ModelTime::from_nanoseconds(view.now);
     view.sampled.skip(
         (SequenceNumber(501), SequenceNumber(503)),
         FAR,
@@ -128,7 +128,7 @@ fn an_interval_is_that_between_neighbours_that_both_were_seen() {
 #[test]
 fn a_heartbeat_shows_lost_last_samples_and_a_gap_those_never_written() {
     let mut view = View::new();
-    let now = Timestamp(view.now);
+    let now = ModelTime::from_nanoseconds(view.now);
     assert_eq!(
         view.sampled
             .exist(SequenceNumber(7), FAR, now, &mut view.sequence),
@@ -184,7 +184,7 @@ fn a_writer_that_begins_anew_under_its_old_name_counts_from_there() {
 fn a_sample_announced_by_a_heartbeat_and_seen_late_is_no_restart() {
     let mut view = View::new();
     view.see(1);
-    let now = Timestamp(view.now);
+    let now = ModelTime::from_nanoseconds(view.now);
     assert_eq!(
         view.sampled
             .exist(SequenceNumber(5), FAR, now, &mut view.sequence),
@@ -206,7 +206,7 @@ fn what_was_not_seen_is_left_out_once_when_it_has_waited() {
     let mut view = View::new();
     let settle = |view: &mut View| {
         view.now += nanoseconds(ARRIVAL_TIMEOUT);
-        view.sampled.tick(Timestamp(view.now));
+        view.sampled.tick(ModelTime::from_nanoseconds(view.now));
         view.sampled.take_unseen()
     };
     view.see(1);
@@ -221,7 +221,7 @@ fn what_was_not_seen_is_left_out_once_when_it_has_waited() {
     assert!(!view.see(4).finished, "given after it was left out");
     // Neither a part of a sample nor a HEARTBEAT makes it seen.
     view.part(6, Completeness::Partial);
-    let now = Timestamp(view.now);
+    let now = ModelTime::from_nanoseconds(view.now);
     view.sampled
         .exist(SequenceNumber(8), FAR, now, &mut view.sequence);
     // Numbers skipped by a GAP are not missing.
@@ -250,7 +250,7 @@ fn what_was_counted_otherwise_meanwhile_is_not_left_out() {
     // The sample may still arrive; it is skipped when the view begins again.
     assert_eq!(view.sampled.take_unseen(), []);
     assert!(view.sampled.awaits(SequenceNumber(2)) && !view.sampled.awaits(SequenceNumber(3)));
-    let now = Timestamp(view.now);
+    let now = ModelTime::from_nanoseconds(view.now);
     for number in 4..500 {
         view.sequence
             .exists(SequenceNumber(number), now, &mut |_| {});
@@ -293,7 +293,7 @@ fn a_forged_number_far_ahead_counts_as_one_message_and_ends_no_other() {
     assert!(!view.part(1 << 40, Completeness::Complete).finished);
     assert!(view.part(6, Completeness::Complete).finished);
     assert_eq!(view.see(7).samples, 1);
-    let now = Timestamp(view.now);
+    let now = ModelTime::from_nanoseconds(view.now);
     let messages = view
         .sampled
         .exist(SequenceNumber(3000), REACH, now, &mut view.sequence);
@@ -308,16 +308,16 @@ fn a_forged_number_far_ahead_counts_as_one_message_and_ends_no_other() {
 
 #[test]
 fn it_is_sampled_until_shared_memory_has_been_silent_for_a_while() {
-    let mut sampled = Sampled::new(Timestamp(SECOND));
-    assert!(sampled.is_current(Timestamp(10 * SECOND)));
-    assert!(!sampled.is_current(Timestamp(11 * SECOND)));
-    sampled.touch(Timestamp(5 * SECOND));
-    assert!(sampled.is_current(Timestamp(11 * SECOND)));
+    let mut sampled = Sampled::new(ModelTime::from_nanoseconds(SECOND));
+    assert!(sampled.is_current(ModelTime::from_nanoseconds(10 * SECOND)));
+    assert!(!sampled.is_current(ModelTime::from_nanoseconds(11 * SECOND)));
+    sampled.touch(ModelTime::from_nanoseconds(5 * SECOND));
+    assert!(sampled.is_current(ModelTime::from_nanoseconds(11 * SECOND)));
 }
 
 #[test]
 fn the_stamp_of_a_first_fragment_is_that_of_the_sample() {
-    let mut sampled = Sampled::new(Timestamp(SECOND));
+    let mut sampled = Sampled::new(ModelTime::from_nanoseconds(SECOND));
     assert_eq!(sampled.stamp(SequenceNumber(1), Some((5, 6))), Some((5, 6)));
     assert_eq!(sampled.stamp(SequenceNumber(1), None), Some((5, 6)));
     assert_eq!(sampled.stamp(SequenceNumber(2), None), None);

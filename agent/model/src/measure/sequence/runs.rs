@@ -10,6 +10,7 @@ use super::STALE;
 use super::Sequence;
 use super::Settled;
 use super::unconfirmed::{CONFIRMATIONS, Run};
+use crate::facts::model_time::ModelTime;
 
 impl Sequence {
     /// Checks number and source time of a sample before any other processing, to recognise a writer
@@ -19,7 +20,7 @@ impl Sequence {
         number: SequenceNumber,
         source: Option<Timestamp>,
         reach: u64,
-        now: Timestamp,
+        now: ModelTime,
     ) -> RunMembership {
         if !number.is_valid() {
             return RunMembership::Live;
@@ -92,7 +93,7 @@ impl Sequence {
     }
 
     /// Records the samples of a confirmed run.
-    pub fn accept(&mut self, run: &Run, now: Timestamp, settled: &mut impl FnMut(Settled)) {
+    pub fn accept(&mut self, run: &Run, now: ModelTime, settled: &mut impl FnMut(Settled)) {
         for &(number, is_whole) in &run.numbers {
             self.exists(number, now, settled);
             if is_whole {

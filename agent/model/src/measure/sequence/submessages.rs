@@ -1,6 +1,6 @@
 //! HEARTBEAT, GAP and ACKNACK: existing numbers, and those that readers miss (RTPS 2.5, 8.3.8).
 
-use ros2probe_wire::{SequenceNumber, Timestamp};
+use ros2probe_wire::SequenceNumber;
 
 use super::FAR;
 use super::MAX_JUMP;
@@ -8,6 +8,7 @@ use super::REACH;
 use super::Sequence;
 use super::Settled;
 use super::unconfirmed::Run;
+use crate::facts::model_time::ModelTime;
 
 impl Sequence {
     /// Processes a HEARTBEAT: the writer has `first..=last`. It sends nothing below `first` again,
@@ -16,7 +17,7 @@ impl Sequence {
         &mut self,
         first: SequenceNumber,
         last: SequenceNumber,
-        now: Timestamp,
+        now: ModelTime,
         settled: &mut impl FnMut(Settled),
     ) {
         if !self.started() || first == SequenceNumber::ZERO || first > last.next() {
@@ -47,7 +48,7 @@ impl Sequence {
         &mut self,
         next: SequenceNumber,
         reach: u64,
-        now: Timestamp,
+        now: ModelTime,
     ) -> (bool, Option<Run>) {
         let live = self.next;
         let unconfirmed = self.unconfirmed.as_mut();
@@ -91,7 +92,7 @@ impl Sequence {
         start: SequenceNumber,
         base: SequenceNumber,
         set: impl Iterator<Item = SequenceNumber>,
-        now: Timestamp,
+        now: ModelTime,
         settled: &mut impl FnMut(Settled),
     ) {
         if !self.started() || start == SequenceNumber::ZERO || base < start {

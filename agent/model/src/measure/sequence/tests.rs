@@ -1,5 +1,7 @@
 use std::time::Duration;
 
+use ros2probe_wire::Timestamp;
+
 use super::*;
 use ros2probe_wire::time::SECOND;
 
@@ -26,7 +28,7 @@ impl Bench {
     fn receive_at(&mut self, number: u64, source: Option<u64>) {
         let number = SequenceNumber(number);
         let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
-        let (source, now) = (source.map(Timestamp), Timestamp(self.now));
+        let (source, now) = (source.map(Timestamp), ModelTime::from_nanoseconds(self.now));
         match self.sequence.recognise(number, source, REACH, now) {
             RunMembership::Live => {}
             RunMembership::Unconfirmed { .. } => {
@@ -42,7 +44,7 @@ impl Bench {
         let arrival = self.sequence.receive(
             number,
             RepairMode::Reliable,
-            Timestamp(self.now),
+            ModelTime::from_nanoseconds(self.now),
             &mut |settled| note(settled, lost, irrelevant),
         );
         match arrival {
@@ -60,7 +62,7 @@ impl Bench {
         self.sequence.heartbeat(
             SequenceNumber(first),
             SequenceNumber(last),
-            Timestamp(self.now),
+            ModelTime::from_nanoseconds(self.now),
             &mut note,
         );
         self
@@ -72,7 +74,7 @@ impl Bench {
             self.now += SECOND / 10;
             let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
             self.sequence.advance(
-                Timestamp(self.now),
+                ModelTime::from_nanoseconds(self.now),
                 (Duration::from_secs(1), Duration::from_secs(1)),
                 None,
                 &mut |settled| {
@@ -155,7 +157,7 @@ fn gap_excuses_and_heartbeat_does_not() {
         SequenceNumber(2),
         SequenceNumber(4),
         [].into_iter(),
-        Timestamp(bench.now),
+        ModelTime::from_nanoseconds(bench.now),
         &mut |_| {},
     );
     bench.heartbeat(7, 9).wait(3);
@@ -193,7 +195,7 @@ fn what_the_writer_withdrew_is_decided_after_the_grace_and_not_the_window() {
     bench.receive([1, 4, 6]).heartbeat(4, 6);
     let mut lost = Vec::new();
     for (after, decided) in [(SECOND - 1, &[][..]), (SECOND, &[2, 3])] {
-        let now = Timestamp(bench.now + after);
+        let now = ModelTime::from_nanoseconds(bench.now + after);
         let windows = (Duration::from_secs(10), Duration::from_secs(1));
         let mut note = |settled| note(settled, &mut lost, &mut Vec::new());
         bench.sequence.advance(now, windows, None, &mut note);
@@ -209,7 +211,7 @@ fn a_gap_ahead_of_the_data_does_not_hide_data() {
         SequenceNumber(2),
         SequenceNumber(4),
         [SequenceNumber(4)].into_iter(),
-        Timestamp(bench.now),
+        ModelTime::from_nanoseconds(bench.now),
         &mut |_| {},
     );
     bench.receive([3, 5]).wait(3);
@@ -227,7 +229,7 @@ fn the_last_sample_of_a_burst_is_missed_by_its_heartbeat() {
     bench.sequence.heartbeat(
         SequenceNumber(1),
         SequenceNumber(3),
-        Timestamp(bench.now),
+        ModelTime::from_nanoseconds(bench.now),
         &mut |_| {},
     );
     bench.wait(3);
@@ -238,7 +240,7 @@ fn the_last_sample_of_a_burst_is_missed_by_its_heartbeat() {
 fn forged_heartbeats_and_gaps_make_no_losses() {
     let mut bench = Bench::default();
     bench.receive([1, 2]);
-    let now = Timestamp(bench.now);
+    let now = ModelTime::from_nanoseconds(bench.now);
     for (first, last) in [(1, u64::MAX), (0, 5), (9, 3), (u64::MAX, u64::MAX)] {
         bench.sequence.heartbeat(
             SequenceNumber(first),
@@ -311,7 +313,7 @@ fn a_fragment_of_a_number_that_cannot_be_loses_nothing() {
         let mut bench = Bench::default();
         bench.receive([1, 2]);
         let mut decided = 0;
-        let now = Timestamp(bench.now);
+        let now = ModelTime::from_nanoseconds(bench.now);
         bench
             .sequence
             .exists(SequenceNumber(number), now, &mut |_| decided += 1);
@@ -386,7 +388,7 @@ fn checkpoints_do_not_pile_up_while_a_growing_sample_holds_the_others() {
     let mut lost = 0;
     let mut count = |settled| lost += u64::from(matches!(settled, Settled::Lost(_)));
     for step in 1..10_000_u64 {
-        let now = Timestamp(step * SECOND / 10);
+        let now = ModelTime::from_nanoseconds(step * SECOND / 10);
         sequence.receive(
             SequenceNumber(2 * step),
             RepairMode::BestEffort,
@@ -401,7 +403,7 @@ fn checkpoints_do_not_pile_up_while_a_growing_sample_holds_the_others() {
         );
         assert!(!sequence.checkpoints.is_full());
     }
-    let end = Timestamp(2000 * SECOND);
+    let end = ModelTime::from_nanoseconds(2000 * SECOND);
     sequence.advance(
         end,
         (Duration::from_secs(1), Duration::from_secs(1)),

@@ -6,10 +6,11 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use ros2probe_wire::{SequenceNumber, Timestamp};
+use ros2probe_wire::SequenceNumber;
 
 use super::FAR;
 use crate::facts::bounded::Bounded;
+use crate::facts::model_time::ModelTime;
 use crate::facts::tables::UnconfirmedNumbers;
 
 /// Number of datagrams that confirm a run.
@@ -24,10 +25,10 @@ pub(super) struct UnconfirmedRun {
     /// Number of datagrams that continued the run since the live run last did.
     evidence: u8,
     /// Times of the first and last of them.
-    since: Timestamp,
-    latest: Timestamp,
+    since: ModelTime,
+    latest: ModelTime,
     /// The number after lastSN of a HEARTBEAT, and its time.
-    claim: (SequenceNumber, Timestamp),
+    claim: (SequenceNumber, ModelTime),
 }
 
 /// Samples that were counted before their numbers were confirmed.
@@ -41,7 +42,7 @@ pub struct Run {
 
 impl UnconfirmedRun {
     /// Records the number of a sample. Returns whether it begins a run, and whether it is new.
-    pub(super) fn note(&mut self, number: SequenceNumber, now: Timestamp) -> (bool, bool) {
+    pub(super) fn note(&mut self, number: SequenceNumber, now: ModelTime) -> (bool, bool) {
         let numbers = &self.run.numbers;
         if numbers.iter().any(|(known, _)| *known == number) {
             return (false, false);
@@ -89,7 +90,7 @@ impl UnconfirmedRun {
     /// Resets the evidence, because the live run continued.
     pub(super) const fn contradict(&mut self) {
         self.evidence = 0;
-        self.claim = (SequenceNumber::ZERO, Timestamp(0));
+        self.claim = (SequenceNumber::ZERO, ModelTime::ZERO);
     }
 
     /// Returns whether a HEARTBEAT with lastSN `next - 1` confirms the run, where `live` is the
@@ -98,7 +99,7 @@ impl UnconfirmedRun {
         &self,
         next: SequenceNumber,
         live: SequenceNumber,
-        now: Timestamp,
+        now: ModelTime,
     ) -> bool {
         let end = self.end();
         let is_ahead = end > live;
@@ -109,7 +110,7 @@ impl UnconfirmedRun {
     }
 
     /// Returns whether an earlier HEARTBEAT had the same lastSN, or one lower by at most `reach`.
-    pub(super) fn is_claimed(&mut self, next: SequenceNumber, reach: u64, now: Timestamp) -> bool {
+    pub(super) fn is_claimed(&mut self, next: SequenceNumber, reach: u64, now: ModelTime) -> bool {
         let (claimed, at) = self.claim;
         let is_same = claimed > SequenceNumber::ZERO
             && (claimed..=claimed.saturating_add(reach)).contains(&next);
@@ -156,18 +157,18 @@ mod tests {
         let mut unconfirmed = UnconfirmedRun::default();
         for number in 1..=100 {
             assert_eq!(
-                unconfirmed.note(SequenceNumber(number), Timestamp(1)),
+                unconfirmed.note(SequenceNumber(number), ModelTime::from_nanoseconds(1)),
                 (number == 1, true)
             );
         }
         assert!(unconfirmed.run.numbers.is_full());
         // The evidence counts again.
         assert_eq!(
-            unconfirmed.note(SequenceNumber(1), Timestamp(1)),
+            unconfirmed.note(SequenceNumber(1), ModelTime::from_nanoseconds(1)),
             (false, true)
         );
         assert_eq!(
-            unconfirmed.note(SequenceNumber(100), Timestamp(1)),
+            unconfirmed.note(SequenceNumber(100), ModelTime::from_nanoseconds(1)),
             (false, false)
         );
         assert_eq!(unconfirmed.evidence, 1);

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{GuidPrefix, SequenceNumber, Timestamp};
+use ros2probe_wire::{GuidPrefix, SequenceNumber};
 
 use super::Subscribers;
 use super::WriterContext;
@@ -13,6 +13,7 @@ use super::is_best_effort;
 use super::is_reader;
 use super::is_unknown;
 use crate::facts::loss_share::LossShare;
+use crate::facts::model_time::ModelTime;
 use crate::facts::route::Receiver;
 use crate::facts::route::Route;
 use crate::measure::delivery::{Delivery, Totals};
@@ -34,7 +35,7 @@ impl Subscribers {
             ));
         }
         self.expect(context, false);
-        if now.0.is_multiple_of(SECOND) {
+        if now.nanoseconds().is_multiple_of(SECOND) {
             self.deliveries.iter_mut().for_each(Delivery::end_second);
             self.routes.retain(|known| {
                 known.matched == Matched::Yes || known.last_seen + ROUTE_TIMEOUT > now
@@ -76,14 +77,14 @@ impl Subscribers {
     }
 
     /// Returns the time of the last record of each delivery that can be dropped for a new one.
-    pub fn silent_since(&self) -> impl Iterator<Item = Timestamp> + '_ {
+    pub fn silent_since(&self) -> impl Iterator<Item = ModelTime> + '_ {
         self.deliveries.iter().map(|delivery| delivery.seen().1)
     }
 
     /// Drops at most `count` deliveries whose last record is not after this time; returns how many.
     pub fn give_up(
         &mut self,
-        until: Timestamp,
+        until: ModelTime,
         count: usize,
         context: &mut WriterContext<'_>,
     ) -> usize {

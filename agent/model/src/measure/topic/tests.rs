@@ -26,8 +26,20 @@ fn watchlist(patterns: &[&str]) -> Watchlist {
 fn the_same_name_in_two_domains_is_two_topics() {
     let mut topics = Topics::default();
     let naming = naming("rt/chatter");
-    let (one, _) = topics.join(DomainId(0), &naming, guid(1), Role::Writer, Timestamp(1));
-    let (two, _) = topics.join(DomainId(5), &naming, guid(2), Role::Writer, Timestamp(1));
+    let (one, _) = topics.join(
+        DomainId(0),
+        &naming,
+        guid(1),
+        Role::Writer,
+        ModelTime::from_nanoseconds(1),
+    );
+    let (two, _) = topics.join(
+        DomainId(5),
+        &naming,
+        guid(2),
+        Role::Writer,
+        ModelTime::from_nanoseconds(1),
+    );
     assert_ne!(one, two);
 }
 
@@ -69,10 +81,16 @@ fn cpu_buffers_belong_to_the_topic_beside_them() {
         &naming("rt/image"),
         guid(1),
         Role::Writer,
-        Timestamp(1),
+        ModelTime::from_nanoseconds(1),
     );
     let buffer = naming("rt/image/_buf_cpu");
-    let (same, _) = topics.join(DomainId(0), &buffer, guid(2), Role::Writer, Timestamp(1));
+    let (same, _) = topics.join(
+        DomainId(0),
+        &buffer,
+        guid(2),
+        Role::Writer,
+        ModelTime::from_nanoseconds(1),
+    );
     assert_eq!(main, same);
     assert_eq!(topics.get(main).unwrap().writers, [guid(1)]);
 }
@@ -88,15 +106,20 @@ fn the_cap_rejects_and_counts_until_a_place_is_free() {
             &naming(name),
             guid(1),
             Role::Writer,
-            Timestamp(1),
+            ModelTime::from_nanoseconds(1),
         );
-        topics.apply_lists(id, (&all, &[], false), 2, Timestamp(1));
+        topics.apply_lists(id, (&all, &[], false), 2, ModelTime::from_nanoseconds(1));
         ids.push(id);
     }
     let state = |topics: &Topics, index: usize| topics.get(ids[index]).unwrap().watched;
     assert_eq!((state(&topics, 2), topics.rejected), (Watched::Rejected, 1));
-    topics.leave(ids[0], guid(1), Timestamp(2));
-    topics.apply_lists(ids[2], (&all, &[], false), 2, Timestamp(3));
+    topics.leave(ids[0], guid(1), ModelTime::from_nanoseconds(2));
+    topics.apply_lists(
+        ids[2],
+        (&all, &[], false),
+        2,
+        ModelTime::from_nanoseconds(3),
+    );
     assert_eq!((state(&topics, 2), topics.watched()), (Watched::Yes, 2));
     assert!(topics.get(ids[0]).is_none());
 }
@@ -109,11 +132,11 @@ fn a_vanished_topic_stays_for_its_grace_period() {
         &naming("rt/a"),
         guid(1),
         Role::Writer,
-        Timestamp(1),
+        ModelTime::from_nanoseconds(1),
     );
-    topics.leave(id, guid(1), Timestamp(100));
-    topics.expire(Timestamp(599), Duration::from_nanos(500));
+    topics.leave(id, guid(1), ModelTime::from_nanoseconds(100));
+    topics.expire(ModelTime::from_nanoseconds(599), Duration::from_nanos(500));
     assert!(topics.get(id).unwrap().is_vanished());
-    topics.expire(Timestamp(600), Duration::from_nanos(500));
+    topics.expire(ModelTime::from_nanoseconds(600), Duration::from_nanos(500));
     assert!(topics.is_empty());
 }

@@ -6,6 +6,7 @@ use super::HISTORY;
 use super::Writer;
 use super::seconds;
 use crate::facts::header::{PLAUSIBLE, stamp_time};
+use crate::facts::model_time::ModelTime;
 
 impl Writer {
     pub(super) fn delays(
@@ -13,7 +14,7 @@ impl Writer {
         number: SequenceNumber,
         newest: bool,
         (source, stamp): (RtpsTime, Option<(i32, u32)>),
-        (now, wall_clock): (Timestamp, Timestamp),
+        (now, wall_clock): (ModelTime, Timestamp),
     ) {
         let source = source.timestamp();
         if self.traits.keeps_history {

@@ -7,10 +7,10 @@ use super::Counted;
 use super::MeasurementContext;
 use super::Writer;
 use super::reach;
-use super::record_time;
 use super::seconds;
 use crate::facts::dispatch::MissedReason;
 use crate::facts::journal::{Journal, Missing};
+use crate::facts::model_time::ModelTime;
 use crate::facts::rate::Sum;
 use crate::measure::sampled::{Completeness, Sampled, SampledUpdate};
 use crate::measure::samples::Budget;
@@ -29,15 +29,15 @@ impl Writer {
         }
     }
 
-    /// Returns whether the sample was pending when the sampled view ended.
-    pub(super) fn is_under_way(&self, sample: Sample<'_>) -> bool {
-        let (number, at) = (sample.sequence_number(), record_time(sample.record()));
+    /// Returns whether the sample, seen at `at`, was pending when the sampled view ended.
+    pub(super) fn is_under_way(&self, sample: Sample<'_>, at: ModelTime) -> bool {
+        let number = sample.sequence_number();
         self.sampled
             .as_ref()
             .is_some_and(|sampled| !sampled.is_current(at) && sampled.awaits(number))
     }
 
-    pub(super) fn is_sampled(&self, now: Timestamp) -> bool {
+    pub(super) fn is_sampled(&self, now: ModelTime) -> bool {
         let sampled = self.sampled.as_ref();
         sampled.is_some_and(|sampled| sampled.is_current(now))
     }
@@ -49,7 +49,7 @@ impl Writer {
         is_sampled: bool,
         context: &mut MeasurementContext<'_>,
     ) -> Option<Counted> {
-        let now = record_time(record);
+        let now = context.now;
         let abandoned = match self.is_sampled(now) {
             true => Vec::new(),
             false => self.reception.abandon(),
@@ -67,8 +67,8 @@ impl Writer {
         let sequence = self.reception.sequence_mut();
         let announced = match record.body() {
             Body::Sample(sample) => {
-                let update = self.sampled_update(sample, reach, context.budget)?;
-                self.count_span(sample, &update, since);
+                let update = self.sampled_update(sample, reach, now, context.budget)?;
+                self.count_span(sample, &update, (since, now));
                 return self.sampled_sample(
                     sample,
                     &update,
@@ -99,8 +99,12 @@ impl Writer {
     }
 
     /// Counts the samples up to a seen one. Unseen ones are assumed to have its size.
-    fn count_span(&mut self, sample: Sample<'_>, update: &SampledUpdate, since: Timestamp) {
-        let now = record_time(sample.record());
+    fn count_span(
+        &mut self,
+        sample: Sample<'_>,
+        update: &SampledUpdate,
+        (since, now): (ModelTime, ModelTime),
+    ) {
         if let Some(sampled) = &mut self.sampled {
             sampled.pace(update.samples, since, now);
         }
@@ -115,7 +119,7 @@ impl Writer {
     }
 
     /// Counts what was sent after `since`, each message in the second of its time.
-    fn spread(&mut self, sent: Sum, since: Timestamp, now: Timestamp) {
+    fn spread(&mut self, sent: Sum, since: ModelTime, now: ModelTime) {
         let tally = &mut self.tally;
         tally.messages += sent.messages;
         tally.bytes = tally.bytes.saturating_add(sent.bytes);
@@ -129,17 +133,18 @@ impl Writer {
         &mut self,
         sample: Sample<'_>,
         reach: u64,
+        now: ModelTime,
         budget: &mut Budget,
     ) -> Option<SampledUpdate> {
         let sampled = self.sampled.as_mut()?;
-        let (number, now) = (sample.sequence_number(), record_time(sample.record()));
+        let number = sample.sequence_number();
         let source = sample.source_timestamp().timestamp();
         let sequence = self.reception.sequence();
         let unconfirmed = sequence.is_unconfirmed(number, source, reach);
         let has = !unconfirmed && sampled.has(number, sequence.next());
         let is_whole = match sample {
             Sample::DataFrag(fragments) => {
-                !has && self.reception.assemble(fragments, unconfirmed, budget)
+                !has && self.reception.assemble(fragments, unconfirmed, now, budget)
             }
             Sample::Data(_) => true,
         };
@@ -160,10 +165,12 @@ impl Writer {
         sample: Sample<'_>,
         context: &mut MeasurementContext<'_>,
     ) -> Option<Counted> {
+        let now = context.now;
         let is_whole = match sample {
             Sample::Data(_) => true,
             Sample::DataFrag(fragments) => {
-                self.reception.assemble(fragments, false, context.budget)
+                self.reception
+                    .assemble(fragments, false, now, context.budget)
             }
         };
         let seen = if is_whole {
@@ -173,7 +180,6 @@ impl Writer {
         };
         let number = sample.sequence_number();
         let update = self.sampled.as_mut()?.catch_up(number, seen);
-        let now = record_time(sample.record());
         self.sampled_sample(sample, &update, (now, context.wall_clock.wall_time(now)))
     }
 
@@ -181,7 +187,7 @@ impl Writer {
         &mut self,
         sample: Sample<'_>,
         update: &SampledUpdate,
-        (now, wall_clock): (Timestamp, Timestamp),
+        (now, wall_clock): (ModelTime, Timestamp),
     ) -> Option<Counted> {
         let (number, is_message) = (sample.sequence_number(), sample.is_message());
         let bytes = u64::from(sample.size());

@@ -11,7 +11,7 @@ struct Bench {
     budget: Budget,
     journal: Journal,
     now: u64,
-    opened: Timestamp,
+    opened: ModelTime,
 }
 
 impl Bench {
@@ -21,7 +21,7 @@ impl Bench {
             budget: Budget::new(1 << 20),
             journal: Journal::default(),
             now: START,
-            opened: Timestamp(0),
+            opened: ModelTime::ZERO,
         }
     }
 
@@ -37,7 +37,7 @@ impl Bench {
             ..record
         };
         let mut context = MeasurementContext {
-            now: Timestamp(self.now),
+            now: ModelTime::from_nanoseconds(self.now),
             budget: &mut self.budget,
             journal: &mut self.journal,
             wall_clock: WallClock::default(),
@@ -62,7 +62,7 @@ impl Bench {
         while self.now < end {
             self.now = (self.now + 100 * MILLISECOND).min(end);
             let mut context = MeasurementContext {
-                now: Timestamp(self.now),
+                now: ModelTime::from_nanoseconds(self.now),
                 budget: &mut self.budget,
                 journal: &mut self.journal,
                 wall_clock: WallClock::default(),
@@ -74,7 +74,8 @@ impl Bench {
     }
 
     fn facts(&self) -> Measurement {
-        self.writer.measurement(Timestamp(self.now))
+        self.writer
+            .measurement(ModelTime::from_nanoseconds(self.now))
     }
 }
 
@@ -166,7 +167,7 @@ fn a_sample_begun_before_its_writer_was_in_the_kernels_map_is_no_loss_if_fragmen
     let mut bench = Bench::new(Traits::default());
     bench
         .writer
-        .allow_incomplete(Timestamp(bench.now + 200 * MILLISECOND));
+        .allow_incomplete(ModelTime::from_nanoseconds(bench.now + 200 * MILLISECOND));
     bench.fragments(1, 1..=4).fragments(1, 8..=10).wait(300);
     bench.fragments(2, 1..=9).fragments(3, 1..=10).wait(5000);
     let facts = bench.facts();
@@ -325,7 +326,7 @@ fn intervals_are_exact() {
 fn samples_sent_elsewhere_before_a_reader_existed_here_are_not_lost() {
     let mut bench = Bench::new(Traits::default());
     bench.data(1).data(2).wait(60_000);
-    bench.opened = Timestamp(bench.now);
+    bench.opened = ModelTime::from_nanoseconds(bench.now);
     for number in 500..=504 {
         bench.now += MILLISECOND;
         bench.data(number);
@@ -381,11 +382,17 @@ fn a_message_that_only_a_heartbeat_tells_of_is_the_last_message() {
     let mut bench = Bench::new(RELIABLE);
     bench.put(in_shared_memory(data(1))).wait(1000);
     bench.put(in_shared_memory(heartbeat(1, 2)));
-    assert_eq!(bench.writer.last_message(), Some(Timestamp(bench.now)));
+    assert_eq!(
+        bench.writer.last_message(),
+        Some(ModelTime::from_nanoseconds(bench.now))
+    );
     let told = bench.now;
     bench.wait(1000);
     bench.put(in_shared_memory(heartbeat(1, 2)));
-    assert_eq!(bench.writer.last_message(), Some(Timestamp(told)));
+    assert_eq!(
+        bench.writer.last_message(),
+        Some(ModelTime::from_nanoseconds(told))
+    );
 }
 
 #[test]
@@ -588,10 +595,8 @@ fn every_sample_is_given_or_missed(
                 for record in records {
                     bench.now += MILLISECOND;
                     // A record without payload cannot complete a requested sample.
-                    let time = bench.now;
-                    let has = bench
-                        .writer
-                        .has(Record { time, ..*record }.sample().unwrap());
+                    let now = ModelTime::from_nanoseconds(bench.now);
+                    let has = bench.writer.has(record.sample().unwrap(), now);
                     if let Some(counted) = bench.take(*record) {
                         assert!(!has, "{record:?}");
                         given[usize::try_from(counted.number.0).unwrap() - 1] += 1;

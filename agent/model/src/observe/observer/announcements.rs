@@ -5,9 +5,10 @@ use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::record::Sample;
 use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
 use ros2probe_wire::walk::{Envelope, Found};
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp, WireError};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, WireError};
 
 use super::Observer;
+use crate::facts::model_time::ModelTime;
 use crate::facts::route::Destination;
 use crate::graph::discovery::{Origin, Priority, endpoints_of};
 
@@ -16,7 +17,7 @@ impl Observer {
         &mut self,
         found: &Found<'_>,
         vendor: Option<VendorId>,
-        envelope: &Envelope,
+        (envelope, at): (&Envelope, ModelTime),
     ) {
         let record = &found.record;
         if let Some(sample) = record.sample() {
@@ -24,7 +25,7 @@ impl Observer {
             let [first, second, ..] = prefix.0;
             let vendor = vendor.unwrap_or(VendorId([first, second]));
             let origin = Origin {
-                at: self.wall_clock.model_time(Timestamp(envelope.time)),
+                at,
                 sender: prefix,
                 sequence_number: sample.sequence_number(),
                 destination: envelope.destination,
@@ -33,7 +34,7 @@ impl Observer {
             self.read(found, sample, vendor, &origin);
             self.follow_up(origin.at);
             self.identify_call(found, sample, vendor, origin.at);
-            self.keep(found);
+            self.keep_payload(record, at, found.payload);
         }
     }
 

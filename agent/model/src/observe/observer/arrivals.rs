@@ -3,11 +3,12 @@
 use std::collections::BTreeSet;
 
 use ros2probe_wire::qos::HistoryKind;
-use ros2probe_wire::{DomainId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
 use super::Observer;
 use crate::derive::inside::reader_queue::{Arrivals, ArrivalsOf};
 use crate::facts::diagnosis::{Offer, Verdict, verdict};
+use crate::facts::model_time::ModelTime;
 use crate::facts::naming::Naming;
 use crate::facts::route::Direction;
 use crate::facts::route::Receiver;
@@ -18,7 +19,7 @@ use crate::report::transport::{transport, vendor};
 
 impl Observer {
     /// Compares arrivals with the calls that take them.
-    pub(super) fn compare_queues(&mut self, at: Timestamp) {
+    pub(super) fn compare_queues(&mut self, at: ModelTime) {
         let mut inside = std::mem::take(&mut self.inside);
         let now = at.max(self.clock);
         inside.compare_queues(now, |participants, domain_id, naming| {
@@ -34,7 +35,7 @@ impl Observer {
         participants: &BTreeSet<GuidPrefix>,
         domain_id: DomainId,
         naming: &Naming,
-        now: Timestamp,
+        now: ModelTime,
     ) -> Option<Arrivals> {
         let topic = self.topics.get(self.topics.find(domain_id, naming)?)?;
         if topic.watched != Watched::Yes {
@@ -104,8 +105,8 @@ fn arrived(
     measured: &Measured,
     transport: Transport,
     participant: GuidPrefix,
-    now: Timestamp,
-) -> Option<(Option<Timestamp>, u64)> {
+    now: ModelTime,
+) -> Option<(Option<ModelTime>, u64)> {
     if !matches!(transport, Transport::Network | Transport::SharedMemory) {
         return None;
     }

@@ -3,9 +3,10 @@
 use ros2probe_wire::record::{Sample, Verdict};
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::walk::Found;
-use ros2probe_wire::{Guid, Record, Timestamp};
+use ros2probe_wire::{Guid, Record};
 
 use super::Observer;
+use crate::facts::model_time::ModelTime;
 use crate::facts::route::Route;
 
 impl Observer {
@@ -15,7 +16,7 @@ impl Observer {
         found: &Found<'_>,
         sample: Sample<'_>,
         vendor: VendorId,
-        at: Timestamp,
+        at: ModelTime,
     ) {
         let writer = found.record.writer();
         match self.services.identify(found, sample, vendor, at) {
@@ -37,19 +38,19 @@ impl Observer {
     }
 
     /// Counts a copy of a request or reply.
-    pub(super) fn call_seen(&mut self, record: &Record) {
+    pub(super) fn call_seen(&mut self, record: &Record, at: ModelTime) {
         if let Some(sample) = record.sample()
             && self.services.follows(record.writer())
         {
             let (receivers, discovery) = (&self.receivers, &self.discovery);
-            self.services.seen(record, sample, || {
+            self.services.seen((record, at), sample, || {
                 receivers.owner(&Route::of(record), discovery)
             });
         }
     }
 
     /// Marks hanging calls, and captures writers again that had exceeded their budget.
-    pub(super) fn advance_calls(&mut self, now: Timestamp) {
+    pub(super) fn advance_calls(&mut self, now: ModelTime) {
         let topics = &self.topics;
         let timeout = self.settings.service_timeout;
         let resumed = self.services.advance(timeout, now, |domain_id, name| {

@@ -1,12 +1,13 @@
 //! Messages with stamps, which chains consist of.
 
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, Record};
 
 use super::Observer;
 use super::lists::traced_share;
 use crate::derive::chain::causality::{CausalPublication, Origin};
 use crate::derive::chain::graph::publisher;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName};
 use crate::facts::naming::Naming;
 use crate::facts::route::Route;
@@ -29,7 +30,7 @@ impl Observer {
             && self.chains.follows(record.writer())
         {
             let (receivers, discovery) = (&self.receivers, &self.discovery);
-            self.chains.seen(record, sample, self.wall_clock, || {
+            self.chains.seen(record, sample, || {
                 receivers.owner(&Route::of(record), discovery)
             });
         }
@@ -72,7 +73,7 @@ impl Observer {
     }
 
     /// Evaluates the chains, and measures the topics that configured chains need.
-    pub(super) fn advance_chains(&mut self, now: Timestamp) {
+    pub(super) fn advance_chains(&mut self, now: ModelTime) {
         let graph = (&self.discovery, &self.topics, &self.profiler);
         let watchlist = &self.watchlist;
         let share = |topic: &Topic| traced_share(topic, watchlist);

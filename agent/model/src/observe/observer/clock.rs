@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_wire::record::Verdict;
-use ros2probe_wire::time::{SECOND, nanoseconds};
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::JUMP;
@@ -16,6 +16,7 @@ use crate::facts::diagnosis;
 use crate::facts::event::{EventKind, TEXT, bounded, bounded_finding};
 use crate::facts::loss_share::LossShare;
 use crate::facts::measurement::Measurement;
+use crate::facts::model_time::ModelTime;
 use crate::facts::rate::Slot;
 use crate::facts::route::Receiver;
 use crate::facts::watch::WatchState;
@@ -25,10 +26,9 @@ use crate::report::transport::is_polled;
 
 impl Observer {
     /// Advances the time: expires leases, settles gaps, evaluates expectations.
-    pub(super) fn advance(&mut self, now: Timestamp) {
-        let now = self.wall_clock.model_time(now);
-        if self.clock.0 == 0 || now - self.clock > JUMP {
-            self.clock = Timestamp(now.0 - now.0 % nanoseconds(TICK));
+    pub(super) fn advance(&mut self, now: ModelTime) {
+        if self.clock == ModelTime::ZERO || now - self.clock > JUMP {
+            self.clock = now.round_down(TICK);
             self.tick(self.clock);
         }
         while now - self.clock >= TICK {
@@ -41,7 +41,7 @@ impl Observer {
     /// a lease ends.
     #[must_use]
     pub fn next_decision(&self) -> Timestamp {
-        let second = Timestamp(self.clock.0 - self.clock.0 % SECOND + SECOND);
+        let second = ModelTime::of_second(self.clock.whole_seconds() + 1);
         let second = self.wall_clock.wall_time(second);
         self.next_expiry().map_or(second, |end| end.min(second))
     }
@@ -51,8 +51,7 @@ impl Observer {
     #[must_use]
     pub fn next_expiry(&self) -> Option<Timestamp> {
         let end = self.discovery.next_expiry()?;
-        let tick = nanoseconds(TICK);
-        let end = Timestamp(end.0.div_ceil(tick).saturating_mul(tick));
+        let end = end.round_up(TICK);
         Some(self.wall_clock.wall_time(end.max(self.clock + TICK)))
     }
 
@@ -121,7 +120,7 @@ impl Observer {
         });
     }
 
-    pub(super) fn tick(&mut self, now: Timestamp) {
+    pub(super) fn tick(&mut self, now: ModelTime) {
         self.discovery.advance(now, &mut self.journal);
         self.follow_up(now);
         let graph = graph!(self);
@@ -136,7 +135,7 @@ impl Observer {
         for writer in self.payloads.unsettled() {
             self.turn(writer, now);
         }
-        if now.0.is_multiple_of(SECOND) {
+        if now.nanoseconds().is_multiple_of(SECOND) {
             self.payloads.expire(now);
             for writer in self.latched.advance(now) {
                 self.apply_again(writer, now);
@@ -164,7 +163,7 @@ impl Observer {
         }
     }
 
-    pub(super) fn examine(&mut self, now: Timestamp) {
+    pub(super) fn examine(&mut self, now: ModelTime) {
         let before = Arc::clone(self.examiner.current());
         self.examiner.examine(
             &self.discovery,
@@ -191,7 +190,7 @@ impl Observer {
     }
 
     /// Evaluates every watched topic under every entry that covers it.
-    pub(super) fn judge(&mut self, now: Timestamp) {
+    pub(super) fn judge(&mut self, now: ModelTime) {
         for id in self.topics.ids() {
             let Some(topic) = self.topics.get(id) else {
                 continue;
@@ -247,11 +246,12 @@ impl Observer {
                 Some(_) => &|_| Duration::ZERO,
                 None => &seeming_silence,
             };
+            let last_message = last_message.max(retired).max(seen_inside);
             let evidence = Evidence {
                 now,
                 publishers: topic.writers.len().max(publishers),
                 subscriptions: topic.readers.len().max(subscriptions),
-                last_message: last_message.max(retired).max(seen_inside),
+                last_message,
                 seeming_silence,
                 since: topic.published,
                 observed: topic.published.max(topic.subscribed).max(self.view_began),
@@ -281,7 +281,7 @@ impl Observer {
                         domain_id,
                         topic: name.bounded(TEXT),
                         watch: bounded(&watch.pattern).into(),
-                        last_message: evidence.last_message,
+                        last_message: last_message.map(|at| self.wall_clock.wall_time(at)),
                     };
                     self.journal.events.push(now, kind);
                 }

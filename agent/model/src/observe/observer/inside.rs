@@ -1,21 +1,20 @@
 //! Figures from inside processes: their topics, and whether the network or they decide the counts.
 
-use ros2probe_wire::Timestamp;
-
 use super::Observer;
 use crate::derive::inside::source::Seen;
 use crate::facts::calls::report::Report;
 use crate::facts::event::EventKind;
+use crate::facts::model_time::ModelTime;
 use crate::facts::topic_kind::TopicKind;
 use crate::measure::topic::{TopicId, Watched};
 
 impl Observer {
     /// Takes a report about calls inside processes.
-    pub(super) fn report_inside(&mut self, mut report: Report) {
+    pub(super) fn report_inside(&mut self, report: Report) {
         let clock = self.wall_clock;
-        report.convert(|time| clock.model_time(time));
-        let at = report.at;
-        let transitions = self.inside.report(report, &self.discovery, &self.receivers);
+        let at = clock.model_time(report.at);
+        let (discovery, receivers) = (&self.discovery, &self.receivers);
+        let transitions = self.inside.report(report, clock, discovery, receivers);
         for state in transitions {
             let events = &mut self.journal.events;
             events.push(state.at, EventKind::Lifecycle(state));
@@ -24,7 +23,7 @@ impl Observer {
     }
 
     /// Lists the topics of observed processes, and chooses the source of their counts.
-    pub(super) fn settle_inside(&mut self, now: Timestamp) {
+    pub(super) fn settle_inside(&mut self, now: ModelTime) {
         let mut changed = Vec::new();
         let (topics, limit) = (&mut self.topics, self.settings.endpoints);
         for (domain_id, naming, is_live, id) in self.inside.topics() {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::qos::{Durability, Reliability};
 use ros2probe_wire::record::Verdict;
-use ros2probe_wire::{Guid, RtpsDuration, SequenceNumber, Timestamp};
+use ros2probe_wire::{Guid, RtpsDuration, SequenceNumber};
 
 use super::MAX_MATCHES_PER_ROUND;
 use super::Observer;
@@ -13,6 +13,7 @@ use super::graph;
 use crate::derive::trace::share::Share;
 use crate::facts::dispatch::{self, Offered};
 use crate::facts::header::begins_with_header;
+use crate::facts::model_time::ModelTime;
 use crate::facts::selection::SampleRequest;
 use crate::facts::topic_kind::TopicKind;
 use crate::facts::watch::{Retain, Watch, Watchlist};
@@ -82,7 +83,7 @@ impl Observer {
     }
 
     /// Applies the lists to a topic and its endpoints.
-    pub(super) fn apply_lists(&mut self, id: TopicId, now: Timestamp) {
+    pub(super) fn apply_lists(&mut self, id: TopicId, now: ModelTime) {
         let is_needed = self.topics.get(id).is_some_and(|topic| {
             let dds_name = &topic.naming.dds_name;
             self.chains.needs(topic.domain_id, dds_name)
@@ -102,7 +103,7 @@ impl Observer {
     }
 
     /// Applies the decision about a topic to its endpoints.
-    fn apply_all(&mut self, id: TopicId, now: Timestamp) {
+    fn apply_all(&mut self, id: TopicId, now: ModelTime) {
         let Some(topic) = self.topics.get(id) else {
             return;
         };
@@ -114,7 +115,7 @@ impl Observer {
     }
 
     /// Applies the decision about a topic to one endpoint.
-    pub(super) fn apply(&mut self, id: TopicId, guid: Guid, now: Timestamp) {
+    pub(super) fn apply(&mut self, id: TopicId, guid: Guid, now: ModelTime) {
         let Some(topic) = self.topics.get(id) else {
             return;
         };
@@ -165,7 +166,7 @@ impl Observer {
     }
 
     /// Applies the decision about its topic to a writer whose last message is kept.
-    pub(super) fn apply_again(&mut self, writer: Guid, now: Timestamp) {
+    pub(super) fn apply_again(&mut self, writer: Guid, now: ModelTime) {
         let endpoint = self.discovery.endpoints().get(&writer);
         let id = endpoint.and_then(|endpoint| {
             let naming = endpoint.naming()?;
@@ -206,7 +207,7 @@ impl Observer {
     }
 
     /// Stops measuring this writer; its topic keeps the counts.
-    pub(super) fn retire(&mut self, guid: Guid, now: Timestamp) {
+    pub(super) fn retire(&mut self, guid: Guid, now: ModelTime) {
         let graph = graph!(self);
         let Some(retired) = self.profiler.stop(guid, now, &mut self.journal, graph) else {
             return;

@@ -10,6 +10,7 @@ use ros2probe_wire::{DomainId, EntityId, Guid, Timestamp};
 
 use super::Observer;
 use crate::facts::measurement::Measurement;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::{DdsName, NodeName};
 use crate::facts::watch::WatchState;
 use crate::graph::discovery::{Discovery, Endpoint, ParticipantProxy};
@@ -21,10 +22,12 @@ use crate::report::snapshot::{
 };
 use crate::report::transport::transports;
 
-pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
+pub(super) fn snapshot(observer: &Observer, wall_time: Timestamp) -> Snapshot {
+    let now = observer.wall_clock.model_time(wall_time);
     let nodes = nodes_of_endpoints(&observer.discovery);
     Snapshot {
         at: now,
+        wall_clock: observer.wall_clock,
         participants: participants(observer),
         nodes: node_facts(&observer.discovery),
         topics: observer
@@ -39,7 +42,7 @@ pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
         actions: observer.services.action_facts(),
         inside: observer.inside.facts().map(Arc::new),
         zenoh: observer.zenoh.is_used().then(|| observer.zenoh.facts()),
-        chains: observer.chains.facts(observer.wall_clock.wall_time(now)),
+        chains: observer.chains.facts(wall_time),
         diagnoses: Arc::clone(observer.examiner.current()),
         diagnosed: Arc::clone(observer.examiner.since()),
         churn: observer.discovery.churn.facts(),
@@ -119,7 +122,7 @@ fn topic(
     observer: &Observer,
     topic: &Topic,
     nodes: &HashMap<Guid, &NodeName>,
-    now: Timestamp,
+    now: ModelTime,
 ) -> TopicFacts {
     let endpoint = |guid: &Guid| {
         let endpoint = observer.discovery.endpoints().get(guid)?;
@@ -196,7 +199,7 @@ fn topic(
 /// Returns all counts of each measured topic.
 pub(super) fn measured(
     observer: &Observer,
-    now: Timestamp,
+    now: ModelTime,
 ) -> impl Iterator<Item = (DomainId, &DdsName, Measurement)> {
     let topics = observer.topics.iter().map(|(_, topic)| topic);
     let topics = topics.filter(|topic| topic.watched == Watched::Yes);
@@ -217,7 +220,7 @@ pub(super) fn measured(
 
 /// Returns the counts of vanished writers and of buffer topics; `None` for a topic that is not
 /// measured.
-fn apart(observer: &Observer, topic: &Topic, now: Timestamp) -> Option<Box<Measurement>> {
+fn apart(observer: &Observer, topic: &Topic, now: ModelTime) -> Option<Box<Measurement>> {
     let mut sum = topic.retired.clone()?;
     for guid in &topic.buffer_endpoints {
         if let Some(buffer_endpoints) = observer.profiler.get(*guid) {
@@ -255,7 +258,7 @@ fn endpoint_facts(
     }
 }
 
-fn unknown_writers(observer: &Observer, now: Timestamp) -> Vec<UnknownWriterFacts> {
+fn unknown_writers(observer: &Observer, now: ModelTime) -> Vec<UnknownWriterFacts> {
     let unknown_writers = observer
         .profiler
         .iter()

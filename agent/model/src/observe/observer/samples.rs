@@ -3,7 +3,6 @@
 use std::sync::Arc;
 
 use ros2probe_wire::record::Sample;
-use ros2probe_wire::walk::Found;
 use ros2probe_wire::{Guid, Record, SequenceNumber, Timestamp};
 
 use ros2probe_wire::names::DdsTopic;
@@ -11,6 +10,7 @@ use ros2probe_wire::names::DdsTopic;
 use super::Observer;
 use super::graph;
 use crate::facts::dispatch::{self, Dispatch, SampleOutcome};
+use crate::facts::model_time::ModelTime;
 use crate::facts::naming::Naming;
 use crate::facts::selection::SampleRequest;
 use crate::measure::profiler::{Measured, UNDELIVERED};
@@ -72,11 +72,11 @@ impl Observer {
     }
 
     /// Dispatches a retransmitted sample that was first counted before its writer's announcement.
-    pub(super) fn came_again(&mut self, writer: Guid, record: &Record) {
+    pub(super) fn came_again(&mut self, writer: Guid, record: &Record, at: ModelTime) {
         let Some(sample) = record.sample() else {
             return;
         };
-        let (number, at) = (sample.sequence_number(), Timestamp(record.time));
+        let number = sample.sequence_number();
         let stamp = match sample {
             Sample::Data(_) => sample.header_stamp(),
             Sample::DataFrag(_) => None,
@@ -105,7 +105,7 @@ impl Observer {
     }
 
     /// Dispatches the samples of this writer whose turn has come.
-    pub(super) fn turn(&mut self, writer: Guid, now: Timestamp) {
+    pub(super) fn turn(&mut self, writer: Guid, now: ModelTime) {
         let progress = self.profiler.progress(writer, now, graph!(self));
         if let Some(progress) = progress {
             let skip = self.payloads.turn(writer, &progress, now);
@@ -119,31 +119,22 @@ impl Observer {
         }
     }
 
-    /// Keeps the payload of a requested sample that is not counted yet.
-    pub(super) fn keep(&mut self, found: &Found<'_>) {
-        self.keep_payload(&found.record, found.payload);
-    }
-
     /// Keeps the payload of a record that is not counted yet, if it is requested.
-    pub(super) fn keep_payload(&mut self, record: &Record, payload: &[u8]) {
+    pub(super) fn keep_payload(&mut self, record: &Record, at: ModelTime, payload: &[u8]) {
         let writer = record.writer();
         if self.payloads.wants_bytes(writer) {
-            let moved = self.wall_clock.model_record(record);
-            let record = moved.as_ref().unwrap_or(record);
             let known = self.profiler.get(writer);
             let Some(sample) = record.sample() else {
                 return;
             };
             let lacks = self.payloads.lacks(writer, sample.sequence_number());
-            if lacks || known.is_some_and(|known| !known.writer.has(sample)) {
-                self.payloads.keep(sample, payload);
+            if lacks || known.is_some_and(|known| !known.writer.has(sample, at)) {
+                self.payloads.keep(sample, at, payload);
             }
         } else if self.latched.verdict(writer).is_some() {
-            let moved = self.wall_clock.model_record(record);
-            let record = moved.as_ref().unwrap_or(record);
             let sample = record.sample();
-            if sample.is_some_and(|sample| self.latched.put(sample, payload)) {
-                self.apply_again(writer, Timestamp(record.time));
+            if sample.is_some_and(|sample| self.latched.put(sample, at, payload)) {
+                self.apply_again(writer, at);
             }
         }
     }
@@ -152,7 +143,8 @@ impl Observer {
     pub(super) fn keep_dispatched(&mut self, samples: &[Dispatch]) {
         for each in samples {
             if let SampleOutcome::Sample(sample) = &each.outcome {
-                self.latched.dispatched(sample);
+                let at = self.wall_clock.model_time(sample.time);
+                self.latched.dispatched(sample, at);
             }
         }
     }
@@ -167,19 +159,21 @@ impl Observer {
                 .is_ok_and(|name| request.covers(topic.domain_id, &Naming::of(&name)))
         };
         let mut samples = self.latched.samples();
-        samples.retain(|sample| {
+        samples.retain(|(at, sample)| {
             let number = sample.sequence_number;
-            let is_recent = sample.time >= self.requests_changed;
+            let is_recent = *at >= self.requests_changed;
             let writer = sample.writer;
             covers(sample) && (self.payloads).give_before(writer, (request.id, number), is_recent)
         });
-        for sample in &mut samples {
-            if self.wall_clock.is_set() {
-                let time = self.wall_clock.wall_time(sample.time);
-                Arc::make_mut(sample).time = time;
+        let samples = samples.into_iter().map(|(at, mut sample)| {
+            let time = self.wall_clock.wall_time(at);
+            // The clock may have been set since the message came.
+            if sample.time != time {
+                Arc::make_mut(&mut sample).time = time;
             }
-        }
-        samples
+            sample
+        });
+        samples.collect()
     }
 
     /// Returns the bytes of the kept last messages.

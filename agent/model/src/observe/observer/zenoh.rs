@@ -8,6 +8,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, RtpsTime, SequenceNumbe
 
 use super::Observer;
 use crate::derive::services::service::CallId;
+use crate::facts::model_time::ModelTime;
 use crate::graph::discovery::{Origin, Priority};
 use crate::graph::zenoh::{
     GraphChange, Holder, Shown, StreamId, StreamReport, ZenohSample, unknown_guid,
@@ -20,26 +21,24 @@ impl Observer {
     pub(super) fn zenoh_report(&mut self, report: &StreamReport<'_>) {
         // The state is apart while it calls back.
         let mut zenoh = std::mem::take(&mut self.zenoh);
+        let (time, at) = (report.time, self.wall_clock.model_time(report.time));
         let mut alive = None;
         let wants_bytes = self.payloads.wants_any_bytes() || self.latched.is_used();
         // A sample may precede its announcement in a batch, as that of an unknown writer.
-        zenoh.report(report, wants_bytes, &mut |shown| match shown {
-            Shown::Sample(sample) => self.zenoh_sample(report.stream, report.time, sample),
+        zenoh.report(report, at, wants_bytes, &mut |shown| match shown {
+            Shown::Sample(sample) => self.zenoh_sample(report.stream, (time, at), sample),
             Shown::Owner(socket, prefix) => self.receivers.sends(socket, prefix),
             Shown::Disowned(socket, prefix) => self.receivers.sends_no_longer(socket, prefix),
             Shown::Alive(session) => alive = Some(session),
             Shown::Relayed(session) => {
-                let at = self.wall_clock.model_time(report.time);
                 self.discovery
                     .seen(session.guid_prefix(), at, Priority::NOTHING);
             }
             Shown::Missed(destination) => {
-                let at = self.wall_clock.model_time(report.time);
                 self.profiler.missed(destination, at);
             }
             Shown::Malformed(reason) => self.decode_error("zenoh", reason),
         });
-        let at = self.wall_clock.model_time(report.time);
         if let Some(session) = alive {
             let prefix = session.guid_prefix();
             match self.discovery.knows(prefix) {
@@ -83,8 +82,8 @@ impl Observer {
     }
 
     /// Ends the sessions of Zenoh that a router no longer reaches.
-    pub(super) fn end_unreachable_sessions(&mut self, now: Timestamp) {
-        self.zenoh.end_unreachable(self.wall_clock.wall_time(now));
+    pub(super) fn end_unreachable_sessions(&mut self, now: ModelTime) {
+        self.zenoh.end_unreachable(now);
         self.change_zenoh_graph(now);
     }
 
@@ -113,7 +112,7 @@ impl Observer {
     }
 
     /// Applies changes of the graph.
-    fn change_zenoh_graph(&mut self, at: Timestamp) {
+    fn change_zenoh_graph(&mut self, at: ModelTime) {
         let changes = self.zenoh.graph.take();
         if changes.is_empty() {
             return;
@@ -172,14 +171,18 @@ impl Observer {
     }
 
     /// Counts a sample, request or reply.
-    fn zenoh_sample(&mut self, stream: &StreamId, time: Timestamp, sample: &ZenohSample<'_>) {
-        let record = record(stream, time, sample);
+    fn zenoh_sample(
+        &mut self,
+        stream: &StreamId,
+        (time, at): (Timestamp, ModelTime),
+        sample: &ZenohSample<'_>,
+    ) {
+        let record = record(stream, (time, at), sample);
         if let Some((client, number)) = sample.call {
             let call = CallId {
                 client: client.0,
                 number,
             };
-            let at = self.wall_clock.model_time(time);
             let captured = sample.payload.captured;
             let is_over =
                 self.services
@@ -187,22 +190,27 @@ impl Observer {
             self.follow_call(record.writer(), is_over);
         }
         if let Some(payload) = sample.payload.whole() {
-            self.keep_payload(&record, payload);
+            self.keep_payload(&record, at, payload);
         }
-        self.count(&record);
+        self.count(&record, at);
         if stream.outgoing && stream.is_loopback() {
             // Nothing is read at the receiver's socket: TCP brings it what was sent.
-            self.count(&Record {
+            let arriving = Record {
                 flags: record.flags & !flag::OUTGOING,
                 socket: sample.receiving_socket,
                 ..record
-            });
+            };
+            self.count(&arriving, at);
         }
     }
 }
 
 /// Returns the record of a sample that has arrived whole.
-fn record(stream: &StreamId, time: Timestamp, sample: &ZenohSample<'_>) -> Record {
+fn record(
+    stream: &StreamId,
+    (time, at): (Timestamp, ModelTime),
+    sample: &ZenohSample<'_>,
+) -> Record {
     let mut flags = flag::STREAM;
     for (is_set, bit) in [
         (sample.is_relayed, flag::RELAYED),
@@ -231,7 +239,7 @@ fn record(stream: &StreamId, time: Timestamp, sample: &ZenohSample<'_>) -> Recor
         EntityId::UNKNOWN,
     );
     let flow = stream.flow;
-    let elapsed = time.0.saturating_sub(sample.began.0);
+    let elapsed = (at - sample.began).as_nanos();
     Record {
         time: time.0,
         writer: guid_words(sample.writer),

@@ -5,9 +5,10 @@ use std::fmt;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::Guid;
 
 use crate::facts::measurement::Delivered;
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::NodeName;
 use crate::facts::route::Direction;
 
@@ -37,9 +38,9 @@ pub struct DeliveryFacts {
     /// Control group of that socket, as a path below the root.
     pub cgroup: Option<Arc<str>>,
     /// Time of the first record.
-    pub first_seen: Timestamp,
+    pub first_seen: ModelTime,
     /// Time of the last record.
-    pub last_seen: Timestamp,
+    pub last_seen: ModelTime,
     /// Fate of the samples.
     pub delivered: Delivered,
     /// Delivered samples that the process never took from the queue of its subscription; `None` if

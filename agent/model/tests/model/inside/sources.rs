@@ -157,9 +157,12 @@ fn times_follow_a_clock_that_is_set() {
     let reports = report(&world, 9);
     let at = world.now;
     world.second(reports);
-    let topic = world.topic("/scan");
-    assert_eq!(topic.measurement.unwrap().last_message, Some(Timestamp(at)));
-    let facts = world.snapshot().inside.unwrap();
-    assert_eq!(facts.publishers[0].last, Timestamp(at));
-    assert_eq!(facts.at, Timestamp(at + 500 * MILLISECOND));
+    let snapshot = world.snapshot();
+    let last = world.topic("/scan").measurement.unwrap().last_message;
+    assert_eq!(snapshot.wall_time(last.unwrap()), Timestamp(at));
+    let facts = snapshot.inside.as_deref().unwrap();
+    let last = facts.publishers[0].last;
+    assert_eq!(snapshot.wall_time(last), Timestamp(at));
+    let reported = Timestamp(at + 500 * MILLISECOND);
+    assert_eq!(snapshot.wall_time(facts.at), reported);
 }

@@ -18,7 +18,7 @@ fn a_topic_within_one_process_is_not_0_hz_and_silent_while_it_runs() {
     let topic = world.topic("/inner");
     assert!(topic.measurement.is_some());
     assert_eq!((topic.rate_hz(), topic.bandwidth()), (None, None));
-    assert!(!topic.is_silent(Timestamp(world.now)));
+    assert!(!topic.is_silent(world.snapshot().at));
     // Calls show the rate, but no sizes.
     for second in 1..=12 {
         let mut report = process(70);
@@ -43,7 +43,7 @@ fn an_event_without_an_expectation_is_not_silent_and_a_stream_that_stops_is() {
         host.wait(then);
         let topic = host.topic();
         assert_eq!(topic.rate_hz(), Some(0.0));
-        topic.is_silent(Timestamp(host.now))
+        topic.is_silent(host.snapshot().at)
     };
     assert!(!run(0, 100, 60_000), "it was never sent");
     assert!(!run(3, 2_000, 60_000), "a few transitions of a node");

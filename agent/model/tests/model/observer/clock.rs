@@ -27,9 +27,9 @@ fn a_clock_that_is_set_an_hour_forward_or_back_ends_no_lease_and_delays_none() {
         // A gap settles after ten seconds, as without the step.
         world.stream(alice(WRITER), 702..=1000);
         let snapshot = world.snapshot();
-        assert_eq!(snapshot.at.0, world.now);
+        assert_eq!(snapshot.time().0, world.now);
         let seen = &snapshot.participants[0];
-        let age = |time: Timestamp| Timestamp(world.now).nanoseconds_since(time);
+        let age = |at| Timestamp(world.now).nanoseconds_since(snapshot.wall_time(at));
         assert_eq!(age(seen.first_seen), 9_990 * MILLISECOND.cast_signed());
         assert_eq!(age(seen.last_seen), 10 * MILLISECOND.cast_signed());
         let chatter = world.measurement("/chatter");

@@ -138,7 +138,7 @@ fn a_killed_participant_is_removed_with_its_endpoints_when_its_lease_ends() {
             .iter()
             .find(|event| event.event == "expired")
             .unwrap();
-        assert_eq!(expired.at.0, last + u64::from(lease) * SECOND);
+        assert_eq!(expired.at.nanoseconds(), last + u64::from(lease) * SECOND);
         let cascaded: Vec<_> = events
             .iter()
             .filter(|event| event.event == "cascaded")

@@ -185,7 +185,7 @@ fn of_graph(all: &Circumstances<'_>) -> Vec<Finding> {
         .chain(std::iter::repeat(None));
     let found = list.zip(times).map(|(diagnosis, since)| {
         let mut finding = in_words(all, diagnosis, &ends);
-        finding.since = since.map(|since| since.seconds());
+        finding.since = since.map(|since| snapshot.wall_time(*since).seconds());
         if let Some(topic) = diagnosis.topic() {
             finding.domain_id = Some(topic.domain_id.0);
             finding.topic = all.ids.topic(topic.domain_id, &topic.dds_name);

@@ -84,7 +84,7 @@ impl SharedLines {
             lost: lost_lately(past),
         };
         self.update_rows(figures.rows(&self.ids));
-        self.at = snapshot.at.seconds();
+        self.at = snapshot.time().seconds();
         self.totals = totals(snapshot, past);
         self.progress = (state.agent.source == SourceKind::Replay)
             .then(|| Progress(state.agent.replayed, state.agent.finished.into()));

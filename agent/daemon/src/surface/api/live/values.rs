@@ -97,7 +97,7 @@ impl Figures<'_> {
             part(0),
             part(1),
             flags,
-            at.map(|at| thousandths(at.seconds())),
+            at.map(|at| thousandths(self.snapshot.wall_time(at).seconds())),
             Some(measured.loss.expected),
         )
     }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_model::report::snapshot::{
     EndpointFacts, NodeFacts, ParticipantFacts, Snapshot, TopicFacts,
@@ -32,7 +33,7 @@ fn endpoint(
         }),
         message_type: message_type.into(),
         type_hash: None,
-        first_seen: ros2probe_wire::Timestamp(1),
+        first_seen: ModelTime::ZERO,
         measurement: None,
         transports: 0,
         latched: None,

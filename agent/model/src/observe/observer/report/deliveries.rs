@@ -2,8 +2,9 @@
 
 use std::collections::{BTreeSet, HashMap};
 
-use ros2probe_wire::{EntityId, Guid, Timestamp};
+use ros2probe_wire::{EntityId, Guid};
 
+use crate::facts::model_time::ModelTime;
 use crate::facts::names::NodeName;
 use crate::facts::route::Direction;
 use crate::facts::route::Receiver;
@@ -128,7 +129,7 @@ pub(super) fn acknowledgements(
     observer: &Observer,
     topic: &Topic,
     nodes: &Nodes<'_>,
-    now: Timestamp,
+    now: ModelTime,
 ) -> Vec<AcknowledgementFacts> {
     let mut facts = Vec::new();
     for writer in &topic.writers {
