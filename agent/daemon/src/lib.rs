@@ -31,7 +31,6 @@ pub mod discover;
 pub mod escape;
 pub mod events;
 pub mod file;
-pub mod host_examination;
 mod latched;
 pub mod limit_facts;
 mod logging;

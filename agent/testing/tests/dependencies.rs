@@ -34,8 +34,12 @@ const ALLOWED: &[(&str, &[&str])] = &[
         ],
     ),
     // The package is called ros2probe. It reaches a running agent only through the API; the daemon
-    // composes a replay, listens for `rp discover` and examines this host for `rp doctor`.
-    ("cli", &["message", "bag", "api", "daemon"]),
+    // composes a replay and listens for `rp discover`. `rp doctor` examines this host with the code
+    // of the sources.
+    (
+        "cli",
+        &["attach", "capture", "message", "bag", "api", "daemon"],
+    ),
 ];
 
 /// Libraries that must not be in the model's tree: it has no I/O, no clock, no configuration.
