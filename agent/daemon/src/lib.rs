@@ -2,7 +2,6 @@
 //!
 //! - [`agent::run`] is the lifecycle of an agent. [`agent::Components`] composes one, live or
 //!   replayed.
-//! - [`replay_agent`] replays a capture within the process of a client.
 //! - [`bag_chains`] finds chains in a bag.
 //! - [`config`] reads the configuration, [`watches`] merges the watched topics.
 //! - [`run`] is the loop of the working thread, the only one that touches the model.
@@ -38,7 +37,6 @@ mod memory;
 pub mod missed_announcements;
 pub mod privilege;
 pub mod recording;
-pub mod replay_agent;
 pub mod run;
 mod series_name;
 pub mod settings_cell;

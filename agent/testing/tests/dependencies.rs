@@ -33,12 +33,14 @@ const ALLOWED: &[(&str, &[&str])] = &[
             "wire", "model", "attach", "capture", "message", "bag", "api", "page",
         ],
     ),
-    // The package is called ros2probe. It reaches a running agent only through the API; the daemon
-    // composes a replay and listens for `rp discover`. `rp doctor` examines this host with the code
-    // of the sources.
+    // The package is called ros2probe. It reaches a running agent only through the API. A replay
+    // composes an agent of its own from source and model; `rp doctor` examines this host with the
+    // code of the sources.
     (
         "cli",
-        &["attach", "capture", "message", "bag", "api", "daemon"],
+        &[
+            "wire", "model", "attach", "capture", "message", "bag", "api", "daemon",
+        ],
     ),
 ];
 
