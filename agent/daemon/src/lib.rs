@@ -2,7 +2,6 @@
 //!
 //! - [`agent::run`] is the lifecycle of an agent. [`agent::Components`] composes one, live or
 //!   replayed.
-//! - [`bag_chains`] finds chains in a bag.
 //! - [`config`] reads the configuration, [`watches`] merges the watched topics.
 //! - [`run`] is the loop of the working thread, the only one that touches the model.
 //! - [`snapshot_cell`] holds the latest snapshot, [`events`] the log of events, [`limit_facts`] the
@@ -22,7 +21,6 @@
 
 pub mod agent;
 pub mod agent_facts;
-pub mod bag_chains;
 pub mod broker;
 pub mod config;
 mod control;
