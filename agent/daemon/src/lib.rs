@@ -24,7 +24,6 @@ pub mod agent_facts;
 pub mod broker;
 pub mod config;
 mod control;
-pub mod discover;
 pub mod escape;
 pub mod events;
 pub mod file;

@@ -35,7 +35,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ),
     // The package is called ros2probe. It reaches a running agent only through the API. A replay
     // composes an agent of its own from source and model; `rp doctor` examines this host with the
-    // code of the sources.
+    // code of the sources; `rp discover` listens with them, and speaks RTPS and Zenoh itself.
     (
         "cli",
         &[
