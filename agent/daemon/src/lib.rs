@@ -21,7 +21,6 @@
 
 pub mod agent;
 pub mod agent_facts;
-pub mod broker;
 pub mod config;
 mod control;
 pub mod escape;
@@ -29,7 +28,7 @@ pub mod events;
 pub mod file;
 mod latched;
 pub mod limit_facts;
-mod logging;
+pub mod logging;
 mod memory;
 pub mod missed_announcements;
 pub mod privilege;
