@@ -1,6 +1,13 @@
-//! Declarations of the tables of commands: what participants and routers can fill, and how far.
+//! Declarations of the tables of commands: what agents, participants and routers can fill, and how
+//! far.
+
+use ros2probe_daemon::tables::DescribedWriters;
 
 ros2probe_model::tables! {
+    /// Topics that one stream of messages has described, in `rp`
+    StreamTopics { name: "samples.topics", entries: 65_536, effect: "described again by each message" }
+    /// Their writers
+    StreamWriters { name: "samples.writers", entries: DescribedWriters::CAP, effect: "described again by each message" }
     /// Announcements of one kind that `rp discover` receives from a participant
     ReceivedAnnouncements { name: "discover.received", entries: 4096 }
     /// Endpoints of this participant

@@ -28,10 +28,6 @@ ros2probe_model::tables! {
     QueueLosses { name: "queue.losses", entries: 1024, effect: "counted with the last one" }
     /// Events that one stream has read and not sent
     StreamEvents { name: "events.stream", entries: 65, effect: "read from the log later" }
-    /// Topics that one stream of messages has described, in `rp`
-    StreamTopics { name: "samples.topics", entries: 65_536, effect: "described again by each message" }
-    /// Their writers
-    StreamWriters { name: "samples.writers", entries: DescribedWriters::CAP, effect: "described again by each message" }
     /// Topics of one recording
     RecordedTopics { name: "recording.topics", entries: 2048, effect: "not recorded, and counted in the report" }
     /// Bytes of their names and types

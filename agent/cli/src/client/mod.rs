@@ -9,6 +9,7 @@
 
 mod compressed;
 mod error;
+mod line_reader;
 mod lines;
 mod replay_agent;
 mod samples;

@@ -7,12 +7,13 @@ use std::path::Path;
 /// Reasons, each behind `#`, and below it the files, or their fields, to which it applies.
 const EXCEPTIONS: &str = include_str!("plain_collections.txt");
 /// Sources that are read. Of the commands, those that read foreign bytes or this host themselves.
-const PLACES: [&str; 8] = [
+const PLACES: [&str; 9] = [
     "wire/src",
     "agent/model/src",
     "agent/capture/src",
     "agent/daemon/src",
     "agent/cli/src/chain/bag.rs",
+    "agent/cli/src/client/line_reader.rs",
     "agent/cli/src/client/replay_agent.rs",
     "agent/cli/src/discover",
     "agent/cli/src/doctor/cgroup.rs",
