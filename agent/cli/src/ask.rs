@@ -7,11 +7,11 @@ use std::io::{Write, stdout};
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, bail};
+use ros2probe::discover::announcements::Announcements;
+use ros2probe::discover::participants::{HeardParticipant, Listening, listen};
+use ros2probe::discover::session::{MOST_PACKETS, Session, Target};
+use ros2probe::discover::{converse, local_participant};
 use ros2probe_daemon::agent::configuration;
-use ros2probe_daemon::discover::announcements::Announcements;
-use ros2probe_daemon::discover::participants::{HeardParticipant, Listening, listen};
-use ros2probe_daemon::discover::session::{MOST_PACKETS, Session, Target};
-use ros2probe_daemon::discover::{converse, local_participant};
 
 use crate::cli::Discover;
 

@@ -1,4 +1,6 @@
-//! Text of `rp chain`: each chain with a line for each hop.
+//! Text of `rp chain`: each chain with a line for each hop. [`bag`] finds the chains of a bag.
+
+pub mod bag;
 
 use std::fmt::Write as _;
 

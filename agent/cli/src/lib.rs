@@ -3,6 +3,7 @@
 //! - [`client`] reaches an agent at a socket or an address, or replays a capture in this process.
 //! - [`ros2`] formats answers as `ros2 topic`, `ros2 node`, `ros2 bag info` and others do.
 //! - [`learn`] chooses expectations from what a healthy robot does.
+//! - [`discover`] requests announcements from running participants and routers.
 //! - [`inside`] formats what processes show from inside.
 //! - [`top`] is the screen of `rp top`, [`doctor`] the checks of `rp doctor`.
 //!
@@ -18,8 +19,10 @@
 
 pub mod chain;
 pub mod client;
+pub mod discover;
 pub mod doctor;
 pub mod inside;
 pub mod learn;
 pub mod ros2;
+pub mod tables;
 pub mod top;

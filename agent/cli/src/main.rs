@@ -3,6 +3,7 @@
 #![forbid(unsafe_code)]
 
 mod ask;
+mod broker;
 mod cli;
 
 use std::io::Write as _;
@@ -11,8 +12,8 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::Parser as _;
+use ros2probe_attach::client::declare_command;
 use ros2probe_daemon::agent;
-use ros2probe_daemon::broker;
 use ros2probe_daemon::config::{Config, ConfigError};
 use ros2probe_daemon::escape::visible_lines;
 use ros2probe_daemon::privilege::{CapabilitiesRemain, ConfineError, Missing};
@@ -27,7 +28,7 @@ const BAD_CONFIG: u8 = 78;
 const BROKEN_PIPE: u8 = 141;
 
 fn main() -> ExitCode {
-    broker::declare_command();
+    declare_command();
     let done = |done: Result<()>| done.map(|()| ExitCode::SUCCESS);
     let ended = match Arguments::parse().command {
         None => cli::help(&[]),

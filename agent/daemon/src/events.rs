@@ -32,7 +32,7 @@ pub use record::{AgentEvent, Record, Value};
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::event::{Class, Taken};
 pub use self_monitor::{DropMonitor, SourceMonitor};
-pub use table::{Definition, EVENTS, Severity, markdown};
+pub use table::{Definition, EVENTS, Severity};
 pub use trigger::Trigger;
 
 /// Most events of one name per second.

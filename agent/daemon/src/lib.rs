@@ -2,8 +2,6 @@
 //!
 //! - [`agent::run`] is the lifecycle of an agent. [`agent::Components`] composes one, live or
 //!   replayed.
-//! - [`replay_agent`] replays a capture within the process of a client.
-//! - [`bag_chains`] finds chains in a bag.
 //! - [`config`] reads the configuration, [`watches`] merges the watched topics.
 //! - [`run`] is the loop of the working thread, the only one that touches the model.
 //! - [`snapshot_cell`] holds the latest snapshot, [`events`] the log of events, [`limit_facts`] the
@@ -23,23 +21,18 @@
 
 pub mod agent;
 pub mod agent_facts;
-pub mod bag_chains;
-pub mod broker;
 pub mod config;
 mod control;
-pub mod discover;
 pub mod escape;
 pub mod events;
 pub mod file;
-pub mod host_examination;
 mod latched;
 pub mod limit_facts;
-mod logging;
+pub mod logging;
 mod memory;
 pub mod missed_announcements;
 pub mod privilege;
 pub mod recording;
-pub mod replay_agent;
 pub mod run;
 mod series_name;
 pub mod settings_cell;

@@ -14,9 +14,9 @@ use tracing_subscriber::layer::SubscriberExt as _;
 use tracing_subscriber::util::SubscriberInitExt as _;
 use tracing_subscriber::{Layer as _, Registry, fmt, reload};
 
-/// Log whose level can change at run time.
+/// Log whose level can change at run time. It stays started after it is dropped.
 #[derive(Debug)]
-pub(crate) struct Log {
+pub struct Log {
     level: reload::Handle<EnvFilter, Registry>,
     /// Whether `RUST_LOG` is set, which then takes precedence.
     fixed: bool,
@@ -26,8 +26,9 @@ pub(crate) struct Log {
 
 impl Log {
     /// Starts logging at `level`, or as `RUST_LOG` sets. Lines of the level `exported` are queued for
-    /// export.
-    pub(crate) fn start(level: Level, exported: Option<Level>) -> Self {
+    /// export. A process has one log: the first one that is started.
+    #[must_use]
+    pub fn start(level: Level, exported: Option<Level>) -> Self {
         let fixed = EnvFilter::try_from_default_env().ok();
         let (filter, handle) = reload::Layer::new(fixed.clone().unwrap_or_else(|| filter(level)));
         // The journal adds its own timestamps.

@@ -28,10 +28,6 @@ ros2probe_model::tables! {
     QueueLosses { name: "queue.losses", entries: 1024, effect: "counted with the last one" }
     /// Events that one stream has read and not sent
     StreamEvents { name: "events.stream", entries: 65, effect: "read from the log later" }
-    /// Topics that one stream of messages has described, in `rp`
-    StreamTopics { name: "samples.topics", entries: 65_536, effect: "described again by each message" }
-    /// Their writers
-    StreamWriters { name: "samples.writers", entries: DescribedWriters::CAP, effect: "described again by each message" }
     /// Topics of one recording
     RecordedTopics { name: "recording.topics", entries: 2048, effect: "not recorded, and counted in the report" }
     /// Bytes of their names and types
@@ -48,18 +44,6 @@ ros2probe_model::tables! {
     ViewerSubscriptions { name: "foxglove.subscriptions", entries: 4096, effect: "closed with 1008" }
     /// Topics that one viewer's status of losses counts apart
     ViewerLosses { name: "foxglove.losses", entries: 64, effect: "only in the sum" }
-    /// Announcements of one kind that `rp discover` receives from a participant
-    ReceivedAnnouncements { name: "discover.received", entries: 4096 }
-    /// Endpoints of this participant
-    DiscoveredEndpoints { name: "discover.endpoints", entries: 2 * ReceivedAnnouncements::CAP }
-    /// Announcements of this participant with missing fragments
-    PartialAnnouncements { name: "discover.partial", entries: 8 }
-    /// Writers of user data of this participant
-    UserWriters { name: "discover.writers", entries: 256 }
-    /// Liveliness tokens of a router (`rp discover --router`)
-    RouterTokens {
-        name: "discover.tokens", entries: 65_536, effect: "a part is printed, and exit code 1", reported: "error",
-    }
 }
 
 #[cfg(test)]

@@ -33,9 +33,15 @@ const ALLOWED: &[(&str, &[&str])] = &[
             "wire", "model", "attach", "capture", "message", "bag", "api", "page",
         ],
     ),
-    // The package is called ros2probe. It reaches a running agent only through the API; the daemon
-    // composes a replay, listens for `rp discover` and examines this host for `rp doctor`.
-    ("cli", &["message", "bag", "api", "daemon"]),
+    // The package is called ros2probe. It reaches a running agent only through the API. A replay
+    // composes an agent of its own from source and model; `rp doctor` examines this host with the
+    // code of the sources; `rp discover` listens with them, and speaks RTPS and Zenoh itself.
+    (
+        "cli",
+        &[
+            "wire", "model", "attach", "capture", "message", "bag", "api", "daemon",
+        ],
+    ),
 ];
 
 /// Libraries that must not be in the model's tree: it has no I/O, no clock, no configuration.

@@ -5,11 +5,11 @@ use std::io::{Write, stdout};
 use std::path::Path;
 
 use anyhow::{Result, bail};
+use ros2probe::discover::zenoh::address::RouterAddress;
+use ros2probe::discover::zenoh::graph::{DomainGraph, EndpointKind};
+use ros2probe::discover::zenoh::session::Step;
+use ros2probe::discover::zenoh::{Answer, connect, converse, plan};
 use ros2probe_daemon::agent::configuration;
-use ros2probe_daemon::discover::zenoh::address::RouterAddress;
-use ros2probe_daemon::discover::zenoh::graph::{DomainGraph, EndpointKind};
-use ros2probe_daemon::discover::zenoh::session::Step;
-use ros2probe_daemon::discover::zenoh::{Answer, connect, converse, plan};
 use ros2probe_daemon::privilege::{Role, give_up};
 
 use crate::cli::Discover;

@@ -4,7 +4,8 @@ use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::Args;
-use ros2probe_daemon::broker;
+
+use crate::broker;
 
 /// Options of `rp attach`.
 #[derive(Debug, Args)]

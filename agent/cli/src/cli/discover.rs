@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use ros2probe_daemon::discover::zenoh::address::RouterAddress;
-use ros2probe_daemon::discover::{GuidPrefix, participants};
+use ros2probe::discover::zenoh::address::RouterAddress;
+use ros2probe::discover::{GuidPrefix, participants};
 
 #[derive(Debug, Args)]
 #[command(after_help = "\

@@ -4,6 +4,7 @@
 mod graph_cache;
 mod keys;
 mod output;
+mod shortfalls;
 mod signals;
 
 use std::collections::BTreeMap;

@@ -9,7 +9,9 @@
 
 mod compressed;
 mod error;
+mod line_reader;
 mod lines;
+mod replay_agent;
 mod samples;
 mod target;
 mod transport;
@@ -30,13 +32,14 @@ use tokio::time::timeout;
 use ros2probe_api::problem::Code;
 use ros2probe_daemon::agent::Speed;
 use ros2probe_daemon::escape::visible;
-use ros2probe_daemon::replay_agent::Pace;
 use ros2probe_daemon::run::CaptureTime;
+
+use replay_agent::Pace;
 
 pub use compressed::Compressed;
 pub use error::{ClientError, Refusal};
 pub use lines::{Lines, Next};
-pub use ros2probe_daemon::replay_agent::Outcome;
+pub use replay_agent::Outcome;
 pub use samples::Samples;
 pub use target::{InvalidEnvironment, Target};
 use transport::Transport;

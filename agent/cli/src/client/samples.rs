@@ -4,10 +4,10 @@ use std::time::Duration;
 
 use bytes::Bytes;
 
+use super::line_reader::LineReader;
 use super::{Agent, ClientError, Lines, Next};
 use ros2probe_api::samples::{Line, Open};
 use ros2probe_daemon::subscriptions::NextItem;
-use ros2probe_daemon::subscriptions::line_reader::LineReader;
 
 /// Open stream of messages. Dropping it closes the stream.
 #[derive(Debug)]

@@ -18,8 +18,8 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpStream, UnixStream};
 use tokio::time::timeout;
 
+use super::replay_agent::{Outcome, Pace, ReplayAgent, ReplayError, ReplayOptions};
 use super::{ClientError, Target};
-use ros2probe_daemon::replay_agent::{Outcome, Pace, ReplayAgent, ReplayError, ReplayOptions};
 use ros2probe_daemon::run::CaptureTime;
 
 /// The agent's socket, as created by the package and the service manager.

@@ -105,7 +105,7 @@ fn milliseconds(microseconds: i64) -> String {
 mod tests {
     use super::super::host_state::tests::host;
     use super::*;
-    use ros2probe_daemon::host_examination::ClockState;
+    use ros2probe_capture::system::ClockState;
 
     fn found(clock: Result<ClockState, String>) -> Finding {
         let (_directory, mut host) =

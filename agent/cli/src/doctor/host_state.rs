@@ -9,7 +9,7 @@ use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use ros2probe_daemon::host_examination::{ClockState, clock};
+use ros2probe_capture::system::{ClockState, clock_state};
 use rustix::param::page_size;
 use rustix::process::{Gid, getegid, geteuid, getgroups};
 use rustix::thread::{CapabilitySet, capabilities};
@@ -70,7 +70,7 @@ impl HostState {
             user_id: geteuid().as_raw(),
             group_ids: group_ids(),
             environment: environment(),
-            clock: clock(),
+            clock: clock_state().map_err(|error| error.to_string()),
         }
     }
 

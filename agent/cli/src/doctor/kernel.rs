@@ -3,9 +3,9 @@
 
 use std::path::Path;
 
+use super::cgroup::CgroupHierarchy;
 use super::finding::{Area, Finding, Severity};
 use super::host_state::{HostState, Unread};
-use ros2probe_daemon::host_examination::CgroupHierarchy;
 
 const AREA: Area = Area::Kernel;
 const RELEASE: &str = "/proc/sys/kernel/osrelease";

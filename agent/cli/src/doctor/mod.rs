@@ -7,6 +7,7 @@
 pub mod agent;
 pub mod answers;
 pub mod buffers;
+pub mod cgroup;
 pub mod clock;
 pub mod finding;
 pub mod graph;
@@ -29,8 +30,8 @@ use finding::Finding;
 use host_state::HostState;
 use processes::Processes;
 use report::Report;
+use ros2probe_capture::error_chain::in_words;
 use ros2probe_daemon::config::{CaptureSettings, Config, ExactChoice, InsideChoice};
-use ros2probe_daemon::host_examination::error_in_words;
 use ros2probe_daemon::privilege;
 use ros2probe_daemon::run;
 use variables::{Range, Variables};
@@ -127,7 +128,7 @@ fn tried(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
     settings.inside = InsideChoice::Off;
     match run::probe(&settings) {
         Ok(facts) => visibility::check(&Visibility::of_trial(facts)),
-        Err(error) => visibility::failed(&error_in_words(&error)),
+        Err(error) => visibility::failed(&in_words(&error)),
     }
 }
 

@@ -1,10 +1,11 @@
 //! Checks of permissions: those of this process, of the running agent and of the service, with the
-//! command that grants missing ones. `crate::privilege` defines the required capabilities.
+//! command that grants missing ones. `ros2probe_daemon::privilege` defines the required capabilities.
 
 use super::answers::Answers;
 use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
 use ros2probe_api::health::Health;
+use ros2probe_capture::uprobe;
 use ros2probe_daemon::config::{CaptureSettings, ExactChoice, InsideChoice, ShmMode};
 use ros2probe_daemon::privilege;
 
@@ -123,7 +124,7 @@ fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
         (false, true) => "capture.inside needs",
         (true, true) => "capture.shm.exact and capture.inside need",
     };
-    let missing = ros2probe_daemon::host_examination::uprobes_lack(host.capabilities);
+    let missing = uprobe::lacking(host.capabilities);
     let socket = settings.broker.display().to_string();
     if missing.is_empty() || host.files.exists(&socket) {
         return None;

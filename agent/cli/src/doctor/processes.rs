@@ -11,7 +11,7 @@ use super::finding::{Area, Finding, Severity};
 use super::host_state::{HostState, Unread, base_name};
 use super::variables::{Range, Variables};
 use ros2probe_api::participants::ParticipantList;
-use ros2probe_daemon::host_examination::is_fast_dds;
+use ros2probe_attach::functions::Library;
 
 const AREA: Area = Area::Processes;
 /// Bytes read of a process's memory map.
@@ -325,7 +325,7 @@ fn implementation(map: &str) -> Option<&'static str> {
                 let rest = name.strip_prefix(library);
                 rest.is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', ' ']))
             });
-            let fast = is_fast_dds(name).then_some("Fast DDS");
+            let fast = Library::FastDds.has_name(name).then_some("Fast DDS");
             by_name.map(|(_, implementation)| *implementation).or(fast)
         })
         .collect();

@@ -6,9 +6,9 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 use std::path::Path;
 
 use proptest::prelude::*;
-use ros2probe_daemon::discover::Refusal;
-use ros2probe_daemon::discover::message::{LocalParticipant, Message};
-use ros2probe_daemon::discover::session::{MOST_PACKETS, Outgoing, Session, Target};
+use ros2probe::discover::Refusal;
+use ros2probe::discover::message::{LocalParticipant, Message};
+use ros2probe::discover::session::{MOST_PACKETS, Outgoing, Session, Target};
 use ros2probe_model::facts::bounded::ledger;
 use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::graph::discovery::{Addresses, hexadecimal};

@@ -8,12 +8,12 @@ mod command;
 use std::path::Path;
 
 use proptest::prelude::*;
-use ros2probe_daemon::discover::zenoh::graph::EndpointKind;
-use ros2probe_daemon::discover::zenoh::message;
-use ros2probe_daemon::discover::zenoh::session::{
+use ros2probe::discover::zenoh::graph::EndpointKind;
+use ros2probe::discover::zenoh::message;
+use ros2probe::discover::zenoh::session::{
     MOST_BYTES, MOST_MESSAGE_BYTES, Session, Step, Unusable,
 };
-use ros2probe_daemon::tables::RouterTokens;
+use ros2probe::tables::RouterTokens;
 use ros2probe_wire::DomainId;
 use ros2probe_wire::zenoh::{Batch, Message, NetworkMessage, WhatAmI};
 use zenoh_buffers::reader::{HasReader, Reader as _};

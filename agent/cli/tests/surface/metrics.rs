@@ -1,5 +1,7 @@
 //! The metrics page: complete, well-formed in both formats whatever the network sends, bounded.
 
+mod markdown;
+
 use ros2probe_model::report::snapshot::ChainsFacts;
 use ros2probe_wire::DomainId;
 use std::collections::BTreeSet;
@@ -8,12 +10,10 @@ use std::path::Path;
 use std::sync::Arc;
 
 use ros2probe_daemon::agent_facts::{Ability, AgentFacts, SourceKind};
-use ros2probe_daemon::config::{Expectations, Watch};
-use ros2probe_daemon::config::{Limits, limits_markdown, tables_markdown};
-use ros2probe_daemon::events;
+use ros2probe_daemon::config::{Expectations, Limits, Watch};
 use ros2probe_daemon::recording::SnapshotFigures;
 use ros2probe_daemon::settings_cell::Settings;
-use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind, markdown};
+use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind};
 use ros2probe_daemon::surface::otlp::Signal;
 use ros2probe_daemon::surface::ros2_daemon::PortState;
 use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
@@ -117,7 +117,7 @@ fn page_of(metric: &str) -> &'static str {
 
 /// The rows of the catalogue that a page lists, below the head of the table.
 fn metrics_on(page: &str) -> String {
-    let table = markdown();
+    let table = markdown::metrics();
     let is_shown = |(number, line): &(usize, &str)| match line.split('`').nth(1) {
         Some(metric) if *number > 1 => page_of(metric) == page,
         _ => true,
@@ -146,12 +146,13 @@ fn the_book_s_tables_are_those_of_the_sources() {
     };
     let declared = |page, tables: &[Table]| {
         let (begin, end) = ("/tables.rs -->\n", "<!-- tables: end");
-        (page, begin, end, tables_markdown(tables))
+        (page, begin, end, markdown::tables(tables))
     };
     let tables = |page, derived| {
         let tables = ALL.iter().filter(|table| is_derived(table) == derived);
         declared(page, &tables.copied().collect::<Vec<_>>())
     };
+    let agent = [ros2probe_daemon::tables::ALL, ros2probe::tables::ALL].concat();
     for (page, begin, end, wanted) in [
         metrics("metrics-graph.md"),
         metrics("metrics-topics.md"),
@@ -162,18 +163,18 @@ fn the_book_s_tables_are_those_of_the_sources() {
             "events.md",
             "events/table.rs -->\n",
             "<!-- events: end",
-            events::markdown(),
+            markdown::events(),
         ),
         (
             "limits.md",
             "model/src/facts/limits.rs -->\n",
             "<!-- limits: end",
-            limits_markdown(),
+            markdown::limits(),
         ),
         tables("limits-model.md", false),
         tables("limits-tables.md", true),
         declared("limits-capture.md", ros2probe_capture::tables::ALL),
-        declared("limits-agent.md", ros2probe_daemon::tables::ALL),
+        declared("limits-agent.md", &agent),
     ] {
         let path = docs.join(page);
         let text = std::fs::read_to_string(&path).unwrap();

@@ -21,7 +21,6 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use crate::events::Trigger;
-pub use limits::{markdown as limits_markdown, tables_markdown};
 pub use mistake::{Mistake, Mistakes, Position};
 pub use otlp_endpoint::otlp_endpoint;
 pub use ros2probe_capture::settings::{
@@ -30,7 +29,7 @@ pub use ros2probe_capture::settings::{
 use ros2probe_message::Dialect;
 pub use ros2probe_model::derive::chain::expected::ExpectedChain;
 pub use ros2probe_model::facts::glob;
-pub use ros2probe_model::facts::limits::{Limit, Limits, Row as LimitRow};
+pub use ros2probe_model::facts::limits::{Limit, Limits};
 pub use ros2probe_model::facts::loss_share::LossShare;
 pub use ros2probe_model::facts::watch::{
     self, Expectations, ManyGlobs, PatternError, Retain, Watch, Watchlist, check_globs,

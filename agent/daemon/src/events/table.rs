@@ -372,33 +372,6 @@ pub const EVENTS: &[Definition] = &[
     SUPPRESSED,
 ];
 
-/// The table in Markdown, for `docs/events.md`.
-#[must_use]
-pub fn markdown() -> String {
-    let mut table =
-        "| event | severity | attributes | meaning |\n| --- | --- | --- | --- |\n".to_owned();
-    for Definition {
-        name,
-        severity,
-        relief,
-        attributes,
-        help,
-        ..
-    } in EVENTS
-    {
-        let attributes: Vec<String> = attributes.iter().map(|name| format!("`{name}`")).collect();
-        let attributes = attributes.join(", ");
-        let mut severities = severity.text().to_owned();
-        if relief != severity {
-            severities = format!("{severities} or {}", relief.text());
-        }
-        table.push_str(&format!(
-            "| `{name}` | {severities} | {attributes} | {help} |\n"
-        ));
-    }
-    table
-}
-
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeSet;

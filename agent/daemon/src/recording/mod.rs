@@ -20,7 +20,6 @@ pub use figures::{RecordingFigures, SnapshotFigures};
 pub use filter::{Candidate, Filter, FilterError};
 pub use graph::{DiscoveredTopic, GraphSnapshot, PublishedTopic, by_name};
 pub use recorder::{Finished, Recorder, Sources};
-pub use report::{counted, shortfalls, unobserved_lines};
 pub use sample_ring::SampleRing;
 pub use service::{
     Components, Recording, RecordingOptions, Recordings, Refusal, Status, default_name, schema,

@@ -1,10 +1,8 @@
-//! Conversion of subscription items to lines of the API's stream, and back.
+//! Conversion of subscription items to lines of the API's stream, and of QoS in lines back.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_api::samples::{self, Clock, End, Line, OfferedQos};
-use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::{Durability, History, HistoryKind, Liveliness, Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{RtpsDuration, Timestamp};
@@ -77,14 +75,6 @@ pub fn offered(offered: &Offered) -> samples::Offered {
     samples::Offered {
         type_hash: offered.type_hash.as_ref().map(ToString::to_string),
         qos: offered_qos(&offered.qos),
-    }
-}
-
-/// Offered QoS of a writer in the form of discovery.
-pub(super) fn announced(offered: &samples::Offered) -> Offered {
-    Offered {
-        type_hash: offered.type_hash.as_deref().and_then(TypeHash::parse),
-        qos: Arc::new(qos(&offered.qos)),
     }
 }
 

@@ -8,7 +8,6 @@
 mod backlog;
 mod channel;
 pub mod line;
-pub mod line_reader;
 mod retained;
 
 use std::collections::BTreeSet;

@@ -618,33 +618,6 @@ pub const CATALOGUE: &[Metric] = &[
     PROCESS_START_TIME,
 ];
 
-/// Returns the catalogue as a Markdown table, for `docs/metrics-*.md`.
-#[must_use]
-pub fn markdown() -> String {
-    let mut table = "| metric | type | labels | meaning |\n| --- | --- | --- | --- |\n".to_owned();
-    for Metric {
-        name,
-        kind,
-        labels,
-        help,
-        stability,
-        ..
-    } in CATALOGUE
-    {
-        let labels: Vec<String> = labels.iter().map(|label| format!("`{label}`")).collect();
-        let kind = kind.label();
-        let mark = match stability {
-            Stability::Stable => "",
-            Stability::Experimental => " (experimental)",
-        };
-        let labels = labels.join(", ");
-        table.push_str(&format!(
-            "| `{name}`{mark} | {kind} | {labels} | {help} |\n"
-        ));
-    }
-    table
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

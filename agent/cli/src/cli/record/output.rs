@@ -12,12 +12,11 @@ use ros2probe_api::participants::UnknownWriter;
 use ros2probe_api::recordings::FilterOptions;
 use ros2probe_daemon::escape::visible;
 use ros2probe_daemon::missed_announcements::{explanation, remedy_for, sentence};
-use ros2probe_daemon::recording::{
-    Activity, Finished, GraphSnapshot, Recorder, shortfalls, unobserved_lines,
-};
+use ros2probe_daemon::recording::{Activity, Finished, GraphSnapshot, Recorder};
 
 use super::super::notes::{SILENT, Sampling, is_sampled};
 use super::graph_cache::{GraphCache, locked};
+use super::shortfalls::{shortfalls, unobserved_lines};
 
 /// Interval at which writers without a known topic are requested, and at which they are reported
 /// while they send.

@@ -1,6 +1,7 @@
 //! The table of limits: the page, /health and docs/limits-*.md agree about each cap.
 
 use super::*;
+use ros2probe::tables as commands;
 use ros2probe_capture::tables as capture;
 use ros2probe_daemon::tables as daemon;
 use ros2probe_model::facts::bounded::Table;
@@ -94,7 +95,8 @@ fn every_cap_names_the_test_that_drives_it_over() {
     let rows = rows
         .chain(declared(model::ALL, "agent/model/src/facts/tables.rs"))
         .chain(declared(capture::ALL, "agent/capture/src/tables.rs"))
-        .chain(declared(daemon::ALL, "agent/daemon/src/tables.rs"));
+        .chain(declared(daemon::ALL, "agent/daemon/src/tables.rs"))
+        .chain(declared(commands::ALL, "agent/cli/src/tables.rs"));
     let rows: BTreeSet<_> = rows.collect();
     let fixed = driven::fixed();
     let named: Vec<_> = fixed

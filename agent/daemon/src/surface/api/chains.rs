@@ -77,8 +77,10 @@ async fn list(
     Ok(Json(answer).into_response())
 }
 
-/// Returns the chains, cut at these topics; those that do not pass them are left out.
-pub(crate) fn parts<'a>(
+/// Returns the chains as the API answers them, cut at these ROS names of topics. Chains that do not
+/// pass both are left out; of equal parts, the one with the most messages stays. `None`: not cut.
+#[must_use]
+pub fn parts<'a>(
     facts: impl Iterator<Item = &'a ChainFacts>,
     from: Option<&str>,
     to: Option<&str>,

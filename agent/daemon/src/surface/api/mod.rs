@@ -6,7 +6,7 @@
 mod actions;
 mod body;
 mod body_stream;
-mod chains;
+pub mod chains;
 mod downloads;
 mod endpoint;
 mod events;
@@ -41,8 +41,6 @@ mod services;
 mod snapshots;
 mod topics;
 mod watch;
-
-pub(crate) use chains::parts;
 
 use std::sync::Arc;
 use std::time::Duration;

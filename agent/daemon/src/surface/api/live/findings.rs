@@ -10,7 +10,6 @@ use super::structure::Ids;
 use super::values::{LOSS, lost_lately};
 use crate::agent_facts::{Ability, AgentFacts, SourceKind};
 use crate::missed_announcements;
-use crate::recording::counted;
 use ros2probe_api::live::{Finding, Severity};
 use ros2probe_model::facts::diagnosis::{Diagnosis, Policies, Policy, TopicKey};
 use ros2probe_model::graph::zenoh::Unseen;
@@ -101,7 +100,10 @@ fn of_agent(all: &Circumstances<'_>) -> Vec<Finding> {
 fn unseen_zenoh(snapshot: &Snapshot) -> Vec<Finding> {
     let unseen = snapshot.zenoh.iter().flat_map(|zenoh| zenoh.unseen());
     let findings = unseen.map(|(reason, connections)| {
-        let connections = counted(connections, "connection");
+        let connections = match connections {
+            1 => "1 connection".to_owned(),
+            many => format!("{many} connections"),
+        };
         let which = format!("{connections} of Zenoh {}", reason.in_words());
         let unseen = |severity, text| finding("zenoh_unseen", severity, reason.label(), text);
         match reason {

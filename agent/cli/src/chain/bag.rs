@@ -8,13 +8,12 @@ use std::path::Path;
 
 use ros2probe_api::chains::Chain;
 use ros2probe_bag::messages::{self, Message, MessagesError};
+use ros2probe_daemon::run::CaptureTime;
+use ros2probe_daemon::surface::api::chains::parts;
 use ros2probe_model::derive::chain::recorded::{RecordedChains, RecordedFacts};
 use ros2probe_model::facts::header::begins_with_header;
 use ros2probe_model::facts::names::TopicName;
 use ros2probe_wire::{Expansion, Timestamp};
-
-use crate::run::CaptureTime;
-use crate::surface::api::parts;
 
 /// Interval of progress reports, in messages.
 const PROGRESS: u64 = 65_536;

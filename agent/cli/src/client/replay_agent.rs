@@ -8,6 +8,15 @@ use std::time::{Duration, Instant};
 
 use ros2probe_capture::pcap::{PcapError, Speed, link_name};
 use ros2probe_capture::reassembly::Limits;
+use ros2probe_daemon::agent::{AssembledAgent, Components};
+use ros2probe_daemon::config::{Config, RetainChoice, Watch};
+use ros2probe_daemon::run::replay::{Replay, ReplayControl, pause_at};
+use ros2probe_daemon::run::{CaptureTime, Run, RunError, Source};
+use ros2probe_daemon::settings_cell::Settings;
+use ros2probe_daemon::snapshot_cell::SnapshotCell;
+use ros2probe_daemon::surface::MetricSources;
+use ros2probe_daemon::surface::api;
+use ros2probe_daemon::watches::Watches;
 use ros2probe_message::{Library, Sources};
 use ros2probe_model::observe::observer::{self, Observer};
 use ros2probe_wire::Expansion;
@@ -15,16 +24,6 @@ use ros2probe_wire::frame::Link;
 use tokio::io::{DuplexStream, duplex};
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
-
-use crate::agent::{AssembledAgent, Components};
-use crate::config::{Config, RetainChoice, Watch};
-use crate::run::replay::{Replay, ReplayControl, pause_at};
-use crate::run::{CaptureTime, Run, RunError, Source};
-use crate::settings_cell::Settings;
-use crate::snapshot_cell::SnapshotCell;
-use crate::surface::MetricSources;
-use crate::surface::api;
-use crate::watches::Watches;
 
 /// Capacity of a pipe in bytes; most answers are smaller.
 const PIPE_BYTES: usize = 1 << 20;
@@ -35,22 +34,22 @@ const TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Range and pace of a replay.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ReplayOptions {
+pub(super) struct ReplayOptions {
     /// Time at which [`Pace::Pause`] pauses. `None` means the beginning of the capture.
-    pub from: Option<CaptureTime>,
+    pub(super) from: Option<CaptureTime>,
     /// Time at which the replay ends. `None` means the end of the capture.
-    pub until: Option<CaptureTime>,
+    pub(super) until: Option<CaptureTime>,
     /// Whether every topic is measured.
-    pub measured: bool,
+    pub(super) measured: bool,
     /// Pace of the replay during requests.
-    pub pace: Pace,
+    pub(super) pace: Pace,
     /// How far a gzipped capture may expand.
-    pub expansion: Expansion,
+    pub(super) expansion: Expansion,
 }
 
 /// Pace of a replay during requests.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Pace {
+pub(super) enum Pace {
     /// It ends before the first request.
     ToEnd,
     /// It pauses until [`ReplayAgent::resume`].
@@ -63,7 +62,7 @@ pub enum Pace {
 
 /// A capture with its own agent. Dropping it ends the agent.
 #[derive(Debug)]
-pub struct ReplayAgent {
+pub(super) struct ReplayAgent {
     capture: PathBuf,
     pipes: mpsc::UnboundedSender<DuplexStream>,
     control: Option<ReplayControl>,
@@ -82,7 +81,7 @@ pub struct Outcome {
 
 /// A capture cannot be replayed.
 #[derive(Debug, thiserror::Error)]
-pub enum ReplayError {
+pub(super) enum ReplayError {
     /// The file is not a capture, or cannot be read.
     #[error(transparent)]
     Capture(PcapError),
@@ -99,7 +98,7 @@ impl ReplayAgent {
     /// # Errors
     ///
     /// Returns [`ReplayError`] if the capture has an unsupported link layer or cannot be opened.
-    pub async fn start(
+    pub(super) async fn start(
         capture: &Path,
         options: ReplayOptions,
         report: fn(&str),
@@ -142,7 +141,7 @@ impl ReplayAgent {
 
     /// Result of the replay. `None` until its end.
     #[must_use]
-    pub fn outcome(&self) -> Option<Outcome> {
+    pub(super) fn outcome(&self) -> Option<Outcome> {
         let deadline = Instant::now() + TIMEOUT;
         while self.outcome.get().is_none() && Instant::now() < deadline {
             std::thread::sleep(TIMEOUT / 50);
@@ -152,7 +151,7 @@ impl ReplayAgent {
 
     /// Opens a pipe to the API of the agent.
     #[must_use]
-    pub fn connect(&self) -> DuplexStream {
+    pub(super) fn connect(&self) -> DuplexStream {
         let (client, server) = duplex(PIPE_BYTES);
         // Without an agent the pipe is broken, which the client reports.
         let _ = self.pipes.send(server);
@@ -160,7 +159,7 @@ impl ReplayAgent {
     }
 
     /// Replays the rest after a pause.
-    pub fn resume(&self) {
+    pub(super) fn resume(&self) {
         if let Some(control) = &self.control {
             control.resume();
         }
@@ -168,7 +167,7 @@ impl ReplayAgent {
 
     /// Replays to this time after a pause of [`Pace::Steps`], and pauses again. Returns `false` if
     /// the replay has ended.
-    pub async fn advance(&self, to: CaptureTime) -> bool {
+    pub(super) async fn advance(&self, to: CaptureTime) -> bool {
         match &self.control {
             Some(control) => control.advance(to).await,
             None => false,
@@ -177,7 +176,7 @@ impl ReplayAgent {
 
     /// Path of the capture.
     #[must_use]
-    pub fn capture(&self) -> &Path {
+    pub(super) fn capture(&self) -> &Path {
         &self.capture
     }
 }

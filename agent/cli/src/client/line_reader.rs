@@ -5,19 +5,20 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use ros2probe_api::samples::{self, Line, Open};
-use ros2probe_model::facts::dispatch::{Missed, MissedReason, Sample, Topic};
+use ros2probe_daemon::subscriptions::Item;
+use ros2probe_daemon::subscriptions::line::qos;
+use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::facts::dispatch::{Missed, MissedReason, Offered, Sample, Topic};
 use ros2probe_model::graph::discovery::hexadecimal;
+use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
-use super::Item;
-use super::line::announced;
 use crate::tables::{StreamTopics, StreamWriters};
-use ros2probe_model::facts::bounded::Bounded;
 
 /// Converts lines to items, with the topics that earlier lines described.
 #[derive(Debug)]
-pub struct LineReader {
+pub(super) struct LineReader {
     topics: Bounded<StreamTopics, HashMap<(u32, String), Arc<Topic>>>,
     /// Topics by writer, with the writer's announcement.
     writers: Bounded<StreamWriters, HashMap<String, Arc<Topic>>>,
@@ -26,8 +27,7 @@ pub struct LineReader {
 
 impl LineReader {
     /// Creates the reader of the stream that began with `open`.
-    #[must_use]
-    pub fn new(open: Open) -> Self {
+    pub(super) fn new(open: Open) -> Self {
         Self {
             topics: Bounded::default(),
             writers: Bounded::default(),
@@ -36,14 +36,13 @@ impl LineReader {
     }
 
     /// First line of the stream.
-    #[must_use]
-    pub const fn opened(&self) -> &Open {
+    pub(super) const fn opened(&self) -> &Open {
         &self.open
     }
 
     /// The item of a line. `None` for [`Line::Open`]. `payload` holds the bytes after the line of a
     /// sample.
-    pub fn item(&mut self, line: &Line, payload: Bytes) -> Option<Item> {
+    pub(super) fn item(&mut self, line: &Line, payload: Bytes) -> Option<Item> {
         Some(match line {
             Line::Open(_) => return None,
             Line::Clock(clock) => Item::Clock(time(clock.time_ns)),
@@ -130,6 +129,14 @@ fn sample(topic: Arc<Topic>, facts: &samples::Sample, payload: Bytes) -> Sample 
     }
 }
 
+/// Offered QoS of a writer in the form of discovery.
+fn announced(offered: &samples::Offered) -> Offered {
+    Offered {
+        type_hash: offered.type_hash.as_deref().and_then(TypeHash::parse),
+        qos: Arc::new(qos(&offered.qos)),
+    }
+}
+
 fn time(nanoseconds: i64) -> Timestamp {
     Timestamp(u64::try_from(nanoseconds).unwrap_or(0))
 }
@@ -153,6 +160,8 @@ fn guid(text: &str) -> Guid {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_model::facts::bounded::{Declared as _, ledger};
+
     use super::*;
 
     #[test]
@@ -183,8 +192,11 @@ mod tests {
                 u32::try_from(number).unwrap().to_be_bytes()
             );
         }
-        crate::tables::tests::assert_driven::<StreamTopics>();
-        crate::tables::tests::assert_driven::<StreamWriters>();
+        let ledger = ledger();
+        for table in [StreamTopics::TABLE, StreamWriters::TABLE] {
+            let used = ledger[table.name];
+            assert!(used.is_driven(), "{}: {used:?}", table.name);
+        }
     }
 
     #[test]

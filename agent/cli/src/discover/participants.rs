@@ -5,6 +5,8 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use ros2probe_capture::live::LiveSource;
 use ros2probe_capture::reassembly::Limits;
+use ros2probe_daemon::config::{CaptureSettings, ShmMode, SourceChoice};
+use ros2probe_daemon::privilege;
 use ros2probe_model::graph::discovery::hexadecimal;
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{Observer, Settings};
@@ -13,8 +15,6 @@ use ros2probe_wire::GuidPrefix;
 
 use super::Refusal;
 use super::session::Target;
-use crate::config::{CaptureSettings, ShmMode, SourceChoice};
-use crate::privilege;
 
 /// The polling period while listening.
 const POLL_INTERVAL: Duration = Duration::from_millis(250);

@@ -8,19 +8,17 @@ use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, bail};
-pub use ros2probe_attach::client::declare_command;
 use ros2probe_attach::server::{serve, serve_one};
 use ros2probe_capture::system::hide_memory;
+use ros2probe_daemon::config::Level;
+use ros2probe_daemon::logging::Log;
+use ros2probe_daemon::privilege::{self, Role, user_id};
 use rustix::io::Errno;
 use rustix::net::sockopt::socket_acceptconn;
 use rustix::net::{
     AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, connect, listen, socket_with,
 };
 use rustix::process::{getpid, set_child_subreaper};
-
-use crate::config::Level;
-use crate::logging::Log;
-use crate::privilege::{self, Role, user_id};
 
 /// Time without a connection after which a broker that systemd starts on demand ends.
 const IDLE: Duration = Duration::from_secs(10);
@@ -39,7 +37,7 @@ const PERMISSIONS: u32 = 0o666;
 ///
 /// # Errors
 /// Fails without a socket, or if the process cannot be confined.
-pub fn run(path: Option<&Path>, user: &str) -> Result<()> {
+pub(crate) fn run(path: Option<&Path>, user: &str) -> Result<()> {
     let _log = Log::start(Level::Info, None);
     hide_memory().context("cannot protect the memory of this process")?;
     let (listener, idle) = match path {
