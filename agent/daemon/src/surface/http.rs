@@ -273,7 +273,7 @@ async fn readyz(Extract(pages): Extract<Pages>) -> Response {
             Some(reason) => format!("ready\ndegraded: {reason}\n").into_response(),
             None => "ready\n".into_response(),
         },
-        Err(reason) => (StatusCode::SERVICE_UNAVAILABLE, reason + "\n").into_response(),
+        Err(reason) => (StatusCode::SERVICE_UNAVAILABLE, format!("{reason}\n")).into_response(),
     }
 }
 

@@ -451,7 +451,7 @@ fn a_requested_bag_is_never_removed_for_others() {
     robot.payload = 4000;
     robot.run(20);
     let mut results = (0..5).map(|_| robot.task.write_memory(Cause::Request));
-    let refused = results.find_map(Result::err).unwrap();
+    let refused = results.find_map(Result::err).unwrap().to_string();
     assert!(refused.contains("max_total_bytes"), "{refused}");
     assert!(robot.bags().contains_key(&requested));
     assert!(robot.shown().failed >= 1);

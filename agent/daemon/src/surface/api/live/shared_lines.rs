@@ -118,6 +118,7 @@ impl SharedLines {
     fn update_agent(&mut self, state: &State, past: &Past, in_force: &InForce) {
         let (snapshot, agent, round) = (state.known(), &state.agent, self.round);
         let unready = state.ready(Instant::now()).err();
+        let unready = unready.map(|reason| reason.to_string());
         let abilities = Able::ALL.iter().map(|ability| {
             let reason = agent.blind.iter().find(|(blind, _)| blind == ability);
             Ability(
