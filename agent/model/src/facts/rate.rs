@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_late_counts_in_the_second_of_its_time() {
+    fn late_messages_count_in_the_second_of_their_time() {
         let mut window = Window::default();
         let now = fill(&mut window, 100_000, 100, 50);
         for late in [102_500, 102_600, 50_000] {
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_of_a_long_time_are_no_spike_in_one_second() {
+    fn messages_of_a_long_gap_are_spread_over_it() {
         let mut window = Window::default();
         let at = |milliseconds: u64| Timestamp(milliseconds * 1_000_000);
         window.second(at(100_000)).messages += 1;

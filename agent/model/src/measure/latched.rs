@@ -84,7 +84,7 @@ enum Last {
     Unseen,
     Kept(Arc<Sample>),
     TooLarge(u32),
-    /// The writer was paused when it came.
+    /// The writer was paused when it arrived.
     Paused,
     NoRoom(u32),
 }

@@ -233,7 +233,7 @@ impl Subscribers {
         let source = sample.source_timestamp().timestamp();
         let began = context.graph.wall_clock.wall_time(sample.record().began());
         // Both times are from one clock. A sample that leaves before its timestamp, or hours after
-        // it, is no measure of the send delay.
+        // it, is not a measure of the send delay.
         if let Some(source) = source.filter(|_| sample.is_start())
             && (source..=source + PLAUSIBLE).contains(&began)
             && self.departures.is_first(source)

@@ -195,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn what_had_no_room_is_taken_out_of_the_run_that_covers_it_once() {
+    fn undelivered_samples_are_subtracted_once_from_their_run() {
         let mut undelivered = Undelivered::default();
         note(&mut undelivered, &fragments(3, 1, 12 * MILLISECOND, 0));
         note(&mut undelivered, &fragments(4, 1, 13 * MILLISECOND, 0));

@@ -11,7 +11,7 @@
 //! - Takes followed the last arrival, and for long there was neither.
 //!
 //! Arrivals are compared with the takes of the next report, so a message under way is never lost.
-//! Messages within the process cannot be compared, and are not judged.
+//! Messages within the process cannot be compared, and are not evaluated.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -23,7 +23,7 @@ use super::tracked::HALF_WINDOW;
 use crate::facts::bounded::Bounded;
 use crate::facts::tables::QueueTotals;
 
-/// Writers of one queue; a queue with more is not judged.
+/// Writers of one queue; a queue with more is not evaluated.
 const WRITERS: usize = 256;
 /// Time without arrivals and takes after which nothing waits.
 const QUIET: Duration = Duration::from_secs(10);
@@ -85,14 +85,14 @@ pub(super) struct ReaderQueue {
     arrived: u64,
     past: Bounded<QueueTotals, VecDeque<(Timestamp, u64)>>,
     lost: u64,
-    /// Whether the begin of the arrivals is known: a report after that of the takes.
+    /// Whether the start of the arrivals is known: a report after that of the takes.
     has_begun: bool,
     /// Time of the last change, and the longest time between takes.
     changed: Timestamp,
     took: Timestamp,
     longest_gap: Duration,
     since: Timestamp,
-    /// The earlier and the later begin of a window: time, arrivals and losses.
+    /// The earlier and the later start of a window: time, arrivals and losses.
     marks: [(Timestamp, u64, u64); 2],
     pub(super) alarm: Alarm,
 }
