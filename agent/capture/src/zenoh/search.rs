@@ -150,7 +150,7 @@ impl Lanes {
     }
 }
 
-/// Returns whether a lane may number its messages so. One number is left out behind fragments.
+/// Returns whether a lane may use these numbers. One number is left out after fragments.
 fn follows(expected: u32, number: u32) -> bool {
     number == expected || number == Resolution::DEFAULT.next(expected)
 }

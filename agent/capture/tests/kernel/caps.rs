@@ -41,7 +41,7 @@ fn the_interest_map_takes_so_many_and_refuses_the_next() {
 }
 
 #[test]
-fn so_many_participants_are_followed_and_the_next_is_refused() {
+fn participants_beyond_the_cap_are_refused() {
     let mut kernel = Kernel::load();
     for number in 0..PARTICIPANT_CAPACITY {
         kernel
