@@ -322,7 +322,7 @@ fn unknown_submessages_are_stepped_over_by_their_length() {
 }
 
 #[test]
-fn what_came_before_a_malformed_submessage_stands() {
+fn submessages_before_a_malformed_one_are_kept() {
     let mut message = message(Endianness::Little);
     message.submessage(0x15, 0, |body| data_head(body, 1));
     message.submessage(0x15, 0x0c, |body| data_head(body, 2));
