@@ -38,7 +38,7 @@ pub struct SnapshotCell {
     /// When a client last needed calls inside processes.
     calls_wanted: ArcSwapOption<Instant>,
     bell: Arc<CaptureBell>,
-    news: Notify,
+    publication: Notify,
 }
 
 /// Wakes the capture thread from its wait for packets. Without a socket pair, readers wait until
@@ -99,7 +99,7 @@ impl SnapshotCell {
             read: AtomicBool::new(false),
             calls_wanted: ArcSwapOption::empty(),
             bell: Arc::new(CaptureBell::new()),
-            news: Notify::new(),
+            publication: Notify::new(),
         }
     }
 
@@ -111,7 +111,7 @@ impl SnapshotCell {
         });
         self.state.store(Arc::clone(&state));
         self.asked.store(false, Ordering::Relaxed);
-        self.news.notify_waiters();
+        self.publication.notify_waiters();
         state
     }
 
@@ -196,19 +196,19 @@ impl SnapshotCell {
     /// Requests a newer state and waits for it for at most `timeout`. Counters in a scrape should
     /// be current, or rates over short windows would be wrong.
     pub async fn refresh(&self, timeout: Duration) {
-        let news = self.news.notified();
+        let publication = self.publication.notified();
         if self.state.load().agent.finished {
             return;
         }
         self.asked.store(true, Ordering::Relaxed);
         self.bell.ring();
         // After a timeout, the latest state is shown with its age.
-        let _ = tokio::time::timeout(timeout, news).await;
+        let _ = tokio::time::timeout(timeout, publication).await;
     }
 
     /// Returns when a newer state is published, without requesting one.
     pub async fn published(&self) {
-        self.news.notified().await;
+        self.publication.notified().await;
     }
 }
 
@@ -366,22 +366,22 @@ mod tests {
         };
         cell.publish(snapshot, at(0));
         assert!(!cell.was_read());
-        let mut news = Box::pin(cell.published());
-        assert!(futures_util::poll!(&mut news).is_pending());
+        let mut publication = Box::pin(cell.published());
+        assert!(futures_util::poll!(&mut publication).is_pending());
         cell.refresh(Duration::ZERO).await;
         cell.publish_agent(at(3));
-        assert!(futures_util::poll!(&mut news).is_pending() && cell.is_asked());
+        assert!(futures_util::poll!(&mut publication).is_pending() && cell.is_asked());
         let own = cell.own_state();
         assert_eq!((own.known().records, own.agent.at), (7, at(3).at));
         assert!(!cell.was_read(), "the snapshot was not read");
         assert_eq!(cell.state().known().records, 7);
         assert!(cell.was_read() && !cell.was_read());
         cell.publish(Snapshot::default(), at(4));
-        news.await;
+        publication.await;
     }
 
     #[tokio::test]
-    async fn who_asks_gets_the_next_state_and_waits_for_a_stuck_writer_only_so_long() {
+    async fn a_refresh_gets_the_next_state_and_waits_for_a_stuck_writer_up_to_a_timeout() {
         let cell = SnapshotCell::new(SourceKind::Wire);
         let writer = async {
             while !cell.is_asked() {

@@ -65,7 +65,7 @@ fn losses(facts: &AgentFacts) -> Losses {
 
 impl SourceMonitor {
     /// Events about changes of visibility at `now`. `ready` has the reason of a failure, and
-    /// `attached_anew` the number of times the hook was attached. If a control group went and came
+    /// `attached_anew` the number of times the hook was attached. If a control group was recreated
     /// between two checks, both events are returned, with the time between the checks.
     pub fn check(
         &mut self,

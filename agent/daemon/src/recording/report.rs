@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_is_counted_by_reason_and_named_with_its_numbers() {
+    fn missing_messages_are_counted_by_reason_and_named_with_their_numbers() {
         let mut report = Report::default();
         add_written(&mut report, "/points", 100);
         add_missed(&mut report, &missed(2, 3, MissedReason::Incomplete));
@@ -277,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_storage_refused_counts_as_missing() {
+    fn messages_that_the_storage_refused_count_as_missing() {
         let mut report = Report::default();
         add_written(&mut report, "/points", 100);
         add_written(&mut report, "/points", 100);
@@ -289,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn what_belongs_to_no_topic_of_the_bag_is_named_and_makes_it_incomplete() {
+    fn unobserved_topics_and_unknown_writers_make_a_report_incomplete() {
         let mut report = Report::default();
         let unobserved = |why: &str| ("/imu".to_owned(), why.to_owned());
         report.unobserved.extend([unobserved(NO_SUBSCRIBER)]);

@@ -235,8 +235,8 @@ mod tests {
     }
 
     #[test]
-    fn what_would_leave_the_listener_open_is_refused() {
-        for (text, says) in [
+    fn a_setting_that_would_leave_the_listener_open_is_refused() {
+        for (text, expected) in [
             ("basic_auth_user:\n  alice: x\n", "basic_auth_user"),
             ("basic_auth_users:\n  alice: secret\n", "not a bcrypt hash"),
             ("basic_auth_users: {a: $2y$10$short}", "not a bcrypt hash"),
@@ -267,7 +267,7 @@ mod tests {
             ),
         ] {
             let error = parse(text).unwrap_err().to_string();
-            assert!(error.contains(says), "{text}: {error}");
+            assert!(error.contains(expected), "{text}: {error}");
         }
         let slow = ALICE.replace("$10$", "$31$");
         let error = parse(&format!("basic_auth_users: {{a: {slow}}}"))

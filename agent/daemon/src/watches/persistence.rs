@@ -337,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_added_is_read_again_as_it_was() {
+    fn added_watches_are_read_again_unchanged() {
         let (_place, directory) = directory();
         assert_eq!(load(&directory), LoadedWatches::Nothing);
         let keeper = WatchWriter::start(Arc::clone(&directory)).unwrap();

@@ -305,7 +305,7 @@ fn only_problems_of_the_domain_meet_a_short_name_and_every_event_meets_its_full_
 }
 
 #[test]
-fn findings_meet_their_kind_once_they_are_new() {
+fn a_new_finding_triggers_the_snapshots_of_its_kind() {
     let topic = TopicKey {
         domain_id: DomainId(0),
         dds_name: "rq/addRequest".into(),

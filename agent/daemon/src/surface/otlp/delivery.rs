@@ -95,7 +95,7 @@ impl<E: Export> Delivery<E> {
         self.drop(Reason::Overflow, items);
     }
 
-    /// Delivers what is in a queue until the agent stops. Items that come within `gather` after the
+    /// Delivers what is in a queue until the agent stops. Items that arrive within `gather` after the
     /// first one are collected into its request.
     pub(super) async fn drain(mut self, mut queue: impl Queue<Batch = E::Batch>, gather: Duration) {
         let mut left = Vec::new();

@@ -633,7 +633,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_source_does_not_show_is_in_words() {
+    fn each_blind_spot_of_a_source_is_described() {
         let mut agent = AgentFacts::new(SourceKind::Replay, Instant::now());
         let text = |agent: &AgentFacts| -> Vec<String> {
             let notes = unseen(agent).into_iter();
