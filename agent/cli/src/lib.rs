@@ -2,8 +2,8 @@
 //!
 //! - [`client`] reaches an agent at a socket or an address, or replays a capture in this process.
 //! - [`ros2`] formats answers as `ros2 topic`, `ros2 node`, `ros2 bag info` and others do.
-//! - [`learn`] chooses expectations from what a healthy robot does.
-//! - [`inside`] formats what processes show from inside.
+//! - [`learn`] chooses expectations from the figures of a healthy robot.
+//! - [`inside`] formats figures of calls inside processes.
 //! - [`top`] is the screen of `rp top`, [`doctor`] the checks of `rp doctor`.
 //!
 //! The commands themselves are in the program (`src/cli/`).

@@ -76,8 +76,8 @@ impl Top {
             hidden: self.hidden,
         };
         if self.target.from.is_some() {
-            let said = "rp: rp top shows a capture from its beginning on: leave out --from";
-            return Err(UserError(said.to_owned()).into());
+            let text = "rp: rp top shows a capture from its beginning on: leave out --from";
+            return Err(UserError(text.to_owned()).into());
         }
         let speed = self.speed.unwrap_or(Speed::Times(1.0));
         let agent = Agent::reach_measured(&self.target, (!self.once).then_some(speed))?;
