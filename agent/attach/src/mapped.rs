@@ -51,7 +51,7 @@ pub struct Use {
 }
 
 impl Use {
-    /// Parses the text of a map.
+    /// Parses the text of `/proc/<pid>/maps`.
     #[must_use]
     pub fn parse(text: &str, library: Library) -> Self {
         let mut found = Self::default();

@@ -646,7 +646,7 @@ mod tests {
     }
 
     #[test]
-    fn no_more_records_of_the_kernel_are_taken_than_there_is_room_for() {
+    fn the_buffer_is_full_at_the_cap_of_kernel_records() {
         let mut order = ReorderBuffer::default();
         let mut number = 0;
         while !order.is_full() {

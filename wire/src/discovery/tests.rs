@@ -379,7 +379,7 @@ fn a_missing_parameter_has_the_default_of_the_specification() {
 }
 
 #[test]
-fn vendor_parameters_mean_what_their_vendor_means() {
+fn vendor_parameters_are_read_by_the_vendor_of_the_payload() {
     let mut payload = endpoint_list("rt/a", "A");
     payload.parameter(0x8006, &[1, 0, 0, 0]);
     assert!(

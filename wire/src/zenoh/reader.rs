@@ -178,7 +178,7 @@ impl<'a> Reader<'a> {
         })
     }
 
-    /// Reads a length of 32 bits and this many bytes, of which the capture may lack the end.
+    /// Reads a length of 32 bits and that many bytes, of which the capture may lack the end.
     pub(super) fn bytes(&mut self, what: &'static str) -> Result<Bytes<'a>, WireError> {
         Ok(self.nested(what)?.rest())
     }
@@ -191,13 +191,13 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Reads a length of at most `limit` and this many captured bytes.
+    /// Reads a length of at most `limit` and that many captured bytes.
     pub(super) fn sized(&mut self, what: &'static str, limit: u64) -> Result<&'a [u8], WireError> {
         let length = self.length(what, limit)?;
         self.take(what, length)
     }
 
-    /// Reads a length of at most `limit` and this many bytes of UTF-8.
+    /// Reads a length of at most `limit` and that many bytes of UTF-8.
     pub(super) fn text(&mut self, what: &'static str, limit: u64) -> Result<&'a str, WireError> {
         let start = *self;
         let bytes = self.sized(what, limit)?;

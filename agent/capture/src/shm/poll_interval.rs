@@ -391,7 +391,7 @@ mod tests {
     }
 
     #[test]
-    fn while_every_message_is_wanted_it_looks_every_50_us_within_a_budget_of_its_own() {
+    fn polling_for_every_message_runs_every_50_us_within_its_own_budget() {
         let idle = |_: f64| 0;
         let mut interval = PollInterval::new(BUDGET).on(2);
         let (share, looks) = run(&mut interval, 10.0, 8e-6, Need::Every, idle);

@@ -42,7 +42,7 @@ enum Position {
     Beginning(Search),
     /// In a batch, or before one.
     Batch(Partial),
-    /// In a connection of something else.
+    /// In a connection of another protocol.
     Other,
 }
 

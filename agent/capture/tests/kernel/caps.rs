@@ -91,7 +91,7 @@ fn an_unknown_writer_is_captured_up_to_its_bytes_and_again_after_many_others() {
 }
 
 #[test]
-fn a_fragmented_datagram_is_forgotten_after_so_many_others_began() {
+fn a_fragmented_datagram_is_forgotten_after_the_capped_number_of_others() {
     let mut kernel = Kernel::load();
     let metered = writer(0);
     kernel.set_interest(&BTreeMap::from([(metered, Verdict::Meter)]));

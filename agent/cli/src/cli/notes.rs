@@ -295,9 +295,9 @@ impl Missing {
 
 /// How the agent sees messages in shared memory.
 pub(crate) enum Sampling {
-    /// It sees each one, or none is there.
+    /// It sees every message, or no message uses shared memory.
     Nothing,
-    /// It is about to see each one, since a client reads them.
+    /// It will see every message soon, because a client reads them.
     OnDemand,
     /// It sees samples, with the remedy or the reason.
     Sampled(String),

@@ -422,7 +422,7 @@ mod tests {
     }
 
     #[test]
-    fn the_state_names_what_is_wrong() {
+    fn the_state_names_the_fault() {
         let measured = json!({"messages": 9, "rate_hertz": 9.0});
         let one = json!([{"measurement": measured}]);
         let state = |watches: serde_json::Value, diagnoses: serde_json::Value| {

@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn a_steady_topic_reads_its_rate_from_the_second_second_on() {
+    fn a_steady_topic_has_its_rate_from_the_second_second_on() {
         let mut window = Window::default();
         let now = fill(&mut window, 100_300, 5, 400);
         let (sum, seconds) = window.sum(now, SECONDS);

@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_may_end_within_what_had_no_room() {
+    fn a_run_may_end_within_undelivered_samples() {
         let mut undelivered = Undelivered::default();
         for fragment in 4..8 {
             let time = u64::from(10 + fragment) * MILLISECOND;

@@ -64,7 +64,7 @@ struct Counts {
     matched: u32,
     /// Those with a rounded stamp.
     rounded: u32,
-    /// Those whose stamp was seen on no input before.
+    /// Those whose stamp was not seen on any input before.
     own: u32,
     /// Those whose age was compared with that of the inputs, and those with almost no age.
     aged: u32,

@@ -8,7 +8,7 @@
 //! - More messages wait than the queues hold, if their depth is announced.
 //! - A message that was published later has been taken. Queues keep the order, and the latency of a
 //!   take shows when its message was published.
-//! - Takes followed the last arrival, and for long there was neither.
+//! - Takes followed the last arrival, and neither was seen for a while.
 //!
 //! Arrivals are compared with the takes of the next report, so a message under way is never lost.
 //! Messages within the process cannot be compared, and are not evaluated.

@@ -292,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn without_fair_shares_whatever_came_first_stays() {
+    fn without_fair_shares_the_first_entries_stay() {
         let mut table: ByOwner<First, _, _, _> = ByOwner::default();
         let room = (0..200_u32).filter(|key| table.insert(*key, *key, text(0), 0));
         let room = room.count();

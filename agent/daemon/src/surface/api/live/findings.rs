@@ -560,7 +560,7 @@ mod tests {
     use ros2probe_model::graph::zenoh::ZenohFacts;
 
     #[test]
-    fn of_more_findings_than_are_sent_the_worst_are() {
+    fn the_worst_findings_are_sent_if_they_exceed_the_cap() {
         let list = (0..2 * MOST).map(|number| Diagnosis::DuplicateNode {
             domain_id: DomainId(0),
             node: format!("/node_{number}").into(),
