@@ -191,7 +191,7 @@ impl Observer {
         }
         self.count(&record);
         if stream.outgoing && stream.is_loopback() {
-            // Nothing is read at the receiver's socket: TCP delivers what the sender's socket showed.
+            // Nothing is read at the receiver's socket: the sender's socket showed it.
             self.count(&Record {
                 flags: record.flags & !flag::OUTGOING,
                 socket: sample.receiving_socket,
