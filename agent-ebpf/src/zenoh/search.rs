@@ -178,7 +178,7 @@ extern "C" fn begin(slot: u32, pending: u32) -> u32 {
     close(slot)
 }
 
-/// Forgets what is guessed of the direction.
+/// Discards the guess about the direction.
 #[unsafe(export_name = "zenoh_forget")]
 #[inline(never)]
 extern "C" fn close(slot: u32) -> u32 {
@@ -206,7 +206,7 @@ fn know(slot: u32, mut this: Current, mode: u32) -> u32 {
     u32::from(CONNECTIONS.insert(&this.key, &this.state, 0).is_ok())
 }
 
-/// Continues what is guessed of the direction, or begins a guess; returns 1 once it is certain.
+/// Continues the guess about the direction, or begins one; returns 1 once it is certain.
 #[inline(always)]
 fn guess(skb: *mut __sk_buff, slot: u32) -> u32 {
     let Some(mut this) = segment(slot) else {
@@ -301,7 +301,7 @@ extern "C" fn fits(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
     } else if guess.lanes[index] != lane {
         return 1;
     } else {
-        // One number is left out behind the FRAGMENTs of a message.
+        // One number is left out after the FRAGMENTs of a message.
         let ahead = number.wrapping_sub(guess.expected[index]);
         if ahead > 1 {
             return 0;
