@@ -3,7 +3,7 @@
 //!
 //! Only the first fragment has a UDP header, and submessage headers may lie in any fragment. A
 //! table holds the walk's state between frames. The filter cannot continue alone after discovery
-//! behind user data, a header cut in two, or fragments out of order. It then hands the rest of the
+//! after user data, a header cut in two, or fragments out of order. It then hands the rest of the
 //! datagram and the walk's state to user space, so nothing is decided twice and nothing is missed.
 
 use aya_ebpf::{bindings::__sk_buff, helpers::bpf_ktime_get_ns};

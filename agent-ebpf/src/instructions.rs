@@ -2,7 +2,7 @@
 
 use core::arch::asm;
 
-/// Adds to a field of a map value, so that no other run comes between.
+/// Adds to a field of a map value atomically.
 #[inline(always)]
 pub fn add(to: *mut u64, by: u64) {
     // SAFETY: `to` is a field of a map value. Without a returned value this is an instruction that

@@ -1,7 +1,7 @@
 //! Joins the DATA_FRAGs of one sample: a point cloud in two thousand fragments becomes one record.
 //!
 //! A run begins with a sample's first fragment and ends with its last, or before a missing
-//! fragment. Everything else (a retransmission, the rest behind a gap) is written at once. If the
+//! fragment. Everything else (a retransmission, the rest after a gap) is written at once. If the
 //! sender moves to another CPU in the middle, the run is written and a new one starts there. User
 //! space removes runs that have stopped growing; it checks at least once a second.
 

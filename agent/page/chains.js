@@ -245,7 +245,7 @@ export function stepKey(from, to) {
 }
 
 /**
- * Returns the way of a chain through the graph.
+ * Returns the path of a chain through the graph.
  * @param {Chain} chain
  * @returns {Way}
  */

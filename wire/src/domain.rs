@@ -7,11 +7,11 @@ use core::fmt;
 pub struct DomainId(pub u32);
 
 impl DomainId {
-    /// The highest domain for which UDP has ports (RTPS 2.5, 9.6.1.4).
+    /// The highest domain for which UDP has ports (RTPS 2.5, 9.6.2.3).
     pub const MAX: Self = Self(232);
 }
 
-/// A number is no domain id.
+/// A number is not a domain id.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct InvalidDomainId(pub u32);
 

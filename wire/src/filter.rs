@@ -60,7 +60,7 @@ pub enum Counter {
     /// RTPS datagrams with missing IP fragments that the kernel gave up, or refused for lack of
     /// memory for fragments, whose first fragment is known.
     NotReassembled,
-    /// UDP datagrams given up or refused likewise, whose first fragment is missing or unreadable.
+    /// The same of UDP datagrams whose first fragment is missing or unreadable.
     NotReassembledUnnamed,
     /// Messages for shared memory that could not be read in their sender's memory.
     Unreadable,

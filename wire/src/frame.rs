@@ -230,7 +230,7 @@ pub fn parse(link: Link, bytes: &[u8], length: u32) -> Result<Frame<'_>, WireErr
 ///
 /// Of a doubly tagged frame the kernel strips the outer tag only. A received packet then begins
 /// with the inner tag; a sent one begins with the IP header although its protocol names a tag.
-/// Since Linux 6.11 the protocol is the one behind all tags, even if a tag is left.
+/// Since Linux 6.11 the protocol is the one after all tags, even if a tag is left.
 ///
 /// # Errors
 /// Fails as [`parse`] does.

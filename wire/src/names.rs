@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn what_ros_did_not_make_is_left_alone() {
+    fn names_that_ros_did_not_mangle_are_not_demangled() {
         for name in [
             "Square",
             "rt",

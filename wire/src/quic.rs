@@ -39,7 +39,7 @@ mod tests {
     }
 
     #[test]
-    fn other_packets_are_not() {
+    fn other_packets_are_no_initial_packets() {
         for head in [
             *b"RTPS\x02\x03",
             [0x40, 0, 0, 0, 1, 8],

@@ -75,7 +75,7 @@ pub mod flag {
     /// Carried by a TCP connection of Zenoh: a copy is for another receiver, never a repetition. Of a
     /// [`crate::host::Piece`]: it is a chunk of such a connection.
     pub const STREAM: u16 = 1 << 11;
-    /// With [`STREAM`]: sent to a router, which passes it on and is no subscriber.
+    /// With [`STREAM`]: sent to a router, which passes it on and is not a subscriber.
     pub const RELAYED: u16 = 1 << 12;
 }
 

@@ -32,7 +32,7 @@ impl Bytes for &[u8] {
     }
 }
 
-/// Size of the RTPS message header, behind which the first submessage begins.
+/// Size of the RTPS message header, after which the first submessage begins.
 pub const HEADER_LEN: u32 = 20;
 /// Longest message that is walked. A datagram has at most 65,507 bytes; a shared-memory transport
 /// may be configured for longer messages.
@@ -80,9 +80,9 @@ pub struct Walk {
 pub enum Step {
     /// The datagram ends here.
     End = 0,
-    /// The next submessage header begins beyond the bytes at hand.
+    /// The next submessage header begins beyond the available bytes.
     Later = 1,
-    /// The next submessage begins here, but the bytes that the walk needs are not all at hand.
+    /// The next submessage begins here, but the bytes that the walk needs are not all available.
     Split = 2,
     /// A submessage contradicts the datagram's length; the rest is unreadable.
     Malformed = 3,
@@ -184,7 +184,7 @@ macro_rules! read {
 }
 
 /// Reads the submessage at `walk.offset`, given that the first `present` bytes of the payload are
-/// at hand. Advances the offset unless it returns [`Step::Later`], [`Step::Split`] or
+/// available. Advances the offset unless it returns [`Step::Later`], [`Step::Split`] or
 /// [`Step::End`].
 #[inline(always)]
 pub fn step<B: Bytes>(walk: &mut Walk, bytes: &B, present: u32) -> Step {
@@ -307,7 +307,7 @@ fn zero() -> u32 {
 const EXTRA_LEN: u32 = 4;
 
 /// Returns octetsToInlineQos of a DATA or DATA_FRAG whose first word is `extra`. It counts from
-/// behind itself to the inline QoS, or to the payload (RTPS 2.5, 9.4.5.4). Later versions may
+/// after itself to the inline QoS, or to the payload (RTPS 2.5, 9.4.5.4). Later versions may
 /// insert fields, so the walk follows the offset.
 #[inline(always)]
 const fn octets_to_inline_qos(order: Order, extra: u32) -> u32 {

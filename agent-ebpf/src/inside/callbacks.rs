@@ -123,7 +123,7 @@ unsafe fn waited_since_source(
     }
 }
 
-/// Adds the time since the timer was due. At this moment, its structure has the next call.
+/// Adds the time since the timer was due. Its structure already has the time of the next call.
 #[inline(always)]
 unsafe fn waited_since_due(current: &Current, figures: *mut Figures, timer: u64, now: u64) {
     let structure = read::<u64>(timer);

@@ -69,7 +69,7 @@ macro_rules! arguments {
     };
 }
 
-/// Most programs behind [`called`].
+/// Most programs that [`called`] runs.
 const PROGRAMS: u32 = 32;
 
 /// The programs of functions, by cookie. Set by user space.

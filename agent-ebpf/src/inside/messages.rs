@@ -164,7 +164,7 @@ pub fn dequeued(buffer: u64, index: u64, size: u32) {
     }
 }
 
-/// A ring buffer is emptied.
+/// Records that a ring buffer was emptied.
 #[inline(always)]
 pub fn cleared(buffer: u64) {
     let Some(current) = Current::of_call() else {

@@ -3,7 +3,7 @@
 //! A segment that repeats earlier bytes is left out. Missing bytes do not matter within a batch
 //! of which only the head is needed: the next boundary is still known. Otherwise everything is
 //! passed on until a boundary is found again, and also the missing bytes when TCP repeats them. User
-//! space puts segments into their order and goes on by itself.
+//! space puts segments into their order and continues from there.
 
 use aya_ebpf::bindings::__sk_buff;
 use core::mem::swap;

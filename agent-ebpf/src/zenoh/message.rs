@@ -165,7 +165,7 @@ pub extern "C" fn number(slot: u32) -> u32 {
     0
 }
 
-/// Reads the extensions at the reader's position; returns 0 if they end behind the window or are
+/// Reads the extensions at the reader's position; returns 0 if they end after the window or are
 /// malformed.
 #[unsafe(export_name = "zenoh_extensions")]
 #[inline(never)]

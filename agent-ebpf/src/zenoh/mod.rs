@@ -57,7 +57,7 @@ pub fn socket(skb: *mut __sk_buff, at: u32) -> Option<()> {
     // SAFETY: the verifier rewrites reads of this field.
     let interface = unsafe { (*skb).ifindex };
     if at != hook::EGRESS && interface == LOOPBACK {
-        // TCP brings to the receiver what its sender sent, and that is seen there.
+        // These bytes were captured at the socket of their sender.
         return None;
     }
     let header = header(skb, 0)?;

@@ -19,7 +19,7 @@ const PUSH: u32 = 0x1d;
 const PUT: u32 = 0x01;
 /// Bytes of the payload that go with the head: those before and in `Header.stamp`, and more.
 const PAYLOAD: u32 = 32;
-/// Attachments of rmw_zenoh: length, and offset of the gid behind its own length.
+/// Attachments of rmw_zenoh: length, and offset of the gid after its own length.
 const PLAIN: [u32; 2] = [33, 17];
 const LABELLED: [u32; 2] = [77, 61];
 const GID: u32 = 16;
@@ -149,7 +149,7 @@ fn put(slot: u32) -> Option<()> {
     Some(())
 }
 
-/// Skips bytes with their length before them; returns 0 if they end behind the window.
+/// Skips bytes with their length before them; returns 0 if they end after the window.
 #[unsafe(export_name = "zenoh_skip")]
 #[inline(never)]
 pub extern "C" fn skip(slot: u32) -> u32 {

@@ -133,7 +133,7 @@ extern "C" fn begin(slot: u32, pending: u32) -> u32 {
     close(slot)
 }
 
-/// Forgets what is guessed of the direction.
+/// Discards the guess about the direction.
 #[unsafe(export_name = "zenoh_forget")]
 #[inline(never)]
 extern "C" fn close(slot: u32) -> u32 {
@@ -157,7 +157,7 @@ fn know(slot: u32, mut this: Current, mode: u32) -> u32 {
     u32::from(CONNECTIONS.insert(&this.key, &this.state, 0).is_ok())
 }
 
-/// Continues what is guessed of the direction, or begins a guess; returns 1 once it is certain.
+/// Continues the guess about the direction, or begins one; returns 1 once it is certain.
 #[inline(always)]
 fn guess(skb: *mut __sk_buff, slot: u32) -> u32 {
     let Some(mut this) = segment(slot) else {

@@ -113,13 +113,13 @@ pub struct Direction {
     pub next: u32,
     /// Sequence number of the next batch.
     pub boundary: u32,
-    /// Sequence number behind the last byte that a chunk covers.
+    /// Sequence number after the last byte that a chunk covers.
     pub covered: u32,
     /// What is passed on of the current batch, one of [`body`].
     pub body: u32,
     /// Bits of [`chain`].
     pub chain: u32,
-    /// The first byte of a length, with bit 8 set, if the last segment ended behind it.
+    /// The first byte of a length, with bit 8 set, if the last segment ended after it.
     pub prefix: u32,
     /// Flags of the next chunk.
     pub pending: u32,
@@ -158,9 +158,9 @@ pub struct Segment {
     pub window: u32,
     /// The number that was read last.
     pub value: u32,
-    /// Position behind the header of a FRAME or FRAGMENT.
+    /// Position after the header of a FRAME or FRAGMENT.
     pub message: u32,
-    /// What extensions say.
+    /// Content of the extensions.
     pub priority: u32,
     pub is_first: u32,
     pub is_shared: u32,
@@ -175,7 +175,7 @@ pub struct Segment {
     pub payload_len: u32,
     /// Length of the current batch with its prefix.
     pub total: u32,
-    /// Whether the batch is only judged, so that its sample does not matter.
+    /// Whether the batch is only examined, so that its sample does not matter.
     pub is_judged: u32,
     /// Whether user space should read the batch soon.
     pub wakes: u32,
@@ -253,7 +253,7 @@ impl Window {
         piece(slot).map(|buffer| Self(buffer.bytes.as_ptr()))
     }
 
-    /// Returns the byte at `at`; `None` at `end` and behind it.
+    /// Returns the byte at `at`; `None` at `end` and after it.
     #[inline(always)]
     pub fn byte(self, at: u32, end: u32) -> Option<u32> {
         if at >= end || at >= WINDOW {

@@ -38,7 +38,7 @@ pub struct Chain<'a> {
     pub source: Option<Cow<'a, str>>,
     /// Nodes of the chain with their inputs and outputs, in order.
     pub hops: Vec<Hop<'a>>,
-    /// Messages that went the whole way.
+    /// Messages that passed the whole path.
     pub messages: u64,
     /// Time from the first publication to the last.
     pub latency: Quantiles,
@@ -63,9 +63,9 @@ pub struct Hop<'a> {
     pub latency: Quantiles,
     /// Time from the publication of the input to its arrival at the node.
     pub transit: Option<Quantiles>,
-    /// Time from the arrival to the begin of the callback.
+    /// Time from the arrival to the start of the callback.
     pub wait: Option<Quantiles>,
-    /// Time from the begin of the callback to the publication of the output.
+    /// Time from the start of the callback to the publication of the output.
     pub callback: Option<Quantiles>,
     /// Time from the arrival to the publication of the output.
     pub processing: Option<Quantiles>,

@@ -96,7 +96,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_missing_is_named_with_its_size_and_remedy() {
+    fn a_missing_last_message_is_named_with_its_size_and_remedy() {
         let missing = |state: LatchedState, bytes| {
             let latched = Latched {
                 state: state.into(),

@@ -1,4 +1,4 @@
-//! Puts programs at the functions of a library's file.
+//! Attaches programs to the functions of a library's file.
 
 use std::collections::BTreeMap;
 use std::ffi::CString;
@@ -24,12 +24,12 @@ pub enum AttachError {
     /// The library has no functions to attach to.
     #[error("it exports neither ros_trace_rcl_publish nor ros_trace_rmw_take")]
     NoFunctions,
-    /// Other programs came than the functions need.
+    /// The received programs are not those that the functions need.
     #[error("expected {expected} BPF programs, received {given}")]
     Programs {
         /// Number of programs that the request needs.
         expected: usize,
-        /// Number of programs that came.
+        /// Number of received programs.
         given: usize,
     },
     /// The kernel has no uprobes.

@@ -42,7 +42,7 @@ struct FunctionsAttributes {
     unused: u32,
 }
 
-/// Puts a program at instructions of a file in all processes, with one cookie for each (Linux 6.6).
+/// Attaches a program to instructions of a file in all processes, one cookie for each (Linux 6.6).
 /// Closing the descriptor removes them together.
 ///
 /// # Errors

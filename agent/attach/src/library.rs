@@ -51,7 +51,7 @@ pub enum Form {
 }
 
 impl Form {
-    /// Returns the begin of the mangled parameters.
+    /// Returns the start of the mangled parameters.
     pub(crate) const fn parameters(self) -> &'static str {
         match self {
             Self::Whole => WHOLE,
@@ -252,7 +252,7 @@ fn search(
     Ok(())
 }
 
-/// Returns the file offset of the code loaded at this address, behind a landing pad.
+/// Returns the file offset of the code loaded at this address, after a landing pad.
 fn place(file: &File, header: &Header, address: u64) -> Result<u64, LibraryError> {
     let segments = table(file, header.segments, header.segment_count, SEGMENT)?;
     let (segments, _) = segments.as_chunks::<SEGMENT>();

@@ -51,7 +51,7 @@ pub struct Use {
 }
 
 impl Use {
-    /// Parses the text of a map.
+    /// Parses the text of `/proc/<pid>/maps`.
     #[must_use]
     pub fn parse(text: &str, library: Library) -> Self {
         let mut found = Self::default();
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn what_only_looks_alike_is_left_alone() {
+    fn files_with_similar_names_are_not_libraries() {
         for path in [
             "/usr/lib/libfastrtpsx.so.2",
             "/usr/lib/librmw_fastrtps_cpp.so",

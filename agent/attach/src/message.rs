@@ -43,7 +43,7 @@ pub(crate) fn send<T: Serialize>(
 /// Receives a message; `None` at the end of the connection.
 ///
 /// # Errors
-/// Fails if a packet is no message, or exceeds its bounds.
+/// Fails if a packet is not a message, or exceeds its bounds.
 pub(crate) fn receive<T: DeserializeOwned>(
     socket: BorrowedFd<'_>,
 ) -> io::Result<Option<(T, Vec<OwnedFd>)>> {

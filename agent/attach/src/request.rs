@@ -60,7 +60,7 @@ pub enum Request {
         /// Its id.
         process: u32,
     },
-    /// Puts the programs that come with the request at functions of a library:
+    /// Attaches the programs of the request to functions of a library:
     /// [`Answer::Attached`].
     Attach {
         /// The functions.

@@ -179,7 +179,7 @@ fn ready(source: Option<BorrowedFd<'_>>, limit: Duration) -> io::Result<bool> {
     Ok(polled.iter().any(|each| !each.revents().is_empty()))
 }
 
-/// A bucket of tokens: so many per second, and at once.
+/// A bucket of tokens: this many per second, and at once.
 struct Tokens {
     left: f64,
     rate: f64,
@@ -397,7 +397,7 @@ mod tests {
     }
 
     #[test]
-    fn tokens_beyond_a_burst_come_at_their_rate() {
+    fn tokens_beyond_a_burst_are_granted_at_the_rate() {
         let mut tokens = Tokens::new(100.0, 5.0);
         let began = Instant::now();
         for _ in 0..15 {

@@ -263,7 +263,7 @@ impl FileWriter {
         end.extend_from_slice(&summary);
         end.extend_from_slice(&mcap::MAGIC);
         self.append(&[&end])?;
-        // Releases the space reserved behind the end.
+        // Releases the space reserved after the end.
         self.file.set_len(self.position)
     }
 
@@ -530,7 +530,7 @@ impl FileWriter {
     }
 }
 
-/// Reserves space behind `offset` without changing the file's length.
+/// Reserves space after `offset` without changing the file's length.
 fn allocate(file: &File, offset: u64, length: u64) -> io::Result<()> {
     retry_on_intr(|| fallocate(file, FallocateFlags::KEEP_SIZE, offset, length))?;
     Ok(())

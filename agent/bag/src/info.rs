@@ -186,11 +186,11 @@ pub(super) fn read_text(path: &Path) -> std::io::Result<String> {
 
 /// Returns metadata.yaml's equivalent for a single file.
 pub(super) fn of_contents(contents: &Contents, path: &str) -> Metadata {
-    let mut said = None;
+    let mut stored = None;
     let mut ros_distro = String::new();
     for record in &contents.metadata {
         if let Some(text) = record.entries.get("serialized_metadata") {
-            said = Metadata::read_record(text).ok().or(said);
+            stored = Metadata::read_record(text).ok().or(stored);
         }
         if let Some(distro) = record.entries.get("ROS_DISTRO") {
             ros_distro.clone_from(distro);
@@ -219,7 +219,7 @@ pub(super) fn of_contents(contents: &Contents, path: &str) -> Metadata {
         message_count,
     };
     Metadata {
-        version: said.as_ref().map_or(5, |said| said.version),
+        version: stored.as_ref().map_or(5, |stored| stored.version),
         storage_identifier: "mcap".to_owned(),
         duration: file.duration,
         starting_time: start,
@@ -229,12 +229,12 @@ pub(super) fn of_contents(contents: &Contents, path: &str) -> Metadata {
         compression_mode: String::new(),
         relative_file_paths: vec![path.to_owned()],
         files: vec![file],
-        custom_data: said
+        custom_data: stored
             .as_ref()
-            .map(|said| said.custom_data.clone())
+            .map(|stored| stored.custom_data.clone())
             .unwrap_or_default(),
-        ros_distro: match said {
-            Some(said) if !said.ros_distro.is_empty() => said.ros_distro,
+        ros_distro: match stored {
+            Some(stored) if !stored.ros_distro.is_empty() => stored.ros_distro,
             _ => ros_distro,
         },
     }

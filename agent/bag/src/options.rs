@@ -319,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn what_would_have_no_effect_is_refused() {
+    fn unsupported_and_invalid_storage_options_are_refused() {
         for keys in [
             "noSummary: true",
             "chunksize: 5",

@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn no_publisher_is_what_readers_take_for_none() {
+    fn profiles_of_no_publisher_are_an_empty_text_or_list() {
         assert_eq!(profiles(&[], Spelling::Numbers), "");
         assert_eq!(profiles(&[], Spelling::Names), "[]");
     }

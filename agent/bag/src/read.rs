@@ -363,7 +363,7 @@ fn finish_chunk(indexed: Option<IndexedChunk>, scan: &mut Scan, at_end: bool) {
         return;
     };
     if at_end && indexed.offsets.len() < indexed.index.len() {
-        // All indexes are written again behind the chunk.
+        // All indexes are written again after the chunk.
         scan.end = indexed.chunk.offset + indexed.chunk.length;
         scan.last_chunk_index = indexed.index;
     } else {

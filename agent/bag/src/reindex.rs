@@ -231,7 +231,7 @@ fn definition(known: &Contents, message: &Message<'_>) -> Option<(mcap::Schema, 
     Some((schema.clone(), channel.clone()))
 }
 
-/// Returns the bytes behind the last complete record that once were a record.
+/// Returns the bytes after the last complete record that once were a record.
 fn cut_bytes(source: &mut File, scan: &Scan) -> io::Result<u64> {
     let length = source.metadata()?.len();
     if scan.is_ended || is_zero(source, scan.end)? {
@@ -286,7 +286,7 @@ fn metadata_of(
 ) -> Metadata {
     let mut topics: BTreeMap<String, Topic> = BTreeMap::new();
     let mut files = Vec::new();
-    let mut said: Option<Metadata> = before;
+    let mut stored: Option<Metadata> = before;
     let mut times: Option<(u64, u64)> = None;
     for (name, contents) in parts {
         let suffix = format!(".{}", compression.name());
@@ -311,20 +311,20 @@ fn metadata_of(
             }
             known.message_count = known.message_count.saturating_add(topic.message_count);
         }
-        said.get_or_insert(part);
+        stored.get_or_insert(part);
     }
     let is_named = |topic: &Topic| {
         let history = topic.offered_qos_profiles.strip_prefix("- history: ");
         history.is_some_and(|history| history.starts_with(|c: char| c.is_ascii_alphabetic()))
     };
-    let version = match &said {
+    let version = match &stored {
         _ if topics.values().any(is_named) => 9,
-        Some(said) => said.version.max(5),
+        Some(stored) => stored.version.max(5),
         None => 5,
     };
-    let mut custom_data = said
+    let mut custom_data = stored
         .as_ref()
-        .map(|said| said.custom_data.clone())
+        .map(|stored| stored.custom_data.clone())
         .unwrap_or_default();
     for report in reports {
         if report.found != Found::Complete {
@@ -351,7 +351,7 @@ fn metadata_of(
         relative_file_paths: parts.iter().map(|(name, _)| name.clone()).collect(),
         files,
         custom_data,
-        ros_distro: said.map(|said| said.ros_distro).unwrap_or_default(),
+        ros_distro: stored.map(|stored| stored.ros_distro).unwrap_or_default(),
     }
 }
 

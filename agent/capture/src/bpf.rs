@@ -16,7 +16,7 @@ const BTF_LOAD: c_int = 18;
 const LINK_CREATE: c_int = 28;
 const ITER_CREATE: c_int = 33;
 
-/// Type of programs at functions.
+/// Type of programs attached to functions.
 const PROG_TYPE_KPROBE: u32 = 2;
 
 /// Attributes of `BPF_PROG_LOAD`.
@@ -195,7 +195,7 @@ unsafe fn descriptor<T>(command: c_int, attributes: &T) -> io::Result<OwnedFd> {
 /// # Safety
 /// Pointers in the attributes are null, or refer to as much memory as the command reads.
 unsafe fn call<T>(command: c_int, attributes: &T) -> io::Result<c_int> {
-    // SAFETY: the attributes' size is passed; the rest is the caller's.
+    // SAFETY: the attributes' size is passed; the caller ensures the rest.
     let result = unsafe {
         libc::syscall(
             libc::SYS_bpf,
@@ -215,7 +215,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_does_not_exist_is_not_found() {
+    fn a_lookup_in_no_map_fails_with_ebadf_or_eperm() {
         let error = failed_lookup().raw_os_error();
         assert!(
             matches!(error, Some(libc::EBADF | libc::EPERM)),

@@ -1,4 +1,4 @@
-//! Kernel programs at functions of a library, in every process that maps it.
+//! Kernel programs attached to functions of a library, in every process that maps it.
 //!
 //! Linux 6.6 has one link for all functions of a library: it is created and removed in the time of
 //! one function, and needs no capability beyond those that load a program. Earlier kernels have a
@@ -121,7 +121,7 @@ impl Breakpoints {
         programs.collect()
     }
 
-    /// Lets the broker put the programs at the functions of a library. `calls`: those for which the
+    /// Lets the broker attach the programs to functions of a library. `calls`: those for which the
     /// programs are loaded, or a part of them.
     ///
     /// # Errors
@@ -151,7 +151,7 @@ impl Breakpoints {
         })
     }
 
-    /// Puts the programs at the functions of a file with the rights of this process, without a
+    /// Attaches the programs to functions of a file with the rights of this process, without a
     /// broker: for tests and examples.
     ///
     /// # Errors

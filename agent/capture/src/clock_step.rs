@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn what_came_before_the_step_is_taken_for_what_it_is() {
+    fn times_from_before_a_step_are_converted_by_the_step() {
         for step in [HOUR, -HOUR] {
             let mut set = ClockStep::new(&clocks(0, 0));
             let mut now = clocks(5 * SECOND, step);

@@ -2,6 +2,25 @@
 
 use std::error::Error;
 
+/// Why something is not available, as text: an error is rendered when it happens.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct Reason(pub String);
+
+impl Reason {
+    /// Renders an error and its causes as [`in_words`].
+    #[must_use]
+    pub fn of(error: &dyn Error) -> Self {
+        Self(in_words(error))
+    }
+
+    /// Returns the text.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
 /// Returns an error and its causes in one line; only the first line of a verifier's log.
 #[must_use]
 pub fn in_words(error: &dyn Error) -> String {

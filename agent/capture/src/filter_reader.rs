@@ -215,7 +215,7 @@ impl FilterReader {
                 decode_datagram(&piece, &bytes, clocks, waiting, observer);
                 continue;
             }
-            // Queued behind those that wait: overtaking them would let a sample count by duplicate
+            // Queued after those that wait: overtaking them would let a sample count by duplicate
             // fragments whose bytes are still in the ring.
             self.fresh.push_back((piece, bytes.into_owned()));
         }

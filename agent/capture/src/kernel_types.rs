@@ -1,7 +1,7 @@
 //! Layout of the running kernel's types: offsets of members, values of enumerators. Read from BTF
 //! (Documentation/bpf/btf.rst) in `/sys/kernel/btf/vmlinux`.
 //!
-//! It only looks up and does not interpret further. The file is the kernel's own; still every read
+//! It only finds offsets, sizes and enumerators. The file is the kernel's own; still every read
 //! is bounded and unreadable content is an error. Kernels differ, so the caller handles missing
 //! members.
 
@@ -311,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_there_and_bit_fields_have_no_offset() {
+    fn missing_members_and_bit_fields_have_no_offset() {
         let types = KernelTypes::parse(types()).unwrap();
         assert_eq!(types.offset("sock", "flag"), None);
         assert_eq!(types.offset("sock", "cook"), None);

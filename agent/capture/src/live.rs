@@ -48,8 +48,8 @@ const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
 const UNKNOWN_RECORDS_PER_TENTH: u32 = 410;
 /// Most of these portions at once: a fifth of a ring of the default size.
 const UNKNOWN_PORTIONS: u64 = 4;
-/// How long news from the host hook is collected: a starting node announces its endpoints one by
-/// one, and each round costs CPU time.
+/// How long captures of the host hook are collected: a starting node announces its endpoints one
+/// by one, and each round costs CPU time.
 const GATHER: Duration = Duration::from_millis(10);
 /// The same while whole samples are captured: a point cloud fills the ring in a few milliseconds.
 const GATHER_PAYLOADS: Duration = Duration::from_millis(2);

@@ -169,8 +169,8 @@ impl Ring {
         for (offset, byte) in (from..).zip(into) {
             let place = self.page + usize::try_from(offset % size).unwrap_or(0);
             let place = self.start.as_ptr().wrapping_add(place);
-            // SAFETY: the place is in the mapping, behind its first page. The kernel writes only
-            // behind the head.
+            // SAFETY: the place is in the mapping, after its first page. The kernel writes only
+            // after the head.
             *byte = unsafe { place.read() };
         }
     }

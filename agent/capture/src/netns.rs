@@ -130,7 +130,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn work_is_done_there_and_the_caller_stays_here() {
+    fn work_runs_in_the_other_namespace_and_the_caller_stays_in_its_own() {
         let outside = current();
         let (before, outside_name) = (name(&outside), name(&outside));
         in_new_namespace(|| {

@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn one_whose_rest_never_comes_is_given_up_once() {
+    fn an_incomplete_datagram_is_given_up_once() {
         let mut wholes = PieceAssembler::default();
         let all = pieces(1, 40_000);
         assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
@@ -216,7 +216,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn whatever_comes_only_true_datagrams_are_given(
+        fn any_pieces_yield_only_true_datagrams(
             sequence in proptest::collection::vec(
                 (0_u32..3, 0_u32..5, 0_u32..4, 0_u32..3),
                 0..60,

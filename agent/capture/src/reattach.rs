@@ -120,7 +120,7 @@ impl Drop for Reattach {
         if let Some(thread) = self.thread.take()
             && self.shared.progress.stalled().is_none()
         {
-            // The thread has ended in any case; its result has no user.
+            // The thread has ended in any case; its result is not needed.
             let _ = thread.join();
         }
     }

@@ -67,7 +67,7 @@ struct Walked {
     /// The record, with its time in the wall clock.
     record: Record,
     /// Whether it was already passed as not delivered.
-    no_room_said: bool,
+    no_room_reported: bool,
 }
 
 /// A segment of a connection of Zenoh, or a part of one.
@@ -155,7 +155,7 @@ impl ReorderBuffer {
         let left = self.walked.push_back(Walked {
             at,
             record,
-            no_room_said: false,
+            no_room_reported: false,
         });
         left.map(|walked| walked.record)
     }
@@ -299,8 +299,8 @@ impl ReorderBuffer {
         }
         let walked = self.walked.front_mut()?;
         let record = walked.record;
-        if !walked.no_room_said && self.undelivered_tokens.contains(&record.datagram) {
-            walked.no_room_said = true;
+        if !walked.no_room_reported && self.undelivered_tokens.contains(&record.datagram) {
+            walked.no_room_reported = true;
             if record.is_sample() {
                 let flags = record.flags | flag::SOCKET_FULL;
                 return Some(Next::Walked(Record { flags, ..record }));
@@ -434,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn no_room_is_reported_before_everything_of_its_time_or_later() {
+    fn a_full_buffer_is_reported_before_the_records_of_its_time_and_later() {
         let mut order = ReorderBuffer::default();
         order.kernel(of_the_kernel(1, 5));
         order.kernel(of_the_kernel(2, 10));
@@ -453,7 +453,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_captured_datagram_holds_is_said_as_not_delivered_first() {
+    fn samples_of_a_captured_datagram_are_first_reported_as_not_delivered() {
         for pieces_first in [true, false] {
             let mut order = ReorderBuffer::default();
             let heartbeat = |(at, record)| {
@@ -519,7 +519,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_burst_took_is_given_back_when_it_is_over() {
+    fn memory_of_a_burst_is_released_after_it() {
         let mut order = ReorderBuffer::default();
         for number in 0..20_000 {
             order.kernel(of_the_kernel(number, 1));
@@ -618,7 +618,7 @@ mod tests {
     }
 
     #[test]
-    fn no_more_wait_than_there_is_room_for() {
+    fn records_beyond_the_caps_are_refused() {
         let mut order = ReorderBuffer::default();
         let refused = (0..20_000).filter(|number| {
             let (at, record) = captured(*number, 1);
@@ -646,7 +646,7 @@ mod tests {
     }
 
     #[test]
-    fn no_more_records_of_the_kernel_are_taken_than_there_is_room_for() {
+    fn the_buffer_is_full_at_the_cap_of_kernel_records() {
         let mut order = ReorderBuffer::default();
         let mut number = 0;
         while !order.is_full() {

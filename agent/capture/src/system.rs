@@ -363,21 +363,21 @@ mod tests {
     fn a_created_file_ends_the_sleep_and_is_reported_once() {
         let directory = tempfile::tempdir().unwrap();
         let mut watch = DirectoryWatch::new().unwrap();
-        let news = |watch: &mut DirectoryWatch, timeout, name: &str| {
+        let is_created = |watch: &mut DirectoryWatch, timeout, name: &str| {
             wait(&[watch.as_fd()], timeout).unwrap() == Some(0)
                 && watch.created(|created| name.is_empty() || created == name)
         };
         assert!(watch.add(directory.path()));
         assert!(!watch.add(Path::new("/nowhere")));
         let short = Duration::from_micros(100);
-        assert!(!news(&mut watch, short, ""));
+        assert!(!is_created(&mut watch, short, ""));
         for name in ["one", "two"] {
             std::fs::write(directory.path().join(name), "").unwrap();
         }
-        assert!(news(&mut watch, Duration::from_secs(60), "two"));
-        assert!(!news(&mut watch, short, ""));
+        assert!(is_created(&mut watch, Duration::from_secs(60), "two"));
+        assert!(!is_created(&mut watch, short, ""));
         std::fs::write(directory.path().join("three"), "").unwrap();
-        assert!(!news(&mut watch, Duration::from_secs(60), "two"));
+        assert!(!is_created(&mut watch, Duration::from_secs(60), "two"));
     }
 
     #[test]

@@ -4,14 +4,12 @@
 //! All of them are optional. A program that this kernel does not support is skipped, and
 //! [`Abilities`] holds the reason.
 
-use std::error::Error;
-use std::fmt::Write as _;
-
 use aya::programs::raw_trace_point::RawTracePointLink;
 use aya::programs::{ProgramError, RawTracePoint};
 use aya::{Ebpf, EbpfLoader};
 use ros2probe_wire::host::Layout;
 
+use super::error_chain::{Reason, in_words};
 use super::kernel_types::KernelTypes;
 use super::owners::Owners;
 
@@ -19,11 +17,11 @@ use super::owners::Owners;
 #[derive(Clone, Debug)]
 pub struct Abilities {
     /// Datagrams dropped at a full socket buffer, by writer and sequence number.
-    pub socket_losses: Result<(), String>,
+    pub socket_losses: Result<(), Reason>,
     /// Datagrams with missing IP fragments, by writer and sequence number.
-    pub reassembly_losses: Result<(), String>,
+    pub reassembly_losses: Result<(), Reason>,
     /// Processes that hold a socket.
-    pub owners: Result<(), String>,
+    pub owners: Result<(), Reason>,
 }
 
 /// The running kernel's types that the programs read.
@@ -31,7 +29,7 @@ pub struct Abilities {
 pub struct KernelLayout {
     array: [u32; Layout::COUNT],
     /// Why they are unknown altogether.
-    unknown: Option<String>,
+    unknown: Option<Reason>,
 }
 
 /// The enumeration of drop reasons: Linux 5.17; those for fragments: 6.2.
@@ -102,13 +100,13 @@ impl KernelLayout {
     pub fn read() -> Self {
         match KernelTypes::read() {
             Ok(types) => Self::of(&types),
-            Err(error) => Self::unknown(chain(&error)),
+            Err(error) => Self::unknown(Reason::of(&error)),
         }
     }
 
     /// Marks every type as unknown, for this reason.
     #[must_use]
-    pub const fn unknown(reason: String) -> Self {
+    pub const fn unknown(reason: Reason) -> Self {
         Self {
             array: [Layout::ABSENT; Layout::COUNT],
             unknown: Some(reason),
@@ -139,7 +137,7 @@ impl KernelLayout {
     }
 
     /// Checks that all of these are known; otherwise returns the reason why a program cannot run.
-    fn need(&self, layout: &[Layout]) -> Result<(), String> {
+    fn need(&self, layout: &[Layout]) -> Result<(), Reason> {
         if let Some(unknown) = &self.unknown {
             return Err(unknown.clone());
         }
@@ -147,7 +145,9 @@ impl KernelLayout {
             layout.contains(place) && self.array.get(*place as usize) == Some(&Layout::ABSENT)
         });
         match absent {
-            Some((_, structure, member)) => Err(format!("this kernel has no {structure} {member}")),
+            Some((_, structure, member)) => {
+                Err(Reason(format!("this kernel has no {structure} {member}")))
+            }
             None => Ok(()),
         }
     }
@@ -191,10 +191,10 @@ fn socket_losses(
     ebpf: &mut Ebpf,
     layout: &KernelLayout,
     whole_host: bool,
-) -> Result<Vec<RawTracePointLink>, String> {
+) -> Result<Vec<RawTracePointLink>, Reason> {
     if !whole_host && let Err(reason) = layout.need(&[Layout::SocketCookie]) {
         // A socket outside of the hook's cgroup could be mistaken for one inside.
-        return Err(format!("limited to one cgroup, and {reason}"));
+        return Err(Reason(format!("limited to one cgroup, and {reason}")));
     }
     let mut links = vec![tracepoint(ebpf, "socket_full", "udp_fail_queue_rcv_skb")?];
     if release().is_none_or(|release| release < REPORTS_IPV6) {
@@ -216,7 +216,7 @@ pub(crate) fn release() -> Option<(u32, u32)> {
     Some((parts.next()?.parse().ok()?, parts.next()?.parse().ok()?))
 }
 
-fn reassembly_losses(ebpf: &mut Ebpf, layout: &KernelLayout) -> Result<RawTracePointLink, String> {
+fn reassembly_losses(ebpf: &mut Ebpf, layout: &KernelLayout) -> Result<RawTracePointLink, Reason> {
     layout.need(&[
         Layout::BufferHead,
         Layout::BufferTail,
@@ -231,7 +231,7 @@ fn reassembly_losses(ebpf: &mut Ebpf, layout: &KernelLayout) -> Result<RawTraceP
     tracepoint(ebpf, program, "kfree_skb")
 }
 
-fn owners(ebpf: &mut Ebpf, layout: &KernelLayout) -> Result<Owners, String> {
+fn owners(ebpf: &mut Ebpf, layout: &KernelLayout) -> Result<Owners, Reason> {
     layout.need(&[
         Layout::SocketCookie,
         Layout::FileInode,
@@ -248,14 +248,14 @@ fn owners(ebpf: &mut Ebpf, layout: &KernelLayout) -> Result<Owners, String> {
         Layout::PidNumbers,
         Layout::PidNumberSize,
     ])?;
-    Owners::load(ebpf).map_err(|error| chain(&error))
+    Owners::load(ebpf).map_err(|error| Reason::of(&error))
 }
 
 fn tracepoint(
     ebpf: &mut Ebpf,
     program: &'static str,
     tracepoint: &'static str,
-) -> Result<RawTracePointLink, String> {
+) -> Result<RawTracePointLink, Reason> {
     let mut attach = || -> Result<RawTracePointLink, ProgramError> {
         let Some(found) = ebpf.program_mut(program) else {
             return Err(ProgramError::NotLoaded);
@@ -265,23 +265,7 @@ fn tracepoint(
         let link = found.attach(tracepoint)?;
         found.take_link(link)
     };
-    attach().map_err(|error| format!("tracepoint {tracepoint}: {}", chain(&error)))
-}
-
-/// Returns an error and its causes in one line; only the first line of a verifier's log.
-fn chain(error: &dyn Error) -> String {
-    let mut text = String::new();
-    let mut cause = Some(error);
-    while let Some(error) = cause {
-        let separator = if text.is_empty() { "" } else { ": " };
-        let message = error.to_string();
-        let first = message.lines().next().unwrap_or_default();
-        if !text.ends_with(first) {
-            let _ = write!(text, "{separator}{first}");
-        }
-        cause = error.source();
-    }
-    text
+    attach().map_err(|error| Reason(format!("tracepoint {tracepoint}: {}", in_words(&error))))
 }
 
 #[cfg(test)]
@@ -309,11 +293,12 @@ mod tests {
         layout.array[Layout::ReasonTimeout as usize] = Layout::ABSENT;
         let reason = layout.need(&needed).unwrap_err();
         assert_eq!(
-            reason,
+            reason.as_str(),
             "this kernel has no skb_drop_reason SKB_DROP_REASON_FRAG_REASM_TIMEOUT"
         );
         assert_eq!(layout.need(&[Layout::BufferHead]), Ok(()));
-        let unknown = KernelLayout::unknown("no types".to_owned());
-        assert_eq!(unknown.need(&needed), Err("no types".to_owned()));
+        let reason = Reason("no types".to_owned());
+        let unknown = KernelLayout::unknown(reason.clone());
+        assert_eq!(unknown.need(&needed), Err(reason));
     }
 }

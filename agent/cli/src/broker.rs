@@ -84,7 +84,7 @@ fn bound(path: &Path) -> Result<OwnedFd> {
     let shown = path.display();
     match connect(&probe, &address) {
         Ok(()) => bail!("another broker listens at {shown}"),
-        // A file that is no socket refuses connections, too.
+        // A file that is not a socket refuses connections, too.
         Err(Errno::CONNREFUSED) if is_socket(path) => std::fs::remove_file(path)
             .with_context(|| format!("cannot replace the socket {shown}"))?,
         Err(_) => {}

@@ -2,9 +2,9 @@
 //!
 //! - [`client`] reaches an agent at a socket or an address, or replays a capture in this process.
 //! - [`ros2`] formats answers as `ros2 topic`, `ros2 node`, `ros2 bag info` and others do.
-//! - [`learn`] chooses expectations from what a healthy robot does.
+//! - [`learn`] chooses expectations from the figures of a healthy robot.
 //! - [`discover`] requests announcements from running participants and routers.
-//! - [`inside`] formats what processes show from inside.
+//! - [`inside`] formats figures of calls inside processes.
 //! - [`top`] is the screen of `rp top`, [`doctor`] the checks of `rp doctor`.
 //!
 //! The commands themselves are in the program (`src/cli/`).

@@ -79,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn nothing_that_a_terminal_would_obey_is_left() {
+    fn every_control_character_is_escaped() {
         assert_eq!(
             visible("/a\u{1b}[2J\r\nb\u{202e}c"),
             r"/a\u{1b}[2J\r\nb\u{202e}c"

@@ -44,7 +44,7 @@ pub struct EventLog {
     run: Run,
     begun: Instant,
     log: Mutex<Log>,
-    news: Notify,
+    recorded: Notify,
     overtaken: [AtomicU64; Reader::ALL.len()],
 }
 
@@ -124,7 +124,7 @@ impl EventLog {
             run: Run(wall_clock().0 / 1000),
             begun: Instant::now(),
             log: Mutex::default(),
-            news: Notify::new(),
+            recorded: Notify::new(),
             overtaken: Default::default(),
         }
     }
@@ -143,10 +143,10 @@ impl EventLog {
         }
         // Events are settled up to a second after they happen.
         log.turn_robot(clock.whole_seconds().saturating_sub(1));
-        let is_news = log.last > before;
+        let is_recorded = log.last > before;
         drop(log);
-        if is_news {
-            self.news.notify_waiters();
+        if is_recorded {
+            self.recorded.notify_waiters();
         }
     }
 
@@ -155,7 +155,7 @@ impl EventLog {
         let mut log = self.log();
         log.record_suppressed();
         drop(log);
-        self.news.notify_waiters();
+        self.recorded.notify_waiters();
     }
 
     /// Records an event of the agent at the current time.
@@ -163,13 +163,13 @@ impl EventLog {
         self.record_at(event, Instant::now());
     }
 
-    /// Events after the number `behind`, oldest first, at most `most`.
+    /// Events after the number `after`, oldest first, at most `most`.
     #[must_use]
-    pub fn read(&self, behind: u64, most: usize) -> Batch {
+    pub fn read(&self, after: u64, most: usize) -> Batch {
         let log = self.log();
         let before_first = log.last - log.kept.len() as u64;
-        let behind_what_is_kept = behind.clamp(before_first, log.last);
-        let skip = usize::try_from(behind_what_is_kept - before_first).unwrap_or(usize::MAX);
+        let kept_after = after.clamp(before_first, log.last);
+        let skip = usize::try_from(kept_after - before_first).unwrap_or(usize::MAX);
         let entries: Vec<_> = log
             .kept
             .iter()
@@ -179,10 +179,8 @@ impl EventLog {
             .collect();
         drop(log);
         Batch {
-            lagged: before_first.saturating_sub(behind),
-            last: entries
-                .last()
-                .map_or(behind_what_is_kept, |entry| entry.number),
+            lagged: before_first.saturating_sub(after),
+            last: entries.last().map_or(kept_after, |entry| entry.number),
             records: entries.iter().map(|entry| entry.record()).collect(),
         }
     }
@@ -193,15 +191,15 @@ impl EventLog {
         self.log().last
     }
 
-    /// Waits for an event after the number `behind`.
-    pub async fn wait(&self, behind: u64) {
+    /// Waits for an event after the number `after`.
+    pub async fn wait(&self, after: u64) {
         loop {
             // Registered before the check, so that no event is missed.
-            let news = self.news.notified();
-            if self.last() > behind {
+            let recorded = self.recorded.notified();
+            if self.last() > after {
                 return;
             }
-            news.await;
+            recorded.await;
         }
     }
 
@@ -271,7 +269,7 @@ impl EventLog {
         }
         log.record(wall_clock(), Occurrence::Agent(event));
         drop(log);
-        self.news.notify_waiters();
+        self.recorded.notify_waiters();
     }
 
     /// Simulates `count` events, after which all kept events are overwritten.
@@ -281,7 +279,7 @@ impl EventLog {
         log.kept.clear();
         log.last += count;
         drop(log);
-        self.news.notify_waiters();
+        self.recorded.notify_waiters();
     }
 
     /// Locks the log. A poisoned lock is usable, since appended events are complete.

@@ -52,7 +52,7 @@ pub fn is_zenoh(vendor: &str) -> bool {
     VendorId::ZENOH.to_string() == vendor
 }
 
-/// Returns the sentence about so many active writers.
+/// Returns the sentence about this many active writers.
 #[must_use]
 pub fn sentence(writers: usize) -> String {
     match writers {

@@ -38,7 +38,7 @@ pub struct SnapshotCell {
     /// When a client last needed calls inside processes.
     calls_wanted: ArcSwapOption<Instant>,
     bell: Arc<CaptureBell>,
-    news: Notify,
+    publication: Notify,
 }
 
 /// Wakes the capture thread from its wait for packets. Without a socket pair, readers wait until
@@ -99,7 +99,7 @@ impl SnapshotCell {
             read: AtomicBool::new(false),
             calls_wanted: ArcSwapOption::empty(),
             bell: Arc::new(CaptureBell::new()),
-            news: Notify::new(),
+            publication: Notify::new(),
         }
     }
 
@@ -111,7 +111,7 @@ impl SnapshotCell {
         });
         self.state.store(Arc::clone(&state));
         self.asked.store(false, Ordering::Relaxed);
-        self.news.notify_waiters();
+        self.publication.notify_waiters();
         state
     }
 
@@ -196,20 +196,37 @@ impl SnapshotCell {
     /// Requests a newer state and waits for it for at most `timeout`. Counters in a scrape should
     /// be current, or rates over short windows would be wrong.
     pub async fn refresh(&self, timeout: Duration) {
-        let news = self.news.notified();
+        let publication = self.publication.notified();
         if self.state.load().agent.finished {
             return;
         }
         self.asked.store(true, Ordering::Relaxed);
         self.bell.ring();
         // After a timeout, the latest state is shown with its age.
-        let _ = tokio::time::timeout(timeout, news).await;
+        let _ = tokio::time::timeout(timeout, publication).await;
     }
 
     /// Returns when a newer state is published, without requesting one.
     pub async fn published(&self) {
-        self.news.notified().await;
+        self.publication.notified().await;
     }
+}
+
+/// Why a state does not describe the robot.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Unready {
+    /// No snapshot exists yet.
+    #[error("starting: nothing captured yet")]
+    Starting,
+    /// The capture thread has not finished a round for this many seconds.
+    #[error("the capture has made no progress for {0} s")]
+    NoProgress(u64),
+    /// The last snapshot is this many seconds old.
+    #[error("the last snapshot is {0} s old")]
+    Outdated(u64),
+    /// The source does not see its target, for this reason.
+    #[error("{0}")]
+    Unseen(String),
 }
 
 impl State {
@@ -225,12 +242,12 @@ impl State {
     /// # Errors
     ///
     /// Returns the reason if it does not.
-    pub fn ready(&self, now: Instant) -> Result<(), String> {
+    pub fn ready(&self, now: Instant) -> Result<(), Unready> {
         self.progresses(now)?;
         let agent = &self.agent;
         let unseen = agent.gone.as_ref().or(agent.stalled.as_ref());
         let unseen = unseen.or(agent.pending.as_ref());
-        unseen.map_or(Ok(()), |reason| Err(reason.clone()))
+        unseen.map_or(Ok(()), |reason| Err(Unready::Unseen(reason.clone())))
     }
 
     /// Checks whether the capture works, even if its target no longer exists.
@@ -238,23 +255,20 @@ impl State {
     /// # Errors
     ///
     /// Returns the reason if it does not.
-    pub fn progresses(&self, now: Instant) -> Result<(), String> {
+    pub fn progresses(&self, now: Instant) -> Result<(), Unready> {
         if self.snapshot.is_none() {
-            return Err("starting: nothing captured yet".to_owned());
+            return Err(Unready::Starting);
         }
         if self.agent.finished {
             return Ok(());
         }
         let stuck = now.saturating_duration_since(self.agent.capture_progress);
         if stuck > FRESH {
-            return Err(format!(
-                "the capture has made no progress for {} s",
-                stuck.as_secs()
-            ));
+            return Err(Unready::NoProgress(stuck.as_secs()));
         }
         let age = now.saturating_duration_since(self.agent.at);
         if age > FRESH {
-            return Err(format!("the last snapshot is {} s old", age.as_secs()));
+            return Err(Unready::Outdated(age.as_secs()));
         }
         Ok(())
     }
@@ -269,12 +283,7 @@ mod tests {
     fn an_agent_is_ready_only_while_it_sees() {
         let cell = SnapshotCell::new(SourceKind::Wire);
         let start = Instant::now();
-        assert!(
-            cell.state()
-                .ready(start)
-                .unwrap_err()
-                .starts_with("starting")
-        );
+        assert_eq!(cell.state().ready(start), Err(Unready::Starting));
 
         cell.publish(
             Snapshot::default(),
@@ -285,7 +294,10 @@ mod tests {
             .state()
             .ready(start + Duration::from_secs(7))
             .unwrap_err();
-        assert_eq!(reason, "the capture has made no progress for 7 s");
+        assert_eq!(
+            reason.to_string(),
+            "the capture has made no progress for 7 s"
+        );
 
         let later = start + Duration::from_secs(60);
         let agent = AgentFacts {
@@ -294,7 +306,7 @@ mod tests {
         };
         cell.publish(Snapshot::default(), agent);
         assert_eq!(
-            cell.state().ready(later).unwrap_err(),
+            cell.state().ready(later).unwrap_err().to_string(),
             "the last snapshot is 60 s old"
         );
     }
@@ -310,7 +322,7 @@ mod tests {
                 ..AgentFacts::new(SourceKind::Host, start)
             },
         };
-        assert_eq!(state.ready(start), Err(gone));
+        assert_eq!(state.ready(start), Err(Unready::Unseen(gone)));
         assert_eq!(state.progresses(start), Ok(()));
         let later = start + Duration::from_hours(1);
         assert!(state.progresses(later).is_err());
@@ -319,13 +331,13 @@ mod tests {
         // So are the figures of a part that makes no progress.
         let stalled = "capture.inside: its thread has made no progress for 5 s".to_owned();
         state.agent.stalled = Some(stalled.clone());
-        assert_eq!(state.ready(start), Err(stalled));
+        assert_eq!(state.ready(start), Err(Unready::Unseen(stalled)));
         assert_eq!(state.progresses(start), Ok(()));
         state.agent.stalled = None;
         // Breakpoints that are still to be set are missing as well.
         let pending = "capture.inside: not inspected yet".to_owned();
         state.agent.pending = Some(pending.clone());
-        assert_eq!(state.ready(start), Err(pending));
+        assert_eq!(state.ready(start), Err(Unready::Unseen(pending)));
         assert_eq!(state.progresses(start), Ok(()));
     }
 
@@ -354,22 +366,22 @@ mod tests {
         };
         cell.publish(snapshot, at(0));
         assert!(!cell.was_read());
-        let mut news = Box::pin(cell.published());
-        assert!(futures_util::poll!(&mut news).is_pending());
+        let mut publication = Box::pin(cell.published());
+        assert!(futures_util::poll!(&mut publication).is_pending());
         cell.refresh(Duration::ZERO).await;
         cell.publish_agent(at(3));
-        assert!(futures_util::poll!(&mut news).is_pending() && cell.is_asked());
+        assert!(futures_util::poll!(&mut publication).is_pending() && cell.is_asked());
         let own = cell.own_state();
         assert_eq!((own.known().records, own.agent.at), (7, at(3).at));
         assert!(!cell.was_read(), "the snapshot was not read");
         assert_eq!(cell.state().known().records, 7);
         assert!(cell.was_read() && !cell.was_read());
         cell.publish(Snapshot::default(), at(4));
-        news.await;
+        publication.await;
     }
 
     #[tokio::test]
-    async fn who_asks_gets_the_next_state_and_waits_for_a_stuck_writer_only_so_long() {
+    async fn a_refresh_gets_the_next_state_and_waits_for_a_stuck_writer_up_to_a_timeout() {
         let cell = SnapshotCell::new(SourceKind::Wire);
         let writer = async {
             while !cell.is_asked() {

@@ -64,7 +64,7 @@ pub enum Done {
 pub enum Refused {
     /// The configuration or the command line has this watch; clients cannot override it.
     #[error("it is defined by {}", by.phrase())]
-    Given {
+    DefinedElsewhere {
         /// Origin of the watch.
         by: Origin,
     },
@@ -90,7 +90,7 @@ pub struct Watches {
     lists: Mutex<Lists>,
     in_force: ArcSwap<InForce>,
     /// Latest list that the capture thread has not read yet.
-    news: ArcSwapOption<Watchlist>,
+    unread: ArcSwapOption<Watchlist>,
     limits: Arc<LimitFigures>,
     events: Arc<EventLog>,
     shown: Arc<SettingsCell>,
@@ -174,7 +174,7 @@ impl Watches {
         let watches = Self {
             lists: Mutex::default(),
             in_force: ArcSwap::default(),
-            news: ArcSwapOption::default(),
+            unread: ArcSwapOption::default(),
             limits,
             events,
             shown,
@@ -295,7 +295,7 @@ impl Watches {
             match in_force.find(pattern, domain_id) {
                 None => return Err(Refused::Unknown),
                 Some(Entry { origin, .. }) if *origin != Origin::Api => {
-                    return Err(Refused::Given { by: *origin });
+                    return Err(Refused::DefinedElsewhere { by: *origin });
                 }
                 Some(_) => {}
             }
@@ -320,7 +320,7 @@ impl Watches {
     /// For the capture thread: the watches, if they changed since the last call.
     #[must_use]
     pub fn take_changed(&self) -> Option<Arc<Watchlist>> {
-        self.news.swap(None)
+        self.unread.swap(None)
     }
 
     fn cap(&self) -> usize {
@@ -333,7 +333,7 @@ impl Watches {
             let done = match in_force.find(&watch.pattern, watch.domain_id.map(|id| id.0)) {
                 Some(old) if old.watch == watch => return Ok(Done::Unchanged),
                 Some(old) if old.origin != Origin::Api => {
-                    return Err(Refused::Given { by: old.origin });
+                    return Err(Refused::DefinedElsewhere { by: old.origin });
                 }
                 Some(_) if !replace => return Err(Refused::Different),
                 Some(_) => Done::Replaced,
@@ -384,7 +384,7 @@ impl Watches {
             keeper.keep(new.added.clone());
         }
         *lists = new;
-        self.news.store(Some(Arc::clone(&merged.watchlist)));
+        self.unread.store(Some(Arc::clone(&merged.watchlist)));
         self.shown.watch(merged.watchlist.watches());
         self.in_force.store(Arc::new(merged));
         drop(lists);

@@ -14,7 +14,7 @@ use ros2probe_wire::cursor::{Cursor, Endianness, Reason, WireError};
 use crate::definition::{Element, Field, MessageType, Shape, Structure, TypeName};
 use crate::value::{Array, Items, Message, Scalar, ScalarKind, Scalars, Value};
 
-/// Every XCDR structure is aligned relative to the first byte behind this.
+/// Every XCDR structure is aligned relative to the first byte after this.
 const ENCAPSULATION: usize = 4;
 /// Padding of submessages in RTPS: most bytes after the last field.
 const PADDING: usize = 3;
@@ -490,7 +490,7 @@ fn within(cursor: &Cursor<'_>, length: usize, shape: Shape) -> Result<(), Decode
 }
 
 /// Returns UTF-16 text; an invalid code unit counts as a character of its own. A byte order mark at
-/// the begin is no part of the text, and determines its order, as in rclpy.
+/// the begin is not a part of the text, and determines its order, as in rclpy.
 fn wide(units: &Scalars<'_>) -> String {
     const MARK: u64 = 0xfeff;
     const SWAPPED: u64 = 0xfffe;

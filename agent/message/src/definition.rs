@@ -387,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn what_contains_itself_or_misses_a_part_is_refused() {
+    fn a_recursive_or_incomplete_definition_is_refused() {
         let text = format!("B b\n{}\nMSG: a/B\nA a\n", "=".repeat(80));
         let error = MessageType::parse(&name("a/msg/A"), &text).unwrap_err();
         assert!(

@@ -117,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_is_on_the_wire_changes_the_hash() {
+    fn every_change_of_the_wire_format_changes_the_hash() {
         let one = |text| hash("a/msg/A", text);
         let all = [
             "int8 x",

@@ -281,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_place_wins_unless_the_hash_says_otherwise() {
+    fn the_first_source_wins_unless_another_has_the_announced_hash() {
         let old = prefix(&[("a/msg/B.msg", "int8 x")]);
         let new = prefix(&[("a/msg/B.msg", "int8 x\nint8 y")]);
         let (old_hash, new_hash) = (hash("a/msg/B", &[&old]), hash("a/msg/B", &[&new]));
@@ -475,7 +475,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_regular_file_is_refused_without_waiting() {
+    fn a_file_that_is_not_regular_is_refused_without_waiting() {
         let here = prefix(&[("a/msg/B.msg", "")]);
         let path = here.path().join("share/a/msg/B.msg");
         fs::remove_file(&path).unwrap();
@@ -538,7 +538,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_kept_is_bounded() {
+    fn kept_definitions_are_bounded() {
         let here = prefix(&[("a/msg/B.msg", "int8 x")]);
         let library = library(&[&here]);
         for index in 0..=MAX_KEPT {

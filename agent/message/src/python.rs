@@ -136,7 +136,7 @@ fn is_printable(character: char) -> bool {
     if character.is_ascii() {
         return !character.is_control();
     }
-    // Behind another character Rust escapes combining ones only if they are not printable.
+    // After another character Rust escapes combining ones only if they are not printable.
     let text: String = ['a', character].iter().collect();
     text.escape_debug().count() == 2
 }

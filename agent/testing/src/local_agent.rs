@@ -249,11 +249,11 @@ pub fn promtool(page: &str) -> String {
         .write_all(page.as_bytes())
         .unwrap();
     let output = promtool.wait_with_output().unwrap();
-    let said = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
+    let printed = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
     let end = if output.status.success() {
         ""
     } else {
         "(failed)"
     };
-    format!("{said}{end}")
+    format!("{printed}{end}")
 }

@@ -300,7 +300,7 @@ fn the_api_needs_serde_alone() {
 }
 
 #[test]
-fn what_is_below_the_daemon_needs_no_runtime() {
+fn crates_below_the_daemon_need_no_runtime() {
     let workspace = Workspace::read();
     for room in ["wire", "model", "capture", "message", "bag", "api", "page"] {
         let name = package(room);

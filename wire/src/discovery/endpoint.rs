@@ -1,4 +1,4 @@
-//! SEDP: a participant announces its writers and readers (RTPS 2.5, 8.5.4 and 9.6.2.2).
+//! SEDP: a participant announces its writers and readers (RTPS 2.5, 8.5.4 and 9.6.3.2).
 
 use alloc::vec::Vec;
 

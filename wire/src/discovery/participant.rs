@@ -1,4 +1,4 @@
-//! SPDP: a participant announces itself (RTPS 2.5, 8.5.3.2 and 9.6.2.2).
+//! SPDP: a participant announces itself (RTPS 2.5, 8.5.3.2 and 9.6.3.2).
 
 use alloc::boxed::Box;
 use alloc::string::String;
@@ -15,7 +15,7 @@ use crate::rtps::{Locator, ProtocolVersion, VendorId};
 use crate::text;
 use crate::time::RtpsDuration;
 
-/// Lease of a participant that announces none (RTPS 2.5, 9.6.2.2.1).
+/// Lease of a participant that announces none (RTPS 2.5, 9.6.3.2).
 const DEFAULT_LEASE: RtpsDuration = RtpsDuration::Finite(Duration::from_secs(100));
 /// Most properties kept per participant, and the longest name or value of one.
 const MAX_PROPERTIES: usize = 32;

@@ -258,7 +258,7 @@ fn what_rustdds_announces() {
 }
 
 #[test]
-fn iron_and_later_say_the_type_hash() {
+fn iron_and_later_announce_the_type_hash() {
     let [first, ..] = &captured_endpoints(testing::JAZZY_SEDP)[..] else {
         panic!()
     };
@@ -363,7 +363,7 @@ fn identity_is_never_made_up() {
 }
 
 #[test]
-fn what_is_not_announced_has_the_specifications_default() {
+fn a_missing_parameter_has_the_default_of_the_specification() {
     let participant = announced(&participant_list().bytes).unwrap();
     assert_eq!(
         participant.lease,
@@ -379,7 +379,7 @@ fn what_is_not_announced_has_the_specifications_default() {
 }
 
 #[test]
-fn vendor_parameters_mean_what_their_vendor_means() {
+fn vendor_parameters_are_read_by_the_vendor_of_the_payload() {
     let mut payload = endpoint_list("rt/a", "A");
     payload.parameter(0x8006, &[1, 0, 0, 0]);
     assert!(
@@ -451,7 +451,7 @@ fn hostile_names_are_refused_with_their_reason() {
 }
 
 #[test]
-fn lists_are_bounded_and_say_when_they_are_cut() {
+fn lists_are_bounded_and_report_that_they_are_cut() {
     let mut payload = participant_list();
     for _ in 0..200 {
         payload.parameter(0x0032, &[1; 24]);

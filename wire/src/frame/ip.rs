@@ -140,7 +140,7 @@ pub(super) fn v6(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
     Err(start.error("IPv6 extension headers", Reason::OverLimit))
 }
 
-/// The bytes behind a header: the captured ones may be fewer than the true length.
+/// The bytes after a header: the captured ones may be fewer than the true length.
 struct Body<'a> {
     cursor: Cursor<'a>,
     length: usize,

@@ -188,7 +188,7 @@ fn ipv4_options_are_skipped() {
 }
 
 #[test]
-fn ipv4_fragments_say_where_they_belong() {
+fn ipv4_fragments_have_their_offset_and_length() {
     let mut frame = PADDED;
     // First part: more fragments, 16 octets.
     frame[17] = 0x24;
@@ -379,7 +379,7 @@ proptest! {
     }
 
     #[test]
-    fn what_etherparse_builds_we_read(
+    fn packets_built_by_etherparse_are_read(
         vlan in 0..3_u8,
         v6 in any::<bool>(),
         ports in any::<(u16, u16)>(),

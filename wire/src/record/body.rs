@@ -442,7 +442,7 @@ mod tests {
         };
         let base = SequenceNumber(2 << 32 | 9);
         assert_eq!((gap.start(), gap.list().base), (SequenceNumber(7), base));
-        // One bit of the second word lies behind numBits.
+        // One bit of the second word lies after numBits.
         assert_eq!(
             gap.list().iter().collect::<Vec<_>>(),
             [base, base + 31, base + 33]
@@ -501,7 +501,7 @@ mod tests {
     }
 
     #[test]
-    fn flags_and_status_tell_a_message_from_a_disposal() {
+    fn flags_and_status_distinguish_a_message_from_a_disposal() {
         let message = |kind, submessage_flags, status_info| {
             let record = Record {
                 kind,
@@ -523,7 +523,7 @@ mod tests {
     }
 
     #[test]
-    fn fragments_tell_where_in_the_sample_they_are() {
+    fn fragments_have_their_offset_in_the_sample() {
         let fragments = |start: u32, count: u32| Record {
             kind: kind::DATA_FRAG,
             fragment_start: start,

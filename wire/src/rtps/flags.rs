@@ -64,7 +64,7 @@ mod tests {
     }
 
     #[test]
-    fn all_bits_asked_for_have_to_be_set() {
+    fn all_requested_bits_must_be_set() {
         let (data, key) = (SubmessageFlags::DATA, SubmessageFlags::KEY);
         assert!(data.with(key).contains(data) && data.with(key).contains(data.with(key)));
         assert!(!data.contains(data.with(key)) && !data.contains(key));

@@ -37,7 +37,7 @@ impl VendorId {
     pub const CYCLONE: Self = Self([0x01, 0x10]);
     /// Atostek RustDDS.
     pub const RUSTDDS: Self = Self([0x01, 0x12]);
-    /// Eclipse Zenoh, which is no DDS and has no number of the OMG: all numbers of the OMG begin
+    /// Eclipse Zenoh, which is not DDS and has no number of the OMG: all numbers of the OMG begin
     /// with 1.
     pub const ZENOH: Self = Self(*b"Ze");
 

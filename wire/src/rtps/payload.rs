@@ -1,4 +1,4 @@
-//! Content of a DATA behind its inline QoS (RTPS 2.5, 9.4.5.4).
+//! Content of a DATA after its inline QoS (RTPS 2.5, 9.4.5.4).
 
 /// Content of a change, encapsulation header included; up to three bytes of it may be padding.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]

@@ -6,7 +6,7 @@
 use super::SequenceNumber;
 use crate::cursor::{Cursor, Endianness, Reason, WireError};
 
-/// `cdds_request_header_t` of rmw_cyclonedds: the first 16 bytes behind the encapsulation of each
+/// `cdds_request_header_t` of rmw_cyclonedds: the first 16 bytes after the encapsulation of each
 /// request and of its reply.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct RequestHeader {
@@ -20,7 +20,7 @@ impl RequestHeader {
     /// Bytes of the encapsulation header (RTPS 2.5, 10.2) and of this header.
     pub const END: usize = 20;
 
-    /// Parses the begin of a serialized payload, encapsulation included.
+    /// Parses the start of a serialized payload, encapsulation included.
     ///
     /// # Errors
     /// Fails if the payload is shorter, or its encapsulation is not one of plain CDR.

@@ -322,7 +322,7 @@ fn unknown_submessages_are_stepped_over_by_their_length() {
 }
 
 #[test]
-fn what_came_before_a_malformed_submessage_stands() {
+fn submessages_before_a_malformed_one_are_kept() {
     let mut message = message(Endianness::Little);
     message.submessage(0x15, 0, |body| data_head(body, 1));
     message.submessage(0x15, 0x0c, |body| data_head(body, 2));
@@ -534,7 +534,7 @@ proptest! {
     }
 
     #[test]
-    fn number_sets_come_back(base in 1..i64::MAX - 256, bits in 0..=256_u32, words: [u32; 8]) {
+    fn the_bits_of_an_acknack_are_its_missing_numbers(base in 1..i64::MAX - 256, bits in 0..=256_u32, words: [u32; 8]) {
         let mut message = message(Endianness::Big);
         message.submessage(0x06, 0, |body| {
             body.raw(&READER.0).raw(&WRITER.0).sequence_number(base).u32(bits);

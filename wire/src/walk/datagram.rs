@@ -1,4 +1,4 @@
-//! The walk over a whole datagram in user space, where all of its bytes are at hand.
+//! The walk over a whole datagram in user space, where all of its bytes are available.
 
 use super::{
     Bytes as _, EXTRA_LEN, MAGIC, MAX_MESSAGE, Order, Step, Walk, octets_to_inline_qos, step,
@@ -84,7 +84,7 @@ impl Envelope {
 pub struct Found<'a> {
     /// The record that the kernel filter would report.
     pub record: Record,
-    /// The whole submessage behind its header: fixed fields, inline QoS and payload.
+    /// The whole submessage after its header: fixed fields, inline QoS and payload.
     pub body: &'a [u8],
     /// Serialized payload of DATA, the fragment bytes of DATA_FRAG; empty for the others.
     pub payload: &'a [u8],
@@ -114,7 +114,7 @@ impl<'a> Found<'a> {
     /// the meaning of the vendor-specific parameters.
     ///
     /// # Errors
-    /// Fails if the parameter list is malformed, even behind the parameters that the walk read.
+    /// Fails if the parameter list is malformed, even after the parameters that the walk read.
     pub fn inline_qos(&self, vendor: VendorId) -> Result<InlineQos, WireError> {
         let flags = self.flags();
         if !flags.contains(SubmessageFlags::INLINE_QOS) {

@@ -190,7 +190,7 @@ fn inline_qos_behind_those_that_the_walk_follows_are_read_and_have_to_be_well_fo
 }
 
 #[test]
-fn flags_say_whether_a_payload_is_a_value_or_a_key() {
+fn flags_distinguish_values_from_keys() {
     let bytes = [0, 1, 0, 0, 5, 5, 5, 5];
     for (flags, expected) in [
         (0x05, Payload::Data(&bytes)),
@@ -296,7 +296,7 @@ fn a_gap_of_256_becomes_two_records() {
 }
 
 #[test]
-fn only_discovery_is_captured_without_being_asked_for() {
+fn only_discovery_is_captured_without_a_request() {
     let record = |writer: EntityId, kind| Record {
         writer: crate::record::guid_words(Guid::new(GuidPrefix(SOURCE), writer)),
         kind,

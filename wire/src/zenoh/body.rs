@@ -139,7 +139,7 @@ pub struct Query<'a> {
     pub body: Option<(Encoding<'a>, Bytes<'a>)>,
     /// Attachment; see [`super::Attachment`]. It follows the payload, so a cut capture lacks it.
     pub attachment: Option<Bytes<'a>>,
-    /// Whether the capture ends before the extensions behind the payload.
+    /// Whether the capture ends before the extensions after the payload.
     pub is_cut: bool,
 }
 

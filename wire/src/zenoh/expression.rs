@@ -53,7 +53,7 @@ impl<'a> WireExpr<'a> {
         })
     }
 
-    /// Reads an expression behind a header with the flags N 0x20 and M 0x40.
+    /// Reads an expression after a header with the flags N 0x20 and M 0x40.
     pub(super) fn behind(header: u8, reader: &mut Reader<'a>) -> Result<Self, WireError> {
         Self::read(reader, header & 0x20 != 0, header & 0x40 != 0)
     }

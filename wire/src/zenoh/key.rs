@@ -14,7 +14,7 @@ use super::attachment::Gid;
 const NO_HASH: &str = "TypeHashNotSupported";
 
 /// Parses a type hash chunk: `Some(None)` for a version or placeholder without a known hash,
-/// `None` for text that is no hash.
+/// `None` for text that is not a hash.
 pub(super) fn type_hash(text: &str) -> Option<Option<TypeHash>> {
     (text == NO_HASH || text.starts_with("RIHS")).then(|| TypeHash::parse(text))
 }
@@ -31,7 +31,7 @@ pub enum Key {
     /// Samples of a topic, or requests of a service.
     Topic(TopicKey),
     /// History, heartbeats and discovery of an AdvancedPublisher or AdvancedSubscriber (`@adv`): a
-    /// sample with such a key is none of the topic's.
+    /// sample with such a key does not belong to the topic.
     Advanced,
     /// A liveliness token, see [`super::Token`].
     Token,

@@ -1,8 +1,8 @@
 //! Reads Zenoh's primitives from one batch or message, of which the capture may lack the end
 //! (`zenoh-codec`, `core/zint.rs`).
 //!
-//! A reader knows how long its input was on the wire. A field that ends behind the captured bytes
-//! but within that length is [`Reason::Truncated`]: the capture is cut. A field that ends behind
+//! A reader knows how long its input was on the wire. A field that ends after the captured bytes
+//! but within that length is [`Reason::Truncated`]: the capture is cut. A field that ends after
 //! the length is [`Reason::BadLength`]: the message is malformed.
 
 use alloc::vec::Vec;
@@ -34,7 +34,7 @@ impl<'a> Bytes<'a> {
 #[derive(Clone, Copy, Debug)]
 pub struct Reader<'a> {
     cursor: Cursor<'a>,
-    /// Bytes on the wire behind the captured ones.
+    /// Bytes on the wire after the captured ones.
     missing: usize,
 }
 
@@ -178,7 +178,7 @@ impl<'a> Reader<'a> {
         })
     }
 
-    /// Reads a length of 32 bits and so many bytes, of which the capture may lack the end.
+    /// Reads a length of 32 bits and that many bytes, of which the capture may lack the end.
     pub(super) fn bytes(&mut self, what: &'static str) -> Result<Bytes<'a>, WireError> {
         Ok(self.nested(what)?.rest())
     }
@@ -191,13 +191,13 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Reads a length of at most `limit` and so many captured bytes.
+    /// Reads a length of at most `limit` and that many captured bytes.
     pub(super) fn sized(&mut self, what: &'static str, limit: u64) -> Result<&'a [u8], WireError> {
         let length = self.length(what, limit)?;
         self.take(what, length)
     }
 
-    /// Reads a length of at most `limit` and so many bytes of UTF-8.
+    /// Reads a length of at most `limit` and that many bytes of UTF-8.
     pub(super) fn text(&mut self, what: &'static str, limit: u64) -> Result<&'a str, WireError> {
         let start = *self;
         let bytes = self.sized(what, limit)?;
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cut_field_is_told_from_a_malformed_one() {
+    fn a_cut_field_is_distinguished_from_a_malformed_one() {
         // Five bytes declared, two captured, of eight on the wire.
         let mut reader = Reader::new(&[5, 1, 2], 8);
         let bytes = reader.bytes("payload").unwrap();

@@ -163,7 +163,7 @@ impl<'a> Init<'a> {
 /// OPEN: the session begins.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Open {
-    /// Whether the acceptor answers.
+    /// Whether this is the acceptor's answer.
     pub is_ack: bool,
     /// Time without any message after which the session ends.
     pub lease: Duration,

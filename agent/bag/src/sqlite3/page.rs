@@ -7,7 +7,7 @@ use std::os::unix::fs::FileExt as _;
 
 use super::row::{Row, varint};
 
-/// Length of the header of the file, at the begin of page 1.
+/// Length of the header of the file, at the start of page 1.
 const HEADER: usize = 100;
 /// Kinds of pages of a table.
 const INTERIOR: u8 = 5;

@@ -1,6 +1,6 @@
 //! A row: a header with the type of each column, and their values.
 
-/// The begin of a row.
+/// The start of a row.
 pub(super) struct Row<'a> {
     bytes: &'a [u8],
 }

@@ -170,7 +170,7 @@ fn a_compressed_chunk_that_was_cut_gives_what_can_be_decompressed() {
 }
 
 #[test]
-fn what_the_loss_of_power_leaves_is_cut_at_the_zeros() {
+fn a_file_after_a_loss_of_power_is_cut_at_its_zeros() {
     let directory = tempfile::tempdir().unwrap();
     let storage = Storage {
         chunk_bytes: 900,

@@ -154,7 +154,7 @@ fn another_reader_finds_every_message_in_its_place() {
 }
 
 #[test]
-fn a_bag_says_in_metadata_what_is_in_it() {
+fn metadata_describes_the_content_of_the_bag() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("run");
     let options = Options {
@@ -236,7 +236,7 @@ fn files_are_split_by_size_and_by_time_and_nothing_is_lost_between() {
 }
 
 #[test]
-fn what_was_flushed_is_there_when_the_writer_is_gone() {
+fn flushed_messages_survive_the_end_of_the_writer() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("killed");
     let mut writer = Writer::create(&path, Options::default()).unwrap();
@@ -268,7 +268,7 @@ fn what_was_flushed_is_there_when_the_writer_is_gone() {
 }
 
 #[test]
-fn what_exists_is_not_written_into() {
+fn an_existing_directory_is_not_written_into() {
     let directory = tempfile::tempdir().unwrap();
     let error = Writer::create(directory.path(), Options::default()).unwrap_err();
     let text = format!(

@@ -16,6 +16,7 @@ use ros2probe_wire::host::{Piece, Socket};
 use zerocopy::FromBytes;
 
 use super::super::bpf;
+use super::super::error_chain::Reason;
 use super::super::tracepoints::{KernelLayout, Tracepoints};
 use super::{
     Filter, FilterError, FilterSettings, UNUSED, failed, load_program, open, ring_size, take,
@@ -73,7 +74,7 @@ impl Filter {
         let layout = if settings.kernel_types {
             KernelLayout::read()
         } else {
-            KernelLayout::unknown("kernel types were not read".to_owned())
+            KernelLayout::unknown(Reason("kernel types were not read".to_owned()))
         };
         let sizes = [("PIECES", pieces), ("FLOWS", UNUSED)];
         let mut ebpf = open(settings, true, &sizes, Some(&layout), 0)?;

@@ -78,29 +78,33 @@ impl Names {
         })
     }
 
-    /// Adds what an announcement says. Returns the name of a new node.
-    pub fn announce(&mut self, said: &Announcement) -> Option<NodeName> {
-        let (address, parent) = (said.address, said.parent);
+    /// Adds the content of an announcement. Returns the name of a new node.
+    pub fn announce(&mut self, announcement: &Announcement) -> Option<NodeName> {
+        let (address, parent) = (announcement.address, announcement.parent);
         let endpoint = || {
-            let middleware = text(&said.second);
+            let middleware = text(&announcement.second);
             Named::Endpoint {
                 node: parent,
-                name: text(&said.text).into(),
+                name: text(&announcement.text).into(),
                 middleware: (!middleware.is_empty()).then(|| middleware.into()),
             }
         };
-        let (of, named) = match said.kind {
+        let (of, named) = match announcement.kind {
             announced::NODE => {
-                let name = NodeName::from(joined(&text(&said.second), &text(&said.text)));
+                let name = NodeName::from(joined(
+                    &text(&announcement.second),
+                    &text(&announcement.text),
+                ));
                 self.known
                     .insert((Of::Node, address), Named::Node(name.clone()));
                 return Some(name);
             }
             announced::PUBLISHER => (Of::Publisher, endpoint()),
             announced::SUBSCRIPTION => {
-                if said.value != 0 {
+                if announcement.value != 0 {
                     let is = Named::Is(Of::Subscription, address);
-                    self.known.insert((Of::SubscriptionHandle, said.value), is);
+                    self.known
+                        .insert((Of::SubscriptionHandle, announcement.value), is);
                 }
                 (Of::Subscription, endpoint())
             }
@@ -111,14 +115,17 @@ impl Names {
             announced::SUBSCRIPTION_CALLBACK => {
                 (Of::Callback, Named::Is(Of::SubscriptionObject, parent))
             }
-            announced::TIMER => (Of::Timer, Named::Period(Duration::from_nanos(said.value))),
+            announced::TIMER => (
+                Of::Timer,
+                Named::Period(Duration::from_nanos(announcement.value)),
+            ),
             announced::TIMER_NODE => (Of::TimerNode, Named::Is(Of::Node, parent)),
             announced::TIMER_CALLBACK => (Of::Callback, Named::Is(Of::Timer, parent)),
             announced::SERVICE => (Of::Service, endpoint()),
             announced::SERVICE_CALLBACK => (Of::Callback, Named::Is(Of::Service, parent)),
             announced::STATE_MACHINE => (Of::StateMachine, Named::Is(Of::Node, parent)),
             announced::BUFFER => {
-                let capacity = u32::try_from(said.value).unwrap_or(u32::MAX);
+                let capacity = u32::try_from(announcement.value).unwrap_or(u32::MAX);
                 (Of::Buffer, Named::Capacity(capacity))
             }
             announced::BUFFER_OWNER => {
@@ -135,7 +142,7 @@ impl Names {
         None
     }
 
-    /// Follows relations to an object that is no relation.
+    /// Follows relations to an object that is not a relation.
     fn resolve(&self, of: Of, address: u64) -> Option<(Of, u64, &Named)> {
         let mut at = (of, address);
         for _ in 0..DEPTH {
@@ -293,23 +300,28 @@ mod tests {
     use super::*;
     use crate::tables::tests::assert_driven;
 
-    fn said(kind: u32, address: u64, parent: u64, value: u64, text: &str) -> Announcement {
-        let mut said = Announcement::new_zeroed();
-        (said.kind, said.address, said.parent, said.value) = (kind, address, parent, value);
-        said.text[..text.len()].copy_from_slice(text.as_bytes());
-        said
+    fn announcement(kind: u32, address: u64, parent: u64, value: u64, text: &str) -> Announcement {
+        let mut announcement = Announcement::new_zeroed();
+        (
+            announcement.kind,
+            announcement.address,
+            announcement.parent,
+            announcement.value,
+        ) = (kind, address, parent, value);
+        announcement.text[..text.len()].copy_from_slice(text.as_bytes());
+        announcement
     }
 
     #[test]
     fn a_callback_leads_to_its_subscription_s_topic_and_node() {
         let mut names = Names::default();
-        let mut node = said(announced::NODE, 1, 0, 0, "lidar");
+        let mut node = announcement(announced::NODE, 1, 0, 0, "lidar");
         node.second[..7].copy_from_slice(b"/robot1");
         assert_eq!(names.announce(&node).unwrap(), "/robot1/lidar");
         for each in [
-            said(announced::SUBSCRIPTION, 20, 1, 21, "/points"),
-            said(announced::SUBSCRIPTION_OBJECT, 22, 21, 0, ""),
-            said(announced::SUBSCRIPTION_CALLBACK, 23, 22, 0, ""),
+            announcement(announced::SUBSCRIPTION, 20, 1, 21, "/points"),
+            announcement(announced::SUBSCRIPTION_OBJECT, 22, 21, 0, ""),
+            announcement(announced::SUBSCRIPTION_CALLBACK, 23, 22, 0, ""),
         ] {
             names.announce(&each);
         }
@@ -325,7 +337,7 @@ mod tests {
     #[test]
     fn relations_in_a_circle_end() {
         let mut names = Names::default();
-        names.announce(&said(announced::SUBSCRIPTION_OBJECT, 1, 2, 0, ""));
+        names.announce(&announcement(announced::SUBSCRIPTION_OBJECT, 1, 2, 0, ""));
         names.known.insert(
             (Of::SubscriptionHandle, 2),
             Named::Is(Of::SubscriptionObject, 1),
@@ -337,7 +349,7 @@ mod tests {
     fn names_beyond_the_cap_are_left_out() {
         let mut names = Names::default();
         for address in 0..=InsideNames::CAP as u64 {
-            names.announce(&said(announced::PUBLISHER, address, 0, 0, "/topic"));
+            names.announce(&announcement(announced::PUBLISHER, address, 0, 0, "/topic"));
         }
         assert_driven::<InsideNames>();
         assert!(names.publisher(0).is_some());

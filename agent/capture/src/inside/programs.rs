@@ -1,4 +1,4 @@
-//! The programs at the functions of `libtracetools.so`, and their tables.
+//! The programs attached to the functions of `libtracetools.so`, and their tables.
 //!
 //! Attached to a library's file, a program runs in every process that maps the file. A probe lives
 //! as long as its descriptor: the kernel removes the breakpoint when this process ends, however it

@@ -26,7 +26,7 @@ use crate::tables::{CausalHops, InsideBuffers, NewNodes, ReportedHandles, Transi
 
 /// Calls per second of one process above which its calls are no longer counted.
 pub const MAX_PROCESS_HITS: u64 = 50_000;
-/// Least time over which calls per second are judged: a shorter one may hold a burst alone.
+/// Least time over which calls per second are evaluated: a shorter time may contain only a burst.
 const JUDGED_OVER: Duration = Duration::from_millis(500);
 /// Rounds after which a process outside of the control group is inspected again.
 const RECHECK: u32 = 5;
@@ -38,7 +38,7 @@ pub struct ProcessTable {
     hops: Bounded<CausalHops, Vec<inside::Hop>>,
     transitions: Bounded<Transitions, Vec<Transition>>,
     rounds: u32,
-    /// Time since calls per second were last judged.
+    /// Time since calls per second were last evaluated.
     unjudged: Duration,
 }
 
@@ -49,7 +49,7 @@ pub struct Round {
     pub report: Report,
     /// Publications during callbacks, in the order of their time.
     pub publications: Vec<CausalPublication>,
-    /// Calls per second of all processes; 0 if they were not judged.
+    /// Calls per second of all processes; 0 if they were not evaluated.
     pub hits: u64,
     /// Whether the programs are detached until a client needs calls again.
     pub is_last: bool,
@@ -64,7 +64,7 @@ struct Observed {
     domain: DomainId,
     names: Names,
     new_nodes: Bounded<NewNodes, Vec<NodeName>>,
-    /// Calls when they were last judged.
+    /// Calls when they were last evaluated.
     hits: u64,
     is_suspended: bool,
     /// What was last reported of each handle.
@@ -150,25 +150,25 @@ impl ProcessTable {
             Some(Item::Hop(hop)) => {
                 self.hops.push(hop);
             }
-            Some(Item::Announcement(said)) => self.announced(&said, clocks, broker),
+            Some(Item::Announcement(announcement)) => self.announced(&announcement, clocks, broker),
             None => {}
         }
     }
 
-    fn announced(&mut self, said: &Announcement, clocks: &Clocks, broker: &mut Broker) {
-        let observed = self.observe(said.process, broker);
-        if said.kind == announced::TRANSITION {
+    fn announced(&mut self, announcement: &Announcement, clocks: &Clocks, broker: &mut Broker) {
+        let observed = self.observe(announcement.process, broker);
+        if announcement.kind == announced::TRANSITION {
             let transition = Transition {
-                process: said.process,
-                node: observed.names.machine(said.address),
-                start: text(&said.text).into(),
-                goal: text(&said.second).into(),
-                at: clocks.calendar(said.time),
+                process: announcement.process,
+                node: observed.names.machine(announcement.address),
+                start: text(&announcement.text).into(),
+                goal: text(&announcement.second).into(),
+                at: clocks.calendar(announcement.time),
             };
             self.transitions.push(transition);
             return;
         }
-        if let Some(node) = observed.names.announce(said) {
+        if let Some(node) = observed.names.announce(announcement) {
             observed.new_nodes.push(node);
         }
     }
@@ -553,9 +553,13 @@ mod tests {
     }
 
     fn announced(table: &mut ProcessTable, kind: u32, address: u64) {
-        let mut said = Announcement::new_zeroed();
-        (said.process, said.kind, said.address) = (u32::MAX, kind, address);
-        table.announced(&said, &Clocks::read(), &mut Broker::here());
+        let mut announcement = Announcement::new_zeroed();
+        (
+            announcement.process,
+            announcement.kind,
+            announcement.address,
+        ) = (u32::MAX, kind, address);
+        table.announced(&announcement, &Clocks::read(), &mut Broker::here());
     }
 
     #[test]

@@ -198,7 +198,7 @@ fn asking_for_a_block_that_is_not_ready_changes_nothing() {
 }
 
 #[test]
-fn what_a_slow_reader_misses_is_counted_once() {
+fn frames_that_a_slow_reader_misses_are_counted_once() {
     in_new_namespace(|| {
         let mut ring = Ring::open(SMALL, None).unwrap();
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();

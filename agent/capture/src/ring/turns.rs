@@ -146,7 +146,7 @@ mod tests {
         fn fill(&self, index: usize, bytes: &[u8]) {
             // SAFETY: within the memory.
             let block = unsafe { self.0.byte_add(index * BLOCK) };
-            // SAFETY: within the block, behind its start.
+            // SAFETY: within the block, after its start.
             let word = unsafe { block.byte_add(STATUS) };
             // SAFETY: aligned, and accessed as an atomic by both sides.
             let status = unsafe { AtomicU32::from_ptr(word.cast().as_ptr()) };
@@ -156,7 +156,7 @@ mod tests {
             let (head, tail) = (&bytes[..STATUS], &bytes[STATUS + 4..]);
             // SAFETY: the kernel's side owns the block, since the reader has released it.
             unsafe { block.copy_from_nonoverlapping(NonNull::from(head).cast(), head.len()) };
-            // SAFETY: within the block, behind the status.
+            // SAFETY: within the block, after the status.
             let behind = unsafe { word.byte_add(4) };
             // SAFETY: as above.
             unsafe { behind.copy_from_nonoverlapping(NonNull::from(tail).cast(), tail.len()) };
@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_read_while_another_thread_fills_the_ring_is_what_it_wrote() {
+    fn frames_read_while_another_thread_fills_the_ring_are_intact() {
         const NUMBERS: u8 = if cfg!(miri) { 12 } else { 240 };
         let memory = Memory::new();
         let mut turns = memory.turns();

@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_of_no_interest_or_no_rtps_is_left_alone() {
+    fn messages_of_no_interest_and_messages_that_are_not_rtps_are_ignored() {
         let mut rules = MessageClassifier::default();
         rules.set(guid(WRITER), Some(Verdict::Ignore));
         assert_eq!(

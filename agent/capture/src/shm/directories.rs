@@ -24,7 +24,7 @@ const MAX_LISTED: usize = 65_536;
 /// without a new timestamp.
 const COARSE: Duration = Duration::from_secs(1);
 /// Number of rounds in which a new process may still be mounting directories; afterwards it is
-/// inspected only once per so many rounds.
+/// inspected only once per this many rounds.
 const MOUNTING_ROUNDS: u32 = 5;
 const ROUNDS: u32 = 32;
 /// Levels of cgroups and processes of a scope that are visited.
@@ -137,7 +137,7 @@ impl Name {
         is_id.then_some(Self::Segment(generation, SegmentId(id)))
     }
 
-    /// Returns the file that this lock file protects; `None` if it is no lock file.
+    /// Returns the file that this lock file protects; `None` if it is not a lock file.
     fn of_lock(name: &str) -> Option<Self> {
         let suffix = |suffix: &&str| name.strip_suffix(*suffix).and_then(Self::parse);
         LOCKED.iter().find_map(suffix)

@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn it_rings_once_much_waits_and_is_silent_when_that_is_taken() {
+    fn the_inbox_rings_once_enough_bytes_wait_and_is_silent_after_they_are_taken() {
         let inbox = Inbox::with_bell();
         let message = |length| Item::Message {
             time: 0,
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn what_there_is_no_room_for_is_counted() {
+    fn items_without_room_are_counted() {
         let inbox = Inbox::default();
         let message = || Item::Message {
             time: 0,

@@ -78,7 +78,7 @@ pub struct Facts {
 struct Shared {
     inbox: Inbox,
     interest: Mutex<Vec<(Guid, Option<Verdict>)>>,
-    has_news: AtomicBool,
+    is_interest_changed: AtomicBool,
     wanted: AtomicU8,
     facts: Mutex<Facts>,
     progress: Progress,
@@ -121,7 +121,9 @@ impl SharedMemory {
         let interest = self.shared.interest.lock();
         let mut interest = interest.unwrap_or_else(PoisonError::into_inner);
         interest.extend_from_slice(changes);
-        self.shared.has_news.store(true, Ordering::Release);
+        self.shared
+            .is_interest_changed
+            .store(true, Ordering::Release);
     }
 
     /// Pauses or resumes polling, while the probes see everything in the sending processes.
@@ -219,7 +221,7 @@ impl Drop for SharedMemory {
         if let Some(thread) = self.thread.take()
             && self.shared.progress.stalled().is_none()
         {
-            // The thread has ended in any case; its result has no user.
+            // The thread has ended in any case; its result is not needed.
             let _ = thread.join();
         }
     }
@@ -252,7 +254,7 @@ fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget, ended: &Pi
     let (mut found, mut looks, mut reported, mut cpu) = (Vec::new(), 0, 0, 0.0);
     while !shared.stop.load(Ordering::Acquire) {
         shared.progress.step();
-        if shared.has_news.swap(false, Ordering::Acquire) {
+        if shared.is_interest_changed.swap(false, Ordering::Acquire) {
             let interest = shared.interest.lock();
             let mut interest = interest.unwrap_or_else(PoisonError::into_inner);
             for (guid, verdict) in interest.drain(..) {
@@ -289,7 +291,7 @@ fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget, ended: &Pi
             Need::Nothing
         };
         if tap.take_discovery_seen() {
-            interval.news(at);
+            interval.announcement(at);
         }
         let sleep = interval.sleep(at, cpu, announced, need);
         tap.is_hurried = interval.is_watching_closely(at);

@@ -131,7 +131,7 @@ impl PollInterval {
     }
 
     /// Extends close polling: an announcement was read, and more may follow.
-    pub fn news(&mut self, now: f64) {
+    pub fn announcement(&mut self, now: f64) {
         self.watch_closely(now + ANNOUNCEMENT_WATCH);
         if self.has_company && self.credit > CREDIT / 2.0 {
             self.awake_until = now + BURSTS;
@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_a_look_costs_the_budget_holds() {
+    fn polling_stays_within_the_budget_at_any_cost_of_a_poll() {
         for budget in [0.005, 0.015, 0.1] {
             for cost in [5e-6, 25e-6, 200e-6] {
                 for burst in [0, 1, 40] {
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn it_looks_a_thousand_times_a_second_while_it_may() {
+    fn polling_exceeds_900_hz_within_the_budget() {
         let mut interval = PollInterval::new(BUDGET);
         let busy = |now: f64| usize::from(now % 1.0 < 0.01);
         let (_, looks) = run(&mut interval, 10.0, 5e-6, Need::Watching, busy);
@@ -374,7 +374,7 @@ mod tests {
             interval.newcomer(100.0);
             let mut microseconds = |now, is_announced, cpu| {
                 if is_announced {
-                    interval.news(now);
+                    interval.announcement(now);
                 }
                 interval.sleep(now, cpu, 1, Need::Names).as_micros()
             };
@@ -391,7 +391,7 @@ mod tests {
     }
 
     #[test]
-    fn while_every_message_is_wanted_it_looks_every_50_us_within_a_budget_of_its_own() {
+    fn polling_for_every_message_runs_every_50_us_within_its_own_budget() {
         let idle = |_: f64| 0;
         let mut interval = PollInterval::new(BUDGET).on(2);
         let (share, looks) = run(&mut interval, 10.0, 8e-6, Need::Every, idle);

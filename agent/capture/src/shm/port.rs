@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_pushed_is_found_once_and_in_order_round_after_round() {
+    fn pushed_messages_are_found_once_and_in_order_over_many_rounds() {
         let mut image = PortImage::new(7411, 8, 0x100);
         let (mut port, backlog) = Port::attach(image.bytes(), 7411, 0).unwrap();
         assert!(backlog.is_empty());
@@ -312,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn what_stands_in_the_ring_already_comes_the_oldest_first() {
+    fn messages_already_in_the_ring_are_read_oldest_first() {
         let mut image = PortImage::new(7411, 8, 0x100);
         for number in 1..=11 {
             image.push(descriptor(number));
@@ -350,7 +350,7 @@ mod tests {
     }
 
     #[test]
-    fn the_overwritten_are_counted_and_the_rest_is_read() {
+    fn overwritten_messages_are_counted_and_the_others_are_read() {
         let mut image = PortImage::new(7411, 8, 0x100);
         let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
         for number in 1..=13 {
@@ -402,7 +402,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn whatever_is_written_there_reading_ends_and_stays_within_the_ring(
+        fn reading_any_ring_ends_and_stays_within_it(
             damage in proptest::collection::vec((0_usize..1200, any::<[u8; 4]>()), 0..60),
             later in proptest::collection::vec((0_usize..1200, any::<[u8; 4]>()), 0..60),
         ) {

@@ -12,7 +12,7 @@ use ros2probe_wire::walk::{Bytes, MAX_MESSAGE};
 use super::cell::Descriptor;
 use super::source::Source;
 
-/// Fields of BufferNode behind the status word.
+/// Fields of BufferNode after the status word.
 const SIZE: u64 = 8;
 const DATA: u64 = 12;
 /// Bits of the status word that hold the validity id.
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn what_points_outside_the_file_is_not_followed() {
+    fn descriptors_that_point_outside_the_file_are_not_followed() {
         let mut image = SegmentImage::new([1; 8], 1 << 16);
         let descriptor = image.put(&[7; 100]);
         let far = Descriptor {
@@ -239,7 +239,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn whatever_stands_in_a_segment_reading_is_bounded(
+        fn reading_any_segment_is_bounded(
             bytes in proptest::collection::vec(any::<u8>(), 0..400),
             node in 0_u32..500,
             validity in 0_u32..4,

@@ -24,7 +24,7 @@ pub trait Source {
             .then(|| u32::from_le_bytes(bytes))
     }
 
-    /// Reads a little-endian 64-bit word as two 32-bit words; `None` if its bytes do not exist.
+    /// Reads a little-endian 64-bit word; `None` if its bytes do not exist.
     fn long(&self, offset: u64) -> Option<u64> {
         let mut bytes = [0; 8];
         self.read(offset, &mut bytes)
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_removed_is_known_to_be() {
+    fn a_removed_file_is_unlinked() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("f");
         fs::write(&path, "x").unwrap();

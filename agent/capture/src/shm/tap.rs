@@ -310,8 +310,8 @@ impl Tap {
                     open.busy = now;
                 }
                 let is_silent = now.saturating_sub(open.busy) > SILENT_AFTER;
-                let rests = is_silent && !self.misses_nothing;
-                open.due = now + if rests { SILENT_EVERY } else { 0 };
+                let is_resting = is_silent && !self.misses_nothing;
+                open.due = now + if is_resting { SILENT_EVERY } else { 0 };
                 self.counters.announced += look.pushed;
                 self.counters.missed += look.overwritten;
                 self.counters.unfilled += look.unfilled;
@@ -407,8 +407,8 @@ impl Tap {
         if judgement == MessageVerdict::Captured {
             self.counters.captured += 1;
             // Samples that are read do not indicate a new participant.
-            let is_news = !(self.misses_nothing && self.classifier.is_wanted);
-            self.met |= is_news
+            let may_be_new = !(self.misses_nothing && self.classifier.is_wanted);
+            self.met |= may_be_new
                 && self.classifier.announces
                 && (self.classifier.is_builtin || may_announce_nodes(&bytes));
             self.counters.captured_bytes += bytes.len() as u64;

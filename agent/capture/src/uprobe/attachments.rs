@@ -17,7 +17,7 @@ use ros2probe_attach::open::installed;
 use ros2probe_attach::request::Place;
 
 use super::processes::Processes;
-use crate::error_chain::in_words;
+use crate::error_chain::Reason;
 use crate::tables::Libraries;
 use ros2probe_model::facts::bounded::Bounded;
 
@@ -39,7 +39,7 @@ pub type Attach<P> = Box<dyn FnMut(&mut Broker, Place) -> Result<P, Refusal> + S
 
 struct Known<P> {
     path: PathBuf,
-    probe: Result<P, String>,
+    probe: Result<P, Reason>,
     processes: usize,
     used: Instant,
     tried: Instant,
@@ -83,7 +83,7 @@ impl<P> Attachments<P> {
 
     /// Returns the probe of a library, or why it has none; `None` if the library is not known.
     #[must_use]
-    pub fn probe(&self, id: &LibraryId) -> Option<&Result<P, String>> {
+    pub fn probe(&self, id: &LibraryId) -> Option<&Result<P, Reason>> {
         self.libraries.get(id).map(|library| &library.probe)
     }
 
@@ -164,11 +164,13 @@ impl<P> Attachments<P> {
         if !is_known && (self.libraries.contains_key(id) || !self.libraries.is_full()) {
             let id = id.clone();
             let probe = (self.attach)(broker, Place::Mapped { process, id });
-            let probe = probe.map_err(|refusal| in_words(&refusal));
+            let probe = probe.map_err(|refusal| Reason::of(&refusal));
             let (library, is_new) = (path.display(), !self.libraries.contains_key(&mapped.id));
             match &probe {
                 Ok(_) => tracing::info!(%library, "attached: {}", self.meaning),
-                Err(reason) if is_new => tracing::warn!(%library, reason, "not attached"),
+                Err(reason) if is_new => {
+                    tracing::warn!(%library, reason = reason.as_str(), "not attached");
+                }
                 Err(_) => {}
             }
             let library = Known {
@@ -195,7 +197,7 @@ impl<P> Attachments<P> {
         let libraries = libraries.map(|library| LibraryFacts {
             path: library.path.clone(),
             processes: library.processes,
-            refused: library.probe.as_ref().err().cloned(),
+            refused: library.probe.as_ref().err().map(Reason::to_string),
         });
         libraries.collect()
     }

@@ -18,7 +18,7 @@ use ros2probe_model::facts::bounded::Bounded;
 /// File that lists the holders of locks.
 const LOCKS: &str = "/proc/locks";
 /// Number of rounds in which a new process may still be loading libraries; afterwards it is
-/// inspected only once per so many rounds.
+/// inspected only once per this many rounds.
 const LOADING_ROUNDS: u32 = 10;
 const ROUNDS: u32 = 32;
 

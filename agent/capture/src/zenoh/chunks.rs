@@ -74,7 +74,7 @@ impl<'a> Chunk<'a> {
                 outgoing: piece.flags & flag::OUTGOING != 0,
                 ..StreamId::default()
             },
-            // The programs do not pass on the SYN itself, but the first bytes behind it.
+            // The programs do not pass on the SYN itself, but the first bytes after it.
             sequence_number: piece.datagram.wrapping_sub(u32::from(syn)),
             syn,
             end: is(chunk::END),

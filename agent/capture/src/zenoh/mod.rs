@@ -71,12 +71,12 @@ impl Chunk<'_> {
 /// What is known of missing bytes before a chunk.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Before {
-    /// Nothing: they may come later.
+    /// Nothing: they may arrive later.
     #[default]
     Unknown,
     /// They were left out because they are not needed.
     Skipped,
-    /// They will not come.
+    /// They will not arrive.
     Lost,
 }
 
@@ -249,7 +249,7 @@ impl Streams {
         }
     }
 
-    /// Returns whether a direction is followed, at whatever socket.
+    /// Returns whether a direction is followed at any socket.
     #[must_use]
     pub fn follows_flow(&self, flow: &Flow) -> bool {
         self.flows.contains_key(flow)

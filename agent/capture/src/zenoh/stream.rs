@@ -42,7 +42,7 @@ enum Position {
     Beginning(Search),
     /// In a batch, or before one.
     Batch(Partial),
-    /// In a connection of something else.
+    /// In a connection of another protocol.
     Other,
 }
 
@@ -186,7 +186,7 @@ impl Stream {
         took
     }
 
-    /// Gives up the missing bytes and goes on with what waits.
+    /// Gives up the missing bytes and continues with the segments that wait.
     pub fn give_up(&mut self, counters: &mut Counters, report: &mut impl FnMut(StreamEvent<'_>)) {
         let Some(first) = self.ahead.front() else {
             return;
@@ -200,7 +200,7 @@ impl Stream {
         self.catch_up(counters, report);
     }
 
-    /// Goes on at a later byte: those before will not come.
+    /// Continues at a later byte: those before will not arrive.
     fn lost(
         &mut self,
         start: u32,
@@ -311,7 +311,7 @@ impl Stream {
         match &mut self.position {
             Position::Batch(partial) => {
                 if !partial.read(bytes, length, counters, report) {
-                    // A prefix was not captured, or says 0.
+                    // A prefix was not captured, or is 0.
                     counters.gaps += 1;
                     report(StreamEvent::Gap);
                     self.position = Position::Searching(Search::default());
@@ -382,7 +382,7 @@ impl Partial {
             let count = wanted.min(length);
             let captured = count.min(bytes.len());
             let (now, rest) = bytes.split_at(captured);
-            // Bytes behind some that were not captured have no use.
+            // Bytes after uncaptured ones cannot be used.
             if self.captured.len() == self.arrived {
                 self.captured.extend_from_slice(now);
             }

@@ -173,7 +173,7 @@ fn a_connection_that_is_older_than_the_capture_is_found() {
 }
 
 #[test]
-fn other_connections_are_left_alone_and_tls_is_named() {
+fn connections_of_other_protocols_are_ignored_and_tls_is_reported() {
     let place = |port| ros2probe_model::facts::route::Destination {
         address: [1; 16],
         port,
@@ -305,7 +305,7 @@ fn unfinished_batches_keep_within_their_bytes() {
 }
 
 #[test]
-fn so_many_segments_wait_for_missing_bytes_that_then_are_given_up() {
+fn missing_bytes_are_given_up_when_the_cap_of_waiting_segments_is_reached() {
     let mut streams = Streams::default();
     let first = Chunk {
         is_boundary: true,
@@ -322,7 +322,7 @@ fn so_many_segments_wait_for_missing_bytes_that_then_are_given_up() {
 }
 
 #[test]
-fn so_many_bytes_wait_for_missing_ones_that_then_are_given_up() {
+fn missing_bytes_are_given_up_when_the_cap_of_waiting_bytes_is_reached() {
     let mut streams = Streams::default();
     let first = Chunk {
         is_boundary: true,

@@ -41,7 +41,7 @@ fn the_interest_map_takes_so_many_and_refuses_the_next() {
 }
 
 #[test]
-fn so_many_participants_are_followed_and_the_next_is_refused() {
+fn participants_beyond_the_cap_are_refused() {
     let mut kernel = Kernel::load();
     for number in 0..PARTICIPANT_CAPACITY {
         kernel
@@ -91,7 +91,7 @@ fn an_unknown_writer_is_captured_up_to_its_bytes_and_again_after_many_others() {
 }
 
 #[test]
-fn a_fragmented_datagram_is_forgotten_after_so_many_others_began() {
+fn a_fragmented_datagram_is_forgotten_after_the_capped_number_of_others() {
     let mut kernel = Kernel::load();
     let metered = writer(0);
     kernel.set_interest(&BTreeMap::from([(metered, Verdict::Meter)]));

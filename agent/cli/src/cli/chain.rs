@@ -191,15 +191,17 @@ fn notes(bag: &BagChains) -> Vec<String> {
 }
 
 /// Parses a topic's name; a relative one is in the root namespace, as ros2 takes it.
-fn topic(text: &str) -> Result<String, String> {
+fn topic(text: &str) -> Result<String, UserError> {
     let name = match text.starts_with('/') {
         true => text.to_owned(),
         false => format!("/{text}"),
     };
     match Watch::named(&name) {
         Ok(watch) if watch.is_literal() => Ok(name),
-        Ok(_) => Err("the topic has a `*`: a chain has two topics as ends".to_owned()),
-        Err(error) => Err(format!("the topic {error}")),
+        Ok(_) => Err(UserError(
+            "the topic has a `*`: a chain has two topics as ends".to_owned(),
+        )),
+        Err(error) => Err(UserError(format!("the topic {error}"))),
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use super::UserError;
 use clap::Args;
 use ros2probe::discover::zenoh::address::RouterAddress;
 use ros2probe::discover::{GuidPrefix, participants};
@@ -58,7 +59,8 @@ pub(crate) struct Discover {
     pub(crate) config: Option<PathBuf>,
 }
 
-fn prefix(text: &str) -> Result<GuidPrefix, String> {
+fn prefix(text: &str) -> Result<GuidPrefix, UserError> {
     let prefix = participants::prefix(text);
-    prefix.ok_or_else(|| "must be 24 hexadecimal digits, as in ros2_participant_info".to_owned())
+    let wrong = "must be 24 hexadecimal digits, as in ros2_participant_info";
+    prefix.ok_or_else(|| UserError(wrong.to_owned()))
 }

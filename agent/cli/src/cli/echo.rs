@@ -329,12 +329,12 @@ fn elapsed(start: i64, now: i64) -> f64 {
     now.saturating_sub(start) as f64 / 1e9
 }
 
-fn positive(text: &str) -> Result<f64, String> {
+fn positive(text: &str) -> Result<f64, UserError> {
     let value = text
         .parse()
         .ok()
         .filter(|value: &f64| *value > 0.0 && value.is_finite());
-    value.ok_or_else(|| "value must be a positive number".to_owned())
+    value.ok_or_else(|| UserError("value must be a positive number".to_owned()))
 }
 
 fn user_error(refused: Refused) -> anyhow::Error {

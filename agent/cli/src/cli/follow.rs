@@ -236,7 +236,7 @@ impl Types {
 pub(crate) struct MessageFilter {
     filter: Filter,
     types: Types,
-    is_told: bool,
+    is_reported: bool,
 }
 
 impl MessageFilter {
@@ -246,7 +246,7 @@ impl MessageFilter {
         Ok(Self {
             filter,
             types,
-            is_told: false,
+            is_reported: false,
         })
     }
 
@@ -260,7 +260,7 @@ impl MessageFilter {
                 passes.map_err(|error| UserError(error.to_string()).into())
             }
             Err(error) => {
-                if !std::mem::replace(&mut self.is_told, true) {
+                if !std::mem::replace(&mut self.is_reported, true) {
                     let Sample { topic, writer, .. } = sample;
                     eprintln!(
                         "rp: {}",

@@ -279,7 +279,7 @@ fn time(seconds: f64) -> String {
     time.map_or_else(String::new, |time| time.to_string())
 }
 
-/// A line on stderr that is updated in place; nothing if stderr is no terminal.
+/// A line on stderr that is updated in place; nothing if stderr is not a terminal.
 struct Progress {
     is_shown: bool,
     /// Whether the end of a capture ends the command, at an unknown time.

@@ -295,9 +295,9 @@ impl Missing {
 
 /// How the agent sees messages in shared memory.
 pub(crate) enum Sampling {
-    /// It sees each one, or none is there.
+    /// It sees every message, or no message uses shared memory.
     Nothing,
-    /// It is about to see each one, since a client reads them.
+    /// It will see every message soon, because a client reads them.
     OnDemand,
     /// It sees samples, with the remedy or the reason.
     Sampled(String),
@@ -392,7 +392,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_missing_since_the_last_report_is_reported_at_the_end() {
+    fn messages_missing_since_the_last_report_are_reported_at_the_end() {
         let mut missing = Missing(BTreeMap::new());
         let mut miss = |samples| {
             missing.add(("/t".to_owned(), "were dropped"), samples);
@@ -438,7 +438,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_configured_is_not_recommended() {
+    fn settings_that_are_configured_are_not_recommended() {
         let text = |exact: &str| {
             let health = format!(
                 r#"{{"abilities":[{{"ability":"shared_memory","able":true}},

@@ -4,7 +4,7 @@
 use std::io::{self, Write as _};
 
 /// A line printed on stderr without a prefix, as the original prints its errors; the exit code is
-/// 1.
+/// 1. As the error of a value's parser, clap prints it with the argument.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub(crate) struct UserError(pub(crate) String);

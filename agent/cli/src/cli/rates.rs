@@ -357,7 +357,7 @@ fn unnamed(quantity: Quantity, dialect: Dialect) -> anyhow::Error {
     clap::Error::raw(ErrorKind::MissingRequiredArgument, format!("{text}\n")).exit()
 }
 
-fn positive(text: &str) -> Result<usize, String> {
+fn positive(text: &str) -> Result<usize, UserError> {
     let value = text.parse().ok().filter(|value| *value > 0);
-    value.ok_or_else(|| "value must be a positive integer".to_owned())
+    value.ok_or_else(|| UserError("value must be a positive integer".to_owned()))
 }

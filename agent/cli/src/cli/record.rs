@@ -354,7 +354,8 @@ fn installed() -> String {
     std::env::var("ROS_DISTRO").unwrap_or_default()
 }
 
-fn pair(text: &str) -> Result<(String, String), String> {
-    let (key, value) = text.split_once('=').ok_or("must be KEY=VALUE")?;
+fn pair(text: &str) -> Result<(String, String), UserError> {
+    let pair = text.split_once('=');
+    let (key, value) = pair.ok_or_else(|| UserError("must be KEY=VALUE".to_owned()))?;
     Ok((key.to_owned(), value.to_owned()))
 }

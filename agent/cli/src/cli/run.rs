@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use super::UserError;
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use ros2probe::client::Compressed;
@@ -100,16 +101,17 @@ fn access() -> impl TypedValueParser<Value = Access> {
     })
 }
 
-fn watch(pattern: &str) -> Result<Watch, String> {
-    Watch::named(pattern).map_err(|error| format!("the topic {error}"))
+fn watch(pattern: &str) -> Result<Watch, UserError> {
+    Watch::named(pattern).map_err(|error| UserError(format!("the topic {error}")))
 }
 
-fn listen(address: &str) -> Result<Listen, String> {
+fn listen(address: &str) -> Result<Listen, UserError> {
     if address == "off" {
         return Ok(Listen(None));
     }
+    let wrong = "must be an IP address and port, as 127.0.0.1:17400, or `off`";
     let address = address.parse();
     address
         .map(|address| Listen(Some(address)))
-        .map_err(|_| "must be an IP address and port, as 127.0.0.1:17400, or `off`".to_owned())
+        .map_err(|_| UserError(wrong.to_owned()))
 }

@@ -76,8 +76,8 @@ impl Top {
             hidden: self.hidden,
         };
         if self.target.from.is_some() {
-            let said = "rp: rp top shows a capture from its beginning on: leave out --from";
-            return Err(UserError(said.to_owned()).into());
+            let text = "rp: rp top shows a capture from its beginning on: leave out --from";
+            return Err(UserError(text.to_owned()).into());
         }
         let speed = self.speed.unwrap_or(Speed::Times(1.0));
         let agent = Agent::reach_measured(&self.target, (!self.once).then_some(speed))?;
@@ -89,10 +89,14 @@ impl Top {
     }
 }
 
-fn interval(text: &str) -> Result<Duration, String> {
+fn interval(text: &str) -> Result<Duration, UserError> {
     let seconds: Option<f64> = text.parse().ok();
     let seconds = seconds.filter(|seconds| (0.1..=MAX_INTERVAL).contains(seconds));
-    let wrong = || format!("must be a number of seconds, 0.1 to {MAX_INTERVAL}");
+    let wrong = || {
+        UserError(format!(
+            "must be a number of seconds, 0.1 to {MAX_INTERVAL}"
+        ))
+    };
     seconds.map(Duration::from_secs_f64).ok_or_else(wrong)
 }
 
@@ -102,7 +106,7 @@ mod tests {
 
     #[test]
     fn an_interval_is_neither_too_short_nor_endless() {
-        assert_eq!(interval("0.5"), Ok(Duration::from_millis(500)));
+        assert_eq!(interval("0.5").unwrap(), Duration::from_millis(500));
         for wrong in ["0", "-1", "inf", "nan", "", "1s", "1e9"] {
             assert!(interval(wrong).is_err(), "{wrong}");
         }

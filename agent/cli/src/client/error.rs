@@ -187,11 +187,11 @@ mod tests {
     }
 
     #[test]
-    fn without_an_agent_one_line_says_how_to_start_one_and_how_to_do_without() {
-        let said = ClientError::NoAgent.to_string();
-        assert!(!said.contains('\n'), "{said}");
+    fn without_an_agent_one_line_names_both_remedies() {
+        let printed = ClientError::NoAgent.to_string();
+        assert!(!printed.contains('\n'), "{printed}");
         for transport in ["systemctl start ros2probe", "sudo rp run", "--replay FILE"] {
-            assert!(said.contains(transport), "{said}");
+            assert!(printed.contains(transport), "{printed}");
         }
     }
 

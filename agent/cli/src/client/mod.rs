@@ -204,7 +204,7 @@ impl Agent {
         })
     }
 
-    /// Opens a stream of lines, some with raw bytes behind them. It lasts until either end closes
+    /// Opens a stream of lines, some with raw bytes after them. It lasts until either end closes
     /// it.
     ///
     /// # Errors

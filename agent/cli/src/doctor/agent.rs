@@ -222,12 +222,12 @@ fn limits(health: &Health) -> Vec<Finding> {
 /// Findings for full tables that are not among the limits the agent reports. Older agents report
 /// no limits.
 fn evictions(health: &Health) -> Vec<Finding> {
-    let is_told = |table: &str| {
+    let is_reported = |table: &str| {
         let limit = limit(table);
         limit.is_some_and(|key| health.limits.iter().any(|known| known.limit == key))
     };
     let full = health.tables.iter().filter(|table| table.evictions > 0);
-    let full = full.filter(|table| !is_told(&table.table));
+    let full = full.filter(|table| !is_reported(&table.table));
     let mut findings: Vec<_> = full
         .map(|table| {
             let sentence = format!(
@@ -247,7 +247,7 @@ fn evictions(health: &Health) -> Vec<Finding> {
             }
         })
         .collect();
-    if health.topics_rejected > 0 && !is_told("topics") {
+    if health.topics_rejected > 0 && !is_reported("topics") {
         let sentence = format!(
             "{} watched topics exceed limits.topics and are not measured",
             health.topics_rejected

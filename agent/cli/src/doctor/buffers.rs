@@ -359,7 +359,7 @@ mod tests {
     const CLOUD: &str = r#"{"name":"/points","measurement":{"messages":100,"bytes":272000000}}"#;
 
     #[test]
-    fn what_a_point_cloud_takes_is_computed() {
+    fn the_buffer_of_a_point_cloud_is_computed() {
         let findings = found(&USUALLY, CLOUD);
         let receive = find(&findings, "receive");
         assert_eq!(receive.severity, Severity::Warning);
@@ -410,7 +410,7 @@ mod tests {
     }
 
     #[test]
-    fn what_died_in_a_buffer_is_a_warning_and_much_of_it_a_problem() {
+    fn losses_at_a_buffer_are_a_warning_and_many_are_a_problem() {
         let topic = |lost: u64| {
             format!(
                 r#"{{"name":"/points","received":{{"messages":1000,
@@ -437,7 +437,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_read_is_unknown_with_the_command() {
+    fn a_value_that_cannot_be_read_is_unknown_and_names_the_command() {
         let (_directory, host) = host(&[]);
         let findings = check(&host, None);
         assert_eq!(findings.len(), 2);

@@ -32,7 +32,7 @@ pub fn check(host: &HostState) -> Vec<Finding> {
             Severity::Unknown,
             format!("the kernel does not report whether the clock is synchronised; {kept}"),
         )
-        .seen(error, "adjtimex(2)")
+        .seen(error.to_string(), "adjtimex(2)")
         .remedy("timedatectl    # or: chronyc tracking"),
         Ok(state) => {
             let (estimated, maximum) = (
@@ -103,11 +103,12 @@ fn milliseconds(microseconds: i64) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::host_state::Unread;
     use super::super::host_state::tests::host;
     use super::*;
     use ros2probe_capture::system::ClockState;
 
-    fn found(clock: Result<ClockState, String>) -> Finding {
+    fn found(clock: Result<ClockState, Unread>) -> Finding {
         let (_directory, mut host) =
             host(&[("/proc/5/comm", "chronyd\n"), ("/proc/6/comm", "sshd\n")]);
         host.clock = clock;
@@ -139,7 +140,7 @@ mod tests {
             Severity::Note
         );
         assert_eq!(found(Ok(state(false, 0, 0))).severity, Severity::Warning);
-        let unknown = found(Err("not permitted".to_owned()));
+        let unknown = found(Err(Unread::NotPermitted));
         assert_eq!(unknown.severity, Severity::Unknown);
         assert!(!unknown.remedies.is_empty());
     }

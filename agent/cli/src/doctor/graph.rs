@@ -391,7 +391,7 @@ mod tests {
     }
 
     #[test]
-    fn that_nothing_is_seen_is_no_problem_where_connections_cannot_be_read() {
+    fn an_empty_graph_is_no_problem_where_connections_cannot_be_read() {
         let unseen = |reason: &str| {
             let health =
                 format!(r#"{{"zenoh":{{"unseen":[{{"reason":"{reason}","connections":2}}]}}}}"#);

@@ -35,7 +35,7 @@ pub struct HostState {
     /// Variables of this shell.
     pub environment: BTreeMap<String, String>,
     /// Clock state of the kernel.
-    pub clock: Result<ClockState, String>,
+    pub clock: Result<ClockState, Unread>,
 }
 
 /// Files below a root directory.
@@ -70,7 +70,7 @@ impl HostState {
             user_id: geteuid().as_raw(),
             group_ids: group_ids(),
             environment: environment(),
-            clock: clock_state().map_err(|error| error.to_string()),
+            clock: clock_state().map_err(|error| Unread::Other(error.to_string())),
         }
     }
 
@@ -212,7 +212,7 @@ pub(super) mod tests {
             user_id: 1000,
             group_ids: vec![1000],
             environment: BTreeMap::new(),
-            clock: Err("not here".to_owned()),
+            clock: Err(Unread::Missing),
         };
         (directory, host)
     }

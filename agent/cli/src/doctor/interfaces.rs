@@ -279,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn what_multicast_does_not_reach_is_named_with_the_command() {
+    fn interfaces_without_multicast_are_named_with_the_command() {
         let findings = found(&[LO, ETH, ("tun0", "0x11", "1500", "unknown")], false);
         let finding = findings
             .iter()

@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn an_agent_that_answers_is_asked_instead_of_trying() {
+    fn doctor_asks_an_agent_that_answers_instead_of_trying_the_source() {
         let (_directory, host) = host(&[]);
         let answers = Box::<Answers>::default();
         let report = examine(

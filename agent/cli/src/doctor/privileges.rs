@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn uprobes_are_checked_where_they_are_asked_for() {
+    fn uprobes_are_checked_if_a_setting_needs_them() {
         let (_directory, host) = host(&[]);
         let mut settings = Config::default().capture;
         let both = probes(&host, &settings).unwrap();

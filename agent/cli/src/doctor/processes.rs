@@ -434,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn those_that_differ_are_named_the_few_first() {
+    fn processes_that_differ_are_named_smallest_group_first() {
         let findings = found(
             &[
                 (11, "talker", "ROS_DOMAIN_ID=3", FAST),
@@ -528,7 +528,7 @@ mod tests {
     }
 
     #[test]
-    fn what_may_not_be_looked_at_is_unknown_until_root_asks() {
+    fn unreadable_processes_are_unknown_and_for_root_a_note() {
         let closed = |closed: &[u32]| Processes {
             closed: closed.to_vec(),
             ..Processes::default()

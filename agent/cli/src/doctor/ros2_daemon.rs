@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn other_states_are_reported_as_they_are() {
+    fn each_state_of_a_port_has_its_severity() {
         let severity = |state| check(&[port(0, state)], &[])[0].severity;
         assert_eq!(severity("released"), Severity::Note);
         assert_eq!(severity("limit"), Severity::Note);

@@ -69,9 +69,9 @@ fn domain(host: &HostState, variables: &Variables) -> Finding {
         .shown("ROS_DOMAIN_ID")
         .unwrap_or_else(|| "not set".to_owned());
     let finding = match variables.domain() {
-        Err(text) => report(
+        Err(error) => report(
             Severity::Problem,
-            format!("`{text}` is not a domain ID: nodes of this shell do not start"),
+            format!("{error}: nodes of this shell do not start"),
         )
         .remedy("export ROS_DOMAIN_ID=0    # 0 to 101, and 215 to 232"),
         Ok(domain) => match ephemeral(host) {

@@ -148,7 +148,7 @@ const fn colour(severity: Severity) -> &'static str {
     }
 }
 
-/// Wraps a text behind the indentation. Longer words stay whole unless they exceed any plausible
+/// Wraps a text after the indentation. Longer words stay whole unless they exceed any plausible
 /// length.
 fn wrapped(text: &str) -> Vec<String> {
     let width = WIDTH - INDENT;
@@ -229,7 +229,7 @@ Buffers
     }
 
     #[test]
-    fn evidence_of_what_is_fine_comes_when_asked_for() {
+    fn evidence_of_good_findings_is_printed_on_request() {
         let style = Style {
             verbose: true,
             colours: false,
@@ -238,7 +238,7 @@ Buffers
     }
 
     #[test]
-    fn colours_come_only_when_asked_for() {
+    fn colours_are_printed_only_on_request() {
         assert!(!text(&report(), Style::default()).contains('\x1b'));
         let style = Style {
             verbose: false,
@@ -248,7 +248,7 @@ Buffers
     }
 
     #[test]
-    fn what_a_terminal_would_obey_is_escaped() {
+    fn control_characters_in_findings_are_escaped() {
         let hostile = "x\x1b]0;gotcha\x07".repeat(100);
         let finding = Finding::new(Area::Graph, "x", Severity::Warning, hostile.clone())
             .seen(hostile.clone(), hostile)

@@ -8,6 +8,12 @@ use std::collections::BTreeMap;
 
 /// Longest value shown, in characters.
 const MAX_VALUE: usize = 120;
+
+/// A value of `ROS_DOMAIN_ID` that is not a valid domain, cut to the longest value shown.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[error("`{0}` is not a domain ID")]
+pub struct InvalidDomain(String);
+
 /// Variables that affect the communication of ROS.
 const NAMES: [&str; 20] = [
     "ROS_DISTRO",
@@ -107,14 +113,14 @@ impl Variables {
     ///
     /// # Errors
     ///
-    /// Returns the value of `ROS_DOMAIN_ID` if it is not a valid domain.
-    pub fn domain(&self) -> Result<u32, String> {
+    /// Fails if the value of `ROS_DOMAIN_ID` is not a valid domain.
+    pub fn domain(&self) -> Result<u32, InvalidDomain> {
         let Some(text) = self.get("ROS_DOMAIN_ID") else {
             return Ok(0);
         };
         let number = text.trim().parse().ok();
         let number = number.filter(|number| *number <= ros2probe_api::MAX_DOMAIN_ID);
-        number.ok_or_else(|| self.shown("ROS_DOMAIN_ID").unwrap_or_default())
+        number.ok_or_else(|| InvalidDomain(self.shown("ROS_DOMAIN_ID").unwrap_or_default()))
     }
 
     /// Returns whether `ROS_LOCALHOST_ONLY` restricts discovery to this host, as rcl reads it.
@@ -191,11 +197,12 @@ mod tests {
         assert_eq!(variables("ROS_DOMAIN_ID=232").domain(), Ok(232));
         assert_eq!(
             variables("ROS_DOMAIN_ID=233").domain(),
-            Err("233".to_owned())
+            Err(InvalidDomain("233".to_owned()))
         );
-        assert_eq!(variables("ROS_DOMAIN_ID=-1").domain(), Err("-1".to_owned()));
+        let invalid = InvalidDomain("-1".to_owned());
+        assert_eq!(variables("ROS_DOMAIN_ID=-1").domain(), Err(invalid));
         let long = format!("ROS_DOMAIN_ID={}", "\u{e9}".repeat(500));
-        let shown = variables(&long).domain().unwrap_err();
+        let InvalidDomain(shown) = variables(&long).domain().unwrap_err();
         assert_eq!(shown.chars().count(), MAX_VALUE + 3);
     }
 

@@ -260,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_kernel_does_not_allow_is_reported_with_its_reason() {
+    fn a_missing_ability_is_reported_with_its_reason() {
         let mut able = Ability::ALL.to_vec();
         able.retain(|each| *each != Ability::ReassemblyLosses);
         let mut visibility = host(&able);
@@ -301,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_to_be_configured_can_be() {
+    fn recommended_settings_are_valid() {
         let mut configured = 0;
         for source in ["host", "wire"] {
             let visibility = Visibility {

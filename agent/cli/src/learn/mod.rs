@@ -1,4 +1,4 @@
-//! Learns a watchlist from a healthy robot: what its topics did becomes what is expected of them.
+//! Learns a watchlist from a healthy robot: the figures of its topics become expectations.
 //!
 //! [`Learner`] takes the agent's view of all topics about once a second, and counts each topic in
 //! whole seconds. [`thresholds`] chooses expectations from them, and drops those that the same

@@ -227,7 +227,7 @@ fn rare_messages_give_a_silence_only_if_they_are_regular() {
 }
 
 #[test]
-fn what_cannot_be_known_is_explained() {
+fn values_that_cannot_be_learnt_are_explained() {
     let mut robot = Robot::new(&["/imu"]);
     for _ in 0..60 {
         robot.second(STEADY);

@@ -1,4 +1,4 @@
-//! Chooses the expectations of a topic from what it did.
+//! Chooses the expectations of a topic from its measured seconds.
 //!
 //! Each threshold begins at a robust statistic (median, 95th percentile, MAD) with a margin. If the
 //! topic's own seconds violate it, by the agent's evaluation, it widens to the extreme value that
@@ -221,7 +221,7 @@ impl<'a> Draft<'a> {
         limits.contains(&rate) && !self.violates(windows.expecting(Some(rate), None))
     }
 
-    /// Returns the rates in windows of so many seconds. `None` if most have no message.
+    /// Returns the rates in windows of this many seconds. `None` if most have no message.
     fn windows(&self, seconds: u64, default: u64) -> Option<Windows> {
         let rates = Summary::of(self.rates(seconds)).filter(|rates| rates.median > 0.0)?;
         Some(Windows {
@@ -231,7 +231,7 @@ impl<'a> Draft<'a> {
         })
     }
 
-    /// Rates of all windows of so many seconds with a publisher.
+    /// Rates of all windows of this many seconds with a publisher.
     fn rates(&self, window: u64) -> Vec<f64> {
         let length = usize::try_from(window).unwrap_or(1).max(1);
         let windows = self.complete.windows(length);
@@ -262,7 +262,7 @@ impl<'a> Draft<'a> {
         let (Some(ratios), Some(sent)) = (Summary::of(ratios), Summary::of(sent)) else {
             return self.leave_out(KEY, "the topic was seen for less than 10 s");
         };
-        // One lost message in a window is no fault.
+        // One lost message in a window is not a fault.
         let base = LEAST_LOSS.max(1.5 / sent.median);
         let candidates = [3.0 * ratios.p95, 1.5 * ratios.maximum];
         let candidates = candidates.map(|ratio| rounded_up(ratio.max(base)));

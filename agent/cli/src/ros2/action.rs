@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn an_action_is_what_has_feedback() {
+    fn a_topic_with_feedback_is_an_action() {
         assert_eq!(list(actions(), false, false), "/fib\n");
         assert_eq!(list(actions(), true, false), "/fib [a/action/Fib]\n");
         assert_eq!(list(actions(), true, true), "1\n");
@@ -157,15 +157,15 @@ mod tests {
             ],
             ..Topic::default()
         };
-        let said = |types, count| info("/fib", Some(&feedback), types, count);
+        let printed = |types, count| info("/fib", Some(&feedback), types, count);
         assert_eq!(
-            said(false, false),
+            printed(false, false),
             "Action: /fib\nAction clients: 2\n    /a/a\n    /b\nAction servers: 1\n    \
              /robot1/server\n"
         );
-        assert!(said(true, false).ends_with("    /robot1/server [a/action/Fib]\n"));
+        assert!(printed(true, false).ends_with("    /robot1/server [a/action/Fib]\n"));
         let counts = "Action: /fib\nAction clients: 2\nAction servers: 1\n";
-        assert_eq!(said(true, true), counts);
+        assert_eq!(printed(true, true), counts);
         let none = "Action: /nope\nAction clients: 0\nAction servers: 0\n";
         assert_eq!(info("/nope", None, false, false), none);
     }

@@ -14,7 +14,7 @@ const BARE: [&str; 2] = ["_CREATED_BY_BARE_DDS_APP_"; 2];
 /// Trailing zero bytes of a GID in Humble, which is longer than a GUID.
 const PADDING: usize = 8;
 
-/// The block without the empty line behind it.
+/// The block without the empty line after it.
 #[must_use]
 pub fn block(endpoint: &Endpoint<'_>, kind: &str, dialect: Dialect) -> String {
     let mut text = String::new();

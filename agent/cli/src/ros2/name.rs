@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_topic_is_called_is_pointed_at() {
+    fn an_invalid_name_is_printed_with_the_position_of_the_mistake() {
         let refused = full_name("/foo bar").unwrap_err().0;
         let expected = "Invalid topic name: topic name must not contain characters other than \
             alphanumerics, '_', or '/':\n  '/foo bar'\n       ^";

@@ -160,13 +160,13 @@ mod tests {
     #[test]
     fn a_missing_or_hidden_node_is_not_found() {
         let hidden = node("/_ros2cli_1", 1);
-        let said = |name, node, all| info(name, node, all);
-        let refused = said("/_ros2cli_1", Some(&hidden), false).unwrap_err();
+        let printed = |name, node, all| info(name, node, all);
+        let refused = printed("/_ros2cli_1", Some(&hidden), false).unwrap_err();
         assert_eq!(refused.0, "Unable to find node '/_ros2cli_1'");
-        assert!(said("/_ros2cli_1", Some(&hidden), true).is_ok());
-        assert!(said("_ros2cli_1", Some(&hidden), true).is_err());
-        assert!(said("/nope", None, true).is_err());
-        let warning = said("/talker", Some(&node("/talker", 2)), false)
+        assert!(printed("/_ros2cli_1", Some(&hidden), true).is_ok());
+        assert!(printed("_ros2cli_1", Some(&hidden), true).is_err());
+        assert!(printed("/nope", None, true).is_err());
+        let warning = printed("/talker", Some(&node("/talker", 2)), false)
             .unwrap()
             .warning;
         assert!(

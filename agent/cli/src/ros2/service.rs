@@ -117,13 +117,13 @@ mod tests {
 
     #[test]
     fn a_list_is_names_or_their_number() {
-        let said = |show_types, count| list(services().iter(), List { show_types, count });
-        assert_eq!(said(false, false), "/add\n/fib/_action/send_goal\n");
+        let printed = |show_types, count| list(services().iter(), List { show_types, count });
+        assert_eq!(printed(false, false), "/add\n/fib/_action/send_goal\n");
         assert_eq!(
-            said(true, false),
+            printed(true, false),
             "/add [a/srv/Add]\n/fib/_action/send_goal [a/srv/Add]\n"
         );
-        assert_eq!(said(true, true), "2\n");
+        assert_eq!(printed(true, true), "2\n");
     }
 
     #[test]
@@ -155,12 +155,12 @@ mod tests {
 
     #[test]
     fn servers_are_counted_by_their_replies_and_later_by_requests() {
-        let said = |dialect| info("/add", services().iter(), dialect).unwrap();
+        let printed = |dialect| info("/add", services().iter(), dialect).unwrap();
         for dialect in [Dialect::Jazzy, Dialect::Kilted] {
             let text = "Type: a/srv/Add\nClients count: 3\nServices count: 1\n";
-            assert_eq!(said(dialect), text);
+            assert_eq!(printed(dialect), text);
         }
-        assert!(said(Dialect::Rolling).ends_with("Services count: 2\n"));
+        assert!(printed(Dialect::Rolling).ends_with("Services count: 2\n"));
         let refused = info("/x", services().iter(), Dialect::Jazzy).unwrap_err();
         assert_eq!(refused.0, "Unknown service '/x'");
     }

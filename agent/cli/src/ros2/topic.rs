@@ -145,7 +145,7 @@ mod tests {
 
     #[test]
     fn a_list_is_names_and_counting_wins() {
-        let said = |show_types, count, verbose| {
+        let printed = |show_types, count, verbose| {
             let options = List {
                 show_types,
                 count,
@@ -153,16 +153,16 @@ mod tests {
             };
             list(topics().iter(), options)
         };
-        assert_eq!(said(false, false, false), "/chatter\n/rosout\n");
+        assert_eq!(printed(false, false, false), "/chatter\n/rosout\n");
         assert_eq!(
-            said(true, false, false),
+            printed(true, false, false),
             "/chatter [std_msgs/msg/String]\n/rosout [std_msgs/msg/String]\n"
         );
-        assert_eq!(said(true, true, true), "2\n");
+        assert_eq!(printed(true, true, true), "2\n");
         let verbose = "Published topics:\n * /chatter [std_msgs/msg/String] 1 publisher\n \
             * /rosout [std_msgs/msg/String] 2 publishers\n\nSubscribed topics:\n \
             * /chatter [std_msgs/msg/String] 1 subscriber\n\n";
-        assert_eq!(said(false, false, true), verbose);
+        assert_eq!(printed(false, false, true), verbose);
         assert_eq!(list([].iter(), List::default()), "");
     }
 
@@ -185,12 +185,12 @@ mod tests {
     #[test]
     fn info_counts_and_verbose_info_shows_endpoints_by_gid() {
         let topic = topic(&["std_msgs/msg/String"]);
-        let said = |verbose| info("/chatter", Some(&topic), verbose, Dialect::Jazzy).unwrap();
+        let printed = |verbose| info("/chatter", Some(&topic), verbose, Dialect::Jazzy).unwrap();
         assert_eq!(
-            said(false),
+            printed(false),
             "Type: std_msgs/msg/String\nPublisher count: 2\nSubscription count: 0\n"
         );
-        let verbose = said(true);
+        let verbose = printed(true);
         let head = "Type: std_msgs/msg/String\n\nPublisher count: 2\n\nNode name: _CREATED_BY_";
         assert!(verbose.starts_with(head), "{verbose}");
         assert!(
@@ -206,8 +206,11 @@ mod tests {
     #[test]
     fn several_types_are_a_list_of_python() {
         let topic = topic(&["a/msg/X", "b/msg/Y"]);
-        let said = info("/chatter", Some(&topic), false, Dialect::Humble).unwrap();
-        assert!(said.starts_with("Type: ['a/msg/X', 'b/msg/Y']\n"), "{said}");
+        let printed = info("/chatter", Some(&topic), false, Dialect::Humble).unwrap();
+        assert!(
+            printed.starts_with("Type: ['a/msg/X', 'b/msg/Y']\n"),
+            "{printed}"
+        );
     }
 
     #[test]

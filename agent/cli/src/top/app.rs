@@ -139,7 +139,7 @@ pub struct App {
     /// The selected topic.
     pub selected: Option<Key>,
     /// The latest events.
-    pub news: EventPane,
+    pub event_pane: EventPane,
     /// First visible line of the details.
     pub details_scroll: usize,
     /// Number of newer events below the visible ones.
@@ -259,13 +259,13 @@ impl App {
             }
             Fact::Details(..) => {}
             Fact::Event(event) => {
-                let before = self.news.shown().count();
-                self.news.add(&event, self.domain_id);
+                let before = self.event_pane.shown().count();
+                self.event_pane.add(&event, self.domain_id);
                 self.stay(before);
             }
             Fact::Lagged(lagged) => {
-                let before = self.news.shown().count();
-                self.news.lag(&lagged);
+                let before = self.event_pane.shown().count();
+                self.event_pane.lag(&lagged);
                 self.stay(before);
             }
             Fact::Gone(why) => {
@@ -281,7 +281,7 @@ impl App {
     /// Keeps the visible lines in place after the user has scrolled back.
     fn stay(&mut self, before: usize) {
         if self.events_back > 0 {
-            let more = self.news.shown().count().saturating_sub(before);
+            let more = self.event_pane.shown().count().saturating_sub(before);
             self.events_back += more;
         }
     }
@@ -344,7 +344,7 @@ impl App {
         let needed = self.heights.details_needed;
         let last = needed.saturating_sub(self.heights.details.max(1));
         self.details_scroll = self.details_scroll.min(last);
-        let events = self.news.shown().count();
+        let events = self.event_pane.shown().count();
         let last = events.saturating_sub(self.heights.events.max(1));
         self.events_back = self.events_back.min(last);
     }
@@ -404,7 +404,7 @@ impl App {
                 self.settle(Pane::Events, self.events_open);
             }
             KeyCode::Char('v') => {
-                self.news.only_warnings = !self.news.only_warnings;
+                self.event_pane.only_warnings = !self.event_pane.only_warnings;
                 self.events_back = 0;
             }
             KeyCode::Tab => self.focus_next(),

@@ -62,8 +62,8 @@ impl EventPane {
                 let key = key.as_ref();
                 let is_noise = matches!(key, "domain_id" | "kind" | "message_type");
                 let value = shown(value);
-                let is_said = first.contains(&key) || is_noise || value.is_empty();
-                if !is_said && last.contains(&key) == is_identity {
+                let is_skipped = first.contains(&key) || is_noise || value.is_empty();
+                if !is_skipped && last.contains(&key) == is_identity {
                     text.push_str(&format!(" {}={value}", safe(key)));
                 }
             }
@@ -138,14 +138,14 @@ mod tests {
 
     #[test]
     fn an_event_begins_with_what_it_is_about() {
-        let mut news = EventPane::default();
+        let mut events = EventPane::default();
         let lost = event(json!({
             "time": "2026-11-20T14:02:11.123Z", "name": "ros2.message.lost", "severity": "WARN",
             "attributes": {"domain_id": 0, "count": 3, "topic": "/po\u{1b}[31mints", "writer": "01.02"},
         }));
-        news.add(&lost, Some(0));
-        news.add(&lost, Some(7));
-        let lines: Vec<_> = news.shown().map(|line| line.text.as_str()).collect();
+        events.add(&lost, Some(0));
+        events.add(&lost, Some(7));
+        let lines: Vec<_> = events.shown().map(|line| line.text.as_str()).collect();
         assert_eq!(
             lines,
             [r"14:02:11 WARN  message.lost /po\u{1b}[31mints count=3 writer=01.02"]
@@ -153,21 +153,21 @@ mod tests {
     }
 
     #[test]
-    fn it_remembers_only_the_latest_and_what_is_missing() {
-        let mut news = EventPane::default();
+    fn the_pane_keeps_the_latest_events_and_the_number_of_missed_ones() {
+        let mut events = EventPane::default();
         for number in 0..KEPT + 5 {
-            news.add(
+            events.add(
                 &event(json!({"severity": "INFO", "attributes": {"count": number}})),
                 None,
             );
         }
-        news.lag(&Lagged {
+        events.lag(&Lagged {
             missed: Some(7),
             reason: "overwritten".into(),
         });
-        assert_eq!(news.shown().count(), KEPT);
-        news.only_warnings = true;
-        let lines: Vec<_> = news.shown().collect();
+        assert_eq!(events.shown().count(), KEPT);
+        events.only_warnings = true;
+        let lines: Vec<_> = events.shown().collect();
         assert_eq!(lines.len(), 1);
         assert!(lines[0].text.contains("7 events are missing"));
     }

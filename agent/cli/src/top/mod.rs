@@ -88,7 +88,7 @@ pub fn once(agent: &Agent, options: &Options) -> Result<String, ClientError> {
 ///
 /// # Errors
 ///
-/// Standard output is no terminal, or a thread cannot be started.
+/// Standard output is not a terminal, or a thread cannot be started.
 pub fn live(agent: Agent, options: &Options, interval: Duration) -> io::Result<u8> {
     let theme = Theme::of(|name| std::env::var(name).ok());
     let mut app = App::new(options, agent.place());
@@ -113,9 +113,9 @@ pub fn live(agent: Agent, options: &Options, interval: Duration) -> io::Result<u
 /// Waits for input and processes it. Returns the exit code if it ends the program.
 fn handle_input(app: &mut App, poller: &Poller, input: &Receiver<Input>) -> Option<u8> {
     let begun = Instant::now();
-    let mut is_news = false;
+    let mut is_changed = false;
     loop {
-        let timeout = if is_news { CALM } else { TICK };
+        let timeout = if is_changed { CALM } else { TICK };
         let next = match input.recv_timeout(timeout.saturating_sub(begun.elapsed())) {
             Ok(next) => next,
             Err(RecvTimeoutError::Timeout) => return None,
@@ -136,6 +136,6 @@ fn handle_input(app: &mut App, poller: &Poller, input: &Receiver<Input>) -> Opti
         if is_urgent {
             return None;
         }
-        is_news = true;
+        is_changed = true;
     }
 }

@@ -194,7 +194,7 @@ impl Poll {
     }
 
     fn send(&self, fact: Fact) {
-        // The reader ends the process when it ends.
+        // Fails only while the program ends, as its main thread reads the channel.
         let _ = self.inputs.send(Input::Fact(fact));
     }
 }

@@ -422,7 +422,7 @@ mod tests {
     }
 
     #[test]
-    fn the_state_names_what_is_wrong() {
+    fn the_state_names_the_fault() {
         let measured = json!({"messages": 9, "rate_hertz": 9.0});
         let one = json!([{"measurement": measured}]);
         let state = |watches: serde_json::Value, diagnoses: serde_json::Value| {
@@ -443,7 +443,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_seen_is_not_called_quiet() {
+    fn an_invisible_topic_is_not_called_quiet() {
         let quiet = json!({"messages": 0, "rate_hertz": 0.0});
         let one = json!([{"measurement": quiet}]);
         let state = |code: &str| {
@@ -491,7 +491,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_known_is_sorted_last_either_way() {
+    fn unknown_values_are_sorted_last_in_both_directions() {
         let rows = [Some(1.0), None, Some(3.0)].map(|rate| {
             let mut row = row(json!({"name": format!("/{rate:?}")}));
             row.rate = rate;

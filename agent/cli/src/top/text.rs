@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_say_what_they_are_in_little_room() {
+    fn numbers_are_short_and_have_a_unit() {
         let rates = [0.0, 0.5, 9.999, 200.04, 1_000.0, 54_321.0].map(rate);
         assert_eq!(rates, ["0", "0.50", "10.0", "200.0", "1000.0", "54.3k"]);
         let sizes = [0.0, 320.0, 999.6, 54.3e6, 2.7e9, 4e13].map(bytes);

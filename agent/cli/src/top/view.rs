@@ -174,10 +174,10 @@ fn nothing(app: &App) -> &'static str {
 
 fn events(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
     let body = below(area);
-    let lines: Vec<_> = app.news.shown().collect();
+    let lines: Vec<_> = app.event_pane.shown().collect();
     let behind = lines.len().saturating_sub(app.events_back);
     let first = behind.saturating_sub(usize::from(body.height));
-    let mut title = match app.news.only_warnings {
+    let mut title = match app.event_pane.only_warnings {
         true => "events: warnings only".to_owned(),
         false => "events".to_owned(),
     };

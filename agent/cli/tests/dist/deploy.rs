@@ -14,7 +14,7 @@ use serde_yaml::Value;
 const NOT_BUILT_IN: &str = "kubernetes_sd_configs";
 
 #[test]
-fn what_compose_mounts_exists_and_images_are_pinned() -> Result<()> {
+fn mounts_of_compose_exist_and_images_are_pinned() -> Result<()> {
     let compose = yaml("compose.yaml")?;
     for (name, service) in compose["services"].as_mapping().context("no services")? {
         let image = service["image"].as_str().context("no image")?;

@@ -232,7 +232,7 @@ fn by_default_the_agent_reads_at_the_sockets_and_reports_it() -> Result<()> {
 }
 
 #[test]
-fn interfaces_that_are_named_make_it_look_at_the_wire_and_it_says_why() -> Result<()> {
+fn named_interfaces_select_the_wire_and_the_log_has_the_reason() -> Result<()> {
     let host = Namespace::alone()?;
     let observed = Observed::start(&host, "capture: {interfaces: {exclude: [wlan0]}}\n")?;
     let log = observed.log()?;
@@ -245,7 +245,8 @@ fn interfaces_that_are_named_make_it_look_at_the_wire_and_it_says_why() -> Resul
 }
 
 #[test]
-fn without_the_capability_to_attach_it_looks_at_the_wire_and_says_why() -> Result<()> {
+fn without_the_capability_to_attach_the_wire_is_selected_and_the_log_has_the_reason() -> Result<()>
+{
     let host = Namespace::alone()?;
     let cgroup = host.cgroup().display();
     let configuration = format!("capture: {{cgroup: {cgroup}}}\n");
@@ -295,7 +296,7 @@ fn three_capabilities_are_enough_at_the_sockets_and_all_are_given_up() -> Result
 }
 
 #[test]
-fn a_source_that_was_asked_for_and_is_not_to_be_had_is_an_error() -> Result<()> {
+fn a_configured_source_that_is_unavailable_is_an_error() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("ros2probe.yaml");

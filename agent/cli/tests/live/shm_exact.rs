@@ -30,7 +30,7 @@ const BURST: u64 = 50_000;
 const FASTER_THAN_IT_GOES: f64 = 1e6;
 
 #[test]
-fn every_message_is_seen_and_none_is_when_the_agent_is_killed() -> Result<()> {
+fn every_message_is_seen_and_breakpoints_end_with_a_killed_agent() -> Result<()> {
     let host = Host::new()?;
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&host.network, directory.path(), &[])?;

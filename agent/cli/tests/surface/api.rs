@@ -196,7 +196,7 @@ const REFUSED: [Refused; 18] = [
 ];
 
 #[test]
-fn what_cannot_be_is_answered_with_a_problem_that_says_why() {
+fn impossible_requests_are_answered_with_a_problem_and_its_reason() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     agent.wait_for_log("ready");
     for (method, path, headers, body, status, code, says) in REFUSED {

@@ -88,7 +88,7 @@ fn dashboards_are_not_edited_in_grafana_and_their_panels_do_not_overlap() -> Res
 }
 
 #[test]
-fn counters_are_asked_for_as_rates_and_gauges_as_they_are() -> Result<()> {
+fn panels_query_counters_as_rates_and_gauges_directly() -> Result<()> {
     let kinds = kinds();
     let mut counters = 0;
     for_each_panel(|panel| {
@@ -212,7 +212,7 @@ fn grafana_s_types_accept_the_dashboards_and_nothing_that_is_wrong() -> Result<(
 }
 
 #[test]
-fn the_readme_s_table_is_what_the_panels_say() -> Result<()> {
+fn the_readme_s_table_lists_the_panels() -> Result<()> {
     const BEGIN: &str = "<!-- panels: begin, from the dashboards -->\n";
     const END: &str = "<!-- panels: end -->";
     let path = dashboard::directory().join("README.md");

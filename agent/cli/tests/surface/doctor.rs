@@ -41,7 +41,7 @@ fn is_root() -> bool {
 }
 
 #[test]
-fn without_an_agent_it_looks_at_the_host_and_tries_what_it_may() {
+fn without_an_agent_doctor_examines_the_host_and_tries_permitted_sources() {
     let output = rp()
         .args(["doctor", "--json", "--socket", NOWHERE])
         .env("ROS_DISTRO", "jazzy")
@@ -99,7 +99,7 @@ fn an_unprivileged_user_gets_the_checks_that_need_root() {
 }
 
 #[test]
-fn an_agent_on_a_replay_is_asked_by_its_socket_and_from_elsewhere() {
+fn doctor_reads_an_agent_on_a_replay_through_its_socket_and_its_address() {
     let directory = tempfile::tempdir().unwrap();
     let socket = directory.path().join("api.sock");
     let config = directory.path().join("c.yaml");

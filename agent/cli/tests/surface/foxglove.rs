@@ -227,7 +227,7 @@ fn check_figures(agent: &LocalAgent, figures: &BTreeMap<String, Value>, viewer: 
 }
 
 #[test]
-fn what_is_no_handshake_of_a_viewer_is_refused_with_the_reason() {
+fn a_request_without_a_viewers_handshake_is_refused_with_the_reason() {
     let (agent, address) = agent(&["--speed", "max"]);
     let refused = |subprotocols: &[&str]| {
         let stream = TcpStream::connect(address).unwrap();

@@ -94,11 +94,11 @@ fn requests_of_ros2_survive() {
 }
 
 #[test]
-fn libraries_survive() {
+fn libraries_survive_hostile_trees() {
     run("fuzz/seeds/library", entry::library);
 }
 
 #[test]
-fn whatever_is_brought_the_model_survives() {
+fn the_model_survives_any_input() {
     run_up_to(400, "fuzz/seeds/model", entry::model);
 }

@@ -233,7 +233,7 @@ fn without_reports_there_are_no_series() {
 }
 
 #[test]
-fn without_the_source_the_command_says_how_to_switch_it_on() {
+fn without_the_source_the_command_prints_how_to_switch_it_on() {
     let capture = local_agent::capture();
     let run = |arguments: &[&str]| {
         let mut command = rp();

@@ -190,7 +190,7 @@ fn the_book_s_tables_are_those_of_the_sources() {
 }
 
 #[test]
-fn values_are_what_the_snapshot_says() {
+fn metric_values_equal_the_snapshot() {
     let page = page(
         sample_robot::snapshot(["/points"]),
         settings(),
@@ -399,7 +399,7 @@ fn series_of_deliveries_are_capped_and_never_twice() {
 }
 
 #[test]
-fn promtool_finds_nothing_to_say() {
+fn promtool_accepts_the_page() {
     let sources = MetricSources::new(SourceKind::Wire, settings());
     let starting = Exposition::new(sources).render(Format::Classic).unwrap();
     assert_eq!(promtool(&starting), "");

@@ -438,7 +438,7 @@ fn traced(
 }
 
 #[test]
-fn a_replay_gives_the_same_traces_every_time_and_they_say_what_the_capture_says() {
+fn a_replay_gives_the_same_traces_every_time_and_they_equal_the_capture() {
     let directory = tempfile::tempdir().unwrap();
     let watch = "{topic: /chatter, trace: 1}";
     let capture = local_agent::capture();

@@ -187,7 +187,7 @@ fn a_recording_that_meets_a_limit_ends_in_order_with_the_reason_and_none_begins_
 }
 
 #[test]
-fn what_is_to_stay_free_is_not_recorded_into() {
+fn a_recording_that_would_use_the_reserve_is_refused() {
     let directory = tempfile::tempdir().unwrap();
     let agent = agent(directory.path(), "  reserve_bytes: 1099511627776\n");
     let (status, refused) = ask(agent.api, "POST", "/recordings", r#"{"name": "none"}"#);
@@ -389,7 +389,7 @@ fn record_late(agent: &LocalAgent, messages: u64) -> Value {
 }
 
 #[test]
-fn snapshots_without_a_place_are_a_mistake_only_where_none_was_asked_for() {
+fn snapshots_without_a_directory_are_a_mistake_only_if_the_directory_is_off() {
     let directory = tempfile::tempdir().unwrap();
     let configuration = directory.path().join("ros2probe.yaml");
     let run = |state: &str| {

@@ -187,7 +187,7 @@ fn a_command_without_a_verb_prints_its_help() {
 }
 
 #[test]
-fn a_capture_answers_as_an_agent_does_and_only_up_to_the_moment_asked_for() {
+fn a_capture_answers_as_an_agent_does_up_to_the_requested_time() {
     let capture = local_agent::capture();
     let capture = capture.to_str().unwrap();
     let list = |further: &[&str]| {

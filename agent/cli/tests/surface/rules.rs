@@ -61,7 +61,7 @@ fn alerts_fire_on_symptoms_and_only_on_them() -> Result<()> {
 }
 
 #[test]
-fn every_alert_has_a_severity_a_summary_and_says_what_to_do() -> Result<()> {
+fn every_alert_has_a_severity_a_summary_and_a_remedy() -> Result<()> {
     for alert in alerts()? {
         let name = alert["alert"].as_str().context("no name")?;
         let severity = alert["labels"]["severity"].as_str().unwrap_or_default();

@@ -435,7 +435,7 @@ fn interest_measures_unwatched_topics_and_ends_with_the_last_request() {
 }
 
 #[test]
-fn what_finds_no_room_is_reported_and_memory_stays_bounded() {
+fn samples_without_room_are_reported_and_memory_stays_bounded() {
     let mut robot = Robot::new(Settings {
         payload_bytes: 100_000,
         ..Settings::default()
@@ -518,7 +518,7 @@ fn a_stream_reports_what_was_missed_and_where_it_is_complete() {
 }
 
 #[test]
-fn what_no_topic_can_be_called_is_refused() {
+fn an_invalid_topic_name_is_refused() {
     let agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     for query in [
         "",

@@ -35,7 +35,7 @@ fn wait_until(holds: impl Fn() -> bool) {
 }
 
 #[test]
-fn it_draws_reacts_to_keys_and_gives_the_terminal_back() {
+fn top_draws_reacts_to_keys_and_restores_the_terminal() {
     let agent = agent();
     let mut top = top(&agent, &[]);
     top.wait_for(TOPIC);
@@ -129,7 +129,7 @@ fn an_agent_that_comes_back_is_found_again() {
 }
 
 #[test]
-fn a_topic_is_measured_while_it_is_asked_for_and_no_longer_than_the_program_lives() {
+fn a_topic_is_measured_on_request_until_the_program_ends() {
     // Eight seconds, long enough for a loaded machine.
     let agent = LocalAgent::start(&mut rp(), &["--speed", "0.2"]);
     let is_measured = || {

@@ -116,8 +116,8 @@ fn check_scalar(node: &Node, text: &str, path: &str, schema: &Value, found: &mut
                     words.join(", ")
                 );
                 found.add(node.position, path, message);
-            } else if let Err(message) = check_text(path, text) {
-                found.add(node.position, path, message);
+            } else if let Err(error) = check_text(path, text) {
+                found.add(node.position, path, error.to_string());
             }
             return;
         }

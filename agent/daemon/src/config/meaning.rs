@@ -19,7 +19,9 @@ use super::shape::{
     ApiShape, CaptureShape, ConfigShape, FoxgloveShape, MetricsShape, OtlpShape, RecordingsShape,
     Ros2DaemonShape, SnapshotShape, Switch, WatchEntryShape, WatchShape,
 };
-use super::watch::{ExpectationValues, Expectations, Retain, Watch, check_globs, check_pattern};
+use super::watch::{
+    ExpectationValues, Expectations, PatternError, Retain, Watch, check_globs, check_pattern,
+};
 use super::{
     ApiSettings, CaptureSettings, Config, Endpoint, FoxgloveSettings, Limits, MetricsSettings,
     OtlpSettings, RecordingLimits, RecordingSettings, Ros2DaemonSettings, ShmSettings,
@@ -413,62 +415,76 @@ fn snapshot(shape: SnapshotShape) -> SnapshotSettings {
     }
 }
 
+/// Why the text at a key is invalid.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum InvalidText {
+    #[error(transparent)]
+    Pattern(#[from] PatternError),
+    #[error("{}", .0.kind())]
+    Glob(#[from] globset::Error),
+    #[error("must be an absolute path, as in {0}")]
+    RelativePath(&'static str),
+    #[error("must be one of {}, or the name of an event, as in `ros2.node.lost`", .0.join(", "))]
+    Trigger(Vec<&'static str>),
+    #[error(
+        "is `{text}`, must be an IP address and port, as in `127.0.0.1:{port}` or \
+         `[::1]:{port}`, or `off`"
+    )]
+    Address { text: String, port: u16 },
+    #[error("must be {0}")]
+    Unfit(&'static str),
+}
+
 /// Checks the text at a key with restricted values.
-pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
+pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
     match without_indices(key).as_str() {
-        "watch[]" | "watch[].topic" | "recordings.snapshots[].topics[]" => {
-            check_pattern(text).map_err(|error| error.to_string())
-        }
+        "watch[]" | "watch[].topic" | "recordings.snapshots[].topics[]" => Ok(check_pattern(text)?),
         "chains[].from" | "chains[].to" if text.contains('*') => {
-            Err("must be the name of one topic, as in `/points`".to_owned())
+            Err(InvalidText::Unfit("the name of one topic, as in `/points`"))
         }
-        "chains[].from" | "chains[].to" => check_pattern(text).map_err(|error| error.to_string()),
+        "chains[].from" | "chains[].to" => Ok(check_pattern(text)?),
         "capture.interfaces.include[]"
         | "capture.interfaces.exclude[]"
         | "capture.mirror_interfaces[]" => {
             if text.is_empty() || text.contains(|c: char| c.is_whitespace() || c == '/') {
-                return Err("must be an interface name or glob, as in `eth*`".to_owned());
+                return Err(InvalidText::Unfit(
+                    "an interface name or glob, as in `eth*`",
+                ));
             }
-            Glob::new(text)
-                .map(|_| ())
-                .map_err(|error| error.kind().to_string())
+            Glob::new(text)?;
+            Ok(())
         }
         "capture.cgroup" if !text.starts_with('/') => {
-            Err("must be an absolute path, as in `/sys/fs/cgroup/robot.slice`".to_owned())
+            Err(InvalidText::RelativePath("`/sys/fs/cgroup/robot.slice`"))
         }
         "capture.network_namespaces[]" if !text.starts_with('/') => {
-            Err("must be an absolute path, as in `/run/netns/robot`".to_owned())
+            Err(InvalidText::RelativePath("`/run/netns/robot`"))
         }
-        "state_directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => {
-            Err("must be an absolute path, as in `/var/lib/ros2probe`, `auto` or `off`".to_owned())
-        }
-        "recordings.snapshots[].name" if !is_plain(text) => {
-            Err("must be 1 to 64 letters, digits, `_` or `-`: it names directories".to_owned())
-        }
+        "state_directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => Err(
+            InvalidText::RelativePath("`/var/lib/ros2probe`, `auto` or `off`"),
+        ),
+        "recordings.snapshots[].name" if !is_plain(text) => Err(InvalidText::Unfit(
+            "1 to 64 letters, digits, `_` or `-`: it names directories",
+        )),
         "recordings.snapshots[].trigger[]" if Trigger::parse(text).is_none() => {
             let short = Trigger::names().filter(|name| !name.contains('.'));
-            let short: Vec<_> = short.collect();
-            Err(format!(
-                "must be one of {}, or the name of an event, as in `ros2.node.lost`",
-                short.join(", ")
-            ))
+            Err(InvalidText::Trigger(short.collect()))
         }
         "recordings.directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => {
-            Err("must be an absolute path, as in `/data/bags`, `auto` or `off`".to_owned())
+            Err(InvalidText::RelativePath("`/data/bags`, `auto` or `off`"))
         }
         "api.socket" if !matches!(text, "auto" | "off") && !text.starts_with('/') => Err(
-            "must be an absolute path, as in `/run/ros2probe/api.sock`, `auto` or `off`".to_owned(),
+            InvalidText::RelativePath("`/run/ros2probe/api.sock`, `auto` or `off`"),
         ),
         "metrics.web_config" if !text.starts_with('/') => {
-            Err("must be an absolute path, as in `/etc/ros2probe/web.yml`".to_owned())
+            Err(InvalidText::RelativePath("`/etc/ros2probe/web.yml`"))
         }
-        "api.token_file" if !text.starts_with('/') => Err(
-            "must be an absolute path, as in `/run/credentials/ros2probe.service/token`".to_owned(),
-        ),
-        "foxglove.origins[]" if !is_origin(text) => Err(
-            "must be an origin, as in `https://app.foxglove.dev` or `file://`, without a path"
-                .to_owned(),
-        ),
+        "api.token_file" if !text.starts_with('/') => Err(InvalidText::RelativePath(
+            "`/run/credentials/ros2probe.service/token`",
+        )),
+        "foxglove.origins[]" if !is_origin(text) => Err(InvalidText::Unfit(
+            "an origin, as in `https://app.foxglove.dev` or `file://`, without a path",
+        )),
         key @ ("metrics.listen" | "api.listen" | "foxglove.listen")
             if text != "off" && text.parse::<SocketAddr>().is_err() =>
         {
@@ -477,16 +493,14 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
                 "foxglove.listen" => 8765,
                 _ => 17400,
             };
-            Err(format!(
-                "is `{text}`, must be an IP address and port, as in `127.0.0.1:{port}` or \
-                 `[::1]:{port}`, or `off`"
-            ))
+            let text = text.to_owned();
+            Err(InvalidText::Address { text, port })
         }
-        "otlp.endpoint" if text != "off" && otlp_endpoint(text).is_none() => {
-            Err("must be the URL of a receiver, as in `http://collector:4317`, or `off`".to_owned())
-        }
+        "otlp.endpoint" if text != "off" && otlp_endpoint(text).is_none() => Err(
+            InvalidText::Unfit("the URL of a receiver, as in `http://collector:4317`, or `off`"),
+        ),
         "otlp.headers_file" if !text.starts_with('/') => {
-            Err("must be an absolute path, as in `/etc/ros2probe/otlp.headers`".to_owned())
+            Err(InvalidText::RelativePath("`/etc/ros2probe/otlp.headers`"))
         }
         _ => Ok(()),
     }

@@ -503,7 +503,7 @@ impl Default for Config {
 }
 
 impl Level {
-    /// As written in the file.
+    /// Returns its name in the configuration file.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use super::AgentEvent;
 use crate::agent_facts::AgentFacts;
+use crate::snapshot_cell::Unready;
 
 /// Least time between two reports of losses.
 const PAUSE: Duration = Duration::from_secs(1);
@@ -64,11 +65,11 @@ fn losses(facts: &AgentFacts) -> Losses {
 
 impl SourceMonitor {
     /// Events about changes of visibility at `now`. `ready` has the reason of a failure, and
-    /// `attached_anew` the number of times the hook was attached. If a control group went and came
+    /// `attached_anew` the number of times the hook was attached. If a control group was recreated
     /// between two checks, both events are returned, with the time between the checks.
     pub fn check(
         &mut self,
-        ready: &Result<(), String>,
+        ready: &Result<(), Unready>,
         attached_anew: u64,
         now: Instant,
     ) -> Vec<AgentEvent> {
@@ -88,7 +89,7 @@ impl SourceMonitor {
             }
             Err(reason) if self.saw.is_some() && self.blind_since.is_none() => {
                 self.blind_since = Some(now);
-                let reason = reason.clone();
+                let reason = reason.to_string();
                 events.push(AgentEvent::Blind { reason });
             }
             Err(_) => {}
@@ -131,7 +132,7 @@ mod tests {
     fn blindness_is_reported_once_and_not_during_the_start() {
         let start = Instant::now();
         let mut sight = SourceMonitor::default();
-        let blind = Err("stuck".to_owned());
+        let blind = Err(Unready::Unseen("stuck".to_owned()));
         assert_eq!(sight.check(&blind, 0, start), []);
         assert_eq!(sight.check(&Ok(()), 0, start), []);
         let reason = "stuck".to_owned();
@@ -159,7 +160,8 @@ mod tests {
         assert_eq!(sight.check(&Ok(()), 1, second(4)), []);
 
         // The check while it was gone has reported it.
-        let gone = Err("the cgroup /robot was removed".to_owned());
+        let gone = "the cgroup /robot was removed".to_owned();
+        let gone = Err(Unready::Unseen(gone));
         assert_eq!(sight.check(&gone, 1, second(6)).len(), 1);
         assert_eq!(sight.check(&Ok(()), 2, second(9)), [seeing(3.0)]);
         assert_eq!(sight.check(&Ok(()), 2, second(10)), []);

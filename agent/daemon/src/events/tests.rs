@@ -233,7 +233,7 @@ fn an_id_means_something_to_its_own_run_alone() {
 }
 
 #[tokio::test]
-async fn who_waits_is_woken_by_the_next_event() {
+async fn a_waiting_reader_is_woken_by_the_next_event() {
     let log = Arc::new(EventLog::new());
     log.wait(0).await_soon(false).await;
     log.record(AgentEvent::Reloaded { watches: 3 });

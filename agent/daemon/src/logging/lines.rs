@@ -29,7 +29,7 @@ pub(super) struct Lines<W> {
     target: W,
     lost: Arc<AtomicU64>,
     /// Dropped lines that are not reported yet.
-    untold: u64,
+    unreported: u64,
     /// Whether the last line was dropped; the next one then does not wait.
     is_stuck: bool,
     /// Whether a line was written in part.
@@ -41,7 +41,7 @@ impl<W: Write + AsFd> Lines<W> {
         Self {
             target,
             lost,
-            untold: 0,
+            unreported: 0,
             is_stuck: false,
             is_cut: false,
         }
@@ -59,13 +59,16 @@ impl<W: Write + AsFd> Lines<W> {
 
     /// Completes a cut line and reports dropped lines before the next one.
     fn catch_up(&mut self) -> io::Result<()> {
-        if self.untold == 0 {
+        if self.unreported == 0 {
             return Ok(());
         }
         let begin = if self.is_cut { "\n" } else { "" };
-        let text = format!("{begin}{} lines of the log were lost here\n", self.untold);
+        let text = format!(
+            "{begin}{} lines of the log were lost here\n",
+            self.unreported
+        );
         self.line(text.as_bytes())?;
-        self.untold = 0;
+        self.unreported = 0;
         Ok(())
     }
 
@@ -87,7 +90,7 @@ impl<W: Write + AsFd> Write for Lines<W> {
         let written = self.catch_up().and_then(|()| self.line(line));
         self.is_stuck = written.is_err();
         if self.is_stuck {
-            self.untold += 1;
+            self.unreported += 1;
             self.lost.fetch_add(1, Ordering::Relaxed);
         }
         Ok(line.len())

@@ -347,7 +347,7 @@ impl Allowed {
         for call in [libc::SYS_mmap, libc::SYS_mprotect] {
             self.when(call, &[without(2, libc::PROT_EXEC)?])?;
         }
-        // Its own abort, as abort() does it.
+        // A signal to itself, which abort() sends.
         self.when(libc::SYS_tgkill, &[equal(0, process)?])?;
         let named_or_read = [
             libc::PR_SET_NAME,

@@ -288,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_configuration_asks_for_beyond_that_is_needed_too() {
+    fn settings_that_need_further_capabilities_require_them() {
         let named = CaptureSettings {
             include_interfaces: vec!["eth0".to_owned()],
             ..settings(SourceChoice::Auto)

@@ -16,7 +16,7 @@ use ros2probe_capture::uprobe;
 
 /// Whether filters are in force, as determined for the first confined thread. The result is the
 /// same for all threads.
-static FILTERED: OnceLock<Result<(), String>> = OnceLock::new();
+static SANDBOX: OnceLock<Sandbox> = OnceLock::new();
 
 /// State of the system-call filter.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -26,7 +26,7 @@ pub enum Sandbox {
     /// Every thread has a filter.
     Filtered,
     /// No thread has a filter, for this reason.
-    Unfiltered(&'static str),
+    Unfiltered(String),
 }
 
 /// Role of a thread, which determines its privileges.
@@ -110,11 +110,11 @@ impl Sandbox {
 
     /// Reason why system calls are not filtered. `None` if they are.
     #[must_use]
-    pub const fn reason(&self) -> Option<&'static str> {
+    pub const fn reason(&self) -> Option<&str> {
         match self {
             Self::Never => Some("part of a command"),
             Self::Filtered => None,
-            Self::Unfiltered(reason) => Some(reason),
+            Self::Unfiltered(reason) => Some(reason.as_str()),
         }
     }
 }
@@ -177,12 +177,12 @@ impl Role {
 pub fn confine(role: Role) -> Result<(), ConfineError> {
     give_up(role)?;
     rustix::thread::set_no_new_privs(true).map_err(|error| ConfineError::Gain(error.into()))?;
-    let filtered = match calls::load(role) {
-        Ok(()) => Ok(()),
-        Err(FilterError::Refused(reason)) => Err(reason),
+    let sandbox = match calls::load(role) {
+        Ok(()) => Sandbox::Filtered,
+        Err(FilterError::Refused(reason)) => Sandbox::Unfiltered(reason),
         Err(error) => return Err(ConfineError::Filter(error)),
     };
-    let _ = FILTERED.set(filtered);
+    let _ = SANDBOX.set(sandbox);
     Ok(())
 }
 
@@ -198,11 +198,7 @@ pub fn give_up(role: Role) -> Result<(), DropError> {
 /// State of the filter in this process.
 #[must_use]
 pub fn sandbox() -> Sandbox {
-    match FILTERED.get() {
-        None => Sandbox::Never,
-        Some(Ok(())) => Sandbox::Filtered,
-        Some(Err(reason)) => Sandbox::Unfiltered(reason),
-    }
+    SANDBOX.get().cloned().unwrap_or(Sandbox::Never)
 }
 
 /// Starts a thread that is confined before any other work. Returns after it is.

@@ -25,7 +25,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn capabilities_are_asked_for_where_the_kernel_asks_for_them() {
+    fn capabilities_are_required_where_the_kernel_requires_them() {
         let release = std::fs::read_to_string("/proc/sys/kernel/osrelease").unwrap();
         let mut numbers = release.split('.').map_while(|number| number.parse().ok());
         let version: (u32, u32) = (numbers.next().unwrap(), numbers.next().unwrap());

@@ -389,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_asked_of_an_agent_is_no_less_than_what_is_taken() {
+    fn the_requested_selection_covers_every_recorded_topic() {
         let options = FilterOptions {
             topics: strings(&["/a", "/b"]),
             services: strings(&["/add"]),

@@ -435,7 +435,7 @@ impl<'a> Recorder<'a> {
         !matches!(self.topics.get(name), Some(TopicDecision::Excluded))
     }
 
-    /// State of a topic with so many messages. `None` if it is not recorded.
+    /// State of a topic with this many messages. `None` if it is not recorded.
     fn place(&mut self, topic: &Topic, messages: u64) -> Result<Option<&mut RecordedTopic>, Error> {
         let Topic {
             name, message_type, ..

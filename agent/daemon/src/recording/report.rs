@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_is_counted_by_reason_and_named_with_its_numbers() {
+    fn missing_messages_are_counted_by_reason_and_named_with_their_numbers() {
         let mut report = Report::default();
         add_written(&mut report, "/points", 100);
         add_missed(&mut report, &missed(2, 3, MissedReason::Incomplete));
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_storage_refused_counts_as_missing() {
+    fn messages_that_the_storage_refused_count_as_missing() {
         let mut report = Report::default();
         add_written(&mut report, "/points", 100);
         add_written(&mut report, "/points", 100);

@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_older_than_the_span_goes() {
+    fn samples_older_than_the_span_are_dropped() {
         let mut ring = SampleRing::new(1 << 20, Some(Duration::from_secs(3)));
         for second in 0..6 {
             ring.push(sample(second, 10));

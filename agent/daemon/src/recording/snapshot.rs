@@ -38,7 +38,21 @@ pub struct WrittenBag {
     pub messages: u64,
 }
 
-type Answer = oneshot::Sender<Result<WrittenBag, String>>;
+/// Why a requested bag was not written.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Unwritten {
+    /// [`CLIENTS`] clients wait already.
+    #[error("too many clients wait for this snapshot")]
+    Busy,
+    /// The snapshot's thread has ended.
+    #[error("the agent is shutting down")]
+    ShuttingDown,
+    /// No directory, no space, or an error of the storage, with its causes.
+    #[error("{0}")]
+    Storage(String),
+}
+
+type Answer = oneshot::Sender<Result<WrittenBag, Unwritten>>;
 
 /// All configured snapshots.
 #[derive(Debug, Default)]
@@ -99,14 +113,14 @@ impl Snapshots {
     }
 
     /// Writes the messages in memory at once, regardless of earlier bags. `None` if it does not exist.
-    pub async fn write(&self, name: &str) -> Option<Result<WrittenBag, String>> {
+    pub async fn write(&self, name: &str) -> Option<Result<WrittenBag, Unwritten>> {
         let snapshot = self.list.iter().find(|each| each.settings.name == name)?;
         let (answer, written) = oneshot::channel();
         if snapshot.clients.try_send(answer).is_err() {
-            return Some(Err("too many clients wait for this snapshot".to_owned()));
+            return Some(Err(Unwritten::Busy));
         }
         let written = written.await;
-        Some(written.unwrap_or_else(|_| Err("the agent is shutting down".to_owned())))
+        Some(written.unwrap_or(Err(Unwritten::ShuttingDown)))
     }
 
     /// Writes all snapshots.

@@ -163,7 +163,7 @@ impl Run {
         let has_applied_lists = self.take_watches();
         self.hand_over();
         if has_applied_lists {
-            self.confirm_wishes();
+            self.confirm_requests();
         }
         self.confirm_complete();
         self.publish();
@@ -196,7 +196,7 @@ impl Run {
             self.remember();
             self.hand_over();
             if has_applied_lists {
-                self.confirm_wishes();
+                self.confirm_requests();
             }
             self.confirm_complete();
             let age = published.elapsed();
@@ -284,9 +284,9 @@ impl Run {
         if clock + SET_BACK < self.published_until {
             self.published_until = clock;
         }
-        let news = (clock > self.published_until).then_some(clock);
+        let new_clock = (clock > self.published_until).then_some(clock);
         self.published_until = self.published_until.max(clock);
-        self.subscriptions.deliver(output.samples, news);
+        self.subscriptions.deliver(output.samples, new_clock);
     }
 
     /// Passes changed watches and requests to the model. Returns whether every topic was matched
@@ -313,7 +313,7 @@ impl Run {
 
     /// Gives readers the retained samples of requests that are in force in the kernel, before the next
     /// packets.
-    fn confirm_wishes(&mut self) {
+    fn confirm_requests(&mut self) {
         if let Some(sample_requests) = self.sample_requests.take() {
             let observer = &mut self.observer;
             (self.subscriptions).in_force(&sample_requests, |request| observer.latched(request));

@@ -16,6 +16,7 @@ use crate::agent_facts::{
     SharedMemoryFacts, SourceKind,
 };
 use crate::config::{CaptureSettings, InsideChoice};
+use ros2probe_capture::error_chain::Reason;
 use ros2probe_capture::host_tap::HostTap;
 use ros2probe_capture::live::{CaptureError, LiveSource, Part};
 use ros2probe_capture::reassembly::Limits;
@@ -80,7 +81,7 @@ impl Source {
             if let Err(reason) = able {
                 tracing::warn!(
                     ability = ability.label(),
-                    reason,
+                    reason = reason.as_str(),
                     "ability not available on this kernel"
                 );
             }
@@ -435,7 +436,7 @@ fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
     }
     let inside = tracepoint_abilities(live).into_iter().flatten();
     let mut blind: Vec<_> = inside
-        .filter_map(|(ability, able)| Some((ability, able.as_ref().err()?.clone())))
+        .filter_map(|(ability, able)| Some((ability, able.as_ref().err()?.to_string())))
         .collect();
     let uncovered = live.exact().and_then(|facts| facts.uncovered);
     let exact = live.without_exact().map(str::to_owned).or(uncovered);
@@ -450,7 +451,7 @@ fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
 }
 
 /// Abilities that depend on tracepoints of the kernel.
-fn tracepoint_abilities(live: &LiveSource) -> Option<[(Ability, &Result<(), String>); 3]> {
+fn tracepoint_abilities(live: &LiveSource) -> Option<[(Ability, &Result<(), Reason>); 3]> {
     let abilities = live.host()?.abilities()?;
     Some([
         (Ability::SocketLosses, &abilities.socket_losses),

@@ -19,7 +19,7 @@ fn unusable(directory: &StateDirectory) -> String {
 }
 
 #[test]
-fn what_is_written_is_read_again_and_nothing_else_is_left() {
+fn a_written_file_is_read_again_and_no_other_file_is_left() {
     let (place, directory) = directory();
     assert_eq!(directory.load(), Loaded::Nothing);
     directory.write(Memory::default()).unwrap();
@@ -55,7 +55,7 @@ fn a_file_that_is_no_state_is_kept_aside_and_a_new_one_begun() {
 }
 
 #[test]
-fn what_a_newer_one_wrote_stays_where_it_is_also_cut_or_of_another_form() {
+fn a_file_of_a_newer_agent_stays_in_place_even_if_cut_or_of_another_form() {
     let (place, directory) = directory();
     let file = place.path().join(FILE);
     for (newer, version) in [

@@ -119,7 +119,7 @@ pub struct Subscriptions {
     /// Requests of watches for the last messages of their topics.
     retained: ArcSwap<Vec<SampleRequest>>,
     /// Latest requests that the capture thread has not read yet.
-    news: ArcSwapOption<Vec<SampleRequest>>,
+    unread: ArcSwapOption<Vec<SampleRequest>>,
     latest: Arc<SnapshotCell>,
     caps: Caps,
     /// Ends waits for readers when the agent ends.
@@ -155,7 +155,7 @@ impl Subscriptions {
             channels: ArcSwap::default(),
             changing: Mutex::default(),
             retained: ArcSwap::default(),
-            news: ArcSwapOption::default(),
+            unread: ArcSwapOption::default(),
             latest,
             caps,
             stop,
@@ -232,7 +232,7 @@ impl Subscriptions {
     /// For the capture thread: all requests, if they changed since the last call.
     #[must_use]
     pub fn take_changed(&self) -> Option<Arc<Vec<SampleRequest>>> {
-        self.news.swap(None)
+        self.unread.swap(None)
     }
 
     /// For the capture thread: requests the messages for which these watches ask.
@@ -289,12 +289,12 @@ impl Subscriptions {
     }
 
     /// For the capture thread: queues samples from the model, then the clock if it has advanced.
-    pub fn deliver(&self, given: Vec<Dispatch>, clock: Option<Timestamp>) {
+    pub fn deliver(&self, dispatches: Vec<Dispatch>, clock: Option<Timestamp>) {
         let channels = self.channels.load();
         if channels.is_empty() {
             return;
         }
-        for Dispatch { to, outcome } in given {
+        for Dispatch { to, outcome } in dispatches {
             match outcome {
                 SampleOutcome::Sample(sample) => self.sample(&channels, &to, &sample),
                 SampleOutcome::Missed(missed) => {
@@ -385,7 +385,7 @@ impl Subscriptions {
         let retained = self.retained.load();
         let sample_requests = sample_requests.chain(retained.iter().cloned()).collect();
         self.channels.store(Arc::new(channels));
-        self.news.store(Some(Arc::new(sample_requests)));
+        self.unread.store(Some(Arc::new(sample_requests)));
     }
 
     fn changing(&self) -> std::sync::MutexGuard<'_, Opened> {

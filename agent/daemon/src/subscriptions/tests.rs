@@ -78,7 +78,7 @@ fn numbers(subscription: &mut Subscription) -> Vec<u64> {
 }
 
 #[test]
-fn each_reader_gets_what_is_for_it_and_bytes_only_when_asked() {
+fn each_reader_gets_its_samples_and_payloads_only_on_request() {
     let all = subscriptions(caps());
     let mut arrivals = all.open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest));
     let mut payloads = all.open(request(Depth::Payloads, 1 << 16, Overflow::DropOldest));
@@ -296,7 +296,7 @@ fn patterns_of_all_subscriptions_together_are_bounded() {
 }
 
 #[tokio::test]
-async fn a_reader_is_woken_told_the_end_and_then_nothing() {
+async fn a_reader_is_woken_gets_the_end_and_then_nothing() {
     let all = subscriptions(caps());
     let mut reader = all
         .open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest))

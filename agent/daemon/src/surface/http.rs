@@ -163,7 +163,7 @@ impl Local {
 /// agent.
 async fn own_names(Extension(local): Extension<Local>, request: Request, next: Next) -> Response {
     let headers = request.headers();
-    // A client without the header is no browser.
+    // A client without the header is not a browser.
     if local.0 && headers.contains_key(HOST) && authority::own(headers).is_err() {
         let reason = "the request is for another host; this listener answers to localhost and \
                       loopback addresses\n";
@@ -273,7 +273,7 @@ async fn readyz(Extract(pages): Extract<Pages>) -> Response {
             Some(reason) => format!("ready\ndegraded: {reason}\n").into_response(),
             None => "ready\n".into_response(),
         },
-        Err(reason) => (StatusCode::SERVICE_UNAVAILABLE, reason + "\n").into_response(),
+        Err(reason) => (StatusCode::SERVICE_UNAVAILABLE, format!("{reason}\n")).into_response(),
     }
 }
 

@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn slow_readers_of_large_answers_never_keep_others_from_theirs() {
+    async fn slow_readers_of_large_answers_do_not_block_others() {
         static ANSWERS: LargeResponses = LargeResponses {
             making: Semaphore::const_new(AT_ONCE),
             longest: Duration::ZERO,

@@ -24,7 +24,7 @@ const REQUEST: u64 = 64 << 10;
 /// Longest time that a connection that makes room may take to close.
 const EVICTION_TIMEOUT: Duration = Duration::from_millis(100);
 
-/// A listener with a limited number of connections; further ones are refused and closed.
+/// A listener with a limited number of connections.
 #[derive(Debug)]
 pub(super) struct LimitedListener<L> {
     listener: L,

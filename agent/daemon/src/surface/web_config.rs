@@ -53,8 +53,56 @@ pub enum WebConfigError {
     Invalid {
         /// Path of the file.
         path: PathBuf,
-        /// Description of the error.
-        reason: String,
+        /// The setting's error.
+        reason: InvalidSetting,
+    },
+}
+
+/// Why a setting of the file is invalid.
+#[derive(Debug, thiserror::Error)]
+pub enum InvalidSetting {
+    /// Not YAML, or an unknown or missing key.
+    #[error(transparent)]
+    Yaml(#[from] serde_yaml::Error),
+    /// A user's password hash cannot be used.
+    #[error("basic_auth_users: the hash of `{name}` {fault}")]
+    Hash {
+        /// Name of the user.
+        name: String,
+        /// What is wrong with the hash.
+        fault: InvalidHash,
+    },
+    /// Client certificates are required, but no authority is named.
+    #[error("tls_server_config: client_auth_type needs client_ca_file")]
+    NoAuthority,
+    /// An authority is named, but client certificates are not required.
+    #[error(
+        "tls_server_config: client_ca_file has no effect without \
+         `client_auth_type: RequireAndVerifyClientCert`"
+    )]
+    UnusedAuthority,
+    /// The kind of client authentication is unknown or not supported.
+    #[error(
+        "tls_server_config: client_auth_type is {0}, must be NoClientCert or \
+         RequireAndVerifyClientCert"
+    )]
+    AuthType(String),
+    /// The TLS version is unknown or not supported.
+    #[error("tls_server_config: min_version is {0}, must be TLS12 or TLS13")]
+    MinVersion(String),
+}
+
+/// Why a password hash cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum InvalidHash {
+    /// Not of the form `$2y$10$` and 53 characters.
+    #[error("is not a bcrypt hash, as printed by `htpasswd -nBC 10 NAME`")]
+    NotBcrypt,
+    /// The cost is outside of the accepted range.
+    #[error("has cost {cost}, must be {} to {}", COSTS.start(), COSTS.end())]
+    Cost {
+        /// The cost.
+        cost: u8,
     },
 }
 
@@ -94,15 +142,17 @@ impl WebConfig {
         Ok(config)
     }
 
-    fn parse(text: &str, directory: &Path) -> Result<Self, String> {
+    fn parse(text: &str, directory: &Path) -> Result<Self, InvalidSetting> {
         if text.trim().is_empty() {
             return Ok(Self::default());
         }
-        let shape: Shape = serde_yaml::from_str(text).map_err(|error| error.to_string())?;
+        let shape: Shape = serde_yaml::from_str(text)?;
         let users = shape.basic_auth_users.unwrap_or_default();
         for (name, hash) in &users {
-            check_hash(hash)
-                .map_err(|what| format!("basic_auth_users: the hash of `{name}` {what}"))?;
+            check_hash(hash).map_err(|fault| InvalidSetting::Hash {
+                name: name.clone(),
+                fault,
+            })?;
         }
         let tls = shape.tls_server_config.map(|shape| shape.check(directory));
         Ok(Self {
@@ -113,34 +163,23 @@ impl WebConfig {
 }
 
 impl TlsShape {
-    fn check(self, directory: &Path) -> Result<TlsFiles, String> {
+    fn check(self, directory: &Path) -> Result<TlsFiles, InvalidSetting> {
         let authorities = self.client_ca_file.map(|path| directory.join(path));
         let client_authorities = match (self.client_auth_type.as_deref(), authorities) {
             (None | Some("NoClientCert" | ""), None) => None,
             (Some("RequireAndVerifyClientCert"), Some(path)) => Some(path),
             (Some("RequireAndVerifyClientCert"), None) => {
-                return Err("tls_server_config: client_auth_type needs client_ca_file".to_owned());
+                return Err(InvalidSetting::NoAuthority);
             }
             (None | Some("NoClientCert" | ""), Some(_)) => {
-                return Err("tls_server_config: client_ca_file has no effect without \
-                            `client_auth_type: RequireAndVerifyClientCert`"
-                    .to_owned());
+                return Err(InvalidSetting::UnusedAuthority);
             }
-            (Some(other), _) => {
-                return Err(format!(
-                    "tls_server_config: client_auth_type is {other}, must be NoClientCert or \
-                     RequireAndVerifyClientCert"
-                ));
-            }
+            (Some(other), _) => return Err(InvalidSetting::AuthType(other.to_owned())),
         };
         let only_tls13 = match self.min_version.as_deref() {
             None | Some("TLS12") => false,
             Some("TLS13") => true,
-            Some(other) => {
-                return Err(format!(
-                    "tls_server_config: min_version is {other}, must be TLS12 or TLS13"
-                ));
-            }
+            Some(other) => return Err(InvalidSetting::MinVersion(other.to_owned())),
         };
         Ok(TlsFiles {
             certificates: directory.join(self.cert_file),
@@ -152,21 +191,19 @@ impl TlsShape {
 }
 
 /// Checks `$2y$10$` and 53 characters. The cost is bounded, because every client can cause it.
-fn check_hash(hash: &str) -> Result<(), String> {
-    let unfit = "is not a bcrypt hash, as printed by `htpasswd -nBC 10 NAME`";
+fn check_hash(hash: &str) -> Result<(), InvalidHash> {
     let mut parts = hash.split('$');
     let (none, version, cost) = (parts.next(), parts.next(), parts.next());
     let letters = parts.next().unwrap_or_default();
     let is_known = none == Some("") && matches!(version, Some("2a" | "2b" | "2y"));
     if !is_known || letters.len() != 53 || parts.next().is_some() {
-        return Err(unfit.to_owned());
+        return Err(InvalidHash::NotBcrypt);
     }
     let cost: u8 = cost
         .and_then(|cost| cost.parse().ok())
-        .ok_or_else(|| unfit.to_owned())?;
+        .ok_or(InvalidHash::NotBcrypt)?;
     if !COSTS.contains(&cost) {
-        let (low, high) = (COSTS.start(), COSTS.end());
-        return Err(format!("has cost {cost}, must be {low} to {high}"));
+        return Err(InvalidHash::Cost { cost });
     }
     Ok(())
 }
@@ -178,7 +215,7 @@ mod tests {
     /// The example in exporter-toolkit's documentation.
     const ALICE: &str = "$2y$10$mDwo.lAisC94iLAyP81MCesa29IzH37oigHC/42V2pdJlUprsJPze";
 
-    fn parse(text: &str) -> Result<WebConfig, String> {
+    fn parse(text: &str) -> Result<WebConfig, InvalidSetting> {
         WebConfig::parse(text, Path::new("/etc/ros2probe"))
     }
 
@@ -198,8 +235,8 @@ mod tests {
     }
 
     #[test]
-    fn what_would_leave_the_listener_open_is_refused() {
-        for (text, says) in [
+    fn a_setting_that_would_leave_the_listener_open_is_refused() {
+        for (text, expected) in [
             ("basic_auth_user:\n  alice: x\n", "basic_auth_user"),
             ("basic_auth_users:\n  alice: secret\n", "not a bcrypt hash"),
             ("basic_auth_users: {a: $2y$10$short}", "not a bcrypt hash"),
@@ -229,11 +266,13 @@ mod tests {
                 "NoClientCert",
             ),
         ] {
-            let error = parse(text).unwrap_err();
-            assert!(error.contains(says), "{text}: {error}");
+            let error = parse(text).unwrap_err().to_string();
+            assert!(error.contains(expected), "{text}: {error}");
         }
         let slow = ALICE.replace("$10$", "$31$");
-        let error = parse(&format!("basic_auth_users: {{a: {slow}}}")).unwrap_err();
+        let error = parse(&format!("basic_auth_users: {{a: {slow}}}"))
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("cost 31"), "{error}");
     }
 }

@@ -15,8 +15,8 @@ use ros2probe_wire::{DomainId, InvalidDomainId};
 use serde::{Deserialize, Serialize};
 
 use crate::config::watch::{
-    ExpectationError, ExpectationValues, Expectations, PatternError, Retain, Watch, check_pattern,
-    check_trace,
+    ExpectationError, ExpectationValues, Expectations, ManyGlobs, PatternError, Retain, Watch,
+    check_pattern, check_trace,
 };
 use crate::config::{Limit, check_globs};
 use crate::state::{ENDING, Form, Found, Newer, StateDirectory, from_json, join_until};
@@ -116,30 +116,33 @@ pub fn load(directory: &StateDirectory) -> LoadedWatches {
         Found::This(document) => document,
     };
     let watches = if document.watches.len() > Limit::Watches.row().range.1 {
-        Err(format!("it has {} watches", document.watches.len()))
+        Err(InvalidList::Watches(document.watches.len()))
     } else {
         let watches = document.watches.into_iter().map(Watch::try_from);
-        let watches: Result<_, InvalidLine> = watches.collect();
-        watches.map_err(|error| error.to_string())
+        watches.collect()
     };
     let watches = watches.and_then(|watches: Vec<Watch>| {
         let patterns = watches.iter().map(|watch| watch.pattern.as_str());
-        check_globs(patterns).map_err(|many| format!("it has {many}"))?;
+        check_globs(patterns)?;
         Ok(watches)
     });
     match watches {
         Ok(watches) => LoadedWatches::These(watches),
-        Err(reason) => match directory.set_aside::<Document>(FILE, reason) {
+        Err(error) => match directory.set_aside::<Document>(FILE, error.to_string()) {
             Found::Unusable { reason, moved_to } => LoadedWatches::Unusable { reason, moved_to },
             Found::Nothing | Found::This(_) | Found::Newer(_) => LoadedWatches::Nothing,
         },
     }
 }
 
-/// Why a saved watch is invalid.
+/// Why the saved watches are invalid.
 #[derive(Debug, thiserror::Error)]
-enum InvalidLine {
-    /// Its pattern matches no topic.
+enum InvalidList {
+    #[error("it has {0} watches")]
+    Watches(usize),
+    #[error("it has {0}")]
+    Globs(#[from] ManyGlobs),
+    /// The pattern of a watch matches no topic.
     #[error("`{topic}` {error}")]
     Pattern { topic: String, error: PatternError },
     #[error(transparent)]
@@ -149,10 +152,10 @@ enum InvalidLine {
 }
 
 impl TryFrom<Line> for Watch {
-    type Error = InvalidLine;
+    type Error = InvalidList;
 
-    fn try_from(line: Line) -> Result<Self, InvalidLine> {
-        check_pattern(&line.topic).map_err(|error| InvalidLine::Pattern {
+    fn try_from(line: Line) -> Result<Self, InvalidList> {
+        check_pattern(&line.topic).map_err(|error| InvalidList::Pattern {
             topic: line.topic.clone(),
             error,
         })?;
@@ -334,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_added_is_read_again_as_it_was() {
+    fn added_watches_are_read_again_unchanged() {
         let (_place, directory) = directory();
         assert_eq!(load(&directory), LoadedWatches::Nothing);
         let keeper = WatchWriter::start(Arc::clone(&directory)).unwrap();

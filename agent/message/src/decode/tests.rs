@@ -86,7 +86,7 @@ fn a_byte_order_mark_begins_no_wide_string() {
 }
 
 #[test]
-fn what_cannot_be_read_is_refused_by_name() {
+fn unsupported_encapsulations_are_refused_by_name() {
     let refused = |id: u8| read("uint8 a", &[0, id, 0, 0, 1]).unwrap_err().to_string();
     assert_eq!(
         refused(3),
@@ -135,7 +135,7 @@ MSG: a/Empty\n";
 }
 
 #[test]
-fn what_is_kept_is_bounded_and_what_is_not_kept_is_checked_all_the_same() {
+fn kept_values_are_bounded_and_the_others_are_still_checked() {
     let schema = "Inner[] a\nstring[] b\n
 ================================================================================
 MSG: a/Inner\nuint8 x\nuint8 y";
@@ -177,7 +177,7 @@ MSG: a/Inner\nuint8 x\nuint8 y";
 }
 
 #[test]
-fn what_is_strange_is_shown_and_counted() {
+fn oddities_are_shown_and_counted() {
     let payload = b"\0\x01\0\0\x05\0\0\0\x03\0\0\0ab\xff\x01";
     let (shown, oddities) = read("bool ok\nstring s", payload).unwrap();
     assert_eq!(shown, "a.msg.B(ok=True, s='ab\u{fffd}')");

@@ -306,7 +306,7 @@ impl<'a> Reader<'a> {
         self.skip_until(";")
     }
 
-    /// Parses an annotation behind `@`: a name and optional parentheses. Only `@optional` changes
+    /// Parses an annotation after `@`: a name and optional parentheses. Only `@optional` changes
     /// the wire format of ROS.
     fn annotation(&mut self) -> Result<(), Problem> {
         let name = self.identifier()?;
@@ -320,7 +320,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Skips to behind a token, over nested brackets.
+    /// Skips to the end of a token, over nested brackets.
     fn skip_until(&mut self, end: &str) -> Result<(), Problem> {
         let mut open = 0_usize;
         loop {
@@ -476,7 +476,7 @@ module a {
 "#;
 
     #[test]
-    fn what_rosidl_writes_is_read_as_the_message_it_stands_for() {
+    fn idl_written_by_rosidl_is_read_as_its_message() {
         let message = "\
 std_msgs/Header header
 float64 x

@@ -182,7 +182,7 @@ impl Members {
     }
 }
 
-/// Returns the line behind its annotations, if it is not empty. `@key` does not change ROS's
+/// Returns the line after its annotations, if it is not empty. `@key` does not change ROS's
 /// encoding; any other annotation may.
 fn without_annotations(mut line: &str) -> Result<Option<&str>, Problem> {
     while line.starts_with('@') {
@@ -207,7 +207,7 @@ fn check_constant(type_text: &str, name: &str, value: &str) -> Result<(), Proble
     }
 }
 
-/// Parses `string<=5[<=3]`: an element type, and behind it the number of elements.
+/// Parses `string<=5[<=3]`: an element type, and after it the number of elements.
 fn field_type(package: &str, text: &str) -> Result<(Element, Shape), Problem> {
     let no_type = || Problem::Type(shortened(text));
     let (element, shape) = match text.strip_suffix(']') {

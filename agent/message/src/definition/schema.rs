@@ -289,7 +289,7 @@ uint32 nanosec
 
     proptest! {
         #[test]
-        fn what_is_written_is_read_again(structure in structure(), more in structure()) {
+        fn a_written_schema_is_parsed_again(structure in structure(), more in structure()) {
             let text = members(&structure);
             let read = Definition::parse(structure.name.clone(), &text).unwrap();
             prop_assert_eq!(&*read.structures[0], &structure);

@@ -8,6 +8,53 @@ use super::{Comparison, FilterError, Function, Kind, Method, Node, Operator};
 use crate::python;
 use crate::value::{Array, Items, Message, Scalar, Value};
 
+/// Why an expression has no value: what Python would raise. Types have their names in Python.
+#[derive(Debug, thiserror::Error)]
+enum Exception {
+    #[error("'{0}' object has no attribute '{1}'")]
+    NoAttribute(String, String),
+    #[error("'{0}' object has no methods here")]
+    NoMethod(String),
+    #[error("'{0}' object is not subscriptable")]
+    NotSubscriptable(String),
+    #[error("'{0}' object is not iterable")]
+    NotIterable(String),
+    #[error("object of type '{0}' has no len()")]
+    NoLength(String),
+    #[error("bad operand type for {0}: '{1}'")]
+    BadOperand(&'static str, String),
+    #[error("cannot calculate with '{0}' and '{1}'")]
+    NotNumbers(String, String),
+    #[error("'{}' not supported between instances of '{left}' and '{right}'", comparison.as_str())]
+    NotComparable {
+        comparison: Comparison,
+        left: String,
+        right: String,
+    },
+    #[error("'in' needs a string or a list, not '{0}'")]
+    NotContainer(String),
+    #[error("an index must be a number, not '{0}'")]
+    BadIndex(String),
+    #[error("index out of range")]
+    OutOfRange,
+    #[error("the number is too large")]
+    TooLarge,
+    #[error("division by zero")]
+    DivisionByZero,
+    #[error("not a number: '{0}'")]
+    NotNumber(String),
+    #[error("not a whole number: '{0}'")]
+    NotInteger(String),
+    #[error("'{0}' cannot be converted to a {1}")]
+    NotConvertible(String, &'static str),
+    #[error("the argument is empty")]
+    EmptyArgument,
+    #[error("takes {0}")]
+    Arguments(&'static str),
+    #[error("takes one argument, not {0}")]
+    ArgumentCount(usize),
+}
+
 /// The value of `m`.
 #[derive(Debug, Clone, Copy)]
 pub enum Subject<'a> {
@@ -77,8 +124,8 @@ impl<'a> Object<'a> {
         }
     }
 
-    fn type_name(&self) -> &str {
-        match self {
+    fn type_name(&self) -> String {
+        let name = match self {
             Self::None => "NoneType",
             Self::Bool(_) => "bool",
             Self::Int(_) => "int",
@@ -88,7 +135,8 @@ impl<'a> Object<'a> {
             Self::List(_) => "list",
             Self::Array(_) => "array",
             Self::Message(message) => message.structure.name.name(),
-        }
+        };
+        name.to_owned()
     }
 
     /// Returns the value as a number, which a boolean is, too; `None` for other values.
@@ -162,7 +210,7 @@ impl Number {
 }
 
 fn evaluate<'a>(node: &Node, subject: &Object<'a>) -> Result<Object<'a>, FilterError> {
-    let wrong = |message: String| FilterError::new(node.column, message);
+    let wrong = |exception: Exception| FilterError::new(node.column, exception.to_string());
     let of = |inner: &Node| evaluate(inner, subject);
     Ok(match &node.kind {
         Kind::Subject => subject.clone(),
@@ -178,8 +226,8 @@ fn evaluate<'a>(node: &Node, subject: &Object<'a>) -> Result<Object<'a>, FilterE
                 Object::Message(message) => message.get(name).map(Object::of),
                 _ => None,
             };
-            let kind = object.type_name();
-            field.ok_or_else(|| wrong(format!("'{kind}' object has no attribute '{name}'")))?
+            let missing = || Exception::NoAttribute(object.type_name(), name.clone());
+            field.ok_or_else(|| wrong(missing()))?
         }
         Kind::Index(inner, index) => element(&of(inner)?, &of(index)?).map_err(wrong)?,
         Kind::Not(inner) => Object::Bool(!of(inner)?.is_true()),
@@ -194,13 +242,15 @@ fn evaluate<'a>(node: &Node, subject: &Object<'a>) -> Result<Object<'a>, FilterE
         Kind::Negative(inner) => {
             let object = of(inner)?;
             match object.number() {
-                Some(Number::Int(number)) => {
-                    Object::Int(number.checked_neg().ok_or_else(|| wrong(too_large()))?)
-                }
+                Some(Number::Int(number)) => Object::Int(
+                    number
+                        .checked_neg()
+                        .ok_or_else(|| wrong(Exception::TooLarge))?,
+                ),
                 Some(Number::Float(number)) => Object::Float(-number),
                 None => {
                     let kind = object.type_name();
-                    return Err(wrong(format!("bad operand type for unary -: '{kind}'")));
+                    return Err(wrong(Exception::BadOperand("unary -", kind)));
                 }
             }
         }
@@ -229,20 +279,11 @@ fn evaluate<'a>(node: &Node, subject: &Object<'a>) -> Result<Object<'a>, FilterE
     })
 }
 
-fn too_large() -> String {
-    "the number is too large".to_owned()
-}
-
-fn element<'a>(object: &Object<'a>, index: &Object<'a>) -> Result<Object<'a>, String> {
+fn element<'a>(object: &Object<'a>, index: &Object<'a>) -> Result<Object<'a>, Exception> {
     let index = match index {
         Object::Int(index) => *index,
         Object::Bool(index) => i128::from(*index),
-        _ => {
-            return Err(format!(
-                "an index must be a number, not '{}'",
-                index.type_name()
-            ));
-        }
+        _ => return Err(Exception::BadIndex(index.type_name())),
     };
     let index = |length: usize| {
         let length = i128::try_from(length).unwrap_or(i128::MAX);
@@ -250,7 +291,7 @@ fn element<'a>(object: &Object<'a>, index: &Object<'a>) -> Result<Object<'a>, St
         usize::try_from(index)
             .ok()
             .filter(|_| index < length)
-            .ok_or("index out of range")
+            .ok_or(Exception::OutOfRange)
     };
     Ok(match object {
         Object::Array(array) => {
@@ -262,27 +303,24 @@ fn element<'a>(object: &Object<'a>, index: &Object<'a>) -> Result<Object<'a>, St
                     .map(|text| Object::Text(Cow::Borrowed(text))),
                 Items::Messages(messages) => messages.get(index).map(Object::Message),
             };
-            element.ok_or("index out of range")?
+            element.ok_or(Exception::OutOfRange)?
         }
         Object::List(items) => items
             .get(index(items.len())?)
             .cloned()
-            .ok_or("index out of range")?,
+            .ok_or(Exception::OutOfRange)?,
         Object::Bytes(bytes) => {
-            let byte = bytes.get(index(bytes.len())?).ok_or("index out of range")?;
+            let byte = bytes
+                .get(index(bytes.len())?)
+                .ok_or(Exception::OutOfRange)?;
             Object::Int((*byte).into())
         }
         Object::Text(text) => {
             let index = index(text.chars().count())?;
-            let character = text.chars().nth(index).ok_or("index out of range")?;
+            let character = text.chars().nth(index).ok_or(Exception::OutOfRange)?;
             Object::Text(Cow::Owned(character.to_string()))
         }
-        _ => {
-            return Err(format!(
-                "'{}' object is not subscriptable",
-                object.type_name()
-            ));
-        }
+        _ => return Err(Exception::NotSubscriptable(object.type_name())),
     })
 }
 
@@ -290,13 +328,12 @@ fn binary<'a>(
     operator: Operator,
     left: &Object<'a>,
     right: &Object<'a>,
-) -> Result<Object<'a>, String> {
+) -> Result<Object<'a>, Exception> {
     if let (Operator::Add, Object::Text(left), Object::Text(right)) = (operator, left, right) {
         return Ok(Object::Text(Cow::Owned(format!("{left}{right}"))));
     }
     let (Some(one), Some(other)) = (left.number(), right.number()) else {
-        let (left, right) = (left.type_name(), right.type_name());
-        return Err(format!("cannot calculate with '{left}' and '{right}'"));
+        return Err(Exception::NotNumbers(left.type_name(), right.type_name()));
     };
     if let (Number::Int(one), Number::Int(other)) = (one, other) {
         let remainder = |one: i128, other: i128| {
@@ -322,7 +359,7 @@ fn binary<'a>(
                 Operator::Divide | Operator::FloorDivide | Operator::Remainder
             )
         {
-            return Err("division by zero".to_owned());
+            return Err(Exception::DivisionByZero);
         }
         let result = match operator {
             Operator::Add => one.checked_add(other),
@@ -341,18 +378,18 @@ fn binary<'a>(
                 );
             }
         };
-        return result.map(Object::Int).ok_or_else(too_large);
+        return result.map(Object::Int).ok_or(Exception::TooLarge);
     }
     floats(operator, one.float(), other.float())
 }
 
-fn floats<'a>(operator: Operator, one: f64, other: f64) -> Result<Object<'a>, String> {
+fn floats<'a>(operator: Operator, one: f64, other: f64) -> Result<Object<'a>, Exception> {
     let dividing = matches!(
         operator,
         Operator::Divide | Operator::FloorDivide | Operator::Remainder
     );
     if dividing && other == 0.0 {
-        return Err("division by zero".to_owned());
+        return Err(Exception::DivisionByZero);
     }
     Ok(Object::Float(match operator {
         Operator::Add => one + other,
@@ -365,7 +402,11 @@ fn floats<'a>(operator: Operator, one: f64, other: f64) -> Result<Object<'a>, St
     }))
 }
 
-fn compare(comparison: Comparison, left: &Object<'_>, right: &Object<'_>) -> Result<bool, String> {
+fn compare(
+    comparison: Comparison,
+    left: &Object<'_>,
+    right: &Object<'_>,
+) -> Result<bool, Exception> {
     match comparison {
         Comparison::Equal => return Ok(left.equals(right)),
         Comparison::NotEqual => return Ok(!left.equals(right)),
@@ -382,12 +423,11 @@ fn compare(comparison: Comparison, left: &Object<'_>, right: &Object<'_>) -> Res
         _ => match (left.number(), right.number()) {
             (Some(left), Some(right)) => left.compare(right),
             _ => {
-                return Err(format!(
-                    "'{}' not supported between instances of '{}' and '{}'",
-                    comparison.as_str(),
-                    left.type_name(),
-                    right.type_name()
-                ));
+                return Err(Exception::NotComparable {
+                    comparison,
+                    left: left.type_name(),
+                    right: right.type_name(),
+                });
             }
         },
     };
@@ -399,7 +439,7 @@ fn compare(comparison: Comparison, left: &Object<'_>, right: &Object<'_>) -> Res
     }))
 }
 
-fn contains(whole: &Object<'_>, part: &Object<'_>) -> Result<bool, String> {
+fn contains(whole: &Object<'_>, part: &Object<'_>) -> Result<bool, Exception> {
     if let (Object::Text(whole), Object::Text(part)) = (whole, part) {
         return Ok(whole.contains(part.as_ref()));
     }
@@ -411,26 +451,22 @@ fn contains(whole: &Object<'_>, part: &Object<'_>) -> Result<bool, String> {
     }
     match whole.elements() {
         Some(elements) => Ok(elements.iter().any(|element| element.equals(part))),
-        None => Err(format!(
-            "'in' needs a string or a list, not '{}'",
-            whole.type_name()
-        )),
+        None => Err(Exception::NotContainer(whole.type_name())),
     }
 }
 
-fn call<'a>(function: Function, arguments: &[Object<'a>]) -> Result<Object<'a>, String> {
+fn call<'a>(function: Function, arguments: &[Object<'a>]) -> Result<Object<'a>, Exception> {
     let several = matches!(function, Function::Min | Function::Max) && arguments.len() > 1;
     if several {
         return extreme(function, arguments);
     }
     let [argument] = arguments else {
-        return Err(format!("takes one argument, not {}", arguments.len()));
+        return Err(Exception::ArgumentCount(arguments.len()));
     };
-    let kind = argument.type_name();
+    let kind = || argument.type_name();
     let elements = || {
-        argument
-            .elements()
-            .ok_or_else(|| format!("'{kind}' object is not iterable"))
+        let elements = argument.elements();
+        elements.ok_or_else(|| Exception::NotIterable(kind()))
     };
     Ok(match function {
         Function::Len => {
@@ -439,14 +475,16 @@ fn call<'a>(function: Function, arguments: &[Object<'a>]) -> Result<Object<'a>, 
                 Object::Bytes(bytes) => bytes.len(),
                 Object::List(items) => items.len(),
                 Object::Array(array) => array.length,
-                _ => return Err(format!("object of type '{kind}' has no len()")),
+                _ => return Err(Exception::NoLength(kind())),
             };
             Object::Int(i128::try_from(length).unwrap_or(i128::MAX))
         }
         Function::Abs => match argument.number() {
-            Some(Number::Int(number)) => Object::Int(number.checked_abs().ok_or_else(too_large)?),
+            Some(Number::Int(number)) => {
+                Object::Int(number.checked_abs().ok_or(Exception::TooLarge)?)
+            }
             Some(Number::Float(number)) => Object::Float(number.abs()),
-            None => return Err(format!("bad operand type for abs(): '{kind}'")),
+            None => return Err(Exception::BadOperand("abs()", kind())),
         },
         Function::Bool => Object::Bool(argument.is_true()),
         Function::All => Object::Bool(elements()?.iter().all(Object::is_true)),
@@ -464,9 +502,9 @@ fn call<'a>(function: Function, arguments: &[Object<'a>]) -> Result<Object<'a>, 
             (_, Some(number)) => Object::Float(number.float()),
             (Object::Text(text), None) => {
                 let number = text.trim().parse();
-                Object::Float(number.map_err(|_| format!("not a number: '{text}'"))?)
+                Object::Float(number.map_err(|_| Exception::NotNumber(text.to_string()))?)
             }
-            _ => return Err(format!("'{kind}' cannot be converted to a number")),
+            _ => return Err(Exception::NotConvertible(kind(), "number")),
         },
         Function::Str => Object::Text(Cow::Owned(match argument {
             Object::None => "None".to_owned(),
@@ -476,13 +514,13 @@ fn call<'a>(function: Function, arguments: &[Object<'a>]) -> Result<Object<'a>, 
             Object::Text(text) => text.to_string(),
             Object::Bytes(bytes) => python::bytes(bytes),
             Object::List(_) | Object::Array(_) | Object::Message(_) => {
-                return Err(format!("'{kind}' cannot be converted to a string"));
+                return Err(Exception::NotConvertible(kind(), "string"));
             }
         })),
     })
 }
 
-fn integer<'a>(object: &Object<'a>) -> Result<Object<'a>, String> {
+fn integer<'a>(object: &Object<'a>) -> Result<Object<'a>, Exception> {
     const LARGEST: f64 = 1e38;
     Ok(Object::Int(match (object, object.number()) {
         (_, Some(Number::Int(number))) => number,
@@ -494,23 +532,23 @@ fn integer<'a>(object: &Object<'a>) -> Result<Object<'a>, String> {
         (Object::Text(text), None) => text
             .trim()
             .parse()
-            .map_err(|_| format!("not a whole number: '{text}'"))?,
+            .map_err(|_| Exception::NotInteger(text.to_string()))?,
         _ => {
-            return Err(format!(
-                "'{}' cannot be converted to a whole number",
-                object.type_name()
+            return Err(Exception::NotConvertible(
+                object.type_name(),
+                "whole number",
             ));
         }
     }))
 }
 
-fn extreme<'a>(function: Function, objects: &[Object<'a>]) -> Result<Object<'a>, String> {
+fn extreme<'a>(function: Function, objects: &[Object<'a>]) -> Result<Object<'a>, Exception> {
     let comparison = if function == Function::Min {
         Comparison::Less
     } else {
         Comparison::Greater
     };
-    let (mut best, rest) = objects.split_first().ok_or("the argument is empty")?;
+    let (mut best, rest) = objects.split_first().ok_or(Exception::EmptyArgument)?;
     for object in rest {
         if compare(comparison, object, best)? {
             best = object;
@@ -523,19 +561,18 @@ fn method<'a>(
     object: &Object<'a>,
     method: Method,
     arguments: &[Object<'a>],
-) -> Result<Object<'a>, String> {
+) -> Result<Object<'a>, Exception> {
     let Object::Text(text) = object else {
-        return Err(format!(
-            "'{}' object has no methods here",
-            object.type_name()
-        ));
+        return Err(Exception::NoMethod(object.type_name()));
     };
     Ok(match (method, arguments) {
         (Method::StartsWith, [Object::Text(part)]) => Object::Bool(text.starts_with(part.as_ref())),
         (Method::EndsWith, [Object::Text(part)]) => Object::Bool(text.ends_with(part.as_ref())),
         (Method::Lower, []) => Object::Text(Cow::Owned(text.to_lowercase())),
         (Method::Upper, []) => Object::Text(Cow::Owned(text.to_uppercase())),
-        (Method::StartsWith | Method::EndsWith, _) => return Err("takes one string".to_owned()),
-        (Method::Lower | Method::Upper, _) => return Err("takes no argument".to_owned()),
+        (Method::StartsWith | Method::EndsWith, _) => {
+            return Err(Exception::Arguments("one string"));
+        }
+        (Method::Lower | Method::Upper, _) => return Err(Exception::Arguments("no argument")),
     })
 }

@@ -22,15 +22,12 @@ fn payload() -> Vec<u8> {
     bytes
 }
 
-fn evaluate(text: &str) -> Result<bool, String> {
+fn evaluate(text: &str) -> Result<bool, FilterError> {
     let message_type = MessageType::parse(&"a/msg/B".parse().unwrap(), SCHEMA).unwrap();
     let payload = payload();
     let decoded = decode(&message_type, &payload, &Limits::default()).unwrap();
     assert_eq!(decoded.oddities.trailing, 0);
-    let filter = Filter::parse(text).map_err(|error| error.to_string())?;
-    filter
-        .passes(Subject::Message(&decoded.message))
-        .map_err(|error| error.to_string())
+    Filter::parse(text)?.passes(Subject::Message(&decoded.message))
 }
 
 #[test]
@@ -117,7 +114,7 @@ fn mistakes_name_their_column() {
             "column 1: `\u{e9}` is not part of an expression",
         ),
     ] {
-        let found = evaluate(text).unwrap_err();
+        let found = evaluate(text).unwrap_err().to_string();
         assert!(found.contains(error), "{text}: {found}");
     }
 }

@@ -139,7 +139,7 @@ impl Float {
         }
     }
 
-    /// Returns the shortest digits, at most the precision behind the point, as whole and fraction.
+    /// Returns the shortest digits, at most the precision after the point, as whole and fraction.
     fn positional(self) -> (String, String) {
         let (short, exact) = match self {
             Self::Single(number) => (digits::positional(number), format!("{number:.PRECISION$}")),
@@ -148,7 +148,7 @@ impl Float {
         split(&short, &exact)
     }
 
-    /// Returns digits with an exponent and this many digits behind the point, including those
+    /// Returns digits with an exponent and this many digits after the point, including those
     /// beyond the shortest.
     fn exact(self, precision: usize) -> (String, i32) {
         let text = match self {

@@ -1,4 +1,4 @@
-//! Causal chains: the way of a measurement from a sensor's message to an actuator's, with the time
+//! Causal chains: the path of a measurement from a sensor's message to an actuator's, with the time
 //! that each hop takes.
 //!
 //! A hop is one node: it reads a message on a topic and publishes another because of it. Two

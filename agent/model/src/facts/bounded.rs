@@ -50,7 +50,7 @@ pub struct Table {
     pub bytes: Option<usize>,
     /// Effect of a cap.
     pub rule: Rule,
-    /// Effect in words, where those of the rule say too little.
+    /// Effect in words, where those of the rule do not suffice.
     pub effect: &'static str,
     /// Metric, or table with series, that counts what a cap refused or removed.
     pub reported: &'static str,

@@ -434,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn two_lists_tell_what_came_changed_and_went() {
+    fn two_lists_yield_added_changed_and_removed_findings() {
         let before = [
             duplicate("/b"),
             unmatched("/a", 1, Unmatched::NoEndpoint),

@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn fine_bounds_tell_microseconds_apart() {
+    fn fine_bounds_distinguish_microseconds() {
         let mut histogram = Histogram::fine();
         histogram.observe(0.000_011);
         histogram.observe(0.000_021);
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn what_came_after_is_the_difference() {
+    fn later_counts_are_a_difference() {
         let mut histogram = Histogram::default();
         histogram.observe(0.0015);
         let earlier = histogram;

@@ -47,7 +47,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn identities_are_what_they_were_in_the_last_version() {
+    fn identities_are_the_same_as_in_the_last_version() {
         let mut identity = Identity::of(b"kind");
         identity.add(b"one");
         assert_eq!(

@@ -362,7 +362,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_limit_is_what_its_key_says() {
+    fn every_limit_has_its_key_and_a_default_within_its_range() {
         let numbers = Limits::of(|limit| limit as usize);
         for (place, limit) in Limit::ALL.into_iter().enumerate() {
             assert_eq!((limit as usize, numbers.get(limit)), (place, place));

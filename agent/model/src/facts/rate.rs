@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn a_steady_topic_reads_its_rate_from_the_second_second_on() {
+    fn a_steady_topic_has_its_rate_from_the_second_second_on() {
         let mut window = Window::default();
         let now = fill(&mut window, 100_300, 5, 400);
         let (sum, seconds) = window.sum(now, SECONDS);
@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_late_counts_in_the_second_of_its_time() {
+    fn late_messages_count_in_the_second_of_their_time() {
         let mut window = Window::default();
         let now = fill(&mut window, 100_000, 100, 50);
         for late in [102_500, 102_600, 50_000] {
@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_of_a_long_time_are_no_spike_in_one_second() {
+    fn messages_of_a_long_gap_are_spread_over_it() {
         let mut window = Window::default();
         let at = |milliseconds: u64| ModelTime::from_nanoseconds(milliseconds * 1_000_000);
         window.second(at(100_000)).messages += 1;

@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_is_written_as_it_was_read() {
+    fn a_destination_is_printed_as_parsed_and_knows_multicast() {
         for text in ["10.0.0.2:7411", "239.255.0.1:7401", "[fe80::1]:7411"] {
             assert_eq!(destination(text).socket_address().to_string(), text);
         }

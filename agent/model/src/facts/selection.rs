@@ -303,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn names_find_hidden_topics_and_patterns_only_when_asked() {
+    fn names_select_hidden_topics_and_patterns_only_on_request() {
         let exact = Selection::named(["/add/_service_event", "/points"]).unwrap();
         assert!(covers(&exact, "rt/add/_service_event") && covers(&exact, "rt/points"));
         assert!(!covers(&exact, "rt/points2"));
@@ -357,7 +357,7 @@ mod tests {
     }
 
     #[test]
-    fn what_names_nothing_is_refused() {
+    fn invalid_patterns_are_refused() {
         for pattern in ["", "/", "/a//b", "/**x", "a*"] {
             assert!(Choice::parse(pattern).is_err(), "{pattern}");
         }

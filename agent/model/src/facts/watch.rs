@@ -111,7 +111,7 @@ pub enum PatternError {
     ManyStars,
 }
 
-/// Why values are no expectations of a watch.
+/// Why values are not expectations of a watch.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum ExpectationError {
     /// A value is out of its range.

@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn an_incomplete_sample_is_never_given_and_keeps_nothing() {
+    fn an_incomplete_sample_is_never_returned_and_keeps_no_bytes() {
         let mut assembly = Assembly::new(1 << 20);
         put(
             &mut assembly,

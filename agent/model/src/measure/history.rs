@@ -488,7 +488,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_sent_before_a_late_announcement_flattens_no_chart() {
+    fn messages_sent_before_a_late_announcement_flatten_no_chart() {
         let (mut history, points) = (
             History::new(Duration::from_secs(600), 10),
             name("rt/points"),

@@ -9,7 +9,7 @@
 //! ACKNACKs are not seen.
 //!
 //! Samples of every writer also wait while uprobes take over from polling: a message that both views
-//! may have seen last arrives behind later ones. The readers do not wait for it, so these samples
+//! may have seen last arrives after later ones. The readers do not wait for it, so these samples
 //! keep their own times.
 
 use std::collections::{BTreeMap, BTreeSet};

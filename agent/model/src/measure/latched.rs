@@ -86,7 +86,7 @@ enum Last {
     /// The message, and the time at which it came.
     Kept(Arc<Sample>, ModelTime),
     TooLarge(u32),
-    /// The writer was paused when it came.
+    /// The writer was paused when it arrived.
     Paused,
     NoRoom(u32),
 }

@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_pending_is_resolved_one_by_one() {
+    fn pending_samples_are_resolved_one_by_one() {
         let mut loss_causes = LossCauses::default();
         assert_eq!(
             loss_causes.wait(SequenceNumber(10), SequenceNumber(12), at(5)),

@@ -47,7 +47,7 @@ const UNKNOWN_WRITERS_SHARE: usize = 4;
 /// Deliveries that may be dropped for new ones: minimum silence, and largest number at once.
 const DELIVERY_TIMEOUT: Duration = Duration::from_secs(10);
 const GIVEN_UP: usize = 64;
-/// Flags of records that report undelivered datagrams; they are no transmissions.
+/// Flags of records that report undelivered datagrams; they are not transmissions.
 pub(crate) const UNDELIVERED: u16 = flag::SOCKET_FULL | flag::NOT_REASSEMBLED;
 
 /// A measured writer.

@@ -33,7 +33,7 @@ pub struct CompleteSample {
     pub number: SequenceNumber,
     /// Payload bytes, including encapsulation.
     pub bytes: u64,
-    /// False for a disposal, which has a sequence number but is no message.
+    /// False for a disposal, which has a sequence number but is not a message.
     pub is_message: bool,
     /// Whether it was retransmitted.
     pub recovered: bool,
@@ -226,7 +226,7 @@ impl Reception {
         });
     }
 
-    /// Hands over to another view: returns the numbers of unfinished samples, which are no losses
+    /// Hands over to another view: returns the numbers of unfinished samples, which are not losses
     /// here.
     pub fn abandon(&mut self) -> Vec<SequenceNumber> {
         let mut partial = Vec::new();

@@ -243,7 +243,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_had_left_by_a_moment_is_remembered_for_a_while() {
+    fn samples_that_had_left_by_a_time_are_remembered_for_a_while() {
         let mut known = KnownRoute {
             route: Route {
                 direction: Direction::Sent,

@@ -233,8 +233,8 @@ impl Subscribers {
         self.totals.seen[1] = true;
         let source = sample.source_timestamp().timestamp();
         let began = sample.record().began();
-        // Both are wall time of one clock. A sample that leaves before its timestamp, or hours after
-        // it, is no measure of the send delay.
+        // Both times are from one clock. A sample that leaves before its timestamp, or hours after
+        // it, is not a measure of the send delay.
         if let Some(source) = source.filter(|_| sample.is_start())
             && (source..=source + PLAUSIBLE).contains(&began)
             && self.departures.is_first(source)

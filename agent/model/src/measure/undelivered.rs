@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn what_had_no_room_is_taken_out_of_the_run_that_covers_it_once() {
+    fn undelivered_samples_are_subtracted_once_from_their_run() {
         let mut undelivered = Undelivered::default();
         note(&mut undelivered, &fragments(3, 1, 12 * MILLISECOND, 0));
         note(&mut undelivered, &fragments(4, 1, 13 * MILLISECOND, 0));
@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_may_end_within_what_had_no_room() {
+    fn a_run_may_end_within_undelivered_samples() {
         let mut undelivered = Undelivered::default();
         for fragment in 4..8 {
             let time = u64::from(10 + fragment) * MILLISECOND;

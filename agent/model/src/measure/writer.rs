@@ -344,7 +344,7 @@ impl Writer {
         let is_sampled = self.is_sampled(now);
         let reliable = self.traits.reliable && !is_sampled;
         // While a sample is waited for in shared memory, its retransmission may pass there, too.
-        // After the sampled view ended, samples of any writer may arrive behind later ones.
+        // After the sampled view ended, samples of any writer may arrive after later ones.
         let unseen = self.sampled.as_ref().and_then(|sampled| sampled.unseen());
         let unseen = unseen.filter(|_| waits || !is_sampled);
         let unseen = unseen.unwrap_or(SequenceNumber(u64::MAX));
@@ -474,7 +474,7 @@ impl Writer {
         });
         match outcome {
             Outcome::Open => {}
-            // A copy at another socket is no retransmission; the caller can distinguish them.
+            // A copy at another socket is not a retransmission; the caller can distinguish them.
             Outcome::Duplicate => {
                 let elsewhere = flag::HOST | flag::SHM | flag::STREAM;
                 self.tally.duplicates += u64::from(record.flags & elsewhere == 0);

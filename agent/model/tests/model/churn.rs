@@ -95,7 +95,7 @@ impl Robot {
 }
 
 #[test]
-fn thousands_that_came_and_went_leave_nothing_behind() {
+fn thousands_of_participants_that_left_leave_no_state() {
     // Small limits fill the tables of former participants early.
     let limits = Limits {
         topics: 200,

@@ -404,7 +404,7 @@ fn a_heartbeat_of_a_later_datagram_confirms_a_jump() {
 }
 
 #[test]
-fn what_a_gap_excused_stays_excused_when_a_jump_over_it_is_believed() {
+fn samples_that_a_gap_excused_stay_excused_after_a_confirmed_jump() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=100 {
@@ -466,7 +466,7 @@ fn a_restart_fills_no_gaps_of_the_run_before() {
 }
 
 #[test]
-fn a_doubted_message_is_given_once_and_holds_no_other_up() {
+fn a_doubted_message_is_dispatched_once_and_delays_no_other() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     host.observer

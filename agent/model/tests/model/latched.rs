@@ -251,7 +251,7 @@ fn no_figure_changes() {
 }
 
 #[test]
-fn what_a_publisher_sent_before_the_agent_began_is_kept_once_it_is_repeated() {
+fn messages_from_before_the_agent_are_kept_once_they_are_repeated() {
     let (mut robot, guid) = Robot::map_server(1);
     robot.domain.wait(5_000);
     assert!(robot.subscribe(7).is_empty());

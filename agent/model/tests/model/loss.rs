@@ -81,7 +81,7 @@ fn a_subscriber_within_the_limit_violates_nothing() {
 }
 
 #[test]
-fn what_reaches_no_receiver_is_lost_once_and_not_once_per_subscriber() {
+fn a_sample_that_reaches_no_receiver_is_lost_once_and_not_per_subscriber() {
     let mut host = host(0.05);
     let (bob, carol) = (host.reader(BOB, 7411), host.reader(CAROL, 7413));
     for number in (1..=400).filter(|number| number % 10 != 0) {
@@ -103,7 +103,7 @@ fn what_reaches_no_receiver_is_lost_once_and_not_once_per_subscriber() {
 }
 
 #[test]
-fn where_no_delivery_is_observed_the_loss_is_what_did_not_reach_this_host() {
+fn without_an_observed_delivery_samples_that_did_not_reach_this_host_are_lost() {
     let mut host = host(0.05);
     let carol = host.bystander(CAROL, 7413);
     for number in (1..=400).filter(|number| number % 10 != 0) {

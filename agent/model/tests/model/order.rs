@@ -80,7 +80,7 @@ fn a_stream_without_holes_never_waits() {
 }
 
 #[test]
-fn what_follows_a_hole_is_given_behind_its_repair_and_at_the_time_of_the_repair() {
+fn samples_after_a_gap_are_dispatched_after_its_repair_and_at_the_time_of_the_repair() {
     let (mut host, bob) = listening();
     for number in [1, 2, 4, 5] {
         host.wait(10);
@@ -118,7 +118,7 @@ fn a_hole_ends_when_its_writer_leaves_it_out_or_withdraws_it_and_when_readers_ac
 }
 
 #[test]
-fn a_hole_that_nothing_explains_is_waited_for_a_while_and_its_late_repair_is_given_late() {
+fn an_unexplained_gap_delays_dispatch_for_a_while_and_its_late_repair_is_dispatched_late() {
     let (mut host, bob) = listening();
     for number in [1, 3, 4] {
         host.data(bob, number);
@@ -200,7 +200,7 @@ fn the_end_gives_what_waits() {
 }
 
 #[test]
-fn what_waits_for_a_writer_is_given_once_it_is_believed_to_begin_anew() {
+fn samples_that_wait_are_dispatched_once_a_new_incarnation_is_confirmed() {
     let (mut host, bob) = listening();
     for number in [1, 2, 4, 5, 6, 7, 8] {
         host.data(bob, number);
@@ -216,7 +216,7 @@ fn what_waits_for_a_writer_is_given_once_it_is_believed_to_begin_anew() {
 }
 
 #[test]
-fn what_waits_is_bounded_in_number() {
+fn waiting_samples_are_bounded_in_number() {
     let (mut host, bob) = listening();
     host.data(bob, 1);
     (3..=10_000).for_each(|number| host.data(bob, number));
@@ -228,7 +228,7 @@ fn what_waits_is_bounded_in_number() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
     #[test]
-    fn whatever_is_lost_and_repaired_within_the_patience_is_given_once_and_in_order(
+    fn samples_repaired_within_the_patience_are_dispatched_once_and_in_order(
         fates in prop::collection::vec((0_u8..6, 1_u64..60), 1..200),
     ) {
         let (mut host, bob) = listening();
@@ -482,7 +482,7 @@ fn a_writer_keeps_its_order_and_its_times_while_breakpoints_attach() {
 }
 
 #[test]
-fn what_neither_view_saw_while_breakpoints_attach_is_named_once_and_holds_nothing_up_for_long() {
+fn samples_unseen_while_breakpoints_attach_are_named_once_and_delay_little() {
     let mut handover = Handover::new(Depth::Arrivals, 2);
     given(&mut handover.host);
     for number in [5, 6, 7] {
@@ -512,7 +512,7 @@ fn what_neither_view_saw_while_breakpoints_attach_is_named_once_and_holds_nothin
 }
 
 #[test]
-fn what_polling_noticed_only_after_a_subscription_began_is_not_missing_from_it() {
+fn samples_that_polling_noticed_after_the_start_of_a_subscription_are_not_missing_from_it() {
     let mut handover = Handover::new(Depth::Arrivals, 1);
     // 2 to 7 were sent before the subscription, and polling missed them.
     handover.host.wait(600);

@@ -430,7 +430,7 @@ fn caps_hold_for_what_comes_from_before_too() {
 }
 
 #[test]
-fn what_is_known_has_another_revision_only_when_something_is_new() {
+fn the_memory_has_a_new_revision_only_after_a_change() {
     let mut observer = agent(Settings::default());
     robot(&mut observer);
     let revision = observer.memory_revision();

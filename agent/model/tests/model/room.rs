@@ -282,7 +282,7 @@ fn an_endpoint_that_found_no_room_is_there_with_its_participant_s_next_announcem
 }
 
 #[test]
-fn a_topic_watched_by_name_is_measured_among_as_many_as_may_be() {
+fn a_topic_watched_by_name_is_measured_at_the_cap_of_topics() {
     let limits = Limits {
         topics: 4,
         ..Limits::default()

@@ -142,7 +142,7 @@ fn a_number_that_a_congested_publisher_left_out_is_lost() {
 }
 
 #[test]
-fn what_a_gap_in_the_capture_hides_is_no_loss() {
+fn messages_in_a_gap_of_the_capture_are_no_loss() {
     assert_eq!(lost(12..15, Some(StreamEvent::Gap)), (0, 0));
 }
 

@@ -208,7 +208,7 @@ fn while_every_message_is_wanted_a_silent_port_is_looked_at_each_time() {
 }
 
 #[test]
-fn what_stood_in_the_ring_before_is_found_without_a_time_of_its_own() {
+fn messages_already_in_the_ring_have_no_source_timestamp() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     let (old, new) = (segment.put(&sample(1)), segment.put(&sample(2)));
@@ -257,7 +257,7 @@ fn files_of_a_killed_process_are_no_port_and_their_messages_no_traffic() {
 }
 
 #[test]
-fn what_one_that_lives_sent_to_the_port_of_a_killed_process_counts() {
+fn a_message_of_a_live_process_to_the_port_of_a_killed_one_counts() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     let _dead = lock_of(&port.path(host.path()), false);
@@ -446,7 +446,7 @@ fn garbage_links_and_directories_with_the_right_names_are_left_alone() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
     #[test]
-    fn whatever_the_other_side_writes_the_tap_goes_on_and_stays_bounded(
+    fn the_tap_continues_and_stays_bounded_with_any_memory_content(
         damage in proptest::collection::vec((any::<bool>(), 0_usize..2000, any::<u32>()), 1..40),
     ) {
         use std::os::unix::fs::FileExt as _;

@@ -65,7 +65,7 @@ impl<'a> UnknownWriters<'a> {
     }
 
     /// Returns the warning if it is due: at once, and from time to time while such writers send.
-    fn news(&mut self, options: &FilterOptions, now: Instant) -> Option<String> {
+    fn warning(&mut self, options: &FilterOptions, now: Instant) -> Option<String> {
         let is_due = |at: Option<Instant>, after| at.is_none_or(|at| now - at >= after);
         if !is_due(self.looked, LOOK) {
             return None;
@@ -200,7 +200,7 @@ impl<'a> RecordingOutput<'a> {
         self.explain(recorder);
         if let Some(text) = self
             .unknown_writers
-            .news(recorder.options(), Instant::now())
+            .warning(recorder.options(), Instant::now())
         {
             self.clear();
             log("WARN", &text);

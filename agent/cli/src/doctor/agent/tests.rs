@@ -236,7 +236,7 @@ fn a_port_that_is_taken_keeps_an_agent_from_starting() {
 }
 
 #[test]
-fn an_agent_that_may_not_be_asked_is_unknown_and_nothing_else_is_guessed() {
+fn an_agent_that_refuses_access_is_unknown_and_nothing_else_is_guessed() {
     let (_directory, host) = host(&[]);
     let findings = absent(&host, &Config::default(), "permission denied", true);
     assert_eq!(findings.len(), 1);

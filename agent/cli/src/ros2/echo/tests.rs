@@ -98,7 +98,7 @@ fn fields_that_are_not_there_are_refused_in_the_originals_words() {
 }
 
 #[test]
-fn what_is_known_of_a_message_stands_before_it() {
+fn message_info_is_printed_before_the_message() {
     let mut options = fields(&["header"]);
     options.include_info = true;
     let document = "publication_sequence_number: 9\nreceived_timestamp: 2000000001\n\

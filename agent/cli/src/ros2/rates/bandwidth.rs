@@ -85,7 +85,7 @@ impl Sizes {
         }))
     }
 
-    /// Report at `now` if a message came since the last one (Lyrical and later).
+    /// Report at `now` if a message arrived since the last one (Lyrical and later).
     ///
     /// # Errors
     ///

@@ -1,6 +1,6 @@
 //! Sequence numbers of one writer whose messages are sampled in shared memory.
 //!
-//! The numbers between two seen messages show how many were not seen. The time of a poll says
+//! The numbers between two seen messages show how many were not seen. The time of a poll shows
 //! little about when a message was sent, so the writer's timestamp counts: both have the clock of
 //! the host. The first poll also finds messages from before it, whose time is unknown. The
 //! measurement begins after them.
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_first_poll_finds_was_sent_before() {
+    fn messages_of_the_first_poll_were_sent_before_it() {
         let (mut numbers, first) = Numbers::new(undated(100, 0));
         assert_eq!(first, Place::Counted);
         for number in [101, 120, 140] {

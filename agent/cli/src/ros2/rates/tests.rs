@@ -94,7 +94,7 @@ fn a_missing_topic_is_reported_once_and_awaited() {
 }
 
 #[test]
-fn a_single_hz_says_nothing_but_rates() {
+fn hz_of_one_topic_prints_only_rates() {
     for (dialect, windows) in [
         (Dialect::Jazzy, ["201", "401", "601"]),
         (Dialect::Kilted, ["198", "398", "598"]),
@@ -295,7 +295,7 @@ fn messages_count_in_the_order_of_their_times() {
 }
 
 #[test]
-fn what_is_not_seen_in_shared_memory_counts_by_its_numbers() {
+fn messages_unseen_in_shared_memory_count_by_their_sequence_numbers() {
     let mut rates = Rates::of(Quantity::Rate, Dialect::Jazzy, 100, named(&["/imu"]));
     rates.opened(&present(&[("/imu", IMU)])).unwrap();
     // Ten messages a second are sent, of which a third is seen.

@@ -96,7 +96,7 @@ fn the_document_is_valid_and_every_operation_has_an_id_of_its_own() {
 }
 
 #[test]
-fn the_document_says_of_topics_and_limits_what_the_agent_accepts() {
+fn the_document_has_the_topics_and_limits_that_the_agent_accepts() {
     let document = serde_json::to_value(ros2probe_daemon::surface::api::document()).unwrap();
     let topic = &document["paths"]["/watch/{topic}"]["post"]["parameters"][0]["schema"];
     assert!(topic["pattern"].is_string(), "{topic}");

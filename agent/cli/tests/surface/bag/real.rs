@@ -58,7 +58,7 @@ fn copies(into: &Path) -> Vec<PathBuf> {
 }
 
 #[test]
-fn info_of_every_real_bag_is_what_the_original_printed() {
+fn info_of_every_real_bag_is_printed_as_the_original_prints_it() {
     let directory = tempfile::tempdir().unwrap();
     let bags = copies(directory.path());
     assert_eq!(bags.len(), 7);
@@ -72,7 +72,7 @@ fn info_of_every_real_bag_is_what_the_original_printed() {
 }
 
 #[test]
-fn later_distributions_add_theirs_and_sort() {
+fn later_distributions_add_services_and_sort_topics() {
     let bag = real().join("bag_zstd_fast");
     let bag = bag.to_str().unwrap();
     let printed = |arguments: &[&str]| {
@@ -101,7 +101,7 @@ Service:           0\nService information: \n";
 }
 
 #[test]
-fn one_file_is_enough_and_says_the_same() {
+fn info_of_a_single_file_is_printed() {
     for (file, messages) in [
         ("bag_zstd_fast/bag_zstd_fast_0.mcap", 1211),
         ("bag_filezstd/bag_filezstd_0.mcap.zstd", 1230),
@@ -122,7 +122,7 @@ fn one_file_is_enough_and_says_the_same() {
 }
 
 #[test]
-fn what_is_no_bag_is_refused_as_the_original_does() {
+fn a_path_without_a_bag_is_refused_as_the_original_does() {
     let directory = tempfile::tempdir().unwrap();
     let nothing = directory.path().join("nothing");
     let refused = |path: &Path, code: i32, text: &str| {

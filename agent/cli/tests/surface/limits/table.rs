@@ -37,7 +37,7 @@ fn pages_of_fixed_caps(root: &Path) -> String {
 }
 
 #[test]
-fn the_table_of_fixed_caps_says_what_the_sources_say() {
+fn the_table_of_fixed_caps_equals_the_sources() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
     let page = pages_of_fixed_caps(&root);
     let rows: Vec<Vec<&str>> = page

@@ -83,7 +83,7 @@ fn the_history_of_a_topic_is_found_by_every_way_to_write_its_name() {
 }
 
 #[test]
-fn without_seconds_nothing_is_kept() {
+fn a_history_of_0_seconds_keeps_nothing() {
     let directory = tempfile::tempdir().unwrap();
     let config = directory.path().join("config.yaml");
     std::fs::write(&config, "page: {history_s: 0}\n").unwrap();

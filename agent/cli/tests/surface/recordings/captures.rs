@@ -36,7 +36,7 @@ fn with_omissions(path: &Path) {
 }
 
 #[test]
-fn what_a_late_capture_lacks_is_counted_by_topic_and_reason_and_the_exit_code_tells() {
+fn messages_missing_in_a_late_capture_are_counted_by_topic_and_reason_and_change_the_exit_code() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("late.pcap");
     with_omissions(&capture);
@@ -95,7 +95,7 @@ fn a_capture_that_is_whole_converts_with_exit_code_0() {
 }
 
 #[test]
-fn a_cut_capture_becomes_a_bag_up_to_the_cut_and_the_exit_code_tells() {
+fn a_cut_capture_becomes_a_bag_up_to_the_cut_and_changes_the_exit_code() {
     let directory = tempfile::tempdir().unwrap();
     let (whole, cut) = (
         directory.path().join("many.pcap"),

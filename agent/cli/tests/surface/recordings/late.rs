@@ -29,7 +29,7 @@ const REMEDY: &str = "`sudo rp discover --all` requests their announcements";
 
 /// It printed `Recording...`, and the reason for an empty bag only at Ctrl-C.
 #[test]
-fn a_recording_says_at_once_and_while_it_lasts_that_writers_without_a_topic_send() {
+fn a_recording_warns_at_once_and_repeatedly_of_writers_without_a_topic() {
     let directory = tempfile::tempdir().unwrap();
     let agent = late_agent(directory.path());
     let mut recording = Recording::start(agent.api, &directory.path().join("bag"), &[]);

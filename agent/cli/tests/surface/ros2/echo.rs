@@ -32,7 +32,7 @@ fn echo(arguments: &[&str], from: &str, until: &str) -> std::process::Output {
 /// When the original's subscription was there is not known, only that it was between the command's
 /// start and its end: what it printed is a part of all that is printed of that time.
 #[test]
-fn what_the_original_echoed_is_echoed() {
+fn echo_prints_as_the_original_does() {
     let text = std::fs::read_to_string(own().join("recorded.jsonl")).unwrap();
     let differences =
         Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/ros2cli-differences.md");
@@ -135,7 +135,7 @@ fn options_choose_what_is_echoed_and_when_it_ends() {
 }
 
 #[test]
-fn what_cannot_be_echoed_is_reported_in_one_line() {
+fn a_topic_that_cannot_be_echoed_is_reported_in_one_line() {
     let ask = |further: &[&str]| echo(&[&["topic", "echo", IMU], further].concat(), START, END);
     fails_with(
         &ask(&["--field", "orientation.v"]),

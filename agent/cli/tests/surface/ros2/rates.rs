@@ -41,7 +41,7 @@ fn corpus() -> PathBuf {
 }
 
 #[test]
-fn what_the_original_printed_is_printed() {
+fn rates_are_printed_as_the_original_prints_them() {
     let list = tolerances();
     let mut compared = 0;
     for recorded in recorded(&own()) {
@@ -53,7 +53,7 @@ fn what_the_original_printed_is_printed() {
 
 #[test]
 #[ignore = "needs the corpus of captures: make test-corpus"]
-fn what_the_original_printed_in_the_corpus_is_printed() {
+fn rates_in_the_corpus_are_printed_as_the_original_prints_them() {
     let (list, corpus) = (tolerances(), corpus());
     let mut compared = 0;
     for recorded in recorded(&corpus.join("cli")) {
@@ -68,7 +68,7 @@ fn what_the_original_printed_in_the_corpus_is_printed() {
 }
 
 #[test]
-fn what_was_received_of_a_lossy_topic_is_counted() {
+fn received_messages_of_a_lossy_topic_are_counted() {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
     let on = |capture: &str, arguments: &str| {
         let capture = data.join(capture);
@@ -127,7 +127,7 @@ fn what_was_received_of_a_lossy_topic_is_counted() {
 }
 
 #[test]
-fn what_cannot_be_measured_is_refused() {
+fn topics_that_cannot_be_measured_are_refused() {
     let capture = own().join("capture.pcap.gz");
     let on = |arguments: &str| {
         let mut words: Vec<&str> = arguments.split(' ').collect();

@@ -100,7 +100,7 @@ lgo: 1
 }
 
 #[test]
-fn what_types_cannot_say_is_checked_too() {
+fn conditions_beyond_types_and_ranges_are_checked() {
     let source = "\
 watch:
   - points
@@ -167,7 +167,7 @@ watch:
 }
 
 #[test]
-fn what_belongs_to_the_other_source_is_a_mistake() {
+fn a_setting_of_the_other_source_is_a_mistake() {
     let source = "\
 capture:
   source: host
@@ -258,7 +258,7 @@ fn a_version_that_is_known_or_left_out_changes_nothing() {
 }
 
 #[test]
-fn of_a_newer_file_one_line_says_what_to_do() {
+fn a_newer_file_is_refused_with_one_line_and_its_remedy() {
     let newer = "watch: {points: {colour: red}}\nversion: 2\nclouds: 7\n";
     let version = env!("CARGO_PKG_VERSION");
     assert_eq!(

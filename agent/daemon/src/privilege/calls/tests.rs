@@ -161,7 +161,7 @@ fn only_threads_with_connections_create_sockets_and_of_no_other_kind() {
 
 /// Ways to redirect a connection: `connect` after a disconnect, and messages with an address.
 #[test]
-fn an_accepted_connection_cannot_be_led_elsewhere() {
+fn an_accepted_connection_cannot_be_connected_elsewhere() {
     for role in [Role::Serve, Role::Ros2Daemon] {
         cannot_lead_elsewhere(role);
     }
@@ -277,7 +277,7 @@ fn threads_of_the_capture_open_nothing_for_writing() {
 
 /// Privileges of single threads: links, file notifications, their own scheduling.
 #[test]
-fn links_news_of_files_and_scheduling_are_of_the_threads_that_need_them() {
+fn links_inotify_and_scheduling_are_of_the_threads_that_need_them() {
     // A link without a program, and a call without parameters.
     let link = [command::LINK_CREATE.into(), 0, 0, 0, 0, 0];
     let running_first = [0, libc::SCHED_FIFO.into(), 0, 0, 0, 0];

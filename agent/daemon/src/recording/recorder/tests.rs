@@ -114,7 +114,7 @@ fn numbers(ended: &Finished) -> Vec<(String, u32)> {
 }
 
 #[test]
-fn what_the_filter_takes_is_in_the_bag_and_what_is_missing_in_the_report() {
+fn selected_messages_are_in_the_bag_and_missing_ones_in_the_report() {
     let directory = tempfile::tempdir().unwrap();
     let options = FilterOptions {
         exclude_topics: vec!["/noise".to_owned()],
@@ -210,7 +210,7 @@ fn a_topic_of_two_types_keeps_the_first_and_reports_it() {
 }
 
 #[test]
-fn what_publishers_sent_before_is_named_unless_it_is_there() {
+fn messages_sent_before_the_recording_are_reported_unless_they_are_recorded() {
     for (number, expected) in [(1, 0), (2, 1)] {
         let directory = tempfile::tempdir().unwrap();
         let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
@@ -232,7 +232,7 @@ fn what_publishers_sent_before_is_named_unless_it_is_there() {
 }
 
 #[test]
-fn what_came_is_on_the_disk_after_a_second_of_samples() {
+fn received_messages_are_on_the_disk_after_a_second_of_samples() {
     let directory = tempfile::tempdir().unwrap();
     let bag = directory.path().join("bag");
     let mut recorder = recorder(&bag, FilterOptions::everything());
@@ -245,7 +245,7 @@ fn what_came_is_on_the_disk_after_a_second_of_samples() {
 }
 
 #[test]
-fn what_was_not_observed_is_counted_from_the_beginning_of_the_recording() {
+fn unobserved_messages_are_counted_from_the_start_of_the_recording() {
     let topic = |domain_id, name: &str, other_transport: Option<&str>, messages| PublishedTopic {
         domain_id,
         name: name.to_owned(),

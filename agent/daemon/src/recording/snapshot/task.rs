@@ -9,7 +9,7 @@ use ros2probe_bag::Error;
 use ros2probe_wire::Timestamp;
 
 use super::bag::{Cause, Failed, SnapshotBag};
-use super::{Answer, WrittenBag};
+use super::{Answer, Unwritten, WrittenBag};
 use crate::config::SnapshotSettings;
 use crate::events::{AgentEvent, Record};
 use crate::recording::SnapshotFigures;
@@ -183,14 +183,14 @@ impl SnapshotTask {
     }
 
     /// Writes the messages in memory into a bag, and completes it.
-    pub(super) fn write_memory(&mut self, cause: Cause) -> Result<WrittenBag, String> {
+    pub(super) fn write_memory(&mut self, cause: Cause) -> Result<WrittenBag, Unwritten> {
         let since = self.clock - self.settings.before;
         let bag = self.create(cause, since)?;
         self.finish(bag, None)
     }
 
     /// Creates a bag with the messages in memory since this time.
-    fn create(&mut self, cause: Cause, since: Timestamp) -> Result<SnapshotBag, String> {
+    fn create(&mut self, cause: Cause, since: Timestamp) -> Result<SnapshotBag, Unwritten> {
         let samples = self.ring.iter().filter(|sample| sample.time >= since);
         let samples: Vec<_> = samples.map(Arc::clone).collect();
         let payloads = samples.iter().filter_map(|sample| sample.payload.as_ref());
@@ -206,12 +206,12 @@ impl SnapshotTask {
     }
 
     /// Reports a bag that could not be created. Returns the reason.
-    fn fail(&mut self, failed: Failed) -> String {
+    fn fail(&mut self, failed: Failed) -> Unwritten {
         self.figures.failed += 1;
         self.figures.removed += failed.removed;
         let reason = Some(failed.reason.clone());
         self.report(&failed.cause, failed.name, 0, reason);
-        failed.reason
+        Unwritten::Storage(failed.reason)
     }
 
     /// Completes the open bag. `error` is the storage error that ended it, if any.
@@ -222,7 +222,7 @@ impl SnapshotTask {
         }
     }
 
-    fn finish(&mut self, bag: SnapshotBag, error: Option<Error>) -> Result<WrittenBag, String> {
+    fn finish(&mut self, bag: SnapshotBag, error: Option<Error>) -> Result<WrittenBag, Unwritten> {
         let ended = bag.finish(error);
         let reason = ended.error.as_ref().map(causes);
         match reason {
@@ -232,7 +232,7 @@ impl SnapshotTask {
         self.figures.removed += ended.removed;
         let WrittenBag { name, messages, .. } = ended.bag.clone();
         self.report(&ended.cause, name, messages, reason.clone());
-        reason.map_or(Ok(ended.bag), Err)
+        reason.map_or(Ok(ended.bag), |reason| Err(Unwritten::Storage(reason)))
     }
 
     fn report(&mut self, cause: &Cause, name: String, messages: u64, reason: Option<String>) {

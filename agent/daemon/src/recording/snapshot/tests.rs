@@ -305,7 +305,7 @@ fn only_problems_of_the_domain_meet_a_short_name_and_every_event_meets_its_full_
 }
 
 #[test]
-fn findings_meet_their_kind_once_they_are_new() {
+fn a_new_finding_triggers_the_snapshots_of_its_kind() {
     let topic = TopicKey {
         domain_id: DomainId(0),
         dds_name: "rq/addRequest".into(),
@@ -451,7 +451,7 @@ fn a_requested_bag_is_never_removed_for_others() {
     robot.payload = 4000;
     robot.run(20);
     let mut results = (0..5).map(|_| robot.task.write_memory(Cause::Request));
-    let refused = results.find_map(Result::err).unwrap();
+    let refused = results.find_map(Result::err).unwrap().to_string();
     assert!(refused.contains("max_total_bytes"), "{refused}");
     assert!(robot.bags().contains_key(&requested));
     assert!(robot.shown().failed >= 1);

@@ -1,4 +1,4 @@
-//! `/chains`: the way of measurements through nodes.
+//! `/chains`: the path of measurements through nodes.
 
 use std::borrow::Cow;
 
@@ -102,7 +102,7 @@ pub fn parts<'a>(
     chains
 }
 
-/// Returns whether both chains go the same way.
+/// Returns whether both chains take the same path.
 fn is_same(one: &Chain<'_>, other: &Chain<'_>) -> bool {
     let mut hops = one.hops.iter().zip(&other.hops);
     (one.domain_id, &one.method, &one.from) == (other.domain_id, &other.method, &other.from)

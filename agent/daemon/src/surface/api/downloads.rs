@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn so_many_files_are_listed() {
+    fn files_beyond_the_cap_are_not_listed() {
         let directory = tempfile::tempdir().unwrap();
         for number in 0..MAX_FILES + 5 {
             File::create(directory.path().join(format!("bag_{number}.mcap"))).unwrap();

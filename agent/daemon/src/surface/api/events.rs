@@ -226,9 +226,9 @@ impl Stream {
                 .id(self.log.id(record.number));
             self.waiting.push_back(message.data(self.text(record)));
         }
-        let is_news = batch.last > self.place || batch.lagged > 0;
+        let is_new = batch.last > self.place || batch.lagged > 0;
         self.place = batch.last;
-        is_news
+        is_new
     }
 
     fn lag(&mut self, missed: Option<u64>, reason: &'static str) {
@@ -376,7 +376,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_slow_client_is_told_how_many_events_it_missed() {
+    async fn a_slow_client_gets_the_number_of_events_that_it_missed() {
         let (log, stop) = (Arc::new(EventLog::new()), CancellationToken::new());
         let mut stream = stream(&log, &stop);
         log.record(AgentEvent::Reloaded { watches: 0 });

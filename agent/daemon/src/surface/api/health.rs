@@ -54,7 +54,7 @@ async fn health(State(context): State<Context>) -> Json<Health> {
     });
     Json(Health {
         ready: ready.is_ok(),
-        reason: ready.err(),
+        reason: ready.err().map(|reason| reason.to_string()),
         degraded: context.limits.degraded(&state),
         host: HOST.clone(),
         version: env!("CARGO_PKG_VERSION").into(),
@@ -103,7 +103,10 @@ async fn health(State(context): State<Context>) -> Json<Health> {
             .into(),
         capabilities: held.into_iter().collect(),
         threads: threads.collect(),
-        unfiltered_reason: agent.sandbox.reason().map(Into::into),
+        unfiltered_reason: agent
+            .sandbox
+            .reason()
+            .map(|reason| reason.to_owned().into()),
         foxglove: foxglove(&context.viewers),
         ros2_daemon: ros2_daemon(&context.ros2_daemon),
         zenoh: snapshot.and_then(|snapshot| snapshot.zenoh.as_ref().map(zenoh)),

@@ -470,7 +470,7 @@ mod tests {
     }
 
     #[test]
-    fn a_source_that_is_off_says_so() {
+    fn a_source_that_is_off_has_the_mode_off_and_its_reason() {
         let snapshot = Snapshot::default();
         assert_eq!(inside(&snapshot, None, |_| true).mode, "off");
         let source = InsideSourceFacts {

@@ -107,7 +107,7 @@ fn operations(item: &mut PathItem) -> impl Iterator<Item = (&'static str, &mut O
 }
 
 /// Returns the id of an operation, which generated clients take as the name of a function:
-/// `get_recordings_by_name_files`. Names of handlers come more than once, as modules separate them.
+/// `get_recordings_by_name_files`. Handlers of different modules have the same names.
 fn operation_id(method: &str, path: &str) -> String {
     let mut id = method.to_owned();
     for segment in path.split('/') {

@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn so_many_processes_are_read_for_one_answer() {
+    fn processes_beyond_the_cap_are_not_read_for_one_answer() {
         // No process has such an id.
         let first = 1 << 30;
         let participants = (first..).take(MAX_PROCESSES + 9);

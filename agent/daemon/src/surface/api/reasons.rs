@@ -5,6 +5,7 @@
 use super::index::Index;
 use crate::agent_facts::SourceKind;
 use crate::config::Watchlist;
+use crate::snapshot_cell::Unready;
 use ros2probe_api::Open;
 use ros2probe_api::topics::{Reason, ReasonCode, UNSUBSCRIBED};
 use ros2probe_model::facts::diagnosis::Diagnosis;
@@ -24,7 +25,7 @@ pub(super) struct Circumstances<'a> {
     /// Whether calls inside processes could be counted and are not.
     pub(super) lacks_inside: bool,
     /// Why the agent is not ready.
-    pub(super) unready: Option<String>,
+    pub(super) unready: Option<Unready>,
 }
 
 impl<'a> Circumstances<'a> {
@@ -38,7 +39,7 @@ impl<'a> Circumstances<'a> {
             });
         };
         if let Some(reason) = &self.unready {
-            say(ReasonCode::AgentNotReady, reason.clone());
+            say(ReasonCode::AgentNotReady, reason.to_string());
         }
         let is_connected = match (topic.publishers.len(), topic.subscriptions.len()) {
             (0, _) | (_, 0) if topic.is_connected_inside() => true,

@@ -304,7 +304,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_can_never_be_given_is_refused() {
+    fn invalid_selections_are_refused() {
         let wanted = |topic: &str, regex: &str| Wanted {
             topic: (!topic.is_empty()).then(|| topic.to_owned()),
             regex: (!regex.is_empty()).then(|| regex.to_owned()),

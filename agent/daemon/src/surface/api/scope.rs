@@ -66,10 +66,10 @@ impl Domain {
     }
 }
 
-/// Returns the domain of a request; a number that is none has this problem code.
+/// Returns the domain of a request; an invalid number has this problem code.
 ///
 /// # Errors
-/// Fails if the number is no domain id.
+/// Fails if the number is not a domain id.
 pub(super) fn domain(number: Option<u32>, code: Code) -> Result<Option<DomainId>, Problem> {
     let domain_id = number.map(DomainId::try_from).transpose();
     domain_id.map_err(|error| Problem::new(code, error.to_string()))

@@ -28,7 +28,7 @@ pub(super) const MAX_BODY: usize = 16 << 10;
 /// clients with a token or on the unix socket, one for other clients, and one for refused requests.
 const RATE: f64 = 500.0;
 const BURST: f64 = 1_000.0;
-/// Valid length of a token: shorter ones can be guessed, and a longer file is no token.
+/// Valid length of a token: shorter ones can be guessed, and a longer file is not a token.
 const TOKEN_BYTES: std::ops::RangeInclusive<usize> = 16..=4096;
 
 const SEC_FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");

@@ -92,7 +92,7 @@ async fn write(
         let detail = format!("no snapshot `{name}`; GET /snapshots lists them");
         return Err(Problem::new(Code::NoSuchSnapshot, detail));
     };
-    let written = written.map_err(|reason| Problem::new(Code::StorageRefuses, reason))?;
+    let written = written.map_err(|error| Problem::new(Code::StorageRefuses, error.to_string()))?;
     let view = WrittenSnapshot {
         name: written.name,
         directory: written.directory.display().to_string(),

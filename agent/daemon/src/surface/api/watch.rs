@@ -104,7 +104,7 @@ async fn show(
 
 /// Watch a topic
 ///
-/// The topic need not exist yet. The body is optional. Repeating the same request is no error.
+/// The topic need not exist yet. The body is optional. Repeating the same request is not an error.
 #[utoipa::path(
     post,
     path = "/watch/{*topic}",
@@ -293,12 +293,12 @@ fn location(watch: &Watch) -> String {
 
 fn problem(refused: &Refused, topic: &str, domain_id: Option<u32>) -> Problem {
     let detail = match refused {
-        Refused::Given {
+        Refused::DefinedElsewhere {
             by: watches::Origin::Config,
         } => {
             format!("{topic} is listed in the configuration file: change it there and reload")
         }
-        Refused::Given { by } => format!("{topic} is defined by {}", by.phrase()),
+        Refused::DefinedElsewhere { by } => format!("{topic} is defined by {}", by.phrase()),
         Refused::Different => {
             format!("{topic} is watched with other settings: PUT replaces them")
         }
@@ -306,7 +306,7 @@ fn problem(refused: &Refused, topic: &str, domain_id: Option<u32>) -> Problem {
         refused => refused.to_string(),
     };
     let code = match refused {
-        Refused::Given { .. } => Code::WatchGiven,
+        Refused::DefinedElsewhere { .. } => Code::WatchGiven,
         Refused::Different => Code::WatchDiffers,
         Refused::Full(_) => Code::TooManyWatches,
         Refused::Unknown | Refused::Globs(_) => Code::InvalidRequest,

@@ -108,7 +108,7 @@ struct Losses {
     /// By the name that the client knows.
     topics: Bounded<ViewerLosses, BTreeMap<String, u64>>,
     messages: u64,
-    is_news: bool,
+    is_changed: bool,
     quiet: u32,
 }
 
@@ -147,7 +147,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         let socket = WebSocketStream::from_raw_socket(stream, Role::Server, Some(config)).await;
         let mut tables = shared.tables.subscribe();
         tables.mark_unchanged();
-        shared.news.notify_one();
+        shared.changed.notify_one();
         Self {
             socket,
             shared,
@@ -533,7 +533,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
             if losses.messages == 0 {
                 continue;
             }
-            if std::mem::take(&mut losses.is_news) {
+            if std::mem::take(&mut losses.is_changed) {
                 losses.quiet = 0;
                 let message = losses.text(what);
                 self.status(Level::Warning, id, &message).await?;
@@ -548,7 +548,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         Ok(())
     }
 
-    /// Reports topics that stay silent because no subscriber exists: the agent is none.
+    /// Reports topics that stay silent because no subscriber exists: the agent does not subscribe.
     async fn report_unsubscribed(&mut self) -> Result<(), End> {
         let message = self.unsubscribed_now();
         if message == self.unsubscribed {
@@ -615,7 +615,7 @@ impl<S> Drop for Client<S> {
 impl Losses {
     fn add(&mut self, name: &str, messages: u64) {
         self.messages += messages;
-        self.is_news = true;
+        self.is_changed = true;
         if let Some(count) = self.topics.get_mut(name) {
             *count += messages;
         } else {

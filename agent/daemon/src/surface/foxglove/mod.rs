@@ -72,7 +72,7 @@ struct Shared {
     viewers: Arc<Viewers>,
     tables: watch::Sender<Option<Arc<Table>>>,
     /// Wakes the task that follows the snapshots.
-    news: Notify,
+    changed: Notify,
     /// Number of viewers that show the graph.
     graphs: AtomicUsize,
     is_replay: bool,
@@ -203,7 +203,7 @@ impl Shared {
             subscriptions: Arc::clone(&context.subscriptions),
             viewers: Arc::clone(&context.viewers),
             tables: watch::Sender::new(None),
-            news: Notify::new(),
+            changed: Notify::new(),
             graphs: AtomicUsize::new(0),
             is_replay: context.latest.state().agent.source == SourceKind::Replay,
             name: format!("ros2probe {version} {host}").trim_end().to_owned(),
@@ -216,7 +216,7 @@ impl Shared {
     fn change_graphs(&self, more: isize) {
         if more > 0 {
             self.graphs.fetch_add(1, Ordering::Relaxed);
-            self.news.notify_one();
+            self.changed.notify_one();
         } else {
             self.graphs.fetch_sub(1, Ordering::Relaxed);
         }
@@ -235,7 +235,7 @@ async fn follow(shared: Arc<Shared>, library: Arc<Library>) {
             shared.tables.send_replace(None);
         }
         tokio::select! {
-            () = shared.news.notified() => shared.latest.refresh(TIMEOUT).await,
+            () = shared.changed.notified() => shared.latest.refresh(TIMEOUT).await,
             _ = ticks.tick(), if is_any => {}
         }
         let state = shared.latest.state();
@@ -280,7 +280,7 @@ async fn open(State(gate): State<Gate>, request: Request) -> Response {
         };
         let address = place.as_ref().and_then(|place| place.address);
         if let Some(place) = place {
-            // It may be silent for as long as it reads.
+            // A viewer may send nothing for as long as it reads.
             place.state.answers(false);
         }
         let access = granted.access();

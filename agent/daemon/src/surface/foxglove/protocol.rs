@@ -30,7 +30,7 @@ pub enum Request {
     SubscribeGraph,
     /// `unsubscribeConnectionGraph`.
     UnsubscribeGraph,
-    /// An operation that the server does not offer, with the begin of its name.
+    /// An operation that the server does not offer, with the start of its name.
     Unsupported(String),
 }
 

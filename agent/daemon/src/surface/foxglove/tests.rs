@@ -169,7 +169,7 @@ fn shared(bytes: usize) -> Arc<Shared> {
         subscriptions: Arc::new(subscriptions),
         viewers: Arc::default(),
         tables: watch::Sender::new(None),
-        news: Notify::new(),
+        changed: Notify::new(),
         graphs: AtomicUsize::new(0),
         is_replay: false,
         name: "test".to_owned(),

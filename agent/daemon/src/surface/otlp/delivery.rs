@@ -95,8 +95,8 @@ impl<E: Export> Delivery<E> {
         self.drop(Reason::Overflow, items);
     }
 
-    /// Delivers what is in a queue until the agent stops. Items that come within `gather` after the
-    /// first one are collected into its request.
+    /// Delivers the items of a queue until the agent stops. Those that arrive within `gather` after
+    /// the first one are collected into its request.
     pub(super) async fn drain(mut self, mut queue: impl Queue<Batch = E::Batch>, gather: Duration) {
         let mut left = Vec::new();
         while left.is_empty() {

@@ -127,7 +127,7 @@ mod tests {
     use crate::events::AgentEvent;
 
     #[test]
-    fn a_record_says_what_the_event_says_with_its_types() {
+    fn a_log_record_has_the_attributes_of_the_event_with_their_types() {
         let log = Arc::new(EventLog::new());
         log.record(AgentEvent::Dropped {
             what: "packets",

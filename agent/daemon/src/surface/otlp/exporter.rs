@@ -63,7 +63,7 @@ impl Exporter {
     /// permission.
     ///
     /// # Errors
-    /// Fails if a connection cannot be configured. An unavailable receiver is no error.
+    /// Fails if a connection cannot be configured. An unavailable receiver is not an error.
     pub fn start(
         settings: Settings,
         sources: &MetricSources,

@@ -36,7 +36,7 @@ const OVERHEAD: usize = 64;
 #[derive(Debug, Default)]
 pub struct LogQueue {
     waiting: Mutex<Waiting>,
-    news: Notify,
+    added: Notify,
     overflowed: AtomicU64,
 }
 
@@ -70,7 +70,7 @@ impl LogQueue {
         waiting.bytes += bytes;
         waiting.lines.push_back(line);
         drop(waiting);
-        self.news.notify_one();
+        self.added.notify_one();
     }
 
     /// Returns the oldest lines; `None` if the queue is empty.
@@ -84,11 +84,11 @@ impl LogQueue {
 
     async fn filled(&self) {
         loop {
-            let news = self.news.notified();
+            let added = self.added.notified();
             if !self.waiting().lines.is_empty() {
                 return;
             }
-            news.await;
+            added.await;
         }
     }
 

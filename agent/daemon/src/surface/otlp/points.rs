@@ -476,7 +476,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_no_room_is_counted() {
+    fn points_without_room_are_counted() {
         let mut points = empty();
         let name = "x".repeat(250);
         points.begin(1);

@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_given_replaces_what_is_known() {
+    fn given_attributes_replace_detected_ones() {
         let yaml = "otlp: {robot: marvin, attributes: {host.name: R2, service.instance.id: ''}}";
         let file = crate::config::Config::parse(yaml.as_bytes()).unwrap().otlp;
         let host = Host {

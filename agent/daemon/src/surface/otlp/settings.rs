@@ -411,20 +411,23 @@ otlp:
         let failed = |yaml: &str, environment: &[(&str, &str)]| {
             resolve(yaml, environment).unwrap_err().to_string()
         };
-        let said = failed(
+        let message = failed(
             "",
             &[("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "collector:4317")],
         );
-        assert!(said.starts_with("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT is `collector:4317`"));
-        let said = failed(
+        assert!(message.starts_with("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT is `collector:4317`"));
+        let message = failed(
             "otlp: {endpoint: 'http://a'}",
             &[("OTEL_EXPORTER_OTLP_PROTOCOL", "http/json")],
         );
-        assert!(said.contains("must be `grpc` or `http/protobuf`"), "{said}");
-        let said = failed("otlp: {endpoint: 'http://a', headers: {'a b': c}}", &[]);
-        assert!(said.starts_with("otlp.headers: `a b`"), "{said}");
-        let said = failed("otlp: {endpoint: 'http://a', headers_file: /no/such}", &[]);
-        assert_eq!(said, "cannot read the headers in /no/such");
+        assert!(
+            message.contains("must be `grpc` or `http/protobuf`"),
+            "{message}"
+        );
+        let message = failed("otlp: {endpoint: 'http://a', headers: {'a b': c}}", &[]);
+        assert!(message.starts_with("otlp.headers: `a b`"), "{message}");
+        let message = failed("otlp: {endpoint: 'http://a', headers_file: /no/such}", &[]);
+        assert_eq!(message, "cannot read the headers in /no/such");
     }
 
     #[test]

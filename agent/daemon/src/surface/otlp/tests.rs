@@ -297,7 +297,7 @@ fn requests(exports: &Exports) -> [u64; 4] {
 }
 
 #[tokio::test]
-async fn what_fails_in_passing_is_sent_again_and_what_is_refused_is_not() {
+async fn a_transient_failure_is_retried_and_a_refusal_is_not() {
     let script = [
         Answer::Says(Code::Unavailable),
         Answer::Taken,

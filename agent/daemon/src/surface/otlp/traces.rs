@@ -41,7 +41,7 @@ const FLAGS: u8 = 0b11;
 #[derive(Debug, Default)]
 pub struct SpanQueue {
     waiting: Mutex<Bounded<WaitingSpans, VecDeque<QueuedSpan>>>,
-    news: Notify,
+    added: Notify,
 }
 
 /// A span in the queue.
@@ -88,7 +88,7 @@ impl SpanQueue {
         let mut waiting = self.waiting();
         let refused = spans.filter_map(|span| waiting.push_back(span)).count();
         drop(waiting);
-        self.news.notify_one();
+        self.added.notify_one();
         refused as u64
     }
 
@@ -100,11 +100,11 @@ impl SpanQueue {
 
     async fn filled(&self) {
         loop {
-            let news = self.news.notified();
+            let added = self.added.notified();
             if !self.waiting().is_empty() {
                 return;
             }
-            news.await;
+            added.await;
         }
     }
 
@@ -367,7 +367,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn the_queue_holds_so_many_and_says_how_many_it_refused() {
+    async fn the_queue_is_bounded_and_counts_refused_spans() {
         let queue = SpanQueue::default();
         let spans = |count| vec![QueuedSpan::Message(span(SpanStage::Send)); count];
         assert_eq!(queue.put(Vec::new()), 0);

@@ -47,7 +47,7 @@ pub enum Malformed {
     /// An argument has another type than text, boolean or integer.
     #[error("an argument has an unsupported type")]
     Type,
-    /// An argument is not what its type says.
+    /// The value of an argument contradicts its type.
     #[error("an argument does not fit its type")]
     Value,
     /// There are too many arguments.

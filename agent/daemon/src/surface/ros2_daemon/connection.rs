@@ -78,7 +78,7 @@ impl ConnectionState {
         *self.since.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
     }
 
-    /// Lets the connection end with a reset, behind the answer in progress.
+    /// Lets the connection end with a reset, after the answer in progress.
     pub(super) fn reset(&self) {
         self.resets.store(true, Ordering::Relaxed);
     }

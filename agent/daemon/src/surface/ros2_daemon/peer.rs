@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn so_many_processes_are_inspected() {
+    fn processes_beyond_the_cap_are_not_inspected() {
         let ids: Vec<PathBuf> = (0..MAX_PROCESSES + 5)
             .map(|id| id.to_string().into())
             .collect();

@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn so_many_domains_have_a_port_and_the_next_has_none() {
+    fn domains_beyond_the_cap_have_no_port() {
         let figures = Arc::<Ros2DaemonFigures>::default();
         let mut ports = Ports::new(Arc::clone(&figures));
         for domain_id in 0..32 {

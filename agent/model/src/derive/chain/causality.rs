@@ -24,7 +24,7 @@ use crate::facts::tables::CausalPublications;
 const QUIET: Duration = Duration::from_secs(2);
 /// Time for which a publication is remembered for those that continue it.
 const REMEMBERED: Duration = Duration::from_secs(5);
-/// Longest time from the begin of a publication to the source timestamp of its message.
+/// Longest time from the start of a publication to the source timestamp of its message.
 const WRITING: Duration = Duration::from_millis(10);
 /// Number of the latest publications among which the origin of another is searched.
 const SEARCHED: usize = 2048;
@@ -61,7 +61,7 @@ pub(super) struct Causality {
     publications: Bounded<CausalPublications, VecDeque<Hop>>,
 }
 
-/// A publication with the way to it.
+/// A publication with the path to it.
 #[derive(Debug)]
 struct Hop {
     /// Time at which it was added.

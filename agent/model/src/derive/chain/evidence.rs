@@ -20,7 +20,7 @@ use super::rates::Rates;
 use super::spans::ChainTracer;
 use super::spans::stamped::Stamped;
 use super::stamps::{Group, Published, Stamp};
-use super::trace::{Method, Path, Point, Trace, ways};
+use super::trace::{Method, Path, Point, Trace, paths};
 use crate::facts::bounded::Bounded;
 use crate::facts::diagnosis::{Diagnosis, TopicKey};
 use crate::facts::header::stamp_time;
@@ -64,7 +64,7 @@ struct Counts {
     matched: u32,
     /// Those with a rounded stamp.
     rounded: u32,
-    /// Those whose stamp was seen on no input before.
+    /// Those whose stamp was not seen on any input before.
     own: u32,
     /// Those whose age was compared with that of the inputs, and those with almost no age.
     aged: u32,
@@ -132,7 +132,7 @@ impl Evidence {
         }
     }
 
-    /// Evaluates the messages with one stamp. Returns the ways along accepted hops.
+    /// Evaluates the messages with one stamp. Returns the paths along accepted hops.
     pub(super) fn conclude(&mut self, mut group: Group, tracer: &mut ChainTracer) -> Vec<Trace> {
         group
             .messages
@@ -374,32 +374,32 @@ fn counts<'a>(
     })
 }
 
-/// Returns the ways of messages that no accepted hop continues. `exported`: the trace of each
+/// Returns the paths of messages that no accepted hop continues. `exported`: the trace of each
 /// message with a span.
 fn traces(
     messages: &[&Published],
     causes: &[Option<usize>],
     exported: &[Option<u128>],
 ) -> Vec<Trace> {
-    let trace_of = |way: Vec<usize>| {
-        // All messages of a way are in one trace.
-        let trace_id = way.iter().find_map(|index| *exported.get(*index)?);
+    let trace_of = |path: Vec<usize>| {
+        // All messages of a path are in one trace.
+        let trace_id = path.iter().find_map(|index| *exported.get(*index)?);
         let message = |index| messages.get(index).copied();
-        let way: Vec<_> = way.into_iter().filter_map(message).collect();
-        trace(&way, trace_id)
+        let path: Vec<_> = path.into_iter().filter_map(message).collect();
+        trace(&path, trace_id)
     };
-    ways(causes).filter_map(trace_of).collect()
+    paths(causes).filter_map(trace_of).collect()
 }
 
 /// Returns the times of these messages, each of which caused the next.
-fn trace(way: &[&Published], trace_id: Option<u128>) -> Option<Trace> {
-    let domain_id = way.first()?.output.node.domain_id;
+fn trace(messages: &[&Published], trace_id: Option<u128>) -> Option<Trace> {
+    let domain_id = messages.first()?.output.node.domain_id;
     let topic = |message: &&Published| {
         let Output { key, node, .. } = &*message.output;
         (key.name.clone(), node.name.clone())
     };
     let point = |(index, message): (usize, &&Published)| {
-        let next = way.get(index + 1);
+        let next = messages.get(index + 1);
         Point {
             published: message.published,
             arrived: next.and_then(|next| message.reached(next)),
@@ -410,9 +410,9 @@ fn trace(way: &[&Published], trace_id: Option<u128>) -> Option<Trace> {
         path: Arc::new(Path {
             domain_id,
             method: Method::Stamps,
-            topics: way.iter().map(topic).collect(),
+            topics: messages.iter().map(topic).collect(),
         }),
-        points: way.iter().enumerate().map(point).collect(),
+        points: messages.iter().enumerate().map(point).collect(),
         trace_id,
     })
 }

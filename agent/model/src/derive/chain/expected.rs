@@ -41,7 +41,7 @@ pub struct ExpectedChain {
 /// State of a configured chain in one domain.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ChainState {
-    /// No message went its way within the last 10 s.
+    /// No message took its path within the last 10 s.
     Idle,
     /// Its latency is within the limit, or it has no limit.
     Ok,
@@ -54,7 +54,7 @@ pub enum ChainState {
 pub struct ExpectedFacts {
     /// The chain as configured.
     pub chain: ExpectedChain,
-    /// Domain in which messages went its way; `None` before the first.
+    /// Domain in which messages took its path; `None` before the first.
     pub domain_id: Option<DomainId>,
     /// How its messages were recognised; `None` before the first.
     pub method: Option<Method>,
@@ -142,7 +142,7 @@ impl ExpectedChains {
         before.symmetric_difference(&self.topics).cloned().collect()
     }
 
-    /// Adds a message's way, if it has the ends of a configured chain.
+    /// Adds a message's path, if it has the ends of a configured chain.
     pub(super) fn observe(&mut self, trace: &Trace) {
         let path = &trace.path;
         for (index, chain) in self.chains.iter().take(MAX_CHAINS).enumerate() {
@@ -163,7 +163,7 @@ impl ExpectedChains {
                 continue;
             };
             let pair = (last.published, first.published);
-            // The ways to several ends may share this part.
+            // The paths to several ends may share this part.
             if progress
                 .recent
                 .iter()

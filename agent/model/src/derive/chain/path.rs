@@ -66,7 +66,7 @@ pub struct ChainsFacts {
 pub struct ChainFacts {
     /// Its identity.
     pub path: Arc<Path>,
-    /// Messages that went the whole way.
+    /// Messages that passed the whole path.
     pub count: u64,
     /// The times of the latest 256 of them, one point for each topic.
     pub traces: Arc<Bounded<ChainTraces, VecDeque<Vec<Point>>>>,
@@ -100,22 +100,22 @@ pub struct HopFigures {
     pub whole: Quantiles,
     /// From the publication of the input to its arrival at the node.
     pub transit: Option<Quantiles>,
-    /// From the arrival to the begin of the callback.
+    /// From the arrival to the start of the callback.
     pub wait: Option<Quantiles>,
-    /// From the begin of the callback to the publication of the output.
+    /// From the start of the callback to the publication of the output.
     pub callback: Option<Quantiles>,
     /// From the arrival to the publication of the output.
     pub node: Option<Quantiles>,
 }
 
 impl Paths {
-    /// Adds a message's way along accepted hops.
+    /// Adds a message's path along accepted hops.
     pub(super) fn add(&mut self, trace: Trace, expected: &mut ExpectedChains) {
         expected.observe(&trace);
         self.add_found(trace);
     }
 
-    /// Adds a message's way without regard to configured chains.
+    /// Adds a message's path without regard to configured chains.
     pub(super) fn add_found(&mut self, trace: Trace) {
         let Trace {
             path,

@@ -4,7 +4,7 @@
 //! read the topic. So the rules of [`super::evidence`] hold as far as they need no nodes, and
 //! stronger ones replace the others:
 //!
-//! - A stamp that is a multiple of 100 µs is no evidence, because several nodes may give it
+//! - A stamp that is a multiple of 100 µs is not evidence, because several nodes may give it
 //!   independently.
 //! - Topics whose messages of one stamp are less than 1 ms apart are published together. They count
 //!   as one topic.

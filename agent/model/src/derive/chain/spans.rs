@@ -1,4 +1,4 @@
-//! Spans of chains: one trace for each measurement on its way through nodes.
+//! Spans of chains: one trace for each measurement on its path through nodes.
 //!
 //! Spans contain only what was observed here, of nodes of this host. Those of nodes on other hosts
 //! are reported by the agents there, under the same trace: its id follows from the measurement. The number of finished
@@ -25,9 +25,9 @@ pub enum ChainStage {
     Publish,
     /// From the publication of a message to its arrival at a node.
     Transit,
-    /// From the arrival to the begin of the callback.
+    /// From the arrival to the start of the callback.
     Wait,
-    /// From the begin of the callback to the publication of its output.
+    /// From the start of the callback to the publication of its output.
     Callback,
     /// From the arrival to the publication of the output, if the callback was not observed.
     Node,

@@ -1,4 +1,4 @@
-//! One message's way along a chain: the times at each topic, and the durations between them.
+//! One message's path along a chain: the times at each topic, and the durations between them.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -40,7 +40,7 @@ pub struct Point {
     pub started: Option<Timestamp>,
 }
 
-/// One message's way along a chain.
+/// One message's path along a chain.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Trace {
     /// The chain.
@@ -58,9 +58,9 @@ pub struct HopTimes {
     pub whole: Duration,
     /// From the publication of the input to its arrival at the node.
     pub transit: Option<Duration>,
-    /// From the arrival to the begin of the callback.
+    /// From the arrival to the start of the callback.
     pub wait: Option<Duration>,
-    /// From the begin of the callback to the publication of the output.
+    /// From the start of the callback to the publication of the output.
     pub callback: Option<Duration>,
     /// From the arrival to the publication of the output.
     pub node: Option<Duration>,
@@ -125,17 +125,17 @@ impl HopTimes {
     }
 }
 
-/// Returns the ways of at least two messages that no other message continues, each from its first
+/// Returns the paths of at least two messages that no other message continues, each from its first
 /// message to its last. `causes`: the cause of each message, which precedes it.
-pub(super) fn ways(causes: &[Option<usize>]) -> impl Iterator<Item = Vec<usize>> {
+pub(super) fn paths(causes: &[Option<usize>]) -> impl Iterator<Item = Vec<usize>> {
     let ends = (0..causes.len()).filter(|end| !causes.contains(&Some(*end)));
-    let ways = ends.map(|end| {
-        let mut way = vec![end];
-        while let Some(cause) = way.last().and_then(|last| *causes.get(*last)?) {
-            way.push(cause);
+    let paths = ends.map(|end| {
+        let mut messages = vec![end];
+        while let Some(cause) = messages.last().and_then(|last| *causes.get(*last)?) {
+            messages.push(cause);
         }
-        way.reverse();
-        way
+        messages.reverse();
+        messages
     });
-    ways.filter(|way| way.len() > 1)
+    paths.filter(|messages| messages.len() > 1)
 }

@@ -2,9 +2,9 @@
 //! period, callbacks that wait, messages overwritten in their queue.
 //!
 //! A rule is evaluated at each report, on the window of the last 5 to 10 s. A finding appears after
-//! [`BAD`] bad evaluations in a row and goes after [`GOOD`] good ones. Handles are not judged in
+//! [`BAD`] bad evaluations in a row and goes after [`GOOD`] good ones. Handles are not evaluated in
 //! their first [`GRACE`], because nodes load and connect when they start. A finding keeps its
-//! figure until that grows by half, so that it is no event per second.
+//! figure until that grows by half, so that it is not an event per second.
 
 use std::time::Duration;
 
@@ -18,13 +18,13 @@ use crate::facts::model_time::ModelTime;
 const BAD: u8 = 3;
 /// Good evaluations in a row until it goes.
 const GOOD: u8 = 10;
-/// Time after the first report of a handle in which it is not judged.
+/// Time after the first report of a handle in which it is not evaluated.
 pub(super) const GRACE: Duration = Duration::from_secs(10);
 /// Least number of calls or messages of a window that are bad.
 const LEAST: u64 = 3;
 /// Their least share, as a divisor: 1 %.
 const SHARE: u64 = 100;
-/// A shorter wait is no finding.
+/// A shorter wait is not a finding.
 const WAIT: Duration = Duration::from_millis(100);
 /// Time for which two callbacks must have run in one thread until one delays the other.
 const SAME_THREAD: Duration = Duration::from_secs(10);

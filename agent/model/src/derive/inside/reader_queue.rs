@@ -8,10 +8,10 @@
 //! - More messages wait than the queues hold, if their depth is announced.
 //! - A message that was published later has been taken. Queues keep the order, and the latency of a
 //!   take shows when its message was published.
-//! - Takes followed the last arrival, and for long there was neither.
+//! - Takes followed the last arrival, and neither was seen for a while.
 //!
 //! Arrivals are compared with the takes of the next report, so a message under way is never lost.
-//! Messages within the process cannot be compared, and are not judged.
+//! Messages within the process cannot be compared, and are not evaluated.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -24,7 +24,7 @@ use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::QueueTotals;
 
-/// Writers of one queue; a queue with more is not judged.
+/// Writers of one queue; a queue with more is not evaluated.
 const WRITERS: usize = 256;
 /// Time without arrivals and takes after which nothing waits.
 const QUIET: Duration = Duration::from_secs(10);
@@ -86,14 +86,14 @@ pub(super) struct ReaderQueue {
     arrived: u64,
     past: Bounded<QueueTotals, VecDeque<(ModelTime, u64)>>,
     lost: u64,
-    /// Whether the begin of the arrivals is known: a report after that of the takes.
+    /// Whether the start of the arrivals is known: a report after that of the takes.
     has_begun: bool,
     /// Time of the last change, and the longest time between takes.
     changed: ModelTime,
     took: ModelTime,
     longest_gap: Duration,
     since: ModelTime,
-    /// The earlier and the later begin of a window: time, arrivals and losses.
+    /// The earlier and the later start of a window: time, arrivals and losses.
     marks: [(ModelTime, u64, u64); 2],
     pub(super) alarm: Alarm,
 }

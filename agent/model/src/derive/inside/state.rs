@@ -63,7 +63,7 @@ pub(super) struct Process {
     /// Nodes that it created while it was observed.
     reported: Bounded<ReportedNodes, Vec<NodeName>>,
     cpu: Duration,
-    /// The earlier and the later begin of a window: time, CPU time and calls.
+    /// The earlier and the later start of a window: time, CPU time and calls.
     marks: [(ModelTime, Duration, u64); 2],
     pub(super) handles: Bounded<InsideHandles, BTreeMap<(Kind, u64), Tracked>>,
     /// Queues of its subscriptions.
@@ -191,7 +191,7 @@ impl Inside {
         process.is_some_and(|process| process.facts.nodes.contains(node))
     }
 
-    /// Returns what processes show of a topic.
+    /// Returns a topic's figures from calls inside processes.
     #[must_use]
     pub fn topic(&self, domain_id: DomainId, naming: &Naming) -> Option<TopicInside> {
         let topic = self.find(domain_id, naming)?;
@@ -239,7 +239,7 @@ impl Inside {
         })
     }
 
-    /// Returns what a snapshot shows; `None` while the source is off.
+    /// Returns the facts for a snapshot; `None` while the source is off.
     #[must_use]
     pub fn facts(&self) -> Option<InsideFacts> {
         let mut facts = InsideFacts {
@@ -386,7 +386,7 @@ impl Inside {
         self.participants = attribution.all;
     }
 
-    /// Adds what a report brought to the topics.
+    /// Adds the figures of a report to the topics.
     fn add_to_topics(&mut self, added: &[HandleAdded], ended: &[u32], at: ModelTime) {
         let mut topics: BTreeMap<(DomainId, TopicName), TopicAdded> = BTreeMap::new();
         for of_process in added.chunk_by(|one, other| one.process == other.process) {

@@ -41,7 +41,7 @@ pub(super) struct InsideTopic {
     last: Option<ModelTime>,
     latency: Arc<Durations>,
     waiting: Arc<Durations>,
-    /// Messages lost in queues of subscriptions; `None` before any queue could be judged.
+    /// Messages lost in queues of subscriptions; `None` before any queue was evaluated.
     lost_in_queues: Option<u64>,
     /// Times and totals of the last reports.
     past: Bounded<TopicTotals, VecDeque<(ModelTime, u64)>>,
@@ -88,7 +88,7 @@ impl InsideTopics {
         self.topics.get(&(domain_id, name.clone()))
     }
 
-    /// Adds what a report brings. The handles of all topics are counted again afterwards.
+    /// Adds the figures of a report. The handles of all topics are counted again afterwards.
     pub(super) fn add(&mut self, key: &(DomainId, TopicName), added: TopicAdded, at: ModelTime) {
         if !self.topics.contains_key(key) {
             let dds_name = match key.1.starts_with('/') {
@@ -321,7 +321,7 @@ impl InsideTopic {
         }
     }
 
-    /// Returns what a snapshot shows.
+    /// Returns the facts for a snapshot.
     pub(super) fn facts(&self) -> TopicInside {
         TopicInside {
             counts: self.counts,

@@ -70,7 +70,7 @@ pub(super) struct Counts {
     pub(super) within: u64,
 }
 
-/// A handle with the begin of its window.
+/// A handle with the start of its window.
 #[derive(Debug)]
 pub(super) struct Tracked {
     pub(super) figures: Figures,
@@ -84,7 +84,7 @@ pub(super) struct Tracked {
     /// A subscription: time of publication of the last message that it took, or before. Only
     /// increases.
     pub(super) published: Option<ModelTime>,
-    /// The earlier and the later begin of a window.
+    /// The earlier and the later start of a window.
     marks: [Mark; 2],
     pub(super) recent: Recent,
     pub(super) alarms: Alarms,

@@ -225,7 +225,7 @@ fn a_writer_of_this_host_has_no_arrivals_and_a_router_sends_nothing_of_its_own()
 }
 
 #[test]
-fn every_agent_samples_the_same_messages_and_as_many_as_asked() {
+fn every_agent_samples_the_same_messages_at_the_configured_ratio() {
     let records: Vec<Record> = (1..=20_000).map(|n| data(n, n, flag::OUTGOING)).collect();
     let sampled = |ratio: f64| {
         let mut tracer = tracer();
@@ -246,7 +246,7 @@ fn every_agent_samples_the_same_messages_and_as_many_as_asked() {
 }
 
 #[test]
-fn what_never_completes_or_is_never_acknowledged_takes_bounded_room() {
+fn traces_that_never_complete_take_bounded_memory() {
     let mut tracer = tracer();
     for number in 1..=1_000 {
         take(&mut tracer, &[fragments(number, 1, 1, number, 0)], 1.0);

@@ -292,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn without_fair_shares_whatever_came_first_stays() {
+    fn without_fair_shares_the_first_entries_stay() {
         let mut table: ByOwner<First, _, _, _> = ByOwner::default();
         let room = (0..200_u32).filter(|key| table.insert(*key, *key, text(0), 0));
         let room = room.count();
@@ -335,7 +335,7 @@ mod tests {
     }
 
     #[test]
-    fn what_an_entry_takes_elsewhere_counts() {
+    fn bytes_of_an_entry_in_other_tables_count() {
         let mut table: ByOwner<First, _, _, _> = ByOwner::default();
         let room = (0..100_u32).filter(|key| table.insert(0, *key, (), 5_000));
         assert_eq!(room.count(), 3);

@@ -10,7 +10,7 @@ use ros2probe_wire::inside::{BUCKETS, bucket, bucket_start};
 
 use crate::facts::histogram::Histogram;
 
-/// A bucket's count in the kernel has so many values.
+/// A bucket's count in the kernel has this many values.
 const WRAP: u64 = 1 << 32;
 
 /// A distribution of durations.
@@ -351,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn what_came_after_is_the_difference_and_merging_adds_up() {
+    fn later_counts_are_a_difference_and_merged_counts_a_sum() {
         let mut durations = Durations::default();
         durations.observe(Duration::from_millis(1));
         let earlier = durations.clone();

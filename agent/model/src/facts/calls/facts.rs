@@ -1,4 +1,4 @@
-//! Facts from inside processes in a snapshot.
+//! Calls inside processes, as a snapshot shows them.
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -538,7 +538,7 @@ mod tests {
 
         /// Compares with a simple recursive matcher.
         #[test]
-        fn patterns_match_as_a_naive_matcher_says(pattern in "[ab*?]{0,7}", name in "[ab]{0,7}") {
+        fn patterns_match_as_in_a_naive_matcher(pattern in "[ab*?]{0,7}", name in "[ab]{0,7}") {
             fn naive(pattern: &[u8], name: &[u8]) -> bool {
                 match (pattern.split_first(), name.split_first()) {
                     (None, None) => true,

@@ -252,7 +252,7 @@ pub(super) fn named(nodes: &[Node]) -> usize {
 }
 
 /// Returns the participant's domain and its source. Without an announced domain, it follows from
-/// the destination port (RTPS 2.5, 9.6.1.1: 7400 + 250 d, multicast + 0, unicast + 10 + 2 p). Ports
+/// the destination port (RTPS 2.5, 9.6.2.3: 7400 + 250 d, multicast + 0, unicast + 10 + 2 p). Ports
 /// from 32768 on are mostly ephemeral, so the domain is then assumed to be 0.
 pub(super) fn domain(announced: Option<DomainId>, origin: &Origin) -> (DomainId, DomainSource) {
     const EPHEMERAL: u16 = 32_768;
@@ -275,7 +275,7 @@ pub(super) fn domain(announced: Option<DomainId>, origin: &Origin) -> (DomainId,
 }
 
 impl Endpoint {
-    /// Returns the names of its topic; `None` if that is no valid name.
+    /// Returns the names of its topic; `None` if that is not a valid name.
     #[must_use]
     pub fn naming(&self) -> Option<Naming> {
         let topic = DdsTopic::parse(&self.topic).ok()?;

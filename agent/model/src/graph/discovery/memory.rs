@@ -445,7 +445,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_matching_asks_for_comes_back_and_may_be_missing_in_older_files() {
+    fn qos_for_matching_is_restored_and_may_be_missing_in_older_files() {
         let prefix = GuidPrefix([1; 12]);
         let guid = Guid::new(prefix, EntityId([0, 0, 1, 3]));
         let defaults = Qos::defaults(Role::Writer, VendorId::CYCLONE);

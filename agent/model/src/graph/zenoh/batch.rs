@@ -133,7 +133,7 @@ impl Zenoh {
                 Sample::Put(put) => attachment(&put).map(|_| wants_bytes),
                 Sample::Del(_) => Some(false),
             },
-            // Requests and replies have their attachment behind the payload.
+            // Requests and replies have their attachment after the payload.
             Ok(_) => Some(true),
             Err(_) => fragment.is_first.then_some(true),
         };

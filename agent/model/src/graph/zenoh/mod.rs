@@ -6,7 +6,7 @@
 //! endpoint, or two with a service. A message with an attachment is a sample of the writer whose
 //! token has the attachment's gid.
 //!
-//! Routers pass messages on. A message to a router counts for its writer, and is no delivery.
+//! Routers pass messages on. A message to a router counts for its writer, and is not a delivery.
 
 mod batch;
 mod connections;

@@ -158,7 +158,7 @@ impl Remembered {
         self.relayed.take()
     }
 
-    /// Forgets what was not seen for too long.
+    /// Forgets entries that were not seen for too long.
     pub(super) fn expire(&mut self, now: ModelTime) {
         if now > self.end && !(self.senders.is_empty() && self.relayed.is_empty()) {
             self.senders.clear();

@@ -93,7 +93,7 @@ impl Zenoh {
     }
 
     /// Returns whether the receiver at the end of a direction is a router, as far as is known. A
-    /// message to it is no delivery.
+    /// message to it is not a delivery.
     pub(super) fn is_for_router(&self, stream: &StreamId) -> bool {
         let own = self.directions.get(stream);
         let opposite = self.opposite(stream);

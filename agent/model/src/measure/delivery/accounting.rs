@@ -52,7 +52,7 @@ impl Totals {
     }
 }
 
-/// State that decisions change.
+/// Counts and events that change when a sample is decided.
 pub(super) struct Accounting<'a> {
     pub(super) tally: &'a mut Delivered,
     pub(super) loss_causes: &'a mut LossCauses,

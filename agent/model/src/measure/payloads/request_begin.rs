@@ -25,7 +25,7 @@ pub(super) struct RequestBegin {
 }
 
 impl RequestBegin {
-    /// Creates the begin of request `id` at `since`, before the sample `number`.
+    /// Creates the start of request `id` at `since`, before the sample `number`.
     pub(super) const fn new(id: u64, number: SequenceNumber, since: ModelTime) -> Self {
         Self {
             id,

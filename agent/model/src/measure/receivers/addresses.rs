@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn an_address_that_two_announce_in_turn_is_nobody_s() {
+    fn an_address_that_two_participants_announce_in_turn_has_no_owner() {
         let mut addresses = AnnouncedAddresses::new(4, 2);
         addresses.put(ALICE, at(1));
         assert!(addresses.put(BOB, at(1)));

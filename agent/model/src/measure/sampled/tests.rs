@@ -46,7 +46,7 @@ impl View {
 }
 
 #[test]
-fn what_was_not_seen_was_sent_and_is_no_loss() {
+fn unseen_messages_were_sent_and_are_no_loss() {
     let mut view = View::new();
     for number in [1, 2, 5, 6, 100] {
         view.see(number);
@@ -202,7 +202,7 @@ fn a_sample_announced_by_a_heartbeat_and_seen_late_is_no_restart() {
 }
 
 #[test]
-fn what_was_not_seen_is_left_out_once_when_it_has_waited() {
+fn an_unseen_message_is_left_out_once_after_the_wait() {
     let mut view = View::new();
     let settle = |view: &mut View| {
         view.now += nanoseconds(ARRIVAL_TIMEOUT);
@@ -242,7 +242,7 @@ fn what_was_not_seen_is_left_out_once_when_it_has_waited() {
 }
 
 #[test]
-fn what_was_counted_otherwise_meanwhile_is_not_left_out() {
+fn a_message_counted_from_another_source_is_not_left_out() {
     let mut view = View::new();
     view.see(1);
     view.see(3);
@@ -307,7 +307,7 @@ fn a_forged_number_far_ahead_counts_as_one_message_and_ends_no_other() {
 }
 
 #[test]
-fn it_is_sampled_until_shared_memory_has_been_silent_for_a_while() {
+fn a_writer_is_sampled_until_shared_memory_is_silent() {
     let mut sampled = Sampled::new(ModelTime::from_nanoseconds(SECOND));
     assert!(sampled.is_current(ModelTime::from_nanoseconds(10 * SECOND)));
     assert!(!sampled.is_current(ModelTime::from_nanoseconds(11 * SECOND)));

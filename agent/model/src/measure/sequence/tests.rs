@@ -132,7 +132,7 @@ fn a_retransmission_recovers() {
 }
 
 #[test]
-fn a_fast_retransmission_that_was_asked_for_is_no_reordering() {
+fn a_fast_retransmission_on_request_is_no_reordering() {
     let mut bench = Bench::default();
     bench.receive([1, 2, 4]);
     bench
@@ -168,7 +168,7 @@ fn gap_excuses_and_heartbeat_does_not() {
 }
 
 #[test]
-fn what_readers_acknowledge_is_no_loss_unless_the_writer_had_withdrawn_it() {
+fn acknowledged_samples_are_no_loss_unless_the_writer_had_withdrawn_them() {
     let mut bench = Bench::default();
     bench.receive([1, 4]);
     bench.sequence.acknowledged(SequenceNumber(4));
@@ -190,7 +190,7 @@ fn samples_that_a_heartbeat_announces_and_withdraws_at_once_are_lost() {
 }
 
 #[test]
-fn what_the_writer_withdrew_is_decided_after_the_grace_and_not_the_window() {
+fn samples_that_the_writer_withdrew_are_decided_after_the_grace() {
     let mut bench = Bench::default();
     bench.receive([1, 4, 6]).heartbeat(4, 6);
     let mut lost = Vec::new();

@@ -337,7 +337,7 @@ fn samples_sent_elsewhere_before_a_reader_existed_here_are_not_lost() {
 }
 
 #[test]
-fn two_hundred_hertz_reads_two_hundred() {
+fn messages_at_200_hz_have_a_rate_of_200_hz() {
     let mut bench = Bench::new(Traits::default());
     bench.now += 1234;
     for number in 1..=200 * 15 {
@@ -378,7 +378,7 @@ fn in_shared_memory_messages_are_the_span_of_their_numbers_and_no_gap_is_a_loss(
 }
 
 #[test]
-fn a_message_that_only_a_heartbeat_tells_of_is_the_last_message() {
+fn a_message_that_only_a_heartbeat_announces_is_the_last_message() {
     let mut bench = Bench::new(RELIABLE);
     bench.put(in_shared_memory(data(1))).wait(1000);
     bench.put(in_shared_memory(heartbeat(1, 2)));
@@ -422,7 +422,7 @@ fn a_writer_of_which_polling_misses_many_messages_seems_silent_for_long() {
 }
 
 #[test]
-fn what_shared_memory_sent_while_it_was_not_polled_is_no_spike_of_the_rate() {
+fn messages_sent_while_shared_memory_was_not_polled_are_no_spike_of_the_rate() {
     let mut bench = Bench::new(RELIABLE);
     let mut number = 1;
     let send = |bench: &mut Bench, number: &mut u64, count: u64, is_polled: bool| {
@@ -467,7 +467,7 @@ fn one_fragment_that_was_seen_is_a_message_of_its_sample_s_size() {
 }
 
 #[test]
-fn what_comes_by_the_network_beside_shared_memory_counts_once() {
+fn a_message_on_the_network_and_in_shared_memory_counts_once() {
     let mut bench = Bench::new(RELIABLE);
     for number in 1..=10 {
         bench.data(number);
@@ -521,7 +521,7 @@ fn seen_in_its_process_a_writer_s_gap_is_a_loss_and_a_copy_is_nothing() {
 }
 
 #[test]
-fn what_passed_before_a_writer_was_seen_in_its_process_counts_by_its_span() {
+fn messages_from_before_a_writer_was_seen_in_its_process_count_by_their_span() {
     let mut bench = Bench::new(Traits::default());
     for number in [1, 4, 7] {
         bench.put(in_shared_memory(data(number))).wait(10);
@@ -575,7 +575,7 @@ fn thirds() -> Vec<Record> {
 
 /// Processes two views' records in every interleaved order. Each sample must be dispatched once or
 /// reported once as not captured.
-fn every_sample_is_given_or_missed(
+fn every_sample_is_counted_or_missed(
     before: &[Record],
     after: &[Record],
     between: fn(&mut Bench),
@@ -630,30 +630,31 @@ fn every_sample_is_given_or_missed(
 }
 
 #[test]
-fn a_sample_under_way_when_its_process_is_seen_is_given() {
+fn a_sample_in_transit_when_its_process_is_first_seen_is_counted() {
     let records = thirds();
     let looked: Vec<_> = records.iter().copied().map(in_shared_memory).collect();
     let exact: Vec<_> = records.into_iter().map(in_its_process).collect();
     for begins in 0..exact.len() {
         for ends in begins.max(1)..exact.len() {
             let fewest =
-                every_sample_is_given_or_missed(&looked[..ends], &exact[begins..], |_| {}, true);
+                every_sample_is_counted_or_missed(&looked[..ends], &exact[begins..], |_| {}, true);
             assert_eq!(fewest, [1; 4], "{begins} {ends}");
         }
     }
 }
 
 #[test]
-fn a_sample_under_way_when_its_process_is_seen_counts_as_not_captured_if_a_part_stays_away() {
+fn a_sample_in_transit_when_its_process_is_first_seen_counts_as_not_captured_if_a_part_is_missing()
+{
     let records = thirds();
     let looked = [in_shared_memory(records[0])];
     let exact: Vec<_> = records[2..].iter().copied().map(in_its_process).collect();
-    let fewest = every_sample_is_given_or_missed(&looked, &exact, |_| {}, false);
+    let fewest = every_sample_is_counted_or_missed(&looked, &exact, |_| {}, false);
     assert_eq!(fewest, [0, 1, 1, 1]);
 }
 
 #[test]
-fn a_sample_under_way_when_its_process_is_seen_no_longer_is_given_by_looking() {
+fn a_sample_in_transit_when_its_process_is_last_seen_is_counted_by_polling() {
     let records = thirds();
     for ends in 1..records.len() {
         let exact: Vec<_> = records[..ends]
@@ -667,7 +668,7 @@ fn a_sample_under_way_when_its_process_is_seen_no_longer_is_given_by_looking() {
             .map(in_shared_memory)
             .collect();
         let end = |bench: &mut Bench| bench.writer.end_exact_view();
-        let fewest = every_sample_is_given_or_missed(&exact, &looked, end, false);
+        let fewest = every_sample_is_counted_or_missed(&exact, &looked, end, false);
         assert_eq!(fewest, [1; 4], "{ends}");
     }
 }

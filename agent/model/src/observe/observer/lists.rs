@@ -274,7 +274,7 @@ fn published(topic: &Topic, endpoint: &Endpoint) -> dispatch::Topic {
 
 pub(super) fn traits(guid: Guid, endpoint: &Endpoint) -> Traits {
     Traits {
-        // TCP repeats for Zenoh, unseen: a missing number will not come.
+        // TCP repeats for Zenoh, unseen: a missing number will not arrive.
         reliable: !guid.prefix.is_zenoh() && endpoint.qos.reliability == Reliability::RELIABLE,
         keeps_history: endpoint.qos.durability != Durability::VOLATILE,
         has_header: begins_with_header(&endpoint.message_type),

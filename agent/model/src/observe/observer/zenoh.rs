@@ -14,7 +14,7 @@ use crate::graph::zenoh::{
     GraphChange, Holder, Shown, StreamId, StreamReport, ZenohSample, unknown_guid,
 };
 
-/// Bytes of the payload in which a header's stamp ends, behind the encapsulation.
+/// Bytes of the payload in which a header's stamp ends, after the encapsulation.
 const STAMP_END: usize = 12;
 
 impl Observer {
@@ -118,7 +118,7 @@ impl Observer {
             return;
         }
         for change in changes {
-            // A counter, so that a token that comes back is no delayed copy.
+            // A counter, so that a token that comes back is not a delayed copy.
             self.zenoh_changes = self.zenoh_changes.next();
             let origin = |prefix: GuidPrefix| Origin {
                 at,
@@ -194,7 +194,7 @@ impl Observer {
         }
         self.count(&record, at);
         if stream.outgoing && stream.is_loopback() {
-            // Nothing is read at the receiver's socket: TCP brings it what was sent.
+            // Nothing is read at the receiver's socket: the sender's socket showed it.
             let arriving = Record {
                 flags: record.flags & !flag::OUTGOING,
                 socket: sample.receiving_socket,

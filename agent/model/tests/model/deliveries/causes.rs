@@ -154,7 +154,7 @@ fn a_loss_whose_fragments_expire_later_has_its_final_cause() {
 }
 
 #[test]
-fn a_reassembly_that_is_given_up_after_the_repair_came_is_no_loss() {
+fn a_failed_reassembly_after_the_retransmission_is_no_loss() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     host.data(bob, 1);
@@ -173,7 +173,7 @@ fn a_reassembly_that_is_given_up_after_the_repair_came_is_no_loss() {
 }
 
 #[test]
-fn what_left_this_host_and_never_arrived_is_lost_unless_its_socket_is_closed() {
+fn a_sample_that_left_this_host_and_never_arrived_is_lost_unless_its_socket_is_closed() {
     for is_closed in [false, true] {
         let mut host = Host::new();
         let bob = host.reader(BOB, 7411);
@@ -206,7 +206,7 @@ fn what_left_this_host_and_never_arrived_is_lost_unless_its_socket_is_closed() {
 }
 
 #[test]
-fn what_left_for_a_receiver_that_still_talks_is_lost_soon() {
+fn a_sample_to_a_live_receiver_that_never_arrived_is_lost_soon() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=20 {

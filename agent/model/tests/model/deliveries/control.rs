@@ -4,7 +4,7 @@ use ros2probe_model::facts::loss::LossCause;
 use ros2probe_testing::model::host::{BOB, CAROL, Host};
 
 #[test]
-fn a_heartbeat_tells_the_tail_to_the_reader_it_is_for_and_to_no_other() {
+fn a_heartbeat_announces_the_tail_to_its_reader_alone() {
     let mut host = Host::new();
     let (bob, carol) = (host.reader(BOB, 7411), host.reader(CAROL, 7413));
     for number in 1..=10 {
@@ -98,7 +98,7 @@ fn heartbeats_alone_lose_nothing_until_the_reader_asks() {
 }
 
 #[test]
-fn what_a_writer_of_few_samples_overwrote_before_it_came_is_lost() {
+fn a_sample_that_a_short_history_overwrote_before_it_arrived_is_lost() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=100 {
@@ -121,7 +121,7 @@ fn what_a_writer_of_few_samples_overwrote_before_it_came_is_lost() {
 }
 
 #[test]
-fn what_its_reader_acknowledged_is_not_lost_although_it_was_not_seen() {
+fn an_unseen_sample_that_its_reader_acknowledged_is_not_lost() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=101 {
@@ -145,7 +145,7 @@ fn what_its_reader_acknowledged_is_not_lost_although_it_was_not_seen() {
 }
 
 #[test]
-fn what_was_written_while_a_reader_was_away_is_not_lost_when_a_heartbeat_begins_later() {
+fn samples_written_while_a_reader_was_away_are_not_lost_when_a_heartbeat_begins_later() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     (1..=100).for_each(|number| host.data(bob, number));

@@ -56,7 +56,7 @@ fn arrival(host: &Host, bob: CapturePoint, number: u64, fragmented: bool, part: 
 proptest! {
     #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
     #[test]
-    fn what_was_sent_is_delivered_lost_for_one_cause_or_irrelevant(
+    fn every_sent_sample_is_delivered_lost_for_one_cause_or_irrelevant(
         fates in prop::collection::vec((fate(), any::<bool>(), 1u64..30), 1..300),
     ) {
         let mut host = Host::new();

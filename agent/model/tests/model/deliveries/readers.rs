@@ -110,7 +110,7 @@ fn the_counts_of_a_socket_are_shown_once_its_participant_is_known_to_have_read()
 }
 
 #[test]
-fn what_a_late_reader_did_not_subscribe_to_yet_is_neither_delivered_nor_lost() {
+fn samples_from_before_a_late_reader_are_neither_delivered_nor_lost() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411).multicast(101);
     host.owner(bob, BOB);

@@ -99,7 +99,7 @@ fn a_reader_that_leaves_loses_nothing_and_returns_without_a_gap() {
 }
 
 #[test]
-fn what_arrives_without_a_reader_is_unmatched_and_takes_no_room() {
+fn samples_that_arrive_without_a_reader_are_unmatched_and_take_no_room() {
     let mut host = Host::new();
     let (bob, carol) = (host.reader(BOB, 7411), host.bystander(CAROL, 7413));
     let (bob, carol) = (bob.multicast(101), carol.multicast(102));

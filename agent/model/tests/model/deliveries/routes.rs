@@ -113,7 +113,7 @@ fn a_receiver_whose_socket_is_known_late_is_still_one() {
 }
 
 #[test]
-fn what_is_pending_when_ways_are_put_together_stays_pending_once() {
+fn samples_pending_when_routes_are_merged_stay_pending_once() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let group = bob.multicast(101);

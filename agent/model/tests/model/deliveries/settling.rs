@@ -66,7 +66,7 @@ fn the_last_messages_of_a_best_effort_writer_are_pending_until_they_are_lost() {
 }
 
 #[test]
-fn what_left_for_a_socket_that_was_closed_is_not_pending_for_ever() {
+fn samples_to_a_closed_socket_are_not_pending_for_ever() {
     let mut host = Host::new();
     let bob = best_effort(&mut host);
     for number in 1..=100 {
@@ -105,7 +105,7 @@ fn the_losses_of_a_reliable_writer_that_leaves_are_settled_when_it_leaves() {
 }
 
 #[test]
-fn what_a_writer_withdrew_is_lost_within_two_seconds() {
+fn samples_that_a_writer_withdrew_are_lost_within_two_seconds() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in (1..=20).filter(|number| *number != 7) {

@@ -176,7 +176,7 @@ fn a_changed_expectation_is_one_event_and_another_watch_changes_nothing() {
 }
 
 #[test]
-fn what_the_source_could_not_see_is_no_silence() {
+fn time_in_which_the_source_was_blind_is_no_silence() {
     let mut world = World::new(&[]);
     let watch = Watch {
         expectations: Expectations {
@@ -222,7 +222,7 @@ fn what_the_source_could_not_see_is_no_silence() {
 }
 
 #[test]
-fn a_subscriber_that_comes_back_is_given_time_for_its_first_message() {
+fn a_subscriber_that_returns_has_time_for_its_first_message() {
     let mut world = World::new(&[]);
     let watch = Watch {
         expectations: Expectations {

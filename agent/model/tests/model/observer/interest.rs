@@ -91,7 +91,7 @@ fn the_cap_on_watched_topics_rejects_and_counts() {
 }
 
 #[test]
-fn lists_of_costly_globs_are_asked_a_part_at_a_time() {
+fn lists_of_costly_globs_are_matched_in_parts() {
     const TOPICS: u16 = 400;
     let mut world = World::new(&["/chatter"]);
     world.spdp(ALICE, 100);
@@ -136,7 +136,7 @@ fn lists_of_costly_globs_are_asked_a_part_at_a_time() {
 }
 
 #[test]
-fn what_was_counted_survives_writers_and_watchlists() {
+fn counts_of_a_topic_survive_its_writer_and_its_watch() {
     let mut world = World::new(&["/chatter"]);
     world.spdp(ALICE, 100);
     world.sedp(alice(WRITER), "rt/chatter");

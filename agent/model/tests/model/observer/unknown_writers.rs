@@ -36,7 +36,7 @@ fn a_writer_whose_announcement_was_missed_is_shown_and_moves_to_its_topic() {
 }
 
 #[test]
-fn what_was_sent_before_the_announcement_is_no_spike_of_the_rate() {
+fn messages_sent_before_the_announcement_are_no_spike_of_the_rate() {
     let mut world = World::new(&["/chatter"]);
     world.spdp(ALICE, 100);
     world.sedp(alice(READER), "rt/chatter");
@@ -137,7 +137,7 @@ fn an_unknown_writer_is_reported_with_its_process_guid_and_participant() {
 }
 
 #[test]
-fn what_the_kernels_budget_for_unknown_writers_omits_is_not_lost() {
+fn samples_beyond_the_budget_for_unknown_writers_are_not_lost() {
     let mut world = World::new(&["/chatter"]);
     for number in [1, 2, 3, 40, 90, 91, 200] {
         world.sample(alice(WRITER), number);

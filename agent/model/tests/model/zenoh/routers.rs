@@ -404,7 +404,7 @@ fn a_session_with_another_way_outlives_one_of_three_routers() {
 }
 
 #[test]
-fn what_a_router_lists_no_longer_ends_with_the_next_command() {
+fn tokens_that_a_router_no_longer_lists_end_with_the_next_command() {
     let order = [Step::Routers, Step::Listener, Step::Talker];
     let mut host = started(&order, 3);
     assert_eq!(host.listed(), [true; 3]);

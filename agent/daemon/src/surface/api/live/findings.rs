@@ -562,7 +562,7 @@ mod tests {
     use ros2probe_model::graph::zenoh::ZenohFacts;
 
     #[test]
-    fn of_more_findings_than_are_sent_the_worst_are() {
+    fn the_worst_findings_are_sent_if_they_exceed_the_cap() {
         let list = (0..2 * MOST).map(|number| Diagnosis::DuplicateNode {
             domain_id: DomainId(0),
             node: format!("/node_{number}").into(),
@@ -635,7 +635,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_source_does_not_show_is_in_words() {
+    fn each_blind_spot_of_a_source_is_described() {
         let mut agent = AgentFacts::new(SourceKind::Replay, Instant::now());
         let text = |agent: &AgentFacts| -> Vec<String> {
             let notes = unseen(agent).into_iter();

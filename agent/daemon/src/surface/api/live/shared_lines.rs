@@ -118,6 +118,7 @@ impl SharedLines {
     fn update_agent(&mut self, state: &State, past: &Past, in_force: &InForce) {
         let (snapshot, agent, round) = (state.known(), &state.agent, self.round);
         let unready = state.ready(Instant::now()).err();
+        let unready = unready.map(|reason| reason.to_string());
         let abilities = Able::ALL.iter().map(|ability| {
             let reason = agent.blind.iter().find(|(blind, _)| blind == ability);
             Ability(
@@ -168,16 +169,16 @@ impl SharedLines {
     /// `seen`.
     pub(super) fn parts(&self, seen: u64) -> impl Iterator<Item = &Bytes> {
         let parts = [&self.structure, &self.agent, &self.findings];
-        let news = parts.into_iter().filter(move |part| part.changed > seen);
-        news.map(|part| &part.text)
+        let newer = parts.into_iter().filter(move |part| part.changed > seen);
+        newer.map(|part| &part.text)
     }
 
     /// Returns the values that changed since the round `seen`.
     pub(super) fn values(&self, seen: u64) -> Values {
-        let news = self.rows.values().filter(|(changed, _)| *changed > seen);
+        let newer = self.rows.values().filter(|(changed, _)| *changed > seen);
         Values {
             t: self.at,
-            topics: news.map(|(_, row)| *row).collect(),
+            topics: newer.map(|(_, row)| *row).collect(),
             totals: self.totals,
             replay: self.progress,
         }

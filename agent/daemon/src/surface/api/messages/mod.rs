@@ -30,7 +30,7 @@ use super::{Context, Streamed};
 use crate::config::Access;
 use crate::subscriptions::{Depth, Item, Overflow, Refused, Request, Selection, Subscription};
 use ros2probe_api::messages::{self, Beat, Definition, End, Message, Missed};
-use ros2probe_message::{Library, Limits, MessageType, decode};
+use ros2probe_message::{DecodeError, Library, Limits, MessageType, decode};
 use ros2probe_model::facts::dispatch::Sample;
 use ros2probe_model::facts::names::{DdsName, TypeName};
 use ros2probe_wire::DomainId;
@@ -291,7 +291,7 @@ impl Stream {
         let decoded = spawn_blocking(move || value(message_type.as_deref(), &shown)).await;
         let (value, error) = match decoded {
             Ok(Ok(value)) => (value, None),
-            Ok(Err(error)) => (None, Some(error)),
+            Ok(Err(error)) => (None, Some(error.to_string())),
             Err(_) => (None, Some("decoding it failed".to_owned())),
         };
         let state = self.context.latest.state();
@@ -372,8 +372,20 @@ fn unknown(name: &str, reason: String) -> Definition {
     }
 }
 
+/// Why the fields of a message cannot be shown.
+#[derive(Debug, thiserror::Error)]
+enum ValueError {
+    #[error(transparent)]
+    Decode(#[from] DecodeError),
+    #[error(transparent)]
+    Json(#[from] serde_json::Error),
+}
+
 /// Decodes the fields of a message; returns `None` if its type or its bytes are unknown.
-fn value(message_type: Option<&MessageType>, sample: &Sample) -> Result<Option<JsonText>, String> {
+fn value(
+    message_type: Option<&MessageType>,
+    sample: &Sample,
+) -> Result<Option<JsonText>, ValueError> {
     let (Some(message_type), Some(payload)) = (message_type, &sample.payload) else {
         return Ok(None);
     };
@@ -381,11 +393,9 @@ fn value(message_type: Option<&MessageType>, sample: &Sample) -> Result<Option<J
         kept: ELEMENTS,
         ..Limits::default()
     };
-    let decoded = decode(message_type, payload, &limits).map_err(|error| error.to_string())?;
-    let shown = serde_json::value::to_raw_value(&Tree::new(&decoded.message));
-    shown
-        .map(|text| Some(JsonText(text)))
-        .map_err(|error| error.to_string())
+    let decoded = decode(message_type, payload, &limits)?;
+    let shown = serde_json::value::to_raw_value(&Tree::new(&decoded.message))?;
+    Ok(Some(JsonText(shown)))
 }
 
 #[cfg(test)]

@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn long_arrays_and_texts_are_cut_and_tell_their_length() {
+    fn long_arrays_and_texts_are_cut_and_show_their_length() {
         let mut body = 1000_u32.to_le_bytes().to_vec();
         body.extend((0..1000_u32).map(|number| number as u8));
         body.extend(2001_u32.to_le_bytes());

@@ -8,7 +8,7 @@ use ros2probe_wire::{DomainId, Timestamp};
 use super::RecordedChains;
 use super::Times;
 use super::relation::{Relation, relation};
-use crate::derive::chain::trace::{Method, Path, Point, Trace, ways};
+use crate::derive::chain::trace::{Method, Path, Point, Trace, paths};
 use crate::facts::names::TopicName;
 
 /// Number of matches from which on a hop may be accepted.
@@ -47,7 +47,7 @@ struct Causes {
     candidates: BTreeSet<u16>,
 }
 
-/// Finds the hops, and the ways of messages along them.
+/// Finds the hops, and the paths of messages along them.
 pub(super) fn find(recorded: &RecordedChains, times: Times, preferred: &[&str]) -> Found {
     let mut stamps: Stamps = recorded.stamps(times).collect();
     let together = together(recorded, &stamps, preferred);
@@ -252,7 +252,7 @@ fn join(stamp: &mut Vec<(u16, Timestamp)>, together: &BTreeMap<u16, u16>) {
     });
 }
 
-/// Adds the ways along accepted hops that no other hop continues.
+/// Adds the paths along accepted hops that no other hop continues.
 fn traces(
     recorded: &RecordedChains,
     stamp: &[(u16, Timestamp)],
@@ -266,12 +266,14 @@ fn traces(
         accepts(topic(cause)?, topic(place)?).then_some(cause)
     };
     let causes: Vec<_> = (0..stamp.len()).map(accepted).collect();
-    for way in ways(&causes) {
-        let way: Vec<_> = way
+    for messages in paths(&causes) {
+        let messages: Vec<_> = messages
             .into_iter()
             .filter_map(|place| stamp.get(place))
             .collect();
-        let topics = way.iter().map(|(topic, _)| (recorded.name(*topic), None));
+        let topics = messages
+            .iter()
+            .map(|(topic, _)| (recorded.name(*topic), None));
         let path = Path {
             domain_id: DomainId(0),
             method: Method::Stamps,
@@ -284,7 +286,7 @@ fn traces(
         };
         traces.push(Trace {
             path: Arc::new(path),
-            points: way.iter().map(point).collect(),
+            points: messages.iter().map(point).collect(),
             trace_id: None,
         });
     }

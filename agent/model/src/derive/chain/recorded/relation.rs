@@ -1,4 +1,4 @@
-//! Whether the second of three topics is on the way from the first to the third, by delays.
+//! Whether the second of three topics is on the path from the first to the third, by delays.
 //!
 //! Let `second` and `third` be the delays of two topics after the first, for each stamp. If the
 //! third derives from the second, its delay contains that of the second: the slope of `third` over

@@ -43,8 +43,8 @@ fn add(chains: &mut RecordedChains, topic: &str, stamp: u64, at: u64, transport:
     chains.add(&topic.into(), (seconds, nanoseconds), logged, published);
 }
 
-fn ways(facts: &RecordedFacts) -> Vec<String> {
-    let way = |chain: &ChainFacts| {
+fn paths(facts: &RecordedFacts) -> Vec<String> {
+    let path = |chain: &ChainFacts| {
         let names: Vec<_> = chain
             .path
             .topics
@@ -53,7 +53,7 @@ fn ways(facts: &RecordedFacts) -> Vec<String> {
             .collect();
         format!("{} {}", names.join(" "), chain.count)
     };
-    facts.chains.iter().map(way).collect()
+    facts.chains.iter().map(path).collect()
 }
 
 #[test]
@@ -64,7 +64,7 @@ fn topics_whose_delays_add_up_are_a_chain() {
         vec![("/scan", 0), ("/clean", first), ("/cmd", second)]
     });
     let facts = chains.finish(&[]);
-    assert_eq!(ways(&facts), ["/scan /clean /cmd 100"]);
+    assert_eq!(paths(&facts), ["/scan /clean /cmd 100"]);
     assert_eq!(facts.times, Times::Publish);
     let hop = facts.chains[0].hop(1).whole;
     assert!((0.005..0.007).contains(&hop.p50), "{hop:?}");
@@ -78,7 +78,7 @@ fn branches_of_one_topic_are_no_chain_though_one_always_comes_first() {
         vec![("/scan", 0), ("/clean", clean), ("/map", map)]
     });
     let facts = chains.finish(&[]);
-    assert_eq!(ways(&facts), ["/scan /clean 100", "/scan /map 100"]);
+    assert_eq!(paths(&facts), ["/scan /clean 100", "/scan /map 100"]);
     assert_eq!(facts.times, Times::Log);
 }
 
@@ -89,7 +89,7 @@ fn constant_delays_leave_the_cause_open() {
         vec![("/scan", 0), ("/clean", clean), ("/map", map)]
     });
     let facts = chains.finish(&[]);
-    assert_eq!(ways(&facts), ["/scan /clean 100"]);
+    assert_eq!(paths(&facts), ["/scan /clean 100"]);
     let others = vec!["/scan".into(), "/clean".into()];
     assert_eq!(facts.unclear, [("/map".into(), others)]);
 }
@@ -104,10 +104,10 @@ fn topics_published_together_count_as_one_and_the_named_one_stands_for_them() {
         })
     };
     let facts = chains().finish(&[]);
-    assert_eq!(ways(&facts), ["/image /rectified 100"]);
+    assert_eq!(paths(&facts), ["/image /rectified 100"]);
     assert_eq!(facts.together, [("/depth".into(), "/image".into())]);
     let facts = chains().finish(&["/depth"]);
-    assert_eq!(ways(&facts), ["/depth /rectified 100"]);
+    assert_eq!(paths(&facts), ["/depth /rectified 100"]);
 }
 
 #[test]
@@ -119,7 +119,7 @@ fn rounded_stamps_and_topics_in_any_order_prove_nothing() {
         add(&mut chains, "/b", stamp, stamp + 9 * MILLISECOND, None);
     }
     let facts = chains.finish(&[]);
-    assert_eq!((ways(&facts), facts.rounded), (vec![], 200));
+    assert_eq!((paths(&facts), facts.rounded), (vec![], 200));
     let chains = recorded(None, |delays| {
         let (one, other) = (
             delays.next(0, 9 * MILLISECOND),
@@ -127,7 +127,7 @@ fn rounded_stamps_and_topics_in_any_order_prove_nothing() {
         );
         vec![("/a", one), ("/b", other)]
     });
-    assert_eq!(ways(&chains.finish(&[])), Vec::<String>::new());
+    assert_eq!(paths(&chains.finish(&[])), Vec::<String>::new());
 }
 
 #[test]
@@ -139,7 +139,7 @@ fn a_topic_that_is_stamped_again_is_in_no_chain() {
         let again = stamp + 9 * MILLISECOND;
         add(&mut chains, "/b", again, again, None);
     }
-    assert_eq!(ways(&chains.finish(&[])), Vec::<String>::new());
+    assert_eq!(paths(&chains.finish(&[])), Vec::<String>::new());
 }
 
 #[test]
@@ -159,7 +159,7 @@ fn steps_of_the_clock_spoil_at_most_the_messages_at_the_step() {
             add(&mut chains, "/b", stamp, second, None);
         }
         let facts = chains.finish(&[]);
-        assert_eq!(ways(&facts), ["/a /b 99"], "{step}");
+        assert_eq!(paths(&facts), ["/a /b 99"], "{step}");
         let whole = facts.chains[0].between(0, 1);
         assert!((whole.max - 0.008).abs() < 1e-9, "{whole:?}");
     }
@@ -176,7 +176,7 @@ fn a_recording_that_is_played_again_and_again_counts_each_time() {
             add(&mut chains, "/b", stamp, at + 9 * MILLISECOND, None);
         }
     }
-    assert_eq!(ways(&chains.finish(&[])), ["/a /b 30"]);
+    assert_eq!(paths(&chains.finish(&[])), ["/a /b 30"]);
 }
 
 #[test]
@@ -207,7 +207,7 @@ fn all_tables_are_bounded() {
     }
     let facts = chains.finish(&[]);
     assert_eq!(
-        (ways(&facts), facts.refused),
+        (paths(&facts), facts.refused),
         (vec!["/a /b 50".into()], 100)
     );
 }

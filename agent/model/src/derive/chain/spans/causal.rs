@@ -20,7 +20,7 @@ use crate::facts::names::{NodeName, TopicName};
 #[derive(Clone, Copy, Debug)]
 pub(in crate::derive::chain) struct Traced {
     trace_id: u128,
-    /// Span of the input's way to the node.
+    /// Span of the input's path to the node.
     transit: SpanId,
     /// Span of the publication.
     publish: SpanId,

@@ -1,11 +1,11 @@
 //! Spans of the messages with one stamp.
 //!
-//! A span belongs to a node, and the agent of the node's host exports it: the way of the input to
+//! A span belongs to a node, and the agent of the node's host exports it: the path of the input to
 //! the node, its processing, and the publication. Other agents derive its id without a copy of it.
 //!
 //! The stamp alone identifies the measurement if it has nanoseconds and is of the present. Then all
 //! agents that see a part of the chain report one trace. Rounded, simulated and recorded stamps
-//! come more than once: there, the first message of the chain is a part of the identity.
+//! occur more than once: there, the first message of the chain is a part of the identity.
 
 use std::sync::Arc;
 
