@@ -11,10 +11,6 @@ use std::path::Path;
 
 use ros2probe_testing::repository;
 
-/// Results that may have a string as their error. The state of the kernel's clock is read for
-/// `rp doctor` only, which stores the reason as [`Unread`](../../cli/src/doctor/host_state.rs).
-const ALLOWED: [&str; 1] = ["Result<ClockState, String>"];
-
 /// Results with a string as their error, in the order of the source.
 fn string_errors(source: &str) -> Vec<&str> {
     let starts = source.match_indices("Result<").map(|(start, _)| start);
@@ -50,7 +46,6 @@ fn check(folder: &Path, found: &mut Vec<String>, read: &mut usize) {
             *read += 1;
             let source = fs::read_to_string(&path).unwrap();
             let wrong = string_errors(&source).into_iter();
-            let wrong = wrong.filter(|result| !ALLOWED.contains(result));
             found.extend(wrong.map(|result| format!("{}: {result}", path.display())));
         }
     }

@@ -20,7 +20,7 @@ pub const PUBLICATIONS_READER: EntityId = EntityId([0x00, 0x00, 0x03, 0xc7]);
 pub const SUBSCRIPTIONS_READER: EntityId = EntityId([0x00, 0x00, 0x04, 0xc7]);
 const SPDP_READER: EntityId = EntityId([0x00, 0x01, 0x00, 0xc7]);
 
-/// Multicast address of discovery in all domains (RTPS 2.5, 9.6.1.4).
+/// Multicast address of discovery in all domains (RTPS 2.5, 9.6.2.4).
 const MULTICAST: [u8; 4] = [239, 255, 0, 1];
 /// SPDP writer, SEDP publications reader, SEDP subscriptions writer and reader. Fast DDS accepts a
 /// goodbye only from participants with the first.
@@ -67,7 +67,7 @@ impl Message {
     pub fn announce(self, local: LocalParticipant) -> Self {
         let own = Guid::new(local.prefix, EntityId::PARTICIPANT);
         let unicast = locator(*local.address.ip(), local.address.port());
-        // 7400 + 250 d (RTPS 2.5, 9.6.1.1); no ports exist beyond domain 232.
+        // 7400 + 250 d (RTPS 2.5, 9.6.2.3); no ports exist beyond domain 232.
         let port = local.domain_id.saturating_mul(250).saturating_add(7400);
         let multicast = locator(MULTICAST.into(), port);
         let payload = Parameters::default()

@@ -29,7 +29,7 @@ use ros2probe_model::graph::discovery_fragments::DiscoveryFragments;
 /// Most packets sent to one participant, including the goodbye.
 pub const MOST_PACKETS: u32 = 6;
 
-/// Silence after which the announcement is repeated once, in nanoseconds. Both vendors announce
+/// Silence after which the announcement is repeated once. Both vendors announce
 /// themselves within 2 ms.
 const SILENCE: Duration = Duration::from_millis(500);
 /// Time from the first HEARTBEAT to the request, for the second one to arrive.
