@@ -76,9 +76,13 @@ END
         [ "$lost" -ge 75 ] && [ "$causes" = "before_host $lost" ]
 }
 
+# How many messages the recorder's report names as missing.
+named_as_missing() {
+    sed -n 's/^.*: \([0-9]*\) of \([0-9]*\) messages recorded.*/\2 \1/p' record.log |
+        awk '{ missing += $1 - $2 } END { print missing + 0 }'
+}
 # A recording has every message of Fast DDS's shared memory, with the packaged configuration: the
-# broker attaches for the agent. Of messages in several pieces, sampling misses most. Nothing is left
-# in a process after the agent and the broker were killed.
+# broker attaches for the agent. Of messages in several pieces, sampling misses most.
 recorded() {
     rm -rf bag
     rp bag record -o bag "/$1" >record.log 2>&1 &
@@ -89,8 +93,10 @@ recorded() {
     status=$?
     kill -INT $recorder
     wait $recorder
+    missing=$(named_as_missing)
     in_bag=$(rp bag info bag | sed -n 's/^Messages: *\([0-9]*\).*/\1/p')
-    figure="sent $published, received $received, in the bag $in_bag"
+    figure="sent $published, received $received, in the bag $in_bag, named as missing $missing"
+    sed 's/^/RECORD\t/' record.log
     [ $status = 0 ] && [ "$in_bag" = "$published" ]
 }
 # A default robot of Fast DDS with six topics, small and frequent to large and rare, in one recording: in
@@ -126,13 +132,15 @@ six_topics() {
     sleep 3
     kill -INT $recorder
     wait $recorder
-    figure=
+    missing=$(named_as_missing)
+    sed 's/^/RECORD\t/' record.log
+    figure="named as missing $missing"
     for each; do
         size=${each%:*}
         published=$(grep -c '"ev":"pub"' "six_pub_$size.jsonl")
         in_bag=$(rp bag info bag6 | sed -n "s/.*Topic: \/six_$size |.*Count: \([0-9]*\).*/\1/p")
         [ "$published" = "${in_bag:-0}" ] || status=1
-        figure="$figure${figure:+, }$size B: ${in_bag:-0} of $published"
+        figure="$figure, $size B: ${in_bag:-0} of $published"
     done
     # shellcheck disable=SC2086
     kill -INT $peers 2>/dev/null
