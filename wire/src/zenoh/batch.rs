@@ -2,6 +2,7 @@
 //! (`zenoh-protocol`, `transport/`).
 
 use crate::cursor::{Reason, WireError};
+use crate::zenoh_stream::message;
 
 use super::extension::Extensions;
 use super::network::{NetworkMessage, Oam};
@@ -107,13 +108,13 @@ pub struct Batch<'a> {
 
 impl<'a> Batch<'a> {
     const OAM: u8 = 0x00;
-    const INIT: u8 = 0x01;
+    const INIT: u8 = message::INIT;
     const OPEN: u8 = 0x02;
     const CLOSE: u8 = 0x03;
-    const KEEP_ALIVE: u8 = 0x04;
-    const FRAME: u8 = 0x05;
-    const FRAGMENT: u8 = 0x06;
-    const JOIN: u8 = 0x07;
+    const KEEP_ALIVE: u8 = message::KEEP_ALIVE;
+    const FRAME: u8 = message::FRAME;
+    const FRAGMENT: u8 = message::FRAGMENT;
+    const JOIN: u8 = message::JOIN;
 
     /// Reads a batch, which had `length` bytes on the wire, from its captured beginning. The
     /// length prefix of a stream is not part of the batch.
@@ -156,8 +157,8 @@ impl<'a> Batch<'a> {
         }
         let start = *reader;
         let header = reader.u8("transport message")?;
-        self.in_frame = header & 0x1f == Self::FRAME;
-        Ok(match header & 0x1f {
+        self.in_frame = header & message::ID == Self::FRAME;
+        Ok(match header & message::ID {
             Self::OAM => Message::Oam(Oam::read(header, reader)?),
             Self::INIT => Message::Init(Init::read(header, reader)?),
             Self::OPEN => Message::Open(Open::read(header, reader)?),

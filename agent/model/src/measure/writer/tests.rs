@@ -386,12 +386,12 @@ fn a_message_that_only_a_heartbeat_announces_is_the_last_message() {
         bench.writer.last_message(),
         Some(ModelTime::from_nanoseconds(bench.now))
     );
-    let told = bench.now;
+    let reported = bench.now;
     bench.wait(1000);
     bench.put(in_shared_memory(heartbeat(1, 2)));
     assert_eq!(
         bench.writer.last_message(),
-        Some(ModelTime::from_nanoseconds(told))
+        Some(ModelTime::from_nanoseconds(reported))
     );
 }
 
