@@ -61,6 +61,12 @@ for object in $objects; do
     committed=$object.bpf
     # The linker needs the debug information to write BTF; the object does not contain it.
     "$strip" --strip-debug "$built"
+    # A mangled name contains a hash of the checkout's path: every function needs an export_name,
+    # or is inlined.
+    if grep --text -oE '_R(N|I|Y)[A-Za-z0-9_]+' "$built"; then
+        echo "agent-ebpf: $object has the functions above, whose names depend on the checkout's path" >&2
+        exit 1
+    fi
     if [ "${1:-}" = --check ]; then
         if [ "$(toolchain)" != "$(head -n 1 "$committed.sha256")" ]; then
             ./build.sh --stale

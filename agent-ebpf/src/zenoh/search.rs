@@ -38,14 +38,16 @@ pub fn may_be(skb: *mut __sk_buff, body: u32, len: u32, key: &Key, is_noted: boo
 /// Returns what a payload begins with.
 #[inline(always)]
 fn begins_with(skb: *mut __sk_buff, at: u32, len: u32, ports: u32) -> Beginning {
-    let beginning = if len >= HEAD as u32 {
-        load(skb, at).map(|head| Beginning::of(head, len, is_zenoh_port(ports)))
-    } else if len == 3 {
-        load(skb, at).map(Beginning::of_three)
-    } else {
-        None
-    };
-    beginning.unwrap_or(Beginning::Other)
+    if len >= HEAD as u32 {
+        if let Some(head) = load(skb, at) {
+            return Beginning::of(head, len, is_zenoh_port(ports));
+        }
+    } else if len == 3
+        && let Some(bytes) = load(skb, at)
+    {
+        return Beginning::of_three(bytes);
+    }
+    Beginning::Other
 }
 
 /// Looks for a boundary in a direction that is not known; returns 1 if it is known now, and the
