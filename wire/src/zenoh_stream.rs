@@ -11,7 +11,7 @@ pub const VERSION: u8 = 0x09;
 /// Bytes of the length before a batch.
 pub const PREFIX: u32 = 2;
 /// Batches that continue the numbers of their lanes and make a boundary certain.
-pub const CERTAIN: u32 = 2;
+const CERTAIN: u32 = 2;
 
 /// Largest version that is another version of Zenoh rather than another protocol.
 const PLAUSIBLE_VERSION: u8 = 0x3f;
@@ -22,8 +22,14 @@ const KEEP_ALIVE: [u8; 3] = [1, 0, message::KEEP_ALIVE];
 pub mod message {
     /// Bits of a header that hold the id.
     pub const ID: u8 = 0x1f;
+    /// Operation, administration and maintenance.
+    pub const OAM: u8 = 0;
     /// The first message of each side.
     pub const INIT: u8 = 1;
+    /// The second message of each side.
+    pub const OPEN: u8 = 2;
+    /// The sender closes the session or the link.
+    pub const CLOSE: u8 = 3;
     /// The sender is alive.
     pub const KEEP_ALIVE: u8 = 4;
     /// Network messages follow.

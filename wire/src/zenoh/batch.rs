@@ -107,15 +107,6 @@ pub struct Batch<'a> {
 }
 
 impl<'a> Batch<'a> {
-    const OAM: u8 = 0x00;
-    const INIT: u8 = message::INIT;
-    const OPEN: u8 = 0x02;
-    const CLOSE: u8 = 0x03;
-    const KEEP_ALIVE: u8 = message::KEEP_ALIVE;
-    const FRAME: u8 = message::FRAME;
-    const FRAGMENT: u8 = message::FRAGMENT;
-    const JOIN: u8 = message::JOIN;
-
     /// Reads a batch, which had `length` bytes on the wire, from its captured beginning. The
     /// length prefix of a stream is not part of the batch.
     #[must_use]
@@ -157,19 +148,19 @@ impl<'a> Batch<'a> {
         }
         let start = *reader;
         let header = reader.u8("transport message")?;
-        self.in_frame = header & message::ID == Self::FRAME;
+        self.in_frame = header & message::ID == message::FRAME;
         Ok(match header & message::ID {
-            Self::OAM => Message::Oam(Oam::read(header, reader)?),
-            Self::INIT => Message::Init(Init::read(header, reader)?),
-            Self::OPEN => Message::Open(Open::read(header, reader)?),
-            Self::CLOSE => Message::Close(close(header, reader)?),
-            Self::KEEP_ALIVE => {
+            message::OAM => Message::Oam(Oam::read(header, reader)?),
+            message::INIT => Message::Init(Init::read(header, reader)?),
+            message::OPEN => Message::Open(Open::read(header, reader)?),
+            message::CLOSE => Message::Close(close(header, reader)?),
+            message::KEEP_ALIVE => {
                 Extensions::of(header).skip_all(reader)?;
                 Message::KeepAlive
             }
-            Self::FRAME => Message::Frame(frame(header, reader)?),
-            Self::FRAGMENT => Message::Fragment(fragment(header, reader)?),
-            Self::JOIN => Message::Join(Join::read(header, reader)?),
+            message::FRAME => Message::Frame(frame(header, reader)?),
+            message::FRAGMENT => Message::Fragment(fragment(header, reader)?),
+            message::JOIN => Message::Join(Join::read(header, reader)?),
             _ => return Err(start.error("transport message", Reason::BadMarker)),
         })
     }
