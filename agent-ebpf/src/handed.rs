@@ -154,28 +154,24 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
     let now = unsafe { bpf_ktime_get_ns() };
     let scratch = working.get();
     let token = clear(scratch, slot, now);
-    scratch.walk.begin(source, len);
-    if len > MAX_CAPTURED {
-        scratch.walk.record.datagram_len = MAX_CAPTURED as u16;
-    }
+    begin_walk(scratch, source, len);
     verdict::heard(scratch, source, now);
-    let mut submessages = 0;
-    let mut result = progress::CAPTURE;
-    while submessages < SUBMESSAGES {
-        result = shm_advance(slot, len);
-        if result != progress::ON {
-            break;
+    if shm_walk(slot, len) == progress::CAPTURE {
+        if len <= MAX_CAPTURED {
+            verdict::captured(slot, working.get());
+            if shm_capture(slot, len, token) != 0 {
+                return 1;
+            }
+        } else {
+            count(slot, Counter::PiecesLost, 1);
         }
-        result = progress::CAPTURE;
-        submessages += 1;
-    }
-    if result == progress::CAPTURE && len <= MAX_CAPTURED {
-        verdict::captured(slot, working.get());
-        shm_capture(slot, len, token);
-        return 1;
-    }
-    if result == progress::CAPTURE {
-        count(slot, Counter::PiecesLost, 1);
+        // As if a copy had been captured: its submessages of interest become records.
+        let scratch = working.get();
+        scratch.count = core::hint::black_box(0);
+        scratch.unknown = core::hint::black_box(0);
+        scratch.repeated = core::hint::black_box(1);
+        begin_walk(scratch, source, len);
+        shm_walk(slot, len);
     }
     let records = working.get().count;
     count(
@@ -241,6 +237,30 @@ fn clear(scratch: &mut Scratch, slot: u32, now: u64) -> u32 {
     let cpu = unsafe { bpf_get_smp_processor_id() } as u32;
     // Built as in `host::identify`.
     scratch.named << 12 | (slot + 1) << 8 | (cpu & 0xff)
+}
+
+/// Starts a walk over the message.
+#[inline(always)]
+fn begin_walk(scratch: &mut Scratch, source: [u32; 3], len: u32) {
+    scratch.walk.begin(source, len);
+    if len > MAX_CAPTURED {
+        scratch.walk.record.datagram_len = MAX_CAPTURED as u16;
+    }
+}
+
+/// Walks the submessages; returns the [`progress`] of the last one.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn shm_walk(slot: u32, len: u32) -> u32 {
+    let mut submessages = 0;
+    while submessages < SUBMESSAGES {
+        let result = shm_advance(slot, len);
+        if result != progress::ON {
+            return result;
+        }
+        submessages += 1;
+    }
+    progress::CAPTURE
 }
 
 /// Walks one submessage, as `verdict::advance` does.

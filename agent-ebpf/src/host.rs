@@ -169,11 +169,11 @@ pub fn identify(skb: *mut __sk_buff, slot: u32, named: &mut u32) -> (u32, u64) {
 /// submessage that requires the capture. Always false on the wire hook.
 #[inline(always)]
 pub fn captured_before(slot: u32, scratch: &mut Scratch) -> bool {
-    if scratch.packet.host == 0 {
-        return false;
-    }
     if scratch.repeated != 0 {
         return true;
+    }
+    if scratch.packet.host == 0 {
+        return false;
     }
     let record = &scratch.walk.record;
     let Some(recent) = noted(scratch) else {

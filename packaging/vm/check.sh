@@ -100,7 +100,7 @@ recorded() {
     [ $status = 0 ] && [ "$in_bag" = "$published" ]
 }
 # A default robot of Fast DDS with six topics, small and frequent to large and rare, in one recording: in
-# the bag is what each publisher sent.
+# the bag is what each publisher sent, and `rp topic echo` prints all of two topics.
 six_topics() {
     rm -rf bag6 six_*.jsonl
     set -- 64:250 320:100 4000:50 150000:10 700000:5 2700000:1
@@ -109,6 +109,10 @@ six_topics() {
     # shellcheck disable=SC2086
     rp bag record -o bag6 $topics >record.log 2>&1 &
     recorder=$!
+    rp topic echo /six_64 >echo_64.log 2>&1 &
+    echoes=$!
+    rp topic echo /six_4000 >echo_4000.log 2>&1 &
+    echoes="$echoes $!"
     begun() { grep -q 'Recording' record.log; }
     wait_until 20 begun
     for each; do
@@ -130,11 +134,19 @@ six_topics() {
     wait_until 60 all_sent "$@"
     status=$?
     sleep 3
-    kill -INT $recorder
-    wait $recorder
+    # shellcheck disable=SC2086
+    kill -INT $recorder $echoes
+    # shellcheck disable=SC2086
+    wait $recorder $echoes
     missing=$(named_as_missing)
     sed 's/^/RECORD\t/' record.log
     figure="named as missing $missing"
+    for size in 64 4000; do
+        published=$(grep -c '"ev":"pub"' "six_pub_$size.jsonl")
+        echoed=$(grep -c '^---' "echo_$size.log")
+        [ "$published" = "$echoed" ] || status=1
+        figure="$figure, $size B echoed: $echoed of $published"
+    done
     for each; do
         size=${each%:*}
         published=$(grep -c '"ev":"pub"' "six_pub_$size.jsonl")
@@ -311,6 +323,7 @@ check active active
 check "source" source_of "$source"
 check threads confined
 check systemd-analyze exposed
+report memory "$(systemctl show -P MemoryCurrent ros2probe | awk '{printf "%.1f MB", $1 / 1e6}')"
 cp $config config.before
 if [ "$source" = host ]; then
     check "programs for Zenoh" zenoh_observed

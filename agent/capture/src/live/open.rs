@@ -65,9 +65,6 @@ pub(super) fn open_exact(
     if settings.shm.exact == ExactChoice::Off {
         return (None, None);
     }
-    if !host && settings.shm.exact == ExactChoice::Auto {
-        return (None, None);
-    }
     if !host {
         // Where these programs run, processes can be selected by control group only.
         let reason = "uprobes require observing the host's sockets (capture.source: host)";

@@ -30,9 +30,11 @@ use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Observer;
 use rustix::thread::{CapabilitySet, capabilities};
 
-/// Factor by which the record ring is larger: a process can write a hundred thousand messages per
-/// second, ten times the rate of a socket.
-const RECORD_RINGS: usize = 4;
+/// Factor by which the rings are larger: a process can write a hundred thousand messages per
+/// second, ten times the rate of a socket. It writes a whole image at the speed of memory.
+const RINGS: usize = 4;
+/// Bytes above which the ring of captured messages is not made larger.
+const LARGE_RING: usize = 16 << 20;
 
 /// Why messages cannot be read in the processes that send them.
 #[derive(Debug, thiserror::Error)]
@@ -136,8 +138,10 @@ impl Uprobe {
         let within = cgroup.map(inode).transpose()?;
         let size = |bytes| u32::try_from(bytes).unwrap_or(u32::MAX >> 1);
         let settings = FilterSettings {
-            record_ring_bytes: size(record_ring_bytes.saturating_mul(RECORD_RINGS)),
-            piece_ring_bytes: size(ring_bytes),
+            record_ring_bytes: size(record_ring_bytes.saturating_mul(RINGS)),
+            piece_ring_bytes: size(
+                (ring_bytes.saturating_mul(RINGS)).min(ring_bytes.max(LARGE_RING)),
+            ),
             ..FilterSettings::default()
         };
         let loaded = Filter::load_uprobe(&settings, within, Means::of_this_kernel());

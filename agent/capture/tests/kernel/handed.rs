@@ -78,10 +78,10 @@ impl Handing {
         hand(&mut self.sender, message, lengths)
     }
 
-    fn meter(&mut self) -> Result<()> {
+    fn want(&mut self, verdict: Verdict) -> Result<()> {
         let prefix = GuidPrefix(self.talker.prefix);
         let writer = Guid::new(prefix, EntityId(SAMPLES_WRITER));
-        Ok(self.filter.set_interest(writer, Some(Verdict::Meter))?)
+        Ok(self.filter.set_interest(writer, Some(verdict))?)
     }
 
     fn records(&mut self) -> Vec<Record> {
@@ -149,7 +149,7 @@ fn cuts(form: Form, length: usize) -> Vec<Vec<usize>> {
 fn what_is_metered_is_what_user_space_finds_in_the_same_messages() -> Result<()> {
     for form in [Form::Whole, Form::List] {
         let mut handing = Handing::new(form)?;
-        handing.meter()?;
+        handing.want(Verdict::Meter)?;
         let mut expected = Vec::new();
         for size in [9, 10, 12, 13, 320] {
             for cut in cuts(
@@ -226,10 +226,47 @@ fn what_is_captured_is_whole() -> Result<()> {
 }
 
 #[test]
+fn messages_that_a_full_ring_has_no_room_for_are_metered() -> Result<()> {
+    for form in [Form::Whole, Form::List] {
+        let mut handing = Handing::new(form)?;
+        handing.want(Verdict::Capture)?;
+        let numbers = 1..=30;
+        for number in numbers.clone() {
+            let message = handing.talker.message(SAMPLES_WRITER, number, &[7; 60_000]);
+            let cut = match form {
+                Form::Whole => vec![message.len()],
+                Form::List => vec![44, message.len() - 44],
+            };
+            handing.hand(&message, &cut)?;
+        }
+        let captured = handing.captured().len();
+        let metered = handing.records();
+        assert_eq!(captured, 17, "as many as a ring of a megabyte holds");
+        let metered: Vec<_> = (metered.iter())
+            .map(|record| {
+                (
+                    record.sequence_number,
+                    record.payload_len,
+                    record.flags & EXACT,
+                )
+            })
+            .collect();
+        let rest = numbers
+            .skip(captured)
+            .map(|number| (u64::from(number), 60_000, EXACT));
+        assert_eq!(metered, rest.collect::<Vec<_>>());
+        let counts = handing.counts()?;
+        let lost = counts.get(Counter::PiecesLost.label());
+        assert_eq!(lost, Some(&(metered.len() as u64)), "{counts:?}");
+    }
+    Ok(())
+}
+
+#[test]
 fn longer_messages_than_datagrams_count_and_what_is_unreadable_is_counted() -> Result<()> {
     for form in [Form::Whole, Form::List] {
         let mut handing = Handing::new(form)?;
-        handing.meter()?;
+        handing.want(Verdict::Meter)?;
         // A length of 0: the submessage extends to the end.
         let mut long = handing.talker.message(SAMPLES_WRITER, 5, &vec![7; 40_000]);
         long.splice(22..24, [0, 0]);
@@ -245,6 +282,13 @@ fn longer_messages_than_datagrams_count_and_what_is_unreadable_is_counted() -> R
             .map(|record| (record.sequence_number, record.payload_len))
             .collect();
         assert_eq!(found, [(5, 140_000)]);
+        // Too long to be captured.
+        handing.want(Verdict::Capture)?;
+        handing.hand(&long, &cut)?;
+        let records = handing.records();
+        let found = records.first();
+        let found = found.map(|record| (record.sequence_number, record.payload_len));
+        assert_eq!((found, records.len()), (Some((5, 140_000)), 1));
         handing.sender.write_line("nowhere")?;
         handing.sender.wait_for("handed", PATIENCE)?;
         handing.hand(b"none of RTPS, and yet a message", &[31])?;
@@ -253,7 +297,8 @@ fn longer_messages_than_datagrams_count_and_what_is_unreadable_is_counted() -> R
         let count = |counter: Counter| counts.get(counter.label()).copied();
         assert_eq!(count(Counter::Unreadable), Some(1), "{counts:?}");
         assert_eq!(count(Counter::Malformed), Some(2), "{counts:?}");
-        assert_eq!(count(Counter::Messages), Some(1), "{counts:?}");
+        assert_eq!(count(Counter::Messages), Some(2), "{counts:?}");
+        assert_eq!(count(Counter::PiecesLost), Some(1), "{counts:?}");
         assert_eq!(count(Counter::Contended), Some(0), "{counts:?}");
     }
     Ok(())
@@ -262,7 +307,7 @@ fn longer_messages_than_datagrams_count_and_what_is_unreadable_is_counted() -> R
 #[test]
 fn processes_of_other_control_groups_and_those_behind_the_probe_s_end_are_not_seen() -> Result<()> {
     let mut handing = Handing::new(Form::Whole)?;
-    handing.meter()?;
+    handing.want(Verdict::Meter)?;
     let message = handing.talker.sample(100);
     let elsewhere = handing.host.outside();
     let mut stranger = Process::start(&elsewhere, &handing.program, [""; 0])?;

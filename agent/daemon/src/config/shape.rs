@@ -179,7 +179,8 @@ pub(super) struct CaptureShape {
     /// Further network namespaces for `source: wire`, by path (`/run/netns/robot`). Needs
     /// CAP_SYS_ADMIN. `source: host` covers all of them.
     pub(super) network_namespaces: Option<Vec<String>>,
-    /// Packet ring of each network namespace, in bytes.
+    /// Packet ring of each network namespace, in bytes. The ring for messages that processes write to
+    /// shared memory is 4 times as large, up to 16 MiB.
     #[schemars(range(min = 262_144, max = 1_073_741_824))]
     pub(super) ring_bytes: usize,
     /// Ring for measurement records from the kernel filter, in bytes.

@@ -15,7 +15,7 @@ use crate::agent_facts::{
     Ability, AgentFacts, ExactFacts, InsideLibrary, InsideSourceFacts, InterfaceFacts,
     SharedMemoryFacts, SourceKind,
 };
-use crate::config::{CaptureSettings, InsideChoice};
+use crate::config::{CaptureSettings, ExactChoice, InsideChoice};
 use ros2probe_capture::error_chain::Reason;
 use ros2probe_capture::host_tap::HostTap;
 use ros2probe_capture::live::{CaptureError, LiveSource, Part};
@@ -66,7 +66,11 @@ impl Source {
             tracing::warn!("host hook not used: {reason}; using packet sockets");
         }
         if let Some(reason) = live.without_exact() {
-            tracing::warn!("capture.shm.exact not used: {reason}; shared memory is sampled");
+            let text = format!("capture.shm.exact not used: {reason}; shared memory is sampled");
+            match (settings.shm.exact, live.host()) {
+                (ExactChoice::Auto, None) => tracing::info!("{text}"),
+                _ => tracing::warn!("{text}"),
+            }
         }
         if let Some(reason) = live.without_inside() {
             match settings.inside {
