@@ -418,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_the_file_says_nothing_is_read_beyond_it() {
+    fn no_file_is_read_beyond_its_end() {
         let good = image(&format!("{FUNCTION}{OF_2}"), &LANDING);
         for length in (0..good.len()).step_by(7) {
             assert!(found(&good[..length]).is_err(), "{length}");

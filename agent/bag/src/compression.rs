@@ -259,7 +259,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_compressed_comes_back_and_a_zstd_frame_says_its_size() {
+    fn compressed_data_is_restored_and_a_zstd_frame_has_its_size() {
         let bytes = b"ros2probe ".repeat(40_000);
         for compression in [Compression::Lz4, Compression::Zstd] {
             let compressed = compression.compressed(&bytes).unwrap();

@@ -146,7 +146,7 @@ fn cuts(form: Form, length: usize) -> Vec<Vec<usize>> {
 }
 
 #[test]
-fn what_is_metered_is_what_user_space_finds_in_the_same_messages() -> Result<()> {
+fn metered_records_equal_those_of_user_space() -> Result<()> {
     for form in [Form::Whole, Form::List] {
         let mut handing = Handing::new(form)?;
         handing.want(Verdict::Meter)?;
@@ -193,7 +193,7 @@ fn what_is_metered_is_what_user_space_finds_in_the_same_messages() -> Result<()>
 }
 
 #[test]
-fn what_is_captured_is_whole() -> Result<()> {
+fn captured_messages_are_whole() -> Result<()> {
     for (means, form) in [
         (Means::of_this_kernel(), Form::Whole),
         (Means::of_this_kernel(), Form::List),

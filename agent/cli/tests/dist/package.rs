@@ -210,7 +210,7 @@ fn a_host_without_systemd_takes_the_package_too() -> Result<()> {
     );
     host.run(&format!("rp check-config {CONFIG}"))?;
     host.run("bash -uc '. /usr/share/bash-completion/completions/rp && complete -p rp'")?;
-    serves_as_the_unit_says(&host)?;
+    serves_with_the_rights_of_the_unit(&host)?;
 
     host.run(&format!("echo '# mine' >>{CONFIG}"))?;
     host.run(&format!("dpkg --force-confold --install {new}"))?;
@@ -236,7 +236,7 @@ fn nothing_left(host: &Debian) -> Result<()> {
 
 /// Runs the agent with the unit's user and capabilities on a host without systemd. Root owns none of
 /// the files that the agent writes.
-fn serves_as_the_unit_says(host: &Debian) -> Result<()> {
+fn serves_with_the_rights_of_the_unit(host: &Debian) -> Result<()> {
     let unit = host.run("cat /usr/lib/systemd/system/ros2probe.service")?;
     let setting = |key: &str| {
         let line = unit.lines().find_map(|line| line.strip_prefix(key));

@@ -76,12 +76,12 @@ fn rust_dds_samples_lost_between_two_hosts_are_the_difference_at_the_sockets() -
 }
 
 #[test]
-fn what_was_sent_again_is_not_lost_between_two_hosts_on_the_wire() -> Result<()> {
+fn repairs_are_no_loss_between_two_hosts_on_the_wire() -> Result<()> {
     reliable(Source::Wire, Stack::Cyclone)
 }
 
 #[test]
-fn what_was_sent_again_is_not_lost_between_two_hosts_at_the_sockets() -> Result<()> {
+fn repairs_are_no_loss_between_two_hosts_at_the_sockets() -> Result<()> {
     reliable(Source::Host, Stack::Fast)
 }
 

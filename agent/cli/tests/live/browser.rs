@@ -244,7 +244,7 @@ fn chains_of_hostile_names_stay_text() -> Result<()> {
 }
 
 #[test]
-fn what_processes_show_from_inside_is_on_the_views_of_nodes_and_topics() -> Result<()> {
+fn figures_from_inside_processes_are_on_the_views_of_nodes_and_topics() -> Result<()> {
     let place = Place::new()?;
     let _agent = place.agent_inside("watch: [/**]\n")?;
     // The graph knows the node by its participant.

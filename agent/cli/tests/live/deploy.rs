@@ -24,7 +24,7 @@ const GAP: f64 = 6.0;
 
 /// Not covered: the runtime's seccomp filter, and its own setup of the confinement.
 #[test]
-fn an_agent_that_is_confined_as_the_daemon_set_says_sees_the_whole_node() -> Result<()> {
+fn an_agent_confined_by_the_daemon_set_sees_the_whole_node() -> Result<()> {
     let node = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let file = |name: &str| -> PathBuf { directory.path().join(name) };
@@ -95,7 +95,7 @@ fn an_agent_that_is_confined_as_the_daemon_set_says_sees_the_whole_node() -> Res
 }
 
 #[test]
-fn what_a_robot_measured_out_of_reach_arrives_when_the_link_is_back() -> Result<()> {
+fn figures_measured_out_of_reach_arrive_when_the_link_returns() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let configuration = directory.path().join("ros2probe.yaml");

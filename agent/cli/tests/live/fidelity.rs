@@ -41,7 +41,7 @@ fn fast_dds_point_clouds_of_2_72_mb() -> Result<()> {
 
 #[test]
 fn fast_dds_reliable_samples() -> Result<()> {
-    Repair::of(Stack::Fast)?.ensure_told()
+    Repair::of(Stack::Fast)?.ensure_reported()
 }
 
 #[test]
@@ -66,7 +66,7 @@ fn cyclone_dds_point_clouds_of_2_72_mb() -> Result<()> {
 
 #[test]
 fn cyclone_dds_reliable_samples() -> Result<()> {
-    Repair::of(Stack::Cyclone)?.ensure_told()
+    Repair::of(Stack::Cyclone)?.ensure_reported()
 }
 
 #[test]
@@ -91,7 +91,7 @@ fn rust_dds_point_clouds_of_2_72_mb() -> Result<()> {
 
 #[test]
 fn rust_dds_reliable_samples() -> Result<()> {
-    Repair::of(Stack::Rust)?.ensure_told()
+    Repair::of(Stack::Rust)?.ensure_reported()
 }
 
 #[test]

@@ -410,7 +410,7 @@ fn what_was_sent(recording: &Path, ports: &BTreeSet<u16>) -> Result<Sent> {
 /// -- --ignored --nocapture`. One publisher; what watches it takes turns.
 #[test]
 #[ignore = "takes three minutes and a quiet machine to mean anything"]
-fn what_a_viewer_costs_beside_the_subscriber_of_a_bridge() -> Result<()> {
+fn cost_of_a_viewer_beside_the_subscriber_of_a_bridge() -> Result<()> {
     const WINDOW: Duration = Duration::from_secs(10);
     const ROUNDS: usize = 3;
     let link = Link::new()?;

@@ -436,7 +436,7 @@ impl Drop for Reader {
 /// -- --ignored --nocapture`.
 #[test]
 #[ignore = "takes two minutes and a quiet machine to mean anything"]
-fn what_a_stream_of_point_clouds_costs() -> Result<()> {
+fn cost_of_a_stream_of_point_clouds() -> Result<()> {
     const WINDOW: Duration = Duration::from_secs(20);
     for (stack, rate) in [
         (Stack::Cyclone, 20.0),

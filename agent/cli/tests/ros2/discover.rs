@@ -35,7 +35,7 @@ const OF_ALL: [&str; 2] = ["/rosout", "/parameter_events"];
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn a_router_tells_what_ros2_prints_and_no_node_appears() -> Result<()> {
+fn a_router_lists_what_ros2_prints_and_no_node_appears() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let refused = rp(&host, &[])?;

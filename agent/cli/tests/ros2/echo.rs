@@ -27,7 +27,7 @@ fn every_installed_message_type_prints_as_ros2_prints_it() {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_cyclonedds_cpp: make test-ros2"]
-fn what_cyclone_dds_serializes_prints_as_ros2_prints_it() {
+fn samples_of_cyclone_dds_print_as_by_ros2() {
     assert_prints_equal("rmw_cyclonedds_cpp");
 }
 

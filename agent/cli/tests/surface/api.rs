@@ -377,7 +377,7 @@ fn masked(text: &str) -> String {
 }
 
 #[test]
-fn what_the_book_prints_is_what_is_printed() {
+fn output_in_the_book_is_current() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "0.3"]);
     agent.wait_for_log("ready");
     for (command, expected) in commands("Measure a topic at run time") {

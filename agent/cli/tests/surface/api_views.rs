@@ -269,7 +269,7 @@ fn one_robot_is_described_as_ros2_would() {
     }
 
     edges_are_there(&robot);
-    what_is_asked_wrongly_is_refused_with_a_hint(&robot);
+    wrong_queries_are_refused_with_a_hint(&robot);
 }
 
 fn topics_are_described(robot: &Robot) {
@@ -329,7 +329,7 @@ fn edges_are_there(robot: &Robot) {
     is_there("service:0:/robot1/add_two_ints", sensor, "served_by");
 }
 
-fn what_is_asked_wrongly_is_refused_with_a_hint(robot: &Robot) {
+fn wrong_queries_are_refused_with_a_hint(robot: &Robot) {
     let (status, code, detail) = robot.problem("/topics/robot1/imu/dat");
     assert_eq!((status, code.as_str()), (404, "no-such-topic"));
     assert!(detail.contains("did you mean /robot1/imu/data"), "{detail}");

@@ -274,7 +274,7 @@ fn a_truncated_bag_shows_what_precedes_the_cut() {
 }
 
 #[test]
-fn what_is_no_bag_is_refused_in_one_line() {
+fn a_path_without_a_bag_is_refused_in_one_line() {
     let directory = temporary();
     let empty = directory.path().join("empty");
     fs::create_dir(&empty).unwrap();

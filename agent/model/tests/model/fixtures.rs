@@ -40,7 +40,7 @@ fn the_whole_corpus_reproduces_its_ground_truth() {
 }
 
 #[test]
-fn what_a_keep_last_writer_overwrote_is_lost_as_the_subscribers_log_says() {
+fn samples_overwritten_in_a_keep_last_history_are_lost_as_in_the_subscribers_log() {
     for (label, lost) in [("fastrtps-udp", 8), ("cyclonedds", 78)] {
         let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
         let directory = data.join(label).join("keep-last-lossy-2ns");

@@ -135,7 +135,7 @@ fn send_from_all(observer: &mut Observer, writers: &[Guid], mut now: u64) -> u64
 /// writers and flows, with names of usual length. Two snapshots exist, and a metrics page is being
 /// written.
 #[test]
-fn entries_take_no_more_than_the_table_of_limits_says() {
+fn entries_take_at_most_the_documented_memory() {
     let _alone = ALONE.lock().unwrap();
     let limits = Limits::default();
     let before = resident();
@@ -206,7 +206,7 @@ fn entries_take_no_more_than_the_table_of_limits_says() {
 /// Records as many topics as may be measured, with messages below and above a chunk's size,
 /// compressed and not.
 #[test]
-fn a_recording_takes_no_more_than_the_table_of_limits_says() {
+fn a_recording_takes_at_most_the_documented_memory() {
     const BAGS: usize = 4;
     let _alone = ALONE.lock().unwrap();
     let place = tempfile::tempdir().unwrap();

@@ -54,7 +54,7 @@ fn full_buffers(host: &Namespace) -> (u64, u64) {
 }
 
 #[test]
-fn what_a_socket_has_no_room_for_is_named_and_nothing_else() {
+fn only_datagrams_without_room_in_a_socket_are_named() {
     let (mut observed, link, mut talker, writer) = observed_link(4, Verdict::Meter);
     let robot = link.robot.address();
     let monitor = link.monitor.address();

@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn what_belongs_to_no_topic_of_the_bag_is_named_and_makes_it_incomplete() {
+    fn messages_without_a_topic_of_the_bag_are_named_and_make_it_incomplete() {
         let mut report = Report::default();
         let unobserved = |why: &str| ("/imu".to_owned(), why.to_owned());
         report.unobserved.extend([unobserved(NO_SUBSCRIBER)]);

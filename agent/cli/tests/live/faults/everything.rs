@@ -110,7 +110,7 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     );
     ensure!(sent > 5_000, "{sent} datagrams are no storm");
     ensure!(declared > 5_000, "{declared} declarations are no storm");
-    what_was_refused_has_names(&page)?;
+    refusals_have_names(&page)?;
     let counted = real.check(&page)?;
     let mut recorded = 0;
     for (name, _) in RECORDINGS {
@@ -231,7 +231,7 @@ fn answers(askers: Vec<Asker>) -> Result<Vec<String>> {
     Ok(answered)
 }
 
-fn what_was_refused_has_names(page: &Scrape) -> Result<()> {
+fn refusals_have_names(page: &Scrape) -> Result<()> {
     for limit in [
         "ros2probe_limit_reached_total",
         "ros2probe_table_evictions_total",

@@ -99,7 +99,7 @@ impl Repair {
         })
     }
 
-    pub(crate) fn ensure_told(&self) -> Result<()> {
+    pub(crate) fn ensure_reported(&self) -> Result<()> {
         let Repair {
             sent,
             received,

@@ -34,7 +34,7 @@ fn without_gids(text: &str) -> String {
 }
 
 #[test]
-fn what_the_original_prints_of_a_graph_is_printed() {
+fn a_graph_prints_as_by_ros2() {
     let capture = own().join("graph.pcap.gz");
     let recorded = std::fs::read_to_string(own().join("recorded.jsonl")).unwrap();
     let differing = listed("Recorded commands");
@@ -127,7 +127,7 @@ fn the_nodes_of_an_action_bear_their_names() {
 }
 
 #[test]
-fn what_humble_lacks_is_printed_as_jazzy_prints_it() {
+fn output_absent_in_humble_is_that_of_jazzy() {
     let capture = own().join("graph.pcap.gz");
     let ask = |words: &str| {
         let mut words: Vec<&str> = words.split(' ').collect();
