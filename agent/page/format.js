@@ -197,3 +197,21 @@ export function shortened(text, most) {
   const end = tail > 0 ? characters.slice(-tail) : [];
   return `${characters.slice(0, head).join('')}…${end.join('')}`;
 }
+
+/** What became of the last message of a transient-local writer, by its state in the API. */
+const LATCHED = /** @type {Record<string, string>} */ ({
+  kept: 'kept for recordings and viewers',
+  unseen: 'not seen by the agent',
+  too_large: 'too large to be kept',
+  paused: 'not captured: its publisher sends much',
+  no_room: 'not kept: no room',
+});
+
+/**
+ * Formats what became of the last message of a transient-local writer.
+ * @param {{state: string, bytes: number|null}} latched
+ */
+export function lastMessage({ state, bytes: size }) {
+  const text = LATCHED[state] ?? state;
+  return size == null ? text : `${text} (${bytes(size)})`;
+}

@@ -1,6 +1,6 @@
 // Offered and requested QoS of endpoints, side by side, with incompatible policies marked.
 
-import { count, duration, rate } from './format.js';
+import { count, duration, lastMessage, rate } from './format.js';
 import { address } from './router.js';
 import { html, Mark, Name } from './ui.js';
 import { state } from './store.js';
@@ -32,6 +32,7 @@ function Owner({ endpoint }) {
 
 /** @param {{details: any, topic: import('./state.js').Topic}} props */
 export function Endpoints({ details, topic }) {
+  const latches = details.publishers.some((/** @type {any} */ each) => each.latched);
   const row = (/** @type {any} */ endpoint, /** @type {boolean} */ publishes) => {
     const own = (publishes ? topic.publishers : topic.subscriptions)
       .find((each) => each.guid === endpoint.guid);
@@ -42,6 +43,7 @@ export function Endpoints({ details, topic }) {
       <td>${endpoint.vendor ?? ''}</td>
       <td><${Name} text=${endpoint.message_type} /></td>
       ${publishes && html`<td class="number">${rate(endpoint.measurement?.rate_hertz)}</td>`}
+      ${publishes && latches && html`<td>${endpoint.latched && lastMessage(endpoint.latched)}</td>`}
       <td><${Name} text=${endpoint.guid} /></td></tr>`;
   };
   const table = (/** @type {any[]} */ list, /** @type {boolean} */ publishes) => html`
@@ -51,6 +53,7 @@ export function Endpoints({ details, topic }) {
     <thead><tr><th scope="col">Node</th><th scope="col">Where</th>
       <th scope="col">Implementation</th><th scope="col">Type</th>
       ${publishes && html`<th scope="col" class="number">Rate</th>`}
+      ${publishes && latches && html`<th scope="col">Last message</th>`}
       <th scope="col">GUID</th></tr></thead>
     <tbody>${list.map((endpoint) => row(endpoint, publishes))}</tbody></table></div>`;
   return html`<section aria-labelledby="endpoints"><h2 id="endpoints">Publishers and

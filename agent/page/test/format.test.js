@@ -85,3 +85,12 @@ test('the calls of a service are one line', () => {
   const all = { requests: 3, hanging: 1, latency_p50_seconds: 0.00422, latency_p99_seconds: 0.0075 };
   assert.equal(format.calls(all), '3 calls, p50 4.22 ms, p99 7.50 ms, 1 hanging');
 });
+
+test('the last message of a publisher is kept, or the reason is given', () => {
+  assert.equal(format.lastMessage({ state: 'kept', bytes: 3000 }),
+    'kept for recordings and viewers (3.00 kB)');
+  assert.equal(format.lastMessage({ state: 'too_large', bytes: 54e6 }),
+    'too large to be kept (54.0 MB)');
+  assert.equal(format.lastMessage({ state: 'unseen', bytes: null }), 'not seen by the agent');
+  assert.equal(format.lastMessage({ state: 'of a newer agent', bytes: null }), 'of a newer agent');
+});
