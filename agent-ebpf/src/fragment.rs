@@ -117,7 +117,7 @@ fn flow(slot: u32, packet: &Packet) -> Option<&'static Flow> {
 
 /// Handles the fragment with the UDP header.
 #[inline(always)]
-fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &Flow) -> u32 {
+fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working<Scratch>, flow: &Flow) -> u32 {
     if verdict::begin(skb, slot, scratch.get()).is_none() {
         flow.state.set(state::FOREIGN);
         return 0;
@@ -145,7 +145,7 @@ fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &Flow) -> u
 
 /// Handles any fragment but the first.
 #[inline(always)]
-fn trailing(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &Flow) -> u32 {
+fn trailing(skb: *mut __sk_buff, slot: u32, mut scratch: Working<Scratch>, flow: &Flow) -> u32 {
     let going_on = scratch.get();
     let state = flow.state.get();
     if state == state::HEADLESS {
@@ -183,7 +183,7 @@ fn trailing(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &Flow) -
 
 /// Writes the records found so far, except the last one, and stores the walk's state.
 #[inline(always)]
-fn keep_walk(slot: u32, mut scratch: Working, flow: &Flow) {
+fn keep_walk(slot: u32, mut scratch: Working<Scratch>, flow: &Flow) {
     let walked = scratch.get();
     let found = walked.count;
     flow.walk.store(&walked.walk);

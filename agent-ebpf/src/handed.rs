@@ -23,7 +23,7 @@ use ros2probe_wire::{
 
 use crate::{
     instructions::opaque,
-    maps::{SLOTS, Scratch, claim_outgoing, count, piece, release, scratch},
+    maps::{SLOTS, Scratch, Working, claim_outgoing, count, piece, release, scratch},
     pieces,
     registers::{is_aarch64, register},
     settings::is_within,
@@ -133,10 +133,10 @@ pub fn look(registers: *const u64, in_list: bool) {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -> u32 {
-    let (Some(mut working), Some(handed)) = (scratch(slot), handed(slot)) else {
+    let (Some(mut working), Some(mut handed)) = (scratch(slot), handed(slot)) else {
         return 0;
     };
-    if let Err(reason) = locate(handed, address, len, in_list) {
+    if let Err(reason) = locate(&mut handed, address, len, in_list) {
         count(slot, reason, 1);
         return 0;
     }
@@ -287,7 +287,7 @@ pub extern "C" fn shm_advance(slot: u32, len: u32) -> u32 {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_capture(slot: u32, len: u32, token: u32) -> u32 {
-    let (Some(mut scratch), Some(buffer)) = (scratch(slot), piece(slot)) else {
+    let (Some(mut scratch), Some(mut buffer)) = (scratch(slot), piece(slot)) else {
         return 0;
     };
     let zero = core::hint::black_box(0);
@@ -327,7 +327,7 @@ pub extern "C" fn shm_piece(slot: u32, offset: u32) -> u32 {
     if shm_find(slot, offset, 1) != found::HERE {
         return 0;
     }
-    let (Some(handed), Some(buffer)) = (handed(slot), piece(slot)) else {
+    let (Some(handed), Some(mut buffer)) = (handed(slot), piece(slot)) else {
         return 0;
     };
     let within = handed.end.wrapping_sub(offset);
@@ -348,7 +348,7 @@ pub extern "C" fn shm_piece(slot: u32, offset: u32) -> u32 {
             from as *const _,
         )
     };
-    if loaded != 0 || pieces::publish(slot, buffer) == 0 {
+    if loaded != 0 || pieces::publish(slot, &mut buffer) == 0 {
         return 0;
     }
     len
@@ -359,7 +359,7 @@ pub extern "C" fn shm_piece(slot: u32, offset: u32) -> u32 {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_find(slot: u32, offset: u32, len: u32) -> u32 {
-    let Some(message) = handed(slot) else {
+    let Some(mut message) = handed(slot) else {
         return found::NOWHERE;
     };
     if offset < message.start {
@@ -394,7 +394,9 @@ pub extern "C" fn shm_bridge(slot: u32, offset: u32, index: u32) -> u32 {
     if shm_move(slot, offset) == 0 {
         return 0;
     }
-    let Some(handed) = handed(slot) else { return 0 };
+    let Some(mut handed) = handed(slot) else {
+        return 0;
+    };
     let from = handed.address + u64::from(offset.wrapping_sub(handed.start));
     let Some([byte]) = read::<[u8; 1]>(from) else {
         return 0;
@@ -411,7 +413,9 @@ pub extern "C" fn shm_bridge(slot: u32, offset: u32, index: u32) -> u32 {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_move(slot: u32, offset: u32) -> u32 {
-    let Some(handed) = handed(slot) else { return 0 };
+    let Some(mut handed) = handed(slot) else {
+        return 0;
+    };
     let mut steps = 0;
     while steps < SEARCH {
         if offset < handed.end {
@@ -439,11 +443,8 @@ pub extern "C" fn shm_move(slot: u32, offset: u32) -> u32 {
 }
 
 #[inline(always)]
-fn handed(slot: u32) -> Option<&'static mut Handed> {
-    // SAFETY: the run that has claimed the slot uses it alone, and one reference at a time.
-    HANDED
-        .get_ptr_mut(slot)
-        .map(|handed| unsafe { &mut *handed })
+fn handed(slot: u32) -> Option<Working<Handed>> {
+    Working::of(&HANDED, slot)
 }
 
 /// Reads a plain value from the memory of the running process.

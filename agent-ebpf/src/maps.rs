@@ -1,6 +1,7 @@
 //! The filter's maps and per-CPU state.
 
 use core::cell::UnsafeCell;
+use core::ops::{Deref, DerefMut};
 
 use aya_ebpf::{
     macros::map,
@@ -376,40 +377,68 @@ pub fn release(slot: u32) {
     }
 }
 
-/// Address of a slot's working memory. After a call of a function that uses the same memory, the
-/// caller calls [`Self::get`] again: two references never exist at a time.
-#[derive(Clone, Copy)]
-pub struct Working(*mut Scratch);
+/// Working memory of a run, in a map. References to it last for one access: functions that are
+/// called in between look it up themselves.
+pub struct Working<T>(*mut T);
 
-impl Working {
-    /// Returns the working memory, valid until the next call of a function that looks it up by
-    /// slot.
+impl<T> Clone for Working<T> {
     #[inline(always)]
-    pub fn get(&mut self) -> &mut Scratch {
-        // SAFETY: a map value pointer checked against null by `scratch`; the run that has claimed the
-        // slot uses it alone, and ends one reference before it makes the next.
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<T> Copy for Working<T> {}
+
+impl<T> Working<T> {
+    /// Returns the value of an entry of a map, which the caller has claimed.
+    #[inline(always)]
+    pub fn of(map: &PerCpuArray<T>, index: u32) -> Option<Self> {
+        map.get_ptr_mut(index).map(Self)
+    }
+
+    /// Returns the working memory.
+    #[inline(always)]
+    pub fn get(&mut self) -> &mut T {
+        self
+    }
+}
+
+impl<T> Deref for Working<T> {
+    type Target = T;
+
+    #[inline(always)]
+    fn deref(&self) -> &T {
+        // SAFETY: a map value pointer checked against null; the run that has claimed the entry uses
+        // it alone.
+        unsafe { &*self.0 }
+    }
+}
+
+impl<T> DerefMut for Working<T> {
+    #[inline(always)]
+    fn deref_mut(&mut self) -> &mut T {
+        // SAFETY: as above.
         unsafe { &mut *self.0 }
     }
 }
 
 /// Returns the working memory of a slot.
 #[inline(always)]
-pub fn scratch(slot: u32) -> Option<Working> {
-    SCRATCH.get_ptr_mut(slot).map(Working)
+pub fn scratch(slot: u32) -> Option<Working<Scratch>> {
+    Working::of(&SCRATCH, slot)
 }
 
 /// Returns the keys of a slot.
 #[inline(always)]
-pub fn run_keys(slot: u32) -> Option<&'static mut RunKeys> {
-    // SAFETY: the run that has claimed the slot uses it alone, and one reference at a time.
-    RUN_KEYS.get_ptr_mut(slot).map(|keys| unsafe { &mut *keys })
+pub fn run_keys(slot: u32) -> Option<Working<RunKeys>> {
+    Working::of(&RUN_KEYS, slot)
 }
 
 /// Returns the piece buffer of a slot.
 #[inline(always)]
-pub fn piece(slot: u32) -> Option<&'static mut PieceBuffer> {
-    // SAFETY: as for `run_keys`.
-    PIECE.get_ptr_mut(slot).map(|piece| unsafe { &mut *piece })
+pub fn piece(slot: u32) -> Option<Working<PieceBuffer>> {
+    Working::of(&PIECE, slot)
 }
 
 /// Returns the run with this key, if it exists.

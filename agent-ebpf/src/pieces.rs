@@ -30,7 +30,7 @@ const _: () = assert!(PIECE_BYTES.is_power_of_two());
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn capture(skb: *mut __sk_buff, slot: u32) -> u32 {
-    let (Some(mut scratch), Some(buffer)) = (scratch(slot), piece(slot)) else {
+    let (Some(mut scratch), Some(mut buffer)) = (scratch(slot), piece(slot)) else {
         return 0;
     };
     let scratch = scratch.get();
@@ -67,7 +67,9 @@ pub extern "C" fn capture(skb: *mut __sk_buff, slot: u32) -> u32 {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn hand_over(skb: *mut __sk_buff, slot: u32, base: u32, offset: u32) -> u32 {
-    let Some(buffer) = piece(slot) else { return 0 };
+    let Some(mut buffer) = piece(slot) else {
+        return 0;
+    };
     let left = buffer.piece.datagram_len.wrapping_sub(offset);
     let len = if left > PIECE_BYTES {
         PIECE_BYTES
@@ -88,7 +90,7 @@ pub extern "C" fn hand_over(skb: *mut __sk_buff, slot: u32, base: u32, offset: u
     if loaded != 0 {
         return 0;
     }
-    publish(slot, buffer)
+    publish(slot, &mut buffer)
 }
 
 /// Writes the piece in the buffer; returns 1 if it fit.

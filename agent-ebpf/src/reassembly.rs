@@ -23,7 +23,7 @@ use ros2probe_wire::{
 use crate::{
     instructions::add,
     kernel_memory::{member, place, read},
-    maps::{INTEREST, copy, count_outside},
+    maps::{INTEREST, Working, copy, count_outside},
     packet::IPV4_MAPPED,
     verdict::{spend, write_outside},
 };
@@ -65,11 +65,8 @@ struct Incomplete {
 }
 
 #[inline(always)]
-fn incomplete() -> Option<&'static mut Incomplete> {
-    // SAFETY: the run that has claimed a CPU's entry uses it alone, and one reference at a time.
-    INCOMPLETE
-        .get_ptr_mut(0)
-        .map(|incomplete| unsafe { &mut *incomplete })
+fn incomplete() -> Option<Working<Incomplete>> {
+    Working::of(&INCOMPLETE, 0)
 }
 
 /// The linear part of a buffer, from the UDP payload on.
@@ -141,7 +138,8 @@ fn look(skb: u64, why: Why) {
 
 #[inline(always)]
 fn fragment(skb: u64, why: Why) -> Option<()> {
-    let this = incomplete()?;
+    let mut working = incomplete()?;
+    let this = working.get();
     let head: u64 = member(skb, Layout::BufferHead)?;
     let tail: u32 = member(skb, Layout::BufferTail)?;
     let network: u16 = member(skb, Layout::BufferNetworkHeader)?;
@@ -247,7 +245,10 @@ fn is_again(this: &mut Incomplete) -> bool {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn lost(payload: u64, linear: u32) -> u32 {
-    let Some(this) = incomplete() else { return 0 };
+    let Some(mut working) = incomplete() else {
+        return 0;
+    };
+    let this = working.get();
     let bytes = Linear {
         address: payload,
         len: linear,

@@ -21,10 +21,11 @@ pub fn give(slot: u32, record: &Record, joins: bool) {
         write(slot, record);
         return;
     }
-    let Some(keys) = run_keys(slot) else {
+    let Some(mut keys) = run_keys(slot) else {
         write(slot, record);
         return;
     };
+    let keys = keys.get();
     copy(&record.writer, &mut keys.here.stream.writer);
     copy(&record.destination, &mut keys.here.stream.destination);
     keys.here.stream.destination_port = u32::from(record.destination_port);

@@ -28,13 +28,13 @@ pub const WAKE: u32 = 1 << 16;
 #[unsafe(export_name = "zenoh_load_window")]
 #[inline(never)]
 pub extern "C" fn load_window(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
-    let (Some(mut this), Some(buffer)) = (segment(slot), piece(slot)) else {
+    let (Some(mut this), Some(mut buffer)) = (segment(slot), piece(slot)) else {
         return 0;
     };
     this.end = 0;
     let left = this.len.wrapping_sub(offset);
     let wanted = if left > WINDOW { WINDOW } else { left };
-    if wanted == 0 || !load(skb, buffer, this.body.wrapping_add(offset), wanted) {
+    if wanted == 0 || !load(skb, &mut buffer, this.body.wrapping_add(offset), wanted) {
         return 0;
     }
     this.window = offset;
@@ -102,7 +102,7 @@ pub extern "C" fn head(
     lengths: u64,
     flags: u32,
 ) -> u32 {
-    let (Some(mut this), Some(buffer)) = (segment(slot), piece(slot)) else {
+    let (Some(mut this), Some(mut buffer)) = (segment(slot), piece(slot)) else {
         return 0;
     };
     let (len, copied) = (lengths as u32, (lengths >> 32) as u32);
@@ -112,7 +112,7 @@ pub extern "C" fn head(
     }
     if copied != 0 && (offset != this.window || copied > this.end) {
         this.end = 0;
-        if !load(skb, buffer, this.body.wrapping_add(offset), copied) {
+        if !load(skb, &mut buffer, this.body.wrapping_add(offset), copied) {
             return lost(slot);
         }
     }

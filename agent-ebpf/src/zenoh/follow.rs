@@ -9,13 +9,13 @@ use aya_ebpf::bindings::__sk_buff;
 use core::mem::swap;
 use ros2probe_wire::{filter::Counter, host::chunk as part, zenoh_stream::PREFIX};
 
-use crate::maps::{copy, count};
+use crate::maps::{Working, copy, count};
 
 use super::{
     chunk::{self, WAKE},
     message::{self, WHOLE},
     search,
-    state::{CONNECTIONS, Current, Window, body, mode, segment as current},
+    state::{CONNECTIONS, Segment, Window, body, mode, segment as current},
 };
 
 /// Most batches of one packet that are read; of more, everything is passed on.
@@ -146,7 +146,7 @@ fn finish(skb: *mut __sk_buff, slot: u32, left: u32) {
 }
 
 #[inline(always)]
-fn lose(slot: u32, mut this: Current) {
+fn lose(slot: u32, mut this: Working<Segment>) {
     count(slot, Counter::ZenohGaps, 1);
     this.state.mode = mode::GAP;
     this.state.gap_bytes = 0;

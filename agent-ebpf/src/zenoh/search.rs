@@ -12,14 +12,14 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    maps::{copy, count},
+    maps::{Working, copy, count},
     packet::load,
 };
 
 use super::{
     chunk::{self, WAKE},
     is_zenoh_port, message,
-    state::{CANDIDATES, CONNECTIONS, Current, Direction, Key, Window, body, mode, note, segment},
+    state::{CANDIDATES, CONNECTIONS, Direction, Key, Segment, Window, body, mode, note, segment},
 };
 
 /// Most batches of one packet that are read for it.
@@ -152,7 +152,7 @@ extern "C" fn close(slot: u32) -> u32 {
 }
 
 #[inline(always)]
-fn know(slot: u32, mut this: Current, mode: u32) -> u32 {
+fn know(slot: u32, mut this: Working<Segment>, mode: u32) -> u32 {
     this.state.mode = mode;
     count(slot, Counter::ZenohConnections, 1);
     note(this.key.socket);

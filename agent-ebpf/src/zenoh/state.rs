@@ -1,7 +1,5 @@
 //! Maps of the connections of Zenoh, and the working memory of a run.
 
-use core::ops::{Deref, DerefMut};
-
 use aya_ebpf::{
     helpers::generated::bpf_jiffies64,
     macros::map,
@@ -14,7 +12,7 @@ use ros2probe_wire::{
 
 use crate::{
     instructions::opaque,
-    maps::{SLOTS, Shared, piece},
+    maps::{SLOTS, Shared, Working, piece},
 };
 
 /// Bytes of a batch that are read at most: they hold all headers of a sample, and a power of two.
@@ -187,30 +185,6 @@ pub struct Segment {
     pub number: u32,
 }
 
-/// The working memory of a run. References to it last for one access: functions that are called in
-/// between look it up themselves.
-#[derive(Clone, Copy)]
-pub struct Current(*mut Segment);
-
-impl Deref for Current {
-    type Target = Segment;
-
-    #[inline(always)]
-    fn deref(&self) -> &Segment {
-        // SAFETY: a map value pointer checked against null; the run that has claimed the slot uses it
-        // alone.
-        unsafe { &*self.0 }
-    }
-}
-
-impl DerefMut for Current {
-    #[inline(always)]
-    fn deref_mut(&mut self) -> &mut Segment {
-        // SAFETY: as above.
-        unsafe { &mut *self.0 }
-    }
-}
-
 /// Returns whether a socket may be in one of the tables.
 #[inline(always)]
 pub fn is_noted(socket: u64) -> bool {
@@ -238,8 +212,8 @@ fn noted_index(socket: u64) -> u32 {
 
 /// Returns the working memory of a slot.
 #[inline(always)]
-pub fn segment(slot: u32) -> Option<Current> {
-    SEGMENT.get_ptr_mut(slot).map(Current)
+pub fn segment(slot: u32) -> Option<Working<Segment>> {
+    Working::of(&SEGMENT, slot)
 }
 
 /// The first bytes of the current batch, in a piece's buffer.
