@@ -4,6 +4,7 @@
 //! Each loaded filter has one reader. It assembles pieces and restores the order; it decides
 //! nothing.
 
+use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::os::fd::BorrowedFd;
 
@@ -172,6 +173,7 @@ impl FilterReader {
         {
             let waiting = (&mut self.order, &mut self.streams);
             decode_datagram(&piece, &bytes, clocks, waiting, observer);
+            self.pieces.reuse(bytes);
         }
         let mut newest = 0;
         for _ in 0..PIECES_PER_ROUND {
@@ -213,6 +215,9 @@ impl FilterReader {
             if piece.time <= before && self.fresh.is_empty() {
                 let waiting = (&mut self.order, &mut self.streams);
                 decode_datagram(&piece, &bytes, clocks, waiting, observer);
+                if let Cow::Owned(bytes) = bytes {
+                    self.pieces.reuse(bytes);
+                }
                 continue;
             }
             // Queued after those that wait: overtaking them would let a sample count by duplicate

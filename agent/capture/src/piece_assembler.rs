@@ -10,10 +10,12 @@ use std::collections::VecDeque;
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_wire::host::{PIECE_BYTES, Piece};
 
-use crate::tables::OpenPieces;
+use crate::tables::{FreshDatagrams, OpenPieces};
 
 /// A program writes all pieces within microseconds, unless it loses its CPU.
 const LIFETIME_NANOSECONDS: u64 = 1_000_000_000;
+/// Buffers are freed after this long without a datagram in several pieces.
+const KEPT_NANOSECONDS: u64 = 10_000_000_000;
 
 /// Incomplete datagrams, the oldest first: those of programs that run at the same time, and those
 /// whose rest is lost.
@@ -21,6 +23,10 @@ const LIFETIME_NANOSECONDS: u64 = 1_000_000_000;
 pub struct PieceAssembler {
     open: Bounded<OpenPieces, VecDeque<Open>>,
     given_up: u64,
+    /// Empty buffers. In new ones, the kernel would have to clear each page.
+    spare: Vec<Vec<u8>>,
+    /// Time of the latest datagram in several pieces, in the kernel's clock.
+    used: u64,
 }
 
 #[derive(Debug)]
@@ -53,9 +59,13 @@ impl PieceAssembler {
             if piece.len == piece.datagram_len {
                 return Some((*piece, Cow::Borrowed(bytes)));
             }
+            let mut buffer = self.spare.pop().unwrap_or_default();
+            buffer.reserve_exact(piece.datagram_len as usize);
+            buffer.extend_from_slice(bytes);
+            self.used = piece.time;
             let oldest = self.open.push_back(Open {
                 first: *piece,
-                bytes: bytes.to_vec(),
+                bytes: buffer,
             });
             self.given_up += u64::from(oldest.is_some());
             return None;
@@ -75,8 +85,19 @@ impl PieceAssembler {
         Some((whole.first, Cow::Owned(whole.bytes)))
     }
 
+    /// Takes back the buffer of a datagram that was read, to use it again.
+    pub fn reuse(&mut self, mut buffer: Vec<u8>) {
+        if buffer.capacity() > PIECE_BYTES as usize && self.spare.len() < FreshDatagrams::CAP {
+            buffer.clear();
+            self.spare.push(buffer);
+        }
+    }
+
     /// Discards datagrams that have waited too long, in the kernel's clock.
     pub fn advance(&mut self, now: u64) {
+        if now.saturating_sub(self.used) > KEPT_NANOSECONDS {
+            self.spare = Vec::new();
+        }
         let before = self.open.len();
         self.open
             .retain(|open| now.saturating_sub(open.first.time) < LIFETIME_NANOSECONDS);
@@ -89,10 +110,11 @@ impl PieceAssembler {
         self.given_up
     }
 
-    /// Returns the bytes of incomplete datagrams.
+    /// Returns the bytes of incomplete datagrams, and those kept for others.
     #[must_use]
     pub fn bytes(&self) -> usize {
-        self.open.iter().map(|open| open.bytes.len()).sum()
+        let open: usize = self.open.iter().map(|open| open.bytes.len()).sum();
+        open + self.spare.iter().map(Vec::capacity).sum::<usize>()
     }
 
     fn give_up(&mut self, index: Option<usize>) {
