@@ -12,7 +12,9 @@ use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot, TopicFacts, Transport};
 use ros2probe_wire::qos::Durability;
 
+use crate::agent_facts::Ability;
 use crate::latched::latched;
+use crate::snapshot_cell::State;
 
 const VOLATILE: &str = "VOLATILE";
 
@@ -38,6 +40,8 @@ pub struct PublishedTopic {
     pub subscribed: bool,
     /// Transport of most pairs, if none of them uses the network.
     pub other_transport: Option<String>,
+    /// Whether every message in shared memory is seen at present.
+    pub is_exact: bool,
     /// Publishers that send stored samples to late joiners.
     pub durable_publishers: Vec<DurablePublisher>,
     /// Messages counted so far; `None` if the topic is not measured.
@@ -86,6 +90,17 @@ impl GraphSnapshot {
     }
 }
 
+impl From<&State> for GraphSnapshot {
+    fn from(state: &State) -> Self {
+        let mut graph = Self::from(state.known());
+        let is_exact = state.agent.abilities.contains(&Ability::SharedMemoryExact);
+        for topic in &mut graph.topics {
+            topic.is_exact = is_exact;
+        }
+        graph
+    }
+}
+
 impl From<&Topic<'_>> for PublishedTopic {
     fn from(topic: &Topic<'_>) -> Self {
         let passages = topic.passages.iter();
@@ -99,6 +114,10 @@ impl From<&Topic<'_>> for PublishedTopic {
             message_types: printed(&topic.message_types),
             subscribed: !topic.subscriptions.is_empty(),
             other_transport: other_transport(passages).map(str::to_owned),
+            is_exact: topic
+                .passages
+                .iter()
+                .any(|each| each.view.as_deref() == Some("exact")),
             durable_publishers: durable_publishers
                 .map(|publisher| DurablePublisher {
                     guid: publisher.guid.clone(),
@@ -148,6 +167,7 @@ impl From<&TopicFacts> for PublishedTopic {
             message_types: printed(&facts.message_types),
             subscribed: !facts.subscriptions.is_empty(),
             other_transport: other_transport(passages).map(str::to_owned),
+            is_exact: false,
             durable_publishers: durable_publishers
                 .map(|publisher| DurablePublisher {
                     guid: publisher.guid.to_string(),

@@ -28,6 +28,7 @@ use ros2probe_bag::{
 };
 use ros2probe_model::facts::bounded::{Bounded, Sum};
 use ros2probe_model::facts::dispatch::{Offered, Sample};
+use ros2probe_model::report::snapshot::Transport;
 
 /// Interval of writes to the operating system, by the time of samples. A killed process loses at
 /// most this much.
@@ -208,6 +209,12 @@ impl<'a> Recorder<'a> {
             }
             let why = match &topic.other_transport {
                 _ if !topic.subscribed => NO_SUBSCRIBER.to_owned(),
+                // Nothing was sent.
+                Some(transport)
+                    if topic.is_exact && transport == Transport::SharedMemory.label() =>
+                {
+                    return None;
+                }
                 other_transport => other_transport.clone()?,
             };
             Some((topic.name.clone(), why))

@@ -222,7 +222,7 @@ impl Recordings {
         };
         let quota = self.quota(&directory);
         quota.check().map_err(|error| refusal(&name, error))?;
-        let before = GraphSnapshot::from(self.latest.state().known());
+        let before = GraphSnapshot::from(&*self.latest.state());
         let subscription = self.subscribe(&filter, wanted.domain_id, &name)?;
         let mut options = wanted.options;
         options.storage.chunk_bytes = options.storage.chunk_bytes.min(CHUNK_BYTES);
@@ -383,7 +383,7 @@ impl Recordings {
         let (latest, library) = (Arc::clone(&self.latest), Arc::clone(&self.library));
         let seen = Arc::clone(&self.latest);
         Sources {
-            graph: Box::new(move || GraphSnapshot::from(seen.state().known())),
+            graph: Box::new(move || GraphSnapshot::from(&*seen.state())),
             announced: Box::new(move |names| {
                 let state = latest.state();
                 let topics = state.known().topics.iter();

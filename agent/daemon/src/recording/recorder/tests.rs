@@ -251,6 +251,7 @@ fn unobserved_messages_are_counted_from_the_start_of_the_recording() {
         name: name.to_owned(),
         subscribed: name != "/alone",
         other_transport: other_transport.map(str::to_owned),
+        is_exact: name == "/map",
         messages,
         ..PublishedTopic::default()
     };
@@ -260,6 +261,8 @@ fn unobserved_messages_are_counted_from_the_start_of_the_recording() {
             topic(0, "/quiet", None, None),
             topic(0, "/a", Some("same_process"), None),
             topic(0, "/imu", Some("same_process"), None),
+            topic(0, "/map", Some("shared_memory"), None),
+            topic(0, "/tf", Some("shared_memory"), None),
             topic(7, "/imu", None, Some(others)),
             topic(7, "/odom", None, Some(0)),
             topic(8, "/imu", None, None),
@@ -277,9 +280,10 @@ fn unobserved_messages_are_counted_from_the_start_of_the_recording() {
     recorder.take(&sample("/a", 1)).unwrap();
     let report = recorder.finish(None).report;
     let why = |name: &str| report.unobserved.get(name).map(String::as_str);
-    assert_eq!(report.unobserved.len(), 2);
+    assert_eq!(report.unobserved.len(), 3, "nothing was sent on /map");
     assert_eq!(why("/alone"), Some(NO_SUBSCRIBER));
     assert_eq!(why("/imu"), Some("same_process"));
+    assert_eq!(why("/tf"), Some("shared_memory"));
     let unknown = report.unknown_writers;
     assert_eq!((unknown.writers, unknown.messages), (2, 4));
     let others = report.other_domains.iter();
