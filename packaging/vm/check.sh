@@ -109,9 +109,9 @@ six_topics() {
     # shellcheck disable=SC2086
     rp bag record -o bag6 $topics >record.log 2>&1 &
     recorder=$!
-    rp topic echo /six_64 >echo_64.log 2>&1 &
+    rp topic echo /six_64 sensor_msgs/msg/PointCloud2 --no-arr >echo_64.log 2>&1 &
     echoes=$!
-    rp topic echo /six_4000 >echo_4000.log 2>&1 &
+    rp topic echo /six_4000 sensor_msgs/msg/PointCloud2 --no-arr >echo_4000.log 2>&1 &
     echoes="$echoes $!"
     begun() { grep -q 'Recording' record.log; }
     wait_until 20 begun
