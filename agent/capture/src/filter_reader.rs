@@ -13,6 +13,7 @@ use ros2probe_wire::record::flag;
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Reason, Record, Timestamp};
 
+use super::border::observe;
 use super::filter::Filter;
 use super::piece_assembler::PieceAssembler;
 use super::reorder_buffer::{Next, ReorderBuffer, Segment};
@@ -240,7 +241,7 @@ fn deliver(
     for _ in 0..most {
         match order.next(clocks, until) {
             Some(Next::Kernel(record) | Next::Walked(record) | Next::Polled(record)) => {
-                observer.input(Input::Record(&record));
+                observe(observer, &record);
             }
             Some(Next::Segment(segment)) => read_segment(streams, &segment, observer),
             None => return true,

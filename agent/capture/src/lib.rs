@@ -27,6 +27,7 @@
 
 pub mod ahead;
 pub mod bell;
+pub mod border;
 pub mod bpf;
 pub mod breakpoints;
 pub mod cgroup;

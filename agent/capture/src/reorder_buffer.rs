@@ -22,8 +22,9 @@ use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Observer;
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{Body, flag};
-use ros2probe_wire::walk::Envelope;
+use ros2probe_wire::walk::{self, Envelope};
 
+use super::border::observe;
 use super::filter::Filter;
 use super::system::Clocks;
 use super::zenoh::Chunk;
@@ -53,8 +54,6 @@ pub struct ReorderBuffer {
     /// Tokens of captured datagrams that were not delivered, with the time in the kernel's clock.
     undelivered: Bounded<UndeliveredDatagrams, VecDeque<(u64, u32)>>,
     undelivered_tokens: HashSet<u32>,
-    /// Records of the datagram being walked, otherwise empty.
-    found: Vec<Record>,
     /// Time of the latest record of the kernel's ring, in the kernel's clock.
     recorded: u64,
 }
@@ -203,14 +202,17 @@ impl ReorderBuffer {
         complete: impl Fn(&mut Record),
         observer: &mut Observer,
     ) {
-        let mut found = self.announcements(envelope, payload, 0, observer);
-        for mut record in found.drain(..) {
+        observer.input(Input::Announcements {
+            envelope,
+            payload,
+            is_polled: false,
+        });
+        user_data(envelope, payload, |mut record| {
             complete(&mut record);
             if let Some(record) = self.walked(at, record) {
-                observer.input(Input::Record(&record));
+                observe(observer, &record);
             }
-        }
-        self.found = found;
+        });
     }
 
     /// As [`Self::datagram`], for a message that was polled in shared memory.
@@ -221,31 +223,17 @@ impl ReorderBuffer {
         payload: &[u8],
         observer: &mut Observer,
     ) {
-        let mut found = self.announcements(envelope, payload, flag::SHM, observer);
-        for record in found.drain(..) {
-            if let Some(record) = self.polled(at, record) {
-                observer.input(Input::Record(&record));
-            }
-        }
-        self.found = found;
-    }
-
-    /// Passes the announcements to the model, and returns the records of user data.
-    fn announcements(
-        &mut self,
-        envelope: &Envelope,
-        payload: &[u8],
-        flags: u16,
-        observer: &mut Observer,
-    ) -> Vec<Record> {
-        let mut found = std::mem::take(&mut self.found);
         observer.input(Input::Announcements {
             envelope,
             payload,
-            flags,
-            records: &mut found,
+            is_polled: true,
         });
-        found
+        user_data(envelope, payload, |mut record| {
+            record.flags |= flag::SHM;
+            if let Some(record) = self.polled(at, record) {
+                observe(observer, &record);
+            }
+        });
     }
 
     /// Returns the number of waiting records of the kernel's ring.
@@ -315,9 +303,6 @@ impl ReorderBuffer {
     }
 
     fn give_back(&mut self) {
-        if self.found.capacity() > KEPT {
-            self.found = Vec::new();
-        }
         for records in [&mut self.kernel, &mut self.socket_full] {
             if records.is_empty() && records.capacity() > KEPT {
                 *records = VecDeque::new();
@@ -341,6 +326,15 @@ impl ReorderBuffer {
             self.undelivered_tokens.remove(&token);
         }
     }
+}
+
+/// Passes each record of a datagram's user data to `show`.
+fn user_data(envelope: &Envelope, payload: &[u8], mut show: impl FnMut(Record)) {
+    walk::datagram(payload, envelope, None, |found| {
+        if !found.record.writer().entity.is_builtin() {
+            show(found.record);
+        }
+    });
 }
 
 #[cfg(test)]

@@ -14,6 +14,7 @@ use ros2probe_wire::record::Body;
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Reason, Record, Timestamp, WireError};
 
+use super::border::observe;
 use super::filter::{Filter, FilterError, FilterSettings, ports};
 use super::interfaces::{Change, Interface, Interfaces, InterfacesError, Selection};
 use super::reattach::{Identity, identity};
@@ -417,7 +418,7 @@ impl FrameAssembly {
             let record = match next {
                 Next::Kernel(record) => record,
                 Next::Walked(record) | Next::Polled(record) => {
-                    observer.input(Input::Record(&record));
+                    observe(observer, &record);
                     continue;
                 }
                 Next::Segment(segment) => {
@@ -564,7 +565,7 @@ fn decode_frame(
 /// Passes a complete item to the model.
 fn deliver_ready(ready: Ready, observer: &mut Observer) {
     match ready {
-        Ready::Record(record) => observer.input(Input::Record(&record)),
+        Ready::Record(record) => observe(observer, &record),
         Ready::Rest(rest) => decode_rest(&rest, observer),
     }
 }

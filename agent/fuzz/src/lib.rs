@@ -15,6 +15,7 @@ use ros2probe::ros2::bag::{self, Sort};
 use ros2probe_attach::library;
 use ros2probe_bag::info::Bag;
 use ros2probe_bag::reindex::{Found, reindex};
+use ros2probe_capture::border::observe;
 use ros2probe_capture::pcap::PcapReader;
 use ros2probe_capture::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe_capture::ring::block::Frames;
@@ -484,24 +485,27 @@ fn brought(observer: &mut Observer, kind: u8, now: u64, content: &[u8]) {
             length: u32::from(kind) * 8,
         }),
         4 => {
-            let mut records = Vec::new();
             observer.input(Input::Announcements {
                 envelope: &envelope,
                 payload: content,
-                flags: 0,
-                records: &mut records,
+                is_polled: kind & 16 != 0,
             });
-            for record in &records {
-                observer.input(Input::Record(record));
-            }
+            walk::datagram(content, &envelope, None, |found| {
+                if !found.record.writer().entity.is_builtin() {
+                    observe(observer, &found.record);
+                }
+            });
         }
         // Records as the kernel programs write them, for any traffic.
         _ => {
             if let Ok((record, _)) = Record::read_from_prefix(content) {
-                observer.input(Input::Record(&Record {
-                    time: now,
-                    ..record
-                }));
+                observe(
+                    observer,
+                    &Record {
+                        time: now,
+                        ..record
+                    },
+                );
             }
         }
     }

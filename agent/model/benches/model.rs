@@ -7,6 +7,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use criterion::{BatchSize, Criterion, Throughput, criterion_group, criterion_main};
+use ros2probe_capture::border::observe;
 use ros2probe_capture::frame_decoder::FrameDecoder;
 use ros2probe_capture::pcap::PcapReader;
 use ros2probe_capture::reassembly::Limits;
@@ -99,7 +100,7 @@ fn samples(criterion: &mut Criterion) {
                 source_timestamp: 1_795_143_000 << 32,
                 ..Record::default()
             };
-            world.input(Input::Record(black_box(&record)));
+            observe(&mut world, black_box(&record));
         });
     });
     let mut world = observer(100);
@@ -119,7 +120,7 @@ fn samples(criterion: &mut Criterion) {
                 ..Record::default()
             };
             fragment += 1;
-            world.input(Input::Record(black_box(&record)));
+            observe(&mut world, black_box(&record));
         });
     });
     group.finish();
@@ -160,7 +161,7 @@ fn deliveries(criterion: &mut Criterion) {
                 let (number, socket) = (count / 4 + 1, count % 4 + 1);
                 let record = at(number, socket);
                 if (number + socket) % lost != 0 {
-                    world.input(Input::Record(black_box(&record)));
+                    observe(&mut world, black_box(&record));
                 }
                 if count % 4000 == 0 {
                     world.input(Input::Time(Timestamp(record.time)));
@@ -178,7 +179,7 @@ fn deliveries(criterion: &mut Criterion) {
             if leaves {
                 record.flags |= flag::OUTGOING;
             }
-            world.input(Input::Record(black_box(&record)));
+            observe(&mut world, black_box(&record));
         });
     });
     group.finish();

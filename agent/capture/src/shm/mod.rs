@@ -37,6 +37,7 @@ use self::directories::{Name, ShmDirectories, ShmDirectoryId};
 use self::inbox::{Inbox, Item};
 use self::poll_interval::{Budget, Need, PollInterval};
 use self::tap::{Counters, Tap};
+use super::border::observe;
 use super::reorder_buffer::ReorderBuffer;
 use super::system::{Clocks, DirectoryWatch, calendar, monotonic, run_first, thread_cpu, wait};
 use crate::threads::{Progress, Spawn, Task};
@@ -159,7 +160,7 @@ impl SharedMemory {
                         None => Some(record),
                     };
                     if let Some(record) = record {
-                        observer.input(Input::Record(&record));
+                        observe(observer, &record);
                     }
                 }
                 Item::Message { time, port, bytes } => {

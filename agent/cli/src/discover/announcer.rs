@@ -4,9 +4,9 @@ use ros2probe_wire::SequenceNumber;
 use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
 
+use ros2probe_model::facts::observation::Gap;
 use ros2probe_wire::EntityId;
 use ros2probe_wire::discovery::Role;
-use ros2probe_wire::record::Gap;
 
 use crate::tables::ReceivedAnnouncements;
 use ros2probe_model::facts::bounded::Bounded;
@@ -72,8 +72,8 @@ impl Announcer {
     }
 
     /// Handles a GAP: these samples will never arrive.
-    pub(super) fn skip(&mut self, gap: Gap<'_>) {
-        let (irrelevant, list) = (gap.start()..gap.list().base, gap.list());
+    pub(super) fn skip(&mut self, gap: &Gap) {
+        let (irrelevant, list) = (gap.start..gap.list.base, gap.list);
         let listed: BTreeSet<SequenceNumber> = list.iter().collect();
         let skipped: Vec<SequenceNumber> = self
             .missing()

@@ -12,7 +12,6 @@ use std::time::Duration;
 
 use ros2probe_wire::discovery::{self, Discovery, EndpointAnnouncement, Role};
 use ros2probe_wire::entities::{NodeEntities, ParticipantEntities};
-use ros2probe_wire::record::{Body, Sample};
 use ros2probe_wire::rtps::{InlineQos, Payload, VendorId};
 use ros2probe_wire::walk::{self, Envelope, Found};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
@@ -24,6 +23,8 @@ use super::message::{
 };
 use crate::tables::{DiscoveredEndpoints, PartialAnnouncements, UserWriters};
 use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::facts::observation::{Content, Observation, Sample};
+use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::graph::discovery_fragments::DiscoveryFragments;
 
 /// Most packets sent to one participant, including the goodbye.
@@ -262,13 +263,13 @@ impl Session {
     }
 
     fn receive(&mut self, now: Timestamp, found: &Found<'_>, vendor: VendorId) {
-        let record = &found.record;
-        let entity = record.writer().entity;
+        let observation = Observation::of(&found.record, WallClock::default());
+        let entity = observation.head().writer.entity;
         let announcers = [&mut self.publications, &mut self.subscriptions];
         let announcer = announcers.into_iter().find(|it| it.writer == entity);
-        match record.body() {
-            Body::Heartbeat(heartbeat) => {
-                let range = heartbeat.first()..=heartbeat.last();
+        match &observation {
+            Observation::Heartbeat(heartbeat) => {
+                let range = heartbeat.first..=heartbeat.last;
                 if let Some(announcer) = announcer {
                     announcer.available = Some(range);
                     self.heard.get_or_insert(now);
@@ -276,15 +277,15 @@ impl Session {
                     self.user_writers.insert(entity, range);
                 }
             }
-            Body::Gap(gap) => {
+            Observation::Gap(gap) => {
                 if let Some(announcer) = announcer {
                     announcer.skip(gap);
                 } else if Some(entity) == self.nodes_writer() {
                     self.nodes = Nodes::Missing;
                 }
             }
-            Body::Sample(sample) => {
-                let number = sample.sequence_number();
+            Observation::Sample(sample) => {
+                let number = sample.sequence_number;
                 let came = match &announcer {
                     Some(announcer) => announcer.received.contains(&number),
                     None => matches!(self.nodes, Nodes::Listed(_)),
@@ -311,21 +312,22 @@ impl Session {
         &mut self,
         now: Timestamp,
         found: &Found<'a>,
-        sample: Sample<'_>,
+        sample: &Sample,
         vendor: VendorId,
     ) -> Option<(SamplePayload<'a>, InlineQos)> {
-        let Sample::DataFrag(fragments) = sample else {
+        let Content::DataFrag(fragments) = sample.content else {
             let qos = found.inline_qos(vendor).ok()?;
             return Some((SamplePayload::Borrowed(found.payload()), qos));
         };
-        let key = (found.record.writer().entity, sample.sequence_number());
-        let Some(bytes) = self.discovery_fragments.put(fragments, found.payload) else {
+        let key = (sample.head.writer.entity, sample.sequence_number);
+        let fragmented = &mut self.discovery_fragments;
+        let Some(bytes) = fragmented.put(sample, fragments, found.payload) else {
             self.partial.insert(key, now);
             return None;
         };
         self.partial.remove(&key);
         let qos = InlineQos {
-            status_info: sample.status_info(),
+            status_info: sample.status_info,
             ..InlineQos::default()
         };
         Some((SamplePayload::Joined(bytes), qos))

@@ -9,6 +9,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use crate::rp;
+use ros2probe_capture::border::observe;
 use ros2probe_daemon::agent_facts::{AgentFacts, SourceKind};
 use ros2probe_daemon::config::{Watch, Watchlist};
 use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
@@ -176,16 +177,19 @@ fn acknowledging_readers_beyond_the_page_s_cap_are_counted_as_not_shown() {
         let reader = Guid::new(prefix(1 + number), entity(1, 4));
         world.endpoint(reader, 1, "rt/known", STRING);
         for writer in writers {
-            world.observer.input(Input::Record(&Record {
-                kind: kind::ACKNACK,
-                reader: guid_words(reader),
-                writer: guid_words(writer),
-                flags: flag::HOST | flag::OUTGOING,
-                socket: number.into(),
-                sequence_number: 2,
-                time: world.now,
-                ..Record::default()
-            }));
+            observe(
+                &mut world.observer,
+                &Record {
+                    kind: kind::ACKNACK,
+                    reader: guid_words(reader),
+                    writer: guid_words(writer),
+                    flags: flag::HOST | flag::OUTGOING,
+                    socket: number.into(),
+                    sequence_number: 2,
+                    time: world.now,
+                    ..Record::default()
+                },
+            );
         }
     }
     world.wait(1000);

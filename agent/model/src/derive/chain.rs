@@ -24,8 +24,7 @@ pub mod trace;
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
-use ros2probe_wire::record::{Sample, flag};
-use ros2probe_wire::{DomainId, Guid, GuidPrefix, Record, Timestamp};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix, Timestamp};
 
 use crate::derive::trace::share::Share;
 use crate::facts::bounded::Bounded;
@@ -33,10 +32,11 @@ use crate::facts::bounded::TableFacts;
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::DdsName;
+use crate::facts::observation::Sample;
 use crate::facts::tables::ChainOwners;
 use crate::facts::wall_clock::WallClock;
 use crate::graph::discovery::Discovery;
-use crate::measure::profiler::{Profiler, UNDELIVERED};
+use crate::measure::profiler::Profiler;
 use crate::measure::topic::{Topic, Topics};
 use crate::measure::writer::Counted;
 use causality::{CausalPublication, Causality, Origin};
@@ -141,15 +141,16 @@ impl Chains {
     /// owns the socket.
     pub fn seen(
         &mut self,
-        record: &Record,
-        sample: Sample<'_>,
+        sample: &Sample,
+        clock: WallClock,
         owner: impl FnOnce() -> Option<GuidPrefix>,
     ) {
-        const PLACE: u16 = flag::HOST | flag::OUTGOING | flag::SHM | UNDELIVERED;
-        if record.flags & PLACE != flag::HOST || !sample.is_end() {
+        let head = &sample.head;
+        let is_arrival = head.is_at_socket() && !head.is_sent() && sample.is_delivered();
+        if !is_arrival || !sample.is_end() {
             return;
         }
-        let writer = record.writer();
+        let writer = head.writer;
         if self
             .graph
             .outputs
@@ -162,7 +163,7 @@ impl Chains {
             self.owners.refuse();
             self.owners.clear();
         }
-        let owner = match record.socket {
+        let owner = match head.socket {
             0 => owner(),
             socket => {
                 let known = self.owners.get_or_insert_with(socket, owner);
@@ -170,9 +171,9 @@ impl Chains {
             }
         };
         if let Some(owner) = owner {
-            let at = Timestamp(record.time);
+            let at = clock.wall_time(head.at);
             self.messages
-                .arrived((writer, sample.sequence_number()), owner, at);
+                .arrived((writer, sample.sequence_number), owner, at);
         }
     }
 

@@ -20,10 +20,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_wire::names::{ActionPart, RosName};
-use ros2probe_wire::record::{Sample, flag};
 use ros2probe_wire::rtps::{RequestHeader, VendorId};
 use ros2probe_wire::walk::Found;
-use ros2probe_wire::{DomainId, Guid, GuidPrefix, Record, SequenceNumber, WireError};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix, SequenceNumber, WireError};
 
 use self::facts::{ActionFacts, ServiceFacts};
 use crate::facts::bounded::{Bounded, Counted, Sum, TableFacts};
@@ -31,9 +30,9 @@ use crate::facts::diagnosis::TopicKey;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::TopicName;
 use crate::facts::naming::Naming;
+use crate::facts::observation::{Head, Sample};
 use crate::facts::tables::{CallIdentities, OpenCalls, ServiceFigures, ServiceWriters};
 use crate::facts::topic_kind::TopicKind;
-use crate::measure::profiler::UNDELIVERED;
 use action::Action;
 use service::{CallId, Position, Service, Sighting};
 
@@ -174,11 +173,12 @@ impl Services {
     pub fn identify(
         &mut self,
         found: &Found<'_>,
-        sample: Sample<'_>,
+        sample: &Sample,
         vendor: VendorId,
-        at: ModelTime,
     ) -> Result<bool, WireError> {
-        let guid = found.record.writer();
+        let Head {
+            writer: guid, at, ..
+        } = sample.head;
         let Some(half) = self.writers.get(&guid).map(|writer| writer.half) else {
             return Ok(false);
         };
@@ -189,7 +189,7 @@ impl Services {
             && let Some(identity) = identity(half, found, sample, vendor)?
         {
             self.identities
-                .put((guid, sample.sequence_number()), identity);
+                .put((guid, sample.sequence_number), identity);
         }
         Ok(false)
     }
@@ -230,17 +230,12 @@ impl Services {
         true
     }
 
-    /// Records a copy of a request or reply, seen at `at`; `receiver` determines which participant
-    /// receives it.
-    pub fn seen(
-        &mut self,
-        (record, at): (&Record, ModelTime),
-        sample: Sample<'_>,
-        receiver: impl FnOnce() -> Option<GuidPrefix>,
-    ) {
-        let guid = record.writer();
-        let message = (guid, sample.sequence_number());
-        if record.flags & (flag::SHM | flag::EXACT) == flag::SHM {
+    /// Records a copy of a request or reply; `receiver` determines which participant receives it.
+    pub fn seen(&mut self, sample: &Sample, receiver: impl FnOnce() -> Option<GuidPrefix>) {
+        let head = &sample.head;
+        let guid = head.writer;
+        let message = (guid, sample.sequence_number);
+        if head.is_polled() {
             return;
         }
         let Some(writer) = self.writers.get(&guid) else {
@@ -250,19 +245,19 @@ impl Services {
             return;
         };
         let service = Arc::clone(&writer.service);
-        let position = position(record);
+        let position = position(sample);
         let mut sighting = Sighting {
-            at,
-            socket: record.socket,
+            at: head.at,
+            socket: head.socket,
             position,
             receiver: None,
         };
         match writer.half {
             Half::Requests => {
                 // A fragmented request begins with its first fragment.
-                sighting.at = at.began(record);
+                sighting.at = head.began();
                 self.requested(&service, guid, identity, sighting);
-                if record.flags & flag::EXACT != 0
+                if head.is_exact()
                     && let Some(service) = self.services.get_mut(&service.key)
                 {
                     service.is_exact = true;
@@ -409,7 +404,7 @@ impl Services {
         name: &ServiceName,
         writer: Guid,
         identity: Identity,
-        sample: Sample<'_>,
+        sample: &Sample,
         sighting: Sighting,
     ) {
         let Some(service) = self.services.get_mut(&name.key) else {
@@ -503,10 +498,10 @@ impl Identities {
 fn identity(
     half: Half,
     found: &Found<'_>,
-    sample: Sample<'_>,
+    sample: &Sample,
     vendor: VendorId,
 ) -> Result<Option<Identity>, WireError> {
-    let number = sample.sequence_number();
+    let number = sample.sequence_number;
     let (call, body) = if vendor == VendorId::CYCLONE {
         if !sample.is_start() {
             return Ok(None);
@@ -527,7 +522,7 @@ fn identity(
                 number,
             },
             (Half::Requests, _) if sample.is_start() => CallId {
-                client: found.record.writer().to_bytes(),
+                client: sample.head.writer.to_bytes(),
                 number,
             },
             (Half::Replies, Some(related)) => CallId {
@@ -560,13 +555,13 @@ impl Identity {
 /// Bytes of the encapsulation header (RTPS 2.5, 10.2).
 const ENCAPSULATION: usize = 4;
 
-/// Returns where the record was seen.
-const fn position(record: &Record) -> Position {
-    if record.flags & UNDELIVERED != 0 {
+/// Returns where the sample was seen.
+fn position(sample: &Sample) -> Position {
+    if !sample.is_delivered() {
         Position::Dropped
-    } else if record.flags & flag::HOST == 0 {
+    } else if !sample.head.is_at_socket() {
         Position::Elsewhere
-    } else if record.flags & flag::OUTGOING != 0 {
+    } else if sample.head.is_sent() {
         Position::Leaving
     } else {
         Position::Arriving

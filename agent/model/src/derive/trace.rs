@@ -11,15 +11,15 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_wire::record::{AckNack, Body, Sample, flag};
 use ros2probe_wire::rtps::StatusInfo;
-use ros2probe_wire::{DomainId, Guid, Record, RtpsTime, SequenceNumber, Timestamp};
+use ros2probe_wire::{DomainId, Guid, RtpsTime, SequenceNumber, Timestamp};
 
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, Counted, Sum};
 use crate::facts::identity::Identity;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{TopicName, TypeName};
+use crate::facts::observation::{AckNack, Content, Head, Observation, Path, Sample};
 use crate::facts::route::Destination;
 use crate::facts::tables::{
     FinishedMessages, FinishedSpans, MessagesUnderWay, OpenMessages, OpenSpans, SettledReaders,
@@ -33,11 +33,9 @@ use share::Share;
 const BITMAP_BYTES: usize = 1 << 18;
 /// Acknowledgements after this time have no span.
 const ACKNACK_TIMEOUT: Duration = Duration::from_secs(10);
-/// An arriving message is not a copy of one sent from here if no record shows that within this
+/// An arriving message is not a copy of one sent from here if no observation shows that within this
 /// time.
 const LOCAL_COPY_DELAY: Duration = Duration::from_millis(500);
-/// Index of the loopback interface in every network namespace.
-pub(crate) const LOOPBACK: u32 = 1;
 
 /// The stage that a span covers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -204,17 +202,16 @@ impl Tracer {
         }
     }
 
-    /// Processes a record, seen at `at`. `is_local` states whether the writer is known to run on this host, so
-    /// that no message of it arrives from another one. `about` returns the description and traced share of a new writer, or
-    /// `None` if they are not known yet.
-    pub fn record(
+    /// Processes an observation. `is_local` states whether the writer is known to run on this host,
+    /// so that no message of it arrives from another one. `about` returns the description and
+    /// traced share of a new writer, or `None` if they are not known yet.
+    pub fn observe(
         &mut self,
-        (record, at): (&Record, ModelTime),
+        observation: &Observation,
         is_local: bool,
         about: impl FnOnce() -> Option<(WriterDescription, Option<Share>)>,
     ) {
-        const UNDELIVERED: u16 = flag::SOCKET_FULL | flag::NOT_REASSEMBLED;
-        let writer = record.writer();
+        let writer = observation.head().writer;
         if !self.writers.contains_key(&writer) {
             let Some((description, share)) = about() else {
                 return;
@@ -228,17 +225,17 @@ impl Tracer {
         let Some(Some(traced)) = self.writers.get_mut(&writer) else {
             return;
         };
-        match record.body() {
-            Body::AckNack(acknack) => traced.acknowledged(acknack, at, &mut self.shared),
-            Body::Sample(sample)
-                if record.flags & UNDELIVERED == 0 && sample.status_info() == StatusInfo::ALIVE =>
+        match observation {
+            Observation::AckNack(acknack) => traced.acknowledged(acknack, &mut self.shared),
+            Observation::Sample(sample)
+                if sample.is_delivered() && sample.status_info == StatusInfo::ALIVE =>
             {
                 let place = match self.directed {
-                    true => Place::of(record, is_local),
+                    true => Place::of(&sample.head, is_local),
                     false => Some(Place::Departure),
                 };
                 if let Some(place) = place {
-                    traced.sample((sample, at), place, &mut self.shared);
+                    traced.sample(sample, place, &mut self.shared);
                 }
             }
             _ => {}
@@ -319,8 +316,8 @@ impl WriterTrace {
         }
     }
 
-    fn sample(&mut self, (sample, at): (Sample<'_>, ModelTime), place: Place, shared: &mut Shared) {
-        let (record, number) = (sample.record(), sample.sequence_number());
+    fn sample(&mut self, sample: &Sample, place: Place, shared: &mut Shared) {
+        let (at, number) = (sample.head.at, sample.sequence_number);
         let trace_id = numbered(self.identity, number);
         if !self.share.takes(trace_id) {
             return;
@@ -336,17 +333,17 @@ impl WriterTrace {
         let known = |message: &Message| message.sequence_number == number;
         let index = match self.under_way.iter().position(known) {
             // The wire shows its fragments.
-            Some(_) if record.flags & flag::SHM != 0 => return,
+            Some(_) if sample.head.is_in_shared_memory() => return,
             Some(index) => index,
             None => match self.begin(self.message(sample, trace_id), shared) {
                 Some(index) => index,
                 None => return,
             },
         };
-        let (begin, source) = match sample {
-            Sample::Data(_) => (at.began(record), sample.source_timestamp()),
-            Sample::DataFrag(fragments) => {
-                match self.samples.fragment(fragments, at, &mut shared.budget) {
+        let (begin, source) = match sample.content {
+            Content::Data { .. } => (sample.head.began(), sample.source_timestamp),
+            Content::DataFrag(fragments) => {
+                match self.samples.fragment(sample, fragments, &mut shared.budget) {
                     Progress::Partial | Progress::Duplicate => return,
                     Progress::Complete(facts) => (facts.began, facts.source),
                     Progress::Rejected | Progress::TooMany => {
@@ -439,25 +436,24 @@ impl WriterTrace {
         self.under_way.len().checked_sub(1)
     }
 
-    fn message(&self, sample: Sample<'_>, trace_id: u128) -> Message {
-        let record = sample.record();
+    fn message(&self, sample: &Sample, trace_id: u128) -> Message {
         Message {
-            writer: record.writer(),
-            sequence_number: sample.sequence_number(),
+            writer: sample.head.writer,
+            sequence_number: sample.sequence_number,
             trace_id,
             description: Arc::clone(&self.description),
-            source: sample.source_timestamp(),
+            source: sample.source_timestamp,
             size: sample.size(),
-            fragments: match sample {
-                Sample::Data(_) => 1,
-                Sample::DataFrag(fragments) => fragments.total(),
+            fragments: match sample.content {
+                Content::Data { .. } => 1,
+                Content::DataFrag(fragments) => fragments.total(),
             },
-            destination: Destination::of(record),
+            destination: sample.head.destination,
         }
     }
 
-    fn acknowledged(&mut self, acknack: AckNack<'_>, at: ModelTime, shared: &mut Shared) {
-        let reader = acknack.record().reader();
+    fn acknowledged(&mut self, acknack: &AckNack, shared: &mut Shared) {
+        let Head { at, reader, .. } = acknack.head;
         let covered = |waiting: &&mut Unacknowledged| {
             waiting.message.sequence_number < acknack.base()
                 && !waiting.readers.contains(&reader)
@@ -484,12 +480,10 @@ impl WriterTrace {
 
 impl Place {
     /// Returns the place; `None` for a message that a router of this host passes on.
-    const fn of(record: &Record, is_local: bool) -> Option<Self> {
-        let on_wire = record.flags & flag::HOST == 0;
-        let leaves = record.flags & (flag::OUTGOING | flag::SHM) != 0
-            || on_wire && record.interface == LOOPBACK;
-        let by_router = record.flags & flag::STREAM != 0 && !on_wire && !is_local;
-        match (leaves, is_local) {
+    fn of(head: &Head, is_local: bool) -> Option<Self> {
+        let is_stream = matches!(head.path, Path::Stream { .. });
+        let by_router = is_stream && head.is_at_socket() && !is_local;
+        match (head.leaves(), is_local) {
             (true, _) if by_router => None,
             (true, _) => Some(Self::Departure),
             (false, true) => Some(Self::LocalCopy),

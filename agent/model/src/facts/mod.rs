@@ -18,6 +18,7 @@ pub mod measurement;
 pub mod model_time;
 pub mod names;
 pub mod naming;
+pub mod observation;
 pub mod rate;
 pub mod route;
 pub mod selection;

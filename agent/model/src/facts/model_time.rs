@@ -3,7 +3,6 @@
 use std::ops::{Add, Sub};
 use std::time::Duration;
 
-use ros2probe_wire::Record;
 use ros2probe_wire::time::{SECOND, nanoseconds};
 
 /// Nanoseconds of model time, which steps of the wall clock do not affect. Only
@@ -71,13 +70,6 @@ impl ModelTime {
             false => begin + interval,
         }
     }
-
-    /// Returns the time of the first datagram of a record whose last datagram has this time.
-    #[inline]
-    #[must_use]
-    pub fn began(self, record: &Record) -> Self {
-        self - Duration::from_nanos(record.elapsed.into())
-    }
 }
 
 impl Add<Duration> for ModelTime {
@@ -125,15 +117,5 @@ mod tests {
         }
         assert_eq!(at(7).round_up(Duration::ZERO), at(7));
         assert_eq!(ModelTime::MAX.round_up(second), ModelTime::MAX);
-    }
-
-    #[test]
-    fn a_record_of_fragments_begins_with_its_first_datagram() {
-        let record = Record {
-            elapsed: 30,
-            ..Record::default()
-        };
-        assert_eq!(ModelTime(50).began(&record), ModelTime(20));
-        assert_eq!(ModelTime(10).began(&record), ModelTime::ZERO);
     }
 }

@@ -1,9 +1,8 @@
-//! The route of a record: direction, receiving socket and destination address.
+//! The route of a datagram: direction, receiving socket and destination address.
 
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 
-use ros2probe_wire::record::flag;
-use ros2probe_wire::{GuidPrefix, Record};
+use ros2probe_wire::GuidPrefix;
 
 /// The direction of a delivery.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
@@ -35,20 +34,6 @@ pub struct Destination {
 }
 
 impl Destination {
-    /// Returns the destination of the record's datagram.
-    #[must_use]
-    pub fn of(record: &Record) -> Self {
-        let [a, b, c, d] = record.destination.map(u32::to_ne_bytes);
-        let mut address = [0; 16];
-        for (into, from) in address.iter_mut().zip([a, b, c, d].as_flattened()) {
-            *into = *from;
-        }
-        Self {
-            address,
-            port: record.destination_port,
-        }
-    }
-
     /// Returns whether its datagrams may reach several receivers.
     #[must_use]
     pub fn is_multicast(&self) -> bool {
@@ -85,30 +70,6 @@ pub struct Route {
     pub socket: u64,
     /// Destination of the samples.
     pub destination: Destination,
-}
-
-impl Route {
-    /// Returns the route of the record's datagram.
-    #[must_use]
-    pub fn of(record: &Record) -> Self {
-        let destination = Destination::of(record);
-        if record.flags & flag::OUTGOING != 0 {
-            return Self {
-                direction: Direction::Sent,
-                socket: 0,
-                destination,
-            };
-        }
-        Self {
-            direction: Direction::Received,
-            socket: if record.flags & flag::HOST != 0 {
-                record.socket
-            } else {
-                0
-            },
-            destination,
-        }
-    }
 }
 
 impl Route {
@@ -155,34 +116,5 @@ mod tests {
             !destination("10.0.0.2:7411").is_multicast()
                 && !destination("[fe80::1]:1").is_multicast()
         );
-    }
-
-    #[test]
-    fn a_socket_distinguishes_paths_only_where_it_receives() {
-        let record = Record {
-            destination: [
-                0,
-                0,
-                u32::from_be(0xffff),
-                u32::from_ne_bytes([10, 0, 0, 2]),
-            ],
-            destination_port: 7411,
-            socket: 77,
-            flags: flag::HOST,
-            ..Record::default()
-        };
-        let received = Route::of(&record);
-        assert_eq!(
-            (received.direction, received.socket),
-            (Direction::Received, 77)
-        );
-        assert_eq!(received.destination, destination("10.0.0.2:7411"));
-        let sent = Route::of(&Record {
-            flags: flag::HOST | flag::OUTGOING,
-            ..record
-        });
-        assert_eq!((sent.direction, sent.socket), (Direction::Sent, 0));
-        let on_the_wire = Route::of(&Record { flags: 0, ..record });
-        assert_eq!(on_the_wire.socket, 0);
     }
 }

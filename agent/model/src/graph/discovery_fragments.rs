@@ -7,8 +7,8 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use crate::facts::bounded::{Bounded, Sum};
+use crate::facts::observation::{self, DataFrag};
 use crate::facts::tables::{DiscoveryBytes, DiscoverySamples};
-use ros2probe_wire::record::DataFrag;
 use ros2probe_wire::{Guid, SequenceNumber};
 
 /// Largest sample in bytes, far above any discovery data.
@@ -37,8 +37,8 @@ struct Sample {
 impl DiscoveryFragments {
     /// Returns whether fragments of this sample are kept.
     #[must_use]
-    pub fn holds(&self, fragments: DataFrag<'_>) -> bool {
-        self.place(fragments).is_some()
+    pub fn holds(&self, sample: &observation::Sample) -> bool {
+        self.place(sample).is_some()
     }
 
     /// Returns the missing fragments of a sample that has some, counted from 1.
@@ -58,20 +58,25 @@ impl DiscoveryFragments {
     }
 
     /// Adds the fragments of a DATA_FRAG. Returns the payload once it is complete.
-    pub fn put(&mut self, fragments: DataFrag<'_>, bytes: &[u8]) -> Option<Vec<u8>> {
-        let (size, fragment_size) = (fragments.sample_size(), fragments.fragment_size());
-        if size > MAX_SAMPLE || size == 0 || fragment_size == 0 || fragments.starting() == 0 {
+    pub fn put(
+        &mut self,
+        sample: &observation::Sample,
+        fragments: DataFrag,
+        bytes: &[u8],
+    ) -> Option<Vec<u8>> {
+        let (size, fragment_size) = (fragments.sample_size, fragments.fragment_size);
+        if size > MAX_SAMPLE || size == 0 || fragment_size == 0 || fragments.starting == 0 {
             return None;
         }
-        let index = match self.place(fragments) {
+        let index = match self.place(sample) {
             Some(index) => index,
-            None => self.begin(fragments),
+            None => self.begin(sample, fragments),
         };
         let sample = self.samples.get_mut(index)?;
         let total = fragments.total();
         if sample.size == size && sample.fragment_size == fragment_size {
             let chunks = bytes.chunks(usize::try_from(fragment_size).ok()?);
-            for (number, chunk) in (fragments.starting()..=total).zip(chunks) {
+            for (number, chunk) in (fragments.starting..=total).zip(chunks) {
                 let last = if number == total {
                     size - (total - 1) * fragment_size
                 } else {
@@ -101,12 +106,12 @@ impl DiscoveryFragments {
     }
 
     /// Adds a sample without fragments and returns its index.
-    fn begin(&mut self, fragments: DataFrag<'_>) -> usize {
+    fn begin(&mut self, sample: &observation::Sample, fragments: DataFrag) -> usize {
         let evicted = self.samples.push_back(Sample {
-            writer: fragments.record().writer(),
-            number: fragments.sequence_number(),
-            size: fragments.sample_size(),
-            fragment_size: fragments.fragment_size(),
+            writer: sample.head.writer,
+            number: sample.sequence_number,
+            size: fragments.sample_size,
+            fragment_size: fragments.fragment_size,
             fragments: BTreeMap::new(),
             bytes: OVERHEAD,
         });
@@ -122,9 +127,8 @@ impl DiscoveryFragments {
         self.evictions += 1;
     }
 
-    fn place(&self, fragments: DataFrag<'_>) -> Option<usize> {
-        let writer = fragments.record().writer();
-        let number = fragments.sequence_number();
+    fn place(&self, sample: &observation::Sample) -> Option<usize> {
+        let (writer, number) = (sample.head.writer, sample.sequence_number);
         self.samples
             .iter()
             .position(|each| each.writer == writer && each.number == number)
@@ -134,23 +138,18 @@ impl DiscoveryFragments {
 #[cfg(test)]
 mod tests {
     use ros2probe_wire::Record;
-    use ros2probe_wire::record::{Sample, kind};
+    use ros2probe_wire::record::kind;
 
     use super::*;
-
-    fn data_frag(record: &Record) -> DataFrag<'_> {
-        let Some(Sample::DataFrag(fragments)) = record.sample() else {
-            panic!("{record:?}")
-        };
-        fragments
-    }
+    use crate::facts::observation::tests::{fragments, sample};
 
     fn put(
         discovery_fragments: &mut DiscoveryFragments,
         record: &Record,
         bytes: &[u8],
     ) -> Option<Vec<u8>> {
-        discovery_fragments.put(data_frag(record), bytes)
+        let sample = sample(record);
+        discovery_fragments.put(&sample, fragments(&sample), bytes)
     }
 
     fn fragment(number: u64, start: u32, count: u32, size: u32) -> Record {
@@ -176,7 +175,7 @@ mod tests {
             ),
             None
         );
-        assert!(discovery_fragments.holds(data_frag(&fragment(1, 1, 1, 250))));
+        assert!(discovery_fragments.holds(&sample(&fragment(1, 1, 1, 250))));
         assert_eq!(
             put(
                 &mut discovery_fragments,

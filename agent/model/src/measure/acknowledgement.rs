@@ -6,12 +6,13 @@
 
 use std::collections::VecDeque;
 
-use ros2probe_wire::record::{AckNack, SequenceNumberSet, flag};
+use ros2probe_wire::record::SequenceNumberSet;
 use ros2probe_wire::{Guid, SequenceNumber};
 
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::NodeName;
+use crate::facts::observation::AckNack;
 use crate::facts::tables::{AcknowledgingReaders, SampleTimes};
 
 /// State of acknowledgement between a reliable reader and a writer.
@@ -71,8 +72,8 @@ impl Acknowledgements {
     }
 
     /// Records an ACKNACK.
-    pub fn acknack(&mut self, acknack: AckNack<'_>, now: ModelTime) {
-        let guid = acknack.record().reader();
+    pub fn acknack(&mut self, acknack: &AckNack) {
+        let guid = acknack.head.reader;
         let place = self.readers.binary_search_by_key(&guid, |each| each.guid);
         let index = match place {
             Ok(index) => index,
@@ -85,7 +86,7 @@ impl Acknowledgements {
             }
         };
         if let Some(reader) = self.readers.get_mut(index) {
-            reader.acknack(acknack, now);
+            reader.acknack(acknack);
         }
         self.trim();
     }
@@ -195,14 +196,13 @@ impl Reader {
         }
     }
 
-    fn acknack(&mut self, acknack: AckNack<'_>, now: ModelTime) {
-        let record = acknack.record();
-        let content = acknack.missing();
-        self.last_seen = self.last_seen.max(now);
+    fn acknack(&mut self, acknack: &AckNack) {
+        let content = acknack.missing;
+        self.last_seen = self.last_seen.max(acknack.head.at);
         self.base = acknack.base();
         self.missing = content.iter().count() as u64;
         // If both ends are on this host, the ACKNACK is seen leaving and then arriving.
-        let is_leaving = record.flags & flag::OUTGOING != 0;
+        let is_leaving = acknack.head.is_sent();
         if !is_leaving && self.leaving.take() == Some(content) {
             return;
         }
@@ -214,10 +214,12 @@ impl Reader {
 
 #[cfg(test)]
 mod tests {
-    use ros2probe_wire::record::{Body, guid_words, kind};
+    use ros2probe_wire::record::{flag, guid_words, kind};
     use ros2probe_wire::{EntityId, GuidPrefix, Record};
 
     use super::*;
+    use crate::facts::observation::Observation;
+    use crate::facts::observation::tests::observed;
 
     fn guid(number: u8) -> Guid {
         Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, number, 4]))
@@ -225,10 +227,10 @@ mod tests {
 
     /// Passes the ACKNACK of a record to [`Acknowledgements::acknack`].
     fn put(all: &mut Acknowledgements, record: &Record) {
-        let Body::AckNack(acknack) = record.body() else {
+        let Observation::AckNack(acknack) = observed(record) else {
             panic!("{record:?}")
         };
-        all.acknack(acknack, ModelTime::from_nanoseconds(record.time));
+        all.acknack(&acknack);
     }
 
     fn acknack(reader: u8, base: u64, bits: u32, bitmap: u32) -> Record {

@@ -10,9 +10,9 @@ use std::time::Duration;
 
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{Content, Sample};
 use crate::facts::tables::AssembledSamples;
 use bytes::Bytes;
-use ros2probe_wire::record::{Sample, flag};
 use ros2probe_wire::{Guid, SequenceNumber};
 
 /// Memory per sample, and per fragment that arrived early, in addition to its bytes.
@@ -70,12 +70,12 @@ impl Assembly {
         (self.bytes, self.limit, self.evictions)
     }
 
-    /// Adds the bytes of a DATA or DATA_FRAG that arrived at `now`. `other_bytes` bytes of the budget are used elsewhere.
-    pub fn put(&mut self, sample: Sample<'_>, now: ModelTime, payload: &[u8], other_bytes: usize) {
+    /// Adds the bytes of a DATA or DATA_FRAG. `other_bytes` bytes of the budget are used elsewhere.
+    pub fn put(&mut self, sample: &Sample, payload: &[u8], other_bytes: usize) {
         let Some((size, fragment_size)) = sizes(sample, payload) else {
             return;
         };
-        let key = (sample.record().writer(), sample.sequence_number());
+        let (now, key) = (sample.head.at, (sample.head.writer, sample.sequence_number));
         if !self.parts.contains_key(&key) {
             if self.parts.is_full() {
                 self.parts.refuse();
@@ -96,9 +96,9 @@ impl Assembly {
         }
         let before = part.bytes();
         part.touched = now;
-        let start = match sample {
-            Sample::Data(_) => 1,
-            Sample::DataFrag(fragments) => fragments.starting(),
+        let start = match sample.content {
+            Content::Data { .. } => 1,
+            Content::DataFrag(fragments) => fragments.starting,
         };
         part.put(start, payload);
         self.bytes = self.bytes + part.bytes() - before;
@@ -230,17 +230,16 @@ impl Part {
 }
 
 /// Returns the sizes of the sample and of its fragments, or `None` if the bytes cannot be used.
-fn sizes(sample: Sample<'_>, payload: &[u8]) -> Option<(usize, usize)> {
-    if sample.record().flags & flag::INLINE_QOS_UNREAD != 0 || !sample.is_message() {
-        // The start of the payload is unknown, or the sample is a disposal.
+fn sizes(sample: &Sample, payload: &[u8]) -> Option<(usize, usize)> {
+    if !sample.has_known_begin || !sample.is_message() {
         return None;
     }
-    match sample {
-        Sample::Data(_) => (!payload.is_empty()).then_some((payload.len(), payload.len())),
-        Sample::DataFrag(fragments) => {
-            let size = usize::try_from(fragments.sample_size()).ok()?;
-            let fragment_size = usize::try_from(fragments.fragment_size()).ok()?;
-            let is_possible = size > 0 && fragment_size > 0 && fragments.starting() > 0;
+    match sample.content {
+        Content::Data { .. } => (!payload.is_empty()).then_some((payload.len(), payload.len())),
+        Content::DataFrag(fragments) => {
+            let size = usize::try_from(fragments.sample_size).ok()?;
+            let fragment_size = usize::try_from(fragments.fragment_size).ok()?;
+            let is_possible = size > 0 && fragment_size > 0 && fragments.starting > 0;
             is_possible.then_some((size, fragment_size))
         }
     }
@@ -249,11 +248,12 @@ fn sizes(sample: Sample<'_>, payload: &[u8]) -> Option<(usize, usize)> {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
-    use ros2probe_wire::record::kind;
+    use ros2probe_wire::record::{flag, kind};
     use ros2probe_wire::rtps::SubmessageFlags;
     use ros2probe_wire::{EntityId, GuidPrefix, Record};
 
     use super::*;
+    use crate::facts::observation::tests::sample;
 
     fn writer(number: u8) -> Guid {
         Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, 1, 3]))
@@ -261,8 +261,7 @@ mod tests {
 
     /// Passes the sample of a record to [`Assembly::put`].
     fn put(assembly: &mut Assembly, record: &Record, payload: &[u8], other_bytes: usize) {
-        let now = ModelTime::from_nanoseconds(record.time);
-        assembly.put(record.sample().unwrap(), now, payload, other_bytes);
+        assembly.put(&sample(record), payload, other_bytes);
     }
 
     fn fragment(of: Guid, number: u64, start: u32, count: u32, size: u32, of_size: u32) -> Record {

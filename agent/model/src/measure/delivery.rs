@@ -14,8 +14,7 @@ mod withheld;
 use std::collections::{BTreeSet, VecDeque};
 use std::time::Duration;
 
-use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
-use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber};
+use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber};
 
 use crate::facts::bounded::Bounded;
 use crate::facts::journal::Journal;
@@ -23,6 +22,7 @@ use crate::facts::loss::{DeliveryLoss, LossCause};
 use crate::facts::loss_share::RecentLoss;
 use crate::facts::measurement::Delivered;
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{AckNack, Content, Gap, Heartbeat, Sample};
 use crate::facts::route::Direction;
 use crate::facts::route::{Receiver, Route};
 use crate::facts::tables::WithheldLosses;
@@ -47,10 +47,10 @@ const FIRST_MOMENTS: Duration = Duration::from_secs(5);
 /// A run of lost samples at least this long keeps its pending cause when two deliveries merge.
 const LONG_RUN: u64 = 256;
 
-/// State outside the delivery that a record changes.
+/// State outside the delivery that an observation changes.
 #[derive(Debug)]
 pub struct DeliveryContext<'a> {
-    /// Time of the record, or of the tick.
+    /// Time of the observation, or of the tick.
     pub now: ModelTime,
     /// Writer of the samples.
     pub writer: Guid,
@@ -164,7 +164,7 @@ impl Delivery {
         &self.tally
     }
 
-    /// Returns the times of the first and last record.
+    /// Returns the times of the first and last observation.
     #[must_use]
     pub const fn seen(&self) -> (ModelTime, ModelTime) {
         (self.first_seen, self.last_seen)
@@ -228,7 +228,7 @@ impl Delivery {
     /// Records a DATA or DATA_FRAG. Returns whether it is a duplicate, and the sample it completes.
     pub fn sample(
         &mut self,
-        sample: Sample<'_>,
+        sample: &Sample,
         context: &mut DeliveryContext<'_>,
     ) -> (bool, Option<CompleteSample>) {
         self.touch(context.now);
@@ -239,9 +239,9 @@ impl Delivery {
         let (mut again, mut whole) = (false, None);
         let parts = self
             .undelivered
-            .delivered(sample, context.now, &mut context.budget.evictions);
-        for part in parts.iter().filter_map(Record::sample) {
-            let (came_again, completed) = self.take(part, context);
+            .delivered(sample, &mut context.budget.evictions);
+        for part in parts {
+            let (came_again, completed) = self.take(&part, context);
             again |= came_again;
             whole = completed.or(whole);
         }
@@ -249,17 +249,16 @@ impl Delivery {
     }
 
     /// Records that the socket's buffer was full for this DATA or DATA_FRAG.
-    pub fn socket_full(&mut self, sample: Sample<'_>, context: &mut DeliveryContext<'_>) {
+    pub fn socket_full(&mut self, sample: &Sample, context: &mut DeliveryContext<'_>) {
         self.touch(context.now);
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
-        if self.undelivered.note(sample, context.now) {
+        if self.undelivered.note(sample) {
             context.budget.evictions += 1;
         }
-        let number = sample.sequence_number();
+        let number = sample.sequence_number;
         let is_tail = !sample.is_start() && number.0 > 1;
-        let now = context.now;
         let (reception, budget, mut accounting) = self.split(context);
-        let is_confirmed = reception.recognise(sample, now, budget, &mut |decision| {
+        let is_confirmed = reception.recognise(sample, budget, &mut |decision| {
             accounting.take(decision);
         });
         if !is_confirmed {
@@ -291,34 +290,32 @@ impl Delivery {
 
     /// Records a HEARTBEAT for this receiver. A delivery without samples begins with it. While no
     /// sample arrives and none is requested, the samples may use shared memory.
-    pub fn heartbeat(&mut self, heartbeat: Heartbeat<'_>, context: &mut DeliveryContext<'_>) {
+    pub fn heartbeat(&mut self, heartbeat: &Heartbeat, context: &mut DeliveryContext<'_>) {
         self.touch(context.now);
-        let end = heartbeat.last().next();
+        let end = heartbeat.last.next();
         self.reception.sequence_mut().begin(end);
         if !self.uses_network {
             return;
         }
         let sequence = self.reception.sequence();
         let before = (sequence.next(), sequence.last_advance());
-        let now = context.now;
         let (reception, budget, mut accounting) = self.split(context);
-        reception.heartbeat(heartbeat, now, budget, &mut |decision| {
+        reception.heartbeat(heartbeat, budget, &mut |decision| {
             accounting.take(decision);
         });
         self.excuse_unheard(before);
     }
 
     /// Records a GAP for this receiver.
-    pub fn gap(&mut self, gap: Gap<'_>, context: &mut DeliveryContext<'_>) {
+    pub fn gap(&mut self, gap: &Gap, context: &mut DeliveryContext<'_>) {
         self.touch(context.now);
-        let now = context.now;
         let (reception, budget, mut accounting) = self.split(context);
-        reception.gap(gap, now, budget, &mut |decision| accounting.take(decision));
+        reception.gap(gap, budget, &mut |decision| accounting.take(decision));
     }
 
     /// Records an ACKNACK in which a reader requests samples again.
-    pub fn requested(&mut self, acknack: AckNack<'_>) {
-        let missing = acknack.missing();
+    pub fn requested(&mut self, acknack: &AckNack) {
+        let missing = acknack.missing;
         let sequence = self.reception.sequence_mut();
         let first = sequence.first();
         self.uses_network |= sequence.started() && missing.iter().any(|number| number >= first);
@@ -405,22 +402,21 @@ impl Delivery {
 
     fn take(
         &mut self,
-        sample: Sample<'_>,
+        sample: &Sample,
         context: &mut DeliveryContext<'_>,
     ) -> (bool, Option<CompleteSample>) {
-        let (number, reliable) = (sample.sequence_number(), self.is_reliable(context));
+        let (number, reliable) = (sample.sequence_number, self.is_reliable(context));
         self.begin_anew(number, context);
         let sequence = self.reception.sequence();
         let is_sent = self.direction() == Direction::Sent;
-        let source = sample.source_timestamp().timestamp();
+        let source = sample.source_timestamp.timestamp();
         let is_late = self.misses(number) && number < sequence.settled();
         if !is_sent && is_late && !sequence.is_unconfirmed(number, source, REACH) {
             return self.late(sample, context);
         }
         let before = (sequence.next(), sequence.last_advance());
-        let now = context.now;
         let (reception, budget, mut accounting) = self.split(context);
-        let outcome = reception.sample(sample, now, reliable, budget, &mut |decision| {
+        let outcome = reception.sample(sample, reliable, budget, &mut |decision| {
             accounting.take(decision);
         });
         self.excuse_unheard(before);
@@ -474,11 +470,11 @@ impl Delivery {
     /// its cause was still pending.
     fn late(
         &mut self,
-        sample: Sample<'_>,
+        sample: &Sample,
         context: &mut DeliveryContext<'_>,
     ) -> (bool, Option<CompleteSample>) {
-        let number = sample.sequence_number();
-        let is_whole = matches!(sample, Sample::Data(_));
+        let number = sample.sequence_number;
+        let is_whole = matches!(sample.content, Content::Data { .. });
         if is_whole && self.loss_causes.resolve(number) {
             self.count(context, |tally| {
                 tally.pending = tally.pending.saturating_sub(1);

@@ -10,13 +10,15 @@ mod allowance;
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use ros2probe_wire::record::{self, Verdict};
-use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber, Timestamp};
+use ros2probe_wire::record::Verdict;
+use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use crate::facts::bounded::{Bounded, Counted, Sum, TableFacts};
 use crate::facts::dispatch::{Sample, Topic};
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{self, Content};
 use crate::facts::tables::{RetainedBytes, RetainedWriters};
+use crate::facts::wall_clock::WallClock;
 use crate::measure::assembly::Assembly;
 use allowance::Allowance;
 
@@ -153,9 +155,13 @@ impl Latched {
     }
 
     /// Adds a DATA or DATA_FRAG that no client requests. Returns whether the verdict has changed.
-    pub fn put(&mut self, sample: record::Sample<'_>, now: ModelTime, payload: &[u8]) -> bool {
-        let record = sample.record();
-        let writer = record.writer();
+    pub fn put(
+        &mut self,
+        sample: &observation::Sample,
+        wall_clock: WallClock,
+        payload: &[u8],
+    ) -> bool {
+        let (writer, now) = (sample.head.writer, sample.head.at);
         let Some(known) = self.writers.get_mut(&writer) else {
             return false;
         };
@@ -172,11 +178,11 @@ impl Latched {
         }
         if !is_allowed || bytes > known.most() {
             self.pause(writer);
-            self.seen(record);
+            self.seen(sample);
             return true;
         }
-        let number = sample.sequence_number();
-        let source = record.source_timestamp().timestamp();
+        let number = sample.sequence_number;
+        let source = sample.source_timestamp.timestamp();
         if !known.lacks((number, source)) {
             return false;
         }
@@ -186,7 +192,7 @@ impl Latched {
             // The kept message is no longer the last.
             self.replace(writer, Last::Unseen);
         }
-        self.assembly.put(sample, now, payload, 0);
+        self.assembly.put(sample, payload, 0);
         if !self.assembly.is_whole(writer, number) {
             return false;
         }
@@ -194,14 +200,15 @@ impl Latched {
         let Some(known) = self.writers.get(&writer).filter(|_| payload.is_some()) else {
             return false;
         };
-        let has_stamp = known.about.has_header && matches!(sample, record::Sample::Data(_));
+        let is_whole = matches!(sample.content, Content::Data { .. });
+        let has_stamp = known.about.has_header && is_whole;
         let sample = Sample {
             topic: Arc::clone(&known.about.topic),
-            time: Timestamp(record.time),
+            time: wall_clock.wall_time(now),
             writer,
             sequence_number: number,
             source_timestamp: source,
-            header_stamp: sample.header_stamp().filter(|_| has_stamp),
+            header_stamp: sample.header_stamp.filter(|_| has_stamp),
             size: sample.size(),
             sampled: false,
             payload,
@@ -229,22 +236,18 @@ impl Latched {
         }
     }
 
-    /// Drops the message of a paused writer, if this record shows that it is no longer the last.
-    pub fn seen(&mut self, record: &Record) {
-        if self.paused == 0 {
+    /// Drops the message of a paused writer, if this one shows that it is no longer the last.
+    pub fn seen(&mut self, sample: &observation::Sample) {
+        if self.paused == 0 || !sample.is_message() {
             return;
         }
-        let writer = record.writer();
+        let writer = sample.head.writer;
         let known = self.writers.get_mut(&writer);
         let Some(known) = known.filter(|known| known.is_paused) else {
             return;
         };
-        let sample = record.sample().filter(|sample| sample.is_message());
-        let Some(sample) = sample else {
-            return;
-        };
-        let source = record.source_timestamp().timestamp();
-        let about = (sample.sequence_number(), source);
+        let source = sample.source_timestamp.timestamp();
+        let about = (sample.sequence_number, source);
         if !known.lacks(about) {
             return;
         }

@@ -10,7 +10,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_wire::{Guid, SequenceNumber, record};
+use ros2probe_wire::{Guid, SequenceNumber};
 
 use crate::facts::bounded::Bounded;
 use crate::facts::dispatch::{
@@ -18,6 +18,7 @@ use crate::facts::dispatch::{
 };
 use crate::facts::journal::Missing;
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation;
 use crate::facts::selection::RequestIds;
 use crate::facts::tables::WaitingDispatches;
 use crate::facts::wall_clock::WallClock;
@@ -183,9 +184,9 @@ impl Payloads {
     }
 
     /// Keeps the payload of a DATA or DATA_FRAG whose sample is not counted yet.
-    pub fn keep(&mut self, sample: record::Sample<'_>, now: ModelTime, payload: &[u8]) {
+    pub fn keep(&mut self, sample: &observation::Sample, payload: &[u8]) {
         let other_bytes = self.dispatch_bytes + self.waiting_bytes;
-        self.assembly.put(sample, now, payload, other_bytes);
+        self.assembly.put(sample, payload, other_bytes);
     }
 
     /// Returns whether samples of this writer are requested.

@@ -9,8 +9,7 @@ use std::collections::{BTreeSet, HashMap};
 use std::time::Duration;
 
 use ros2probe_wire::qos::Reliability;
-use ros2probe_wire::record::{Body, flag};
-use ros2probe_wire::{Guid, Record, SequenceNumber};
+use ros2probe_wire::{Guid, SequenceNumber};
 
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{self, Bounded};
@@ -18,6 +17,7 @@ use crate::facts::journal::Journal;
 use crate::facts::loss_share::LossShare;
 use crate::facts::measurement::Measurement;
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{Observation, Path};
 use crate::facts::route::Destination;
 use crate::facts::tables;
 use crate::facts::wall_clock::WallClock;
@@ -25,7 +25,7 @@ use crate::measure::delivery::Totals;
 use crate::measure::in_order::Progress;
 use crate::measure::receivers::GraphView;
 use crate::measure::samples::Budget;
-use crate::measure::subscribers::{DeliveryQuota, RecordNovelty, Subscribers, WriterContext};
+use crate::measure::subscribers::{DeliveryQuota, Novelty, Subscribers, WriterContext};
 use crate::measure::topic::TopicId;
 use crate::measure::writer::{Counted, MeasurementContext, Traits, Writer};
 pub use unknown_writers::UnknownWriters;
@@ -47,8 +47,6 @@ const UNKNOWN_WRITERS_SHARE: usize = 4;
 /// Deliveries that may be dropped for new ones: minimum silence, and largest number at once.
 const DELIVERY_TIMEOUT: Duration = Duration::from_secs(10);
 const GIVEN_UP: usize = 64;
-/// Flags of records that report undelivered datagrams; they are not transmissions.
-pub(crate) const UNDELIVERED: u16 = flag::SOCKET_FULL | flag::NOT_REASSEMBLED;
 
 /// A measured writer.
 #[derive(Debug)]
@@ -59,9 +57,9 @@ pub struct Measured {
     pub subscribers: Option<Box<Subscribers>>,
     /// Its topic; `None` for an unknown writer.
     pub topic: Option<TopicId>,
-    /// Time of the first record or announcement.
+    /// Time of the first observation or announcement.
     pub first_seen: ModelTime,
-    /// Time of the last record.
+    /// Time of the last observation.
     pub last_seen: ModelTime,
     /// Whether an unknown writer has existed long enough to be metered.
     pub metered: bool,
@@ -92,7 +90,7 @@ struct SharedBudgets {
     quota: DeliveryQuota,
 }
 
-/// The writer that a record belongs to.
+/// The writer that an observation belongs to.
 #[derive(Clone, Copy)]
 struct WriterRef {
     writer: Guid,
@@ -114,9 +112,9 @@ pub struct Retired {
     pub departed: LossShare,
 }
 
-/// The result of a record.
+/// The result of an observation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum RecordOutcome {
+pub enum ObservationOutcome {
     /// Its writer is not measured.
     Unmeasured,
     /// Its writer is measured.
@@ -208,58 +206,63 @@ impl Profiler {
         &self.shared.quota
     }
 
-    /// Processes a record, seen at `now`, if its writer is measured.
-    pub fn record(
+    /// Processes an observation if its writer is measured.
+    pub fn observe(
         &mut self,
-        guid: Guid,
-        (record, now): (&Record, ModelTime),
+        observation: &Observation,
         journal: &mut Journal,
         graph: GraphView<'_>,
-    ) -> RecordOutcome {
+    ) -> ObservationOutcome {
+        let head = observation.head();
+        let (guid, now) = (head.writer, head.at);
         let Some(measured) = self.writers.get_mut(&guid) else {
-            return RecordOutcome::Unmeasured;
+            return ObservationOutcome::Unmeasured;
         };
         measured.last_seen = measured.last_seen.max(now);
         if measured.topic.is_none() && !measured.metered {
             // The kernel filter's budget for unknown writers may omit samples, so a gap is no loss.
             measured.opened = now;
         }
-        const LEFT: u16 = flag::HOST | flag::OUTGOING;
-        if measured.topic.is_none() && record.flags & LEFT == LEFT {
-            measured.sent_from = record.socket;
+        if measured.topic.is_none() && head.is_at_socket() && head.is_sent() {
+            measured.sent_from = head.socket;
         }
-        if let Body::AckNack(acknack) = record.body()
+        if let Observation::AckNack(acknack) = observation
             && measured.writer.refuses(acknack)
         {
-            return RecordOutcome::Measured;
+            return ObservationOutcome::Measured;
         }
         let writer_ref = measured.writer_ref(guid);
-        let mut novelty = RecordNovelty::New;
+        let mut novelty = Novelty::New;
         // HEARTBEATs in shared memory do not show which readers receive the samples.
-        if measured.topic.is_some() && record.flags & (flag::SHM | flag::RELAYED) == 0 {
+        let is_delivery = !matches!(
+            head.path,
+            Path::SharedMemory { .. } | Path::Stream { relayed: true, .. }
+        );
+        if measured.topic.is_some() && is_delivery {
             let mut context = self.shared.writer_context(writer_ref, now, journal, graph);
             let subscribers = measured
                 .subscribers
                 .get_or_insert_with(|| Box::new(Subscribers::new(measured.sure_from)));
-            novelty = subscribers.record(record, &mut context);
-            if record.is_acknack()
+            novelty = subscribers.observe(observation, &mut context);
+            if matches!(observation, Observation::AckNack(_))
                 && let Some(below) = subscribers.acknowledged_below()
             {
                 measured.writer.acknowledged(below);
             }
         }
-        if record.flags & UNDELIVERED != 0 || novelty == RecordNovelty::SeenAtSocket {
-            return RecordOutcome::Measured;
+        let is_undelivered = matches!(observation, Observation::Sample(it) if !it.is_delivered());
+        if is_undelivered || novelty == Novelty::SeenAtSocket {
+            return ObservationOutcome::Measured;
         }
         let next = measured.writer.next();
-        let counted = measured.writer.record(
-            record,
+        let counted = measured.writer.observe(
+            observation,
             measured.opened,
             &mut self
                 .shared
                 .measurement_context(writer_ref, now, journal, graph.wall_clock),
         );
-        if novelty == RecordNovelty::Duplicate && record.flags & (flag::HOST | flag::STREAM) != 0 {
+        if novelty == Novelty::Duplicate && head.path != Path::Wire {
             measured.writer.came_again();
         }
         if let Some(subscribers) = &mut measured.subscribers
@@ -267,7 +270,7 @@ impl Profiler {
         {
             subscribers.wrote(measured.writer.next().previous(), now);
         }
-        counted.map_or(RecordOutcome::Measured, RecordOutcome::Counted)
+        counted.map_or(ObservationOutcome::Measured, ObservationOutcome::Counted)
     }
 
     /// Records that samples in shared memory before `now` may have been missed.

@@ -14,14 +14,14 @@ mod matched;
 
 use std::collections::{HashMap, HashSet, VecDeque};
 
-use ros2probe_wire::record::flag;
-use ros2probe_wire::{DomainId, GuidPrefix, Record};
+use ros2probe_wire::{DomainId, GuidPrefix};
 
 use addresses::AnnouncedAddresses;
 pub use matched::{Matched, MatchedReaders};
 
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, Counted};
+use crate::facts::observation::{Head, Observation, Path};
 use crate::facts::route::{Destination, Route};
 use crate::facts::tables::{
     ClosedSockets, LocalParticipants, ParticipantsHere, SocketOwners, SocketProcesses, UsedSockets,
@@ -210,23 +210,29 @@ impl Receivers {
         self.here.insert(prefix) || self.here.contains(&prefix)
     }
 
-    /// Learns the owner of a socket from a record. Returns whether a socket of this host sent it,
-    /// unless that socket sends for too many participants.
-    pub fn learn(&mut self, record: &Record) -> bool {
-        if record.flags & flag::HOST == 0 || record.socket == 0 {
+    /// Learns the owner of a socket from an observation. Returns whether a socket of this host sent
+    /// it, unless that socket sends for too many participants.
+    pub fn learn(&mut self, observation: &Observation) -> bool {
+        let Head {
+            path: Path::Socket,
+            socket: socket @ 1..,
+            destination,
+            ..
+        } = *observation.head()
+        else {
             return false;
-        }
+        };
         // A socket that was reported as closed may still be open if the kernel's table dropped it.
         if !self.closed.is_empty() {
-            self.closed.remove(&record.socket);
+            self.closed.remove(&socket);
         }
-        let (sender, directed) = (record.sender(), record.addressee());
-        let is_sent = record.flags & flag::OUTGOING != 0;
-        if !is_sent && (directed == GuidPrefix::UNKNOWN || Destination::of(record).is_multicast()) {
+        let (sender, directed) = (observation.sender(), observation.addressee());
+        let is_sent = observation.head().is_sent();
+        if !is_sent && (directed == GuidPrefix::UNKNOWN || destination.is_multicast()) {
             return false;
         }
         let owner = if is_sent { sender } else { directed };
-        let known = self.users.get(&record.socket);
+        let known = self.users.get(&socket);
         let list = known.map(|known| {
             if is_sent {
                 &known.senders
@@ -237,7 +243,6 @@ impl Receivers {
         if list.is_some_and(|list| list.0.contains(&owner)) {
             return is_sent && known.is_some_and(|known| !known.is_crowded);
         }
-        let socket = record.socket;
         let Some(known) = self.users.get_or_insert_with(socket, SocketUsers::default) else {
             return false;
         };
@@ -249,7 +254,7 @@ impl Receivers {
             if is_local {
                 self.local.insert(owner);
             }
-            let facts = self.sockets.get(record.socket);
+            let facts = self.sockets.get(socket);
             if let Some(process) = facts.and_then(|facts| facts.process_id)
                 && let Some(known) = self
                     .processes

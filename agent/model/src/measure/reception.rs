@@ -6,10 +6,10 @@
 
 use std::time::Duration;
 
-use ros2probe_wire::record::{self, DataFrag, Gap, Heartbeat};
 use ros2probe_wire::{RtpsTime, SequenceNumber};
 
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{Content, DataFrag, Gap, Heartbeat, Sample};
 use crate::measure::samples::{Budget, Facts, Progress, Samples};
 use crate::measure::sequence::{Arrival, REACH, RepairMode, RunMembership, Sequence, Settled};
 
@@ -51,14 +51,14 @@ pub struct CompleteSample {
     pub repaired_after: i64,
 }
 
-/// Result of a record.
+/// Result of an observation.
 #[derive(Clone, Copy, Debug)]
 pub enum Outcome {
-    /// The record completed a sample.
+    /// It completed a sample.
     Complete(CompleteSample),
-    /// The record is a duplicate.
+    /// It is a duplicate.
     Duplicate,
-    /// The sample is still incomplete, or the record was not usable.
+    /// The sample is still incomplete, or the observation was not usable.
     Open,
 }
 
@@ -100,16 +100,16 @@ impl Reception {
     /// below it are no longer waited for, unless it is `unconfirmed`.
     pub fn assemble(
         &mut self,
-        fragments: DataFrag<'_>,
+        sample: &Sample,
+        fragments: DataFrag,
         unconfirmed: bool,
-        now: ModelTime,
         budget: &mut Budget,
     ) -> bool {
         if !unconfirmed {
-            let oldest = fragments.sequence_number().saturating_sub(UNDER_WAY);
+            let oldest = sample.sequence_number.saturating_sub(UNDER_WAY);
             self.samples.forget_below(oldest, budget);
         }
-        let progress = self.samples.fragment(fragments, now, budget);
+        let progress = self.samples.fragment(sample, fragments, budget);
         matches!(progress, Progress::Complete(_))
     }
 
@@ -127,19 +127,18 @@ impl Reception {
     /// Processes a DATA or DATA_FRAG of a writer that is `reliable` or not.
     pub fn sample(
         &mut self,
-        sample: record::Sample<'_>,
-        now: ModelTime,
+        sample: &Sample,
         reliable: bool,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) -> Outcome {
-        if !self.recognise(sample, now, budget, decide) {
-            return self.unconfirmed(sample, now, budget);
+        if !self.recognise(sample, budget, decide) {
+            return self.unconfirmed(sample, budget);
         }
-        match sample {
-            record::Sample::Data(_) => self.data(sample, now, reliable, budget, decide),
-            record::Sample::DataFrag(fragments) => {
-                self.fragment(fragments, now, reliable, budget, decide)
+        match sample.content {
+            Content::Data { .. } => self.data(sample, reliable, budget, decide),
+            Content::DataFrag(fragments) => {
+                self.fragment(sample, fragments, reliable, budget, decide)
             }
         }
     }
@@ -147,13 +146,12 @@ impl Reception {
     /// Returns whether the number of this DATA or DATA_FRAG is confirmed as the writer's.
     pub fn recognise(
         &mut self,
-        sample: record::Sample<'_>,
-        now: ModelTime,
+        sample: &Sample,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) -> bool {
-        let number = sample.sequence_number();
-        let source = sample.source_timestamp().timestamp();
+        let (number, now) = (sample.sequence_number, sample.head.at);
+        let source = sample.source_timestamp.timestamp();
         let Self { sequence, samples } = self;
         match sequence.recognise(number, source, REACH, now) {
             RunMembership::Live => true,
@@ -170,29 +168,22 @@ impl Reception {
     /// Processes a HEARTBEAT.
     pub fn heartbeat(
         &mut self,
-        heartbeat: Heartbeat<'_>,
-        now: ModelTime,
+        heartbeat: &Heartbeat,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) {
-        let (first, last) = (heartbeat.first(), heartbeat.last());
+        let Heartbeat { head, first, last } = *heartbeat;
         let Self { sequence, samples } = self;
-        sequence.heartbeat(first, last, now, &mut |settled| {
+        sequence.heartbeat(first, last, head.at, &mut |settled| {
             decide(decision(settled, samples, budget));
         });
     }
 
     /// Processes a GAP.
-    pub fn gap(
-        &mut self,
-        gap: Gap<'_>,
-        now: ModelTime,
-        budget: &mut Budget,
-        decide: &mut impl FnMut(Decision),
-    ) {
-        let (start, list) = (gap.start(), gap.list());
+    pub fn gap(&mut self, gap: &Gap, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
+        let Gap { head, start, list } = *gap;
         let Self { sequence, samples } = self;
-        sequence.gap(start, list.base, list.iter(), now, &mut |settled| {
+        sequence.gap(start, list.base, list.iter(), head.at, &mut |settled| {
             decide(decision(settled, samples, budget));
         });
     }
@@ -281,13 +272,12 @@ impl Reception {
 
     fn data(
         &mut self,
-        sample: record::Sample<'_>,
-        now: ModelTime,
+        sample: &Sample,
         reliable: bool,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) -> Outcome {
-        let number = sample.sequence_number();
+        let (number, now) = (sample.sequence_number, sample.head.at);
         let repair_mode = if reliable {
             RepairMode::Reliable
         } else {
@@ -304,30 +294,25 @@ impl Reception {
         Outcome::Complete(CompleteSample {
             recovered,
             newest,
-            ..whole_data(sample, now)
+            ..whole_data(sample)
         })
     }
 
     /// Processes a DATA or DATA_FRAG whose number is not confirmed.
-    fn unconfirmed(
-        &mut self,
-        sample: record::Sample<'_>,
-        now: ModelTime,
-        budget: &mut Budget,
-    ) -> Outcome {
-        let number = sample.sequence_number();
+    fn unconfirmed(&mut self, sample: &Sample, budget: &mut Budget) -> Outcome {
+        let number = sample.sequence_number;
         if self.sequence.has_unconfirmed(number) {
             return Outcome::Duplicate;
         }
-        let whole = match sample {
-            record::Sample::DataFrag(fragments) => {
-                match self.samples.fragment(fragments, now, budget) {
-                    Progress::Complete(facts) => whole_fragments(sample, now, &facts),
+        let whole = match sample.content {
+            Content::DataFrag(fragments) => {
+                match self.samples.fragment(sample, fragments, budget) {
+                    Progress::Complete(facts) => whole_fragments(sample, &facts),
                     Progress::Duplicate => return Outcome::Duplicate,
                     _ => return Outcome::Open,
                 }
             }
-            record::Sample::Data(_) => whole_data(sample, now),
+            Content::Data { .. } => whole_data(sample),
         };
         self.sequence.complete_unconfirmed(number);
         Outcome::Complete(CompleteSample {
@@ -339,18 +324,18 @@ impl Reception {
 
     fn fragment(
         &mut self,
-        fragments: DataFrag<'_>,
-        now: ModelTime,
+        sample: &Sample,
+        fragments: DataFrag,
         reliable: bool,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) -> Outcome {
-        let number = fragments.sequence_number();
+        let (number, now) = (sample.sequence_number, sample.head.at);
         // Sequence numbers are signed (RTPS 2.5, 9.3.2), so larger values are invalid.
         if self.sequence.has(number) || number > SequenceNumber::MAX {
             return Outcome::Duplicate;
         }
-        let progress = self.samples.fragment(fragments, now, budget);
+        let progress = self.samples.fragment(sample, fragments, budget);
         match progress {
             Progress::Rejected => return Outcome::Open,
             Progress::Duplicate => return Outcome::Duplicate,
@@ -364,7 +349,7 @@ impl Reception {
         }
         // The first captured sample does not count as sent if its first fragments were missed,
         // except for number 1.
-        let joined = u64::from(fragments.starting() != 1 && number.0 > 1);
+        let joined = u64::from(fragments.starting != 1 && number.0 > 1);
         self.sequence.begin(number.saturating_add(joined));
         self.exists(number, now, budget, decide);
         let Progress::Complete(facts) = progress else {
@@ -385,34 +370,34 @@ impl Reception {
         let repaired = reliable && facts.repaired_after >= REPAIR;
         Outcome::Complete(CompleteSample {
             recovered: recovered || repaired,
-            ..whole_fragments(record::Sample::DataFrag(fragments), now, &facts)
+            ..whole_fragments(sample, &facts)
         })
     }
 }
 
-fn whole_data(sample: record::Sample<'_>, now: ModelTime) -> CompleteSample {
+fn whole_data(sample: &Sample) -> CompleteSample {
     CompleteSample {
-        number: sample.sequence_number(),
-        bytes: sample.size() as u64,
+        number: sample.sequence_number,
+        bytes: sample.size().into(),
         is_message: sample.is_message(),
         recovered: false,
         newest: true,
         unconfirmed: false,
-        source: sample.source_timestamp(),
-        stamp: sample.header_stamp(),
-        began: now.began(sample.record()),
+        source: sample.source_timestamp,
+        stamp: sample.header_stamp,
+        began: sample.head.began(),
         repaired_after: 0,
     }
 }
 
-fn whole_fragments(sample: record::Sample<'_>, now: ModelTime, facts: &Facts) -> CompleteSample {
+fn whole_fragments(sample: &Sample, facts: &Facts) -> CompleteSample {
     CompleteSample {
         bytes: facts.size as u64,
         source: facts.source,
         stamp: facts.stamp,
         began: facts.began,
         repaired_after: facts.repaired_after,
-        ..whole_data(sample, now)
+        ..whole_data(sample)
     }
 }
 

@@ -44,7 +44,7 @@ pub struct KnownRoute {
     pub is_shared: bool,
     /// Index of its delivery, if resolved.
     pub delivery: Option<usize>,
-    /// Time of the last record.
+    /// Time of the last observation.
     pub last_seen: ModelTime,
     /// Number of new samples that arrived on it.
     pub brought: u64,

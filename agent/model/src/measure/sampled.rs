@@ -38,9 +38,9 @@ const WINDOW: u64 = u128::BITS as u64;
 /// State of one writer's sampled view.
 #[derive(Debug)]
 pub struct Sampled {
-    /// Time of the last record from shared memory.
+    /// Time of the last observation from shared memory.
     last: ModelTime,
-    /// Whether a network record arrived after shared memory fell silent.
+    /// Whether a network observation arrived after shared memory fell silent.
     left: bool,
     span: u64,
     seen: u64,
@@ -71,10 +71,10 @@ pub struct Sampled {
     head: Option<(SequenceNumber, (i32, u32))>,
 }
 
-/// Changes caused by a record.
+/// Changes caused by an observation.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct SampledUpdate {
-    /// Number of samples that are now known to exist, including the record's own.
+    /// Number of samples that are now known to exist, including the observation's own.
     pub samples: u64,
     /// Number of samples assumed to have the size of this one: `samples`, and earlier announced
     /// ones.
@@ -89,7 +89,7 @@ pub struct SampledUpdate {
     pub unconfirmed: bool,
 }
 
-/// How much of a sample was seen, including its latest record.
+/// How much of a sample was seen, including its latest observation.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Completeness {
     /// Some fragments, with more to follow.
@@ -137,8 +137,9 @@ impl Sampled {
         self.last + SAMPLED_TIMEOUT > now
     }
 
-    /// Returns whether a record at `now` belongs to this view: while the writer is sampled, and for
-    /// the first record after that, since samples missing before it may have used shared memory.
+    /// Returns whether an observation at `now` belongs to this view: while the writer is sampled,
+    /// and for the first one after that, since samples missing before it may have used shared
+    /// memory.
     pub fn takes(&mut self, now: ModelTime) -> bool {
         let takes = self.is_current(now) || !self.left;
         self.left |= !self.is_current(now);
@@ -407,7 +408,7 @@ impl Sampled {
         samples
     }
 
-    /// Stores `stamp` if the record has one. Returns the stored stamp of this sample; `None` if it
+    /// Stores `stamp` if there is one. Returns the stored stamp of this sample; `None` if it
     /// was not seen.
     pub fn stamp(
         &mut self,

@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{DataFrag, Sample};
 use crate::facts::tables::PartialSamples;
-use ros2probe_wire::record::DataFrag;
 use ros2probe_wire::{RtpsTime, SequenceNumber};
 
 /// Largest number of fragments per sample: 88 MB of Cyclone DDS, 4 GB of Fast DDS.
@@ -78,7 +78,7 @@ pub struct Facts {
     pub stamp: Option<(i32, u32)>,
     /// Size in bytes.
     pub size: u32,
-    /// Time of the first datagram of the first record.
+    /// Time of the first datagram of the first observation.
     pub began: ModelTime,
     /// Nanoseconds from its last fragment number to its last missing fragment.
     pub repaired_after: i64,
@@ -103,12 +103,13 @@ impl Samples {
     /// Processes a DATA_FRAG.
     pub fn fragment(
         &mut self,
-        fragments: DataFrag<'_>,
-        now: ModelTime,
+        sample: &Sample,
+        fragments: DataFrag,
         budget: &mut Budget,
     ) -> Progress {
-        let (start, count) = (fragments.starting(), fragments.count());
-        let (size, fragment_size) = (fragments.sample_size(), fragments.fragment_size());
+        let now = sample.head.at;
+        let (start, count) = (fragments.starting, fragments.count);
+        let (size, fragment_size) = (fragments.sample_size, fragments.fragment_size);
         let total = fragments.total();
         let end = start.saturating_add(count);
         if total == 0 || start == 0 || count == 0 || end - 1 > total {
@@ -119,9 +120,9 @@ impl Samples {
             budget.rejected += 1;
             return Progress::TooMany;
         }
-        let index = match self.place(fragments.sequence_number()) {
+        let index = match self.place(sample.sequence_number) {
             Some(index) => index,
-            None => self.open(fragments, now, budget),
+            None => self.open(sample, fragments, budget),
         };
         let Some(partial) = self.partial.get_mut(index) else {
             return Progress::Rejected;
@@ -142,10 +143,10 @@ impl Samples {
             partial.tail = Some(now);
         }
         if partial.facts.source == RtpsTime(0) {
-            partial.facts.source = fragments.source_timestamp();
+            partial.facts.source = sample.source_timestamp;
         }
         if start == 1 {
-            partial.facts.stamp = fragments.header_stamp();
+            partial.facts.stamp = sample.header_stamp;
         }
         if partial.seen == total {
             let mut facts = partial.facts;
@@ -154,7 +155,7 @@ impl Samples {
             return Progress::Complete(facts);
         }
         if budget.bytes > budget.limit {
-            self.evict(fragments.sequence_number(), budget);
+            self.evict(sample.sequence_number, budget);
         }
         Progress::Partial
     }
@@ -242,27 +243,27 @@ impl Samples {
         self.partial.iter().position(|each| each.number == number)
     }
 
-    fn open(&mut self, fragments: DataFrag<'_>, now: ModelTime, budget: &mut Budget) -> usize {
-        let number = fragments.sequence_number();
+    fn open(&mut self, sample: &Sample, fragments: DataFrag, budget: &mut Budget) -> usize {
+        let number = sample.sequence_number;
         if self.partial.is_full() {
             self.partial.refuse();
             self.evict(number, budget);
         }
         budget.samples += 1;
-        let began = now.began(fragments.record());
+        let began = sample.head.began();
         if began < self.sure_from {
             self.last_uncertain = self.last_uncertain.max(number);
         }
         self.partial.push(Partial {
             number,
-            size: fragments.sample_size(),
-            fragment_size: fragments.fragment_size(),
+            size: fragments.sample_size,
+            fragment_size: fragments.fragment_size,
             seen: 0,
             bitmap: Vec::new(),
             tail: None,
-            latest: now,
+            latest: sample.head.at,
             facts: Facts {
-                size: fragments.sample_size(),
+                size: fragments.sample_size,
                 began,
                 ..Facts::default()
             },
@@ -313,9 +314,10 @@ impl Partial {
 #[cfg(test)]
 mod tests {
     use ros2probe_wire::Record;
-    use ros2probe_wire::record::{Sample, kind};
+    use ros2probe_wire::record::kind;
 
     use super::*;
+    use crate::facts::observation::tests::{fragments, sample};
 
     #[test]
     fn ranges_are_marked_as_their_numbers_one_by_one_are() {
@@ -355,10 +357,11 @@ mod tests {
 
     /// Passes the DATA_FRAG of a record to [`Samples::fragment`].
     fn put(samples: &mut Samples, record: &Record, at: u64, budget: &mut Budget) -> Progress {
-        let Some(Sample::DataFrag(fragments)) = record.sample() else {
-            panic!("{record:?}")
-        };
-        samples.fragment(fragments, ModelTime::from_nanoseconds(at), budget)
+        let sample = sample(&Record {
+            time: at,
+            ..*record
+        });
+        samples.fragment(&sample, fragments(&sample), budget)
     }
 
     fn fragment(number: u64, start: u32, count: u32, size: u32) -> Record {

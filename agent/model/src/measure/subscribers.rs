@@ -20,14 +20,14 @@ mod lifecycle;
 mod receivers;
 mod submessages;
 
-use ros2probe_wire::record::{Body, Sample, flag};
-use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber};
+use ros2probe_wire::{Guid, SequenceNumber};
 
 use crate::facts::header::PLAUSIBLE;
 use crate::facts::journal::Journal;
 use crate::facts::loss_share::LossShare;
 use crate::facts::measurement::Breakdown;
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{DatagramFate, Observation, Sample};
 use crate::facts::route::Receiver;
 use crate::facts::route::{Destination, Route};
 use crate::measure::acknowledgement::{AcknowledgementFacts, Acknowledgements};
@@ -68,14 +68,14 @@ pub struct Subscribers {
     sure_from: ModelTime,
 }
 
-/// Result of a record for the deliveries.
+/// Result of an observation for the deliveries.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum RecordNovelty {
-    /// The record may contain something new.
+pub enum Novelty {
+    /// It may contain something new.
     New,
     /// The same receiver already had all of it, or all of it had left for the same destination.
     Duplicate,
-    /// The record is from a wire, but the route is observed at sockets.
+    /// It was seen on a wire, but the route is observed at sockets.
     SeenAtSocket,
 }
 
@@ -92,10 +92,10 @@ pub struct DeliveryQuota {
     pub wanted: bool,
 }
 
-/// State outside the deliveries that a record changes, and its context.
+/// State outside the deliveries that an observation changes, and its context.
 #[derive(Debug)]
 pub struct WriterContext<'a> {
-    /// Time of the record, or of the tick.
+    /// Time of the observation, or of the tick.
     pub now: ModelTime,
     /// The writer.
     pub writer: Guid,
@@ -158,35 +158,39 @@ impl Subscribers {
         self.acknowledgements.facts(writer, next, now)
     }
 
-    /// Processes a record of the writer, or an ACKNACK for it.
-    pub fn record(&mut self, record: &Record, context: &mut WriterContext<'_>) -> RecordNovelty {
+    /// Processes an observation of the writer, or an ACKNACK for it.
+    pub fn observe(
+        &mut self,
+        observation: &Observation,
+        context: &mut WriterContext<'_>,
+    ) -> Novelty {
         self.refresh(context);
-        let body = record.body();
-        if let Body::AckNack(acknack) = body {
+        if let Observation::AckNack(acknack) = observation {
             self.requested(acknack);
-            let is_reader = |topic: &Topic| is_reader(topic, record.reader());
+            let is_reader = |topic: &Topic| is_reader(topic, acknack.head.reader);
             if context.topic().is_some_and(is_reader) {
-                self.acknowledgements.acknack(acknack, context.now);
+                self.acknowledgements.acknack(acknack);
                 self.acknowledged(acknack);
             }
-            return RecordNovelty::New;
+            return Novelty::New;
         }
-        if record.flags & flag::NOT_REASSEMBLED != 0 {
-            if let Body::Sample(sample) = body {
-                self.not_reassembled(sample, context);
-            }
-            return RecordNovelty::New;
+        if let Observation::Sample(sample) = observation
+            && sample.fate == DatagramFate::NotReassembled
+        {
+            self.not_reassembled(sample, context);
+            return Novelty::New;
         }
-        self.reassembled |= record.flags & flag::HOST != 0 && record.datagram_len > ONE_FRAME;
-        let route = Route::of(record);
-        match body {
-            Body::Sample(_) => {}
-            Body::Heartbeat(_) | Body::Gap(_) if !route.is_sent() => {}
-            _ => return RecordNovelty::New,
+        let head = observation.head();
+        let is_host = head.is_at_socket();
+        self.reassembled |= is_host && head.datagram_len > ONE_FRAME;
+        let route = head.route();
+        match observation {
+            Observation::Sample(_) => {}
+            Observation::Heartbeat(_) | Observation::Gap(_) if !route.is_sent() => {}
+            _ => return Novelty::New,
         }
-        let is_host = record.flags & flag::HOST != 0;
         if !is_host && self.at_socket && self.routes.is_at_socket(route.destination) {
-            return RecordNovelty::SeenAtSocket;
+            return Novelty::SeenAtSocket;
         }
         if is_host && route.socket != 0 && self.routes.find(&route).is_none() {
             self.learn_socket(route, context);
@@ -201,14 +205,14 @@ impl Subscribers {
                 index = self.routes.find(&route).unwrap_or(index);
             }
         }
-        let came_again = match body {
-            Body::Sample(sample) if route.is_sent() => self.leave(index, sample, context),
-            _ => self.arrive(index, record, body, context),
+        let came_again = match observation {
+            Observation::Sample(sample) if route.is_sent() => self.leave(index, sample, context),
+            _ => self.arrive(index, observation, context),
         };
         if came_again {
-            RecordNovelty::Duplicate
+            Novelty::Duplicate
         } else {
-            RecordNovelty::New
+            Novelty::New
         }
     }
 
@@ -226,13 +230,13 @@ impl Subscribers {
 
     /// Processes an outgoing sample. Returns whether it had left for this unicast destination
     /// before.
-    fn leave(&mut self, index: usize, sample: Sample<'_>, context: &mut WriterContext<'_>) -> bool {
+    fn leave(&mut self, index: usize, sample: &Sample, context: &mut WriterContext<'_>) -> bool {
         let Some(route) = self.routes.get(index).map(|known| known.route) else {
             return false;
         };
         self.totals.seen[1] = true;
-        let source = sample.source_timestamp().timestamp();
-        let began = sample.record().began();
+        let source = sample.source_timestamp.timestamp();
+        let began = context.graph.wall_clock.wall_time(sample.head.began());
         // Both times are from one clock. A sample that leaves before its timestamp, or hours after
         // it, is not a measure of the send delay.
         if let Some(source) = source.filter(|_| sample.is_start())
@@ -265,12 +269,11 @@ impl Subscribers {
     fn arrive(
         &mut self,
         index: usize,
-        record: &Record,
-        body: Body<'_>,
+        observation: &Observation,
         context: &mut WriterContext<'_>,
     ) -> bool {
         self.totals.seen[0] = true;
-        let Some((receiver, matched)) = self.receiver(index, record, context) else {
+        let Some((receiver, matched)) = self.receiver(index, observation, context) else {
             return false;
         };
         let is_elsewhere = match receiver {
@@ -278,10 +281,10 @@ impl Subscribers {
             Receiver::Route(route) => route.socket == 0 && !self.has_readers,
         };
         if is_elsewhere {
-            if let Body::Sample(sample) = body
+            if let Observation::Sample(sample) = observation
                 && sample.is_message()
                 && sample.is_end()
-                && record.flags & flag::SOCKET_FULL == 0
+                && sample.is_delivered()
             {
                 let place = self.find(receiver);
                 match place.and_then(|place| self.deliveries.get_mut(place)) {
@@ -291,12 +294,12 @@ impl Subscribers {
             }
             return false;
         }
-        match body {
-            Body::Sample(sample) => return self.sample(index, receiver, sample, context),
-            Body::Heartbeat(heartbeat) => {
+        match observation {
+            Observation::Sample(sample) => return self.sample(index, receiver, sample, context),
+            Observation::Heartbeat(heartbeat) => {
                 self.heartbeat(index, (receiver, matched), heartbeat, context);
             }
-            Body::Gap(gap) => self.gap(index, receiver, gap, context),
+            Observation::Gap(gap) => self.gap(index, receiver, gap, context),
             _ => {}
         }
         false
@@ -306,10 +309,10 @@ impl Subscribers {
     fn receiver(
         &mut self,
         index: usize,
-        record: &Record,
+        observation: &Observation,
         context: &mut WriterContext<'_>,
     ) -> Option<(Receiver, Matched)> {
-        let directed = Some(record.reader().prefix).filter(|to| *to != GuidPrefix::UNKNOWN);
+        let directed = observation.head().directed_at();
         let readers = context.readers();
         let known = self.routes.get_mut(index)?;
         let is_multicast = known.route.destination.is_multicast();
@@ -333,7 +336,7 @@ impl Subscribers {
             }
             (None, None) => Some((Receiver::Route(known.route), Matched::Unknown)),
             (None, Some(_)) => {
-                if let Some(sample) = record.sample() {
+                if let Observation::Sample(sample) = observation {
                     self.repair(sample, context);
                 }
                 None
@@ -345,10 +348,10 @@ impl Subscribers {
         &mut self,
         index: usize,
         receiver: Receiver,
-        sample: Sample<'_>,
+        sample: &Sample,
         context: &mut WriterContext<'_>,
     ) -> bool {
-        let socket_full = sample.record().flags & flag::SOCKET_FULL != 0;
+        let socket_full = sample.fate == DatagramFate::SocketFull;
         let route = self.routes.get(index).map(|known| known.route);
         if route.is_some_and(|route| self.is_repair_elsewhere(route, receiver, sample)) {
             return false;
@@ -426,8 +429,8 @@ impl Subscribers {
 
     /// Fills the gaps of deliveries that may be the same receiver. Returns whether any of them
     /// knows the sample.
-    fn repair(&mut self, sample: Sample<'_>, context: &mut WriterContext<'_>) -> bool {
-        let number = sample.sequence_number();
+    fn repair(&mut self, sample: &Sample, context: &mut WriterContext<'_>) -> bool {
+        let number = sample.sequence_number;
         let mut is_known = false;
         for delivery in self.deliveries.iter_mut().filter(|each| is_open(each)) {
             is_known |= delivery.next() > number;
@@ -441,16 +444,16 @@ impl Subscribers {
         is_known
     }
 
-    /// Returns whether a unicast record on a wire is a retransmission to another host: its receiver
+    /// Returns whether a unicast sample on a wire is a retransmission to another host: its receiver
     /// is unknown, and a socket of this host received the sample by multicast.
-    fn is_repair_elsewhere(&self, route: Route, receiver: Receiver, sample: Sample<'_>) -> bool {
+    fn is_repair_elsewhere(&self, route: Route, receiver: Receiver, sample: &Sample) -> bool {
         let is_at_socket = |route: Route| route.is_open() && route.socket != 0;
         route.socket == 0
             && self.at_socket
             && !route.destination.is_multicast()
             && self.find(receiver).is_none()
             && self.deliveries.iter().any(|delivery| {
-                is_at_socket(delivery.main()) && delivery.next() > sample.sequence_number()
+                is_at_socket(delivery.main()) && delivery.next() > sample.sequence_number
             })
     }
 

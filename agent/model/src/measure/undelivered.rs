@@ -11,9 +11,9 @@ use std::time::Duration;
 
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{Content, DataFrag, Head, Sample};
 use crate::facts::tables::UndeliveredParts;
-use ros2probe_wire::record::Sample;
-use ros2probe_wire::{Record, SequenceNumber};
+use ros2probe_wire::SequenceNumber;
 
 /// Largest difference between the clock conversions of the two reports.
 const SLACK: Duration = Duration::from_micros(100);
@@ -44,23 +44,23 @@ impl Undelivered {
         self.waiting.is_empty()
     }
 
-    /// Records that this DATA or DATA_FRAG was dropped at `now`. Returns whether an older entry was evicted.
-    pub fn note(&mut self, sample: Sample<'_>, now: ModelTime) -> bool {
-        let record = sample.record();
+    /// Records that this DATA or DATA_FRAG was dropped. Returns whether an older entry was evicted.
+    pub fn note(&mut self, sample: &Sample) -> bool {
+        let socket = sample.head.socket;
         let (start, end) = range(sample);
-        let (first, last) = span(record, now);
+        let (first, last) = span(&sample.head);
         if let Some(back) = self.waiting.back_mut()
-            && back.socket == record.socket
-            && back.number == sample.sequence_number()
+            && back.socket == socket
+            && back.number == sample.sequence_number
             && back.end == start
-            && matches!(sample, Sample::DataFrag(_))
+            && matches!(sample.content, Content::DataFrag(_))
         {
             (back.end, back.last) = (end, last);
             return false;
         }
         let evicted = self.waiting.push_back(UndeliveredPart {
-            socket: record.socket,
-            number: sample.sequence_number(),
+            socket,
+            number: sample.sequence_number,
             start,
             end,
             first,
@@ -69,20 +69,14 @@ impl Undelivered {
         evicted.is_some()
     }
 
-    /// Returns the delivered parts of an arrival at `now`, in order. Adds evicted entries to `evictions`.
-    pub fn delivered(
-        &mut self,
-        sample: Sample<'_>,
-        now: ModelTime,
-        evictions: &mut u64,
-    ) -> Vec<Record> {
-        let record = sample.record();
+    /// Returns the delivered parts of an arrival, in order. Adds evicted entries to `evictions`.
+    pub fn delivered(&mut self, sample: &Sample, evictions: &mut u64) -> Vec<Sample> {
         let mut parts = vec![range(sample)];
-        let (begin, end) = span(record, now);
+        let (begin, end) = span(&sample.head);
         let mut left = Vec::new();
         self.waiting.retain_mut(|each| {
-            let is_meant = each.socket == record.socket
-                && each.number == sample.sequence_number()
+            let is_meant = each.socket == sample.head.socket
+                && each.number == sample.sequence_number
                 && each.last + SLACK >= begin
                 && each.first <= end + SLACK;
             if !is_meant {
@@ -109,14 +103,17 @@ impl Undelivered {
         for part in left {
             *evictions += u64::from(self.waiting.push_back(part).is_some());
         }
-        let Sample::DataFrag(fragments) = sample else {
-            return if parts.is_empty() {
-                Vec::new()
-            } else {
-                vec![*record]
-            };
+        let part = |(start, end): (u32, u32)| Sample {
+            content: match sample.content {
+                Content::DataFrag(fragments) => Content::DataFrag(DataFrag {
+                    starting: start,
+                    count: end - start,
+                    ..fragments
+                }),
+                data @ Content::Data { .. } => data,
+            },
+            ..*sample
         };
-        let part = |(start, end): (u32, u32)| fragments.part(start, end);
         parts.into_iter().map(part).collect()
     }
 
@@ -134,23 +131,23 @@ impl Undelivered {
 }
 
 /// Returns the fragments, as a half-open range.
-const fn range(sample: Sample<'_>) -> (u32, u32) {
-    match sample {
-        Sample::Data(_) => (0, 1),
-        Sample::DataFrag(fragments) => {
-            let start = fragments.starting();
-            (start, start.saturating_add(fragments.count()))
+const fn range(sample: &Sample) -> (u32, u32) {
+    match sample.content {
+        Content::Data { .. } => (0, 1),
+        Content::DataFrag(fragments) => {
+            let start = fragments.starting;
+            (start, start.saturating_add(fragments.count))
         }
     }
 }
 
 /// Returns the times of its first and last datagram.
-fn span(record: &Record, end: ModelTime) -> (ModelTime, ModelTime) {
-    let begin = match record.elapsed {
+fn span(head: &Head) -> (ModelTime, ModelTime) {
+    let begin = match head.elapsed {
         u32::MAX => ModelTime::ZERO,
-        _ => end.began(record),
+        _ => head.began(),
     };
-    (begin, end)
+    (begin, head.at)
 }
 
 fn take_out(parts: &[(u32, u32)], from: u32, to: u32) -> Vec<(u32, u32)> {
@@ -164,9 +161,11 @@ fn take_out(parts: &[(u32, u32)], from: u32, to: u32) -> Vec<(u32, u32)> {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::Record;
     use ros2probe_wire::record::kind;
 
     use super::*;
+    use crate::facts::observation::tests::sample;
     use ros2probe_wire::time::MILLISECOND;
 
     fn fragments(start: u32, count: u32, time: u64, elapsed: u32) -> Record {
@@ -183,27 +182,19 @@ mod tests {
     }
 
     fn note(undelivered: &mut Undelivered, record: &Record) -> bool {
-        undelivered.note(
-            record.sample().unwrap(),
-            ModelTime::from_nanoseconds(record.time),
-        )
+        undelivered.note(&sample(record))
     }
 
     fn delivered(
         undelivered: &mut Undelivered,
         record: &Record,
         evictions: &mut u64,
-    ) -> Vec<Record> {
-        undelivered.delivered(
-            record.sample().unwrap(),
-            ModelTime::from_nanoseconds(record.time),
-            evictions,
-        )
+    ) -> Vec<Sample> {
+        undelivered.delivered(&sample(record), evictions)
     }
 
-    fn ranges(parts: &[Record]) -> Vec<(u32, u32)> {
-        let samples = parts.iter().filter_map(Record::sample);
-        samples.map(range).collect()
+    fn ranges(parts: &[Sample]) -> Vec<(u32, u32)> {
+        parts.iter().map(range).collect()
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Measurement of one writer: samples, bytes, losses, intervals, latencies.
 //!
-//! Its input is records from any source. A sample counts once, at the record that completes it. An
+//! Its input is observations of any source. A sample counts once, at the one that completes it. An
 //! idle writer needs less than 2 KiB; bitmaps, which grow with traffic, are bounded in
 //! [`crate::measure::sequence`] and [`crate::measure::samples`].
 
@@ -9,8 +9,7 @@ mod sampled_view;
 
 use std::time::Duration;
 
-use ros2probe_wire::record::{AckNack, Body, Sample, flag};
-use ros2probe_wire::{Guid, Record, RtpsTime, SequenceNumber};
+use ros2probe_wire::{Guid, RtpsTime, SequenceNumber};
 
 use crate::facts::dispatch::MissedReason;
 use crate::facts::histogram::Histogram;
@@ -19,6 +18,7 @@ use crate::facts::loss::Loss;
 use crate::facts::loss_share::LossShare;
 use crate::facts::measurement::{EarlierCounts, Measurement};
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{AckNack, Head, Observation, Path, Sample};
 use crate::facts::rate::{SECONDS, Slot, Window};
 use crate::facts::wall_clock::WallClock;
 use crate::measure::in_order::Progress;
@@ -34,8 +34,8 @@ pub const RELIABLE_WINDOW: Duration = Duration::from_secs(10);
 /// A first sample older than this is history that a late joiner requested.
 const HISTORY: Duration = Duration::from_secs(10);
 
-/// A uprobe's view of a writer stays exact for this long after its last record: samples read from
-/// shared memory in that time were seen already.
+/// A uprobe's view of a writer stays exact for this long after its last observation: samples read
+/// from shared memory in that time were seen already.
 const EXACT_FOR: Duration = Duration::from_secs(10);
 
 /// Properties of the writer from discovery; all false if it is unknown.
@@ -49,10 +49,10 @@ pub struct Traits {
     pub has_header: bool,
 }
 
-/// State outside the writer that a record changes.
+/// State outside the writer that an observation changes.
 #[derive(Debug)]
 pub struct MeasurementContext<'a> {
-    /// Time of the record, or of the tick.
+    /// Time of the observation, or of the tick.
     pub now: ModelTime,
     /// Memory budget for fragmented samples.
     pub budget: &'a mut Budget,
@@ -100,7 +100,7 @@ pub struct Writer {
     implausible_latency: u64,
     /// State of a writer that was sampled in shared memory.
     sampled: Option<Box<Sampled>>,
-    /// Time of the last record from a uprobe in the writer's own process.
+    /// Time of the last observation from a uprobe in the writer's own process.
     exact: Option<ModelTime>,
 }
 
@@ -187,15 +187,15 @@ impl Writer {
         self.tally.duplicates += 1;
     }
 
-    /// Returns whether this sample, seen at `at`, is counted or settled.
+    /// Returns whether this sample is counted or settled.
     #[must_use]
-    pub fn has(&self, sample: Sample<'_>, at: ModelTime) -> bool {
-        let (record, number) = (sample.record(), sample.sequence_number());
+    pub fn has(&self, sample: &Sample) -> bool {
+        let (at, number) = (sample.head.at, sample.sequence_number);
         let sequence = self.reception.sequence();
-        if self.is_under_way(sample, at) {
+        if self.is_under_way(sample) {
             return false;
         }
-        if is_polled(record) && self.is_exact(at) {
+        if sample.head.is_polled() && self.is_exact(at) {
             return true;
         }
         if self.is_unconfirmed(sample) {
@@ -208,7 +208,7 @@ impl Writer {
     }
 
     /// Returns whether this ACKNACK acknowledges samples that are not known to exist.
-    pub const fn refuses(&mut self, acknack: AckNack<'_>) -> bool {
+    pub const fn refuses(&mut self, acknack: &AckNack) -> bool {
         let sequence = self.reception.sequence_mut();
         sequence.refuses(acknack.base())
     }
@@ -260,24 +260,23 @@ impl Writer {
         self.exact = None;
     }
 
-    /// Processes a record of this writer and returns the message that it completed. `opened` is the
-    /// time at which this host last gained a view of its samples: those missing before it went
-    /// elsewhere.
-    pub fn record(
+    /// Processes an observation of this writer and returns the message that it completed. `opened`
+    /// is the time at which this host last gained a view of its samples: those missing before it
+    /// went elsewhere.
+    pub fn observe(
         &mut self,
-        record: &Record,
+        observation: &Observation,
         opened: ModelTime,
         context: &mut MeasurementContext<'_>,
     ) -> Option<Counted> {
         let at = context.now;
-        let is_exact = record.flags & flag::EXACT != 0;
-        let is_sampled = is_polled(record);
+        let head = observation.head();
+        let (is_exact, is_sampled) = (head.is_exact(), head.is_polled());
         if is_exact {
             self.exact = self.exact.max(Some(at));
         }
-        let body = record.body();
-        if let Body::Sample(sample) = body
-            && self.is_under_way(sample, at)
+        if let Observation::Sample(sample) = observation
+            && self.is_under_way(sample)
         {
             return self.catch_up(sample, context);
         }
@@ -285,12 +284,15 @@ impl Writer {
             // The sample has been seen already, or will be.
             return None;
         }
-        let takes = self.sampled.as_mut().is_some_and(|sampled| match body {
-            Body::Sample(_) | Body::Heartbeat(_) => sampled.takes(at),
-            _ => sampled.is_current(at),
-        });
+        let takes = self
+            .sampled
+            .as_mut()
+            .is_some_and(|sampled| match observation {
+                Observation::Sample(_) | Observation::Heartbeat(_) => sampled.takes(at),
+                _ => sampled.is_current(at),
+            });
         if is_sampled || takes {
-            let counted = self.sampled_record(record, is_sampled, context);
+            let counted = self.sampled_observation(observation, is_sampled, context);
             self.leave_unseen(context.journal);
             if let Some(sampled) = self.sampled.as_mut().filter(|_| is_exact) {
                 // From here on every message is seen.
@@ -301,28 +303,28 @@ impl Writer {
         let sequence = self.reception.sequence();
         let before = (sequence.next(), sequence.last_advance());
         let mut counted = None;
-        match body {
-            Body::Sample(sample) => counted = self.sample(sample, context),
-            Body::Heartbeat(heartbeat) => {
+        match observation {
+            Observation::Sample(sample) => counted = self.sample(sample, context),
+            Observation::Heartbeat(heartbeat) => {
                 self.traits.reliable = true;
                 let (reception, mut settling) =
                     self.parts(context.journal, (context.now, context.has_receivers));
-                reception.heartbeat(heartbeat, at, context.budget, &mut |decision| {
+                reception.heartbeat(heartbeat, context.budget, &mut |decision| {
                     settling.take(decision);
                 });
             }
-            Body::Gap(gap) => {
+            Observation::Gap(gap) => {
                 let (reception, mut settling) =
                     self.parts(context.journal, (context.now, context.has_receivers));
-                reception.gap(gap, at, context.budget, &mut |decision| {
+                reception.gap(gap, context.budget, &mut |decision| {
                     settling.take(decision);
                 });
             }
-            Body::AckNack(acknack) => {
+            Observation::AckNack(acknack) => {
                 let sequence = self.reception.sequence_mut();
-                sequence.requested(acknack.missing().iter());
+                sequence.requested(acknack.missing.iter());
             }
-            Body::Complete | Body::Handover | Body::Undelivered | Body::Unknown => {}
+            Observation::Presence(_) => {}
         }
         let (next, advanced) = before;
         let sequence = self.reception.sequence_mut();
@@ -460,24 +462,19 @@ impl Writer {
         (&mut self.reception, settling)
     }
 
-    fn sample(
-        &mut self,
-        sample: Sample<'_>,
-        context: &mut MeasurementContext<'_>,
-    ) -> Option<Counted> {
-        let (record, now) = (sample.record(), context.now);
+    fn sample(&mut self, sample: &Sample, context: &mut MeasurementContext<'_>) -> Option<Counted> {
+        let now = context.now;
         let reliable = self.traits.reliable;
         let (reception, mut settling) =
             self.parts(context.journal, (context.now, context.has_receivers));
-        let outcome = reception.sample(sample, now, reliable, context.budget, &mut |decision| {
+        let outcome = reception.sample(sample, reliable, context.budget, &mut |decision| {
             settling.take(decision);
         });
         match outcome {
             Outcome::Open => {}
             // A copy at another socket is not a retransmission; the caller can distinguish them.
             Outcome::Duplicate => {
-                let elsewhere = flag::HOST | flag::SHM | flag::STREAM;
-                self.tally.duplicates += u64::from(record.flags & elsewhere == 0);
+                self.tally.duplicates += u64::from(sample.head.path == Path::Wire);
             }
             Outcome::Complete(whole) if whole.is_message => {
                 self.count(now, whole.bytes, whole.recovered);
@@ -508,10 +505,10 @@ impl Writer {
     }
 
     /// Returns whether the number of this DATA or DATA_FRAG is outside the writer's live run.
-    fn is_unconfirmed(&self, sample: Sample<'_>) -> bool {
-        let source = sample.source_timestamp().timestamp();
+    fn is_unconfirmed(&self, sample: &Sample) -> bool {
+        let source = sample.source_timestamp.timestamp();
         let sequence = self.reception.sequence();
-        sequence.is_unconfirmed(sample.sequence_number(), source, reach(sample.record()))
+        sequence.is_unconfirmed(sample.sequence_number, source, reach(&sample.head))
     }
 
     fn is_exact(&self, now: ModelTime) -> bool {
@@ -587,14 +584,9 @@ impl Settling<'_> {
     }
 }
 
-/// Returns how far the numbers of a record may be ahead; polling shared memory misses more.
-const fn reach(record: &Record) -> u64 {
-    if is_polled(record) { FAR } else { REACH }
-}
-
-/// Returns whether it was read by polling shared memory, where others may have been missed.
-const fn is_polled(record: &Record) -> bool {
-    record.flags & (flag::SHM | flag::EXACT) == flag::SHM
+/// Returns how far the numbers of an observation may be ahead; polling shared memory misses more.
+fn reach(head: &Head) -> u64 {
+    if head.is_polled() { FAR } else { REACH }
 }
 
 #[expect(

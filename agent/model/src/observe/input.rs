@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use ros2probe_wire::record::{Handover, Verdict};
 use ros2probe_wire::walk::Envelope;
-use ros2probe_wire::{Guid, GuidPrefix, Reason, Record, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, Reason, Timestamp};
 
 use crate::derive::chain::causality::CausalPublication;
 use crate::derive::chain::expected::ExpectedChain;
@@ -13,13 +13,15 @@ use crate::derive::trace::Spans;
 use crate::facts::calls::report::Report;
 use crate::facts::dispatch::Dispatch;
 use crate::facts::event::Taken;
+use crate::facts::observation::Observation;
 use crate::facts::selection::SampleRequest;
 use crate::facts::watch::Watchlist;
 use crate::graph::discovery::Memory;
 use crate::graph::sockets::SocketFacts;
 use crate::graph::zenoh::StreamReport;
 
-/// An input of the model. Times are in nanoseconds since the Unix epoch.
+/// An input of the model. Times are in nanoseconds since the Unix epoch, except those of
+/// observations.
 #[derive(Debug)]
 pub enum Input<'a> {
     /// The time has reached this value: leases expire, gaps settle, expectations are evaluated.
@@ -47,16 +49,15 @@ pub enum Input<'a> {
         /// Length of the whole RTPS message in bytes.
         length: u32,
     },
-    /// A captured datagram that is read for discovery only.
+    /// A captured datagram that is read for discovery and payloads. The caller sorts its user data
+    /// among other observations.
     Announcements {
         /// Its addresses and time.
         envelope: &'a Envelope,
         /// The RTPS message.
         payload: &'a [u8],
-        /// Flags of its records that the bytes do not contain.
-        flags: u16,
-        /// Receives the records of user data, which the caller sorts among others.
-        records: &'a mut Vec<Record>,
+        /// Whether it was polled in shared memory, where others may have been missed.
+        is_polled: bool,
     },
     /// A message that was sampled from shared memory, where others may have been missed.
     SharedMemory {
@@ -71,8 +72,10 @@ pub enum Input<'a> {
     ProbesDetached,
     /// A report about one direction of a Zenoh connection.
     Zenoh(&'a StreamReport<'a>),
-    /// A record of a complete datagram, from the kernel filter.
-    Record(&'a Record),
+    /// A submessage that a source saw, with the model's time by [`Observer::wall_clock`].
+    ///
+    /// [`Observer::wall_clock`]: crate::observe::observer::Observer::wall_clock
+    Observation(&'a Observation),
     /// The time at which a participant last sent a packet, from the kernel filter.
     ParticipantAlive(GuidPrefix, Timestamp),
     /// Facts about a socket; repeated when they change.

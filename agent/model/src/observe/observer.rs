@@ -21,21 +21,22 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_wire::discovery::Role;
-use ros2probe_wire::record::{Body, Handover, flag};
+use ros2probe_wire::record::Handover;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::walk::{self, Envelope, Outcome};
-use ros2probe_wire::{DomainId, Guid, Reason, Record, SequenceNumber, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, Reason, SequenceNumber, Timestamp};
 
 use crate::derive::chain::Chains;
 use crate::derive::examiner::Examiner;
 use crate::derive::inside::Inside;
 use crate::derive::services::Services;
-use crate::derive::trace::{LOOPBACK, Tracer, WriterDescription};
+use crate::derive::trace::{Tracer, WriterDescription};
 use crate::facts::event::TEXT;
 use crate::facts::journal::Journal;
 use crate::facts::measurement::Measurement;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::DdsName;
+use crate::facts::observation::{Observation, Path, Sample};
 use crate::facts::selection::SampleRequest;
 use crate::facts::wall_clock::WallClock;
 use crate::facts::watch::Watchlist;
@@ -44,7 +45,7 @@ use crate::graph::discovery_fragments::DiscoveryFragments;
 use crate::graph::zenoh::{RestoredEndpoint, Zenoh};
 use crate::measure::latched::Latched;
 use crate::measure::payloads::Payloads;
-use crate::measure::profiler::{Profiler, RecordOutcome, UNDELIVERED};
+use crate::measure::profiler::{ObservationOutcome, Profiler};
 use crate::measure::receivers::Receivers;
 use crate::measure::topic::{TopicId, Topics, Watched};
 use crate::observe::input::{Input, Output};
@@ -181,7 +182,7 @@ impl Observer {
                 envelope,
                 payload,
                 handover,
-            } => self.walk(envelope, payload, handover, 0, Self::count),
+            } => self.walk((envelope, payload, handover), false, |_| true),
             Input::CutDatagram {
                 envelope,
                 payload,
@@ -190,24 +191,15 @@ impl Observer {
             Input::Announcements {
                 envelope,
                 payload,
-                flags,
-                records,
-            } => self.walk(envelope, payload, None, flags, |observer, record, at| {
-                if record.writer().entity.is_builtin() {
-                    observer.count(record, at);
-                } else {
-                    records.push(*record);
-                }
-            }),
+                is_polled,
+            } => self.walk((envelope, payload, None), is_polled, EntityId::is_builtin),
             Input::SharedMemory { envelope, payload } => {
-                self.walk(envelope, payload, None, flag::SHM, Self::count);
+                self.walk((envelope, payload, None), true, |_| true);
             }
             Input::SharedMemoryGap(now) => self.profiler.uncertain(self.wall_clock.model_time(now)),
             Input::ProbesDetached => self.profiler.end_exact_view(),
             Input::Zenoh(report) => self.zenoh_report(report),
-            Input::Record(record) => {
-                self.count(record, self.wall_clock.model_time(Timestamp(record.time)));
-            }
+            Input::Observation(observation) => self.count(observation),
             Input::ParticipantAlive(prefix, at) => {
                 let at = self.wall_clock.model_time(at);
                 self.discovery.seen(prefix, at, Priority::NOTHING);
@@ -241,6 +233,12 @@ impl Observer {
         self.keep_dispatched(&output.samples);
         self.zenoh_interest(&mut output.interest);
         output
+    }
+
+    /// Returns the clock by which sources convert the times of their observations.
+    #[must_use]
+    pub const fn wall_clock(&self) -> WallClock {
+        self.wall_clock
     }
 
     /// Returns whether a subscription requests payloads.
@@ -285,9 +283,8 @@ impl Observer {
         let length = length.min(u16::MAX.into()).try_into().unwrap_or(0);
         let mut padded = payload.to_vec();
         padded.resize(payload.len().max(length), 0);
-        let at = self.wall_clock.model_time(Timestamp(envelope.time));
         walk::datagram(&padded, envelope, None, |found| {
-            self.count(&found.record, at);
+            self.count(&Observation::of(&found.record, self.wall_clock));
         });
     }
 
@@ -355,27 +352,29 @@ impl Observer {
             .or_default() += 1;
     }
 
-    /// Counts a record that was captured at `at`.
-    fn count(&mut self, record: &Record, at: ModelTime) {
+    /// Counts an observation.
+    fn count(&mut self, observation: &Observation) {
         self.records += 1;
-        let (writer, sender) = (record.writer(), record.sender());
-        if matches!(record.body(), Body::Handover | Body::Undelivered) {
+        let head = observation.head();
+        let (writer, sender, at) = (head.writer, observation.sender(), head.at);
+        if matches!(observation, Observation::Presence(_)) {
             self.discovery.seen(sender, at, Priority::NOTHING);
             return;
         }
+        let sample = observation.sample();
         let evidence = Priority {
             watched: false,
-            local: match record.flags & flag::STREAM {
-                0 if self.settings.directed && shows_departure(record) => {
+            local: match head.path {
+                // A router's socket sends samples of many sessions.
+                Path::Stream { .. } => self.receivers.is_local(&sender),
+                Path::Wire | Path::SharedMemory { .. }
+                    if self.settings.directed && head.leaves() =>
+                {
                     self.receivers.found_here(sender)
                 }
-                0 => self.receivers.learn(record),
-                // A router's socket sends samples of many sessions.
-                _ => self.receivers.is_local(&sender),
+                _ => self.receivers.learn(observation),
             },
-            sends: record.is_sample()
-                && record.flags & UNDELIVERED == 0
-                && !writer.entity.is_builtin(),
+            sends: sample.is_some_and(Sample::is_delivered) && !writer.entity.is_builtin(),
         };
         if self.discovery.seen(sender, at, evidence) {
             let journal = &mut self.journal;
@@ -387,32 +386,43 @@ impl Observer {
         if writer.entity.is_builtin() {
             return;
         }
-        self.latched.seen(record);
+        if let Some(sample) = sample {
+            self.latched.seen(sample);
+        }
         if self.tracer.is_wanted() {
-            self.trace(record, at);
+            self.trace(observation);
         }
         // Requests and replies are seldom measured: ordinary topics need no further lookup.
         let measures_calls = self.services.has_measured();
-        if measures_calls {
-            self.call_seen(record, at);
+        if let Some(sample) = sample.filter(|_| measures_calls) {
+            self.call_seen(sample);
         }
         let graph = graph!(self);
         let journal = &mut self.journal;
-        match self.profiler.record(writer, (record, at), journal, graph) {
-            RecordOutcome::Unmeasured if measures_calls => {}
-            RecordOutcome::Unmeasured => self.call_seen(record, at),
-            RecordOutcome::Measured => {
-                self.chain_seen(record);
+        match self.profiler.observe(observation, journal, graph) {
+            ObservationOutcome::Unmeasured => {
+                if let Some(sample) = sample.filter(|_| !measures_calls) {
+                    self.call_seen(sample);
+                }
+            }
+            ObservationOutcome::Measured => {
+                if let Some(sample) = sample {
+                    self.chain_seen(sample);
+                }
                 if self.payloads.is_unsettled(writer) {
-                    self.came_again(writer, record, at);
+                    if let Some(sample) = sample {
+                        self.came_again(sample);
+                    }
                     self.turn(writer, at);
                 }
                 return;
             }
-            RecordOutcome::Counted(counted) => {
+            ObservationOutcome::Counted(counted) => {
                 self.report_missing();
                 self.chain_counted(writer, &counted);
-                self.chain_seen(record);
+                if let Some(sample) = sample {
+                    self.chain_seen(sample);
+                }
                 self.counted(writer, &counted);
                 return;
             }
@@ -423,15 +433,14 @@ impl Observer {
         if is_strange {
             let graph = graph!(self);
             let journal = &mut self.journal;
-            let seen = (record, at);
-            let outcome = self.profiler.unknown_writer(writer, seen, journal, graph);
-            if let RecordOutcome::Counted(counted) = outcome {
+            let outcome = self.profiler.unknown_writer(observation, journal, graph);
+            if let ObservationOutcome::Counted(counted) = outcome {
                 self.counted(writer, &counted);
             }
         }
     }
 
-    fn trace(&mut self, record: &Record, at: ModelTime) {
+    fn trace(&mut self, observation: &Observation) {
         let Self {
             tracer,
             discovery,
@@ -440,39 +449,44 @@ impl Observer {
             receivers,
             ..
         } = self;
-        let is_local = receivers.is_local(&record.writer().prefix);
-        tracer.record((record, at), is_local, || {
-            let endpoint = discovery.endpoints().get(&record.writer())?;
+        let writer = observation.head().writer;
+        let is_local = receivers.is_local(&writer.prefix);
+        tracer.observe(observation, is_local, || {
+            let endpoint = discovery.endpoints().get(&writer)?;
             let naming = endpoint.naming()?;
             let topic = topics.get(topics.find(endpoint.domain_id, &naming)?)?;
             let subject = WriterDescription {
                 domain_id: topic.domain_id,
                 topic: topic.naming.name.bounded(TEXT),
                 message_type: endpoint.message_type.bounded(TEXT),
-                reliable: traits(record.writer(), endpoint).reliable,
+                reliable: traits(writer, endpoint).reliable,
             };
             (topic.watched == Watched::Yes).then(|| (subject, traced_share(topic, watchlist)))
         });
     }
 
+    /// Reads the announcements and payloads in a datagram, and counts submessages of the writers for
+    /// which `counts` is true.
     fn walk(
         &mut self,
-        envelope: &Envelope,
-        payload: &[u8],
-        handover: Option<&Handover>,
-        flags: u16,
-        mut count: impl FnMut(&mut Self, &Record, ModelTime),
+        (envelope, payload, handover): (&Envelope, &[u8], Option<&Handover>),
+        is_polled: bool,
+        counts: impl Fn(EntityId) -> bool,
     ) {
         self.datagrams += 1;
         let vendor = payload
             .get(6..8)
             .and_then(|bytes| <[u8; 2]>::try_from(bytes).ok());
         let vendor = vendor.filter(|vendor| *vendor != [0, 0]).map(VendorId);
-        let at = self.wall_clock.model_time(Timestamp(envelope.time));
-        let outcome = walk::datagram(payload, envelope, handover, |mut found| {
-            found.record.flags |= flags;
-            self.announced(&found, vendor, (envelope, at));
-            count(self, &found.record, at);
+        let outcome = walk::datagram(payload, envelope, handover, |found| {
+            let observation = match is_polled {
+                true => Observation::of_polled(&found.record, self.wall_clock),
+                false => Observation::of(&found.record, self.wall_clock),
+            };
+            self.announced((&found, &observation), vendor, envelope);
+            if counts(observation.head().writer.entity) {
+                self.count(&observation);
+            }
         });
         if outcome == Outcome::Malformed {
             self.decode_error("rtps", Reason::BadLength);
@@ -546,11 +560,4 @@ impl Observer {
             self.topics.leave(id, guid, now);
         }
     }
-}
-
-/// Returns whether the record shows that its sender is on this host, without a socket.
-const fn shows_departure(record: &Record) -> bool {
-    let on_wire = record.flags & flag::HOST == 0;
-    let leaves = record.flags & flag::OUTGOING != 0 || record.interface == LOOPBACK;
-    record.flags & flag::SHM != 0 || on_wire && leaves
 }

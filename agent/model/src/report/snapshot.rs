@@ -384,7 +384,7 @@ pub struct UnknownWriterFacts {
     pub vendor: Option<VendorId>,
     /// Host and process of the writer.
     pub process: ProcessFacts,
-    /// Time of the first record.
+    /// Time of the first observation.
     pub first_seen: ModelTime,
     /// Counts and times, as for any writer.
     pub measurement: Measurement,

@@ -10,6 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::allocator;
+use ros2probe_capture::border::observe;
 use ros2probe_model::facts::bounded::ledger;
 use ros2probe_model::facts::limits::Limits;
 use ros2probe_model::facts::selection::{Depth, SampleRequest, Selection};
@@ -363,7 +364,7 @@ fn one_writer(observer: &mut Observer, dice: &mut Dice, now: u64) {
             process_id: Some(dice.pick(5000) as u32),
             ..SocketFacts::default()
         })),
-        _ => observer.input(Input::Record(&forged_record(dice, newest, now))),
+        _ => observe(observer, &forged_record(dice, newest, now)),
     }
 }
 

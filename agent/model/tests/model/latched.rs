@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use ros2probe_capture::border::observe;
 use ros2probe_model::facts::bounded::ledger;
 use ros2probe_model::facts::dispatch::SampleOutcome;
 use ros2probe_model::facts::selection::{Depth, SampleRequest, Selection};
@@ -108,7 +109,7 @@ impl Robot {
         let mut records = Vec::new();
         ros2probe_wire::walk::datagram(&bytes, &envelope, None, |found| records.push(found.record));
         for record in &records {
-            self.domain.observer.input(Input::Record(record));
+            observe(&mut self.domain.observer, record);
         }
     }
 

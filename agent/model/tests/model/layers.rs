@@ -1,5 +1,5 @@
 //! The folders of the model are layers: a module imports its own layer and those below it, and no
-//! modules import each other in a cycle.
+//! modules import each other in a cycle. The kernel's record ends in one module.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -11,14 +11,30 @@ const LAYERS: [&str; 6] = ["facts", "graph", "measure", "derive", "report", "obs
 /// A module of a layer, such as `measure::writer`.
 type Module = (String, String);
 
+/// The only file that reads the kernel's record.
+const CONVERSION: &str = "facts/observation/record.rs";
+
+/// Returns the lines of a source outside of comments and tests.
+fn code(source: &str) -> impl Iterator<Item = &str> {
+    let source = source.split("#[cfg(test)]").next().unwrap();
+    let lines = source.lines();
+    lines.filter(|line| !line.trim_start().starts_with("//"))
+}
+
+/// Returns whether a source names the kernel's record, its flags or kinds, or a view of it.
+fn names_record(source: &str) -> bool {
+    let is_word = |letter: char| letter.is_alphanumeric() || letter == '_';
+    code(source).any(|line| {
+        let is_import = line.contains("record::") && line.contains("ros2probe_wire");
+        let mut words = line.split(|letter| !is_word(letter));
+        words.any(|word| word == "Record" || is_import && matches!(word, "flag" | "kind" | "Body"))
+    })
+}
+
 /// Returns the modules that a source names by `crate::layer::module`, outside of comments and tests.
 fn imports(source: &str) -> BTreeSet<Module> {
     let mut found = BTreeSet::new();
-    let source = source.split("#[cfg(test)]").next().unwrap();
-    let code = source
-        .lines()
-        .filter(|line| !line.trim_start().starts_with("//"));
-    for part in code.flat_map(|line| line.split("crate::").skip(1)) {
+    for part in code(source).flat_map(|line| line.split("crate::").skip(1)) {
         let mut names = part.split("::").map(|name| {
             let end = name.find(|letter: char| !letter.is_alphanumeric() && letter != '_');
             name[..end.unwrap_or(name.len())].to_owned()
@@ -119,6 +135,35 @@ fn each_layer_imports_only_those_below_it() {
     assert_eq!(beside, BTreeSet::from(["lib.rs".to_owned()]));
     assert!(modules.len() > 50, "{modules:#?}");
     assert_eq!(mistakes(&modules), Vec::<String>::new());
+}
+
+#[test]
+fn one_module_reads_the_record_of_the_kernel() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    let mut folders = vec![root.clone()];
+    let mut found = Vec::new();
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.file_stem().is_none_or(|stem| stem != "tests")
+                && names_record(&fs::read_to_string(&path).unwrap())
+            {
+                found.push(path.strip_prefix(&root).unwrap().to_owned());
+            }
+        }
+    }
+    assert_eq!(found, [Path::new(CONVERSION)]);
+    for line in [
+        "fn seen(record: &Record) {",
+        "use ros2probe_wire::record::{Verdict, flag};",
+    ] {
+        assert!(names_record(line), "{line}");
+    }
+    for line in ["// Record", "use ros2probe_wire::record::Verdict;"] {
+        assert!(!names_record(line), "{line}");
+    }
 }
 
 #[test]

@@ -10,6 +10,7 @@ use std::time::Instant;
 
 use crate::allocator;
 use ros2probe_bag::{Options, Storage, TopicDescription, Writer};
+use ros2probe_capture::border::observe;
 use ros2probe_daemon::agent_facts::{AgentFacts, SourceKind};
 use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
 use ros2probe_model::facts::limits::{Limit, Limits};
@@ -109,21 +110,24 @@ fn announce_all(observer: &mut Observer, limits: &Limits, now: u64) -> Vec<Guid>
 fn send_from_all(observer: &mut Observer, writers: &[Guid], mut now: u64) -> u64 {
     for number in 1..=100 {
         for (place, writer) in writers.iter().enumerate() {
-            observer.input(Input::Record(&Record {
-                kind: kind::DATA,
-                submessage_flags: 5,
-                writer: guid_words(*writer),
-                time: now,
-                sequence_number: number,
-                source_timestamp: now,
-                destination: [0, 0, u32::from_ne_bytes([0, 0, 0xff, 0xff]), 0x0100_000a],
-                destination_port: 7401,
-                datagram_len: 200,
-                payload_len: 100,
-                flags: flag::HOST,
-                socket: place as u64 + 1,
-                ..Record::default()
-            }));
+            observe(
+                observer,
+                &Record {
+                    kind: kind::DATA,
+                    submessage_flags: 5,
+                    writer: guid_words(*writer),
+                    time: now,
+                    sequence_number: number,
+                    source_timestamp: now,
+                    destination: [0, 0, u32::from_ne_bytes([0, 0, 0xff, 0xff]), 0x0100_000a],
+                    destination_port: 7401,
+                    datagram_len: 200,
+                    payload_len: 100,
+                    flags: flag::HOST,
+                    socket: place as u64 + 1,
+                    ..Record::default()
+                },
+            );
         }
         now += 100 * host::MILLISECOND;
         observer.input(Input::Time(Timestamp(now)));

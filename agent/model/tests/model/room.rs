@@ -5,6 +5,7 @@ use std::ops::{Deref, DerefMut};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use ros2probe_capture::border::observe;
 use ros2probe_model::facts::limits::Limits;
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Settings;
@@ -81,7 +82,7 @@ impl World {
             time: self.now,
             ..Record::default()
         };
-        self.observer.input(Input::Record(&record));
+        observe(&mut self.observer, &record);
     }
 
     /// Announces forged participants repeatedly until they count as established.

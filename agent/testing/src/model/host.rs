@@ -3,6 +3,7 @@
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 
+use ros2probe_capture::border::observe;
 use ros2probe_model::facts::loss::LossCause;
 use ros2probe_model::facts::watch::{Watch, Watchlist};
 use ros2probe_model::observe::input::Input;
@@ -183,7 +184,7 @@ impl Host {
             time: self.now,
             ..Record::default()
         };
-        self.observer.input(Input::Record(&out));
+        observe(&mut self.observer, &out);
     }
 
     pub fn announce(&mut self, message: Message) {
@@ -234,7 +235,7 @@ impl Host {
     }
 
     pub fn put(&mut self, record: Record) {
-        self.observer.input(Input::Record(&record));
+        observe(&mut self.observer, &record);
     }
 
     pub fn data(&mut self, seen: CapturePoint, number: u64) {

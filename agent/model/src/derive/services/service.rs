@@ -4,12 +4,12 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use ros2probe_wire::record::Sample;
 use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber};
 
 use super::latency::Latencies;
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{Content, Sample};
 use crate::facts::tables::{ReplyRuns, ServiceClients};
 
 /// Request numbers below the highest one that are remembered per client, for late duplicates.
@@ -161,7 +161,7 @@ impl Service {
         &mut self,
         id: CallId,
         writer: Guid,
-        sample: Sample<'_>,
+        sample: &Sample,
         sighting: Sighting,
     ) -> Option<Answered> {
         let call = self.calls.get_mut(&id)?;
@@ -297,11 +297,11 @@ impl Client {
 
 impl Received {
     /// Adds a reply or some of its fragments. Returns whether all of it has arrived.
-    fn put(&mut self, writer: Guid, sample: Sample<'_>) -> bool {
-        let Sample::DataFrag(fragments) = sample else {
+    fn put(&mut self, writer: Guid, sample: &Sample) -> bool {
+        let Content::DataFrag(fragments) = sample.content else {
             return true;
         };
-        let of = Some((writer, sample.sequence_number()));
+        let of = Some((writer, sample.sequence_number));
         if self.of != of {
             (self.of, self.runs) = (of, Bounded::default());
         }
@@ -309,8 +309,8 @@ impl Received {
         if total == 0 {
             return false;
         }
-        let start = fragments.starting();
-        let mut run = (start, start.saturating_add(fragments.count()));
+        let start = fragments.starting;
+        let mut run = (start, start.saturating_add(fragments.count));
         self.runs.retain(|other| {
             let touches = other.0 <= run.1 && run.0 <= other.1;
             if touches {

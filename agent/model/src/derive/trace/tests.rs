@@ -1,7 +1,9 @@
-use ros2probe_wire::record::{guid_words, kind};
-use ros2probe_wire::{EntityId, GuidPrefix, SequenceNumber};
+use ros2probe_wire::record::{flag, guid_words, kind};
+use ros2probe_wire::{EntityId, GuidPrefix, Record, SequenceNumber};
 
 use super::*;
+use crate::facts::observation::LOOPBACK;
+use crate::facts::observation::tests::observed;
 use ros2probe_wire::time::SECOND;
 
 const WRITER: Guid = Guid::new(GuidPrefix([7; 12]), EntityId([0, 0, 1, 3]));
@@ -10,11 +12,6 @@ const WRITER: Guid = Guid::new(GuidPrefix([7; 12]), EntityId([0, 0, 1, 3]));
 fn size(tracer: &Tracer) -> (usize, usize, u64) {
     let facts = tracer.table();
     (facts.size as usize, facts.limit as usize, facts.evictions)
-}
-
-/// Returns the record with its time.
-fn seen(record: &Record) -> (&Record, ModelTime) {
-    (record, ModelTime::from_nanoseconds(record.time))
 }
 
 fn reader(number: u8) -> Guid {
@@ -72,7 +69,7 @@ fn description() -> WriterDescription {
 
 fn take(tracer: &mut Tracer, records: &[Record], ratio: f64) -> Vec<Span> {
     for record in records {
-        tracer.record(seen(record), false, || {
+        tracer.observe(&observed(record), false, || {
             Some((description(), Share::of(ratio)))
         });
     }
@@ -203,7 +200,7 @@ fn a_writer_of_this_host_has_no_arrivals_and_a_router_sends_nothing_of_its_own()
     let taken = |records: &[Record], is_local: bool| {
         let mut tracer = tracer();
         for record in records {
-            tracer.record(seen(record), is_local, || {
+            tracer.observe(&observed(record), is_local, || {
                 Some((description(), Share::of(1.0)))
             });
         }
@@ -263,7 +260,7 @@ fn traces_that_never_complete_take_bounded_memory() {
                 writer: guid_words(other),
                 ..data(sample, SECOND, flag::OUTGOING)
             };
-            tracer.record(seen(&record), false, || {
+            tracer.observe(&observed(&record), false, || {
                 Some((description(), Share::of(1.0)))
             });
         }
@@ -282,7 +279,7 @@ fn a_known_writer_is_looked_up_only_once() {
     let mut tracer = tracer();
     let mut asked = 0;
     for number in 1..=3 {
-        tracer.record(seen(&data(number, number, 0)), false, || {
+        tracer.observe(&observed(&data(number, number, 0)), false, || {
             asked += 1;
             // Discovery has not announced the writer at first.
             (asked > 1).then(|| (description(), None))

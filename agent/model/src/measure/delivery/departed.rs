@@ -46,7 +46,7 @@ impl Delivery {
     }
 
     /// Excuses samples that were written before the receiver's reader appeared. `next` and the time
-    /// of its last rise are the values from before the current record.
+    /// of its last rise are the values from before the current observation.
     pub(super) fn excuse_unheard(&mut self, (next, advanced): (SequenceNumber, ModelTime)) {
         let sequence = self.reception.sequence_mut();
         if next > SequenceNumber::ZERO && advanced < self.opened && sequence.next() > next {

@@ -3,16 +3,16 @@
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
-use ros2probe_wire::{Guid, Record};
+use ros2probe_wire::Guid;
 
 use super::ESTABLISHED_MESSAGES;
 use super::EVICTABLE_AFTER;
 use super::Measured;
+use super::ObservationOutcome;
 use super::Profiler;
-use super::RecordOutcome;
-use super::UNDELIVERED;
 use crate::facts::journal::Journal;
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::Observation;
 use crate::measure::receivers::GraphView;
 use crate::measure::writer::{Traits, Writer};
 
@@ -35,27 +35,27 @@ impl Profiler {
         self.unknown_writers.range(writers).next().is_some()
     }
 
-    /// Processes a record of a writer without an announcement, seen at `now`.
+    /// Processes an observation of a writer without an announcement.
     pub fn unknown_writer(
         &mut self,
-        guid: Guid,
-        (record, now): (&Record, ModelTime),
+        observation: &Observation,
         journal: &mut Journal,
         graph: GraphView<'_>,
-    ) -> RecordOutcome {
-        if !record.is_sample() || record.flags & UNDELIVERED != 0 {
-            return RecordOutcome::Unmeasured;
-        }
+    ) -> ObservationOutcome {
+        let Some(sample) = observation.sample().filter(|sample| sample.is_delivered()) else {
+            return ObservationOutcome::Unmeasured;
+        };
+        let (guid, now) = (sample.head.writer, sample.head.at);
         if self.unknown_writers.is_full() && !self.evict_unknown_writer(now, graph) {
             self.unknown_writers.refuse();
-            return RecordOutcome::Unmeasured;
+            return ObservationOutcome::Unmeasured;
         }
         self.unknown_writers.insert(guid);
         self.writers.insert(
             guid,
             Measured::new(Writer::new(guid, Traits::default()), None, now),
         );
-        self.record(guid, (record, now), journal, graph)
+        self.observe(observation, journal, graph)
     }
 
     /// Drops the unknown writer with the longest silence, unless it is established. Returns whether

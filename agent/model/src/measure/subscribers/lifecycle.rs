@@ -19,7 +19,7 @@ use crate::facts::route::Route;
 use crate::measure::delivery::{Delivery, Totals};
 use crate::measure::receivers::Matched;
 
-/// A route is dropped after this long without a record, unless it leads to a known reader.
+/// A route is dropped after this long without an observation, unless it leads to a known reader.
 const ROUTE_TIMEOUT: Duration = Duration::from_secs(60);
 
 impl Subscribers {
@@ -76,12 +76,13 @@ impl Subscribers {
         (self.totals, worst.unwrap_or_default())
     }
 
-    /// Returns the time of the last record of each delivery that can be dropped for a new one.
+    /// Returns the time of the last observation of each delivery that can be dropped for a new one.
     pub fn silent_since(&self) -> impl Iterator<Item = ModelTime> + '_ {
         self.deliveries.iter().map(|delivery| delivery.seen().1)
     }
 
-    /// Drops at most `count` deliveries whose last record is not after this time; returns how many.
+    /// Drops at most `count` deliveries whose last observation is not after this time; returns how
+    /// many.
     pub fn give_up(
         &mut self,
         until: ModelTime,

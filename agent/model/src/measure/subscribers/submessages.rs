@@ -1,13 +1,10 @@
 //! HEARTBEAT, GAP and ACKNACK handling, and datagrams that failed IP reassembly.
 
-use ros2probe_wire::GuidPrefix;
-use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
-
 use super::Subscribers;
 use super::WriterContext;
 use super::delivery_context;
 use super::is_open;
-use crate::facts::route::Destination;
+use crate::facts::observation::{AckNack, Gap, Heartbeat, Sample};
 use crate::facts::route::Receiver;
 use crate::measure::receivers::Matched;
 use crate::measure::routes::KnownRoute;
@@ -18,7 +15,7 @@ impl Subscribers {
         &mut self,
         index: usize,
         (receiver, matched): (Receiver, Matched),
-        heartbeat: Heartbeat<'_>,
+        heartbeat: &Heartbeat,
         context: &mut WriterContext<'_>,
     ) {
         let Some(known) = self.routes.get(index) else {
@@ -27,7 +24,7 @@ impl Subscribers {
         let is_known = matched == Matched::Yes && matches!(receiver, Receiver::Participant(_));
         // Without a known receiver, the route must have carried samples.
         let holds = known.has_data || is_known;
-        let is_meant = heartbeat.record().reader().prefix != GuidPrefix::UNKNOWN;
+        let is_meant = heartbeat.head.directed_at().is_some();
         let opens = is_known && (is_meant || !known.route.destination.is_multicast());
         let place = match self.find(receiver) {
             None if opens => self.delivery(index, receiver, context),
@@ -47,7 +44,7 @@ impl Subscribers {
         &mut self,
         index: usize,
         receiver: Receiver,
-        gap: Gap<'_>,
+        gap: &Gap,
         context: &mut WriterContext<'_>,
     ) {
         let Some(known) = self.routes.get(index) else {
@@ -67,8 +64,8 @@ impl Subscribers {
     }
 
     /// Processes a request of a reader: samples that fill its gaps afterwards are retransmissions.
-    pub(super) fn requested(&mut self, acknack: AckNack<'_>) {
-        let reader = acknack.record().reader().prefix;
+    pub(super) fn requested(&mut self, acknack: &AckNack) {
+        let reader = acknack.head.reader.prefix;
         for delivery in &mut self.deliveries {
             if is_open(delivery) || delivery.receiver() == Receiver::Participant(reader) {
                 delivery.requested(acknack);
@@ -78,8 +75,8 @@ impl Subscribers {
 
     /// Processes an acknowledgement. A delivery belongs to a participant: samples that all of its
     /// readers have did arrive, even if they were not seen.
-    pub(super) fn acknowledged(&mut self, acknack: AckNack<'_>) {
-        let prefix = acknack.record().reader().prefix;
+    pub(super) fn acknowledged(&mut self, acknack: &AckNack) {
+        let prefix = acknack.head.reader.prefix;
         let below = self.acknowledgements.floor(|guid| guid.prefix == prefix);
         for delivery in &mut self.deliveries {
             let below = match delivery.receiver() {
@@ -94,11 +91,10 @@ impl Subscribers {
     }
 
     /// Processes a sample in a datagram that failed IP reassembly.
-    pub(super) fn not_reassembled(&mut self, sample: Sample<'_>, context: &mut WriterContext<'_>) {
+    pub(super) fn not_reassembled(&mut self, sample: &Sample, context: &mut WriterContext<'_>) {
         self.reassembled = true;
-        let record = sample.record();
-        let destination = Destination::of(record);
-        let directed = Some(record.reader().prefix).filter(|to| *to != GuidPrefix::UNKNOWN);
+        let destination = sample.head.destination;
+        let directed = sample.head.directed_at();
         let has_readers = self.has_readers;
         for delivery in &mut self.deliveries {
             let leads_there = |known: &KnownRoute| {
@@ -116,7 +112,7 @@ impl Subscribers {
                     }
             };
             if self.routes.iter().any(leads_there) {
-                let number = sample.sequence_number();
+                let number = sample.sequence_number;
                 delivery.not_reassembled(
                     number,
                     &mut delivery_context(&mut self.totals, self.reassembled, context),

@@ -1,7 +1,6 @@
 //! Measurement of a writer in shared memory, where polling misses messages.
 
-use ros2probe_wire::record::{Body, Sample, flag};
-use ros2probe_wire::{Record, Timestamp};
+use ros2probe_wire::Timestamp;
 
 use super::Counted;
 use super::MeasurementContext;
@@ -11,6 +10,7 @@ use super::seconds;
 use crate::facts::dispatch::MissedReason;
 use crate::facts::journal::{Journal, Missing};
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{Content, Observation, Sample};
 use crate::facts::rate::Sum;
 use crate::measure::sampled::{Completeness, Sampled, SampledUpdate};
 use crate::measure::samples::Budget;
@@ -29,9 +29,9 @@ impl Writer {
         }
     }
 
-    /// Returns whether the sample, seen at `at`, was pending when the sampled view ended.
-    pub(super) fn is_under_way(&self, sample: Sample<'_>, at: ModelTime) -> bool {
-        let number = sample.sequence_number();
+    /// Returns whether the sample was pending when the sampled view ended.
+    pub(super) fn is_under_way(&self, sample: &Sample) -> bool {
+        let (at, number) = (sample.head.at, sample.sequence_number);
         self.sampled
             .as_ref()
             .is_some_and(|sampled| !sampled.is_current(at) && sampled.awaits(number))
@@ -42,10 +42,10 @@ impl Writer {
         sampled.is_some_and(|sampled| sampled.is_current(now))
     }
 
-    /// Processes a record of a view in which missing samples may still have been sent.
-    pub(super) fn sampled_record(
+    /// Processes an observation of a view in which missing samples may still have been sent.
+    pub(super) fn sampled_observation(
         &mut self,
-        record: &Record,
+        observation: &Observation,
         is_sampled: bool,
         context: &mut MeasurementContext<'_>,
     ) -> Option<Counted> {
@@ -62,12 +62,12 @@ impl Writer {
         if is_sampled {
             sampled.touch(now);
         }
-        let reach = reach(record);
+        let reach = reach(observation.head());
         let since = self.reception.sequence().last_advance();
         let sequence = self.reception.sequence_mut();
-        let announced = match record.body() {
-            Body::Sample(sample) => {
-                let update = self.sampled_update(sample, reach, now, context.budget)?;
+        let announced = match observation {
+            Observation::Sample(sample) => {
+                let update = self.sampled_update(sample, reach, context.budget)?;
                 self.count_span(sample, &update, (since, now));
                 return self.sampled_sample(
                     sample,
@@ -75,16 +75,16 @@ impl Writer {
                     (now, context.wall_clock.wall_time(now)),
                 );
             }
-            Body::Heartbeat(heartbeat) => {
+            Observation::Heartbeat(heartbeat) => {
                 self.traits.reliable = true;
-                sampled.exist(heartbeat.last(), reach, now, sequence)
+                sampled.exist(heartbeat.last, reach, now, sequence)
             }
-            Body::Gap(gap) => sampled.skip((gap.start(), gap.list().base), reach, now, sequence),
+            Observation::Gap(gap) => sampled.skip((gap.start, gap.list.base), reach, now, sequence),
             // The reader has all samples below this number.
-            Body::AckNack(acknack) => {
+            Observation::AckNack(acknack) => {
                 sampled.exist(acknack.base().previous(), reach, now, sequence)
             }
-            Body::Complete | Body::Handover | Body::Undelivered | Body::Unknown => 0,
+            Observation::Presence(_) => 0,
         };
         sampled.pace(announced, since, now);
         if announced > 0 {
@@ -101,7 +101,7 @@ impl Writer {
     /// Counts the samples up to a seen one. Unseen ones are assumed to have its size.
     fn count_span(
         &mut self,
-        sample: Sample<'_>,
+        sample: &Sample,
         update: &SampledUpdate,
         (since, now): (ModelTime, ModelTime),
     ) {
@@ -131,28 +131,26 @@ impl Writer {
     /// Applies a sample, or a part of one, to the sampled view.
     fn sampled_update(
         &mut self,
-        sample: Sample<'_>,
+        sample: &Sample,
         reach: u64,
-        now: ModelTime,
         budget: &mut Budget,
     ) -> Option<SampledUpdate> {
         let sampled = self.sampled.as_mut()?;
-        let number = sample.sequence_number();
-        let source = sample.source_timestamp().timestamp();
+        let (now, number) = (sample.head.at, sample.sequence_number);
+        let source = sample.source_timestamp.timestamp();
         let sequence = self.reception.sequence();
         let unconfirmed = sequence.is_unconfirmed(number, source, reach);
         let has = !unconfirmed && sampled.has(number, sequence.next());
-        let is_whole = match sample {
-            Sample::DataFrag(fragments) => {
-                !has && self.reception.assemble(fragments, unconfirmed, now, budget)
+        let is_whole = match sample.content {
+            Content::DataFrag(fragments) => {
+                !has && (self.reception).assemble(sample, fragments, unconfirmed, budget)
             }
-            Sample::Data(_) => true,
+            Content::Data { .. } => true,
         };
-        let is_exact = sample.record().flags & flag::EXACT != 0;
         let seen = match is_whole {
             true => Completeness::Complete,
             // Polling shared memory may yield a sample after the uprobe did.
-            false if sample.is_end() && !is_exact => Completeness::LastFragment,
+            false if sample.is_end() && !sample.head.is_exact() => Completeness::LastFragment,
             false => Completeness::Partial,
         };
         let sequence = self.reception.sequence_mut();
@@ -162,15 +160,14 @@ impl Writer {
     /// Processes a part of a sample that was pending when the sampled view ended, from any source.
     pub(super) fn catch_up(
         &mut self,
-        sample: Sample<'_>,
+        sample: &Sample,
         context: &mut MeasurementContext<'_>,
     ) -> Option<Counted> {
         let now = context.now;
-        let is_whole = match sample {
-            Sample::Data(_) => true,
-            Sample::DataFrag(fragments) => {
-                self.reception
-                    .assemble(fragments, false, now, context.budget)
+        let is_whole = match sample.content {
+            Content::Data { .. } => true,
+            Content::DataFrag(fragments) => {
+                (self.reception).assemble(sample, fragments, false, context.budget)
             }
         };
         let seen = if is_whole {
@@ -178,25 +175,25 @@ impl Writer {
         } else {
             Completeness::Partial
         };
-        let number = sample.sequence_number();
+        let number = sample.sequence_number;
         let update = self.sampled.as_mut()?.catch_up(number, seen);
         self.sampled_sample(sample, &update, (now, context.wall_clock.wall_time(now)))
     }
 
     fn sampled_sample(
         &mut self,
-        sample: Sample<'_>,
+        sample: &Sample,
         update: &SampledUpdate,
         (now, wall_clock): (ModelTime, Timestamp),
     ) -> Option<Counted> {
-        let (number, is_message) = (sample.sequence_number(), sample.is_message());
+        let (number, is_message) = (sample.sequence_number, sample.is_message());
         let bytes = u64::from(sample.size());
         let sampled = self.sampled.as_mut()?;
-        let stamp = sampled.stamp(number, sample.header_stamp());
+        let stamp = sampled.stamp(number, sample.header_stamp);
         if let Some(interval) = update.interval {
             self.interarrival.observe(seconds(interval));
         }
-        let source = sample.source_timestamp();
+        let source = sample.source_timestamp;
         if update.arrived && is_message {
             self.delays(number, true, (source, stamp), (now, wall_clock));
         }

@@ -1,7 +1,9 @@
-use ros2probe_wire::record::kind;
+use ros2probe_wire::Record;
+use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::time::{MILLISECOND, SECOND};
 
 use super::*;
+use crate::facts::observation::tests::{observed, sample};
 
 const START: u64 = 1_795_143_000 * SECOND;
 
@@ -32,10 +34,10 @@ impl Bench {
 
     /// Processes a record as [`Self::put`] does, and returns the completed message.
     fn take(&mut self, record: Record) -> Option<Counted> {
-        let record = Record {
+        let observation = observed(&Record {
             time: self.now,
             ..record
-        };
+        });
         let mut context = MeasurementContext {
             now: ModelTime::from_nanoseconds(self.now),
             budget: &mut self.budget,
@@ -43,7 +45,7 @@ impl Bench {
             wall_clock: WallClock::default(),
             has_receivers: false,
         };
-        self.writer.record(&record, self.opened, &mut context)
+        (self.writer).observe(&observation, self.opened, &mut context)
     }
 
     fn data(&mut self, number: u64) -> &mut Self {
@@ -595,8 +597,8 @@ fn every_sample_is_counted_or_missed(
                 for record in records {
                     bench.now += MILLISECOND;
                     // A record without payload cannot complete a requested sample.
-                    let now = ModelTime::from_nanoseconds(bench.now);
-                    let has = bench.writer.has(record.sample().unwrap(), now);
+                    let time = bench.now;
+                    let has = bench.writer.has(&sample(&Record { time, ..*record }));
                     if let Some(counted) = bench.take(*record) {
                         assert!(!has, "{record:?}");
                         given[usize::try_from(counted.number.0).unwrap() - 1] += 1;

@@ -2,45 +2,43 @@
 
 use ros2probe_wire::discovery::{self, EndpointAnnouncement, ParticipantAnnouncement, Role};
 use ros2probe_wire::entities::ParticipantEntities;
-use ros2probe_wire::record::Sample;
 use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
 use ros2probe_wire::walk::{Envelope, Found};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, WireError};
 
 use super::Observer;
-use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{Content, Observation, Sample};
 use crate::facts::route::Destination;
 use crate::graph::discovery::{Origin, Priority, endpoints_of};
 
 impl Observer {
     pub(super) fn announced(
         &mut self,
-        found: &Found<'_>,
+        (found, observation): (&Found<'_>, &Observation),
         vendor: Option<VendorId>,
-        (envelope, at): (&Envelope, ModelTime),
+        envelope: &Envelope,
     ) {
-        let record = &found.record;
-        if let Some(sample) = record.sample() {
-            let prefix = record.writer().prefix;
+        if let Observation::Sample(sample) = observation {
+            let prefix = sample.head.writer.prefix;
             let [first, second, ..] = prefix.0;
             let vendor = vendor.unwrap_or(VendorId([first, second]));
             let origin = Origin {
-                at,
+                at: sample.head.at,
                 sender: prefix,
-                sequence_number: sample.sequence_number(),
+                sequence_number: sample.sequence_number,
                 destination: envelope.destination,
                 port: envelope.destination_port,
             };
             self.read(found, sample, vendor, &origin);
             self.follow_up(origin.at);
-            self.identify_call(found, sample, vendor, origin.at);
-            self.keep_payload(record, at, found.payload);
+            self.identify_call(found, sample, vendor);
+            self.keep_payload(sample, found.payload);
         }
     }
 
     /// Parses a sample if it is relevant to discovery.
-    fn read(&mut self, found: &Found<'_>, sample: Sample<'_>, vendor: VendorId, origin: &Origin) {
-        let writer = found.record.writer();
+    fn read(&mut self, found: &Found<'_>, sample: &Sample, vendor: VendorId, origin: &Origin) {
+        let writer = sample.head.writer;
         let stage = match writer.entity {
             EntityId::SPDP_WRITER | EntityId::SPDP_SECURE_WRITER => "spdp",
             EntityId::SEDP_PUBLICATIONS_WRITER
@@ -51,12 +49,13 @@ impl Observer {
             _ => return,
         };
         let whole;
-        let (payload, inline_qos) = if let Sample::DataFrag(fragments) = sample {
-            let Some(bytes) = self.discovery_fragments.put(fragments, found.payload) else {
+        let (payload, inline_qos) = if let Content::DataFrag(fragments) = sample.content {
+            let fragmented = &mut self.discovery_fragments;
+            let Some(bytes) = fragmented.put(sample, fragments, found.payload) else {
                 return;
             };
             whole = bytes;
-            let status_info = sample.status_info();
+            let status_info = sample.status_info;
             (
                 Payload::Data(&whole),
                 Ok(InlineQos {
@@ -79,9 +78,9 @@ impl Observer {
 
     /// Returns whether a sample is on `ros_discovery_info`, or on an unannounced topic and of the
     /// same form. It is sent once, perhaps before its writer's announcement is processed.
-    fn may_be_entities(&self, found: &Found<'_>, sample: Sample<'_>) -> bool {
-        let writer = found.record.writer();
-        if sample.status_info() != StatusInfo::ALIVE {
+    fn may_be_entities(&self, found: &Found<'_>, sample: &Sample) -> bool {
+        let writer = sample.head.writer;
+        if sample.status_info != StatusInfo::ALIVE {
             return false;
         }
         if let Some(endpoint) = self.discovery.endpoints().get(&writer) {
@@ -89,10 +88,10 @@ impl Observer {
         }
         let own = Guid::new(writer.prefix, EntityId::PARTICIPANT).to_bytes();
         let begins = found.payload.get(4..20).is_some_and(|gid| *gid == own);
-        match sample {
-            Sample::Data(_) => begins,
-            Sample::DataFrag(fragments) => {
-                sample.is_start() && begins || self.discovery_fragments.holds(fragments)
+        match sample.content {
+            Content::Data { .. } => begins,
+            Content::DataFrag(_) => {
+                sample.is_start() && begins || self.discovery_fragments.holds(sample)
             }
         }
     }

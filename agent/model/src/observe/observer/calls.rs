@@ -1,25 +1,19 @@
 //! Calls of services: captured requests and replies, and their further copies.
 
-use ros2probe_wire::record::{Sample, Verdict};
+use ros2probe_wire::Guid;
+use ros2probe_wire::record::Verdict;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::walk::Found;
-use ros2probe_wire::{Guid, Record};
 
 use super::Observer;
 use crate::facts::model_time::ModelTime;
-use crate::facts::route::Route;
+use crate::facts::observation::Sample;
 
 impl Observer {
     /// Reads the identity of a captured request or reply.
-    pub(super) fn identify_call(
-        &mut self,
-        found: &Found<'_>,
-        sample: Sample<'_>,
-        vendor: VendorId,
-        at: ModelTime,
-    ) {
-        let writer = found.record.writer();
-        match self.services.identify(found, sample, vendor, at) {
+    pub(super) fn identify_call(&mut self, found: &Found<'_>, sample: &Sample, vendor: VendorId) {
+        let writer = sample.head.writer;
+        match self.services.identify(found, sample, vendor) {
             Ok(is_over_budget) => self.follow_call(writer, is_over_budget),
             Err(error) => self.decode_error("request", error.reason),
         }
@@ -38,14 +32,11 @@ impl Observer {
     }
 
     /// Counts a copy of a request or reply.
-    pub(super) fn call_seen(&mut self, record: &Record, at: ModelTime) {
-        if let Some(sample) = record.sample()
-            && self.services.follows(record.writer())
-        {
+    pub(super) fn call_seen(&mut self, sample: &Sample) {
+        if self.services.follows(sample.head.writer) {
             let (receivers, discovery) = (&self.receivers, &self.discovery);
-            self.services.seen((record, at), sample, || {
-                receivers.owner(&Route::of(record), discovery)
-            });
+            self.services
+                .seen(sample, || receivers.owner(&sample.head.route(), discovery));
         }
     }
 

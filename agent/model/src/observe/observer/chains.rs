@@ -1,7 +1,7 @@
 //! Messages with stamps, which chains consist of.
 
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::{Guid, GuidPrefix, Record};
+use ros2probe_wire::{Guid, GuidPrefix};
 
 use super::Observer;
 use super::lists::traced_share;
@@ -10,7 +10,7 @@ use crate::derive::chain::graph::publisher;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName};
 use crate::facts::naming::Naming;
-use crate::facts::route::Route;
+use crate::facts::observation::Sample;
 use crate::measure::topic::Topic;
 use crate::measure::writer::Counted;
 
@@ -25,13 +25,11 @@ impl Observer {
     }
 
     /// Notes where a copy of a message arrived.
-    pub(super) fn chain_seen(&mut self, record: &Record) {
-        if let Some(sample) = record.sample()
-            && self.chains.follows(record.writer())
-        {
+    pub(super) fn chain_seen(&mut self, sample: &Sample) {
+        if self.chains.follows(sample.head.writer) {
             let (receivers, discovery) = (&self.receivers, &self.discovery);
-            self.chains.seen(record, sample, || {
-                receivers.owner(&Route::of(record), discovery)
+            self.chains.seen(sample, self.wall_clock, || {
+                receivers.owner(&sample.head.route(), discovery)
             });
         }
     }

@@ -2,8 +2,7 @@
 
 use std::sync::Arc;
 
-use ros2probe_wire::record::Sample;
-use ros2probe_wire::{Guid, Record, SequenceNumber, Timestamp};
+use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
 use ros2probe_wire::names::DdsTopic;
 
@@ -12,8 +11,9 @@ use super::graph;
 use crate::facts::dispatch::{self, Dispatch, SampleOutcome};
 use crate::facts::model_time::ModelTime;
 use crate::facts::naming::Naming;
+use crate::facts::observation::{Content, Sample};
 use crate::facts::selection::SampleRequest;
-use crate::measure::profiler::{Measured, UNDELIVERED};
+use crate::measure::profiler::Measured;
 use crate::measure::writer::Counted;
 
 impl Observer {
@@ -72,23 +72,21 @@ impl Observer {
     }
 
     /// Dispatches a retransmitted sample that was first counted before its writer's announcement.
-    pub(super) fn came_again(&mut self, writer: Guid, record: &Record, at: ModelTime) {
-        let Some(sample) = record.sample() else {
-            return;
+    pub(super) fn came_again(&mut self, sample: &Sample) {
+        let (writer, at) = (sample.head.writer, sample.head.at);
+        let number = sample.sequence_number;
+        let stamp = match sample.content {
+            Content::Data { .. } => sample.header_stamp,
+            Content::DataFrag(_) => None,
         };
-        let number = sample.sequence_number();
-        let stamp = match sample {
-            Sample::Data(_) => sample.header_stamp(),
-            Sample::DataFrag(_) => None,
-        };
-        if record.flags & UNDELIVERED != 0 || !self.payloads.lacks(writer, number) {
+        if !sample.is_delivered() || !self.payloads.lacks(writer, number) {
             return;
         }
         let has_header = |known: &Measured| known.writer.traits().has_header;
         let counted = Counted {
             number,
             bytes: sample.size().into(),
-            source: record.source_timestamp(),
+            source: sample.source_timestamp,
             stamp: stamp.filter(|_| self.profiler.get(writer).is_some_and(has_header)),
             at,
             began: at,
@@ -119,23 +117,19 @@ impl Observer {
         }
     }
 
-    /// Keeps the payload of a record that is not counted yet, if it is requested.
-    pub(super) fn keep_payload(&mut self, record: &Record, at: ModelTime, payload: &[u8]) {
-        let writer = record.writer();
+    /// Keeps the payload of a sample that is not counted yet, if it is requested.
+    pub(super) fn keep_payload(&mut self, sample: &Sample, payload: &[u8]) {
+        let writer = sample.head.writer;
         if self.payloads.wants_bytes(writer) {
             let known = self.profiler.get(writer);
-            let Some(sample) = record.sample() else {
-                return;
-            };
-            let lacks = self.payloads.lacks(writer, sample.sequence_number());
-            if lacks || known.is_some_and(|known| !known.writer.has(sample, at)) {
-                self.payloads.keep(sample, at, payload);
+            let lacks = self.payloads.lacks(writer, sample.sequence_number);
+            if lacks || known.is_some_and(|known| !known.writer.has(sample)) {
+                self.payloads.keep(sample, payload);
             }
-        } else if self.latched.verdict(writer).is_some() {
-            let sample = record.sample();
-            if sample.is_some_and(|sample| self.latched.put(sample, at, payload)) {
-                self.apply_again(writer, at);
-            }
+        } else if self.latched.verdict(writer).is_some()
+            && self.latched.put(sample, self.wall_clock, payload)
+        {
+            self.apply_again(writer, sample.head.at);
         }
     }
 

@@ -1,32 +1,31 @@
-//! Connections of Zenoh: announcements for discovery, and records for everything else.
+//! Connections of Zenoh: announcements for discovery, and observations for everything else.
 
 use ros2probe_wire::discovery::{EndpointAnnouncement, Role};
-use ros2probe_wire::record::{Verdict, flag, guid_words, kind};
-use ros2probe_wire::rtps::SubmessageFlags;
+use ros2probe_wire::record::Verdict;
+use ros2probe_wire::rtps::StatusInfo;
 use ros2probe_wire::zenoh::Gid;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, RtpsTime, SequenceNumber, Timestamp};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, RtpsTime, SequenceNumber};
 
 use super::Observer;
 use crate::derive::services::service::CallId;
 use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{Content, DatagramFate, Head, Observation, Path, Sample};
+use crate::facts::route::Direction;
 use crate::graph::discovery::{Origin, Priority};
 use crate::graph::zenoh::{
     GraphChange, Holder, Shown, StreamId, StreamReport, ZenohSample, unknown_guid,
 };
 
-/// Bytes of the payload in which a header's stamp ends, after the encapsulation.
-const STAMP_END: usize = 12;
-
 impl Observer {
     pub(super) fn zenoh_report(&mut self, report: &StreamReport<'_>) {
         // The state is apart while it calls back.
         let mut zenoh = std::mem::take(&mut self.zenoh);
-        let (time, at) = (report.time, self.wall_clock.model_time(report.time));
+        let at = self.wall_clock.model_time(report.time);
         let mut alive = None;
         let wants_bytes = self.payloads.wants_any_bytes() || self.latched.is_used();
         // A sample may precede its announcement in a batch, as that of an unknown writer.
         zenoh.report(report, at, wants_bytes, &mut |shown| match shown {
-            Shown::Sample(sample) => self.zenoh_sample(report.stream, (time, at), sample),
+            Shown::Sample(sample) => self.zenoh_sample(report.stream, at, sample),
             Shown::Owner(socket, prefix) => self.receivers.sends(socket, prefix),
             Shown::Disowned(socket, prefix) => self.receivers.sends_no_longer(socket, prefix),
             Shown::Alive(session) => alive = Some(session),
@@ -171,107 +170,84 @@ impl Observer {
     }
 
     /// Counts a sample, request or reply.
-    fn zenoh_sample(
-        &mut self,
-        stream: &StreamId,
-        (time, at): (Timestamp, ModelTime),
-        sample: &ZenohSample<'_>,
-    ) {
-        let record = record(stream, (time, at), sample);
+    fn zenoh_sample(&mut self, stream: &StreamId, at: ModelTime, sample: &ZenohSample<'_>) {
+        let observed = observed(stream, at, sample);
+        let writer = sample.writer;
         if let Some((client, number)) = sample.call {
             let call = CallId {
                 client: client.0,
                 number,
             };
             let captured = sample.payload.captured;
-            let is_over =
-                self.services
-                    .identified(record.writer(), sample.number, call, captured, at);
-            self.follow_call(record.writer(), is_over);
+            let services = &mut self.services;
+            let is_over = services.identified(writer, sample.number, call, captured, at);
+            self.follow_call(writer, is_over);
         }
         if let Some(payload) = sample.payload.whole() {
-            self.keep_payload(&record, at, payload);
+            self.keep_payload(&observed, payload);
         }
-        self.count(&record, at);
+        self.count(&Observation::Sample(observed));
         if stream.outgoing && stream.is_loopback() {
             // Nothing is read at the receiver's socket: the sender's socket showed it.
-            let arriving = Record {
-                flags: record.flags & !flag::OUTGOING,
+            let head = Head {
+                direction: Direction::Received,
                 socket: sample.receiving_socket,
-                ..record
+                ..observed.head
             };
-            self.count(&arriving, at);
+            self.count(&Observation::Sample(Sample { head, ..observed }));
         }
     }
 }
 
-/// Returns the record of a sample that has arrived whole.
-fn record(
-    stream: &StreamId,
-    (time, at): (Timestamp, ModelTime),
-    sample: &ZenohSample<'_>,
-) -> Record {
-    let mut flags = flag::STREAM;
-    for (is_set, bit) in [
-        (sample.is_relayed, flag::RELAYED),
-        (stream.outgoing, flag::OUTGOING),
-        (stream.socket != 0, flag::HOST),
-        (!is_ipv4(stream), flag::IPV6),
-    ] {
-        flags |= if is_set { bit } else { 0 };
-    }
-    let head: Option<&[u8; STAMP_END]> = sample.payload.captured.first_chunk();
-    let (mut encapsulation, mut seconds, mut nanoseconds) = (0, 0, 0);
-    if let Some([a, b, c, d, s @ .., e, f, g, h]) = head
-        && let [s0, s1, s2, s3] = *s
-    {
-        encapsulation = u32::from_be_bytes([*a, *b, *c, *d]);
-        // The lowest bit of the identifier is the byte order (RTPS 2.5, 10.5).
-        let word = |bytes: [u8; 4]| match b & 1 {
-            0 => u32::from_be_bytes(bytes),
-            _ => u32::from_le_bytes(bytes),
-        };
-        (seconds, nanoseconds) = (word([s0, s1, s2, s3]), word([*e, *f, *g, *h]));
-        flags |= flag::STAMP;
-    }
-    let receiver = Guid::new(
-        sample.receiver.unwrap_or(GuidPrefix::UNKNOWN),
-        EntityId::UNKNOWN,
-    );
-    let flow = stream.flow;
-    let elapsed = (at - sample.began).as_nanos();
-    Record {
-        time: time.0,
-        writer: guid_words(sample.writer),
-        reader: guid_words(receiver),
-        sequence_number: sample.number.0,
+/// Returns the observation of a sample that has arrived whole.
+fn observed(stream: &StreamId, at: ModelTime, sample: &ZenohSample<'_>) -> Sample {
+    let receiver = sample.receiver.unwrap_or(GuidPrefix::UNKNOWN);
+    Sample {
+        head: Head {
+            at,
+            elapsed: u32::try_from((at - sample.began).as_nanos()).unwrap_or(u32::MAX),
+            writer: sample.writer,
+            reader: Guid::new(receiver, EntityId::UNKNOWN),
+            path: Path::Stream {
+                relayed: sample.is_relayed,
+                at_socket: stream.socket != 0,
+            },
+            direction: match stream.outgoing {
+                true => Direction::Sent,
+                false => Direction::Received,
+            },
+            socket: stream.socket,
+            destination: stream.flow.destination,
+            interface: stream.interface,
+            datagram_len: 0,
+        },
+        sequence_number: sample.number,
         source_timestamp: sample
             .source_timestamp
-            .map_or(0, |time| RtpsTime::of(time).0),
-        destination: words(flow.destination.address),
-        destination_port: flow.destination.port,
-        source_port: flow.source.port,
-        interface: stream.interface,
-        kind: kind::DATA,
-        submessage_flags: SubmessageFlags::DATA.0,
-        flags,
-        payload_len: u32::try_from(sample.payload.length).unwrap_or(u32::MAX),
-        encapsulation,
-        stamp_seconds: seconds,
-        stamp_nanoseconds: nanoseconds,
-        socket: stream.socket,
-        elapsed: u32::try_from(elapsed).unwrap_or(u32::MAX),
-        ..Record::default()
+            .map_or(RtpsTime::default(), RtpsTime::of),
+        status_info: StatusInfo::ALIVE,
+        has_value: true,
+        has_known_begin: true,
+        header_stamp: header_stamp(sample.payload.captured),
+        fate: DatagramFate::Passed,
+        content: Content::Data {
+            size: u32::try_from(sample.payload.length).unwrap_or(u32::MAX),
+        },
     }
 }
 
-/// Returns the words of an address in a record, which hold its bytes.
-fn words(address: [u8; 16]) -> [u32; 4] {
-    guid_words(Guid::from_bytes(address))
-}
-
-fn is_ipv4(stream: &StreamId) -> bool {
-    stream.flow.destination.socket_address().is_ipv4()
+/// Returns the stamp of a header at the beginning of a payload, as seconds and nanoseconds.
+fn header_stamp(payload: &[u8]) -> Option<(i32, u32)> {
+    let ([_, order, _, _], rest) = payload.split_first_chunk()?;
+    let (seconds, rest) = rest.split_first_chunk()?;
+    let nanoseconds = rest.first_chunk()?;
+    // The lowest bit of the identifier is the byte order (RTPS 2.5, 10.5).
+    let word = |bytes: &[u8; 4]| match order & 1 {
+        0 => u32::from_be_bytes(*bytes),
+        _ => u32::from_le_bytes(*bytes),
+    };
+    let nanoseconds = word(nanoseconds);
+    (nanoseconds < 1_000_000_000).then(|| (word(seconds).cast_signed(), nanoseconds))
 }
 
 /// Number of the first change.

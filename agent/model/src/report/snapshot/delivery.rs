@@ -37,9 +37,9 @@ pub struct DeliveryFacts {
     pub process: Option<Arc<str>>,
     /// Control group of that socket, as a path below the root.
     pub cgroup: Option<Arc<str>>,
-    /// Time of the first record.
+    /// Time of the first observation.
     pub first_seen: ModelTime,
-    /// Time of the last record.
+    /// Time of the last observation.
     pub last_seen: ModelTime,
     /// Fate of the samples.
     pub delivered: Delivered,

@@ -1,5 +1,6 @@
 //! Forged messages with stamps, of which some continue others, and forged publications.
 
+use ros2probe_capture::border::observe;
 use ros2probe_model::derive::chain::causality::CausalPublication;
 use ros2probe_model::derive::chain::expected::ExpectedChain;
 use ros2probe_testing::model::forge::AnnouncedNode;
@@ -110,7 +111,7 @@ pub(super) fn messages(observer: &mut Observer, dice: &mut Dice, now: u64) {
         record(OUTPUT, (number, now + 100), stamp, flag::OUTGOING),
         record(FRESH, (number, now + 100), now + 90, flag::OUTGOING),
     ] {
-        observer.input(Input::Record(&record));
+        observe(observer, &record);
     }
     for _ in 0..3 {
         publish(observer, dice, now);

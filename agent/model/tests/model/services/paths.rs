@@ -1,5 +1,7 @@
 //! Calls seen at the sockets of a host, where a reply counts once it reaches its client.
 
+use ros2probe_capture::border::observe;
+
 use super::*;
 
 /// A reply or request at one of the sockets of this host.
@@ -70,7 +72,7 @@ impl Robot {
             socket: at.socket,
             ..Record::default()
         };
-        self.domain.observer.input(Input::Record(&record));
+        observe(&mut self.domain.observer, &record);
     }
 
     /// A client of this host sends its request.

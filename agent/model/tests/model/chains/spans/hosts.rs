@@ -3,6 +3,7 @@
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 
+use ros2probe_capture::border::observe;
 use ros2probe_model::facts::watch::{Watch, Watchlist};
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{Observer, Settings};
@@ -133,20 +134,26 @@ impl Agent {
             ..Record::default()
         };
         if self.hosts[node] == self.host {
-            self.observer.input(Input::Record(&Record {
-                time: at + 100 * MICROSECOND,
-                flags: flag::STAMP | flag::HOST | flag::OUTGOING,
-                socket: 100 + node as u64,
-                ..record
-            }));
+            observe(
+                &mut self.observer,
+                &Record {
+                    time: at + 100 * MICROSECOND,
+                    flags: flag::STAMP | flag::HOST | flag::OUTGOING,
+                    socket: 100 + node as u64,
+                    ..record
+                },
+            );
         }
         if is_read && self.hosts[node + 1] == self.host {
-            self.observer.input(Input::Record(&Record {
-                time: at + 400 * MICROSECOND,
-                flags: flag::STAMP | flag::HOST,
-                socket: 100 + node as u64 + 1,
-                ..record
-            }));
+            observe(
+                &mut self.observer,
+                &Record {
+                    time: at + 400 * MICROSECOND,
+                    flags: flag::STAMP | flag::HOST,
+                    socket: 100 + node as u64 + 1,
+                    ..record
+                },
+            );
         }
     }
 }

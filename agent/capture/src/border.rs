@@ -1,0 +1,12 @@
+//! The border of the model, where the kernel's records become observations.
+
+use ros2probe_model::facts::observation::Observation;
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Observer;
+use ros2probe_wire::Record;
+
+/// Passes a record of a complete datagram to the model. Its time is wall time.
+pub fn observe(observer: &mut Observer, record: &Record) {
+    let observation = Observation::of(record, observer.wall_clock());
+    observer.input(Input::Observation(&observation));
+}
