@@ -5,7 +5,7 @@
 //! many, within one budget for all samples. When the budget is exhausted, the oldest sample is
 //! dropped. Counting of samples happens elsewhere.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::time::Duration;
 
 use crate::facts::bounded::Bounded;
@@ -21,6 +21,11 @@ const OVERHEAD: usize = 128;
 const FRAGMENT_TIMEOUT: Duration = Duration::from_secs(30);
 /// Smallest allocation for a sample.
 const LEAST: usize = 4096;
+/// Buffers from this size on are used again: in new ones, the kernel would have to clear each page.
+const LARGE: usize = 128 << 10;
+/// Most buffers that are kept for it, and after how long without a sample they are freed.
+const KEPT: usize = 4;
+const KEPT_FOR: Duration = Duration::from_secs(10);
 
 /// All unfinished samples.
 #[derive(Debug)]
@@ -28,6 +33,8 @@ pub struct Assembly {
     parts: Bounded<AssembledSamples, HashMap<(Guid, SequenceNumber), Part>>,
     /// The same samples in the order in which they began.
     ages: Bounded<AssembledSamples, BTreeMap<u64, (Guid, SequenceNumber)>>,
+    /// Payloads that were passed on, the oldest first. Their readers drop them at some time.
+    passed: VecDeque<(ModelTime, Bytes)>,
     begun: u64,
     bytes: usize,
     limit: usize,
@@ -57,6 +64,7 @@ impl Assembly {
         Self {
             parts: Bounded::default(),
             ages: Bounded::default(),
+            passed: VecDeque::new(),
             begun: 0,
             bytes: 0,
             limit,
@@ -83,8 +91,11 @@ impl Assembly {
             }
             self.begun += 1;
             self.ages.insert(self.begun, key);
-            self.bytes += OVERHEAD;
-            let part = Part::new(self.begun, size, fragment_size, now);
+            let part = Part {
+                head: self.buffer(size),
+                ..Part::new(self.begun, size, fragment_size, now)
+            };
+            self.bytes += part.bytes() + OVERHEAD;
             self.parts.insert(key, part);
         }
         let Some(part) = self.parts.get_mut(&key) else {
@@ -102,7 +113,11 @@ impl Assembly {
         };
         part.put(start, payload);
         self.bytes = self.bytes + part.bytes() - before;
-        while self.bytes + other_bytes > self.limit && self.evict() {}
+        while self.bytes + self.passed_bytes() + other_bytes > self.limit {
+            if self.passed.pop_front().is_none() && !self.evict() {
+                break;
+            }
+        }
     }
 
     /// Drops the oldest sample. Returns whether there was one.
@@ -125,7 +140,33 @@ impl Assembly {
     /// Removes a sample that was counted and returns its bytes, or `None` if some are missing.
     pub fn take(&mut self, writer: Guid, number: SequenceNumber) -> Option<Bytes> {
         let part = self.remove((writer, number))?;
-        (part.head.len() == part.size).then(|| part.head.into())
+        if part.head.len() != part.size {
+            return None;
+        }
+        let payload = Bytes::from(part.head);
+        if payload.len() >= LARGE && payload.len() <= self.limit / (2 * KEPT) {
+            if self.passed.len() >= KEPT {
+                self.passed.pop_front();
+            }
+            self.passed.push_back((part.touched, payload.clone()));
+        }
+        Some(payload)
+    }
+
+    fn passed_bytes(&self) -> usize {
+        self.passed.iter().map(|(_, payload)| payload.len()).sum()
+    }
+
+    /// Returns an empty buffer, of a payload of at least `size` bytes that has no reader any longer.
+    fn buffer(&mut self, size: usize) -> Vec<u8> {
+        let is_free = |(_, payload): &(ModelTime, Bytes)| {
+            (size..=2 * size).contains(&payload.len()) && payload.is_unique()
+        };
+        let index = (size >= LARGE).then(|| self.passed.iter().position(is_free));
+        let free = index.flatten().and_then(|index| self.passed.remove(index));
+        let mut buffer = free.map_or_else(Vec::new, |(_, payload)| Vec::from(payload));
+        buffer.clear();
+        buffer
     }
 
     /// Drops this sample.
@@ -141,6 +182,7 @@ impl Assembly {
     /// Drops samples that have received no fragment for a long time.
     pub fn expire(&mut self, now: ModelTime) {
         self.retain(|_, part| part.touched + FRAGMENT_TIMEOUT > now);
+        self.passed.retain(|(at, _)| *at + KEPT_FOR > now);
     }
 
     fn retain(&mut self, mut keep: impl FnMut(&(Guid, SequenceNumber), &Part) -> bool) {
@@ -438,6 +480,30 @@ mod tests {
             assert!(assembly.bytes <= 1 << 20);
         }
         assert_eq!(assembly.take(writer(2), SequenceNumber(1)), None);
+    }
+
+    #[test]
+    fn the_buffer_of_a_payload_without_readers_is_used_again() {
+        let mut assembly = Assembly::new(64 << 20);
+        let size = 300_000;
+        let mut next = |number: u64, size: u32| {
+            let payload = vec![number as u8; size as usize];
+            let whole = fragment(writer(1), number, 1, 1, size, size);
+            put(&mut assembly, &whole, &payload, 0);
+            let taken = assembly.take(writer(1), SequenceNumber(number)).unwrap();
+            assert_eq!(taken, payload);
+            (taken.as_ptr(), taken, assembly.size().0)
+        };
+        let (first, held, _) = next(1, size);
+        let (second, released, _) = next(2, size);
+        assert_ne!(first, second, "a reader still has the first one");
+        drop(released);
+        assert_eq!(next(3, size - 100).0, second);
+        assert_ne!(next(4, size / 4).0, second, "it is much larger");
+        assert_eq!(next(5, size).2, 0);
+        assert_eq!(held, vec![1; 300_000]);
+        assembly.expire(ModelTime::ZERO + 2 * KEPT_FOR + FRAGMENT_TIMEOUT);
+        assert_eq!(assembly.passed_bytes(), 0);
     }
 
     #[test]
