@@ -407,7 +407,7 @@ impl Observer {
             }
             ObservationOutcome::Measured => {
                 if let Some(sample) = sample {
-                    self.chain_seen(sample);
+                    self.chain_seen(sample, None);
                 }
                 if self.payloads.is_unsettled(writer) {
                     if let Some(sample) = sample {
@@ -419,9 +419,8 @@ impl Observer {
             }
             ObservationOutcome::Counted(counted) => {
                 self.report_missing();
-                self.chain_counted(writer, &counted);
                 if let Some(sample) = sample {
-                    self.chain_seen(sample);
+                    self.chain_seen(sample, Some(&counted));
                 }
                 self.counted(writer, &counted);
                 return;

@@ -1,7 +1,7 @@
 //! Messages with stamps, which chains consist of.
 
+use ros2probe_wire::GuidPrefix;
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::{Guid, GuidPrefix};
 
 use super::Observer;
 use super::lists::traced_share;
@@ -15,23 +15,20 @@ use crate::measure::topic::Topic;
 use crate::measure::writer::Counted;
 
 impl Observer {
-    /// Adds a counted message to the chains.
-    pub(super) fn chain_counted(&mut self, writer: Guid, counted: &Counted) {
-        if self.chains.follows(writer) {
+    /// Adds the message that this sample completed to the chains, and notes where it arrived.
+    pub(super) fn chain_seen(&mut self, sample: &Sample, completed: Option<&Counted>) {
+        let (writer, clock) = (sample.head.writer, self.wall_clock);
+        if !self.chains.follows(writer) {
+            return;
+        }
+        if let Some(counted) = completed {
             let is_local = !self.settings.directed || self.receivers.is_local(&writer.prefix);
-            self.chains
-                .counted(writer, counted, is_local, self.wall_clock);
+            self.chains.counted(writer, counted, is_local, clock);
         }
-    }
-
-    /// Notes where a copy of a message arrived.
-    pub(super) fn chain_seen(&mut self, sample: &Sample) {
-        if self.chains.follows(sample.head.writer) {
-            let (receivers, discovery) = (&self.receivers, &self.discovery);
-            self.chains.seen(sample, self.wall_clock, || {
-                receivers.owner(&sample.head.route(), discovery)
-            });
-        }
+        let (receivers, discovery) = (&self.receivers, &self.discovery);
+        self.chains.seen(sample, clock, || {
+            receivers.owner(&sample.head.route(), discovery)
+        });
     }
 
     /// Adds a publication within a callback to the chains.
