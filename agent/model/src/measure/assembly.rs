@@ -144,8 +144,9 @@ impl Assembly {
             return None;
         }
         let payload = Bytes::from(part.head);
-        if payload.len() >= LARGE && payload.len() <= self.limit / (2 * KEPT) {
-            if self.passed.len() >= KEPT {
+        if (LARGE..=self.limit / 2).contains(&payload.len()) {
+            let others = self.limit / 2 - payload.len();
+            while self.passed.len() >= KEPT || self.passed_bytes() > others {
                 self.passed.pop_front();
             }
             self.passed.push_back((part.touched, payload.clone()));
