@@ -17,7 +17,7 @@ use ros2probe_daemon::agent;
 use ros2probe_daemon::config::{Config, ConfigError};
 use ros2probe_daemon::escape::visible_lines;
 use ros2probe_daemon::privilege::{CapabilitiesRemain, ConfineError, Missing};
-use ros2probe_daemon::surface::otlp::SettingsError;
+use ros2probe_metrics::otlp::SettingsError;
 
 use cli::{Arguments, Command, UserError};
 

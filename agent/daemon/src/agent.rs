@@ -19,6 +19,7 @@ pub use ros2probe_wire::Expansion;
 use tokio_util::sync::CancellationToken;
 
 use crate::config::{Access, Config, ConfigError, PageChoice, RetainChoice, Watch};
+use crate::events::EventLog;
 use crate::logging::Log;
 use crate::privilege::{self, Identity, Role, Sandbox, Unprivileged};
 use crate::recording::{self, Recordings, Refusal, Snapshots};
@@ -32,11 +33,11 @@ use crate::surface::api::reload::Reloads;
 use crate::surface::api::{self, reload};
 use crate::surface::foxglove;
 use crate::surface::http::Server;
-use crate::surface::otlp::{self, Exporter, Host, Queues, SpanQueue, SpanSink};
 use crate::surface::ros2_daemon::Ros2Daemon;
 use crate::surface::{Exposition, Format, MetricSources};
 use crate::watches::Watches;
-use crate::{control, memory};
+use crate::{control, file, memory};
+use ros2probe_metrics::otlp::{self, Exporter, Host, Inputs, SpanQueue, SpanSink};
 
 /// Default configuration file.
 pub const DEFAULT_CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
@@ -225,11 +226,14 @@ pub fn run(options: Options) -> Result<()> {
     let responder = Responder::start().context("cannot start the thread that answers requests")?;
     let spans = Arc::<SpanQueue>::default();
     let ros2_daemon = ros2_daemon(&config, options.report)?;
-    let queues = Queues {
+    let inputs = Inputs {
+        metrics: Arc::new(sources.clone()),
+        events: Arc::<EventLog>::clone(&sources.events),
         spans: Arc::clone(&spans),
         log: log.exported_lines(),
+        exports: Arc::clone(&sources.exports),
     };
-    let exporter = export.map(|export| Exporter::start(export, &sources, queues));
+    let exporter = export.map(|export| Exporter::start(export, inputs, privilege::spawn_export));
     let exporter = exporter.transpose()?;
     let powerless = give_up()?;
     report_listeners(server.as_ref(), &control, viewers.as_ref(), &watches);
@@ -326,7 +330,7 @@ fn ros2_daemon(config: &Config, is_report: bool) -> Result<Option<Ros2Daemon>> {
 /// Settings of exports, from the configuration and the environment.
 fn export(config: &Config) -> Result<Option<otlp::Settings>, otlp::SettingsError> {
     let variable = |name: &str| std::env::var(name).ok();
-    otlp::Settings::resolve(&config.otlp, &variable, &Host::read())
+    otlp::Settings::resolve(&config.otlp, &variable, file::read_text, &Host::read())
 }
 
 /// Watches of the configuration and of the command line.

@@ -18,6 +18,7 @@ mod trigger;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
+use std::pin::Pin;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
@@ -27,12 +28,14 @@ use ros2probe_wire::time::SECOND;
 use tokio::sync::Notify;
 
 use crate::tables::KeptEvents;
+pub use record::AgentEvent;
 use record::Occurrence;
-pub use record::{AgentEvent, Record, Value};
+use ros2probe_metrics::event::EventSource;
+pub use ros2probe_metrics::event::{Batch, Definition, Record, Severity, Value};
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::event::{Class, Taken};
 pub use self_monitor::{DropMonitor, SourceMonitor};
-pub use table::{Definition, EVENTS, Severity};
+pub use table::EVENTS;
 pub use trigger::Trigger;
 
 /// Most events of one name per second.
@@ -68,17 +71,6 @@ pub enum Position {
     After(u64),
     /// In another run, or beyond the events of this one.
     Unknown,
-}
-
-/// Events for a reader.
-#[derive(Debug, Default)]
-pub struct Batch {
-    /// Number of events overwritten before they were read.
-    pub lagged: u64,
-    /// Events after those.
-    pub records: Vec<Record>,
-    /// Number of the last event, after which to continue.
-    pub last: u64,
 }
 
 #[derive(Debug, Default)]
@@ -285,6 +277,21 @@ impl EventLog {
     /// Locks the log. A poisoned lock is usable, since appended events are complete.
     fn log(&self) -> MutexGuard<'_, Log> {
         self.log.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The exporter of log records.
+impl EventSource for EventLog {
+    fn wait_after(&self, after: u64) -> Pin<Box<dyn Future<Output = ()> + '_>> {
+        Box::pin(self.wait(after))
+    }
+
+    fn read_after(&self, after: u64, most: usize) -> Batch {
+        let batch = self.read(after, most);
+        if batch.lagged > 0 {
+            self.overtook(Reader::Otlp, batch.lagged);
+        }
+        batch
     }
 }
 

@@ -6,7 +6,7 @@
 //! - [`run`] is the loop of the working thread, the only one that touches the model.
 //! - [`snapshot_cell`] holds the latest snapshot, [`events`] the log of events, [`limit_facts`] the
 //!   caps.
-//! - [`surface`] serves snapshots: Prometheus, OTLP, the API and the page.
+//! - [`surface`] serves snapshots: Prometheus, the API and the page. OTLP exports them.
 //! - [`subscriptions`] and [`recording`] pass single messages into streams and bags.
 //!
 //! ```
@@ -34,10 +34,8 @@ pub mod missed_announcements;
 pub mod privilege;
 pub mod recording;
 pub mod run;
-mod series_name;
 pub mod settings_cell;
 pub mod snapshot_cell;
-pub mod stability;
 pub mod state;
 pub mod subscriptions;
 mod supervise;

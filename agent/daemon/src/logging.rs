@@ -7,8 +7,8 @@ use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex};
 
 use crate::config::Level;
-use crate::surface::otlp::LogQueue;
 use lines::Lines;
+use ros2probe_metrics::otlp::LogQueue;
 use tracing_subscriber::filter::{EnvFilter, LevelFilter};
 use tracing_subscriber::layer::SubscriberExt as _;
 use tracing_subscriber::util::SubscriberInitExt as _;
@@ -28,7 +28,7 @@ impl Log {
     /// Starts logging at `level`, or as `RUST_LOG` sets. Lines of the level `exported` are queued for
     /// export. A process has one log: the first one that is started.
     #[must_use]
-    pub fn start(level: Level, exported: Option<Level>) -> Self {
+    pub fn start(level: Level, exported: Option<LevelFilter>) -> Self {
         let fixed = EnvFilter::try_from_default_env().ok();
         let (filter, handle) = reload::Layer::new(fixed.clone().unwrap_or_else(|| filter(level)));
         // The journal adds its own timestamps.
@@ -43,7 +43,7 @@ impl Log {
         };
         let queue = exported.map(|_| Arc::<LogQueue>::default());
         let export = queue.as_ref().zip(exported);
-        let export = export.map(|(queue, level)| LogQueue::layer(queue, severity(level)));
+        let export = export.map(|(queue, level)| LogQueue::layer(queue, level));
         // Fails if a log exists already, which happens only in tests.
         let _ = tracing_subscriber::registry()
             .with(lines)
@@ -78,15 +78,5 @@ impl Log {
 }
 
 fn filter(level: Level) -> EnvFilter {
-    EnvFilter::default().add_directive(severity(level).into())
-}
-
-const fn severity(level: Level) -> LevelFilter {
-    match level {
-        Level::Error => LevelFilter::ERROR,
-        Level::Warn => LevelFilter::WARN,
-        Level::Info => LevelFilter::INFO,
-        Level::Debug => LevelFilter::DEBUG,
-        Level::Trace => LevelFilter::TRACE,
-    }
+    EnvFilter::default().add_directive(level.filter().into())
 }

@@ -16,12 +16,6 @@ ros2probe_model::tables! {
     Ros2DaemonPorts {
         name: "ros2_daemon.ports", entries: 32, effect: "not answered", reported: "`ros2probe_ros2_daemon_ports`",
     }
-    /// Spans that wait for export
-    WaitingSpans {
-        name: "otlp.spans", entries: 4096, effect: "dropped", reported: "`ros2probe_otlp_dropped_total`",
-    }
-    /// Series with a start time
-    SeriesStarts { name: "otlp.starts", entries: 200_000, effect: "further ones start with the agent" }
     /// Writers that one stream of messages has described
     DescribedWriters { name: "samples.described", entries: 65_536, effect: "further ones are not described" }
     /// Losses of one subscription, by writer and reason, until its client reads them

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::Command;
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind};
+use ros2probe_metrics::catalogue::{CATALOGUE, Kind};
 use ros2probe_testing::dashboard::{self, DATA_SOURCE, Dashboard, Panel, list, resolved, text};
 use serde_json::{Value, json};
 

@@ -13,10 +13,10 @@ use ros2probe_daemon::agent_facts::{Ability, AgentFacts, SourceKind};
 use ros2probe_daemon::config::{Expectations, Limits, Watch};
 use ros2probe_daemon::recording::SnapshotFigures;
 use ros2probe_daemon::settings_cell::Settings;
-use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind};
-use ros2probe_daemon::surface::otlp::Signal;
 use ros2probe_daemon::surface::ros2_daemon::PortState;
 use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
+use ros2probe_metrics::catalogue::{CATALOGUE, Kind};
+use ros2probe_metrics::otlp::Signal;
 use ros2probe_model::facts::bounded::Table;
 use ros2probe_model::facts::tables::ALL;
 use ros2probe_model::facts::topic_kind::TopicKind;
@@ -152,7 +152,12 @@ fn the_book_s_tables_are_those_of_the_sources() {
         let tables = ALL.iter().filter(|table| is_derived(table) == derived);
         declared(page, &tables.copied().collect::<Vec<_>>())
     };
-    let agent = [ros2probe_daemon::tables::ALL, ros2probe::tables::ALL].concat();
+    let agent = [
+        ros2probe_daemon::tables::ALL,
+        ros2probe_metrics::tables::ALL,
+        ros2probe::tables::ALL,
+    ]
+    .concat();
     for (page, begin, end, wanted) in [
         metrics("metrics-graph.md"),
         metrics("metrics-topics.md"),

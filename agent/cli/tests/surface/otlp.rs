@@ -12,7 +12,7 @@ use opentelemetry_proto::tonic::collector::metrics::v1::metrics_service_server::
 use opentelemetry_proto::tonic::collector::metrics::v1::{
     ExportMetricsServiceRequest, ExportMetricsServiceResponse,
 };
-use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind};
+use ros2probe_metrics::catalogue::{CATALOGUE, Kind};
 use ros2probe_testing::local_agent::{self, LocalAgent, metric};
 use ros2probe_testing::ports::free_address;
 use ros2probe_testing::repository;

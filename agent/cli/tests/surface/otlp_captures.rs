@@ -20,7 +20,7 @@ use opentelemetry_proto::tonic::metrics::v1::{
     AggregationTemporality, HistogramDataPoint, Metric as Family, NumberDataPoint, metric::Data,
     number_data_point,
 };
-use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind, Metric};
+use ros2probe_metrics::catalogue::{CATALOGUE, Kind, Metric};
 use ros2probe_testing::local_agent::{LocalAgent, PATIENCE};
 use ros2probe_testing::repository;
 use tokio::net::TcpListener;

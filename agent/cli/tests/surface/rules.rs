@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind};
+use ros2probe_metrics::catalogue::{CATALOGUE, Kind};
 use serde_yaml::Value;
 
 const INSTALL: &str =

@@ -14,7 +14,6 @@ use ros2probe_wire::filter::PORT_CAPACITY;
 use super::check::check;
 use super::document::Node;
 use super::mistake::{Mistakes, Position};
-use super::otlp_endpoint::otlp_endpoint;
 use super::shape::{
     ApiShape, CaptureShape, ConfigShape, FoxgloveShape, MetricsShape, OtlpShape, RecordingsShape,
     Ros2DaemonShape, SnapshotShape, Switch, WatchEntryShape, WatchShape,
@@ -23,11 +22,12 @@ use super::watch::{
     ExpectationValues, Expectations, PatternError, Retain, Watch, check_globs, check_pattern,
 };
 use super::{
-    ApiSettings, CaptureSettings, Config, Endpoint, FoxgloveSettings, Limits, MetricsSettings,
-    OtlpSettings, RecordingLimits, RecordingSettings, Ros2DaemonSettings, ShmSettings,
-    SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
+    ApiSettings, CaptureSettings, Config, Endpoint, FoxgloveSettings, Level, Limits,
+    MetricsSettings, OtlpSettings, RecordingLimits, RecordingSettings, Ros2DaemonSettings,
+    ShmSettings, SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
 };
 use crate::events::Trigger;
+use ros2probe_metrics::otlp::otlp_endpoint;
 
 /// Most configured snapshots; each needs memory and a thread.
 const MAX_SNAPSHOTS: usize = 8;
@@ -580,7 +580,7 @@ fn otlp(shape: OtlpShape) -> OtlpSettings {
         metrics: shape.metrics,
         events: shape.events,
         traces: shape.traces,
-        log: shape.log,
+        log: shape.log.map(Level::filter),
         robot: shape.robot,
         attributes: shape.attributes.unwrap_or_default(),
     }

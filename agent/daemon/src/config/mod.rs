@@ -8,10 +8,8 @@ mod document;
 mod limits;
 mod meaning;
 mod mistake;
-mod otlp_endpoint;
 mod shape;
 
-use std::collections::BTreeMap;
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -22,11 +20,11 @@ use serde::Deserialize;
 
 use crate::events::Trigger;
 pub use mistake::{Mistake, Mistakes, Position};
-pub use otlp_endpoint::otlp_endpoint;
 pub use ros2probe_capture::settings::{
     CaptureSettings, ExactChoice, InsideChoice, ShmMode, ShmSettings, SourceChoice,
 };
 use ros2probe_message::Dialect;
+pub use ros2probe_metrics::otlp::{Compression, Endpoint, OtlpProtocol, OtlpSettings};
 pub use ros2probe_model::derive::chain::expected::ExpectedChain;
 pub use ros2probe_model::facts::glob;
 pub use ros2probe_model::facts::limits::{Limit, Limits};
@@ -36,6 +34,7 @@ pub use ros2probe_model::facts::watch::{
     check_pattern,
 };
 pub use ros2probe_model::measure::rehearsal;
+use tracing_subscriber::filter::LevelFilter;
 
 /// Largest file accepted, in bytes.
 const MAX_BYTES: u64 = 1 << 20;
@@ -270,70 +269,6 @@ pub struct SnapshotSettings {
     pub max_total_bytes: u64,
 }
 
-/// Exports to an OpenTelemetry receiver; `None` = the standard variable, or a default.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct OtlpSettings {
-    /// Address of the receiver.
-    pub endpoint: Endpoint,
-    /// Interval between exports of metrics.
-    pub interval: Option<Duration>,
-    /// Timeout for an answer.
-    pub timeout: Option<Duration>,
-    /// Headers of each request.
-    pub headers: BTreeMap<String, String>,
-    /// File with further headers.
-    pub headers_file: Option<PathBuf>,
-    /// Protocol of requests.
-    pub protocol: Option<OtlpProtocol>,
-    /// Whether requests are compressed.
-    pub compression: Option<Compression>,
-    /// Whether metrics are exported.
-    pub metrics: Option<bool>,
-    /// Whether events are exported.
-    pub events: Option<bool>,
-    /// Whether spans are exported, for watches with `trace`.
-    pub traces: Option<bool>,
-    /// Least severe level of exported lines of the log; no line is exported without it.
-    pub log: Option<Level>,
-    /// Name of the robot.
-    pub robot: Option<String>,
-    /// Additional attributes of the resource.
-    pub attributes: BTreeMap<String, String>,
-}
-
-/// Address of an OpenTelemetry receiver.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub enum Endpoint {
-    /// The address in the standard variables; nothing is exported without one.
-    #[default]
-    Environment,
-    /// Nothing is exported.
-    Off,
-    /// This URL.
-    At(String),
-}
-
-/// Protocol of exports.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
-pub enum OtlpProtocol {
-    /// gRPC.
-    #[serde(rename = "grpc")]
-    Grpc,
-    /// Protobuf in HTTP/1.1 requests, which pass through proxies.
-    #[serde(rename = "http/protobuf")]
-    HttpProtobuf,
-}
-
-/// Compression of requests.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum Compression {
-    /// No compression.
-    None,
-    /// gzip: a fifth of the size or less, for some CPU time.
-    Gzip,
-}
-
 /// Level of the log.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
@@ -512,6 +447,18 @@ impl Level {
             Self::Info => "info",
             Self::Debug => "debug",
             Self::Trace => "trace",
+        }
+    }
+
+    /// Returns the filter of lines of this level or a more severe one.
+    #[must_use]
+    pub const fn filter(self) -> LevelFilter {
+        match self {
+            Self::Error => LevelFilter::ERROR,
+            Self::Warn => LevelFilter::WARN,
+            Self::Info => LevelFilter::INFO,
+            Self::Debug => LevelFilter::DEBUG,
+            Self::Trace => LevelFilter::TRACE,
         }
     }
 }

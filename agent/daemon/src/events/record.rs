@@ -1,25 +1,24 @@
-//! One event with its attributes, as streams and log records carry it. It is built from the facts
-//! when it is read, so unread events cost no formatting.
+//! Events with their attributes. A record is built from the facts when it is read, so unread events
+//! cost no formatting.
 
 use std::borrow::Cow;
-use std::fmt::{Display, Write as _};
+use std::fmt::Display;
 use std::time::Duration;
 
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Timestamp};
 
-use super::table::{self, Definition, Severity};
+use super::table;
 use crate::agent_facts::SourceKind;
-use crate::series_name::series_name;
+use ros2probe_metrics::event::{Definition, Severity, Value};
+use ros2probe_metrics::series_name::series_name;
 use ros2probe_model::facts::churn;
 use ros2probe_model::facts::diagnosis::{Diagnosis, Policy};
 use ros2probe_model::facts::event::{EventKind, LossBurst, bounded};
 use ros2probe_model::facts::naming::Naming;
 use ros2probe_model::report::snapshot::WatchState;
 
-const SECONDS_OF_A_DAY: u64 = 86_400;
 /// State of a managed node that handles an error (`lifecycle_msgs/msg/State`).
 const ERROR_PROCESSING: &str = "errorprocessing";
 
@@ -117,52 +116,6 @@ pub enum AgentEvent {
         /// Number of suppressed events.
         count: u64,
     },
-}
-
-/// One event as streams and exports carry it.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Record {
-    /// Number of the event in this run of the agent.
-    pub number: u64,
-    /// Time of the event, by the source's clock.
-    pub at: Timestamp,
-    /// Time of its record, by this host's clock.
-    pub observed: Timestamp,
-    /// Definition of the event.
-    pub definition: &'static Definition,
-    /// Severity of the event.
-    pub severity: Severity,
-    /// Attributes with their values, in the order of the definition.
-    pub attributes: Vec<(&'static str, Value)>,
-}
-
-/// Value of an attribute.
-#[derive(Clone, Debug, PartialEq, serde::Serialize)]
-#[serde(untagged)]
-pub enum Value {
-    /// Text of bounded length.
-    Text(String),
-    /// A count or another whole number.
-    Number(u64),
-    /// A real number.
-    Real(f64),
-    /// Several texts.
-    List(Vec<String>),
-}
-
-impl Record {
-    /// Value of an attribute. `None` if it is absent.
-    #[must_use]
-    pub fn attribute(&self, name: &str) -> Option<&Value> {
-        let mut attributes = self.attributes.iter();
-        attributes.find_map(|(key, value)| (*key == name).then_some(value))
-    }
-
-    /// Time of the event in RFC 3339 format.
-    #[must_use]
-    pub fn time(&self) -> String {
-        rfc3339(self.at)
-    }
 }
 
 impl Occurrence {
@@ -609,53 +562,9 @@ fn seconds(at: Timestamp, last: Timestamp) -> f64 {
     at.nanoseconds_since(last) as f64 / 1e9
 }
 
-/// UTC with nanoseconds (RFC 3339, 5.6). Days are counted from 1 March of the year 0, so that the
-/// leap day is the last day of a year.
-fn rfc3339(at: Timestamp) -> String {
-    let (days, rest) = (
-        at.whole_seconds() / SECONDS_OF_A_DAY,
-        at.whole_seconds() % SECONDS_OF_A_DAY,
-    );
-    let days = days + 719_468;
-    let (era, day) = (days / 146_097, days % 146_097);
-    let year = (day - day / 1460 + day / 36_524 - day / 146_096) / 365;
-    let day = day - (365 * year + year / 4 - year / 100);
-    let month = (5 * day + 2) / 153;
-    let day = day - (153 * month + 2) / 5 + 1;
-    let (month, next) = if month < 10 {
-        (month + 3, 0)
-    } else {
-        (month - 9, 1)
-    };
-    let year = era * 400 + year + next;
-    let (hour, minute, second) = (rest / 3600, rest / 60 % 60, rest % 60);
-    let mut time = String::with_capacity(30);
-    let _ = write!(
-        time,
-        "{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{:09}Z",
-        at.0 % SECOND
-    );
-    time
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn times_are_utc_with_leap_years() {
-        for (seconds, expected) in [
-            (0, "1970-01-01T00:00:00.000000000Z"),
-            (951_782_399, "2000-02-28T23:59:59.000000000Z"),
-            (951_868_800, "2000-03-01T00:00:00.000000000Z"),
-            (1_709_164_800, "2024-02-29T00:00:00.000000000Z"),
-            (1_795_219_199, "2026-11-20T23:59:59.000000000Z"),
-            (4_107_542_400, "2100-03-01T00:00:00.000000000Z"),
-        ] {
-            assert_eq!(rfc3339(Timestamp(seconds * SECOND)), expected);
-        }
-        assert!(rfc3339(Timestamp(7)).ends_with("00.000000007Z"));
-    }
 
     #[test]
     fn a_goodbye_is_no_warning_and_an_expired_lease_is_one() {

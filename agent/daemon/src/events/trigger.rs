@@ -2,8 +2,8 @@
 
 use ros2probe_model::facts::diagnosis::Diagnosis;
 
-use super::record::{Record, Value};
-use super::table::{self, Definition, EVENTS, Severity};
+use super::table::{self, EVENTS};
+use ros2probe_metrics::event::{Definition, Record, Severity, Value};
 
 /// Short names of triggers, with the event that reports each problem.
 const PROBLEMS: [(&str, &Definition); 5] = [

@@ -224,6 +224,15 @@ pub fn spawn(
     Ok(thread)
 }
 
+/// Starts the thread of exports, confined to its role.
+///
+/// # Errors
+///
+/// As [`spawn`].
+pub fn spawn_export(thread: Builder, work: Box<dyn FnOnce() + Send>) -> io::Result<JoinHandle<()>> {
+    spawn(Role::Export, thread, work).map_err(io::Error::other)
+}
+
 /// Starts a thread of a source, confined to its task.
 ///
 /// # Errors

@@ -5,10 +5,7 @@ use std::fmt;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::catalogue as metric;
 use super::foxglove::Viewers;
-use super::metric_sink::{Label, MetricSink};
-use super::otlp::{Exports, Outcome, Reason};
 use super::process::Process;
 use super::ros2_daemon::{PortState, Ros2DaemonFigures};
 use super::ros2_metrics::TopicRows;
@@ -18,6 +15,9 @@ use crate::limit_facts::{LimitFacts, LimitFigures};
 use crate::recording::{RecordingFigures, SnapshotFigures};
 use crate::settings_cell::Reload;
 use crate::snapshot_cell::State;
+use ros2probe_metrics::catalogue as metric;
+use ros2probe_metrics::metric_sink::{Label, MetricSink};
+use ros2probe_metrics::otlp::{Exports, Outcome, Reason};
 use ros2probe_model::facts::dispatch::MissedReason;
 
 /// Writes version, source and readiness of the agent.

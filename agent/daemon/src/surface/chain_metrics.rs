@@ -9,9 +9,9 @@ use ros2probe_model::derive::chain::path::Quantiles;
 use ros2probe_model::facts::histogram::Histogram;
 use ros2probe_model::report::snapshot::{ChainFacts, Snapshot};
 
-use super::catalogue::{self as metric, Metric};
-use super::metric_sink::{Label, MetricSink};
 use crate::settings_cell::Settings;
+use ros2probe_metrics::catalogue::{self as metric, Metric};
+use ros2probe_metrics::metric_sink::{Label, MetricSink};
 
 /// The figures of a series.
 struct Figures<'a, const LABELS: usize> {

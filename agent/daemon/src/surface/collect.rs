@@ -2,6 +2,7 @@
 //! both use it, so they show the same values.
 
 use std::fmt;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -12,8 +13,6 @@ use super::delivery_metrics::{self, Deliveries};
 use super::diagnosis_metrics;
 use super::foxglove::Viewers;
 use super::inside_metrics::{self, Callbacks};
-use super::metric_sink::MetricSink;
-use super::otlp::{Exports, Signal};
 use super::ros2_daemon::Ros2DaemonFigures;
 use super::ros2_metrics::{self, TopicRows};
 use super::service_metrics;
@@ -24,6 +23,9 @@ use crate::limit_facts::LimitFigures;
 use crate::recording::RecordingFigures;
 use crate::settings_cell::{Settings, SettingsCell};
 use crate::snapshot_cell::SnapshotCell;
+use ros2probe_metrics::metric_sink::MetricSink;
+use ros2probe_metrics::metric_source::MetricSource;
+use ros2probe_metrics::otlp::{Exports, Signal};
 
 /// Input of a collection. Each part has its own writer; only the agent's setup and the collections
 /// hold all parts.
@@ -68,8 +70,54 @@ impl MetricSources {
         }
     }
 
-    /// Returns whether a page shows exemplars.
-    pub(super) fn has_exemplars(&self) -> bool {
+    /// Returns whether traces are exported, so that exemplars lead somewhere.
+    fn has_traces(&self) -> bool {
+        let mut signals = self.exports.signals();
+        signals.any(|signal| signal == Signal::Traces)
+    }
+}
+
+impl MetricSource for MetricSources {
+    fn collect(&self, sink: &mut MetricSink<'_>, previous: Duration) -> fmt::Result {
+        let (state, settings) = (self.latest.state(), self.settings.settings());
+        let snapshot = state.known();
+        let rows = TopicRows::new(snapshot, &settings);
+        let known = snapshot.inside.as_deref();
+        let callbacks = Callbacks::new(known);
+        let now = Instant::now();
+
+        ros2_metrics::graph(sink, snapshot)?;
+        diagnosis_metrics::diagnoses(sink, snapshot)?;
+        service_metrics::services(sink, snapshot, &settings)?;
+        let has_traces = self.has_traces();
+        chain_metrics::chains(sink, snapshot, &settings, has_traces)?;
+        let deliveries = Deliveries::new(&rows.shown);
+        ros2_metrics::topics(sink, snapshot, &rows.shown, &settings)?;
+        delivery_metrics::sums(sink, &rows.shown, &settings)?;
+        inside_metrics::topics(sink, snapshot, &rows.shown, &settings)?;
+        inside_metrics::callbacks(sink, &callbacks, known, &settings)?;
+        ros2_metrics::writers(sink, &rows.shown, &settings)?;
+        deliveries.write(sink)?;
+        delivery_metrics::sockets(sink, &snapshot.sockets)?;
+        ros2_metrics::watches(sink, snapshot, &settings.watches)?;
+        agent_metrics::identity(sink, &state, now)?;
+        agent_metrics::capture(sink, &state)?;
+        let inside = state.agent.inside.as_ref();
+        inside_metrics::source(sink, inside, known, &callbacks)?;
+        zenoh_metrics::zenoh(sink, snapshot)?;
+        agent_metrics::model(sink, &state, &rows, deliveries.hidden, &self.limits)?;
+        agent_metrics::surface(sink, &state, self.settings.reload(), previous, now)?;
+        agent_metrics::kept(sink, &state)?;
+        agent_metrics::subscriptions(sink, &state)?;
+        agent_metrics::viewers(sink, &self.viewers)?;
+        agent_metrics::ros2_daemon(sink, &self.ros2_daemon)?;
+        agent_metrics::events(sink, &self.events, self.lost_lines.load(Ordering::Relaxed))?;
+        agent_metrics::recordings(sink, &self.recordings)?;
+        agent_metrics::exports(sink, &self.exports)?;
+        agent_metrics::process(sink)
+    }
+
+    fn has_exemplars(&self) -> bool {
         let state = self.latest.state();
         let chains = &state.known().chains;
         let mut of_chains = chains.chains.iter().map(|chain| &chain.exemplars);
@@ -78,57 +126,7 @@ impl MetricSources {
             && (of_chains.any(|all| !all.is_empty()) || expected.any(|all| !all.is_empty()))
     }
 
-    /// Returns whether traces are exported, so that exemplars lead somewhere.
-    pub(super) fn has_traces(&self) -> bool {
-        let mut signals = self.exports.signals();
-        signals.any(|signal| signal == Signal::Traces)
+    fn refresh(&self, timeout: Duration) -> Pin<Box<dyn Future<Output = ()> + '_>> {
+        Box::pin(self.latest.refresh(timeout))
     }
-}
-
-/// Writes all metrics to `sink`; `previous` is the duration of the last collection.
-pub(super) fn collect(
-    sink: &mut MetricSink<'_>,
-    sources: &MetricSources,
-    previous: Duration,
-) -> fmt::Result {
-    let (state, settings) = (sources.latest.state(), sources.settings.settings());
-    let snapshot = state.known();
-    let rows = TopicRows::new(snapshot, &settings);
-    let known = snapshot.inside.as_deref();
-    let callbacks = Callbacks::new(known);
-    let now = Instant::now();
-
-    ros2_metrics::graph(sink, snapshot)?;
-    diagnosis_metrics::diagnoses(sink, snapshot)?;
-    service_metrics::services(sink, snapshot, &settings)?;
-    let has_traces = sources.has_traces();
-    chain_metrics::chains(sink, snapshot, &settings, has_traces)?;
-    let deliveries = Deliveries::new(&rows.shown);
-    ros2_metrics::topics(sink, snapshot, &rows.shown, &settings)?;
-    delivery_metrics::sums(sink, &rows.shown, &settings)?;
-    inside_metrics::topics(sink, snapshot, &rows.shown, &settings)?;
-    inside_metrics::callbacks(sink, &callbacks, known, &settings)?;
-    ros2_metrics::writers(sink, &rows.shown, &settings)?;
-    deliveries.write(sink)?;
-    delivery_metrics::sockets(sink, &snapshot.sockets)?;
-    ros2_metrics::watches(sink, snapshot, &settings.watches)?;
-    agent_metrics::identity(sink, &state, now)?;
-    agent_metrics::capture(sink, &state)?;
-    let inside = state.agent.inside.as_ref();
-    inside_metrics::source(sink, inside, known, &callbacks)?;
-    zenoh_metrics::zenoh(sink, snapshot)?;
-    agent_metrics::model(sink, &state, &rows, deliveries.hidden, &sources.limits)?;
-    agent_metrics::surface(sink, &state, sources.settings.reload(), previous, now)?;
-    agent_metrics::kept(sink, &state)?;
-    agent_metrics::subscriptions(sink, &state)?;
-    agent_metrics::viewers(sink, &sources.viewers)?;
-    agent_metrics::ros2_daemon(sink, &sources.ros2_daemon)?;
-    agent_metrics::events(
-        sink,
-        &sources.events,
-        sources.lost_lines.load(Ordering::Relaxed),
-    )?;
-    agent_metrics::recordings(sink, &sources.recordings)?;
-    agent_metrics::exports(sink, &sources.exports)?;
-    agent_metrics::process(sink)
 }

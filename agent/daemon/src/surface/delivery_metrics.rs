@@ -5,10 +5,10 @@ use std::cmp::Reverse;
 use std::fmt;
 use std::net::SocketAddr;
 
-use super::catalogue::{self as metric, Metric};
-use super::metric_sink::{Family, Label, MetricSink, Number};
 use super::ros2_metrics::TopicRow;
 use crate::settings_cell::Settings;
+use ros2probe_metrics::catalogue::{self as metric, Metric};
+use ros2probe_metrics::metric_sink::{Family, Label, MetricSink, Number};
 use ros2probe_model::facts::histogram::Histogram;
 use ros2probe_model::facts::loss::LossCause;
 use ros2probe_model::report::snapshot::Subscriber;

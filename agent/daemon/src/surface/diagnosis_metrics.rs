@@ -4,9 +4,9 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
 
-use super::catalogue::{self as metric, Metric};
-use super::metric_sink::{Label, MetricSink};
-use crate::series_name::series_name;
+use ros2probe_metrics::catalogue::{self as metric, Metric};
+use ros2probe_metrics::metric_sink::{Label, MetricSink};
+use ros2probe_metrics::series_name::series_name;
 use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::DomainId;

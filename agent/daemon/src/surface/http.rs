@@ -25,7 +25,6 @@ use super::basic_auth::{self, Gate};
 use super::collect::MetricSources;
 use super::compressed_text::{Encoding, TextCompressor};
 use super::connection::Connection;
-use super::exposition::{Exposition, Format};
 use super::large_responses::LargeResponses;
 use super::limited_listener::{LimitedListener, Refusal};
 use super::listen::listen;
@@ -35,6 +34,7 @@ use super::web_config::{WebConfig, WebConfigError};
 use crate::config::Limit;
 use crate::limit_facts::LimitFigures;
 use crate::snapshot_cell::SnapshotCell;
+use ros2probe_metrics::exposition::{Exposition, Format};
 
 const INDEX: &str = "<!doctype html><title>ros2probe</title><h1>ros2probe</h1>
 <p>Watches the ROS 2 robot on this host from copies of its traffic.

@@ -4,12 +4,12 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::time::Duration;
 
-use super::catalogue::{self as metric, Metric};
 use super::inside_nodes::NodeActivity;
-use super::metric_sink::{Label, MetricSink};
 use super::ros2_metrics::TopicRow;
 use crate::agent_facts::InsideSourceFacts;
 use crate::settings_cell::Settings;
+use ros2probe_metrics::catalogue::{self as metric, Metric};
+use ros2probe_metrics::metric_sink::{Label, MetricSink};
 use ros2probe_model::facts::calls::facts::{Callback, InsideFacts, TopicInside};
 use ros2probe_model::facts::calls::report::Trigger;
 use ros2probe_model::facts::histogram::Histogram;

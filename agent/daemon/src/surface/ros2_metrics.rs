@@ -5,11 +5,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::sync::Arc;
 
-use super::catalogue::{self as metric, Metric};
-use super::metric_sink::{Family, Label, MetricSink, Number};
 use crate::config::Watch;
-use crate::series_name::series_name;
 use crate::settings_cell::Settings;
+use ros2probe_metrics::catalogue::{self as metric, Metric};
+use ros2probe_metrics::metric_sink::{Family, Label, MetricSink, Number};
+use ros2probe_metrics::series_name::series_name;
 use ros2probe_model::facts::histogram::Histogram;
 use ros2probe_model::facts::names::TypeName;
 use ros2probe_model::facts::topic_kind::TopicKind;

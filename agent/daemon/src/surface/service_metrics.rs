@@ -2,9 +2,9 @@
 
 use std::fmt;
 
-use super::catalogue::{self as metric, Metric};
-use super::metric_sink::{Label, MetricSink};
 use crate::settings_cell::Settings;
+use ros2probe_metrics::catalogue::{self as metric, Metric};
+use ros2probe_metrics::metric_sink::{Label, MetricSink};
 use ros2probe_model::report::snapshot::{ActionFacts, LatencyFacts, ServiceFacts, Snapshot};
 
 /// Reads a number of a service.

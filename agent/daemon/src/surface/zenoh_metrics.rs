@@ -5,8 +5,8 @@ use std::fmt;
 use ros2probe_model::graph::zenoh::{Unseen, ZenohFacts};
 use ros2probe_model::report::snapshot::Snapshot;
 
-use super::catalogue::{self as metric, Metric};
-use super::metric_sink::{Label, MetricSink};
+use ros2probe_metrics::catalogue::{self as metric, Metric};
+use ros2probe_metrics::metric_sink::{Label, MetricSink};
 
 /// Reads a figure.
 type Figure = fn(&ZenohFacts) -> u64;

@@ -7,10 +7,11 @@ use std::path::Path;
 /// Reasons, each behind `#`, and below it the files, or their fields, to which it applies.
 const EXCEPTIONS: &str = include_str!("plain_collections.txt");
 /// Sources that are read. Of the commands, those that read foreign bytes or this host themselves.
-const PLACES: [&str; 9] = [
+const PLACES: [&str; 10] = [
     "wire/src",
     "agent/model/src",
     "agent/capture/src",
+    "agent/metrics/src",
     "agent/daemon/src",
     "agent/cli/src/chain/bag.rs",
     "agent/cli/src/client/line_reader.rs",

@@ -4,6 +4,7 @@ use super::*;
 use ros2probe::tables as commands;
 use ros2probe_capture::tables as capture;
 use ros2probe_daemon::tables as daemon;
+use ros2probe_metrics::tables as metrics;
 use ros2probe_model::facts::bounded::Table;
 use ros2probe_model::facts::tables as model;
 
@@ -95,6 +96,7 @@ fn every_cap_names_the_test_that_drives_it_over() {
     let rows = rows
         .chain(declared(model::ALL, "agent/model/src/facts/tables.rs"))
         .chain(declared(capture::ALL, "agent/capture/src/tables.rs"))
+        .chain(declared(metrics::ALL, "agent/metrics/src/tables.rs"))
         .chain(declared(daemon::ALL, "agent/daemon/src/tables.rs"))
         .chain(declared(commands::ALL, "agent/cli/src/tables.rs"));
     let rows: BTreeSet<_> = rows.collect();

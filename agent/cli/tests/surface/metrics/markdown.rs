@@ -3,8 +3,8 @@
 use std::fmt::Write as _;
 
 use ros2probe_daemon::events::{Definition, EVENTS};
-use ros2probe_daemon::stability::Stability;
-use ros2probe_daemon::surface::catalogue::{CATALOGUE, Metric};
+use ros2probe_metrics::catalogue::{CATALOGUE, Metric};
+use ros2probe_metrics::stability::Stability;
 use ros2probe_model::facts::bounded::{CONFIGURED, Table};
 use ros2probe_model::facts::limits::{Limit, Row};
 

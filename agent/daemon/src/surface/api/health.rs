@@ -15,10 +15,10 @@ use crate::agent_facts::{Ability, AgentFacts};
 use crate::missed_announcements;
 use crate::privilege;
 use crate::surface::foxglove::{ViewerListener, Viewers};
-use crate::surface::otlp::Host;
 use crate::surface::process::Process;
 use crate::surface::ros2_daemon::{PortState, Ros2DaemonFigures, port};
 use ros2probe_api::health::{self, Health, Interface, Limit, Table, Thread};
+use ros2probe_metrics::otlp::Host;
 
 /// Read once, because the host's name rarely changes while the agent runs.
 pub(super) static HOST: LazyLock<Option<String>> = LazyLock::new(|| Host::read().name);

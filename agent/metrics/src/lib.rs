@@ -1,0 +1,22 @@
+//! The metrics of an agent: their declarations, pages of them, and exports over OTLP.
+//!
+//! - [`catalogue`] declares each metric once. [`metric_sink`] accepts their samples.
+//! - [`exposition`] writes a page for a scrape.
+//! - [`otlp`] pushes metrics, events, spans and the log to a receiver.
+//! - [`metric_source`] and [`event`] are the interfaces through which both read an agent.
+//!
+//! This crate knows neither the configuration file nor privileges. The caller translates settings,
+//! and passes a function that starts the thread of exports.
+
+#![forbid(unsafe_code)]
+
+pub mod catalogue;
+pub mod event;
+mod exemplar_lines;
+pub mod exposition;
+pub mod metric_sink;
+pub mod metric_source;
+pub mod otlp;
+pub mod series_name;
+pub mod stability;
+pub mod tables;

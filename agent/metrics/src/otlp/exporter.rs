@@ -1,0 +1,225 @@
+//! The thread of all exports, with its own runtime.
+
+use std::io;
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, SystemTime};
+
+use opentelemetry::Context;
+use opentelemetry_sdk::logs::LogExporter as _;
+use opentelemetry_sdk::trace::SpanExporter as _;
+use tokio::runtime::{Builder, Runtime};
+use tokio::sync::oneshot;
+use tokio::time::timeout;
+use tokio_util::sync::CancellationToken;
+
+use super::delivery::{Delivery, Export};
+use super::events::{self, LogExport, Reporter};
+use super::exports::{Exports, Signal};
+use super::metrics::{Collector, MetricExport};
+use super::own_log::{self, LogQueue};
+use super::points::scope;
+use super::reports::Reports;
+use super::settings::{Settings, SettingsError, Target};
+use super::traces::{self, SpanExport, SpanQueue, Tracing};
+use super::transport::Transport;
+use crate::event::EventSource;
+use crate::metric_source::MetricSource;
+
+/// Longest time to stop, whatever the receiver does.
+const ENDING: Duration = Duration::from_secs(2);
+
+/// Starts a thread with only the privileges of exports, and returns after the others are dropped.
+///
+/// Fails if the system has no thread left, or if the thread cannot be confined.
+pub type Spawn = fn(thread::Builder, Box<dyn FnOnce() + Send>) -> io::Result<JoinHandle<()>>;
+
+/// What is exported, and the counters of exports.
+#[derive(Debug)]
+pub struct Inputs {
+    /// Metrics.
+    pub metrics: Arc<dyn MetricSource>,
+    /// Events.
+    pub events: Arc<dyn EventSource>,
+    /// Spans.
+    pub spans: Arc<SpanQueue>,
+    /// Lines of the agent's own log, if they are exported.
+    pub log: Option<Arc<LogQueue>>,
+    /// Counters of exports.
+    pub exports: Arc<Exports>,
+}
+
+/// The running thread.
+pub struct Exporter {
+    thread: JoinHandle<()>,
+    stop: CancellationToken,
+    ended: oneshot::Receiver<()>,
+}
+
+/// Why the exporter cannot start.
+#[derive(Debug, thiserror::Error)]
+pub enum StartError {
+    /// The settings cannot be applied.
+    #[error(transparent)]
+    Settings(#[from] SettingsError),
+    /// The runtime cannot be created.
+    #[error("cannot start the export thread")]
+    Runtime(#[source] io::Error),
+    /// The thread cannot be created, or it could not drop its privileges.
+    #[error("cannot start the export thread")]
+    Thread(#[source] io::Error),
+}
+
+impl Exporter {
+    /// Starts exporting in a thread that may open connections, so the caller can drop that
+    /// permission.
+    ///
+    /// # Errors
+    /// Fails if a connection cannot be configured. An unavailable receiver is not an error.
+    pub fn start(settings: Settings, inputs: Inputs, spawn: Spawn) -> Result<Self, StartError> {
+        // Blocking threads resolve names, at most one per signal.
+        let mut runtime = Builder::new_current_thread();
+        let runtime = runtime
+            .max_blocking_threads(Signal::ALL.len())
+            .enable_all()
+            .build();
+        let runtime = runtime.map_err(StartError::Runtime)?;
+        let stop = CancellationToken::new();
+        let reports = Reports::dispatch();
+        let jobs = tracing::dispatcher::with_default(&reports, || {
+            Jobs::new(settings, inputs, &stop, &runtime)
+        })?;
+        let (tell, ended) = oneshot::channel();
+        let thread = thread::Builder::new().name("otlp".to_owned());
+        let work = move || {
+            // Log lines of this thread are not exported: each could cause the next one.
+            let _suppressed = Context::enter_telemetry_suppressed_scope();
+            tracing::dispatcher::with_default(&reports, || runtime.block_on(jobs.run()));
+            // A pending name resolution must not delay the end.
+            runtime.shutdown_background();
+            let _ = tell.send(());
+        };
+        let thread = spawn(thread, Box::new(work)).map_err(StartError::Thread)?;
+        Ok(Self {
+            thread,
+            stop,
+            ended,
+        })
+    }
+
+    /// Exports a last time and stops, within two seconds.
+    pub async fn finish(self) {
+        self.stop.cancel();
+        if timeout(ENDING, self.ended).await.is_err() {
+            tracing::warn!("the last export did not end in time");
+        } else if self.thread.join().is_err() {
+            tracing::error!("the exporting thread panicked");
+        }
+    }
+}
+
+/// Work of the thread.
+struct Jobs {
+    metrics: Option<(Collector, Delivery<MetricExport>, Duration)>,
+    events: Option<(Reporter, Delivery<LogExport>)>,
+    traces: Option<(Tracing, Delivery<SpanExport>)>,
+    log: Option<(Arc<LogQueue>, Delivery<LogExport>)>,
+}
+
+impl Jobs {
+    fn new(
+        settings: Settings,
+        inputs: Inputs,
+        stop: &CancellationToken,
+        runtime: &Runtime,
+    ) -> Result<Self, SettingsError> {
+        // Connections need the runtime from their creation on.
+        let _inside = runtime.enter();
+        let resource = &settings.resource;
+        let exports = &inputs.exports;
+        let metrics = delivery(
+            Signal::Metrics,
+            settings.metrics,
+            exports,
+            stop,
+            |transport| {
+                let (exporter, encoded) = transport.metrics()?;
+                Ok(MetricExport { exporter, encoded })
+            },
+        )?;
+        let logs = |transport: &Transport| {
+            let mut exporter = transport.logs()?;
+            exporter.set_resource(resource);
+            let scope = scope();
+            Ok(LogExport { exporter, scope })
+        };
+        let events = delivery(Signal::Events, settings.events, exports, stop, logs)?;
+        let log = delivery(Signal::Log, settings.log, exports, stop, logs)?;
+        let traces = delivery(
+            Signal::Traces,
+            settings.traces,
+            exports,
+            stop,
+            |transport| {
+                let mut exporter = transport.spans()?;
+                exporter.set_resource(resource);
+                Ok(SpanExport(exporter))
+            },
+        )?;
+        let collector = || Collector::new(inputs.metrics, resource, SystemTime::now());
+        let tracing = Tracing::new(settings.host, inputs.spans);
+        let reporter = || Reporter::new(inputs.events);
+        Ok(Self {
+            metrics: metrics.map(|delivery| (collector(), delivery, settings.interval)),
+            events: events.map(|delivery| (reporter(), delivery)),
+            traces: traces.map(|delivery| (tracing, delivery)),
+            log: inputs.log.zip(log),
+        })
+    }
+
+    async fn run(self) {
+        let metrics = async {
+            if let Some((collector, delivery, interval)) = self.metrics {
+                collector.run(delivery, interval).await;
+            }
+        };
+        let events = async {
+            if let Some((reporter, delivery)) = self.events {
+                delivery.drain(reporter, events::GATHER).await;
+            }
+        };
+        let traces = async {
+            if let Some((tracing, delivery)) = self.traces {
+                delivery.drain(tracing, traces::GATHER).await;
+            }
+        };
+        let log = async {
+            if let Some((queue, delivery)) = self.log {
+                delivery.drain(&*queue, own_log::GATHER).await;
+            }
+        };
+        tokio::join!(metrics, events, traces, log);
+    }
+}
+
+/// Returns the delivery of a signal, if it has a target.
+fn delivery<E: Export>(
+    signal: Signal,
+    target: Option<Target>,
+    exports: &Arc<Exports>,
+    stop: &CancellationToken,
+    exporter: impl FnOnce(&Transport) -> Result<E, SettingsError>,
+) -> Result<Option<Delivery<E>>, SettingsError> {
+    let Some(target) = target else {
+        return Ok(None);
+    };
+    let transport = Transport::new(target)?;
+    let exporter = exporter(&transport)?;
+    Ok(Some(Delivery::new(
+        exporter,
+        signal,
+        transport.endpoint(),
+        Arc::clone(exports),
+        stop.clone(),
+    )))
+}

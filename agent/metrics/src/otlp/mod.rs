@@ -1,0 +1,33 @@
+//! OTLP: metrics, events, traces and the log are pushed to a receiver on a separate thread.
+//!
+//! The receiver may be absent, slow or intermittent. Memory stays bounded, undelivered items are
+//! counted, and the capture never waits. The caller starts the thread, with the privileges of
+//! exports.
+
+mod delivery;
+mod encoded;
+mod endpoint;
+mod events;
+mod exporter;
+mod exports;
+mod instruments;
+mod metrics;
+mod naming;
+mod own_log;
+pub(crate) mod points;
+mod reports;
+mod resource;
+mod settings;
+mod starts;
+mod traces;
+mod transport;
+
+pub use endpoint::otlp_endpoint;
+pub use exporter::{Exporter, Inputs, Spawn, StartError};
+pub use exports::{Exports, Outcome, Reason, Signal};
+pub use own_log::LogQueue;
+pub use resource::Host;
+pub use settings::{
+    Compression, Endpoint, OtlpProtocol, OtlpSettings, ReadText, Settings, SettingsError,
+};
+pub use traces::{SpanQueue, SpanSink};
