@@ -18,7 +18,7 @@
 use std::collections::{HashSet, VecDeque};
 
 use ros2probe_model::facts::bounded::{self, Bounded, Sum};
-use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::input::{Captured, Input};
 use ros2probe_model::observe::observer::Observer;
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{Body, flag};
@@ -202,12 +202,8 @@ impl ReorderBuffer {
         complete: impl Fn(&mut Record),
         observer: &mut Observer,
     ) {
-        observer.input(Input::Announcements {
-            envelope,
-            payload,
-            is_polled: false,
-        });
-        user_data(envelope, payload, |mut record| {
+        let captured = Captured::new(envelope, payload, false);
+        read(captured, payload, observer, |mut record, observer| {
             complete(&mut record);
             if let Some(record) = self.walked(at, record) {
                 observe(observer, &record);
@@ -223,12 +219,8 @@ impl ReorderBuffer {
         payload: &[u8],
         observer: &mut Observer,
     ) {
-        observer.input(Input::Announcements {
-            envelope,
-            payload,
-            is_polled: true,
-        });
-        user_data(envelope, payload, |mut record| {
+        let captured = Captured::new(envelope, payload, true);
+        read(captured, payload, observer, |mut record, observer| {
             record.flags |= flag::SHM;
             if let Some(record) = self.polled(at, record) {
                 observe(observer, &record);
@@ -328,13 +320,21 @@ impl ReorderBuffer {
     }
 }
 
-/// Passes each record of a datagram's user data to `show`.
-fn user_data(envelope: &Envelope, payload: &[u8], mut show: impl FnMut(Record)) {
-    walk::datagram(payload, envelope, None, |found| {
+/// Passes a captured datagram to the model, and each record of its user data to `user_data`.
+fn read(
+    captured: Captured<'_>,
+    payload: &[u8],
+    observer: &mut Observer,
+    mut user_data: impl FnMut(Record, &mut Observer),
+) {
+    let outcome = walk::datagram(payload, captured.envelope, None, |found| {
+        let found = &found;
+        observer.input(Input::Submessage { captured, found });
         if !found.record.writer().entity.is_builtin() {
-            show(found.record);
+            user_data(found.record, observer);
         }
     });
+    observer.input(Input::DatagramEnd(outcome));
 }
 
 #[cfg(test)]

@@ -29,7 +29,7 @@ use ros2probe_daemon::surface::ros2_daemon::call::{self, Argument, Call};
 use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::{Decoded, Definition, MessageType, Truncation, csv, decode, yaml};
 use ros2probe_model::facts::selection::{Depth, SampleRequest, Selection};
-use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::input::{Captured, Input};
 use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_wire::frame::{self, Packet, Payload};
 use ros2probe_wire::record::Record;
@@ -485,16 +485,15 @@ fn brought(observer: &mut Observer, kind: u8, now: u64, content: &[u8]) {
             length: u32::from(kind) * 8,
         }),
         4 => {
-            observer.input(Input::Announcements {
-                envelope: &envelope,
-                payload: content,
-                is_polled: kind & 16 != 0,
-            });
-            walk::datagram(content, &envelope, None, |found| {
+            let captured = Captured::new(&envelope, content, kind & 16 != 0);
+            let outcome = walk::datagram(content, &envelope, None, |found| {
+                let found = &found;
+                observer.input(Input::Submessage { captured, found });
                 if !found.record.writer().entity.is_builtin() {
                     observe(observer, &found.record);
                 }
             });
+            observer.input(Input::DatagramEnd(outcome));
         }
         // Records as the kernel programs write them, for any traffic.
         _ => {

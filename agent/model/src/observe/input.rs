@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use ros2probe_wire::record::{Handover, Verdict};
-use ros2probe_wire::walk::Envelope;
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::walk::{Envelope, Found, Outcome};
 use ros2probe_wire::{Guid, GuidPrefix, Reason, Timestamp};
 
 use crate::derive::chain::causality::CausalPublication;
@@ -49,16 +50,16 @@ pub enum Input<'a> {
         /// Length of the whole RTPS message in bytes.
         length: u32,
     },
-    /// A captured datagram that is read for discovery and payloads. The caller sorts its user data
-    /// among other observations.
-    Announcements {
-        /// Its addresses and time.
-        envelope: &'a Envelope,
-        /// The RTPS message.
-        payload: &'a [u8],
-        /// Whether it was polled in shared memory, where others may have been missed.
-        is_polled: bool,
+    /// A submessage of a captured datagram, which is read for discovery and payloads. The caller
+    /// sorts observations of user data among others. [`Self::DatagramEnd`] follows the last one.
+    Submessage {
+        /// The datagram.
+        captured: Captured<'a>,
+        /// The submessage.
+        found: &'a Found<'a>,
     },
+    /// The end of a captured datagram whose submessages were passed one by one.
+    DatagramEnd(Outcome),
     /// A message that was sampled from shared memory, where others may have been missed.
     SharedMemory {
         /// Its source and time.
@@ -113,6 +114,32 @@ pub enum Input<'a> {
     },
     /// The input has ended: open decisions are made without elapsed time.
     End,
+}
+
+/// A captured datagram, without its submessages.
+#[derive(Clone, Copy, Debug)]
+pub struct Captured<'a> {
+    /// Its addresses and time.
+    pub envelope: &'a Envelope,
+    /// vendorId of the message header (RTPS 2.5, 8.3.3); `None` if it is VENDORID_UNKNOWN.
+    pub vendor: Option<VendorId>,
+    /// Whether it was polled in shared memory, where others may have been missed.
+    pub is_polled: bool,
+}
+
+impl<'a> Captured<'a> {
+    /// Describes a datagram whose UDP payload is `payload`.
+    #[must_use]
+    pub fn new(envelope: &'a Envelope, payload: &[u8], is_polled: bool) -> Self {
+        let vendor = payload
+            .get(6..8)
+            .and_then(|bytes| <[u8; 2]>::try_from(bytes).ok());
+        Self {
+            envelope,
+            vendor: vendor.filter(|vendor| *vendor != [0, 0]).map(VendorId),
+            is_polled,
+        }
+    }
 }
 
 /// Outputs of the model since they were last drained.

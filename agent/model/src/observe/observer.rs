@@ -22,8 +22,7 @@ use std::time::Duration;
 
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::record::Handover;
-use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::walk::{self, Envelope, Outcome};
+use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
 use ros2probe_wire::{DomainId, EntityId, Guid, Reason, SequenceNumber, Timestamp};
 
 use crate::derive::chain::Chains;
@@ -48,7 +47,7 @@ use crate::measure::payloads::Payloads;
 use crate::measure::profiler::{ObservationOutcome, Profiler};
 use crate::measure::receivers::Receivers;
 use crate::measure::topic::{TopicId, Topics, Watched};
-use crate::observe::input::{Input, Output};
+use crate::observe::input::{Captured, Input, Output};
 use crate::observe::interest::Interest;
 use crate::report::snapshot::Snapshot;
 use crate::report::transport::{lacks_names, may_share_memory};
@@ -182,19 +181,18 @@ impl Observer {
                 envelope,
                 payload,
                 handover,
-            } => self.walk((envelope, payload, handover), false, |_| true),
+            } => self.walk(Captured::new(envelope, payload, false), payload, handover),
             Input::CutDatagram {
                 envelope,
                 payload,
                 length,
             } => self.cut_datagram(envelope, payload, length),
-            Input::Announcements {
-                envelope,
-                payload,
-                is_polled,
-            } => self.walk((envelope, payload, None), is_polled, EntityId::is_builtin),
+            Input::Submessage { captured, found } => {
+                self.submessage(captured, found, EntityId::is_builtin);
+            }
+            Input::DatagramEnd(outcome) => self.datagram_end(outcome),
             Input::SharedMemory { envelope, payload } => {
-                self.walk((envelope, payload, None), true, |_| true);
+                self.walk(Captured::new(envelope, payload, true), payload, None);
             }
             Input::SharedMemoryGap(now) => self.profiler.uncertain(self.wall_clock.model_time(now)),
             Input::ProbesDetached => self.profiler.end_exact_view(),
@@ -464,29 +462,34 @@ impl Observer {
         });
     }
 
-    /// Reads the announcements and payloads in a datagram, and counts submessages of the writers for
-    /// which `counts` is true.
-    fn walk(
+    /// Reads a datagram: the announcements and payloads, and counts every submessage.
+    fn walk(&mut self, captured: Captured<'_>, payload: &[u8], handover: Option<&Handover>) {
+        let outcome = walk::datagram(payload, captured.envelope, handover, |found| {
+            self.submessage(captured, &found, |_| true);
+        });
+        self.datagram_end(outcome);
+    }
+
+    /// Reads the announcement or payload in a submessage, and counts it if `counts` is true for its
+    /// writer.
+    fn submessage(
         &mut self,
-        (envelope, payload, handover): (&Envelope, &[u8], Option<&Handover>),
-        is_polled: bool,
+        captured: Captured<'_>,
+        found: &Found<'_>,
         counts: impl Fn(EntityId) -> bool,
     ) {
+        let observation = match captured.is_polled {
+            true => Observation::of_polled(&found.record, self.wall_clock),
+            false => Observation::of(&found.record, self.wall_clock),
+        };
+        self.announced(captured, found, &observation);
+        if counts(observation.head().writer.entity) {
+            self.count(&observation);
+        }
+    }
+
+    fn datagram_end(&mut self, outcome: Outcome) {
         self.datagrams += 1;
-        let vendor = payload
-            .get(6..8)
-            .and_then(|bytes| <[u8; 2]>::try_from(bytes).ok());
-        let vendor = vendor.filter(|vendor| *vendor != [0, 0]).map(VendorId);
-        let outcome = walk::datagram(payload, envelope, handover, |found| {
-            let observation = match is_polled {
-                true => Observation::of_polled(&found.record, self.wall_clock),
-                false => Observation::of(&found.record, self.wall_clock),
-            };
-            self.announced((&found, &observation), vendor, envelope);
-            if counts(observation.head().writer.entity) {
-                self.count(&observation);
-            }
-        });
         if outcome == Outcome::Malformed {
             self.decode_error("rtps", Reason::BadLength);
         }

@@ -3,21 +3,25 @@
 use ros2probe_wire::discovery::{self, EndpointAnnouncement, ParticipantAnnouncement, Role};
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
-use ros2probe_wire::walk::{Envelope, Found};
+use ros2probe_wire::walk::Found;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, WireError};
 
 use super::Observer;
 use crate::facts::observation::{Content, Observation, Sample};
 use crate::facts::route::Destination;
 use crate::graph::discovery::{Origin, Priority, endpoints_of};
+use crate::observe::input::Captured;
 
 impl Observer {
     pub(super) fn announced(
         &mut self,
-        (found, observation): (&Found<'_>, &Observation),
-        vendor: Option<VendorId>,
-        envelope: &Envelope,
+        captured: Captured<'_>,
+        found: &Found<'_>,
+        observation: &Observation,
     ) {
+        let Captured {
+            envelope, vendor, ..
+        } = captured;
         if let Observation::Sample(sample) = observation {
             let prefix = sample.head.writer.prefix;
             let [first, second, ..] = prefix.0;
