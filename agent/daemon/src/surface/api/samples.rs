@@ -42,8 +42,11 @@ use ros2probe_model::report::snapshot::Snapshot;
 const MAX_PATTERNS: usize = 256;
 const MAX_LIST: usize = 16_384;
 const MAX_REGEX: usize = 4_096;
-/// Size of a piece of the answer, in bytes.
+/// Size of a piece of the answer, in bytes. Larger payloads are pieces of their own, without a copy.
 const BATCH_BYTES: usize = 16 * 1024;
+/// How long a live stream collects messages after the first: one piece for many small ones, instead
+/// of several system calls in agent and client for each. Their times are those of the capture.
+const PAUSE: Duration = Duration::from_millis(20);
 /// Default queue sizes: for a few thousand arrivals, and for messages with payloads.
 const ARRIVALS_BYTES: usize = 1 << 20;
 const PAYLOADS_BYTES: usize = 16 << 20;
@@ -91,6 +94,8 @@ struct Stream {
     /// Payload to send next, after its line.
     payload: Option<Bytes>,
     first: Option<Line>,
+    /// Whether to collect small messages for [`PAUSE`].
+    collects: bool,
     /// Writers whose QoS has been sent.
     introduced: Bounded<DescribedWriters, HashSet<Guid>>,
     ended: bool,
@@ -139,6 +144,8 @@ async fn samples(
     } else {
         (Depth::Arrivals, ARRIVALS_BYTES, LINES)
     };
+    // A smaller queue might overflow during a pause, and a replay waits for its client.
+    let collects = !is_replay && wanted.queue_bytes.is_none_or(|bytes| bytes >= queue_bytes);
     let queue_bytes = wanted.queue_bytes.unwrap_or(queue_bytes).max(LEAST_BYTES);
     let request = Request {
         topics: selection(&wanted)?,
@@ -175,6 +182,7 @@ async fn samples(
         stop: context.stop.clone(),
         payload: None,
         first: Some(first),
+        collects,
         introduced: Bounded::default(),
         ended: false,
     };
@@ -203,7 +211,12 @@ impl Pieces for Stream {
             };
             write(&mut lines, &self.line(&item));
             match item {
-                Item::Sample(sample) => self.payload.clone_from(&sample.payload),
+                Item::Sample(sample) => match &sample.payload {
+                    Some(payload) if lines.len() + payload.len() <= BATCH_BYTES => {
+                        lines.extend_from_slice(payload);
+                    }
+                    payload => self.payload.clone_from(payload),
+                },
                 Item::End(_) => self.ended = true,
                 Item::Clock(_) | Item::Missed(_) => {}
             }
@@ -232,6 +245,12 @@ impl Stream {
             item = self.subscription.next() => item,
             () = self.stop.cancelled() => None,
         };
+        if self.collects && matches!(item, Some(Item::Sample(_) | Item::Clock(_))) {
+            tokio::select! {
+                () = tokio::time::sleep(PAUSE) => {}
+                () = self.stop.cancelled() => {}
+            }
+        }
         item.unwrap_or(Item::End("agent ends"))
     }
 }
