@@ -23,7 +23,7 @@ use crate::facts::tables;
 use crate::facts::wall_clock::WallClock;
 use crate::measure::delivery::Totals;
 use crate::measure::in_order::Progress;
-use crate::measure::receivers::GraphView;
+use crate::measure::receivers::Graph;
 use crate::measure::samples::Budget;
 use crate::measure::subscribers::{DeliveryQuota, Novelty, Subscribers, WriterContext};
 use crate::measure::topic::TopicId;
@@ -162,12 +162,7 @@ impl Profiler {
     }
 
     /// Returns how far the samples of this writer are decided; `None` if it is not measured.
-    pub fn progress(
-        &mut self,
-        guid: Guid,
-        now: ModelTime,
-        graph: GraphView<'_>,
-    ) -> Option<Progress> {
+    pub fn progress(&mut self, guid: Guid, now: ModelTime, graph: &Graph) -> Option<Progress> {
         let measured = self.writers.get_mut(&guid)?;
         let acknowledged = measured.is_acknowledged()
             || !measured.unacknowledged && measured.has_reliable_reader(graph);
@@ -211,7 +206,7 @@ impl Profiler {
         &mut self,
         observation: &Observation,
         journal: &mut Journal,
-        graph: GraphView<'_>,
+        graph: &Graph,
     ) -> ObservationOutcome {
         let head = observation.head();
         let (guid, now) = (head.writer, head.at);
@@ -363,7 +358,7 @@ impl Profiler {
         guid: Guid,
         now: ModelTime,
         journal: &mut Journal,
-        graph: GraphView<'_>,
+        graph: &Graph,
     ) -> Option<Retired> {
         let mut measured = self.writers.remove(&guid)?;
         let writer_ref = measured.writer_ref(guid);
@@ -392,7 +387,7 @@ impl Profiler {
         &mut self,
         now: ModelTime,
         journal: &mut Journal,
-        graph: GraphView<'_>,
+        graph: &Graph,
     ) -> UnknownWriters {
         let mut unknown_writers = UnknownWriters::default();
         for (guid, measured) in &mut self.writers {
@@ -431,7 +426,7 @@ impl Profiler {
     }
 
     /// Settles all samples at the end of the input.
-    pub fn settle(&mut self, now: ModelTime, journal: &mut Journal, graph: GraphView<'_>) {
+    pub fn settle(&mut self, now: ModelTime, journal: &mut Journal, graph: &Graph) {
         let mut guids: Vec<_> = self.writers.keys().copied().collect();
         guids.sort_unstable();
         for guid in guids {
@@ -456,7 +451,7 @@ impl Profiler {
     }
 
     /// Drops the deliveries that have been silent longest, since a new one was refused.
-    fn give_up_silent(&mut self, now: ModelTime, journal: &mut Journal, graph: GraphView<'_>) {
+    fn give_up_silent(&mut self, now: ModelTime, journal: &mut Journal, graph: &Graph) {
         let mut silent: Vec<_> = self
             .writers
             .iter()
@@ -504,7 +499,7 @@ impl SharedBudgets {
         writer_ref: WriterRef,
         now: ModelTime,
         journal: &'a mut Journal,
-        graph: GraphView<'a>,
+        graph: &'a Graph,
     ) -> WriterContext<'a> {
         WriterContext {
             now,
@@ -536,7 +531,7 @@ impl Measured {
     }
 
     /// Returns whether discovery knows a reliable reader of its topic.
-    fn has_reliable_reader(&self, graph: GraphView<'_>) -> bool {
+    fn has_reliable_reader(&self, graph: &Graph) -> bool {
         let topic = self.topic.and_then(|topic| graph.topics.get(topic));
         let readers = topic.into_iter().flat_map(|topic| &topic.readers);
         let mut known = readers.filter_map(|guid| graph.discovery.endpoints().get(guid));

@@ -52,15 +52,15 @@ pub struct Receivers {
     generation: u64,
 }
 
-/// Context in which a writer's samples are processed.
-#[derive(Clone, Copy, Debug)]
-pub struct GraphView<'a> {
+/// The graph, which the measurement of each sample consults.
+#[derive(Debug)]
+pub struct Graph {
     /// Sockets and addresses of receivers.
-    pub receivers: &'a Receivers,
+    pub receivers: Receivers,
     /// Participants and endpoints.
-    pub discovery: &'a Discovery,
+    pub discovery: Discovery,
     /// Readers and writers of each topic.
-    pub topics: &'a Topics,
+    pub topics: Topics,
     /// Difference between model time and wall time, for timestamps of writers.
     pub wall_clock: WallClock,
 }

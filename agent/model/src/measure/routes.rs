@@ -187,7 +187,7 @@ impl KnownRoute {
         let domain_id = topic.map(|topic| topic.domain_id);
         let owners = graph
             .receivers
-            .owners(&self.route, graph.discovery, domain_id);
+            .owners(&self.route, &graph.discovery, domain_id);
         let has_reader = |owner: &GuidPrefix| readers.matched(*owner) == Matched::Yes;
         self.is_shared = owners.len() > 1 && owners.iter().all(has_reader);
         self.owner = match owners[..] {

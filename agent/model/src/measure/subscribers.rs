@@ -33,7 +33,7 @@ use crate::facts::route::{Destination, Route};
 use crate::measure::acknowledgement::{AcknowledgementFacts, Acknowledgements};
 use crate::measure::delivery::{Delivery, DeliveryContext, Totals, seconds};
 use crate::measure::departures::Departures;
-use crate::measure::receivers::{GraphView, Matched, MatchedReaders};
+use crate::measure::receivers::{Graph, Matched, MatchedReaders};
 use crate::measure::reception::CompleteSample;
 use crate::measure::routes::Routes;
 use crate::measure::samples::Budget;
@@ -110,7 +110,7 @@ pub struct WriterContext<'a> {
     /// Quota for deliveries.
     pub quota: &'a mut DeliveryQuota,
     /// Participants, topics and receivers.
-    pub graph: GraphView<'a>,
+    pub graph: &'a Graph,
 }
 
 impl Subscribers {

@@ -13,7 +13,7 @@ use super::Profiler;
 use crate::facts::journal::Journal;
 use crate::facts::model_time::ModelTime;
 use crate::facts::observation::Observation;
-use crate::measure::receivers::GraphView;
+use crate::measure::receivers::Graph;
 use crate::measure::writer::{Traits, Writer};
 
 /// Minimum time between two searches for writers to evict.
@@ -40,7 +40,7 @@ impl Profiler {
         &mut self,
         observation: &Observation,
         journal: &mut Journal,
-        graph: GraphView<'_>,
+        graph: &Graph,
     ) -> ObservationOutcome {
         let Some(sample) = observation.sample().filter(|sample| sample.is_delivered()) else {
             return ObservationOutcome::Unmeasured;
@@ -60,7 +60,7 @@ impl Profiler {
 
     /// Drops the unknown writer with the longest silence, unless it is established. Returns whether
     /// one was dropped.
-    fn evict_unknown_writer(&mut self, now: ModelTime, graph: GraphView<'_>) -> bool {
+    fn evict_unknown_writer(&mut self, now: ModelTime, graph: &Graph) -> bool {
         if now < self.search_after {
             return false;
         }

@@ -6,7 +6,7 @@
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::{Guid, GuidPrefix};
 
-use super::GraphView;
+use super::Graph;
 use crate::facts::diagnosis::{Offer, Verdict, effort, verdict};
 use crate::facts::model_time::ModelTime;
 use crate::graph::discovery::Endpoint;
@@ -20,7 +20,7 @@ const COMPARED: usize = 64;
 /// The readers of one writer's topic.
 #[derive(Clone, Copy, Debug)]
 pub struct MatchedReaders<'a> {
-    graph: GraphView<'a>,
+    graph: &'a Graph,
     topic: Option<&'a Topic>,
     writer: Guid,
 }
@@ -39,7 +39,7 @@ pub enum Matched {
 impl<'a> MatchedReaders<'a> {
     /// Creates a view of the readers that match `writer`, a writer of `topic`.
     #[must_use]
-    pub const fn new(graph: GraphView<'a>, topic: Option<&'a Topic>, writer: Guid) -> Self {
+    pub const fn new(graph: &'a Graph, topic: Option<&'a Topic>, writer: Guid) -> Self {
         Self {
             graph,
             topic,
@@ -49,7 +49,7 @@ impl<'a> MatchedReaders<'a> {
 
     /// Returns the graph.
     #[must_use]
-    pub const fn graph(&self) -> GraphView<'a> {
+    pub const fn graph(&self) -> &'a Graph {
         self.graph
     }
 

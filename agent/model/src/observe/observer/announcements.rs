@@ -54,7 +54,7 @@ impl Observer {
         };
         let whole;
         let (payload, inline_qos) = if let Content::DataFrag(fragments) = sample.content {
-            let fragmented = &mut self.discovery_fragments;
+            let fragmented = &mut self.measure.discovery_fragments;
             let Some(bytes) = fragmented.put(sample, fragments, found.payload) else {
                 return;
             };
@@ -87,7 +87,7 @@ impl Observer {
         if sample.status_info != StatusInfo::ALIVE {
             return false;
         }
-        if let Some(endpoint) = self.discovery.endpoints().get(&writer) {
+        if let Some(endpoint) = self.graph.discovery.endpoints().get(&writer) {
             return &*endpoint.topic == "ros_discovery_info";
         }
         let own = Guid::new(writer.prefix, EntityId::PARTICIPANT).to_bytes();
@@ -95,7 +95,7 @@ impl Observer {
         match sample.content {
             Content::Data { .. } => begins,
             Content::DataFrag(_) => {
-                sample.is_start() && begins || self.discovery_fragments.holds(sample)
+                sample.is_start() && begins || self.measure.discovery_fragments.holds(sample)
             }
         }
     }
@@ -113,7 +113,8 @@ impl Observer {
                 self.announce(announcement.guid.prefix);
             }
             discovery::Discovery::Gone { guid, .. } => {
-                self.discovery
+                self.graph
+                    .discovery
                     .participant_gone(guid, origin, &mut self.journal);
             }
         }
@@ -142,7 +143,8 @@ impl Observer {
                 }
             }
             discovery::Discovery::Gone { guid, .. } => {
-                self.discovery
+                self.graph
+                    .discovery
                     .endpoint_gone(guid, origin, &mut self.journal);
             }
         }
@@ -168,7 +170,8 @@ impl Observer {
     ) {
         let evidence = self.evidence(announcement.guid.prefix);
         let journal = &mut self.journal;
-        self.discovery
+        self.graph
+            .discovery
             .participant(announcement, origin, evidence, journal);
     }
 
@@ -181,7 +184,8 @@ impl Observer {
     ) -> bool {
         let evidence = self.evidence(announcement.guid.prefix);
         let journal = &mut self.journal;
-        self.discovery
+        self.graph
+            .discovery
             .endpoint(announcement, origin, evidence, journal)
     }
 
@@ -194,7 +198,8 @@ impl Observer {
     ) {
         let evidence = self.evidence(writer.prefix);
         let journal = &mut self.journal;
-        self.discovery
+        self.graph
+            .discovery
             .entities(entities, writer, origin, evidence, journal);
     }
 
@@ -202,17 +207,21 @@ impl Observer {
     fn evidence(&self, prefix: GuidPrefix) -> Priority {
         Priority {
             watched: false,
-            local: self.receivers.is_local(&prefix),
-            sends: self.profiler.has_unknown_writer(endpoints_of(prefix)),
+            local: self.graph.receivers.is_local(&prefix),
+            sends: self
+                .measure
+                .profiler
+                .has_unknown_writer(endpoints_of(prefix)),
         }
     }
 
     /// Records the announced addresses of a known participant.
     pub(super) fn announce(&mut self, prefix: GuidPrefix) {
-        if let Some(participant) = self.discovery.participants().get(&prefix) {
+        if let Some(participant) = self.graph.discovery.participants().get(&prefix) {
             let addresses = &participant.addresses;
             let addresses = addresses.default.iter().chain(&addresses.metatraffic);
-            self.receivers
+            self.graph
+                .receivers
                 .announce(prefix, addresses.copied().map(Destination::from));
         }
     }

@@ -12,7 +12,9 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::naming::Naming;
 use crate::facts::route::Direction;
 use crate::facts::route::Receiver;
-use crate::measure::profiler::Measured;
+use crate::graph::discovery::Discovery;
+use crate::measure::profiler::{Measured, Profiler};
+use crate::measure::receivers::Graph;
 use crate::measure::topic::Watched;
 use crate::report::snapshot::Transport;
 use crate::report::transport::{transport, vendor};
@@ -20,83 +22,84 @@ use crate::report::transport::{transport, vendor};
 impl Observer {
     /// Compares arrivals with the calls that take them.
     pub(super) fn compare_queues(&mut self, at: ModelTime) {
-        let mut inside = std::mem::take(&mut self.inside);
         let now = at.max(self.clock);
-        inside.compare_queues(now, |participants, domain_id, naming| {
-            self.arrivals(participants, domain_id, naming, now)
-        });
-        self.inside = inside;
+        let (graph, profiler) = (&self.graph, &self.measure.profiler);
+        self.derive
+            .inside
+            .compare_queues(now, |participants, domain_id, naming| {
+                arrivals((graph, profiler), participants, (domain_id, naming), now)
+            });
     }
+}
 
-    /// Returns what has arrived at the readers of a topic at these participants. Returns `None` if
-    /// messages arrive that are not counted: within the process, or by a way that is not observed.
-    fn arrivals(
-        &self,
-        participants: &BTreeSet<GuidPrefix>,
-        domain_id: DomainId,
-        naming: &Naming,
-        now: ModelTime,
-    ) -> Option<Arrivals> {
-        let topic = self.topics.get(self.topics.find(domain_id, naming)?)?;
-        if topic.watched != Watched::Yes {
-            return None;
-        }
-        let own = participants.iter();
-        let readers: Vec<Guid> = own.flat_map(|prefix| topic.readers_of(*prefix)).collect();
-        let mut found = Arrivals {
-            readers,
-            depth: Some(0),
-            ..Arrivals::default()
-        };
+/// Returns what has arrived at the readers of a topic at these participants. Returns `None` if
+/// messages arrive that are not counted: within the process, or by a way that is not observed.
+fn arrivals(
+    (graph, profiler): (&Graph, &Profiler),
+    participants: &BTreeSet<GuidPrefix>,
+    (domain_id, naming): (DomainId, &Naming),
+    now: ModelTime,
+) -> Option<Arrivals> {
+    let (discovery, topics) = (&graph.discovery, &graph.topics);
+    let topic = topics.get(topics.find(domain_id, naming)?)?;
+    if topic.watched != Watched::Yes {
+        return None;
+    }
+    let own = participants.iter();
+    let readers: Vec<Guid> = own.flat_map(|prefix| topic.readers_of(*prefix)).collect();
+    let mut found = Arrivals {
+        readers,
+        depth: Some(0),
+        ..Arrivals::default()
+    };
+    for reader in &found.readers {
+        let history = discovery.endpoints().get(reader)?.qos.history;
+        let depth = history.filter(|history| history.kind == HistoryKind::KEEP_LAST);
+        let depth = depth.and_then(|history| u64::try_from(history.depth).ok());
+        found.depth = found.depth.zip(depth).map(|(sum, depth)| sum + depth);
+    }
+    for writer in &topic.writers {
+        let mut messages = 0;
+        let mut since = None;
         for reader in &found.readers {
-            let history = self.discovery.endpoints().get(reader)?.qos.history;
-            let depth = history.filter(|history| history.kind == HistoryKind::KEEP_LAST);
-            let depth = depth.and_then(|history| u64::try_from(history.depth).ok());
-            found.depth = found.depth.zip(depth).map(|(sum, depth)| sum + depth);
-        }
-        for writer in &topic.writers {
-            let mut messages = 0;
-            let mut since = None;
-            for reader in &found.readers {
-                if !self.are_matched(*writer, *reader)? {
-                    continue;
-                }
-                let measured = self.profiler.get(*writer)?;
-                let transport = transport(&self.discovery, *writer, *reader)?;
-                let (begin, count) = arrived(measured, transport, reader.prefix, now)?;
-                messages += count;
-                since = begin;
-                let facts = measured.writer.measurement(now);
-                found.last = found.last.max(facts.last_message);
-                found.is_ahead |= facts.negative_latency > 0;
+            if !are_matched(discovery, *writer, *reader)? {
+                continue;
             }
-            if messages > 0 {
-                found.writers.push(ArrivalsOf {
-                    writer: *writer,
-                    since,
-                    messages,
-                });
-            }
+            let measured = profiler.get(*writer)?;
+            let transport = transport(discovery, *writer, *reader)?;
+            let (begin, count) = arrived(measured, transport, reader.prefix, now)?;
+            messages += count;
+            since = begin;
+            let facts = measured.writer.measurement(now);
+            found.last = found.last.max(facts.last_message);
+            found.is_ahead |= facts.negative_latency > 0;
         }
-        Some(found)
+        if messages > 0 {
+            found.writers.push(ArrivalsOf {
+                writer: *writer,
+                since,
+                messages,
+            });
+        }
     }
+    Some(found)
+}
 
-    /// Returns whether both have the same type and compatible quality of service; `None` if one is
-    /// unknown.
-    fn are_matched(&self, writer: Guid, reader: Guid) -> Option<bool> {
-        let endpoints = self.discovery.endpoints();
-        let (of_writer, of_reader) = (endpoints.get(&writer)?, endpoints.get(&reader)?);
-        let offered = Offer {
-            qos: &of_writer.qos,
-            vendor: vendor(&self.discovery, writer.prefix),
-        };
-        let requested = Offer {
-            qos: &of_reader.qos,
-            vendor: vendor(&self.discovery, reader.prefix),
-        };
-        let is_one_type = of_writer.message_type == of_reader.message_type;
-        Some(is_one_type && verdict(offered, requested) == Verdict::Match)
-    }
+/// Returns whether both have the same type and compatible quality of service; `None` if one is
+/// unknown.
+fn are_matched(discovery: &Discovery, writer: Guid, reader: Guid) -> Option<bool> {
+    let endpoints = discovery.endpoints();
+    let (of_writer, of_reader) = (endpoints.get(&writer)?, endpoints.get(&reader)?);
+    let offered = Offer {
+        qos: &of_writer.qos,
+        vendor: vendor(discovery, writer.prefix),
+    };
+    let requested = Offer {
+        qos: &of_reader.qos,
+        vendor: vendor(discovery, reader.prefix),
+    };
+    let is_one_type = of_writer.message_type == of_reader.message_type;
+    Some(is_one_type && verdict(offered, requested) == Verdict::Match)
 }
 
 /// Returns the messages of a writer that arrived at a participant, and the time since which all of

@@ -13,7 +13,7 @@ impl Observer {
     /// Reads the identity of a captured request or reply.
     pub(super) fn identify_call(&mut self, found: &Found<'_>, sample: &Sample, vendor: VendorId) {
         let writer = sample.head.writer;
-        match self.services.identify(found, sample, vendor) {
+        match self.derive.services.identify(found, sample, vendor) {
             Ok(is_over_budget) => self.follow_call(writer, is_over_budget),
             Err(error) => self.decode_error("request", error.reason),
         }
@@ -21,39 +21,46 @@ impl Observer {
 
     /// Stops capturing a writer of requests or replies that has exceeded its budget.
     pub(super) fn follow_call(&mut self, writer: Guid, is_over_budget: bool) {
-        if is_over_budget && !self.payloads.wants_bytes(writer) {
-            let is_measured = self.profiler.get(writer).is_some();
+        if is_over_budget && !self.measure.payloads.wants_bytes(writer) {
+            let is_measured = self.measure.profiler.get(writer).is_some();
             let verdict = match is_measured {
                 true => Verdict::Meter,
                 false => Verdict::Ignore,
             };
-            self.interest.set(writer, verdict);
+            self.requested.interest.set(writer, verdict);
         }
     }
 
     /// Counts a copy of a request or reply.
     pub(super) fn call_seen(&mut self, sample: &Sample) {
-        if self.services.follows(sample.head.writer) {
-            let (receivers, discovery) = (&self.receivers, &self.discovery);
-            self.services
+        if self.derive.services.follows(sample.head.writer) {
+            let (receivers, discovery) = (&self.graph.receivers, &self.graph.discovery);
+            self.derive
+                .services
                 .seen(sample, || receivers.owner(&sample.head.route(), discovery));
         }
     }
 
     /// Marks hanging calls, and captures writers again that had exceeded their budget.
     pub(super) fn advance_calls(&mut self, now: ModelTime) {
-        let topics = &self.topics;
+        let topics = &self.graph.topics;
         let timeout = self.settings.service_timeout;
-        let resumed = self.services.advance(timeout, now, |domain_id, name| {
-            let halves = [format!("rq{name}Request"), format!("rr{name}Reply")];
-            halves
-                .iter()
-                .any(|dds_name| topics.knows(domain_id, dds_name))
-        });
+        let resumed = self
+            .derive
+            .services
+            .advance(timeout, now, |domain_id, name| {
+                let halves = [format!("rq{name}Request"), format!("rr{name}Reply")];
+                halves
+                    .iter()
+                    .any(|dds_name| topics.knows(domain_id, dds_name))
+            });
         for guid in resumed {
-            let endpoint = self.discovery.endpoints().get(&guid);
-            let id = endpoint
-                .and_then(|endpoint| self.topics.find(endpoint.domain_id, &endpoint.naming()?));
+            let endpoint = self.graph.discovery.endpoints().get(&guid);
+            let id = endpoint.and_then(|endpoint| {
+                self.graph
+                    .topics
+                    .find(endpoint.domain_id, &endpoint.naming()?)
+            });
             if let Some(id) = id {
                 self.apply(id, guid, now);
             }

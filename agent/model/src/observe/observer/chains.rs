@@ -3,8 +3,8 @@
 use ros2probe_wire::GuidPrefix;
 use ros2probe_wire::names::DdsTopic;
 
-use super::Observer;
 use super::lists::traced_share;
+use super::{Derive, Observer};
 use crate::derive::chain::causality::{CausalPublication, Origin};
 use crate::derive::chain::graph::publisher;
 use crate::facts::model_time::ModelTime;
@@ -17,30 +17,30 @@ use crate::measure::writer::Counted;
 impl Observer {
     /// Adds the message that this sample completed to the chains, and notes where it arrived.
     pub(super) fn chain_seen(&mut self, sample: &Sample, completed: Option<&Counted>) {
-        let (writer, clock) = (sample.head.writer, self.wall_clock);
-        if !self.chains.follows(writer) {
+        let (writer, clock) = (sample.head.writer, self.graph.wall_clock);
+        if !self.derive.chains.follows(writer) {
             return;
         }
         if let Some(counted) = completed {
-            let is_local = !self.settings.directed || self.receivers.is_local(&writer.prefix);
-            self.chains.counted(writer, counted, is_local, clock);
+            let is_local = !self.settings.directed || self.graph.receivers.is_local(&writer.prefix);
+            self.derive.chains.counted(writer, counted, is_local, clock);
         }
-        let (receivers, discovery) = (&self.receivers, &self.discovery);
-        self.chains.seen(sample, clock, || {
+        let (receivers, discovery) = (&self.graph.receivers, &self.graph.discovery);
+        self.derive.chains.seen(sample, clock, || {
             receivers.owner(&sample.head.route(), discovery)
         });
     }
 
     /// Adds a publication within a callback to the chains.
     pub(super) fn chain_published(&mut self, publication: &CausalPublication) {
-        let Self {
-            topics,
+        let Derive {
+            chains,
             tracer,
-            watchlist,
-            discovery,
             inside,
             ..
-        } = self;
+        } = &mut self.derive;
+        let (topics, discovery) = (&self.graph.topics, &self.graph.discovery);
+        let watchlist = &self.requested.watchlist;
         let topic = |name: &TopicName| {
             let name = DdsTopic::parse(&format!("rt{name}")).ok()?;
             topics.get(topics.find(publication.domain_id, &Naming::of(&name))?)
@@ -64,22 +64,26 @@ impl Observer {
                 share: share.and_then(|input| traced_share(input, watchlist)),
             }
         };
-        self.chains.publication(publication, self.clock, origin);
+        chains.publication(publication, self.clock, origin);
     }
 
     /// Evaluates the chains, and measures the topics that configured chains need.
     pub(super) fn advance_chains(&mut self, now: ModelTime) {
-        let graph = (&self.discovery, &self.topics, &self.profiler);
-        let watchlist = &self.watchlist;
+        let graph = (
+            &self.graph.discovery,
+            &self.graph.topics,
+            &self.measure.profiler,
+        );
+        let watchlist = &self.requested.watchlist;
         let share = |topic: &Topic| traced_share(topic, watchlist);
-        let (is_directed, receivers) = (self.settings.directed, &self.receivers);
+        let (is_directed, receivers) = (self.settings.directed, &self.graph.receivers);
         let is_local = |prefix: &GuidPrefix| !is_directed || receivers.is_local(prefix);
-        let times = (now, self.wall_clock);
-        let changed = self.chains.advance(graph, times, share, is_local);
+        let times = (now, self.graph.wall_clock);
+        let changed = self.derive.chains.advance(graph, times, share, is_local);
         for (domain_id, dds_name) in changed {
             let id = DdsTopic::parse(&dds_name)
                 .ok()
-                .and_then(|topic| self.topics.find(domain_id, &Naming::of(&topic)));
+                .and_then(|topic| self.graph.topics.find(domain_id, &Naming::of(&topic)));
             if let Some(id) = id {
                 self.apply_lists(id, now);
             }
@@ -88,7 +92,9 @@ impl Observer {
 
     /// Evaluates the chains at the end of the input.
     pub(super) fn settle_chains(&mut self) {
-        let graph = (&self.topics, &self.profiler);
-        self.chains.settle(graph, (self.clock, self.wall_clock));
+        let graph = (&self.graph.topics, &self.measure.profiler);
+        self.derive
+            .chains
+            .settle(graph, (self.clock, self.graph.wall_clock));
     }
 }

@@ -11,7 +11,6 @@ use ros2probe_wire::{Guid, Timestamp};
 use super::JUMP;
 use super::Observer;
 use super::TICK;
-use super::graph;
 use crate::facts::diagnosis;
 use crate::facts::event::{EventKind, TEXT, bounded, bounded_finding};
 use crate::facts::loss_share::LossShare;
@@ -42,7 +41,7 @@ impl Observer {
     #[must_use]
     pub fn next_decision(&self) -> Timestamp {
         let second = ModelTime::of_second(self.clock.whole_seconds() + 1);
-        let second = self.wall_clock.wall_time(second);
+        let second = self.graph.wall_clock.wall_time(second);
         self.next_expiry().map_or(second, |end| end.min(second))
     }
 
@@ -50,18 +49,20 @@ impl Observer {
     /// Leases are checked at multiples of an interval, also those that end at once.
     #[must_use]
     pub fn next_expiry(&self) -> Option<Timestamp> {
-        let end = self.discovery.next_expiry()?;
+        let end = self.graph.discovery.next_expiry()?;
         let end = end.round_up(TICK);
-        Some(self.wall_clock.wall_time(end.max(self.clock + TICK)))
+        Some(self.graph.wall_clock.wall_time(end.max(self.clock + TICK)))
     }
 
     /// Makes all open decisions at the end of the input, without elapsed time.
     pub(super) fn settle(&mut self) {
-        let graph = graph!(self);
-        self.profiler.settle(self.clock, &mut self.journal, graph);
+        let graph = &self.graph;
+        self.measure
+            .profiler
+            .settle(self.clock, &mut self.journal, graph);
         self.report_missing();
-        for writer in self.payloads.unsettled() {
-            self.payloads.give_all(writer, self.clock);
+        for writer in self.measure.payloads.unsettled() {
+            self.measure.payloads.give_all(writer, self.clock);
         }
         self.end_second_of_losses();
         self.report_losses();
@@ -71,8 +72,8 @@ impl Observer {
 
     /// Determines what the worst subscriber of each measured topic lost in the last second.
     fn end_second_of_losses(&mut self) {
-        for id in self.topics.ids() {
-            let Some(topic) = self.topics.get_mut(id) else {
+        for id in self.graph.topics.ids() {
+            let Some(topic) = self.graph.topics.get_mut(id) else {
                 continue;
             };
             let Some(retired) = &topic.retired else {
@@ -81,7 +82,7 @@ impl Observer {
             let mut unreached = retired.loss;
             let mut subscribers: BTreeMap<Receiver, (LossShare, LossShare)> = BTreeMap::new();
             for writer in topic.writers.iter().chain(&topic.buffer_endpoints) {
-                let Some(measured) = self.profiler.get_mut(*writer) else {
+                let Some(measured) = self.measure.profiler.get_mut(*writer) else {
                     continue;
                 };
                 unreached.add(measured.writer.share());
@@ -99,7 +100,8 @@ impl Observer {
                 messages: unreached.expected - unreached.lost,
                 ..Measurement::default()
             };
-            self.inside
+            self.derive
+                .inside
                 .apply(topic.domain_id, &topic.naming, &mut counted);
             unreached.expected = unreached.lost + counted.messages;
             topic.loss.end_second(subscribers.into_values(), unreached);
@@ -108,7 +110,7 @@ impl Observer {
 
     /// Reports the losses of the last second.
     fn report_losses(&mut self) {
-        let discovery = &self.discovery;
+        let discovery = &self.graph.discovery;
         self.journal.events.end_bursts(|burst| {
             if let Some(endpoint) = discovery.endpoints().get(&burst.writer) {
                 burst.topic = Some((endpoint.domain_id, endpoint.topic.bounded(TEXT)));
@@ -121,36 +123,37 @@ impl Observer {
     }
 
     pub(super) fn tick(&mut self, now: ModelTime) {
-        self.discovery.advance(now, &mut self.journal);
+        self.graph.discovery.advance(now, &mut self.journal);
         self.follow_up(now);
-        let graph = graph!(self);
-        let unknown_writers = self.profiler.advance(now, &mut self.journal, graph);
+        let graph = &self.graph;
+        let unknown_writers = self.measure.profiler.advance(now, &mut self.journal, graph);
         for guid in unknown_writers.metered {
-            self.interest.set(guid, Verdict::Meter);
+            self.requested.interest.set(guid, Verdict::Meter);
         }
         for guid in unknown_writers.forgotten {
-            self.interest.remove(guid);
+            self.requested.interest.remove(guid);
         }
         self.report_missing();
-        for writer in self.payloads.unsettled() {
+        for writer in self.measure.payloads.unsettled() {
             self.turn(writer, now);
         }
         if now.nanoseconds().is_multiple_of(SECOND) {
-            self.payloads.expire(now);
-            for writer in self.latched.advance(now) {
+            self.measure.payloads.expire(now);
+            for writer in self.measure.latched.advance(now) {
                 self.apply_again(writer, now);
             }
-            let profiler = &self.profiler;
-            self.payloads.retain_unknown_writers(|writer| {
+            let profiler = &self.measure.profiler;
+            self.measure.payloads.retain_unknown_writers(|writer| {
                 let known = profiler.get(writer);
                 known.is_some_and(|known| known.topic.is_none())
             });
-            self.topics.expire(now, self.settings.topic_grace);
+            self.graph.topics.expire(now, self.settings.topic_grace);
             self.link_sessions();
             self.end_unreachable_sessions(now);
-            self.receivers.tidy(&self.discovery);
-            self.discovery
-                .locate(|prefix| self.receivers.is_local(prefix));
+            self.graph.receivers.tidy(&self.graph.discovery);
+            self.graph
+                .discovery
+                .locate(|prefix| self.graph.receivers.is_local(prefix));
             self.settle_inside(now);
             self.promote();
             self.end_second_of_losses();
@@ -159,20 +162,20 @@ impl Observer {
             self.advance_chains(now);
             self.report_losses();
             self.examine(now);
-            self.tracer.advance(now);
+            self.derive.tracer.advance(now);
         }
     }
 
     pub(super) fn examine(&mut self, now: ModelTime) {
-        let before = Arc::clone(self.examiner.current());
-        self.examiner.examine(
-            &self.discovery,
-            &self.topics,
-            &self.services,
-            (&self.inside, &self.chains),
+        let before = Arc::clone(self.derive.examiner.current());
+        self.derive.examiner.examine(
+            &self.graph.discovery,
+            &self.graph.topics,
+            &self.derive.services,
+            (&self.derive.inside, &self.derive.chains),
             now,
         );
-        let after = self.examiner.current();
+        let after = self.derive.examiner.current();
         if Arc::ptr_eq(&before, after) {
             return;
         }
@@ -191,8 +194,8 @@ impl Observer {
 
     /// Evaluates every watched topic under every entry that covers it.
     pub(super) fn judge(&mut self, now: ModelTime) {
-        for id in self.topics.ids() {
-            let Some(topic) = self.topics.get(id) else {
+        for id in self.graph.topics.ids() {
+            let Some(topic) = self.graph.topics.get(id) else {
                 continue;
             };
             if topic.judgements.is_empty() {
@@ -202,7 +205,7 @@ impl Observer {
                 .writers
                 .iter()
                 .chain(&topic.buffer_endpoints)
-                .filter_map(|guid| self.profiler.get(*guid))
+                .filter_map(|guid| self.measure.profiler.get(*guid))
                 .collect();
             let last_message = writers
                 .iter()
@@ -221,7 +224,7 @@ impl Observer {
                         (sum, seconds.max(longest))
                     })
             };
-            let inside = self.inside.evidence(topic.domain_id, &topic.naming);
+            let inside = self.derive.inside.evidence(topic.domain_id, &topic.naming);
             let (publishers, subscriptions) = inside.map_or((0, 0), |inside| inside.endpoints());
             let seen_inside = inside.and_then(|inside| inside.last_message());
             let recent: &dyn Fn(u64) -> (Slot, u64) = match &inside {
@@ -233,11 +236,11 @@ impl Observer {
                 let longest = polled.map(|each| each.writer.seeming_silence(slowest));
                 let longest = longest.max().unwrap_or_default();
                 let is_unseen = |guid: &&Guid| {
-                    let known = self.profiler.get(**guid);
+                    let known = self.measure.profiler.get(**guid);
                     known.is_none_or(|each| each.writer.is_unseen())
                 };
                 let mut unseen = topic.writers.iter().filter(is_unseen);
-                match unseen.any(|guid| is_polled(&self.discovery, *guid, &topic.readers)) {
+                match unseen.any(|guid| is_polled(&self.graph.discovery, *guid, &topic.readers)) {
                     true => longest.max(Sampled::seeming_silence_of_unseen(slowest)),
                     false => longest,
                 }
@@ -260,7 +263,7 @@ impl Observer {
             };
             let mut judgements = topic.judgements.clone();
             for (index, judgement) in &mut judgements {
-                let Some(watch) = self.watchlist.watches().get(*index) else {
+                let Some(watch) = self.requested.watchlist.watches().get(*index) else {
                     continue;
                 };
                 let changed = judgement.judge(&watch.expectations, &evidence);
@@ -281,12 +284,12 @@ impl Observer {
                         domain_id,
                         topic: name.bounded(TEXT),
                         watch: bounded(&watch.pattern).into(),
-                        last_message: last_message.map(|at| self.wall_clock.wall_time(at)),
+                        last_message: last_message.map(|at| self.graph.wall_clock.wall_time(at)),
                     };
                     self.journal.events.push(now, kind);
                 }
             }
-            if let Some(topic) = self.topics.get_mut(id) {
+            if let Some(topic) = self.graph.topics.get_mut(id) {
                 topic.judgements = judgements;
             }
         }

@@ -11,10 +11,13 @@ use crate::measure::topic::{TopicId, Watched};
 impl Observer {
     /// Takes a report about calls inside processes.
     pub(super) fn report_inside(&mut self, report: Report) {
-        let clock = self.wall_clock;
+        let clock = self.graph.wall_clock;
         let at = clock.model_time(report.at);
-        let (discovery, receivers) = (&self.discovery, &self.receivers);
-        let transitions = self.inside.report(report, clock, discovery, receivers);
+        let (discovery, receivers) = (&self.graph.discovery, &self.graph.receivers);
+        let transitions = self
+            .derive
+            .inside
+            .report(report, clock, discovery, receivers);
         for state in transitions {
             let events = &mut self.journal.events;
             events.push(state.at, EventKind::Lifecycle(state));
@@ -25,8 +28,8 @@ impl Observer {
     /// Lists the topics of observed processes, and chooses the source of their counts.
     pub(super) fn settle_inside(&mut self, now: ModelTime) {
         let mut changed = Vec::new();
-        let (topics, limit) = (&mut self.topics, self.settings.endpoints);
-        for (domain_id, naming, is_live, id) in self.inside.topics() {
+        let (topics, limit) = (&mut self.graph.topics, self.settings.endpoints);
+        for (domain_id, naming, is_live, id) in self.derive.inside.topics() {
             if naming.kind.is_service() || naming.kind == TopicKind::Discovery {
                 continue;
             }
@@ -44,12 +47,12 @@ impl Observer {
                 }
             }
         }
-        self.inside.advance(now, self.settings.topic_grace);
+        self.derive.inside.advance(now, self.settings.topic_grace);
         for id in changed {
             self.apply_lists(id, now);
         }
-        let (topics, profiler) = (&self.topics, &self.profiler);
-        self.inside.choose(|id: Option<TopicId>| {
+        let (topics, profiler) = (&self.graph.topics, &self.measure.profiler);
+        self.derive.inside.choose(|id: Option<TopicId>| {
             let topic = topics.get(id?)?;
             if topic.watched != Watched::Yes {
                 return None;

@@ -9,7 +9,6 @@ use ros2probe_wire::{Guid, RtpsDuration, SequenceNumber};
 
 use super::MAX_MATCHES_PER_ROUND;
 use super::Observer;
-use super::graph;
 use crate::derive::trace::share::Share;
 use crate::facts::dispatch::{self, Offered};
 use crate::facts::header::begins_with_header;
@@ -27,17 +26,23 @@ impl Observer {
     /// topics. Counts of a topic that is no longer watched stay, as do the states of unchanged
     /// entries.
     pub(super) fn set_watchlist(&mut self, watchlist: Arc<Watchlist>) {
-        let before = std::mem::replace(&mut self.watchlist, watchlist);
+        let before = std::mem::replace(&mut self.requested.watchlist, watchlist);
         let moved = |watch: &Arc<Watch>| {
-            let place = self.watchlist.position(&watch.pattern, watch.domain_id)?;
-            let after = self.watchlist.watches().get(place)?;
+            let place = self
+                .requested
+                .watchlist
+                .position(&watch.pattern, watch.domain_id)?;
+            let after = self.requested.watchlist.watches().get(place)?;
             (after.expectations == watch.expectations).then_some(place)
         };
         let moved: Vec<_> = before.watches().iter().map(moved).collect();
-        self.topics.renumber(&moved);
-        self.discovery.watch(Arc::clone(&self.watchlist));
-        let watches = self.watchlist.watches();
-        self.tracer
+        self.graph.topics.renumber(&moved);
+        self.graph
+            .discovery
+            .watch(Arc::clone(&self.requested.watchlist));
+        let watches = self.requested.watchlist.watches();
+        self.derive
+            .tracer
             .restart(watches.iter().any(|watch| watch.trace > 0.0));
         self.apply_lists_to_all();
     }
@@ -45,14 +50,16 @@ impl Observer {
     /// Applies the lists to every topic again.
     pub(super) fn apply_lists_to_all(&mut self) {
         let is_watched = |id: &TopicId| {
-            let topic = self.topics.get(*id);
+            let topic = self.graph.topics.get(*id);
             topic.is_some_and(|topic| topic.watched == Watched::Yes)
         };
         let (watched, others): (Vec<_>, Vec<_>) =
-            self.topics.ids().into_iter().partition(is_watched);
+            self.graph.topics.ids().into_iter().partition(is_watched);
         // Free measuring slots first, then assign them.
-        self.pending_topics = others.into_iter().rev().collect();
-        self.pending_topics.extend(watched.into_iter().rev());
+        self.requested.pending_topics = others.into_iter().rev().collect();
+        self.requested
+            .pending_topics
+            .extend(watched.into_iter().rev());
         self.apply_more_lists();
     }
 
@@ -65,10 +72,15 @@ impl Observer {
         let requested = |request: &SampleRequest| {
             request.selection.globs().count() + request.selection.regexes()
         };
-        let patterns =
-            self.watchlist.globs() + self.sample_requests.iter().map(requested).sum::<usize>();
+        let patterns = self.requested.watchlist.globs()
+            + self
+                .requested
+                .sample_requests
+                .iter()
+                .map(requested)
+                .sum::<usize>();
         for _ in 0..(MAX_MATCHES_PER_ROUND / patterns.max(1)).max(1) {
-            let Some(id) = self.pending_topics.pop() else {
+            let Some(id) = self.requested.pending_topics.pop() else {
                 break;
             };
             self.apply_lists(id, self.clock);
@@ -79,32 +91,36 @@ impl Observer {
     /// Returns whether the lists were applied to all topics since they last changed.
     #[must_use]
     pub const fn has_applied_lists(&self) -> bool {
-        self.pending_topics.is_empty()
+        self.requested.pending_topics.is_empty()
     }
 
     /// Applies the lists to a topic and its endpoints.
     pub(super) fn apply_lists(&mut self, id: TopicId, now: ModelTime) {
-        let is_needed = self.topics.get(id).is_some_and(|topic| {
+        let is_needed = self.graph.topics.get(id).is_some_and(|topic| {
             let dds_name = &topic.naming.dds_name;
-            self.chains.needs(topic.domain_id, dds_name)
+            self.derive.chains.needs(topic.domain_id, dds_name)
         });
-        let displaced = self.topics.apply_lists(
+        let displaced = self.graph.topics.apply_lists(
             id,
-            (&self.watchlist, &self.sample_requests, is_needed),
+            (
+                &self.requested.watchlist,
+                &self.requested.sample_requests,
+                is_needed,
+            ),
             self.settings.topics,
             now,
         );
-        self.chains.changed();
+        self.derive.chains.changed();
         if let Some(id) = displaced {
             self.apply_all(id, now);
-            self.topics.forget_measurement(id);
+            self.graph.topics.forget_measurement(id);
         }
         self.apply_all(id, now);
     }
 
     /// Applies the decision about a topic to its endpoints.
     fn apply_all(&mut self, id: TopicId, now: ModelTime) {
-        let Some(topic) = self.topics.get(id) else {
+        let Some(topic) = self.graph.topics.get(id) else {
             return;
         };
         let lists = [&topic.writers, &topic.readers, &topic.buffer_endpoints];
@@ -116,25 +132,28 @@ impl Observer {
 
     /// Applies the decision about a topic to one endpoint.
     pub(super) fn apply(&mut self, id: TopicId, guid: Guid, now: ModelTime) {
-        let Some(topic) = self.topics.get(id) else {
+        let Some(topic) = self.graph.topics.get(id) else {
             return;
         };
-        let Some(endpoint) = self.discovery.endpoints().get(&guid) else {
+        let Some(endpoint) = self.graph.discovery.endpoints().get(&guid) else {
             return;
         };
         let is_watched = topic.watched == Watched::Yes;
         match endpoint.role {
-            Role::Reader if is_watched => self.interest.set(guid, Verdict::Meter),
-            Role::Reader => self.interest.remove(guid),
+            Role::Reader if is_watched => self.requested.interest.set(guid, Verdict::Meter),
+            Role::Reader => self.requested.interest.remove(guid),
             Role::Writer => {
                 let counts = endpoint.naming().is_some_and(|naming| naming.counts);
                 let measured = is_watched && counts;
-                let is_call = self.services.announce(guid, topic.domain_id, &topic.naming);
+                let is_call = self
+                    .derive
+                    .services
+                    .announce(guid, topic.domain_id, &topic.naming);
                 match self.latched_topic(topic, endpoint, is_watched) {
-                    Some(about) if counts => self.latched.follow(guid, about),
-                    _ => self.latched.forget(guid),
+                    Some(about) if counts => self.measure.latched.follow(guid, about),
+                    _ => self.measure.latched.forget(guid),
                 }
-                let latched = self.latched.verdict(guid);
+                let latched = self.measure.latched.verdict(guid);
                 let verdict = match topic.naming.kind {
                     TopicKind::Discovery => Verdict::Capture,
                     _ if measured && wants_bytes(topic) => Verdict::Capture,
@@ -142,22 +161,24 @@ impl Observer {
                     _ if measured => Verdict::Meter,
                     _ => latched.unwrap_or(Verdict::Ignore),
                 };
-                self.interest.set(guid, verdict);
+                self.requested.interest.set(guid, verdict);
                 match &topic.requested {
                     Some(requested) if measured => {
                         let topic = published(topic, endpoint);
-                        let known = self.profiler.get(guid);
+                        let known = self.measure.profiler.get(guid);
                         let next = known.map_or(SequenceNumber::ZERO, |known| known.writer.next());
-                        self.payloads.want(guid, topic, requested, (next, now));
+                        self.measure
+                            .payloads
+                            .want(guid, topic, requested, (next, now));
                     }
-                    _ => self.payloads.release(guid, now),
+                    _ => self.measure.payloads.release(guid, now),
                 }
                 if measured {
                     if topic.naming.kind.is_service() {
-                        self.services.note_measured();
+                        self.derive.services.note_measured();
                     }
                     let (traits, opened) = (traits(guid, endpoint), topic.reader_appeared);
-                    self.profiler.measure(guid, id, traits, opened, now);
+                    self.measure.profiler.measure(guid, id, traits, opened, now);
                 } else {
                     self.retire(guid, now);
                 }
@@ -167,10 +188,10 @@ impl Observer {
 
     /// Applies the decision about its topic to a writer whose last message is kept.
     pub(super) fn apply_again(&mut self, writer: Guid, now: ModelTime) {
-        let endpoint = self.discovery.endpoints().get(&writer);
+        let endpoint = self.graph.discovery.endpoints().get(&writer);
         let id = endpoint.and_then(|endpoint| {
             let naming = endpoint.naming()?;
-            self.topics.find(endpoint.domain_id, &naming)
+            self.graph.topics.find(endpoint.domain_id, &naming)
         });
         if let Some(id) = id {
             self.apply(id, writer, now);
@@ -192,7 +213,7 @@ impl Observer {
         {
             return None;
         }
-        let watch = |place: usize| self.watchlist.watches().get(place);
+        let watch = |place: usize| self.requested.watchlist.watches().get(place);
         let mut watches = topic
             .judgements
             .iter()
@@ -208,12 +229,16 @@ impl Observer {
 
     /// Stops measuring this writer; its topic keeps the counts.
     pub(super) fn retire(&mut self, guid: Guid, now: ModelTime) {
-        let graph = graph!(self);
-        let Some(retired) = self.profiler.stop(guid, now, &mut self.journal, graph) else {
+        let graph = &self.graph;
+        let Some(retired) = self
+            .measure
+            .profiler
+            .stop(guid, now, &mut self.journal, graph)
+        else {
             return;
         };
         self.report_missing();
-        if let Some(topic) = self.topics.get_mut(retired.topic) {
+        if let Some(topic) = self.graph.topics.get_mut(retired.topic) {
             topic.retire(
                 &retired.measurement,
                 retired.totals.as_ref(),
@@ -224,16 +249,17 @@ impl Observer {
 
     /// Assigns free measuring slots, and those of vanished topics, to rejected topics.
     pub(super) fn promote(&mut self) {
-        if !self.topics.has_place(self.settings.topics) {
+        if !self.graph.topics.has_place(self.settings.topics) {
             return;
         }
         let rejected = self
+            .graph
             .topics
             .iter()
             .filter(|(_, topic)| topic.watched == Watched::Rejected && !topic.is_vanished());
         let rejected: Vec<_> = rejected.map(|(id, _)| id).collect();
         for id in rejected {
-            if !self.topics.has_place(self.settings.topics) {
+            if !self.graph.topics.has_place(self.settings.topics) {
                 return;
             }
             self.apply_lists(id, self.clock);

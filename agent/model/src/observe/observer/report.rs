@@ -23,14 +23,15 @@ use crate::report::snapshot::{
 use crate::report::transport::transports;
 
 pub(super) fn snapshot(observer: &Observer, wall_time: Timestamp) -> Snapshot {
-    let now = observer.wall_clock.model_time(wall_time);
-    let nodes = nodes_of_endpoints(&observer.discovery);
+    let now = observer.graph.wall_clock.model_time(wall_time);
+    let nodes = nodes_of_endpoints(&observer.graph.discovery);
     Snapshot {
         at: now,
-        wall_clock: observer.wall_clock,
+        wall_clock: observer.graph.wall_clock,
         participants: participants(observer),
-        nodes: node_facts(&observer.discovery),
+        nodes: node_facts(&observer.graph.discovery),
         topics: observer
+            .graph
             .topics
             .iter()
             .map(|(_, topic)| self::topic(observer, topic, &nodes, now))
@@ -38,26 +39,27 @@ pub(super) fn snapshot(observer: &Observer, wall_time: Timestamp) -> Snapshot {
         unknown_writers: unknown_writers(observer, now),
         sockets: deliveries::sockets(observer),
         watches: watches(observer),
-        services: observer.services.facts(),
-        actions: observer.services.action_facts(),
-        inside: observer.inside.facts().map(Arc::new),
+        services: observer.derive.services.facts(),
+        actions: observer.derive.services.action_facts(),
+        inside: observer.derive.inside.facts().map(Arc::new),
         zenoh: observer.zenoh.is_used().then(|| observer.zenoh.facts()),
-        chains: observer.chains.facts(wall_time),
-        diagnoses: Arc::clone(observer.examiner.current()),
-        diagnosed: Arc::clone(observer.examiner.since()),
-        churn: observer.discovery.churn.facts(),
+        chains: observer.derive.chains.facts(wall_time),
+        diagnoses: Arc::clone(observer.derive.examiner.current()),
+        diagnosed: Arc::clone(observer.derive.examiner.since()),
+        churn: observer.graph.discovery.churn.facts(),
         decode_errors: decode_errors(observer),
         tables: tables(observer),
-        datagrams: observer.datagrams,
-        records: observer.records,
-        topics_measured: observer.topics.watched() as u64,
-        topics_rejected: observer.topics.rejected,
+        datagrams: observer.counts.datagrams,
+        records: observer.counts.records,
+        topics_measured: observer.graph.topics.watched() as u64,
+        topics_rejected: observer.graph.topics.rejected,
     }
 }
 
 fn participants(observer: &Observer) -> Vec<ParticipantFacts> {
-    let holders = observer.receivers.holders();
+    let holders = observer.graph.receivers.holders();
     let mut facts: Vec<_> = observer
+        .graph
         .discovery
         .participants()
         .iter()
@@ -125,8 +127,9 @@ fn topic(
     now: ModelTime,
 ) -> TopicFacts {
     let endpoint = |guid: &Guid| {
-        let endpoint = observer.discovery.endpoints().get(guid)?;
+        let endpoint = observer.graph.discovery.endpoints().get(guid)?;
         let measured = observer
+            .measure
             .profiler
             .get(*guid)
             .filter(|measured| measured.topic.is_some());
@@ -136,7 +139,7 @@ fn topic(
             endpoint,
             nodes.get(guid).copied(),
             measurement,
-            observer.latched.facts(*guid),
+            observer.measure.latched.facts(*guid),
         ))
     };
     let mut publishers = fitting(
@@ -147,10 +150,10 @@ fn topic(
         topic.readers.len(),
         topic.readers.iter().filter_map(endpoint),
     );
-    let inside = observer.inside.topic(topic.domain_id, &topic.naming);
-    let is_observed = |guid: Guid| inside.is_some() && observer.inside.observes(guid.prefix);
+    let inside = observer.derive.inside.topic(topic.domain_id, &topic.naming);
+    let is_observed = |guid: Guid| inside.is_some() && observer.derive.inside.observes(guid.prefix);
     let (transports, observed_pairs) = transports(
-        &observer.discovery,
+        &observer.graph.discovery,
         &mut publishers,
         &mut subscriptions,
         is_observed,
@@ -167,7 +170,10 @@ fn topic(
             .iter()
             .filter_map(|each| each.measurement.as_ref());
         own.for_each(|own| sum.add(own));
-        observer.inside.apply(topic.domain_id, &topic.naming, sum);
+        observer
+            .derive
+            .inside
+            .apply(topic.domain_id, &topic.naming, sum);
         sum.loss = topic.loss.total;
     }
     let totals = deliveries::totals(observer, topic);
@@ -190,7 +196,10 @@ fn topic(
         vanished: topic.is_vanished(),
         transports,
         is_read: topic.requested.is_some(),
-        source: observer.inside.source(topic.domain_id, &topic.naming),
+        source: observer
+            .derive
+            .inside
+            .source(topic.domain_id, &topic.naming),
         inside: inside.map(Box::new),
         observed_pairs,
     }
@@ -201,17 +210,17 @@ pub(super) fn measured(
     observer: &Observer,
     now: ModelTime,
 ) -> impl Iterator<Item = (DomainId, &DdsName, Measurement)> {
-    let topics = observer.topics.iter().map(|(_, topic)| topic);
+    let topics = observer.graph.topics.iter().map(|(_, topic)| topic);
     let topics = topics.filter(|topic| topic.watched == Watched::Yes);
     topics.filter_map(move |topic| {
         let mut sum = *apart(observer, topic, now)?;
         for guid in &topic.writers {
-            let measured = observer.profiler.get(*guid);
+            let measured = observer.measure.profiler.get(*guid);
             if let Some(own) = measured.filter(|measured| measured.topic.is_some()) {
                 sum.add(&own.writer.measurement(now));
             }
         }
-        let inside = &observer.inside;
+        let inside = &observer.derive.inside;
         inside.apply(topic.domain_id, &topic.naming, &mut sum);
         sum.loss = topic.loss.total;
         Some((topic.domain_id, &topic.naming.dds_name, sum))
@@ -223,7 +232,7 @@ pub(super) fn measured(
 fn apart(observer: &Observer, topic: &Topic, now: ModelTime) -> Option<Box<Measurement>> {
     let mut sum = topic.retired.clone()?;
     for guid in &topic.buffer_endpoints {
-        if let Some(buffer_endpoints) = observer.profiler.get(*guid) {
+        if let Some(buffer_endpoints) = observer.measure.profiler.get(*guid) {
             sum.add(&buffer_endpoints.writer.measurement(now));
         }
     }
@@ -260,14 +269,15 @@ fn endpoint_facts(
 
 fn unknown_writers(observer: &Observer, now: ModelTime) -> Vec<UnknownWriterFacts> {
     let unknown_writers = observer
+        .measure
         .profiler
         .iter()
         .filter(|(_, measured)| measured.metered && measured.topic.is_none());
     let mut facts: Vec<_> = unknown_writers
         .map(|(guid, measured)| {
-            let participant = observer.discovery.participants().get(&guid.prefix);
+            let participant = observer.graph.discovery.participants().get(&guid.prefix);
             let proxy = participant.map(|participant| &participant.proxy);
-            let holder = observer.receivers.sockets().get(measured.sent_from);
+            let holder = observer.graph.receivers.sockets().get(measured.sent_from);
             UnknownWriterFacts {
                 guid: *guid,
                 vendor: vendor(*guid, proxy),
@@ -309,6 +319,7 @@ fn vendor(guid: Guid, proxy: Option<&ParticipantProxy>) -> Option<VendorId> {
 
 fn watches(observer: &Observer) -> Vec<WatchFacts> {
     let mut facts: Vec<_> = observer
+        .requested
         .watchlist
         .watches()
         .iter()
@@ -317,7 +328,7 @@ fn watches(observer: &Observer) -> Vec<WatchFacts> {
             topics: Vec::new(),
         })
         .collect();
-    for (_, topic) in observer.topics.iter() {
+    for (_, topic) in observer.graph.topics.iter() {
         for (index, judgement) in &topic.judgements {
             let Some(fact) = facts.get_mut(*index) else {
                 continue;
@@ -331,12 +342,19 @@ fn watches(observer: &Observer) -> Vec<WatchFacts> {
         }
     }
     let rejected = observer
+        .graph
         .topics
         .iter()
         .filter(|(_, topic)| topic.watched == Watched::Rejected);
     let rejected: BTreeSet<_> = rejected.map(|(_, topic)| &*topic.naming.name).collect();
     let is_rejected = |name: &str| rejected.contains(name);
-    for (watch, fact) in observer.watchlist.watches().iter().zip(&mut facts) {
+    for (watch, fact) in observer
+        .requested
+        .watchlist
+        .watches()
+        .iter()
+        .zip(&mut facts)
+    {
         if watch.is_literal() && fact.topics.is_empty() && !is_rejected(&watch.pattern) {
             fact.topics.push(WatchedTopicFacts {
                 domain_id: watch.domain_id.unwrap_or(DomainId(0)),
@@ -355,17 +373,12 @@ fn decode_errors(observer: &Observer) -> Vec<DecodeErrorCount> {
         reason,
         count: *count,
     };
-    observer.decode_errors.iter().map(fact).collect()
+    observer.counts.decode_errors.iter().map(fact).collect()
 }
 
 fn tables(observer: &Observer) -> Vec<TableFacts> {
-    let Observer {
-        settings,
-        discovery,
-        topics,
-        profiler,
-        ..
-    } = observer;
+    let (settings, profiler) = (&observer.settings, &observer.measure.profiler);
+    let (discovery, topics) = (&observer.graph.discovery, &observer.graph.topics);
     let [participants, endpoints, nodes] = discovery.tables();
     let table = |table, size: usize, limit: usize, evictions| TableFacts {
         table,
@@ -375,11 +388,11 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
         evictions,
     };
     let (writers, unknown_writers) = profiler.size();
-    let (interest, interest_limit, interest_evictions) = observer.interest.size();
-    let [sockets, addresses] = observer.receivers.tables();
-    let (diagnoses, diagnoses_limit, diagnoses_left_out) = observer.examiner.size();
-    let (payloads, payloads_limit, payloads_evictions) = observer.payloads.size();
-    let [chains, messages] = observer.chains.tables();
+    let (interest, interest_limit, interest_evictions) = observer.requested.interest.size();
+    let [sockets, addresses] = observer.graph.receivers.tables();
+    let (diagnoses, diagnoses_limit, diagnoses_left_out) = observer.derive.examiner.size();
+    let (payloads, payloads_limit, payloads_evictions) = observer.measure.payloads.size();
+    let [chains, messages] = observer.derive.chains.tables();
     let quota = profiler.quota();
     let refused = profiler.iter().filter_map(|(_, measured)| {
         let subscribers = measured.subscribers.as_ref()?;
@@ -404,7 +417,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
             "samples",
             samples,
             samples_limit,
-            samples_evictions + observer.discovery_fragments.evictions(),
+            samples_evictions + observer.measure.discovery_fragments.evictions(),
         ),
         table("interest", interest, interest_limit, interest_evictions),
         table(
@@ -416,14 +429,14 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
         sockets,
         addresses,
         table("diagnoses", diagnoses, diagnoses_limit, diagnoses_left_out),
-        observer.tracer.table(),
-        observer.services.table(),
-        observer.inside.table(),
+        observer.derive.tracer.table(),
+        observer.derive.services.table(),
+        observer.derive.inside.table(),
         chains,
         messages,
         table("payloads", payloads, payloads_limit, payloads_evictions),
     ];
-    tables.extend(observer.latched.tables());
+    tables.extend(observer.measure.latched.tables());
     tables.extend(observer.zenoh.tables());
     tables
 }

@@ -7,7 +7,6 @@ use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 use ros2probe_wire::names::DdsTopic;
 
 use super::Observer;
-use super::graph;
 use crate::facts::dispatch::{self, Dispatch, SampleOutcome};
 use crate::facts::model_time::ModelTime;
 use crate::facts::naming::Naming;
@@ -20,10 +19,10 @@ impl Observer {
     /// Replaces the sample requests. They take effect once [`Self::apply_more_lists`] has visited
     /// all topics. Requested topics are measured even without a watch; existing counts stay.
     pub(super) fn set_sample_requests(&mut self, sample_requests: Arc<Vec<SampleRequest>>) {
-        self.sample_requests = sample_requests;
-        self.requests_changed = self.clock;
-        if self.sample_requests.is_empty() {
-            self.payloads.retain_unknown_writers(|_| false);
+        self.requested.sample_requests = sample_requests;
+        self.requested.requests_changed = self.clock;
+        if self.requested.sample_requests.is_empty() {
+            self.measure.payloads.retain_unknown_writers(|_| false);
         }
         self.apply_lists_to_all();
     }
@@ -32,41 +31,49 @@ impl Observer {
     /// `now`.
     #[must_use]
     pub fn dispatched_until(&self, now: Timestamp) -> Timestamp {
-        let writers = self.payloads.wanted();
-        let writers = writers.filter_map(|writer| self.profiler.get(*writer));
+        let writers = self.measure.payloads.wanted();
+        let writers = writers.filter_map(|writer| self.measure.profiler.get(*writer));
         let unseen = writers.filter_map(|measured| measured.writer.unseen_since());
         unseen.fold(now, |until, since| {
-            until.min(self.wall_clock.wall_time(since))
+            until.min(self.graph.wall_clock.wall_time(since))
         })
     }
 
     /// Dispatches a sample in its turn, or remembers its number if the writer is unknown.
     pub(super) fn counted(&mut self, writer: Guid, counted: &Counted) {
-        if self.sample_requests.is_empty() {
+        if self.requested.sample_requests.is_empty() {
             return;
         }
-        if !self.payloads.wants(writer) {
-            let known = self.profiler.get(writer);
+        if !self.measure.payloads.wants(writer) {
+            let known = self.measure.profiler.get(writer);
             if known.is_some_and(|known| known.topic.is_none()) {
-                let sample_requests = self.sample_requests.iter().map(|request| request.id);
+                let sample_requests = self
+                    .requested
+                    .sample_requests
+                    .iter()
+                    .map(|request| request.id);
                 let number = counted.number;
                 // Unknown writers that the profiler has dropped since the last second free their
                 // entries.
-                if self.payloads.unknown_writers() >= self.settings.unknown_writers {
-                    let profiler = &self.profiler;
-                    self.payloads.retain_unknown_writers(|writer| {
+                if self.measure.payloads.unknown_writers() >= self.settings.unknown_writers {
+                    let profiler = &self.measure.profiler;
+                    self.measure.payloads.retain_unknown_writers(|writer| {
                         let known = profiler.get(writer);
                         known.is_some_and(|known| known.topic.is_none())
                     });
                 }
-                self.payloads
+                self.measure
+                    .payloads
                     .counted_of_unknown_writer(writer, number, sample_requests);
             }
             return;
         }
-        let progress = self.profiler.progress(writer, counted.at, graph!(self));
+        let progress = self
+            .measure
+            .profiler
+            .progress(writer, counted.at, &self.graph);
         if let Some(progress) = progress {
-            let skip = self.payloads.counted(writer, counted, &progress);
+            let skip = self.measure.payloads.counted(writer, counted, &progress);
             self.skip(writer, skip);
         }
     }
@@ -79,7 +86,7 @@ impl Observer {
             Content::Data { .. } => sample.header_stamp,
             Content::DataFrag(_) => None,
         };
-        if !sample.is_delivered() || !self.payloads.lacks(writer, number) {
+        if !sample.is_delivered() || !self.measure.payloads.lacks(writer, number) {
             return;
         }
         let has_header = |known: &Measured| known.writer.traits().has_header;
@@ -87,47 +94,53 @@ impl Observer {
             number,
             bytes: sample.size().into(),
             source: sample.source_timestamp,
-            stamp: stamp.filter(|_| self.profiler.get(writer).is_some_and(has_header)),
+            stamp: stamp.filter(|_| self.measure.profiler.get(writer).is_some_and(has_header)),
             at,
             began: at,
             sampled: false,
             unconfirmed: false,
         };
-        let progress = self.profiler.progress(writer, at, graph!(self));
+        let progress = self.measure.profiler.progress(writer, at, &self.graph);
         if let Some(progress) =
-            progress.filter(|_| sample.is_end() || self.payloads.wants_bytes(writer))
+            progress.filter(|_| sample.is_end() || self.measure.payloads.wants_bytes(writer))
         {
-            let skip = self.payloads.came_again(writer, &counted, &progress);
+            let skip = self
+                .measure
+                .payloads
+                .came_again(writer, &counted, &progress);
             self.skip(writer, skip);
         }
     }
 
     /// Dispatches the samples of this writer whose turn has come.
     pub(super) fn turn(&mut self, writer: Guid, now: ModelTime) {
-        let progress = self.profiler.progress(writer, now, graph!(self));
+        let progress = self.measure.profiler.progress(writer, now, &self.graph);
         if let Some(progress) = progress {
-            let skip = self.payloads.turn(writer, &progress, now);
+            let skip = self.measure.payloads.turn(writer, &progress, now);
             self.skip(writer, skip);
         }
     }
 
     pub(super) fn skip(&mut self, writer: Guid, number: Option<SequenceNumber>) {
         if let Some(number) = number {
-            self.profiler.skip(writer, number);
+            self.measure.profiler.skip(writer, number);
         }
     }
 
     /// Keeps the payload of a sample that is not counted yet, if it is requested.
     pub(super) fn keep_payload(&mut self, sample: &Sample, payload: &[u8]) {
         let writer = sample.head.writer;
-        if self.payloads.wants_bytes(writer) {
-            let known = self.profiler.get(writer);
-            let lacks = self.payloads.lacks(writer, sample.sequence_number);
+        if self.measure.payloads.wants_bytes(writer) {
+            let known = self.measure.profiler.get(writer);
+            let lacks = self.measure.payloads.lacks(writer, sample.sequence_number);
             if lacks || known.is_some_and(|known| !known.writer.has(sample)) {
-                self.payloads.keep(sample, payload);
+                self.measure.payloads.keep(sample, payload);
             }
-        } else if self.latched.verdict(writer).is_some()
-            && self.latched.put(sample, self.wall_clock, payload)
+        } else if self.measure.latched.verdict(writer).is_some()
+            && self
+                .measure
+                .latched
+                .put(sample, self.graph.wall_clock, payload)
         {
             self.apply_again(writer, sample.head.at);
         }
@@ -137,8 +150,8 @@ impl Observer {
     pub(super) fn keep_dispatched(&mut self, samples: &[Dispatch]) {
         for each in samples {
             if let SampleOutcome::Sample(sample) = &each.outcome {
-                let at = self.wall_clock.model_time(sample.time);
-                self.latched.dispatched(sample, at);
+                let at = self.graph.wall_clock.model_time(sample.time);
+                self.measure.latched.dispatched(sample, at);
             }
         }
     }
@@ -152,15 +165,16 @@ impl Observer {
             DdsTopic::parse(&topic.dds_name)
                 .is_ok_and(|name| request.covers(topic.domain_id, &Naming::of(&name)))
         };
-        let mut samples = self.latched.samples();
+        let mut samples = self.measure.latched.samples();
         samples.retain(|(at, sample)| {
             let number = sample.sequence_number;
-            let is_recent = *at >= self.requests_changed;
+            let is_recent = *at >= self.requested.requests_changed;
             let writer = sample.writer;
-            covers(sample) && (self.payloads).give_before(writer, (request.id, number), is_recent)
+            covers(sample)
+                && (self.measure.payloads).give_before(writer, (request.id, number), is_recent)
         });
         let samples = samples.into_iter().map(|(at, mut sample)| {
-            let time = self.wall_clock.wall_time(at);
+            let time = self.graph.wall_clock.wall_time(at);
             // The clock may have been set since the message came.
             if sample.time != time {
                 Arc::make_mut(&mut sample).time = time;
@@ -173,13 +187,13 @@ impl Observer {
     /// Returns the bytes of the kept last messages.
     #[must_use]
     pub const fn latched_bytes(&self) -> usize {
-        self.latched.bytes()
+        self.measure.latched.bytes()
     }
 
     /// Reports missing samples to the subscriptions.
     pub(super) fn report_missing(&mut self) {
         for missing in self.journal.take_missing() {
-            self.payloads.missing(&missing, self.clock);
+            self.measure.payloads.missing(&missing, self.clock);
         }
     }
 }

@@ -1,5 +1,7 @@
 //! Connections of Zenoh: announcements for discovery, and observations for everything else.
 
+use std::collections::HashMap;
+
 use ros2probe_wire::discovery::{EndpointAnnouncement, Role};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::rtps::StatusInfo;
@@ -16,33 +18,52 @@ use crate::graph::zenoh::{
     GraphChange, Holder, Shown, StreamId, StreamReport, ZenohSample, unknown_guid,
 };
 
+/// How the model names what Zenoh announces.
+#[derive(Debug)]
+pub(super) struct ZenohNames {
+    /// Number of the last change of the graph.
+    changes: SequenceNumber,
+    /// Writers with a verdict, and their gids.
+    keys: HashMap<Guid, Guid>,
+}
+
+impl Default for ZenohNames {
+    fn default() -> Self {
+        Self {
+            changes: SequenceNumber(1),
+            keys: HashMap::new(),
+        }
+    }
+}
+
 impl Observer {
     pub(super) fn zenoh_report(&mut self, report: &StreamReport<'_>) {
         // The state is apart while it calls back.
         let mut zenoh = std::mem::take(&mut self.zenoh);
-        let at = self.wall_clock.model_time(report.time);
+        let at = self.graph.wall_clock.model_time(report.time);
         let mut alive = None;
-        let wants_bytes = self.payloads.wants_any_bytes() || self.latched.is_used();
+        let wants_bytes = self.measure.payloads.wants_any_bytes() || self.measure.latched.is_used();
         // A sample may precede its announcement in a batch, as that of an unknown writer.
         zenoh.report(report, at, wants_bytes, &mut |shown| match shown {
             Shown::Sample(sample) => self.zenoh_sample(report.stream, at, sample),
-            Shown::Owner(socket, prefix) => self.receivers.sends(socket, prefix),
-            Shown::Disowned(socket, prefix) => self.receivers.sends_no_longer(socket, prefix),
+            Shown::Owner(socket, prefix) => self.graph.receivers.sends(socket, prefix),
+            Shown::Disowned(socket, prefix) => self.graph.receivers.sends_no_longer(socket, prefix),
             Shown::Alive(session) => alive = Some(session),
             Shown::Relayed(session) => {
-                self.discovery
+                self.graph
+                    .discovery
                     .seen(session.guid_prefix(), at, Priority::NOTHING);
             }
             Shown::Missed(destination) => {
-                self.profiler.missed(destination, at);
+                self.measure.profiler.missed(destination, at);
             }
             Shown::Malformed(reason) => self.decode_error("zenoh", reason),
         });
         if let Some(session) = alive {
             let prefix = session.guid_prefix();
-            match self.discovery.knows(prefix) {
+            match self.graph.discovery.knows(prefix) {
                 true => {
-                    self.discovery.seen(prefix, at, Priority::NOTHING);
+                    self.graph.discovery.seen(prefix, at, Priority::NOTHING);
                 }
                 false => zenoh.graph.repeat(session, at),
             }
@@ -61,7 +82,7 @@ impl Observer {
     /// Learns from the processes that hold the sockets which sessions of Zenoh send.
     pub fn link_sessions(&mut self) {
         self.zenoh.has_begun = false;
-        let receivers = &self.receivers;
+        let receivers = &self.graph.receivers;
         let holder = |socket| {
             let process_id = receivers.sockets().get(socket)?.process_id?;
             Some(Holder {
@@ -71,11 +92,14 @@ impl Observer {
         };
         for change in self.zenoh.link(holder) {
             if let Some(before) = change.before {
-                self.receivers
+                self.graph
+                    .receivers
                     .sends_no_longer(change.socket, before.guid_prefix());
             }
             if let Some(after) = change.after {
-                self.receivers.sends(change.socket, after.guid_prefix());
+                self.graph
+                    .receivers
+                    .sends(change.socket, after.guid_prefix());
             }
         }
     }
@@ -89,7 +113,7 @@ impl Observer {
     /// Names writers of Zenoh in changed verdicts as the wire does, by their gid. Readers have no
     /// place there.
     pub(super) fn zenoh_interest(&mut self, interest: &mut Vec<(Guid, Option<Verdict>)>) {
-        let (keys, discovery) = (&mut self.zenoh_keys, &self.discovery);
+        let (keys, discovery) = (&mut self.zenoh_names.keys, &self.graph.discovery);
         interest.retain_mut(|(guid, verdict)| {
             if !guid.prefix.is_zenoh() {
                 return true;
@@ -118,11 +142,11 @@ impl Observer {
         }
         for change in changes {
             // A counter, so that a token that comes back is not a delayed copy.
-            self.zenoh_changes = self.zenoh_changes.next();
+            self.zenoh_names.changes = self.zenoh_names.changes.next();
             let origin = |prefix: GuidPrefix| Origin {
                 at,
                 sender: prefix,
-                sequence_number: self.zenoh_changes,
+                sequence_number: self.zenoh_names.changes,
                 destination: [0; 16],
                 port: 0,
             };
@@ -132,12 +156,13 @@ impl Observer {
                     self.learn_participant(&announcement, &origin);
                     // The sockets of a session without tokens are not remembered.
                     for socket in self.zenoh.sockets(announcement.guid.prefix) {
-                        self.receivers.sends(socket, announcement.guid.prefix);
+                        self.graph.receivers.sends(socket, announcement.guid.prefix);
                     }
                 }
                 GraphChange::ParticipantGone(guid) => {
                     let origin = origin(guid.prefix);
-                    self.discovery
+                    self.graph
+                        .discovery
                         .participant_gone(guid, &origin, &mut self.journal);
                 }
                 GraphChange::Endpoint(announcement) => {
@@ -147,7 +172,8 @@ impl Observer {
                 }
                 GraphChange::EndpointGone(guid) => {
                     let origin = origin(guid.prefix);
-                    self.discovery
+                    self.graph
+                        .discovery
                         .endpoint_gone(guid, &origin, &mut self.journal);
                 }
                 GraphChange::Nodes(entities) => {
@@ -163,9 +189,9 @@ impl Observer {
     fn name_writer(&mut self, announcement: &EndpointAnnouncement) {
         if announcement.role == Role::Writer {
             let before = unknown_guid(Gid(announcement.gid));
-            self.profiler.rename(before, announcement.guid);
-            self.payloads.rename(before, announcement.guid);
-            self.interest.remove(before);
+            self.measure.profiler.rename(before, announcement.guid);
+            self.measure.payloads.rename(before, announcement.guid);
+            self.requested.interest.remove(before);
         }
     }
 
@@ -179,7 +205,7 @@ impl Observer {
                 number,
             };
             let captured = sample.payload.captured;
-            let services = &mut self.services;
+            let services = &mut self.derive.services;
             let is_over = services.identified(writer, sample.number, call, captured, at);
             self.follow_call(writer, is_over);
         }
@@ -249,6 +275,3 @@ fn header_stamp(payload: &[u8]) -> Option<(i32, u32)> {
     let nanoseconds = word(nanoseconds);
     (nanoseconds < 1_000_000_000).then(|| (word(seconds).cast_signed(), nanoseconds))
 }
-
-/// Number of the first change.
-pub(super) const FIRST_CHANGE: SequenceNumber = SequenceNumber(1);

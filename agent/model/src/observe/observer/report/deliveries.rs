@@ -14,7 +14,6 @@ use crate::measure::receivers::MatchedReaders;
 use crate::measure::routes::KnownRoute;
 use crate::measure::topic::Topic;
 use crate::observe::observer::Observer;
-use crate::observe::observer::graph;
 use crate::report::snapshot::{AcknowledgementFacts, DeliveryFacts, Subscriber};
 
 /// Node names by endpoint.
@@ -24,7 +23,7 @@ type Nodes<'a> = HashMap<Guid, &'a NodeName>;
 pub(super) fn totals(observer: &Observer, topic: &Topic) -> Totals {
     let mut sum = topic.retired_totals.as_deref().cloned().unwrap_or_default();
     for writer in topic.writers.iter().chain(&topic.buffer_endpoints) {
-        let measured = observer.profiler.get(*writer);
+        let measured = observer.measure.profiler.get(*writer);
         if let Some(subscribers) = measured.and_then(|measured| measured.subscribers.as_ref()) {
             sum.add(subscribers.totals());
             sum.received.awaited += subscribers.awaited();
@@ -41,7 +40,7 @@ pub(super) fn deliveries(
 ) -> Vec<DeliveryFacts> {
     let mut facts = Vec::new();
     for writer in topic.writers.iter().chain(&topic.buffer_endpoints) {
-        let measured = observer.profiler.get(*writer);
+        let measured = observer.measure.profiler.get(*writer);
         let Some(subscribers) = measured.and_then(|measured| measured.subscribers.as_ref()) else {
             continue;
         };
@@ -69,7 +68,7 @@ fn delivery_facts(
     (delivery, routes): (&Delivery, &[&KnownRoute]),
 ) -> DeliveryFacts {
     let main = delivery.main();
-    let matched = MatchedReaders::new(graph!(observer), Some(topic), writer);
+    let matched = MatchedReaders::new(&observer.graph, Some(topic), writer);
     let owner = match delivery.receiver() {
         Receiver::Participant(prefix) => Some(prefix),
         Receiver::Route(_) => routes.first().and_then(|known| known.owner),
@@ -86,7 +85,7 @@ fn delivery_facts(
     sockets.retain(|socket| *socket != 0);
     sockets.sort_unstable();
     sockets.dedup();
-    let known = observer.receivers.sockets();
+    let known = observer.graph.receivers.sockets();
     let socket = sockets
         .iter()
         .filter_map(|socket| known.get(*socket))
@@ -119,7 +118,10 @@ fn delivery_facts(
             .filter(|_| delivery.direction() == Direction::Received)
             .and_then(|guid| {
                 let key = (topic.domain_id, &topic.naming);
-                observer.inside.lost_in_queue(guid.prefix, key, writer)
+                observer
+                    .derive
+                    .inside
+                    .lost_in_queue(guid.prefix, key, writer)
             }),
     }
 }
@@ -133,7 +135,7 @@ pub(super) fn acknowledgements(
 ) -> Vec<AcknowledgementFacts> {
     let mut facts = Vec::new();
     for writer in &topic.writers {
-        let Some(measured) = observer.profiler.get(*writer) else {
+        let Some(measured) = observer.measure.profiler.get(*writer) else {
             continue;
         };
         let Some(subscribers) = &measured.subscribers else {
@@ -152,7 +154,7 @@ pub(super) fn acknowledgements(
 /// Returns the sockets that receive samples of measured topics.
 pub(super) fn sockets(observer: &Observer) -> Vec<SocketFacts> {
     let mut cookies = BTreeSet::new();
-    for (_, measured) in observer.profiler.iter() {
+    for (_, measured) in observer.measure.profiler.iter() {
         let Some(subscribers) = &measured.subscribers else {
             continue;
         };
@@ -162,7 +164,7 @@ pub(super) fn sockets(observer: &Observer) -> Vec<SocketFacts> {
             }
         }
     }
-    let known = observer.receivers.sockets();
+    let known = observer.graph.receivers.sockets();
     cookies
         .into_iter()
         .filter_map(|cookie| known.get(cookie).cloned())
