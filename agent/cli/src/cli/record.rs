@@ -4,6 +4,7 @@
 mod graph_cache;
 mod keys;
 mod output;
+mod read_ahead;
 mod shortfalls;
 mod signals;
 
@@ -22,7 +23,7 @@ use ros2probe::ros2::name::full_name;
 use ros2probe_api::recordings::FilterOptions;
 use ros2probe_bag::{self, Form, Options, Storage, Writer};
 use ros2probe_daemon::recording::{
-    Filter, FilterError, Recorder, SampleRing, Sources, default_name, record, schema,
+    Activity, Filter, FilterError, Recorder, SampleRing, Sources, default_name, record, schema,
 };
 use ros2probe_message::{Library, Sources as Places};
 
@@ -30,6 +31,7 @@ use super::UserError;
 use graph_cache::{GraphCache, locked};
 use keys::{Keys, read_keys};
 use output::{RecordingOutput, log, report};
+use read_ahead::ReadAhead;
 use signals::{Phase, listen};
 
 /// Default bytes of messages that wait for the storage, as the original's cache.
@@ -109,8 +111,8 @@ pub(crate) struct Record {
     /// Split when a file reaches this many seconds; 0 = never
     #[arg(long, short = 'd', value_name = "SECONDS", default_value_t = 0)]
     max_bag_duration: u64,
-    /// Bytes of messages that may wait for the storage, limited by the agent; messages that do not
-    /// fit are dropped, counted and reported
+    /// Bytes of messages that may wait for the storage in this process; more wait in the agent, and
+    /// those that do not fit there are dropped, counted and reported
     #[arg(long, value_name = "BYTES", default_value_t = CACHE)]
     max_cache_size: u64,
     /// Compress files after they are complete: file
@@ -239,8 +241,22 @@ impl Record {
             false => "Recording...",
         };
         log("INFO", state);
-        let next = |timeout: Duration| samples.next_within(timeout);
-        let (ended, broke) = record(recorder, next, &commands, |going| output.update(going));
+        let activity = |activity: Activity<'_>| output.update(activity);
+        let (ended, broke) = if is_live {
+            let most = usize::try_from(self.max_cache_size).unwrap_or(usize::MAX);
+            let ahead = ReadAhead::new(most);
+            std::thread::scope(|scope| {
+                scope.spawn(|| ahead.read(&mut samples));
+                let next = |timeout: Duration| ahead.next(timeout);
+                let recorded = record(recorder, next, &commands, activity);
+                ahead.close();
+                recorded
+            })
+        } else {
+            // The replay waits for the storage.
+            let next = |timeout: Duration| samples.next_within(timeout);
+            record(recorder, next, &commands, activity)
+        };
         drop(keys);
         output.finish();
         let outcome = agent.outcome().unwrap_or_default();

@@ -20,8 +20,8 @@ use ros2probe_bag::{Compressed, Error, FileCompression, Progress};
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Interval of status reports.
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
-/// Longest wait for messages sent before the end.
-const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
+/// Longest wait for the next of the messages sent before the end.
+const DRAIN: Duration = Duration::from_secs(2);
 
 /// Command to a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -89,6 +89,7 @@ pub fn record<E>(
     mut report_activity: impl FnMut(Activity<'_>),
 ) -> (Finished, Option<E>) {
     let mut compressing = Compressing::default();
+    // When the end was requested, and when the last item came since then.
     let mut stopping: Option<(Timestamp, Instant)> = None;
     let mut hurry = false;
     let mut reported = Instant::now();
@@ -99,7 +100,7 @@ pub fn record<E>(
             Ok(CommandOutcome::Out) => report_activity(Activity::Recording(&recorder)),
             Ok(CommandOutcome::Stop) => {
                 if stopping.is_none() {
-                    stopping = Some((now(), Instant::now() + DRAIN_TIMEOUT));
+                    stopping = Some((now(), Instant::now()));
                     report_activity(Activity::Completing);
                 }
             }
@@ -120,14 +121,17 @@ pub fn record<E>(
                 break (Some(error), None);
             }
         }
-        if stopping.is_some_and(|(_, deadline)| Instant::now() >= deadline) {
-            break (None, None);
-        }
         let item = match got {
             NextItem::Item(item) => item,
+            NextItem::Pending if stopping.is_some_and(|(_, waited)| waited.elapsed() >= DRAIN) => {
+                break (None, None);
+            }
             NextItem::Pending => continue,
             NextItem::Closed => break (None, None),
         };
+        if let Some((_, waited)) = &mut stopping {
+            *waited = Instant::now();
+        }
         if let Err(error) = recorder.take(&item) {
             break (Some(error), None);
         }
