@@ -21,9 +21,10 @@ pub mod spans;
 mod stamps;
 pub mod trace;
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
+use foldhash::HashMap;
 use ros2probe_wire::{DomainId, Guid, GuidPrefix, Timestamp};
 
 use crate::derive::trace::share::Share;

@@ -5,10 +5,11 @@ mod endpoints;
 mod nodes;
 
 use std::cmp::Ordering;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
+use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::{DomainId, Guid};
 
 use crate::derive::chain::Chains;

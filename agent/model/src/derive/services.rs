@@ -15,10 +15,11 @@ pub mod facts;
 pub mod latency;
 pub mod service;
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
+use foldhash::HashMap;
 use ros2probe_wire::names::{ActionPart, RosName};
 use ros2probe_wire::rtps::{RequestHeader, VendorId};
 use ros2probe_wire::walk::Found;

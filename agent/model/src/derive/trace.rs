@@ -7,10 +7,11 @@
 
 pub mod share;
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
+use foldhash::HashMap;
 use ros2probe_wire::rtps::StatusInfo;
 use ros2probe_wire::{DomainId, Guid, RtpsTime, SequenceNumber, Timestamp};
 

@@ -15,11 +15,11 @@ mod nodes;
 mod pending;
 mod priority;
 
-use std::collections::HashMap;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
 
+use foldhash::HashMap;
 use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement};
 use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber};

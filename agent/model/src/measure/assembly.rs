@@ -5,7 +5,7 @@
 //! many, within one budget for all samples. When the budget is exhausted, the oldest sample is
 //! dropped. Counting of samples happens elsewhere.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use crate::facts::bounded::Bounded;
@@ -13,6 +13,7 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::observation::{Content, Sample};
 use crate::facts::tables::AssembledSamples;
 use bytes::Bytes;
+use foldhash::HashMap;
 use ros2probe_wire::{Guid, SequenceNumber};
 
 /// Memory per sample, and per fragment that arrived early, in addition to its bytes.

@@ -3,10 +3,11 @@
 //! A finished second is immutable: readers share it with the ring and never block the capture. The
 //! number of rows is bounded, so many topics shorten the history.
 
-use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
+use foldhash::{HashMap, HashSet};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Timestamp};
 

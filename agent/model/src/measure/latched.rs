@@ -7,9 +7,9 @@
 
 mod allowance;
 
-use std::collections::HashMap;
 use std::sync::Arc;
 
+use foldhash::HashMap;
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
 
@@ -356,7 +356,7 @@ impl Latched {
                 (is_watched || !known.about.is_watched).then_some((writer, sample, *at))
             })
         };
-        let mut sums: HashMap<GuidPrefix, usize> = HashMap::from([(newcomer, bytes)]);
+        let mut sums: HashMap<_, _> = HashMap::from_iter([(newcomer, bytes)]);
         for (writer, sample, _) in kept() {
             *sums.entry(writer.prefix).or_default() += size(sample);
         }

@@ -6,10 +6,10 @@
 
 mod request_begin;
 
-use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::{Guid, SequenceNumber};
 
 use crate::facts::bounded::Bounded;

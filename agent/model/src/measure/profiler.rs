@@ -5,9 +5,10 @@
 
 mod unknown_writers;
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::BTreeSet;
 use std::time::Duration;
 
+use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::{Guid, SequenceNumber};
 

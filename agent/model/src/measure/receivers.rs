@@ -12,8 +12,9 @@
 mod addresses;
 mod matched;
 
-use std::collections::{HashMap, HashSet, VecDeque};
+use std::collections::VecDeque;
 
+use foldhash::{HashMap, HashMapExt as _, HashSet};
 use ros2probe_wire::{DomainId, GuidPrefix};
 
 use addresses::AnnouncedAddresses;

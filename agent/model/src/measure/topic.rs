@@ -4,9 +4,10 @@
 //! topic. A topic without endpoints is kept with its counters for a grace period, so that its
 //! series show silence instead of disappearing.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
+use foldhash::HashMap;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 

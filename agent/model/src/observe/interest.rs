@@ -4,8 +4,9 @@
 //! sent. It has the cap of the kernel's map. When it is full, entries with [`Verdict::Ignore`] go
 //! first: without an entry, the kernel captures a writer within its budget for unknown writers.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::BTreeSet;
 
+use foldhash::HashMap;
 use ros2probe_wire::Guid;
 
 use crate::facts::bounded::{Bounded, Counted};

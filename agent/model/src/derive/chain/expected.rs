@@ -1,9 +1,10 @@
 //! Configured chains: the topics between their ends, and their latency against its limit.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
+use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::{DomainId, Timestamp};
 
 use super::exemplar::Exemplars;

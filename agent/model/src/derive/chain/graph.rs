@@ -1,8 +1,9 @@
 //! Which node reads and writes which measured topics with a header.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
+use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
 use crate::derive::trace::share::Share;

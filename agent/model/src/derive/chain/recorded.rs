@@ -16,9 +16,10 @@ mod relation;
 #[cfg(test)]
 mod tests;
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::VecDeque;
 use std::time::Duration;
 
+use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::Timestamp;
 
 use super::path::{ChainFacts, Paths};

@@ -3,10 +3,11 @@
 //! The messages of one stamp are evaluated together, some seconds after the last one. So the order
 //! in which sources deliver them is irrelevant: shared memory is polled and arrives late.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
+use foldhash::HashMap;
 use ros2probe_wire::{DomainId, Guid, GuidPrefix, RtpsTime, SequenceNumber, Timestamp};
 
 use super::graph::Output;

@@ -1,8 +1,9 @@
 //! Examines one topic: which of its writers and readers match, and which have no counterpart.
 
 use std::collections::hash_map::Entry;
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 
+use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::discovery::{Role, TypeHash};
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, Guid};

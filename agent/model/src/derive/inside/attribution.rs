@@ -3,8 +3,9 @@
 //! A node is never guessed. A publisher belongs to the only node of its process that publishes its
 //! topic, otherwise to the only node of the process. The same holds for subscriptions.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet};
 
+use foldhash::{HashMap, HashMapExt as _, HashSet};
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::{DomainId, GuidPrefix};
 

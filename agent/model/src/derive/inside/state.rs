@@ -1,8 +1,9 @@
 //! Processes and handles of the last reports.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
+use foldhash::{HashMap, HashMapExt as _, HashSet};
 use ros2probe_wire::{DomainId, GuidPrefix};
 
 use super::attribution::Attribution;

@@ -5,7 +5,7 @@ use std::borrow::Borrow;
 use std::collections::{
     BTreeMap, BTreeSet, HashMap, HashSet, VecDeque, btree_map, hash_map, vec_deque,
 };
-use std::hash::Hash;
+use std::hash::{BuildHasher, Hash};
 use std::ops::RangeBounds;
 
 use super::Bounded;
@@ -74,7 +74,7 @@ collection!(
     |set, key| { set.insert(key); }, BTreeSet::pop_first
 );
 collection!(
-    [K: Hash + Eq] HashSet<K>, K, false, |set, key| set.contains(key),
+    [K: Hash + Eq, S: BuildHasher + Default] HashSet<K, S>, K, false, |set, key| set.contains(key),
     |set, key| { set.insert(key); }, |_| None
 );
 collection!(
@@ -82,7 +82,7 @@ collection!(
     |map, (key, value)| { map.insert(key, value); }, BTreeMap::pop_first
 );
 collection!(
-    [K: Hash + Eq, V] HashMap<K, V>, (K, V), false, |map, (key, _)| map.contains_key(key),
+    [K: Hash + Eq, V, S: BuildHasher + Default] HashMap<K, V, S>, (K, V), false, |map, (key, _)| map.contains_key(key),
     |map, (key, value)| { map.insert(key, value); }, |_| None
 );
 
@@ -204,7 +204,7 @@ impl<D: Declared, K: Ord> Bounded<D, BTreeSet<K>> {
     }
 }
 
-impl<D: Declared, K: Hash + Eq> Bounded<D, HashSet<K>> {
+impl<D: Declared, K: Hash + Eq, S: BuildHasher + Default> Bounded<D, HashSet<K, S>> {
     forward! {
         fn clear();
         fn remove(key: &K) -> bool;
@@ -258,7 +258,7 @@ impl<D: Declared, K: Ord, V> Bounded<D, BTreeMap<K, V>> {
     }
 }
 
-impl<D: Declared, K: Hash + Eq, V> Bounded<D, HashMap<K, V>> {
+impl<D: Declared, K: Hash + Eq, V, S: BuildHasher + Default> Bounded<D, HashMap<K, V, S>> {
     forward! {
         fn clear();
         fn remove(key: &K) -> Option<V>;

@@ -1,8 +1,8 @@
 //! Begin and end of connections, with the tokens and sessions that end with them.
 
-use std::collections::HashMap;
 use std::time::Duration;
 
+use foldhash::HashMap;
 use ros2probe_wire::GuidPrefix;
 use ros2probe_wire::zenoh::ZenohId;
 

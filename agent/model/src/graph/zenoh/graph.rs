@@ -4,10 +4,11 @@
 //! until the last of them undeclares it, until its own session undeclares it, or until the session
 //! ends. The end that closes a connection first undeclares its tokens with it.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use foldhash::HashMap;
 use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement, Role};
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::names::{DdsTopic, Demangled};

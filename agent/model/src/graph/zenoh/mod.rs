@@ -24,8 +24,9 @@ mod session_state;
 mod stream;
 mod stream_state;
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 
+use foldhash::HashMap;
 use ros2probe_wire::zenoh::{Batch, Bytes, Gid, Side, WhatAmI, ZenohId};
 use ros2probe_wire::{Guid, GuidPrefix, Reason, SequenceNumber, Timestamp};
 

@@ -3,8 +3,7 @@
 //! A session has one connection to a router. A process with one such connection therefore has one
 //! session, and all of its connections are of this session.
 
-use std::collections::HashMap;
-
+use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::GuidPrefix;
 use ros2probe_wire::zenoh::{PORT, ZenohId};
 

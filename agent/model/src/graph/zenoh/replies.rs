@@ -1,10 +1,11 @@
 //! Numbers of replies. A reply has the number of its request, which other clients use too, so that
 //! its writer has no numbers of its own.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::VecDeque;
 
 use crate::facts::bounded::Bounded;
 use crate::facts::tables::{ZenohReplies, ZenohReplyWriters};
+use foldhash::HashMap;
 use ros2probe_wire::zenoh::Gid;
 use ros2probe_wire::{Guid, SequenceNumber};
 

@@ -3,8 +3,9 @@
 //! Two bounds apply, because a forger may announce a new address each time: one per participant and
 //! one in total. The addresses announced last are kept.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 
+use foldhash::HashMap;
 use ros2probe_wire::GuidPrefix;
 
 use crate::facts::bounded::TableFacts;

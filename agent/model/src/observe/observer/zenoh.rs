@@ -1,7 +1,6 @@
 //! Connections of Zenoh: announcements for discovery, and observations for everything else.
 
-use std::collections::HashMap;
-
+use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::discovery::{EndpointAnnouncement, Role};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::rtps::StatusInfo;

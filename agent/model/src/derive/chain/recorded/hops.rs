@@ -1,8 +1,9 @@
 //! Hops between recorded topics, and the messages that went along them.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
+use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::{DomainId, Timestamp};
 
 use super::RecordedChains;

@@ -1,7 +1,8 @@
 //! Deliveries, acknowledgements and sockets of a snapshot.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::BTreeSet;
 
+use foldhash::HashMap;
 use ros2probe_wire::{EntityId, Guid};
 
 use crate::facts::model_time::ModelTime;
