@@ -91,7 +91,7 @@ impl Sockets {
             }
         }
         if is_awaited {
-            observer.link_sessions();
+            observer.input(Input::SocketsRead);
         }
     }
 

@@ -346,12 +346,13 @@ impl Run {
     /// Applies new lists of watches and subscriptions to further topics. Returns whether all are
     /// done; a replay waits for it.
     fn apply_lists(&mut self) -> bool {
-        while !self.observer.apply_more_lists() {
+        while !self.observer.has_applied_lists() {
+            self.observer.input(Input::MoreLists);
             if let Source::Live(_) = self.source {
-                return false;
+                break;
             }
         }
-        true
+        self.observer.has_applied_lists()
     }
 
     fn publish(&mut self) {

@@ -83,6 +83,9 @@ pub enum Input<'a> {
     Socket(SocketFacts),
     /// The socket with this cookie was closed.
     SocketClosed(u64),
+    /// All sockets were read whose facts have changed. Sessions of Zenoh are attributed to the
+    /// processes that hold their sockets.
+    SocketsRead,
     /// The kernel's table dropped the socket with this cookie, which may still be open.
     SocketForgotten(u64),
     /// Figures from inside processes, with times of this host's clock.
@@ -98,6 +101,10 @@ pub enum Input<'a> {
     },
     /// The topics to measure from now on.
     Watchlist(Arc<Watchlist>),
+    /// Apply the lists to further topics, until [`Observer::has_applied_lists`].
+    ///
+    /// [`Observer::has_applied_lists`]: crate::observe::observer::Observer::has_applied_lists
+    MoreLists,
     /// The samples to dispatch from now on. Their topics are measured as long as they are
     /// requested.
     SampleRequests(Arc<Vec<SampleRequest>>),

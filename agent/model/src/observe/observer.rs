@@ -217,12 +217,14 @@ impl Observer {
                 self.graph.discovery.seen(prefix, at, Priority::NOTHING);
             }
             Input::Socket(facts) => self.graph.receivers.socket(facts),
+            Input::SocketsRead => self.link_sessions(),
             Input::SocketClosed(cookie) => self.graph.receivers.socket_closed(cookie),
             Input::SocketForgotten(cookie) => self.graph.receivers.socket_forgotten(cookie),
             Input::Inside(report) => self.report_inside(report),
             Input::InsideDetached => self.derive.inside.detach(),
             Input::DecodeError { stage, reason } => self.decode_error(stage, reason),
             Input::Watchlist(watchlist) => self.set_watchlist(watchlist),
+            Input::MoreLists => self.apply_more_lists(),
             Input::SampleRequests(sample_requests) => self.set_sample_requests(sample_requests),
             Input::ExpectedChains(chains) => self.derive.chains.expect(chains),
             Input::CausalPublication(publication) => self.chain_published(publication),

@@ -22,7 +22,7 @@ use crate::measure::topic::{Topic, TopicId, Watched};
 use crate::measure::writer::Traits;
 
 impl Observer {
-    /// Replaces the watchlist. It takes effect once [`Self::apply_more_lists`] has visited all
+    /// Replaces the watchlist. It takes effect once `Input::MoreLists` has visited all
     /// topics. Counts of a topic that is no longer watched stay, as do the states of unchanged
     /// entries.
     pub(super) fn set_watchlist(&mut self, watchlist: Arc<Watchlist>) {
@@ -64,10 +64,10 @@ impl Observer {
     }
 
     /// Applies the lists to further topics, as many as take a few milliseconds. The previous
-    /// decision holds for a topic until its turn. Returns whether all topics are done.
-    pub fn apply_more_lists(&mut self) -> bool {
+    /// decision holds for a topic until its turn.
+    pub(super) fn apply_more_lists(&mut self) {
         if self.has_applied_lists() {
-            return true;
+            return;
         }
         let requested = |request: &SampleRequest| {
             request.selection.globs().count() + request.selection.regexes()
@@ -85,7 +85,6 @@ impl Observer {
             };
             self.apply_lists(id, self.clock);
         }
-        self.has_applied_lists()
     }
 
     /// Returns whether the lists were applied to all topics since they last changed.

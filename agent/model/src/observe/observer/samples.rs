@@ -16,7 +16,7 @@ use crate::measure::profiler::Measured;
 use crate::measure::writer::Counted;
 
 impl Observer {
-    /// Replaces the sample requests. They take effect once [`Self::apply_more_lists`] has visited
+    /// Replaces the sample requests. They take effect once `Input::MoreLists` has visited
     /// all topics. Requested topics are measured even without a watch; existing counts stay.
     pub(super) fn set_sample_requests(&mut self, sample_requests: Arc<Vec<SampleRequest>>) {
         self.requested.sample_requests = sample_requests;

@@ -79,7 +79,7 @@ impl Observer {
     }
 
     /// Learns from the processes that hold the sockets which sessions of Zenoh send.
-    pub fn link_sessions(&mut self) {
+    pub(super) fn link_sessions(&mut self) {
         self.zenoh.has_begun = false;
         let receivers = &self.graph.receivers;
         let holder = |socket| {

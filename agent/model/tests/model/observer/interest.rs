@@ -120,7 +120,8 @@ fn lists_of_costly_globs_are_matched_in_parts() {
     // The topic is still counted.
     world.sample(alice(WRITER), 1);
     let mut rounds = 0;
-    while !world.observer.apply_more_lists() {
+    while !world.observer.has_applied_lists() {
+        world.observer.input(Input::MoreLists);
         rounds += 1;
     }
     assert!((2..10).contains(&rounds), "{rounds}");

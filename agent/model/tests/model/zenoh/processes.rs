@@ -175,7 +175,7 @@ fn joined(routers: &[u16]) -> (Observer, [u8; 16]) {
     let ack = init(LATE, Role::Peer, Some(&[]));
     send(&mut observer, &to_listener, START, &ack);
     assert!(observer.awaits_holders());
-    observer.link_sessions();
+    observer.input(Input::SocketsRead);
     assert!(!observer.awaits_holders());
     // The other session leaves.
     for stream in [there, back, to_listener, from_listener] {
