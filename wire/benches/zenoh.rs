@@ -1,5 +1,5 @@
-//! Time of the Zenoh decoder: a batch of small publications, as a busy publisher sends it, and a
-//! batch of declarations, as a new peer gets it. Then single tokens and keys.
+//! Measures the Zenoh decoder on a batch of small publications, as a busy publisher sends it. Other
+//! inputs are a batch of declarations, as a new peer receives it, and single tokens and keys.
 
 #![expect(clippy::unwrap_used, reason = "a benchmark may panic on its own input")]
 
@@ -10,7 +10,7 @@ use ros2probe_wire::zenoh::{
     Attachment, Batch, Declaration, Gid, Key, Message, NetworkMessage, Sample, Token,
 };
 
-/// A PUSH of 20 bytes as captured from a node: an alias, a timestamp, an attachment.
+/// A captured PUSH of a node with a payload of 20 bytes, an alias, a timestamp and an attachment.
 const PUSH: [u8; 85] = *b"\x1d\x03\xa1\xb0\x94\xc0\xaf\xbb\x8e\xc0\x80\x6b\x10\xe8\x73\x83\xf7\
     \x0e\xa9\xbd\xcb\x55\x2c\xc6\x2c\x63\xa1\x0c\xd1\x43\x21\x04\0\0\0\0\0\0\0\0\x36\xe4\xba\x23\
     \xee\xe9\x18\x10\0\x01\x02\x03\x04\x05\x06\x07\x08\x09\x0a\x0b\x0c\x0d\x0e\x0f\x14\0\x01\0\0\

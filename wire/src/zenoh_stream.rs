@@ -1,19 +1,19 @@
-//! How a direction of a TCP connection shows that it is of Zenoh: by its first bytes, or by batches
-//! that continue the sequence numbers of their lanes.
+//! Recognizes a direction of a TCP connection of Zenoh: by its first bytes, or by batches that
+//! continue the sequence numbers of their lanes.
 //!
-//! The kernel programs and the replay compile these rules. They decide on values that the caller has
-//! read, and allocate nothing. Formats: `zenoh-protocol`, `transport/`.
+//! The kernel programs and the replay compile this module. It decides on values that the caller has
+//! read, and allocates no memory. The formats are those of `zenoh-protocol`, `transport/`.
 
-/// Bytes that [`Beginning::of`] reads.
+/// Number of bytes that [`Beginning::of`] reads.
 pub const HEAD: usize = 8;
 /// Version of the wire format since Zenoh 1.0.
 pub const VERSION: u8 = 0x09;
-/// Bytes of the length before a batch.
+/// Size of the length before a batch, in bytes.
 pub const PREFIX: u32 = 2;
-/// Batches that continue the numbers of their lanes and make a boundary certain.
+/// Number of proofs that make a boundary certain.
 const CERTAIN: u32 = 2;
 
-/// Largest version that is another version of Zenoh rather than another protocol.
+/// Largest version number that is taken for another version of Zenoh rather than another protocol.
 const PLAUSIBLE_VERSION: u8 = 0x3f;
 /// A `KEEP_ALIVE` alone in its batch, with the length before it.
 const KEEP_ALIVE: [u8; 3] = [1, 0, message::KEEP_ALIVE];
@@ -36,13 +36,13 @@ pub mod message {
     pub const FRAME: u8 = 5;
     /// A part of a network message.
     pub const FRAGMENT: u8 = 6;
-    /// The largest id: a member of a multicast group.
+    /// A member of a multicast group introduces itself. This is the largest id.
     pub const JOIN: u8 = 7;
-    /// The least id of a network message, which follows a FRAME.
+    /// The smallest id of a network message. Network messages follow a FRAME.
     pub const LEAST_NETWORK: u8 = 0x19;
 }
 
-/// What the payload of a TCP segment begins with.
+/// The start of a TCP segment's payload.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Beginning {
     /// INIT: a connection of the known version begins.
@@ -51,16 +51,17 @@ pub enum Beginning {
     OtherVersion,
     /// A `KEEP_ALIVE`, alone in its batch and in its segment.
     KeepAlive,
-    /// The first handshake message of a side of TLS, on a port of Zenoh.
+    /// The first handshake message of either side of TLS, on a port of Zenoh.
     Tls,
     /// A byte sequence that may be a batch with a FRAME or FRAGMENT.
     Batch,
-    /// Another protocol, or the inside of a batch.
+    /// Another protocol, or the middle of a batch.
     Other,
 }
 
 impl Beginning {
-    /// Returns what a segment of at least [`HEAD`] bytes begins with. `length` is its whole length.
+    /// Classifies the start of a segment of at least [`HEAD`] bytes. `length` is the segment's
+    /// whole length.
     #[inline(always)]
     #[must_use]
     pub const fn of(head: [u8; HEAD], length: u32, is_zenoh_port: bool) -> Self {
@@ -88,7 +89,7 @@ impl Beginning {
         }
     }
 
-    /// Returns what a segment of exactly three bytes is.
+    /// Classifies the start of a segment of exactly three bytes.
     #[inline(always)]
     #[must_use]
     pub const fn of_three(bytes: [u8; 3]) -> Self {
@@ -101,7 +102,8 @@ impl Beginning {
     }
 }
 
-/// Sequence numbers of up to two lanes of a direction. Numbers that continue prove a boundary.
+/// Sequence numbers of up to two lanes of a direction. Numbers that continue a lane prove a
+/// boundary.
 ///
 /// A batch of a third lane is accepted and proves nothing: publishers of ROS use one or two.
 #[repr(C)]
@@ -111,7 +113,7 @@ pub struct Lanes {
     lanes: [Lane; 2],
 }
 
-/// A lane and its next number; the key 0 is none.
+/// A lane and its next sequence number. The key 0 means no lane.
 #[repr(C)]
 #[derive(Clone, Copy, Default, Debug)]
 struct Lane {
@@ -150,13 +152,14 @@ impl Lanes {
         self.proofs >= CERTAIN
     }
 
-    /// Notes a `KEEP_ALIVE` alone in its batch: few other bytes look like one.
+    /// Counts a `KEEP_ALIVE` alone in its batch as a proof, because few other bytes look like one.
     #[inline(always)]
     pub const fn keep_alive(&mut self) {
         self.proofs += 1;
     }
 
-    /// Returns whether a FRAME or FRAGMENT with this number may follow those before.
+    /// Returns whether a FRAME or FRAGMENT with this number may follow the earlier ones of its
+    /// lane.
     #[inline(always)]
     pub const fn continues(&mut self, key: u32, number: u32) -> bool {
         let [one, two] = &mut self.lanes;
@@ -170,7 +173,7 @@ impl Lanes {
         } else if lane.key != key {
             return true;
         } else {
-            // The number behind the FRAGMENTs of a message does not appear.
+            // A sender skips the number after the FRAGMENTs of a message.
             if number.wrapping_sub(lane.expected) & Self::NUMBER > 1 {
                 return false;
             }
@@ -185,7 +188,7 @@ impl Lanes {
 mod tests {
     use super::*;
 
-    /// INIT of a peer, as in the captures of Zenoh 1.8, cut behind its flags.
+    /// INIT of a peer, as in the captures of Zenoh 1.8, cut after its flags.
     const INIT: [u8; HEAD] = [0x20, 0, 0x81, 9, 0xf1, 0x0a, 0, 0];
 
     #[test]
@@ -195,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn another_version_counts_on_a_port_of_zenoh_only() {
+    fn another_version_is_recognized_on_ports_of_zenoh_only() {
         let mut head = INIT;
         head[3] = 8;
         assert_eq!(Beginning::of(head, 34, true), Beginning::OtherVersion);
@@ -205,14 +208,14 @@ mod tests {
     }
 
     #[test]
-    fn a_hello_of_tls_counts_on_a_port_of_zenoh_only() {
+    fn a_tls_hello_is_recognized_on_ports_of_zenoh_only() {
         let head = [0x16, 3, 1, 2, 0, 1, 0, 1];
         assert_eq!(Beginning::of(head, 200, true), Beginning::Tls);
         assert_eq!(Beginning::of(head, 200, false), Beginning::Other);
     }
 
     #[test]
-    fn a_keep_alive_is_three_bytes() {
+    fn a_keep_alive_is_recognized_by_its_three_bytes() {
         assert_eq!(Beginning::of_three([1, 0, 4]), Beginning::KeepAlive);
         for other in [[2, 0, 4], [1, 1, 4], [1, 0, 5]] {
             assert_eq!(Beginning::of_three(other), Beginning::Other);
@@ -220,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_and_fragments_may_be_batches_of_any_connection() {
+    fn frames_and_fragments_may_begin_a_batch_of_any_connection() {
         for (header, beginning) in [
             (0x25, Beginning::Batch),
             (0x65, Beginning::Other),
@@ -235,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn two_numbers_in_a_row_prove_a_boundary() {
+    fn two_numbers_that_continue_a_lane_prove_a_boundary() {
         let mut lanes = Lanes::new();
         let key = Lanes::key(5, 0x20);
         for (number, is_certain) in [(7, false), (8, false), (9, true)] {
@@ -246,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_behind_fragments_is_left_out_and_the_highest_wraps() {
+    fn one_number_may_be_skipped_and_the_highest_number_wraps() {
         let mut lanes = Lanes::new();
         let key = Lanes::key(0, 0);
         for number in [0x0fff_fffd, 0x0fff_ffff, 0, 1] {
@@ -255,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn lanes_count_apart_and_a_third_proves_nothing() {
+    fn two_lanes_count_separately_and_a_third_lane_proves_nothing() {
         let mut lanes = Lanes::new();
         for (key, number) in [(1, 5), (2, 90), (3, 1), (3, 500), (1, 6)] {
             assert!(lanes.continues(Lanes::key(key, 0), number), "{key}");

@@ -1,4 +1,4 @@
-//! Reads captures of real rmw_zenoh nodes and compares what is in them with the findings of an
+//! Reads captures of real rmw_zenoh nodes and compares their contents with the findings of an
 //! independent decoder.
 //!
 //! Runs on the capture in `tests/data/zenoh`, and on those in `../shared/fixtures/zenoh` beside the
@@ -30,19 +30,19 @@ struct Stream {
     bytes: Vec<u8>,
     /// Sequence number of the next byte.
     next: u32,
-    /// Where segments begin in `bytes`, and in which packet each came.
+    /// Offset in `bytes` and packet number of each segment.
     segments: Vec<(usize, usize)>,
     begins_with_syn: bool,
 }
 
 impl Stream {
     fn push(&mut self, packet: usize, sequence: u32, payload: &[u8]) {
-        // The sequence number of an empty segment may be one behind a FIN.
+        // The sequence number of an empty segment may count a preceding FIN.
         if payload.is_empty() {
             return;
         }
         let repeated = self.next.wrapping_sub(sequence);
-        // The captures have no gap: a part may only be a repetition.
+        // The captures have no gap, so bytes can only be repeated.
         assert!(repeated < 1 << 31, "gap before packet {packet}");
         let Some(new) = payload.get(usize::try_from(repeated).unwrap()..) else {
             return;
@@ -54,8 +54,9 @@ impl Stream {
         }
     }
 
-    /// Returns the offset of the first batch. A capture that begins within a connection begins
-    /// anywhere within a batch: the first segment from which everything can be read is taken.
+    /// Returns the offset of the first batch. A capture that begins within a connection may begin
+    /// within a batch. Then the first batch is at the first segment from which everything can be
+    /// read.
     fn first_batch(&self) -> usize {
         if self.begins_with_syn {
             return 0;
@@ -88,7 +89,7 @@ impl Stream {
     }
 }
 
-/// A connection's two directions; the first is that of the initiator, if that is known.
+/// Sender and receiver of one direction of a connection.
 type Ends = (SocketAddr, SocketAddr);
 
 /// Reassembles the streams of a capture of Ethernet frames.
@@ -215,7 +216,7 @@ impl Found {
         assert_eq!(messages.offset(), batch.len());
     }
 
-    /// Checks the sequence numbers of a lane: a sender leaves one out behind each chain of
+    /// Checks the sequence numbers of a lane. A sender skips one number after each chain of
     /// fragments.
     fn sequence(&mut self, ends: Ends, lane: Lane, number: u32, is_last_fragment: bool) {
         let next = Resolution::DEFAULT.next(number);
@@ -407,8 +408,8 @@ fn check(facts: &Value, found: &Found) {
             *counts.entry(name.clone()).or_default() += count.as_u64().unwrap();
         }
     }
-    // The other decoder waits for three batches in a row before it takes a boundary for one. The
-    // bytes that it left out hold a few publications more.
+    // The independent decoder requires three consecutive batches before it accepts a boundary. The
+    // bytes that it left out contain a few more publications.
     let left_out = facts["stats"]["bytes_before_sync"].as_u64().unwrap_or(0);
     let earlier = found.counts["PUSH"] - counts["PUSH"];
     assert!(earlier <= left_out / 100, "{earlier} in {left_out} bytes");
@@ -442,7 +443,7 @@ fn check(facts: &Value, found: &Found) {
         }
         let text = |name: &str| publication[name].as_str().unwrap().to_owned();
         let gid = text("gid");
-        // The token leads to the gid without any alias.
+        // The gid is the hash of the token, so it needs no alias.
         assert_eq!(gids.get(&gid).copied(), publication["token"].as_str());
         let numbers = &publication["seq_range"];
         let one = Publications {
@@ -472,7 +473,7 @@ fn check(facts: &Value, found: &Found) {
 }
 
 #[test]
-fn captures_read_as_the_independent_decoder_read_them() {
+fn captures_yield_the_facts_of_the_independent_decoder() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut all = Vec::new();
     captures(&root.join("tests/data/zenoh"), &mut all);

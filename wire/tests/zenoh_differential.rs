@@ -1,14 +1,15 @@
-//! Compares the Zenoh decoder with Zenoh's own (`zenoh-codec` 1.10): on random messages that it
-//! encodes, on changed bytes of these, and on random bytes. Whatever it accepts, ours reads with
-//! the same fields.
+//! Compares the Zenoh decoder of this crate with Zenoh's own, `zenoh-codec` 1.10. The inputs are
+//! random messages that `zenoh-codec` encodes, these messages with changed bytes, and random bytes.
+//! If `zenoh-codec` accepts an input, this crate must read the same fields.
 //!
-//! Exceptions, each of a sender that Zenoh does not have:
-//! - A number too large for its field: Zenoh keeps the lower bits, ours refuses it.
-//! - An extension whose fields do not fill its length: Zenoh reads on behind them, ours refuses it.
-//!   The stack of timestamps (0x47 of PUSH, REQUEST and RESPONSE), which ours skips, is not compared
-//!   in changed messages.
+//! There are exceptions, which no sender of Zenoh produces:
+//! - A number too large for its field: Zenoh keeps the lower bits, this crate refuses it.
+//! - An extension whose fields do not fill its length: Zenoh reads on after the fields, this crate
+//!   refuses it. This crate skips the stack of timestamps (0x47 of PUSH, REQUEST and RESPONSE), so
+//!   the stack is not compared in changed messages.
 //!
-//! Ours accepts more: payloads with slices in shared memory, which Zenoh reads with a feature only.
+//! This crate also accepts payloads with slices in shared memory, which Zenoh reads with a feature
+//! only.
 
 #![expect(
     clippy::unwrap_used,
@@ -26,7 +27,7 @@ use ros2probe_wire::{Reason, WireError};
 use zenoh_protocol::network::NetworkMessage;
 use zenoh_protocol::transport::TransportMessage;
 
-/// Numbers from a seed (xorshift64).
+/// Pseudo-random numbers from a seed (xorshift64).
 struct Numbers(u64);
 
 impl Numbers {
@@ -113,7 +114,7 @@ fn change(batch: &[u8], numbers: &mut Numbers) -> usize {
 }
 
 #[test]
-fn transport_messages_have_the_same_fields() {
+fn both_decoders_read_the_same_fields_of_transport_messages() {
     let mut numbers = Numbers(0x5eed);
     let mut accepted = 0;
     for _ in 0..400 {
@@ -126,7 +127,7 @@ fn transport_messages_have_the_same_fields() {
 }
 
 #[test]
-fn network_messages_have_the_same_fields() {
+fn both_decoders_read_the_same_fields_of_network_messages() {
     let mut numbers = Numbers(0xfeed);
     let mut accepted = 0;
     for _ in 0..1200 {
@@ -144,7 +145,7 @@ fn network_messages_have_the_same_fields() {
 }
 
 #[test]
-fn random_bytes_are_read_alike() {
+fn both_decoders_read_the_same_fields_of_random_bytes() {
     let mut numbers = Numbers(0xbeef);
     let mut accepted = 0;
     for _ in 0..60_000 {
@@ -152,7 +153,7 @@ fn random_bytes_are_read_alike() {
         let mut batch: Vec<u8> = (0..length)
             .map(|_| u8::try_from(numbers.below(256)).unwrap())
             .collect();
-        // Mostly headers that exist, and small numbers.
+        // Most headers exist, and most numbers are small.
         batch[0] = batch[0] & 0xe0 | u8::try_from(numbers.below(8)).unwrap();
         for byte in &mut batch[1..] {
             if numbers.below(3) > 0 {

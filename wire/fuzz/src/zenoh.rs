@@ -1,4 +1,4 @@
-//! The entry of the Zenoh decoder. The first byte of the input is the number of bytes that the
+//! Fuzz target of the Zenoh decoder. The first byte of the input is the number of bytes that the
 //! capture lacks.
 
 use ros2probe_wire::Reason;
@@ -27,7 +27,7 @@ pub fn read(bytes: &[u8]) {
     }
     assert!(messages.next().is_none());
     assert!(messages.offset() <= batch.len());
-    // Each message has a byte of its own; a cut batch may have an error behind them.
+    // Each message has at least one byte. In a cut batch, an error may follow the messages.
     assert!(count <= batch.len() + 1);
     if *missing > 0 {
         prefix(batch, length);
@@ -43,7 +43,8 @@ pub fn read(bytes: &[u8]) {
     }
 }
 
-/// A cut batch has the same messages as the same bytes without a cut, except for the last one.
+/// Checks that a cut batch has the same messages as the same bytes without a cut, except for the
+/// last one.
 fn prefix(batch: &[u8], length: usize) {
     let cut: Vec<_> = Batch::new(batch, length).map_while(Result::ok).collect();
     let whole: Vec<_> = Batch::whole(batch).map_while(Result::ok).collect();

@@ -15,7 +15,7 @@ impl Gid {
     /// Returns the gid of the endpoint that declares a token.
     #[must_use]
     pub fn of_token(token: &str) -> Self {
-        // The low 64 bits come first, each half least significant byte first.
+        // The low 64 bits come first. Each half begins with the least significant byte.
         Self(twox_hash::XxHash3_128::oneshot(token.as_bytes()).to_le_bytes())
     }
 }
@@ -33,28 +33,29 @@ impl fmt::Debug for Gid {
     }
 }
 
-/// What rmw_zenoh attaches to each sample, request and reply.
+/// The data that rmw_zenoh attaches to each sample, request and reply.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Attachment {
-    /// Number of the sample, from 1 for each publisher and client. A reply has its request's.
+    /// Number of the sample, from 1 for each publisher and client. A reply has the number of its
+    /// request.
     pub sequence_number: SequenceNumber,
     /// Time at which the sample was published, by the realtime clock of the source; `None` if
     /// before 1970.
     pub source_timestamp: Option<Timestamp>,
-    /// The publisher or client. A reply has the client's.
+    /// Identity of the publisher or client. A reply has the identity of the client.
     pub gid: Gid,
 }
 
 impl Attachment {
-    /// Length since rmw_zenoh 0.1.2 (Humble), 0.2.4 (Jazzy) and in Kilted and later.
+    /// Length in bytes since rmw_zenoh 0.1.2 (Humble) and 0.2.4 (Jazzy), and in Kilted and later.
     pub const PLAIN: usize = 33;
-    /// Length in earlier versions, in which each value has a name before it.
+    /// Length in bytes in earlier versions, in which a name precedes each value.
     pub const LABELLED: usize = 77;
 
-    /// Parses an attachment of either form. Zenoh applications other than ROS attach anything.
+    /// Parses an attachment of either form. Zenoh applications other than ROS may attach anything.
     ///
     /// # Errors
-    /// Fails if the length, a name or the gid's length is another one.
+    /// Fails if the length, a name or the length of the gid is wrong.
     pub fn parse(bytes: &[u8]) -> Result<Self, WireError> {
         let mut cursor = Cursor::new(bytes, Endianness::Little);
         let is_labelled = match bytes.len() {
@@ -86,7 +87,7 @@ impl Attachment {
     }
 }
 
-/// Reads a string, which must be the given one.
+/// Reads a string, which must equal `name`.
 fn string(cursor: &mut Cursor<'_>, name: &'static str) -> Result<(), WireError> {
     let start = *cursor;
     let length = cursor.u8(name)?;
@@ -125,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn both_forms_have_the_same_values() {
+    fn both_forms_of_an_attachment_yield_the_same_values() {
         let labelled = labelled();
         assert_eq!(labelled.len(), Attachment::LABELLED);
         let attachment = Attachment::parse(&labelled).unwrap();
@@ -138,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn other_attachments_are_refused() {
+    fn attachments_of_another_form_are_refused() {
         let labelled = labelled();
         for length in 0..labelled.len() {
             assert!(Attachment::parse(&labelled[..length]).is_err(), "{length}");

@@ -1,4 +1,4 @@
-//! A batch: transport messages back to back, and the network messages of its `FRAME`s
+//! A batch: consecutive transport messages, and the network messages of its `FRAME`s
 //! (`zenoh-protocol`, `transport/`).
 
 use crate::cursor::{Reason, WireError};
@@ -14,9 +14,9 @@ use super::session::{Init, Join, Open};
 pub struct Priority(pub u8);
 
 impl Priority {
-    /// Declarations.
+    /// Priority of declarations.
     pub const CONTROL: Self = Self(0);
-    /// Data without another priority, such as all topics of ROS.
+    /// Priority of data without another priority, such as all topics of ROS.
     pub const DATA: Self = Self(5);
     /// Number of priorities.
     pub const COUNT: usize = 8;
@@ -50,16 +50,17 @@ pub struct Frame {
 pub struct Fragment<'a> {
     /// The lane.
     pub lane: Lane,
-    /// Sequence number in the lane; the parts of a message have consecutive ones. The number after
-    /// the last part does not appear (all captures of Zenoh 1.8).
+    /// Sequence number in the lane; the parts of a message have consecutive numbers. The sender
+    /// skips the number after the last part (all captures of Zenoh 1.8).
     pub sequence_number: u32,
     /// Whether another part follows.
     pub has_more: bool,
     /// Whether the part is marked as the first: only if both sides have [`Init::patch`] 1.
     pub is_first: bool,
-    /// Whether the sender gave up the message, see [`Self::is_first`].
+    /// Whether the sender gave up the message: only if both sides have [`Init::patch`] 1.
     pub is_dropped: bool,
-    /// The part; [`NetworkMessage::beginning`] reads the first, [`NetworkMessage::whole`] all.
+    /// Bytes of the part. [`NetworkMessage::beginning`] reads the first part,
+    /// [`NetworkMessage::whole`] all parts together.
     pub bytes: Bytes<'a>,
 }
 
@@ -68,18 +69,18 @@ pub struct Fragment<'a> {
 pub struct Close {
     /// Whether the session ends, not only this link.
     pub is_session: bool,
-    /// Why: 0 for an ordinary end.
+    /// Number of the reason; 0 for an ordinary end.
     pub reason: u8,
 }
 
 /// A transport message, or a network message of the FRAME before it.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Message<'a> {
-    /// Operation and maintenance of the transport.
+    /// Operation, administration and maintenance of the transport.
     Oam(Oam<'a>),
-    /// The first two messages of a session.
+    /// One of the first two messages of a session.
     Init(Init<'a>),
-    /// The second two messages of a session.
+    /// One of the third and fourth messages of a session.
     Open(Open),
     /// The end of a link or session.
     Close(Close),
@@ -95,10 +96,10 @@ pub enum Message<'a> {
     Join(Join),
 }
 
-/// The messages of one batch. Ends after the first error.
+/// The messages of one batch. The iterator ends after the first error.
 ///
-/// A batch of which the capture lacks the end yields the complete messages, then an error with
-/// [`Reason::Truncated`]. The payload of a message may lack its end, see [`Bytes`].
+/// If the capture lacks the end of the batch, the iterator yields the complete messages, then an
+/// error with [`Reason::Truncated`]. The payload of a message may lack its end, see [`Bytes`].
 #[derive(Clone, Debug)]
 pub struct Batch<'a> {
     reader: Reader<'a>,

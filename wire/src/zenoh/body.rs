@@ -33,7 +33,7 @@ impl<'a> Encoding<'a> {
 /// A published sample, or the sample of a reply.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Put<'a> {
-    /// Time of the source's hybrid clock.
+    /// Time of the source's hybrid logical clock.
     pub timestamp: Option<HlcTimestamp>,
     /// Encoding of the payload.
     pub encoding: Encoding<'a>,
@@ -41,7 +41,7 @@ pub struct Put<'a> {
     pub source: Option<SourceInfo>,
     /// Attachment; see [`super::Attachment`].
     pub attachment: Option<Bytes<'a>>,
-    /// Whether slices of the payload are in shared memory. The payload has no captured bytes then.
+    /// Whether slices of the payload are in shared memory. Such a payload has no captured bytes.
     pub is_shared: bool,
     /// The payload.
     pub payload: Bytes<'a>,
@@ -76,7 +76,7 @@ impl<'a> Put<'a> {
 /// A deleted sample; ROS sends none.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Del<'a> {
-    /// Time of the source's hybrid clock.
+    /// Time of the source's hybrid logical clock.
     pub timestamp: Option<HlcTimestamp>,
     /// Source, if an AdvancedPublisher sent the sample.
     pub source: Option<SourceInfo>,
@@ -105,7 +105,7 @@ impl<'a> Del<'a> {
     }
 }
 
-/// What a PUSH or a REPLY carries.
+/// Content of a PUSH or a REPLY.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Sample<'a> {
     /// A sample.
@@ -126,7 +126,7 @@ impl<'a> Sample<'a> {
     }
 }
 
-/// The body of a request: a call of a service, or a question for old samples.
+/// The body of a request: a call of a service, or a query for old samples.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Query<'a> {
     /// How replies are consolidated: 0 automatic, 1 none, 2 monotonic, 3 latest.
@@ -137,7 +137,7 @@ pub struct Query<'a> {
     pub source: Option<SourceInfo>,
     /// Encoding and payload: the request of a service.
     pub body: Option<(Encoding<'a>, Bytes<'a>)>,
-    /// Attachment; see [`super::Attachment`]. It follows the payload, so a cut capture lacks it.
+    /// Attachment; see [`super::Attachment`]. It follows the payload, so a cut capture may lack it.
     pub attachment: Option<Bytes<'a>>,
     /// Whether the capture ends before the extensions after the payload.
     pub is_cut: bool,
@@ -264,7 +264,7 @@ fn encoding<'a>(header: u8, reader: &mut Reader<'a>) -> Result<Encoding<'a>, Wir
     Encoding::read(reader)
 }
 
-/// Reads the consolidation that flag C announces; Zenoh takes an unknown one for automatic.
+/// Reads the consolidation that flag C announces; Zenoh treats an unknown one as automatic.
 fn consolidation(header: u8, reader: &mut Reader<'_>) -> Result<u64, WireError> {
     if header & 0x20 == 0 {
         return Ok(0);
@@ -272,7 +272,7 @@ fn consolidation(header: u8, reader: &mut Reader<'_>) -> Result<u64, WireError> 
     reader.z64("consolidation")
 }
 
-/// Reads a payload. One with slices in shared memory has the length of all slices together.
+/// Reads a payload. A payload with slices in shared memory has the length of all slices together.
 fn payload<'a>(is_shared: bool, reader: &mut Reader<'a>) -> Result<Bytes<'a>, WireError> {
     if !is_shared {
         return reader.bytes("payload");
@@ -286,7 +286,7 @@ fn payload<'a>(is_shared: bool, reader: &mut Reader<'a>) -> Result<Bytes<'a>, Wi
         let mut slice = reader.nested("slice")?;
         let size = match kind {
             0 => slice.rest().length,
-            // A descriptor begins with the length of what it describes.
+            // A descriptor begins with the length of the slice in shared memory.
             1 => slice.number("length of a shared slice")?,
             _ => return Err(start.error("kind of a slice", Reason::BadMarker)),
         };

@@ -7,7 +7,7 @@ use super::expression::{Mapping, WireExpr};
 use super::extension::Extensions;
 use super::reader::Reader;
 
-/// What a DECLARE declares or undeclares. Ids count per kind and sender.
+/// Content of a DECLARE: a declaration or its end. Ids are unique per kind and sender.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Declaration<'a> {
     /// An alias of the sender for a key.
@@ -42,7 +42,7 @@ pub enum Declaration<'a> {
         id: u32,
         /// Keys that it answers for.
         key: WireExpr<'a>,
-        /// Whether it has all there is.
+        /// Whether it is complete: it has all data of its keys.
         is_complete: bool,
         /// Distance in hops.
         distance: u16,
@@ -68,7 +68,7 @@ pub enum Declaration<'a> {
         /// The token, if repeated.
         key: Option<WireExpr<'a>>,
     },
-    /// The answer to an INTEREST has no further current declaration.
+    /// The end of the current declarations that answer an INTEREST.
     Final,
 }
 

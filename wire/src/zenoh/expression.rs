@@ -19,14 +19,14 @@ pub enum Mapping {
 pub struct WireExpr<'a> {
     /// Id of the alias; 0 for none.
     pub scope: u16,
-    /// What follows the alias' key; the whole key without an alias.
+    /// Rest of the key after the alias's key; the whole key without an alias.
     pub suffix: &'a str,
-    /// Whose alias it is.
+    /// The side that declared the alias.
     pub mapping: Mapping,
 }
 
 impl<'a> WireExpr<'a> {
-    /// Returns the key if the expression needs no table.
+    /// Returns the key if the expression has no alias.
     #[must_use]
     pub const fn key(&self) -> Option<&'a str> {
         if self.scope == 0 {
@@ -36,7 +36,8 @@ impl<'a> WireExpr<'a> {
         }
     }
 
-    /// Reads an expression with the flags N (a suffix follows) and M (the sender's alias).
+    /// Reads an expression with the flags N (a suffix follows) and M (the sender declared the
+    /// alias).
     pub(super) fn read(
         reader: &mut Reader<'a>,
         is_named: bool,

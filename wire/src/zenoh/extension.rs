@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_mandatory_extension_is_named() {
+    fn an_unknown_mandatory_extension_is_an_error_with_its_id() {
         let mut reader = Reader::whole(&[0x35, 1]);
         let error = Extensions::of(0x80).skip_all(&mut reader).unwrap_err();
         assert_eq!(error.what, "unknown mandatory extension 0x5");
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn the_reserved_encoding_ends_the_batch() {
+    fn an_extension_with_the_reserved_encoding_is_refused() {
         let mut reader = Reader::whole(&[0x60, 1]);
         assert!(Extensions::of(0x80).skip_all(&mut reader).is_err());
     }

@@ -1,4 +1,4 @@
-//! Identities and times of Zenoh: session ids, entities, hybrid clock timestamps.
+//! Identities and times of Zenoh: session ids, entities, timestamps of hybrid logical clocks.
 
 use core::fmt;
 use core::num::NonZeroU128;
@@ -35,8 +35,8 @@ impl ZenohId {
         NonZeroU128::new(value).map(Self)
     }
 
-    /// Returns the GUID prefix that stands for the session: [`VendorId::ZENOH`] and 20 digits of the
-    /// printed id, the first ones unless it has fewer.
+    /// Returns the GUID prefix that stands for the session: [`VendorId::ZENOH`] and 20 of the id's
+    /// 32 digits: the first ones, or the last ones if the first 12 are zero.
     #[must_use]
     pub fn guid_prefix(self) -> GuidPrefix {
         let bytes = self.0.get().to_be_bytes();
@@ -60,7 +60,7 @@ impl ZenohId {
         Self::from_le_bytes(bytes).ok_or(start.error("Zenoh id", Reason::BadValue))
     }
 
-    /// Reads an id of which the upper half of `flags` has the length.
+    /// Reads an id. The upper four bits of `flags` are its length minus 1.
     pub(super) fn behind(flags: u8, reader: &mut Reader<'_>) -> Result<Self, WireError> {
         Self::read(reader, usize::from(flags >> 4) + 1)
     }
@@ -97,7 +97,7 @@ impl EntityGlobalId {
         })
     }
 
-    /// Reads an extension that has nothing else.
+    /// Reads an extension that contains nothing else.
     pub(super) fn extension(mut value: Reader<'_>) -> Result<Self, WireError> {
         let id = Self::read(&mut value)?;
         value.finish("entity id")?;
@@ -105,7 +105,7 @@ impl EntityGlobalId {
     }
 }
 
-/// Source of a sample as AdvancedPublisher announces it (extension SourceInfo).
+/// Source of a sample as an AdvancedPublisher announces it (extension SourceInfo).
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct SourceInfo {
     /// The publisher.
@@ -153,7 +153,7 @@ impl HlcTimestamp {
         })
     }
 
-    /// Reads an extension that has nothing else.
+    /// Reads an extension that contains nothing else.
     pub(super) fn extension(mut value: Reader<'_>) -> Result<Self, WireError> {
         let timestamp = Self::read(&mut value)?;
         value.finish("timestamp")?;
@@ -168,7 +168,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_id_prints_without_leading_zeros() {
+    fn an_id_is_printed_and_parsed_without_leading_zeros() {
         let id = ZenohId::from_le_bytes(&[0x34, 0x12, 0x0a, 0x00]).unwrap();
         assert_eq!(id.to_string(), "a1234");
         assert_eq!(ZenohId::parse("a1234"), Some(id));

@@ -10,7 +10,7 @@ use crate::names::{DdsType, RosName, RosType};
 
 use super::attachment::Gid;
 
-/// Hash of types in Humble, which knows none.
+/// Placeholder for the hash of a type in Humble, which has no hashes.
 const NO_HASH: &str = "TypeHashNotSupported";
 
 /// Parses a type hash chunk: `Some(None)` for a version or placeholder without a known hash,
@@ -39,7 +39,7 @@ pub enum Key {
     NotRos,
 }
 
-/// The channel beside a topic that "buffer aware" endpoints use (rmw_zenoh of Lyrical and later).
+/// An additional channel of a topic for "buffer aware" endpoints (rmw_zenoh of Lyrical and later).
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Buffer {
     /// `_buf_cpu`: the topic's messages for all subscribers without other backends.
@@ -59,7 +59,7 @@ pub struct TopicKey {
     pub type_name: DdsType,
     /// Hash of the type; `None` in Humble.
     pub type_hash: Option<TypeHash>,
-    /// The channel beside the topic, if it is one.
+    /// The buffer channel, if the key is that of one.
     pub buffer: Option<Buffer>,
 }
 
@@ -96,7 +96,7 @@ impl TopicKey {
     }
 }
 
-/// Returns whether a type is a service's, or an action's service.
+/// Returns whether a type is that of a service, including the services of an action.
 pub(super) fn is_service(type_name: &str) -> bool {
     let is_action_service = ["_SendGoal_", "_GetResult_"]
         .iter()
@@ -104,7 +104,7 @@ pub(super) fn is_service(type_name: &str) -> bool {
     type_name.contains("::srv::") || type_name.contains("::action::") && is_action_service
 }
 
-/// Splits the suffix of a buffer channel off.
+/// Splits off the suffix of a buffer channel.
 fn buffer(key: &str) -> (&str, Option<Buffer>) {
     if let Some(base) = key.strip_suffix("/_buf_cpu") {
         return (base, Some(Buffer::Cpu));
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn services_and_actions_have_keys_too() {
+    fn keys_of_services_and_actions_are_parsed() {
         let key = topic(
             "0/robot1/add_two_ints/example_interfaces::srv::dds_::AddTwoInts_/TypeHashNotSupported",
         );
@@ -190,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn channels_of_buffers_belong_to_their_topic() {
+    fn buffer_channels_belong_to_their_topic() {
         let base = format!("0/image/sensor_msgs::msg::dds_::Image_/{HASH}");
         let cpu = topic(&format!("{base}/_buf_cpu"));
         assert_eq!(
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn other_keys_are_recognized() {
+    fn keys_of_advanced_publishers_tokens_and_others_are_distinguished() {
         let advanced =
             "0/rosout/rcl_interfaces::msg::dds_::Log_/TypeHashNotSupported/@adv/pub/9fb9/12/_";
         assert_eq!(Key::parse(advanced), Ok(Key::Advanced));
@@ -222,7 +222,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_text_is_a_key_or_not(key in ".{0,60}") {
+        fn no_text_makes_the_parser_of_keys_panic(key in ".{0,60}") {
             let _ = Key::parse(&key);
             let _ = Key::parse(&format!("0/{key}/{key}/TypeHashNotSupported"));
         }

@@ -1,4 +1,4 @@
-//! Zenoh 1.x (wire version 9) as rmw_zenoh_cpp speaks it, read without joining.
+//! Reads Zenoh 1.x (wire version 9) as rmw_zenoh_cpp uses it, without joining a session.
 //!
 //! A stream is a sequence of batches with a length prefix ([`Batch::split`]). A [`Batch`] yields
 //! transport messages and the [`NetworkMessage`]s of its `FRAME`s; all borrow from the input. A
@@ -6,17 +6,18 @@
 //! batch: each message that is complete up to its payload is read, and the payload has its length
 //! on the wire ([`Bytes`]).
 //!
-//! [`TopicKey`], [`Token`] and [`Attachment`] are rmw_zenoh's conventions on top: names and types
-//! of publications, the graph of nodes and endpoints, and the identity of each sample. [`Gid`]s
-//! are hashes of tokens, so a publication's attachment leads to its topic without any alias.
+//! [`TopicKey`], [`Token`] and [`Attachment`] are conventions of rmw_zenoh on top of Zenoh: names
+//! and types of publications, the graph of nodes and endpoints, and the identity of each sample.
+//! [`Gid`]s are hashes of tokens, so the attachment of a publication identifies its topic without
+//! any alias.
 //!
-//! The decoder keeps no state. Its user keeps the tables of aliases, one a connection and
-//! direction, and the chains of fragments, one a lane. Unknown extensions are skipped, so later 1.x
-//! versions stay readable. Numbers that exceed their field and extensions with a wrong length are
-//! errors, where Zenoh cuts off the number or reads on.
+//! The decoder keeps no state. Its caller keeps the tables of aliases, one per connection and
+//! direction, and the chains of fragments, one per lane. Unknown extensions are skipped, so later
+//! 1.x versions stay readable. Numbers that exceed their field and extensions with a wrong length
+//! are errors here. Zenoh cuts off such a number, and reads on after such an extension.
 //!
-//! Zenoh has no specification of the wire: the comments name files of its crate `zenoh-protocol`
-//! 1.10, and of rmw_zenoh. The tests compare this decoder with Zenoh's own, `zenoh-codec`.
+//! Zenoh has no specification of the wire, so the comments name files of its crate `zenoh-protocol`
+//! 1.10 and of rmw_zenoh. The tests compare this decoder with Zenoh's own, `zenoh-codec`.
 
 mod attachment;
 mod batch;

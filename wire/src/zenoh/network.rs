@@ -16,7 +16,7 @@ use super::reader::{Bytes, Reader};
 pub struct MessageQos(pub u8);
 
 impl MessageQos {
-    /// Priority DATA; dropped rather than blocking.
+    /// Priority DATA; a congested sender drops the message rather than waiting.
     pub const DEFAULT: Self = Self(Priority::DATA.0);
 
     /// Returns the priority.
@@ -31,7 +31,7 @@ impl MessageQos {
         self.0 & 0x08 != 0
     }
 
-    /// Returns whether the message does not wait for others to share its batch.
+    /// Returns whether the message is sent without waiting for others to share its batch.
     #[must_use]
     pub const fn is_express(self) -> bool {
         self.0 & 0x10 != 0
@@ -43,7 +43,7 @@ impl MessageQos {
 pub struct Common {
     /// Quality of service.
     pub qos: MessageQos,
-    /// Time of a hybrid clock; rmw_zenoh sends it in the PUT instead.
+    /// Time of a hybrid logical clock; rmw_zenoh sends it in the PUT instead.
     pub timestamp: Option<HlcTimestamp>,
     /// Node of the routing tree from which the message comes; 0 unless routers forward it.
     pub node: u16,
@@ -56,7 +56,7 @@ impl Common {
         node: 0,
     };
 
-    /// Takes an extension if it is one of these; returns whether it is.
+    /// Applies an extension if it is a common one; returns whether it is.
     fn take(&mut self, extension: &Extension<'_>) -> Result<bool, WireError> {
         match extension.id {
             0x21 => {
@@ -69,7 +69,7 @@ impl Common {
         Ok(true)
     }
 
-    /// Takes an extension of a message that has a node.
+    /// Applies an extension if it is a common one or the node; returns whether it is.
     fn take_with_node(&mut self, extension: &Extension<'_>) -> Result<bool, WireError> {
         if extension.id == 0x33 {
             let [low, high, ..] = extension.number.to_le_bytes();
@@ -79,7 +79,7 @@ impl Common {
         self.take(extension)
     }
 
-    /// Reads the extensions of a message that has no others.
+    /// Reads the extensions of a message that has only a node and the common ones.
     fn read(header: u8, reader: &mut Reader<'_>) -> Result<Self, WireError> {
         let mut common = Self::DEFAULT;
         let mut extensions = Extensions::of(header);
@@ -91,7 +91,7 @@ impl Common {
         Ok(common)
     }
 
-    /// Reads the extensions of a message that has no node and no others.
+    /// Reads the extensions of a message that has only the common ones.
     fn read_without_node(header: u8, reader: &mut Reader<'_>) -> Result<Self, WireError> {
         let mut common = Self::DEFAULT;
         let mut extensions = Extensions::of(header);
@@ -118,11 +118,11 @@ pub struct Push<'a> {
 /// A declaration.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Declare<'a> {
-    /// The INTEREST that it answers.
+    /// Number of the INTEREST that the declaration answers.
     pub interest: Option<u32>,
     /// Common extensions.
     pub common: Common,
-    /// What is declared.
+    /// The declaration itself.
     pub declaration: Declaration<'a>,
 }
 
@@ -137,11 +137,11 @@ pub struct Request<'a> {
     pub common: Common,
     /// Which queryables answer: 0 the best, 1 all, 2 all complete ones.
     pub target: u8,
-    /// Most replies.
+    /// Maximum number of replies.
     pub budget: Option<u64>,
-    /// Milliseconds until the request ends.
+    /// Time until the request ends, in milliseconds.
     pub timeout: Option<u64>,
-    /// The question.
+    /// The query.
     pub query: Query<'a>,
 }
 
@@ -169,16 +169,18 @@ pub struct ResponseFinal {
     pub common: Common,
 }
 
-/// A question for declarations.
+/// A request for declarations.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Interest<'a> {
     /// Number of the interest.
     pub id: u32,
-    /// Whether current declarations are wanted.
+    /// Whether current declarations are requested.
     pub is_current: bool,
-    /// Whether future declarations are wanted. An interest in neither ends an earlier one.
+    /// Whether future declarations are requested. An interest in neither current nor future
+    /// declarations ends an earlier interest.
     pub is_future: bool,
-    /// Bits 0 to 3: aliases, subscribers, queryables, tokens; 7: aggregated.
+    /// Requested kinds: bits 0 to 3 are aliases, subscribers, queryables and tokens. Bit 7 requests
+    /// an aggregated answer.
     pub options: u8,
     /// Keys of interest; `None` for all.
     pub key: Option<WireExpr<'a>>,
@@ -186,14 +188,14 @@ pub struct Interest<'a> {
     pub common: Common,
 }
 
-/// Operation and maintenance; number 1 is the gossip of locators.
+/// Operation, administration and maintenance. Kind 1 is the gossip of locators.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Oam<'a> {
     /// Number of the kind.
     pub id: u16,
-    /// Body of a number.
+    /// Body, if it is a number.
     pub number: Option<u64>,
-    /// Body of bytes.
+    /// Body, if it consists of bytes.
     pub bytes: Option<Bytes<'a>>,
 }
 
@@ -204,7 +206,8 @@ impl<'a> Oam<'a> {
         let mut extensions = Extensions::of(header);
         while let Some(extension) = extensions.next(reader)? {
             match extension.id {
-                // Quality of service: mandatory in the transport, not in the network.
+                // Quality of service. The extension is mandatory in transport messages, not in
+                // network messages.
                 0x21 | 0x31 => {}
                 0x42 => drop(HlcTimestamp::extension(extension.value)?),
                 _ => extension.skip()?,
@@ -234,9 +237,9 @@ pub enum NetworkMessage<'a> {
     Response(Response<'a>),
     /// The end of the answers to a request.
     ResponseFinal(ResponseFinal),
-    /// A question for declarations.
+    /// A request for declarations.
     Interest(Interest<'a>),
-    /// Operation and maintenance.
+    /// Operation, administration and maintenance.
     Oam(Oam<'a>),
 }
 
@@ -254,7 +257,7 @@ impl<'a> NetworkMessage<'a> {
         header & 0x1f >= Self::INTEREST
     }
 
-    /// Reads a message that FRAGMENTs carried, from all their bytes.
+    /// Reads a message from the joined bytes of all its FRAGMENTs.
     ///
     /// # Errors
     /// Fails if the bytes are not exactly one message.

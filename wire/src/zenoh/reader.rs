@@ -39,8 +39,8 @@ pub struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
-    /// Creates a reader at the start of `captured`, which had `length` bytes on the wire. A length
-    /// below that of the captured bytes counts as equal to it.
+    /// Creates a reader at the start of `captured`, which had `length` bytes on the wire. A
+    /// `length` below that of the captured bytes counts as equal to it.
     #[must_use]
     pub const fn new(captured: &'a [u8], length: usize) -> Self {
         Self {
@@ -55,8 +55,8 @@ impl<'a> Reader<'a> {
         Self::new(bytes, bytes.len())
     }
 
-    /// Creates a reader of the beginning of a message of unknown length, as the first FRAGMENT of a
-    /// chain has it.
+    /// Creates a reader of the beginning of a message of unknown length, such as the first FRAGMENT
+    /// of a chain.
     #[must_use]
     pub const fn beginning(captured: &'a [u8]) -> Self {
         Self::new(captured, usize::MAX)
@@ -127,8 +127,8 @@ impl<'a> Reader<'a> {
         self.cursor.u16(what).map_err(|_| absent)
     }
 
-    /// Reads a number of variable length: seven bits a byte, least significant first, 0x80 for
-    /// more. A ninth byte has eight bits and no successor.
+    /// Reads a number of variable length: seven bits per byte, least significant first. Bit 0x80
+    /// means that a byte follows. A ninth byte has eight bits and is the last.
     pub(super) fn z64(&mut self, what: &'static str) -> Result<u64, WireError> {
         let mut value = 0;
         for shift in (0..56).step_by(7) {
@@ -157,14 +157,14 @@ impl<'a> Reader<'a> {
         usize::try_from(length).map_err(|_| start.error(what, Reason::BadLength))
     }
 
-    /// Reads a length of 32 bits and opens a reader of so many bytes, of which the capture may lack
-    /// the end.
+    /// Reads a length of at most 32 bits. Returns a reader of that many bytes, of which the capture
+    /// may lack the end.
     pub(super) fn nested(&mut self, what: &'static str) -> Result<Self, WireError> {
         let length = self.length(what, u64::from(u32::MAX))?;
         self.split(what, length)
     }
 
-    /// Opens a reader of the next `length` bytes, of which the capture may lack the end.
+    /// Returns a reader of the next `length` bytes, of which the capture may lack the end.
     pub(super) fn split(&mut self, what: &'static str, length: usize) -> Result<Self, WireError> {
         let missing = length.saturating_sub(self.remaining());
         if missing > self.missing {
@@ -178,12 +178,13 @@ impl<'a> Reader<'a> {
         })
     }
 
-    /// Reads a length of 32 bits and that many bytes, of which the capture may lack the end.
+    /// Reads a length of at most 32 bits and that many bytes, of which the capture may lack the
+    /// end.
     pub(super) fn bytes(&mut self, what: &'static str) -> Result<Bytes<'a>, WireError> {
         Ok(self.nested(what)?.rest())
     }
 
-    /// Returns all that follows.
+    /// Returns all bytes that follow.
     pub(super) const fn rest(&self) -> Bytes<'a> {
         Bytes {
             captured: self.cursor.rest(),
@@ -204,8 +205,8 @@ impl<'a> Reader<'a> {
         str::from_utf8(bytes).map_err(|_| start.error(what, Reason::BadText))
     }
 
-    /// Fails unless everything was read: a field that Zenoh reads without its length has to fill
-    /// the length.
+    /// Fails unless everything was read. Some fields have a length that Zenoh does not check; here
+    /// the field must fill it.
     pub(super) const fn finish(&self, what: &'static str) -> Result<(), WireError> {
         if self.is_at_end() {
             Ok(())
@@ -215,8 +216,8 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// Returns a number in the encoding of variable length: seven bits a byte, least significant first,
-/// 0x80 for more. A ninth byte has eight bits and no successor.
+/// Returns a number in the encoding of variable length: seven bits per byte, least significant
+/// first. Bit 0x80 means that a byte follows. A ninth byte has eight bits and is the last.
 #[must_use]
 pub fn vle(mut value: u64) -> Vec<u8> {
     let mut bytes = Vec::new();
@@ -238,7 +239,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_ninth_byte_has_eight_bits() {
+    fn the_ninth_byte_of_a_number_has_eight_bits() {
         let mut reader = Reader::whole(&[0xff; 10]);
         assert_eq!(reader.z64("n"), Ok(u64::MAX));
         assert_eq!(reader.remaining(), 1);
@@ -250,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_must_fit_its_field() {
+    fn a_number_too_large_for_its_field_is_refused() {
         let bytes = [0x80, 0x80, 0x04];
         let mut reader = Reader::whole(&bytes);
         assert_eq!(
@@ -284,7 +285,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn numbers_come_back(value: u64, shift in 0_u32..64) {
+        fn numbers_survive_a_round_trip(value: u64, shift in 0_u32..64) {
             let bytes = vle(value >> shift);
             let mut reader = Reader::whole(&bytes);
             prop_assert_eq!(reader.z64("n"), Ok(value >> shift));
@@ -292,7 +293,7 @@ mod tests {
         }
 
         #[test]
-        fn any_bytes_are_a_number_or_end(bytes: Vec<u8>) {
+        fn numbers_of_any_bytes_take_one_to_nine_bytes(bytes: Vec<u8>) {
             let mut reader = Reader::whole(&bytes);
             while !reader.is_at_end() {
                 let before = reader.offset();

@@ -1,5 +1,5 @@
-//! What a session agrees on in INIT and OPEN, and whether its traffic can be observed
-//! (`zenoh-protocol`, `transport/init.rs`, `open.rs` and `join.rs`).
+//! The parameters that a session negotiates in INIT and OPEN, and whether its traffic can be
+//! observed (`zenoh-protocol`, `transport/init.rs`, `open.rs` and `join.rs`).
 
 use core::fmt;
 use core::time::Duration;
@@ -44,7 +44,7 @@ impl fmt::Display for WhatAmI {
     }
 }
 
-/// Sizes of a session's numbers, as the wire has them: bits 0 and 1 for the sequence numbers of
+/// Sizes of a session's numbers, as encoded on the wire: bits 0 and 1 for the sequence numbers of
 /// `FRAME`s, bits 2 and 3 for the ids of requests.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Resolution(pub u8);
@@ -53,10 +53,10 @@ impl Resolution {
     /// 32 bits each: the default.
     pub const DEFAULT: Self = Self(0x0a);
 
-    /// Returns the bits that a sequence number has; the number after the highest is zero.
+    /// Returns the mask of the bits of a sequence number. The number after the highest is zero.
     ///
-    /// A number of n bits takes no more than n bits of the wire, so it has fewer: 28 with the
-    /// default resolution of 32 (`io/zenoh-transport/src/common/seq_num.rs`).
+    /// The encoding of a number must fit n bits on the wire, so the number has fewer bits: 28 with
+    /// the default resolution of 32 (`io/zenoh-transport/src/common/seq_num.rs`).
     #[must_use]
     pub const fn sequence_number_mask(self) -> u32 {
         match self.0 & 0x03 {
@@ -100,7 +100,7 @@ pub struct Features {
 /// INIT: the sides introduce themselves.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Init<'a> {
-    /// Whether the acceptor answers, with the values that both support.
+    /// Whether this is the acceptor's answer, with the values that both sides support.
     pub is_ack: bool,
     /// Version of the wire format, see [`VERSION`].
     pub version: u8,
@@ -110,13 +110,13 @@ pub struct Init<'a> {
     pub zid: ZenohId,
     /// Sizes of numbers.
     pub resolution: Resolution,
-    /// Most bytes of a batch.
+    /// Maximum size of a batch, in bytes.
     pub batch_size: u16,
     /// Cookie that the initiator's OPEN returns; empty unless [`Self::is_ack`].
     pub cookie: &'a [u8],
     /// Offered features; with [`Self::is_ack`], the accepted ones.
     pub features: Features,
-    /// Patch level of the protocol; from 1 on, FRAGMENTs mark the first of a chain.
+    /// Patch level of the protocol. Since level 1, the first FRAGMENT of a chain is marked.
     pub patch: u64,
     /// Name of the sender's region, since Zenoh 1.10.
     pub region: Option<Bytes<'a>>,
@@ -189,9 +189,9 @@ impl Open {
 /// Next sequence numbers of one priority's lanes.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Hash, Debug)]
 pub struct NextSequenceNumbers {
-    /// Of the reliable lane.
+    /// Next number of the reliable lane.
     pub reliable: u32,
-    /// Of the best-effort lane.
+    /// Next number of the best-effort lane.
     pub best_effort: u32,
 }
 
@@ -215,7 +215,7 @@ pub struct Join {
     pub zid: ZenohId,
     /// Sizes of numbers.
     pub resolution: Resolution,
-    /// Most bytes of a batch.
+    /// Maximum size of a batch, in bytes.
     pub batch_size: u16,
     /// Time without any message after which the membership ends.
     pub lease: Duration,
@@ -236,7 +236,7 @@ impl Join {
             zid: hello.zid,
             resolution: hello.resolution,
             batch_size: hello.batch_size,
-            // Flag T is the acknowledgement's bit of INIT.
+            // Flag T is the bit that marks the acknowledgement in INIT.
             lease: seconds_or_milliseconds(header & 0x20 != 0, reader)?,
             next: NextSequenceNumbers::read(reader)?,
             next_by_priority: None,
@@ -322,7 +322,7 @@ pub struct Side {
     pub whatami: WhatAmI,
 }
 
-/// What both sides of a session agreed on.
+/// The parameters of a session on which both sides agreed.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Session {
     /// Version of the wire format.
@@ -333,7 +333,7 @@ pub struct Session {
     pub acceptor: Side,
     /// Sizes of numbers.
     pub resolution: Resolution,
-    /// Most bytes of a batch.
+    /// Maximum size of a batch, in bytes.
     pub batch_size: u16,
     /// Features that both sides have.
     pub features: Features,
@@ -363,7 +363,8 @@ impl fmt::Display for Unobservable {
 }
 
 impl Session {
-    /// Returns the agreement of an INIT and its acknowledgement: what both have.
+    /// Returns the session that an INIT and its acknowledgement establish, with the values that
+    /// both sides support.
     #[must_use]
     pub fn agreed(init: &Init<'_>, ack: &Init<'_>) -> Self {
         let side = |init: &Init<'_>| Side {
@@ -391,8 +392,9 @@ impl Session {
 
     /// Returns why the session cannot be observed; `None` if it can.
     ///
-    /// Shared memory does not prevent it: sizes, identities and sequence numbers still pass the
-    /// connection. With several links, each connection has gaps in its sequence numbers.
+    /// Shared memory does not prevent observation: sizes, identities and sequence numbers still
+    /// pass through the connection. With several links, each connection has gaps in its sequence
+    /// numbers.
     #[must_use]
     pub const fn unobservable(&self) -> Option<Unobservable> {
         if self.version != VERSION {

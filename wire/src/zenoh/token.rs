@@ -1,7 +1,7 @@
 //! Liveliness tokens: the ROS graph in Zenoh (rmw_zenoh, `liveliness_utils.cpp`).
 //!
-//! A token lives as long as the node or endpoint that declares it. A slash within a chunk is `%`,
-//! and an empty chunk too.
+//! A token lives as long as the node or endpoint that declares it. `%` stands for a slash within a
+//! chunk, and for an empty chunk.
 
 use alloc::boxed::Box;
 use alloc::format;
@@ -17,7 +17,7 @@ use super::attachment::Gid;
 use super::identity::ZenohId;
 use super::{key, token_qos};
 
-/// Longest token that is parsed.
+/// Maximum length of a token, in bytes.
 const MAX_LEN: usize = 4096;
 /// Number of chunks of a node's token.
 const NODE_CHUNKS: usize = 9;
@@ -52,7 +52,7 @@ impl EndpointKind {
 pub struct NodeToken {
     /// Domain.
     pub domain: DomainId,
-    /// Session: the process.
+    /// Id of the session, which is a process.
     pub session: ZenohId,
     /// Number of the node in the session.
     pub node: u64,
@@ -94,7 +94,7 @@ pub struct EndpointToken {
     pub qos: Option<Qos>,
     /// Backends of buffers (rmw_zenoh of Lyrical and later).
     pub backends: Option<Box<str>>,
-    /// Identity in the attachments of the endpoint's samples and requests.
+    /// Identity of the endpoint in the attachments of its samples and requests.
     pub gid: Gid,
 }
 
@@ -131,7 +131,8 @@ pub enum Token {
     Endpoint(EndpointToken),
     /// A route of the bridge.
     Bridge(BridgeToken),
-    /// Not of the ROS graph: those of AdvancedPublishers, of the bridge itself, of others.
+    /// Not part of the ROS graph: a token of an AdvancedPublisher, of the bridge itself, or of
+    /// another application.
     Other,
 }
 
@@ -212,7 +213,7 @@ fn demangle(chunk: &str) -> String {
     chunk.replace('%', "/")
 }
 
-/// Returns the path in a chunk, which begins with a slash: `/` if it is empty.
+/// Returns the path in a chunk. The path begins with a slash; an empty path is `/`.
 fn path(chunk: &str) -> Result<Box<str>, WireError> {
     if !plain(chunk)?.starts_with('%') {
         return Err(error(Reason::BadValue));
@@ -220,7 +221,7 @@ fn path(chunk: &str) -> Result<Box<str>, WireError> {
     Ok(demangle(chunk).into())
 }
 
-/// Checks text that has to be plain and not empty.
+/// Returns text that must be plain and not empty.
 fn plain(chunk: &str) -> Result<&str, WireError> {
     if chunk.is_empty() {
         return Err(error(Reason::BadValue));
@@ -271,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn a_publisher_has_its_node_topic_and_qos() {
+    fn the_token_of_a_publisher_yields_node_topic_and_qos() {
         let talker = endpoint(TALKER);
         assert_eq!(talker.kind, EndpointKind::Publisher);
         assert_eq!((talker.node.domain, talker.entity), (DomainId(0), 10));
@@ -288,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_has_its_namespace() {
+    fn the_token_of_a_node_yields_namespace_and_name() {
         let token = "@ros2_lv/0/9fb9a8907b5b85c9467c19b7ec7b347a/3/3/NN/%/%robot2/dense_sink";
         let Ok(Token::Node(node)) = Token::parse(token) else {
             panic!("no node");
@@ -299,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn servers_without_hashes_and_backends_are_read() {
+    fn endpoints_without_a_hash_and_with_backends_are_parsed() {
         let token = "@ros2_lv/5/e2/0/17/SC/%/%robot2/listener/%robot1%add_two_ints/\
                      example_interfaces::srv::dds_::AddTwoInts_/TypeHashNotSupported/::,10:,:,:,,";
         let client = endpoint(token);
@@ -316,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn the_bridge_is_recognized() {
+    fn a_route_of_the_bridge_is_recognized() {
         let token = "@/a1b2/@ros2_lv/MP/robot§scan/sensor_msgs§msg§LaserScan/K:1:2,5:";
         let Ok(Token::Bridge(route)) = Token::parse(token) else {
             panic!("no route");
@@ -352,7 +353,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_text_is_a_token_or_not(text in "[@/%a-zA-Z0-9§:,_]{0,60}") {
+        fn no_text_makes_the_parser_of_tokens_panic(text in "[@/%a-zA-Z0-9§:,_]{0,60}") {
             let _ = Token::parse(&text);
             let _ = Token::parse(&format!("@ros2_lv/0/a/0/0/MP/{text}"));
             let _ = Token::parse(&format!("@/a/@ros2_lv/MP/{text}"));

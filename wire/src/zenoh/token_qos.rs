@@ -1,7 +1,8 @@
 //! QoS of an endpoint as its liveliness token has it (rmw_zenoh,
 //! `liveliness_utils.cpp`).
 //!
-//! Ten numbers of the enumerations of `rmw/types.h`; an absent one is the default of rmw_zenoh:
+//! The text has eleven numbers. Kinds have the numbers of the enumerations in `rmw/types.h`. An
+//! absent number means the default of rmw_zenoh:
 //! `<reliability>:<durability>:<history>,<depth>:<deadline s>,<ns>:<lifespan s>,<ns>:<liveliness>,
 //! <lease s>,<ns>`.
 
@@ -14,7 +15,7 @@ use crate::time::RtpsDuration;
 /// Depth of an endpoint whose token has none.
 const DEFAULT_DEPTH: i32 = 42;
 
-/// Parses the QoS of an endpoint; `None` if the text has another form or a number without meaning.
+/// Parses the QoS of an endpoint; `None` if the text has another form or an undefined number.
 pub(super) fn parse(text: &str) -> Option<Qos> {
     let mut qos = Qos::defaults(Role::Writer, VendorId::UNKNOWN);
     let mut policies = text.split(':');
@@ -55,7 +56,7 @@ pub(super) fn parse(text: &str) -> Option<Qos> {
     next().is_none().then_some(qos)
 }
 
-/// Parses a number: `Some(None)` for an empty text, `None` for anything else than a number.
+/// Parses a number: `Some(None)` for an empty text, `None` for text that is not a number.
 fn number(text: &str) -> Option<Option<u64>> {
     if text.is_empty() {
         return Some(None);
@@ -87,7 +88,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn absent_values_are_the_defaults_of_rmw_zenoh() {
+    fn absent_values_have_the_defaults_of_rmw_zenoh() {
         let qos = parse("::,7:,:,:,,").unwrap();
         assert_eq!(qos.reliability, Reliability::RELIABLE);
         assert_eq!(qos.durability, Durability::VOLATILE);
@@ -99,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn all_values_can_differ() {
+    fn values_that_differ_from_the_defaults_are_parsed() {
         let qos = parse("2:1:2,5:1,500000000:2,0:3,9223372036,854775807").unwrap();
         assert_eq!(qos.reliability, Reliability::BEST_EFFORT);
         assert_eq!(qos.durability, Durability::TRANSIENT_LOCAL);
@@ -112,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn other_forms_are_unknown() {
+    fn text_of_another_form_is_refused() {
         for text in [
             "",
             "1:2:1,10",
@@ -128,7 +129,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_text_is_a_qos_or_not(text in "[0-9:,]{0,40}") {
+        fn no_text_makes_the_parser_of_qos_panic(text in "[0-9:,]{0,40}") {
             let _ = parse(&text);
         }
     }

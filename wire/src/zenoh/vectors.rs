@@ -1,5 +1,6 @@
-//! Batches of a router and two peers (eclipse-zenoh 1.10.2 with rmw_zenoh's configuration), as they
-//! were captured. Cookies, and the key and payload of the reply, have other bytes of their length.
+//! Captured batches of a router and two peers (eclipse-zenoh 1.10.2 with rmw_zenoh's
+//! configuration). Cookies, and the key and payload of the reply, are replaced by other bytes of
+//! the same length.
 
 use std::string::ToString;
 use std::time::Duration;
@@ -34,7 +35,7 @@ fn read(batch: &[u8]) -> Vec<Message<'_>> {
     Batch::whole(batch).collect::<Result<_, _>>().unwrap()
 }
 
-/// Returns the batches, all of them whole.
+/// Returns all batches, each of them whole.
 fn all() -> Vec<Vec<u8>> {
     let cookie = [7; 49];
     let plain = [D_SUB, PUSH, REQUEST, U_TOKEN, INIT_SYN, OPEN_ACK, "04"];
@@ -66,7 +67,7 @@ fn response() -> Vec<u8> {
 }
 
 #[test]
-fn the_session_begins() {
+fn two_init_messages_establish_a_session() {
     let syn = bytes(INIT_SYN);
     let [Message::Init(syn)] = read(&syn)[..] else {
         panic!("no INIT");
@@ -136,7 +137,7 @@ fn a_subscriber_is_declared_on_the_control_lane() {
 }
 
 #[test]
-fn a_publication_has_its_attachment_and_payload() {
+fn a_publication_yields_its_attachment_and_payload() {
     let batch = bytes(PUSH);
     let [
         Message::Frame(frame),
@@ -158,7 +159,7 @@ fn a_publication_has_its_attachment_and_payload() {
     );
     let attachment = Attachment::parse(put.attachment.unwrap().whole().unwrap()).unwrap();
     assert_eq!(attachment.sequence_number, SequenceNumber(4));
-    // Taken from two clocks' readings of one moment.
+    // Both clocks were read at about the same time.
     let source = attachment.source_timestamp.unwrap();
     let distance = source.distance(timestamp.timestamp().unwrap());
     assert!(distance < Duration::from_secs(1), "{distance:?}");
@@ -167,7 +168,7 @@ fn a_publication_has_its_attachment_and_payload() {
 }
 
 #[test]
-fn a_request_and_its_reply_have_one_number() {
+fn a_request_and_its_reply_have_the_same_number() {
     let batch = bytes(REQUEST);
     let [_, Message::Network(NetworkMessage::Request(request))] = read(&batch)[..] else {
         panic!("no REQUEST");
@@ -222,9 +223,9 @@ fn a_token_is_undeclared_without_its_key() {
 }
 
 #[test]
-fn a_cut_capture_gives_what_was_complete() {
+fn a_cut_capture_yields_its_complete_messages() {
     let batch = bytes(PUSH);
-    // Up to the last byte before the payload.
+    // Length of the batch before the payload.
     let head = batch.len() - 20;
     for captured in 0..batch.len() {
         let messages: Vec<_> = Batch::new(&batch[..captured], batch.len()).collect();
@@ -268,7 +269,7 @@ fn a_cut_request_keeps_its_number_and_size() {
 }
 
 #[test]
-fn batches_that_end_early_are_malformed() {
+fn a_batch_that_ends_early_is_malformed_and_not_truncated() {
     for batch in all() {
         read(&batch);
         for length in 1..batch.len() {
@@ -282,7 +283,7 @@ fn batches_that_end_early_are_malformed() {
 }
 
 #[test]
-fn any_changed_byte_is_survived() {
+fn no_changed_byte_makes_the_decoder_panic() {
     for batch in all() {
         for position in 0..batch.len() {
             for changed in 0..=255 {
@@ -310,7 +311,7 @@ fn a_frame_ends_at_a_transport_message() {
 }
 
 #[test]
-fn fragments_make_one_message() {
+fn fragments_are_joined_into_one_message() {
     let push = &bytes(PUSH)[5..];
     let first = [&[0x66, 0x05][..], &push[..70]].concat();
     let last = [&[0x26, 0x06][..], &push[70..]].concat();
@@ -337,7 +338,7 @@ fn fragments_make_one_message() {
 }
 
 #[test]
-fn a_stream_has_length_prefixes() {
+fn a_stream_is_split_at_its_length_prefixes() {
     let stream = [2, 0, 4, 4, 1, 0, 4, 9];
     let (batch, rest) = Batch::split(&stream).unwrap();
     assert_eq!((batch, rest), (&[4, 4][..], &[1, 0, 4, 9][..]));

@@ -1,4 +1,4 @@
-//! Messages as this crate reads them, in the common form.
+//! Messages as this crate reads them, in the text form of both decoders.
 
 use ros2probe_wire::WireError;
 use ros2probe_wire::zenoh::{
@@ -28,7 +28,7 @@ fn transport(message: Message<'_>) -> String {
                 init.cookie,
                 (init.features.qos, init.features.auth),
                 (init.features.multi_link, init.features.low_latency),
-                // Zenoh keeps 8 bits.
+                // Zenoh keeps 8 bits of the patch level.
                 (init.features.compression, init.patch & 0xff),
                 init.region.map(whole),
             )
@@ -89,7 +89,7 @@ fn network(message: &NetworkMessage<'_>) -> String {
             (
                 (request.id, key(request.key), common(request.common)),
                 (request.target, request.timeout),
-                // Zenoh keeps 32 bits, and takes zero for none.
+                // Zenoh keeps 32 bits, and treats zero as no budget.
                 request
                     .budget
                     .map(|budget| budget & u64::from(u32::MAX))
@@ -136,7 +136,7 @@ fn network(message: &NetworkMessage<'_>) -> String {
             "INTEREST {:?}",
             (
                 (interest.id, interest.is_current, interest.is_future),
-                // Flags N and M are those of the key.
+                // The bits 0x20 and 0x40 are the flags N and M of the key.
                 interest.options & 0x9f,
                 interest.key.map(key),
                 common(interest.common),
@@ -232,7 +232,7 @@ fn source(source: SourceInfo) -> (String, u32, u32) {
 }
 
 fn encoding(encoding: Encoding<'_>) -> (u32, Option<&[u8]>) {
-    // Zenoh keeps 16 bits.
+    // Zenoh keeps 16 bits of the id.
     (encoding.id & 0xffff, encoding.schema)
 }
 

@@ -1,4 +1,4 @@
-//! Messages as Zenoh's codec writes and reads them, in the common form.
+//! Messages as Zenoh's codec writes and reads them, in the text form of both decoders.
 
 use zenoh_buffers::buffer::SplitBuffer;
 use zenoh_buffers::reader::{HasReader, Reader};
@@ -50,7 +50,7 @@ pub fn interest() -> NetworkMessage {
     NetworkBody::Interest(Interest::rand()).into()
 }
 
-/// Reads a batch as `zenoh-transport` does: all of it, or nothing.
+/// Reads a batch as `zenoh-transport` does; `None` if any message is malformed.
 pub fn read(batch: &[u8]) -> Option<Read> {
     let mut reader = batch.reader();
     let mut read = Read {
