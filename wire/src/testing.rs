@@ -1,4 +1,4 @@
-//! Shared by the parsers' tests: captured datagrams, an encoder, and two ways to damage bytes.
+//! Captured datagrams, an encoder, and damaged bytes, which the tests of the parsers share.
 
 use std::string::ToString;
 use std::vec::Vec;
@@ -89,7 +89,7 @@ pub(crate) fn hurt(bytes: &[u8], mut read: impl FnMut(&[u8])) {
     }
 }
 
-/// Encodes what the parsers read. Alignment counts from the first byte written.
+/// Encodes the formats that the parsers read. Alignment counts from the first byte written.
 #[derive(Clone)]
 pub(crate) struct Encoder {
     pub(crate) bytes: Vec<u8>,

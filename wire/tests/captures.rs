@@ -157,8 +157,8 @@ struct Parts {
     end: Option<u32>,
 }
 
-/// Visits every whole datagram of a little-endian classic capture; returns whether all of it was
-/// captured.
+/// Visits every whole datagram of a little-endian pcap capture; returns whether every frame was
+/// captured as a whole.
 fn datagrams(capture: &[u8], mut each: impl FnMut(&[u8])) -> bool {
     let link = Link(u16::try_from(word(&capture[20..]) & 0xffff).unwrap());
     let mut parts: HashMap<([u8; 16], [u8; 16], u32), Parts> = HashMap::new();
@@ -247,7 +247,7 @@ fn locators(locators: &[Locator]) -> Value {
     locators.iter().map(text).collect()
 }
 
-/// Compares `ours` with the facts under `key`; facts absent there were not on the wire.
+/// Compares `ours` with the fact under `key`. A value without a fact was not on the wire.
 fn check(context: &str, facts: &Value, key: &str, ours: &Value) {
     if let Some(theirs) = facts.get(key) {
         assert_eq!(theirs, ours, "{context}: {key}");
@@ -485,7 +485,7 @@ fn check_writers(facts: &Value, found: &Found) {
 }
 
 #[test]
-fn captures_read_as_the_independent_decoder_read_them() {
+fn captures_yield_the_facts_of_the_independent_decoder() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut all = Vec::new();
     captures(&root.join("tests/data"), &mut all);
@@ -498,7 +498,7 @@ fn captures_read_as_the_independent_decoder_read_them() {
         println!("{}", capture.display());
         let facts: Value = serde_json::from_slice(&read(&facts)).unwrap();
         let capture = read(&capture);
-        // Two passes: a sample may precede its writer's announcement.
+        // There are two passes, because a sample may precede its writer's announcement.
         let mut first = Found::default();
         datagrams(&capture, |bytes| {
             // Checks the invariants for any bytes, including the agreement with the kernel filter's

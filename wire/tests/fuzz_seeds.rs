@@ -1,6 +1,6 @@
-//! Runs the fuzz targets' entry functions over their seeds and all truncations of them, so that
-//! their checks run without a fuzzer. Of the seeds, `found-*` were found by fuzzing: kept for
-//! what they reach, and taken as they are.
+//! Runs the functions of the fuzz targets over their seeds and all truncations of these, so that
+//! the checks run without a fuzzer. The seeds `found-*` come from fuzzing. They are kept for the
+//! code that they reach, and run unchanged.
 
 #![expect(
     clippy::unwrap_used,
@@ -14,7 +14,8 @@ mod entry;
 use std::fs;
 use std::path::Path;
 
-/// Every seed in a directory, every truncation of it, and every byte of it changed.
+/// Runs `entry` on every seed in a directory, on every truncation of it, and with every byte
+/// changed.
 fn run(directory: &str, entry: fn(&[u8])) {
     let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join(directory);
     let mut count = 0;
@@ -43,22 +44,22 @@ fn run(directory: &str, entry: fn(&[u8])) {
 }
 
 #[test]
-fn datagrams_survive_and_the_walk_agrees_with_the_parser() {
+fn damaged_datagrams_pass_the_checks_and_walk_and_oracle_agree() {
     run("tests/data/datagrams", entry::datagram);
     run("fuzz/seeds/datagram", entry::datagram);
 }
 
 #[test]
-fn discovery_samples_survive() {
+fn damaged_discovery_samples_pass_the_checks() {
     run("fuzz/seeds/discovery", entry::discovery);
 }
 
 #[test]
-fn entities_survive() {
+fn damaged_entities_pass_the_checks() {
     run("fuzz/seeds/entities", entry::entities);
 }
 
 #[test]
-fn zenoh_batches_survive() {
+fn damaged_zenoh_batches_pass_the_checks() {
     run("fuzz/seeds/zenoh", entry::zenoh);
 }

@@ -1,10 +1,10 @@
-//! Bodies of the fuzz targets: plain functions, so that the tests run them too, over the committed
-//! seeds and all their truncations (`wire/tests/fuzz_seeds.rs`). In this directory: `cargo +nightly
-//! fuzz run datagram corpus/datagram ../tests/data/datagrams`, and `discovery`, `entities` and
-//! `zenoh` with their directories under `seeds`.
+//! Bodies of the fuzz targets. They are plain functions, so that tests run them too, over the
+//! committed seeds and truncations of these (`wire/tests/fuzz_seeds.rs`). To fuzz, run in this
+//! directory `cargo +nightly fuzz run datagram corpus/datagram ../tests/data/datagrams`. The
+//! targets `discovery`, `entities` and `zenoh` have their directories under `seeds`.
 //!
-//! Each reads its bytes as the agent does and asserts what must hold for any bytes: it never
-//! panics, no list exceeds its bound, and nothing is kept that does not exist in the input. The
+//! Each target reads its bytes as the agent does and asserts what must hold for any bytes: no
+//! parser panics, no list exceeds its bound, and no more is kept than the input contains. The
 //! kernel filter's walk agrees with the oracle (`wire/tests/oracle`).
 
 use ros2probe_wire::discovery::{self, Discovery, Role};
@@ -194,8 +194,8 @@ fn walk(bytes: &[u8], prefix: [u8; 12]) -> Vec<(usize, Record)> {
     }
 }
 
-/// Checks that the walk saw what the oracle saw. The opposite need not hold: the walk accepts
-/// numbers that the oracle rejects.
+/// Checks that the walk reports each submessage that the oracle reports. The converse need not
+/// hold: the walk accepts numbers that the oracle rejects.
 fn agrees(submessage: &Submessage<'_>, record: Option<&Record>) {
     let (kind, writer, reader, number) = match submessage.body {
         Body::Data(data) => (kind::DATA, data.writer, data.reader, data.sequence_number),
@@ -273,7 +273,7 @@ fn bodies_agree(submessage: &Submessage<'_>, record: &Record) {
     }
 }
 
-/// Checks the sets; a record holds only the first numbers of a long set.
+/// Checks that the sets agree. A record holds only the first numbers of a long set.
 fn sets_agree(ours: &record::SequenceNumberSet, theirs: &SequenceNumberSet<'_>) {
     assert_eq!(ours.base, theirs.base);
     assert_eq!(ours.num_bits, theirs.num_bits());
@@ -304,7 +304,8 @@ fn samples_agree(bytes: &[u8], message: Message<'_>) {
         let ours = &found[index];
         let list = data.inline_qos.map(|list| InlineQos::parse(list, vendor));
         let inline_qos = list.unwrap_or(Ok(InlineQos::default()));
-        // The oracle's offsets are those in the datagram, the walk's those in the submessage.
+        // The oracle's offsets count from the start of the datagram, the walk's from that of the
+        // submessage.
         assert_eq!(
             ours.inline_qos(vendor).map_err(|error| error.reason),
             inline_qos.map_err(|error| error.reason)

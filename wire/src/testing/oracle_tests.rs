@@ -1,4 +1,4 @@
-//! The oracle of the differential tests reads messages of real participants, and survives malformed
+//! Tests of the oracle, which reads messages of real participants and does not panic on malformed
 //! ones.
 
 use std::vec::Vec;
@@ -34,7 +34,7 @@ fn message(endianness: Endianness) -> Encoder {
     message
 }
 
-/// A DATA body up to the inline QoS.
+/// Writes the body of a DATA up to the inline QoS.
 fn data_head(body: &mut Encoder, sequence_number: i64) {
     body.u16(0)
         .u16(16)
@@ -44,7 +44,7 @@ fn data_head(body: &mut Encoder, sequence_number: i64) {
 }
 
 #[test]
-fn a_gap_and_its_heartbeat_as_fast_dds_sends_them() {
+fn a_gap_and_its_heartbeat_of_fast_dds_are_read() {
     let source = GuidPrefix(*b"\x01\x0f\x0d\x04\x3f\x47\x52\xad\0\0\0\0");
     let destination = GuidPrefix(*b"\x01\x0f\x2b\x7d\x3b\x48\x35\x74\0\0\0\0");
     let message = Message::parse(testing::FAST_GAP).unwrap();
@@ -81,7 +81,7 @@ fn a_gap_and_its_heartbeat_as_fast_dds_sends_them() {
 }
 
 #[test]
-fn acknacks_name_the_senders_reader_and_the_receivers_writer() {
+fn an_acknack_identifies_the_senders_reader_and_the_receivers_writer() {
     let [info, first, second, ..] = all(testing::JAZZY_ACKNACK)[..] else {
         panic!()
     };
@@ -102,7 +102,7 @@ fn acknacks_name_the_senders_reader_and_the_receivers_writer() {
 }
 
 #[test]
-fn nack_frags_name_the_missing_fragments() {
+fn a_nack_frag_lists_the_missing_fragments() {
     let [_, nack_frag, ..] = all(testing::FAST_NACK_FRAG)[..] else {
         panic!()
     };
@@ -118,7 +118,7 @@ fn nack_frags_name_the_missing_fragments() {
 }
 
 #[test]
-fn data_frag_of_several_fragments_as_cyclone_dds_sends_it() {
+fn a_data_frag_of_several_fragments_of_cyclone_dds_is_read() {
     let [fragments, heartbeat] = all(testing::CYCLONE_DATA_FRAG).try_into().unwrap();
     assert!(matches!(heartbeat.body, Body::Heartbeat(_)));
     let Body::DataFrag(fragments) = fragments.body else {
@@ -168,7 +168,7 @@ fn status_info_is_big_endian_in_either_byte_order() {
 }
 
 #[test]
-fn legacy_request_identity_belongs_to_its_vendors_only() {
+fn the_legacy_request_identity_is_read_for_its_vendors_only() {
     let [(vendor, inline_qos, _)] = testing::data(testing::FAST_SPDP_DISPOSE)
         .try_into()
         .unwrap();
@@ -182,7 +182,7 @@ fn legacy_request_identity_belongs_to_its_vendors_only() {
 }
 
 #[test]
-fn receiver_state_decides_whose_and_for_whom() {
+fn the_receiver_state_determines_source_and_destination() {
     for endianness in BOTH {
         let mut message = message(endianness);
         let data = |body: &mut Encoder| data_head(body, 5);
@@ -232,7 +232,7 @@ fn receiver_state_decides_whose_and_for_whom() {
 }
 
 #[test]
-fn length_zero_is_empty_for_pad_and_info_ts_and_the_rest_for_others() {
+fn a_length_of_zero_is_empty_for_pad_and_info_ts_and_the_rest_for_others() {
     let mut message = message(Endianness::Little);
     message
         .raw(&[0x09, 0x03, 0, 0])
@@ -259,7 +259,7 @@ fn length_zero_is_empty_for_pad_and_info_ts_and_the_rest_for_others() {
 }
 
 #[test]
-fn fields_before_the_inline_qos_may_be_added() {
+fn fields_added_before_the_inline_qos_are_skipped() {
     for endianness in BOTH {
         let mut message = message(endianness);
         message.submessage(0x15, 0x06, |body| {
@@ -291,7 +291,7 @@ fn fields_before_the_inline_qos_may_be_added() {
 }
 
 #[test]
-fn unknown_submessages_are_stepped_over_by_their_length() {
+fn unknown_submessages_are_skipped_by_their_length() {
     let mut message = message(Endianness::Big);
     message.submessage(0x7f, 0xfe, |body| {
         body.raw(&[1; 12]);
@@ -334,7 +334,7 @@ fn submessages_before_a_malformed_one_are_kept() {
 }
 
 #[test]
-fn numbers_the_protocol_does_not_have_are_refused() {
+fn sequence_numbers_that_rtps_does_not_allow_are_refused() {
     let reason = |message: &Encoder| parse(&message.bytes)[0].map(|_| ()).unwrap_err().reason;
     for number in [0, -1, SequenceNumber::UNKNOWN.0.cast_signed(), i64::MIN] {
         let mut message = message(Endianness::Little);
@@ -367,7 +367,7 @@ fn numbers_the_protocol_does_not_have_are_refused() {
 }
 
 #[test]
-fn fragment_numbers_have_to_agree_with_the_bytes() {
+fn fragment_numbers_that_contradict_the_bytes_are_refused() {
     let parse = |starting: u32, count: u16, size: u16, sample: u32, bytes: usize| {
         let mut message = message(Endianness::Little);
         message.submessage(0x16, 0x04, |body| {
@@ -389,7 +389,7 @@ fn fragment_numbers_have_to_agree_with_the_bytes() {
     };
     let reason = |result: Result<_, WireError>| result.unwrap_err().reason;
     assert_eq!(parse(1, 2, 16, 40, 32), Ok((32, true)));
-    // The last one is shorter, and its submessage may be padded.
+    // The last fragment is shorter, and its submessage may be padded.
     assert_eq!(parse(2, 2, 16, 39, 24), Ok((23, true)));
     assert_eq!(reason(parse(1, 2, 16, 40, 31)), Reason::Truncated);
     for (starting, count, size, sample) in [
@@ -415,7 +415,7 @@ fn fragment_numbers_have_to_agree_with_the_bytes() {
 }
 
 #[test]
-fn reply_locators_and_fragment_heartbeats() {
+fn reply_locators_and_fragment_heartbeats_are_read() {
     for endianness in BOTH {
         let mut message = message(endianness);
         message.submessage(0x0f, 0x02, |body| {
@@ -466,7 +466,7 @@ fn reply_locators_and_fragment_heartbeats() {
 }
 
 #[test]
-fn other_protocols_are_not_rtps() {
+fn datagrams_of_other_protocols_are_refused() {
     let reason = |bytes: &[u8]| Header::parse(bytes).unwrap_err().reason;
     assert_eq!(
         reason(b"RTPX\x02\x03\x01\x0f............"),
@@ -482,7 +482,7 @@ fn other_protocols_are_not_rtps() {
 }
 
 #[test]
-fn hurt_datagrams_never_panic() {
+fn damaged_datagrams_never_make_the_oracle_panic() {
     for datagram in testing::CAPTURED {
         hurt(datagram.get(..1500).unwrap_or(datagram), |bytes| {
             let Ok(message) = Message::parse(bytes) else {
@@ -508,7 +508,7 @@ fn hurt_datagrams_never_panic() {
 
 proptest! {
     #[test]
-    fn data_comes_back_as_it_was_written(
+    fn an_encoded_data_submessage_survives_a_round_trip(
         little in any::<bool>(),
         number in 1..i64::MAX,
         key_hash in any::<Option<[u8; 16]>>(),
@@ -552,7 +552,7 @@ proptest! {
     }
 
     #[test]
-    fn no_bytes_make_it_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+    fn no_bytes_make_the_oracle_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
         let mut datagram = b"RTPS\x02\x01\x01\x0f123456789012".to_vec();
         datagram.extend_from_slice(&bytes);
         prop_assert!(Message::parse(&datagram).unwrap().count() <= bytes.len() / 4 + 1);

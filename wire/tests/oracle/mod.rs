@@ -1,11 +1,11 @@
 //! A complete reader of RTPS messages (RTPS 2.5, 8.3 and 9.4): the oracle of the differential
 //! tests.
 //!
-//! No production code uses it. The walk reads what the product needs of a message, in the style of
-//! the kernel. The oracle reads every field of every submessage, in the style of the specification,
-//! and rejects numbers that the specification does not allow. The fuzz targets and the tests over
-//! captures compare the two, and compare the oracle with an independent decoder. So the oracle must
-//! not use the walk.
+//! No production code uses it. The walk reads the parts of a message that the product needs, in the
+//! style of the kernel. The oracle reads every field of every submessage, in the style of the
+//! specification, and rejects numbers that the specification does not allow. The fuzz targets and
+//! the tests over captures compare the walk with the oracle, and the oracle with an independent
+//! decoder. Therefore the oracle must not use the walk.
 //!
 //! Parsing borrows the datagram. Unknown submessages are skipped by their length. A malformed one
 //! ends the message (8.3.4.1); the submessages before it remain valid.
@@ -20,7 +20,7 @@ use ros2probe_wire::{Cursor, Endianness, GuidPrefix, Reason, RtpsTime, WireError
 
 pub use submessage::Body;
 
-/// The 20 bytes every RTPS message begins with (RTPS 2.5, 9.4.4).
+/// The first 20 bytes of every RTPS message (RTPS 2.5, 9.4.4).
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Header {
     /// The sender's protocol version.
@@ -32,14 +32,14 @@ pub struct Header {
 }
 
 impl Header {
-    /// Length on the wire.
+    /// Length on the wire, in bytes.
     pub const LEN: usize = 20;
 
     /// Parses the first bytes of a datagram.
     ///
     /// # Errors
-    /// Returns [`Reason::Truncated`] if bytes are missing, and [`Reason::BadMarker`] if it does not
-    /// begin with `RTPS` or its major version is not 2.
+    /// Returns [`Reason::Truncated`] if bytes are missing. Returns [`Reason::BadMarker`] if the
+    /// bytes do not begin with `RTPS` or the major version is not 2.
     pub fn parse(bytes: &[u8]) -> Result<Self, WireError> {
         Self::read(&mut Cursor::new(bytes, Endianness::Big))
     }
@@ -74,7 +74,7 @@ pub struct Receiver {
     /// Destination of the submessages; [`GuidPrefix::UNKNOWN`] is any participant that receives
     /// them.
     pub destination: GuidPrefix,
-    /// INFO_TS in force; zero if none is.
+    /// INFO_TS in force; zero if no timestamp is in force.
     pub timestamp: RtpsTime,
 }
 
@@ -172,7 +172,7 @@ impl<'a> Iterator for Message<'a> {
         }
         let result = self.submessage();
         if result.is_err() {
-            // Offsets behind a malformed submessage cannot be trusted.
+            // Offsets after a malformed submessage cannot be trusted.
             self.rest = Cursor::new(&[], Endianness::Big);
         }
         Some(result)

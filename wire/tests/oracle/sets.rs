@@ -4,7 +4,8 @@
 use ros2probe_wire::rtps::SequenceNumber;
 use ros2probe_wire::{Cursor, Reason, WireError};
 
-/// Reads a sequence number, `i32` high and `u32` low, not below `least` (RTPS 2.5, 9.4.2.5).
+/// Reads a sequence number, `i32` high and `u32` low, that must be at least `least` (RTPS 2.5,
+/// 9.4.2.5).
 pub fn sequence_number(
     cursor: &mut Cursor<'_>,
     what: &'static str,
@@ -60,7 +61,7 @@ impl<'a> Bitmap<'a> {
     }
 }
 
-/// Sequence numbers from a base: the missing ones in ACKNACK, the irrelevant ones in GAP.
+/// A set of sequence numbers from a base: the missing ones in ACKNACK, the irrelevant ones in GAP.
 #[derive(Clone, Copy, Debug)]
 pub struct SequenceNumberSet<'a> {
     /// The number of bit 0.
@@ -84,7 +85,8 @@ impl<'a> SequenceNumberSet<'a> {
         self.bitmap.bits
     }
 
-    /// Iterates over the members, ascending; those that exceed a sequence number are omitted.
+    /// Iterates over the members, ascending. Members beyond the largest sequence number are
+    /// omitted.
     pub fn iter(&self) -> impl Iterator<Item = SequenceNumber> + use<'a> {
         let base = self.base.0;
         self.bitmap
@@ -94,7 +96,7 @@ impl<'a> SequenceNumberSet<'a> {
     }
 }
 
-/// Fragment numbers from a base: the missing ones in NACK_FRAG.
+/// A set of fragment numbers from a base: the missing ones in NACK_FRAG.
 #[derive(Clone, Copy, Debug)]
 pub struct FragmentNumberSet<'a> {
     /// The number of bit 0.
@@ -110,7 +112,8 @@ impl<'a> FragmentNumberSet<'a> {
         })
     }
 
-    /// Iterates over the members, ascending; those that exceed a fragment number are omitted.
+    /// Iterates over the members, ascending. Members beyond the largest fragment number are
+    /// omitted.
     pub fn iter(&self) -> impl Iterator<Item = u32> + use<'a> {
         let base = self.base;
         self.bitmap

@@ -50,11 +50,11 @@ pub struct AckNack<'a> {
     pub reader: Guid,
     /// The destination's writer.
     pub writer: Guid,
-    /// All samples before the base are acknowledged, the members are missing.
+    /// The missing samples. All samples before the base are acknowledged.
     pub missing: SequenceNumberSet<'a>,
-    /// Grows with every new ACKNACK of this reader.
+    /// Number that grows with every new ACKNACK of this reader.
     pub count: u32,
-    /// No answer is required if nothing is missing.
+    /// Whether no answer is required if no sample is missing.
     pub is_final: bool,
 }
 
@@ -69,11 +69,11 @@ pub struct Heartbeat {
     pub first: SequenceNumber,
     /// The newest change.
     pub last: SequenceNumber,
-    /// Grows with every new HEARTBEAT of this writer.
+    /// Number that grows with every new HEARTBEAT of this writer.
     pub count: u32,
-    /// No answer is required from a reader that has all samples.
+    /// Whether no answer is required from a reader that has all samples.
     pub is_final: bool,
-    /// Asserts the writer's liveliness only.
+    /// Whether the HEARTBEAT only asserts the writer's liveliness.
     pub is_liveliness: bool,
 }
 
@@ -86,9 +86,9 @@ pub struct HeartbeatFrag {
     pub writer: Guid,
     /// The change.
     pub sequence_number: SequenceNumber,
-    /// The writer has fragments 1 to this one.
+    /// Number of the last fragment that the writer has; it has all fragments from 1.
     pub last_fragment: u32,
-    /// Grows with every new HEARTBEAT_FRAG of this writer.
+    /// Number that grows with every new HEARTBEAT_FRAG of this writer.
     pub count: u32,
 }
 
@@ -117,7 +117,7 @@ pub struct NackFrag<'a> {
     pub sequence_number: SequenceNumber,
     /// Its missing fragments.
     pub missing: FragmentNumberSet<'a>,
-    /// Grows with every new NACK_FRAG of this reader.
+    /// Number that grows with every new NACK_FRAG of this reader.
     pub count: u32,
 }
 
@@ -154,19 +154,19 @@ pub struct DataFrag<'a> {
     pub writer: Guid,
     /// Sequence number of the change.
     pub sequence_number: SequenceNumber,
-    /// Number of its first fragment, counted from 1.
+    /// Number of the first fragment, counted from 1.
     pub starting: u32,
     /// Number of fragments, at least 1.
     pub count: u16,
     /// Size of every fragment but the last, at least 1.
     pub fragment_size: u16,
-    /// Size of the whole payload. It is unverified: nothing may be allocated for it.
+    /// Size of the whole payload, which is unverified: no memory may be allocated for it.
     pub sample_size: u32,
     /// Parameters of the change.
     pub inline_qos: Option<ParameterList<'a>>,
-    /// The assembled payload is a key only.
+    /// Whether the assembled payload is a key only.
     pub is_key: bool,
-    /// The fragments' bytes without padding, exactly as many as the numbers above require.
+    /// The fragments' bytes without padding, exactly as many as the fragment numbers require.
     pub bytes: &'a [u8],
 }
 
@@ -393,7 +393,7 @@ fn data_frag<'a>(
         .then(|| parameter_list(&mut rest))
         .transpose()?;
 
-    // The fragments span [begin, end) of the payload; the last one may be shorter.
+    // The fragments span [begin, end) of the payload. The last fragment may be shorter.
     let first = u64::from(starting).checked_sub(1).ok_or(numbers)?;
     let begin = first * u64::from(fragment_size);
     let end = ((first + u64::from(count)) * u64::from(fragment_size)).min(sample_size.into());
@@ -417,8 +417,8 @@ fn data_frag<'a>(
 }
 
 /// Reads `extraFlags` and `octetsToInlineQos`; returns the position of the inline QoS (or the
-/// payload). Later versions may insert fields behind the `least` octets of this one, so the offset
-/// is followed.
+/// payload). Later versions may insert fields after the `least` octets of this version, so the
+/// offset is used.
 fn after_octets_to_inline_qos<'a>(
     body: &mut Cursor<'a>,
     least: u16,
@@ -434,7 +434,7 @@ fn after_octets_to_inline_qos<'a>(
     Ok(rest)
 }
 
-/// Reads the list at the cursor, which moves behind the sentinel: only the sentinel marks the start
+/// Reads the list at the cursor and moves the cursor past the sentinel, which alone marks the start
 /// of the payload.
 fn parameter_list<'a>(cursor: &mut Cursor<'a>) -> Result<ParameterList<'a>, WireError> {
     let list = ParameterList::inline(*cursor);

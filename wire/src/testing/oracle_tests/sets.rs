@@ -14,7 +14,8 @@ fn sequence_numbers(bytes: &[u8], endianness: Endianness) -> Result<Vec<u64>, Wi
         .collect())
 }
 
-/// RTPS 2.5, 9.4.2.6: `1234:/12:00110` is 1236 and 1237; here with the example's 30 bits.
+/// The example of RTPS 2.5, 9.4.2.6: `1234:/12:00110` is 1236 and 1237. The bitmap here has 30
+/// bits.
 const EXAMPLE: [u8; 16] = [
     0,
     0,
@@ -35,7 +36,7 @@ const EXAMPLE: [u8; 16] = [
 ];
 
 #[test]
-fn bits_count_from_the_most_significant() {
+fn bits_are_counted_from_the_most_significant_one() {
     assert_eq!(
         sequence_numbers(&EXAMPLE, Endianness::Big),
         Ok([1236, 1237].into())
@@ -51,7 +52,7 @@ fn bits_count_from_the_most_significant() {
 }
 
 #[test]
-fn bits_behind_num_bits_do_not_count() {
+fn bits_after_num_bits_are_ignored() {
     let mut bytes = EXAMPLE;
     bytes[11] = 3;
     assert_eq!(sequence_numbers(&bytes, Endianness::Big), Ok([1236].into()));
@@ -60,7 +61,7 @@ fn bits_behind_num_bits_do_not_count() {
 }
 
 #[test]
-fn a_window_of_more_than_256_is_refused() {
+fn a_set_of_more_than_256_bits_is_refused() {
     let mut bytes = [0xff; 12 + 36];
     bytes[..12].copy_from_slice(&[0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 1, 0]);
     let all = sequence_numbers(&bytes, Endianness::Big).unwrap();
@@ -73,7 +74,7 @@ fn a_window_of_more_than_256_is_refused() {
 }
 
 #[test]
-fn members_beyond_the_last_number_are_left_out() {
+fn members_beyond_the_largest_number_are_left_out() {
     let mut bytes = EXAMPLE;
     bytes[..8].copy_from_slice(&i64::MAX.to_be_bytes());
     bytes[12] = 0xff;
@@ -84,7 +85,7 @@ fn members_beyond_the_last_number_are_left_out() {
 }
 
 #[test]
-fn cut_off_anywhere_is_an_error() {
+fn a_truncated_set_is_an_error() {
     for length in 0..EXAMPLE.len() {
         assert!(
             sequence_numbers(&EXAMPLE[..length], Endianness::Big).is_err(),
