@@ -1,5 +1,5 @@
-//! Time of the parsers on real datagrams: the walk over all submessages of one, a participant's and
-//! an endpoint's announcement, and a `ros_discovery_info` sample.
+//! Measures the parsers on real datagrams: the walk over all submessages of a datagram, the
+//! announcements of a participant and of an endpoint, and a `ros_discovery_info` sample.
 
 #![expect(
     clippy::unwrap_used,

@@ -1,4 +1,4 @@
-//! The one reader of untrusted bytes.
+//! The bounded cursor with which the parsers read untrusted bytes.
 //!
 //! Every length field opens a sub-cursor, so an inner length cannot escape the outer one. Every
 //! error names the field, its offset and the reason. Offsets are relative to the slice of the
@@ -20,7 +20,7 @@ pub enum Reason {
     Truncated,
     /// A length or count that its container cannot hold.
     BadLength,
-    /// A fixed marker (magic, version, encapsulation) that is not what it must be.
+    /// A fixed marker (magic, version, encapsulation) with an unexpected value.
     BadMarker,
     /// Text that is not UTF-8 or lacks its terminator.
     BadText,
@@ -48,7 +48,7 @@ impl Reason {
 /// One failed read.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct WireError {
-    /// The field that was being read, in the specification's words.
+    /// The field that was being read, as the specification names it.
     pub what: &'static str,
     /// Byte offset at which the field begins.
     pub offset: usize,
@@ -132,7 +132,7 @@ impl<'a> Cursor<'a> {
     /// Reads the next `len` bytes.
     ///
     /// # Errors
-    /// [`Reason::Truncated`] when fewer remain.
+    /// Returns [`Reason::Truncated`] if fewer bytes remain.
     pub fn take(&mut self, what: &'static str, len: usize) -> Result<&'a [u8], WireError> {
         let (head, rest) = self
             .rest
@@ -146,7 +146,7 @@ impl<'a> Cursor<'a> {
     /// Reads the next `N` bytes as an array.
     ///
     /// # Errors
-    /// [`Reason::Truncated`] when fewer remain.
+    /// Returns [`Reason::Truncated`] if fewer bytes remain.
     pub fn array<const N: usize>(&mut self, what: &'static str) -> Result<[u8; N], WireError> {
         let (head, rest) = self
             .rest
@@ -160,7 +160,7 @@ impl<'a> Cursor<'a> {
     /// Returns a cursor over the next `len` bytes, and moves this one past them.
     ///
     /// # Errors
-    /// [`Reason::Truncated`] when fewer remain.
+    /// Returns [`Reason::Truncated`] if fewer bytes remain.
     pub fn sub(&mut self, what: &'static str, len: usize) -> Result<Self, WireError> {
         let offset = self.offset;
         Ok(Self {
@@ -173,7 +173,7 @@ impl<'a> Cursor<'a> {
     /// Reads one octet.
     ///
     /// # Errors
-    /// [`Reason::Truncated`] at the end.
+    /// Returns [`Reason::Truncated`] if no byte remains.
     pub fn u8(&mut self, what: &'static str) -> Result<u8, WireError> {
         Ok(u8::from_ne_bytes(self.array(what)?))
     }
@@ -181,7 +181,7 @@ impl<'a> Cursor<'a> {
     /// Reads two octets in the cursor's byte order.
     ///
     /// # Errors
-    /// [`Reason::Truncated`] when fewer remain.
+    /// Returns [`Reason::Truncated`] if fewer bytes remain.
     pub fn u16(&mut self, what: &'static str) -> Result<u16, WireError> {
         let bytes = self.array(what)?;
         Ok(match self.endianness {
@@ -193,7 +193,7 @@ impl<'a> Cursor<'a> {
     /// Reads four octets in the cursor's byte order.
     ///
     /// # Errors
-    /// [`Reason::Truncated`] when fewer remain.
+    /// Returns [`Reason::Truncated`] if fewer bytes remain.
     pub fn u32(&mut self, what: &'static str) -> Result<u32, WireError> {
         let bytes = self.array(what)?;
         Ok(match self.endianness {
@@ -205,7 +205,7 @@ impl<'a> Cursor<'a> {
     /// Reads four octets as a signed number.
     ///
     /// # Errors
-    /// [`Reason::Truncated`] when fewer remain.
+    /// Returns [`Reason::Truncated`] if fewer bytes remain.
     pub fn i32(&mut self, what: &'static str) -> Result<i32, WireError> {
         Ok(self.u32(what)?.cast_signed())
     }
@@ -213,7 +213,7 @@ impl<'a> Cursor<'a> {
     /// Reads eight octets in the cursor's byte order.
     ///
     /// # Errors
-    /// [`Reason::Truncated`] when fewer remain.
+    /// Returns [`Reason::Truncated`] if fewer bytes remain.
     pub fn u64(&mut self, what: &'static str) -> Result<u64, WireError> {
         let bytes = self.array(what)?;
         Ok(match self.endianness {
@@ -222,8 +222,8 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// Skips to the next multiple of `alignment`, counted from the outermost start, or to the end
-    /// if the padding is cut off: trailing padding may be missing.
+    /// Skips to the next multiple of `alignment`, counted from the start of the outermost cursor.
+    /// Skips to the end if fewer bytes remain, because trailing padding may be missing.
     pub fn align(&mut self, alignment: usize) {
         let padding = self.offset.wrapping_neg() & (alignment - 1);
         let padding = padding.min(self.rest.len());
@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn alignment_counts_from_the_outermost_start() {
+    fn alignment_counts_from_the_start_of_the_outermost_cursor() {
         let mut cursor = Cursor::new(&[0; 7], Endianness::Big);
         cursor.u8("x").unwrap();
         cursor.align(4);

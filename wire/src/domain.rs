@@ -7,11 +7,11 @@ use core::fmt;
 pub struct DomainId(pub u32);
 
 impl DomainId {
-    /// The highest domain for which UDP has ports (RTPS 2.5, 9.6.2.3).
+    /// The highest domain id that has UDP ports (RTPS 2.5, 9.6.2.3).
     pub const MAX: Self = Self(232);
 }
 
-/// A number is not a domain id.
+/// A number that is not a domain id.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct InvalidDomainId(pub u32);
 
@@ -29,7 +29,7 @@ impl TryFrom<u32> for DomainId {
     type Error = InvalidDomainId;
 
     /// # Errors
-    /// Fails if UDP has no ports for this domain.
+    /// Returns [`InvalidDomainId`] if the number is larger than [`DomainId::MAX`].
     fn try_from(number: u32) -> Result<Self, InvalidDomainId> {
         let id = Self(number);
         (id <= Self::MAX)

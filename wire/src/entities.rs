@@ -1,8 +1,9 @@
 //! `ros_discovery_info`: the nodes of a participant and their endpoints.
 //!
-//! `rmw_dds_common/msg/ParticipantEntitiesInfo` as CDR. A sample is the participant's whole state
-//! and replaces the previous one. Iron and later write 16-byte gids, Humble 24-byte ones, under the
-//! same topic and type name. One domain may have both, so the bytes decide the layout.
+//! The payload is `rmw_dds_common/msg/ParticipantEntitiesInfo` in CDR. A sample is the
+//! participant's whole state and replaces the previous one. Iron and later write 16-byte gids,
+//! Humble 24-byte ones, under the same topic and type name. One domain may have both layouts, so
+//! the bytes decide which one applies.
 
 use alloc::string::String;
 use alloc::vec::Vec;
@@ -11,9 +12,10 @@ use crate::cursor::{Cursor, Endianness, Reason, WireError};
 use crate::guid::{EntityId, Guid};
 use crate::text;
 
-/// Most nodes kept per participant.
+/// Maximum number of nodes per participant.
 pub const MAX_NODES: usize = 1024;
-/// Longest node name or namespace (ROS allows 255 characters for both together).
+/// Maximum length of a node name or namespace, in bytes (ROS allows 255 characters for both
+/// together).
 const MAX_NAME_LEN: usize = 256;
 
 /// One participant's nodes.
@@ -55,8 +57,8 @@ impl ParticipantEntities {
     /// Parses a sample's payload, encapsulation header included.
     ///
     /// # Errors
-    /// Returns [`Reason::BadMarker`] if it is not plain CDR, and the error of the likelier layout
-    /// if neither layout fits.
+    /// Returns [`Reason::BadMarker`] if the payload is not plain CDR, and the error of the likelier
+    /// layout if neither layout fits.
     pub fn parse(payload: &[u8]) -> Result<Self, WireError> {
         let mut cursor = Cursor::new(payload, Endianness::Big);
         let error = cursor.error("encapsulation", Reason::BadMarker);
@@ -69,8 +71,9 @@ impl ParticipantEntities {
         };
         cursor.u16("encapsulation options")?;
         let cursor = cursor.with_endianness(endianness);
-        // The longer gid's last eight bytes are zero. In the shorter layout they hold the number of
-        // nodes and the first namespace's length; both are zero only if nothing follows.
+        // The last eight bytes of a long gid are zero. In the layout with short gids, these bytes
+        // are the number of nodes and the first namespace's length, which are zero only if nothing
+        // follows.
         let padded = cursor
             .rest()
             .get(16..24)
@@ -112,7 +115,7 @@ fn gids(cursor: &mut Cursor<'_>, gid_len: usize) -> Result<Vec<Guid>, WireError>
     cursor.align(4);
     let error = cursor.error("gid count", Reason::BadLength);
     let count = usize::try_from(cursor.u32("gid count")?).map_err(|_| error)?;
-    // Checks that the bytes exist before it allocates for them.
+    // The bytes must exist before memory is allocated for them.
     let length = count.checked_mul(gid_len).ok_or(error)?;
     let mut bytes = cursor.sub("gids", length)?;
     let mut gids = Vec::with_capacity(count);
@@ -166,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn nodes_with_humbles_long_gids() {
+    fn nodes_with_the_long_gids_of_humble_are_parsed() {
         let entities = captured(testing::FAST_ENTITIES);
         assert_eq!(
             entities.participant.to_string(),
@@ -186,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn nodes_with_jazzys_short_gids() {
+    fn nodes_with_the_short_gids_of_jazzy_are_parsed() {
         let entities = captured(testing::JAZZY_ENTITIES);
         assert_eq!(
             entities.participant.to_string(),
@@ -206,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn a_participant_without_nodes_reads_in_both_layouts() {
+    fn a_participant_without_nodes_is_parsed_in_both_layouts() {
         let participant = Guid::new(GuidPrefix([1; 12]), EntityId::PARTICIPANT);
         let entities = ParticipantEntities {
             participant,
@@ -219,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn the_root_namespace_needs_no_second_slash() {
+    fn namespace_and_name_are_joined_by_exactly_one_slash() {
         let node = |namespace: &str| NodeEntities {
             namespace: namespace.into(),
             name: "talker".into(),
@@ -232,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_are_not_believed() {
+    fn counts_beyond_the_payload_or_the_limit_are_refused() {
         let payload = testing::data(testing::JAZZY_ENTITIES)[0].2.payload.bytes();
         // The number of nodes, of readers, of writers.
         for offset in [20, 56, 60] {
@@ -286,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn other_encapsulations_and_other_writers_are_refused() {
+    fn other_encapsulations_and_gids_of_other_entities_are_refused() {
         let mut payload = testing::data(testing::JAZZY_ENTITIES)[0]
             .2
             .payload
@@ -306,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn hurt_payloads_never_panic() {
+    fn damaged_payloads_never_make_the_parser_panic() {
         for datagram in [
             testing::FAST_ENTITIES,
             testing::JAZZY_ENTITIES,
@@ -339,7 +342,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn both_layouts_are_restored_and_distinguished(
+        fn both_layouts_survive_a_round_trip_and_are_distinguished(
             prefix in any::<[u8; 12]>(),
             nodes in prop::collection::vec(node(), 0..5),
             long in any::<bool>(),

@@ -1,25 +1,25 @@
-//! How far a compressed file may expand.
+//! Limit on the expansion of a compressed file.
 
 use core::error::Error;
 use core::fmt;
 
-/// Whether a compressed file is read only as far as its size explains. A small file can expand to
-/// gigabytes, which take memory or minutes.
+/// Whether the expansion of a compressed file is limited relative to its size. A small file can
+/// expand to gigabytes, which would exhaust memory or take minutes to read.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub enum Expansion {
-    /// Reading fails at a limit.
+    /// Reading fails beyond [`Expansion::limit`].
     #[default]
     Limited,
-    /// A person trusts the file.
+    /// No limit, for a file that the user trusts.
     Unlimited,
 }
 
 impl Expansion {
-    /// Bytes to which any file may expand.
+    /// Expanded size that any file may have, in bytes.
     pub const FREE: u64 = 64 << 20;
 
-    /// Returns the number of bytes to which this many compressed bytes may expand: [`Self::FREE`]
-    /// and `factor` times their number.
+    /// Returns the maximum expanded size of `compressed` bytes, in bytes: [`Self::FREE`] plus
+    /// `factor` times `compressed`, or [`u64::MAX`] without a limit.
     #[must_use]
     pub const fn limit(self, compressed: u64, factor: u64) -> u64 {
         match self {
@@ -29,7 +29,7 @@ impl Expansion {
     }
 }
 
-/// A file expands beyond [`Expansion::limit`] of this factor.
+/// A file expands beyond [`Expansion::limit`] for this factor.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct ExpandsTooFar(pub u64);
 

@@ -1,26 +1,26 @@
-//! Names and limits that the kernel filter and its loader agree on.
+//! Counters and limits shared by the kernel filter and its loader.
 
-/// Counters of the filter, per CPU; the value is the index in its counter array.
+/// Counters of the filter, per CPU. The value is the index in the counter array.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[repr(u32)]
 pub enum Counter {
     /// UDP frames read.
     Frames = 0,
-    /// RTPS messages begun (first or only IP fragment).
+    /// RTPS messages, counted at their first or only IP fragment.
     Messages,
-    /// Datagrams of no interest.
+    /// Datagrams that were ignored.
     Ignored,
     /// Datagrams reported as records only.
     Metered,
-    /// Datagrams handed to user space whole.
+    /// Datagrams copied to user space as a whole.
     Captured,
-    /// Datagrams among them captured because a writer was not classified yet.
+    /// Captured datagrams with a writer that was not classified yet.
     CapturedUnknown,
-    /// Frame bytes handed to user space.
+    /// Bytes of captured frames and datagrams.
     CapturedBytes,
-    /// Submessages of unclassified writers, beyond their capture budget, reported as records.
+    /// Submessages of unclassified writers beyond their capture budget, reported as records.
     MeteredUnknown,
-    /// Submessages of unclassified writers beyond all budgets.
+    /// Submessages of unclassified writers beyond all budgets, not reported.
     UnknownOverBudget,
     /// Records written to the ring.
     Records,
@@ -30,7 +30,8 @@ pub enum Counter {
     Fragments,
     /// Duplicate IP fragments.
     FragmentsRepeated,
-    /// IP fragments whose first fragment is unknown: reordered, or the flow was evicted.
+    /// IP fragments of a datagram whose first fragment is unknown: it arrives later, or the flow
+    /// was evicted.
     FragmentsWithoutFlow,
     /// Fragmented datagrams of interest that became complete.
     FragmentedComplete,
@@ -44,41 +45,42 @@ pub enum Counter {
     LoopbackCopies,
     /// Frames of interfaces that the configuration excludes.
     InterfaceExcluded,
-    /// Frames that hold several datagrams (UDP segmentation offload); not read.
+    /// Frames with several datagrams (UDP segmentation offload), which are not read.
     Segmented,
     /// Frames or datagrams skipped because too many runs of the program interrupted each other on
     /// one CPU.
     Contended,
     /// Host hook: captured datagrams with a piece that did not fit the ring.
     PiecesLost,
-    /// Host hook: copies of a datagram that was captured just before, not captured again.
+    /// Host hook: copies of a datagram that had just been captured; they are not captured again.
     CopiesNotCaptured,
     /// RTPS datagrams dropped at a full socket buffer.
     SocketFull,
-    /// Datagrams dropped at a full socket buffer that the host hook had not just seen there.
+    /// Datagrams dropped at a full socket buffer that do not match the host hook's last datagram.
     SocketFullUnseen,
-    /// RTPS datagrams with missing IP fragments that the kernel gave up, or refused for lack of
-    /// memory for fragments, whose first fragment is known.
+    /// RTPS datagrams with a known first fragment that the kernel did not reassemble: fragments
+    /// were missing, or the memory for fragments was full.
     NotReassembled,
-    /// The same of UDP datagrams whose first fragment is missing or unreadable.
+    /// UDP datagrams that the kernel did not reassemble and whose first fragment is missing or
+    /// unreadable.
     NotReassembledUnnamed,
-    /// Messages for shared memory that could not be read in their sender's memory.
+    /// Messages into shared memory that could not be read from the memory of their sender.
     Unreadable,
-    /// Zenoh: batches that began in a followed direction of a connection.
+    /// Zenoh: batches in followed directions of connections.
     ZenohBatches,
-    /// Zenoh: batches among them of which nothing was passed on.
+    /// Zenoh: batches of which no byte was passed on.
     ZenohSkipped,
     /// Zenoh: chunks written to the ring.
     ZenohChunks,
     /// Zenoh: chunks lost because the ring was full.
     ZenohChunksLost,
-    /// Zenoh: times that the boundary of a batch was lost, as after TCP segments out of order.
+    /// Zenoh: losses of the boundary between batches, for example after reordered TCP segments.
     ZenohGaps,
-    /// Zenoh: places in other TCP connections that looked like a batch.
+    /// Zenoh: directions of other TCP connections with a segment that looked like a batch.
     ZenohCandidates,
-    /// Zenoh: directions of connections found.
+    /// Zenoh: directions of connections that were recognized.
     ZenohConnections,
-    /// Zenoh: frames of connections handed to user space, on interfaces.
+    /// Zenoh, on interfaces: frames of connections copied to user space.
     ZenohFrames,
 }
 
@@ -169,7 +171,7 @@ impl Counter {
     }
 }
 
-/// Entries of the budget array, refilled by user space.
+/// Entries of the budget array, which user space refills.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[repr(u32)]
 pub enum Budget {
@@ -179,28 +181,29 @@ pub enum Budget {
     Records = 1,
 }
 
-/// Working areas with counters of their own, and one for what happens outside of them; a power of
-/// two.
+/// Number of counter sets per CPU, a power of two: one per slot of working memory, and one for
+/// events outside of slots.
 pub const COUNTER_SLOTS: usize = 8;
-/// Writers and readers in the interest map.
+/// Maximum number of writers and readers in the interest map.
 pub const INTEREST_CAPACITY: u32 = 16_384;
-/// Participants whose last message the filter notes.
+/// Maximum number of participants for which the filter notes the time of the last message.
 pub const PARTICIPANT_CAPACITY: u32 = 4_096;
-/// Unclassified writers that the filter remembers.
+/// Maximum number of unclassified writers that the filter remembers.
 pub const UNKNOWN_CAPACITY: u32 = 1_024;
-/// Fragmented datagrams in flight.
+/// Maximum number of fragmented datagrams in flight.
 pub const FLOW_CAPACITY: u32 = 1_024;
-/// Interfaces of one network namespace.
+/// Maximum number of interfaces of one network namespace.
 pub const INTERFACE_CAPACITY: u32 = 1_024;
-/// Incomplete runs of DATA_FRAGs.
+/// Maximum number of incomplete runs of DATA_FRAGs.
 pub const RUN_CAPACITY: u32 = 512;
-/// Directions of TCP connections of Zenoh that the filter follows.
+/// Maximum number of directions of TCP connections of Zenoh that the filter follows.
 pub const CONNECTION_CAPACITY: u32 = 4_096;
-/// Directions of other TCP connections in which batches of Zenoh are searched for.
+/// Maximum number of directions of other TCP connections in which the filter searches for batches
+/// of Zenoh.
 pub const CANDIDATE_CAPACITY: u32 = 1_024;
-/// TCP ports of Zenoh that can be configured.
+/// Maximum number of TCP ports of Zenoh that can be configured.
 pub const PORT_CAPACITY: usize = 8;
-/// Bytes captured per unclassified writer before it is only metered: enough for the whole
+/// Bytes captured per unclassified writer before it is only metered. They suffice for the whole
 /// `ros_discovery_info` burst of a starting node, or a few datagrams of a point cloud.
 pub const UNKNOWN_CAPTURE_BYTES: u32 = 256 * 1024;
 

@@ -1,12 +1,12 @@
-//! Parses a captured frame into a UDP datagram, the piece of one that an IP fragment carries, or a
-//! TCP segment.
+//! Parses a captured frame into a UDP datagram, the part of one in an IP fragment, or a TCP
+//! segment.
 //!
-//! Views only: nothing is copied or kept between frames, and checksums are not verified (transmit
-//! offload leaves them unset in captures). Reassembly happens elsewhere. Packets of other protocols
-//! are identified and not read.
+//! The results are views: the parser copies nothing and keeps no state between frames. It does not
+//! verify checksums, because transmit offload leaves them unset in captures. Reassembly happens
+//! elsewhere. Packets of other protocols are identified and not read.
 //!
-//! A capture may hold less of a frame than was on the wire. Every length here is the true one; the
-//! bytes beside it may be fewer.
+//! A capture may hold less of a frame than was on the wire. Every length here is the length on the
+//! wire; fewer bytes may have been captured.
 
 mod ip;
 
@@ -21,9 +21,9 @@ impl Link {
     pub const NULL: Self = Self(0);
     /// Ethernet; Linux also reports it for `lo` and for Wi-Fi in managed mode.
     pub const ETHERNET: Self = Self(1);
-    /// Raw IP as some BSDs number it.
+    /// Raw IP, with the number of some BSDs.
     pub const RAW_BSD: Self = Self(12);
-    /// Raw IP as OpenBSD numbers it.
+    /// Raw IP, with the number of OpenBSD.
     pub const RAW_OPENBSD: Self = Self(14);
     /// Raw IP, version by the first nibble.
     pub const RAW: Self = Self(101);
@@ -57,7 +57,7 @@ impl Link {
     }
 }
 
-/// The recipient of a frame, as Linux numbers it (`PACKET_*` in `linux/if_packet.h`).
+/// The recipient or direction of a frame, as Linux numbers it (`PACKET_*` in `linux/if_packet.h`).
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct PacketType(pub u8);
 
@@ -79,9 +79,10 @@ impl PacketType {
 pub struct Frame<'a> {
     /// Index of the interface, if the link header carries it (cooked v2).
     pub interface: Option<u32>,
-    /// Direction, if the link header carries it (cooked v1 and v2).
+    /// Packet type, if the link header carries it (cooked v1 and v2), otherwise
+    /// [`PacketType::HOST`].
     pub packet_type: PacketType,
-    /// The IP packet; `None` if the frame carries something else (ARP, LLDP, a third tag).
+    /// The IP packet; `None` if the frame carries something else (ARP, LLDP, a third VLAN tag).
     pub packet: Option<Packet<'a>>,
 }
 
@@ -103,43 +104,43 @@ pub enum Payload<'a> {
     Datagram(Datagram<'a>),
     /// A part of a UDP datagram.
     Fragment(Fragment<'a>),
-    /// A TCP segment, or several that segmentation offload shows as one.
+    /// A TCP segment, or several that segmentation offload has merged.
     Segment(Segment<'a>),
-    /// Another protocol, by its IP protocol number; also a TCP segment in IP fragments.
+    /// Another protocol, by its IP protocol number; also an IP fragment of a TCP segment.
     Other(u8),
 }
 
 /// A TCP segment (RFC 9293, 3.1).
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Segment<'a> {
-    /// Port it was sent from.
+    /// Source port.
     pub source_port: u16,
-    /// Port it was sent to.
+    /// Destination port.
     pub destination_port: u16,
     /// Sequence number of the first byte, or of the SYN.
     pub sequence_number: u32,
-    /// Whether the connection begins.
+    /// Whether the segment opens the connection.
     pub syn: bool,
-    /// Whether the sender sends nothing after this.
+    /// Whether the sender sends no bytes after this segment.
     pub fin: bool,
-    /// Whether the connection is aborted.
+    /// Whether the segment aborts the connection.
     pub rst: bool,
     /// Captured bytes of the payload.
     pub payload: &'a [u8],
-    /// True length of the payload.
+    /// Length of the payload on the wire.
     pub length: u32,
 }
 
 /// A whole UDP datagram.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Datagram<'a> {
-    /// Port it was sent from.
+    /// Source port.
     pub source_port: u16,
-    /// Port it was sent to.
+    /// Destination port.
     pub destination_port: u16,
     /// Captured bytes of the payload after the UDP header.
     pub payload: &'a [u8],
-    /// True length of the payload.
+    /// Length of the payload on the wire.
     pub length: u32,
 }
 
@@ -150,11 +151,12 @@ pub struct Fragment<'a> {
     pub id: u32,
     /// Offset of the part in bytes from the UDP header's start.
     pub offset: u32,
-    /// Whether parts follow; the end of the last part is the datagram's length.
+    /// Whether further parts follow. The end of the last part is the datagram's length, with the
+    /// UDP header.
     pub more: bool,
     /// Captured bytes of the part.
     pub bytes: &'a [u8],
-    /// True length of the part.
+    /// Length of the part on the wire.
     pub length: u32,
 }
 
@@ -168,7 +170,7 @@ impl Fragment<'_> {
 
 const ETHER_TYPE_IPV4: u16 = 0x0800;
 const ETHER_TYPE_IPV6: u16 = 0x86dd;
-/// 802.1Q, 802.1ad and the older tag of stacked VLANs.
+/// EtherTypes of VLAN tags: 802.1Q, 802.1ad, and the older one of stacked VLANs.
 const ETHER_TYPES_VLAN: [u16; 3] = [0x8100, 0x88a8, 0x9100];
 const MOST_VLAN_TAGS: usize = 2;
 
@@ -225,12 +227,13 @@ pub fn parse(link: Link, bytes: &[u8], length: u32) -> Result<Frame<'_>, WireErr
     })
 }
 
-/// Parses a packet of an `AF_PACKET` socket of type `SOCK_DGRAM`: no link header, with the protocol
-/// and the packet type beside it.
+/// Parses a packet from an `AF_PACKET` socket of type `SOCK_DGRAM`. It has no link header; the
+/// kernel reports the protocol and the packet type separately.
 ///
-/// Of a doubly tagged frame the kernel strips the outer tag only. A received packet then begins
-/// with the inner tag; a sent one begins with the IP header although its protocol names a tag.
-/// Since Linux 6.11 the protocol is the one after all tags, even if a tag is left.
+/// The kernel strips only the outer tag of a frame with two VLAN tags. A received packet then
+/// begins with the inner tag; a sent one begins with the IP header although its protocol names a
+/// tag. Since Linux 6.11 the protocol is the one after all tags, even if the packet still begins
+/// with a tag.
 ///
 /// # Errors
 /// Fails as [`parse`] does.
@@ -253,9 +256,9 @@ pub fn parse_cooked(
     network(protocol, cursor, length)
 }
 
-/// Returns whether a tag precedes the packet although `protocol` does not announce one: two octets
-/// of control information and the packet's own ether type. Without a tag, only an IPv4 packet of
-/// 2048 octets or an IPv6 packet of more than 24,000 reads the same.
+/// Returns whether a VLAN tag precedes the packet although `protocol` does not announce one. A tag
+/// has two octets of control information, then the packet's own EtherType. Without a tag, only an
+/// IPv4 packet of 2048 octets or an IPv6 packet of more than 24,000 octets looks the same.
 fn begins_with_unnamed_tag(protocol: u16, bytes: &[u8], length: usize) -> bool {
     const LEAST_AMBIGUOUS: usize = 2048;
     let version = match protocol {
@@ -299,7 +302,8 @@ fn raw(cursor: Cursor<'_>, length: usize) -> Result<Option<Packet<'_>>, WireErro
     }
 }
 
-/// Returns the claimed length, or the captured length if the claim is smaller and so wrong.
+/// Returns the claimed length on the wire, or the captured length if it is larger, because the
+/// claim is then wrong.
 fn true_length(bytes: &[u8], length: u32) -> usize {
     usize::try_from(length)
         .unwrap_or(usize::MAX)

@@ -39,7 +39,7 @@ impl GuidPrefix {
         VendorId([first, second])
     }
 
-    /// Returns whether it stands for a session of Zenoh rather than a participant of DDS.
+    /// Returns whether the prefix stands for a Zenoh session rather than a DDS participant.
     #[must_use]
     pub const fn is_zenoh(self) -> bool {
         let ([first, second], [z, e]) = (self.vendor().0, VendorId::ZENOH.0);
@@ -47,7 +47,7 @@ impl GuidPrefix {
     }
 }
 
-/// The entity within its participant; the last byte is its kind.
+/// Id of an entity within its participant; the last byte is the entity's kind.
 #[derive(
     Clone,
     Copy,
@@ -86,20 +86,22 @@ impl EntityId {
     /// Secure variant of [`Self::SEDP_SUBSCRIPTIONS_WRITER`].
     pub const SEDP_SUBSCRIPTIONS_SECURE_WRITER: Self = Self([0xff, 0x00, 0x04, 0xc2]);
 
-    /// Returns whether it is a builtin (discovery, liveliness, security) or vendor entity, not the
-    /// user's.
+    /// Returns whether the entity is builtin (discovery, liveliness, security) or vendor-specific,
+    /// not user-defined.
     #[must_use]
     pub const fn is_builtin(self) -> bool {
         self.0[3] & 0xc0 != 0
     }
 
-    /// Returns whether its kind octet is a writer's (with or without key), of any origin.
+    /// Returns whether the entity is a writer, with or without key: user-defined, builtin or
+    /// vendor-specific.
     #[must_use]
     pub const fn is_writer(self) -> bool {
         matches!(self.0[3] & 0x3f, 0x02 | 0x03)
     }
 
-    /// Returns whether its kind octet is a reader's (with or without key), of any origin.
+    /// Returns whether the entity is a reader, with or without key: user-defined, builtin or
+    /// vendor-specific.
     #[must_use]
     pub const fn is_reader(self) -> bool {
         matches!(self.0[3] & 0x3f, 0x04 | 0x07)

@@ -1,37 +1,38 @@
 //! Output of the host hook besides records: captured datagrams in pieces, chunks of the TCP
 //! connections of Zenoh, and the sockets that receive and send them.
 //!
-//! Shared binary layout with the kernel program. Words are in the host's byte order unless they
+//! The kernel program shares this binary layout. Words are in the host's byte order unless they
 //! hold wire bytes (addresses).
 
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
-/// Bytes of a datagram in one piece. The largest UDP payload (65,507) needs four.
+/// Maximum number of bytes in one piece of a datagram. The largest UDP payload (65,507 bytes) needs
+/// four pieces.
 pub const PIECE_BYTES: u32 = 16_384;
-/// Sockets that the hook remembers.
+/// Maximum number of sockets that the hook remembers.
 pub const SOCKET_CAPACITY: u32 = 4_096;
 
 /// Bits of [`Piece::chunk`].
 pub mod chunk {
-    /// A batch begins with the first byte.
+    /// A batch begins with the first byte of the chunk.
     pub const BOUNDARY: u16 = 1;
-    /// The bytes before it were left out on purpose: those samples are not needed.
+    /// The bytes before the chunk were left out on purpose, because their samples are not needed.
     pub const SKIPPED: u16 = 1 << 1;
-    /// Bytes before it were seen and could not be passed on, or not understood.
+    /// Bytes before the chunk were seen but could not be passed on, or could not be parsed.
     pub const LOST: u16 = 1 << 2;
-    /// The connection begins with these bytes.
+    /// The connection begins with the chunk.
     pub const SYN: u16 = 1 << 3;
-    /// The sender sends nothing after these bytes.
+    /// The sender sends no bytes after the chunk.
     pub const END: u16 = 1 << 4;
-    /// The bytes are the beginning of a UDP datagram, an Initial packet of QUIC.
+    /// The chunk is the beginning of a UDP datagram with an Initial packet of QUIC.
     pub const QUIC: u16 = 1 << 5;
 }
 
-/// One piece of a captured datagram; the bytes follow. Pieces of one datagram arrive in order of
-/// their offset with the same token; pieces of other datagrams may lie between them. If the last
-/// piece is missing, the ring was full.
+/// Header of one piece of a captured datagram; the bytes follow. Pieces of one datagram arrive in
+/// order of their offset with the same token, possibly between pieces of other datagrams. If the
+/// last piece is missing, the ring was full.
 ///
-/// With [`crate::record::flag::STREAM`] it is a chunk of a connection of Zenoh instead.
+/// With [`crate::record::flag::STREAM`] the piece is a chunk of a connection of Zenoh instead.
 #[derive(
     Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
 )]
@@ -51,12 +52,13 @@ pub struct Piece {
     pub destination_port: u16,
     /// Interface index in the socket's network namespace.
     pub interface: u32,
-    /// Token of the datagram, unique for some seconds, as in [`crate::Record::datagram`]. Of a
-    /// chunk: TCP sequence number of its first byte.
+    /// Token of the datagram, unique for some seconds, as in [`crate::Record::datagram`]. For a
+    /// chunk: the TCP sequence number of its first byte.
     pub datagram: u32,
     /// Length of the whole UDP payload, or of the chunk.
     pub datagram_len: u32,
-    /// Offset of this piece in the UDP payload; 0 for a chunk, of which only the beginning follows.
+    /// Offset of this piece in the UDP payload; 0 for a chunk, of which possibly only the beginning
+    /// follows.
     pub offset: u32,
     /// Number of bytes that follow, at most [`PIECE_BYTES`].
     pub len: u32,
@@ -76,9 +78,9 @@ const _: () = assert!(size_of::<Piece>() == 80 && align_of::<Piece>() == 8);
 )]
 #[repr(C)]
 pub struct Socket {
-    /// Id of the cgroup it was created in: the inode of that cgroup's directory.
+    /// Id of the cgroup in which the socket was created: the inode of that cgroup's directory.
     pub cgroup: u64,
-    /// Datagrams dropped at its full buffer, RTPS or not.
+    /// Datagrams dropped at the socket's full buffer, RTPS or not.
     pub rcvbuf_errors: u64,
     /// 1 = a TCP socket, whose drop counter counts no datagrams.
     pub is_stream: u64,
@@ -108,8 +110,8 @@ pub struct Owner {
 
 const _: () = assert!(size_of::<Owner>() == 48 && align_of::<Owner>() == 8);
 
-/// Members of the running kernel's types that the programs read, as indices of their `LAYOUT`
-/// array, which the loader fills with byte offsets and enumerators.
+/// Members of the running kernel's types that the programs read. The value is the index in the
+/// programs' `LAYOUT` array, which the loader fills with byte offsets and enumerators.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[repr(u32)]
 pub enum Layout {
@@ -139,11 +141,11 @@ pub enum Layout {
     DeviceNamespace,
     /// `net.ipv4.fqdir`: the incomplete IPv4 datagrams of a network namespace.
     NamespaceFragments4,
-    /// `net.ipv6.fqdir`: the same for IPv6.
+    /// `net.ipv6.fqdir`: the incomplete IPv6 datagrams of a network namespace.
     NamespaceFragments6,
     /// `fqdir.mem`: bytes in use for fragments.
     FragmentsMemory,
-    /// `fqdir.high_thresh`: limit of those bytes.
+    /// `fqdir.high_thresh`: limit of `fqdir.mem`.
     FragmentsLimit,
     /// `sock.__sk_common.skc_cookie`.
     SocketCookie,
@@ -151,7 +153,7 @@ pub enum Layout {
     SocketDrops,
     /// `sock.sk_drop_counters`, used instead of `sk_drops` if it is not null (Linux 6.18).
     SocketDropCounters,
-    /// Bytes between the two counters of `numa_drop_counters`.
+    /// Distance between the two counters of `numa_drop_counters`, in bytes.
     SecondDropCounter,
     /// `file.f_inode`.
     FileInode,
@@ -177,7 +179,7 @@ pub enum Layout {
     PidLevel,
     /// `pid.numbers[0].nr`.
     PidNumbers,
-    /// Bytes of one of `pid.numbers`.
+    /// Size of an element of `pid.numbers`, in bytes.
     PidNumberSize,
 }
 

@@ -1,41 +1,43 @@
 //! Calls of `libtracetools.so` inside observed processes, as the kernel programs aggregate them.
 //!
-//! Shared binary layout with the kernel programs. Words are in the host's byte order. Times are
+//! The kernel programs share this binary layout. Words are in the host's byte order. Times are
 //! CLOCK_MONOTONIC nanoseconds unless a field says otherwise. Handles are addresses in the observed
-//! process; nothing here trusts them.
+//! process, which are not trusted.
 
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
-/// Observed processes at a time.
+/// Maximum number of observed processes.
 pub const PROCESS_CAPACITY: u32 = 1_024;
-/// Publishers, subscriptions, ring buffers and callbacks of all processes.
+/// Maximum number of publishers, subscriptions, ring buffers and callbacks of all processes.
 pub const HANDLE_CAPACITY: u32 = 4_096;
-/// Threads whose last calls are remembered; the least recent ones are forgotten.
+/// Maximum number of threads whose last calls are remembered. The least recently used ones are
+/// forgotten.
 pub const THREAD_CAPACITY: u32 = 8_192;
-/// Messages in ring buffers whose time of entry is remembered; the oldest are forgotten.
+/// Maximum number of messages in ring buffers whose time of entry is remembered. The oldest are
+/// forgotten.
 pub const WAITING_CAPACITY: u32 = 8_192;
-/// Bytes of a name, with its final zero; a longer one is cut.
+/// Maximum size of a name with its terminating zero, in bytes. A longer name is cut.
 pub const NAME_BYTES: usize = 256;
-/// Buckets of a distribution.
+/// Number of buckets of a distribution.
 pub const BUCKETS: usize = 96;
-/// Causal publications reported per callback and second.
+/// Maximum number of causal publications reported per callback and second.
 pub const HOPS_PER_SECOND: u32 = 128;
 
-/// Durations below this share the first bucket, in nanoseconds.
+/// Durations below this number of nanoseconds share the first bucket.
 const FLOOR: u64 = 1 << FLOOR_BITS;
 const FLOOR_BITS: u32 = 10;
 /// Each power of two is divided into this many buckets.
 const STEPS: u64 = 4;
 
 /// Returns the bucket of a duration in nanoseconds: four buckets for each power of two, from 1 µs
-/// to 17 s. A bucket's bounds differ by a quarter at most.
+/// to 17 s. The bounds of a bucket differ by a quarter at most.
 #[inline(always)]
 #[must_use]
 pub const fn bucket(nanoseconds: u64) -> usize {
     if nanoseconds < FLOOR {
         return 0;
     }
-    // The kernel's instruction set has no count of leading zeros.
+    // The instruction set of BPF cannot count leading zeros.
     let (mut bits, mut rest) = (0, nanoseconds);
     if rest >> 32 != 0 {
         (bits, rest) = (bits + 32, rest >> 32);
@@ -64,7 +66,7 @@ pub const fn bucket(nanoseconds: u64) -> usize {
     }
 }
 
-/// Returns the least duration of a bucket in nanoseconds; 0 for the first.
+/// Returns the lower bound of a bucket in nanoseconds; 0 for the first bucket.
 #[must_use]
 pub const fn bucket_start(index: usize) -> u64 {
     if index == 0 {
@@ -94,7 +96,7 @@ pub mod kind {
 )]
 #[repr(C)]
 pub struct Handle {
-    /// Its address.
+    /// Address of the object in the process.
     pub address: u64,
     /// Thread group id of the process, in the initial namespace.
     pub process: u32,
@@ -102,11 +104,13 @@ pub struct Handle {
     pub kind: u32,
 }
 
-/// Which distribution of [`Figures`] a duration belongs to.
+/// Indices of the distributions in [`Figures`].
 pub mod distribution {
-    /// Time between consecutive publications, takes or entries; a callback's duration.
+    /// Time between consecutive publications, takes or entries into a buffer; duration of a
+    /// callback.
     pub const INTERVAL: usize = 0;
-    /// From the source timestamp to the take; in the ring buffer; a callback's wait.
+    /// Time from the source timestamp to the take; time in the ring buffer; waiting time of a
+    /// callback.
     pub const DELAY: usize = 1;
 }
 
@@ -129,24 +133,24 @@ pub struct Figures {
     pub maxima: [u64; 2],
     /// Smallest values by [`distribution`], plus 1; 0 = no value.
     pub minima: [u64; 2],
-    /// The buffer's publisher; what triggers the callback: a subscription, buffer or timer; kind 0
-    /// = unknown, or a service.
+    /// Publisher of a buffer, or trigger of a callback: a subscription, buffer or timer. Kind 0
+    /// means unknown, or a service.
     pub trigger: Handle,
     /// Messages in the buffer after the last entry.
     pub depth: u32,
-    /// The largest of these.
+    /// Largest value of `depth`.
     pub max_depth: u32,
     /// Thread that made the last call.
     pub thread: u32,
-    /// Attempts to announce the handle's name; the programs stop once it was announced.
+    /// Number of attempts to announce the handle's name; the maximum number once it was announced.
     pub announced: u32,
-    /// Begin of the second in which `hops` were reported.
+    /// Start of the second in which `hops` are counted.
     pub hops_since: u64,
     /// Time at which the timer's last call was due.
     pub due: u64,
     /// Period of the timer in nanoseconds; 0 = unknown, or no timer.
     pub period: u64,
-    /// Causal publications reported in this second.
+    /// Causal publications reported in the second that starts at `hops_since`.
     pub hops: u32,
     /// Unused.
     pub unused: u32,
@@ -160,7 +164,7 @@ pub struct Figures {
 )]
 #[repr(C)]
 pub struct Process {
-    /// Calls seen, also those that were not counted.
+    /// Calls seen, including those that were not counted.
     pub hits: u64,
     /// Calls for handles beyond [`HANDLE_CAPACITY`].
     pub refused: u64,
@@ -186,15 +190,15 @@ pub mod clock {
 
 /// How the calls of a process are treated.
 pub mod state {
-    /// They are counted.
+    /// The calls are counted.
     pub const COUNTED: u32 = 0;
-    /// Their budget is exceeded: only their number is counted.
+    /// The process exceeds its budget: only the number of its calls is counted.
     pub const SUSPENDED: u32 = 1;
     /// The process is outside of the observed control group.
     pub const OUTSIDE: u32 = 2;
 }
 
-/// Kinds of [`Announcement`]; in brackets the fields that they use.
+/// Kinds of [`Announcement`], with the fields that each kind uses.
 pub mod announced {
     /// A node (`address`, `text` = name, `second` = namespace).
     pub const NODE: u32 = 1;
@@ -231,7 +235,7 @@ pub mod announced {
     pub const HOP: u32 = 16;
 }
 
-/// A name or a relation, sent once for each handle.
+/// The name or a relation of a handle, sent once for each handle.
 #[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[repr(C)]
 pub struct Announcement {
@@ -239,7 +243,7 @@ pub struct Announcement {
     pub kind: u32,
     /// Thread group id of the process.
     pub process: u32,
-    /// Its thread.
+    /// Id of the calling thread.
     pub thread: u32,
     /// Unused.
     pub unused: u32,
@@ -265,7 +269,7 @@ pub struct Hop {
     pub kind: u32,
     /// Thread group id of the process.
     pub process: u32,
-    /// Its thread.
+    /// Id of the calling thread.
     pub thread: u32,
     /// 1 = the publisher has subscriptions in the same process, which get the message directly.
     pub within: u32,
@@ -273,11 +277,11 @@ pub struct Hop {
     pub published: u64,
     /// The publisher.
     pub publisher: u64,
-    /// What triggers the callback: a subscription or buffer.
+    /// Trigger of the callback: a subscription or buffer.
     pub input: Handle,
     /// Source timestamp of the handled message, nanoseconds since the Unix epoch; 0 = unknown.
     pub source_timestamp: u64,
-    /// Time at which it was taken.
+    /// Time at which the handled message was taken.
     pub taken: u64,
     /// Time at which the callback began.
     pub started: u64,
@@ -291,7 +295,7 @@ pub struct Hop {
 pub enum Counter {
     /// Calls seen.
     Hits = 0,
-    /// Calls among them of processes beyond their budget.
+    /// Calls of processes beyond their budget.
     Suspended,
     /// Calls of processes beyond [`PROCESS_CAPACITY`].
     ProcessesFull,
@@ -341,7 +345,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_duration_lies_between_its_bucket_s_start_and_the_next() {
+    fn a_duration_lies_between_the_start_of_its_bucket_and_that_of_the_next() {
         let mut nanoseconds = 1;
         while nanoseconds < 1 << 34 {
             let index = bucket(nanoseconds);

@@ -1,9 +1,11 @@
-//! RTPS as ROS 2 uses it, read without joining: zero-copy, bounded parsers, the walk that decides
-//! what the kernel filter keeps, and the binary layouts shared by kernel and user space. [`zenoh`]
-//! reads the other protocol of ROS 2; the agent does not use it yet.
+//! Parsers for RTPS as ROS 2 uses it, for an observer that does not join a domain. They are bounded
+//! and copy nothing. The crate also holds the walk that decides what the kernel filter keeps, and
+//! the binary layouts shared by kernel and user space. [`zenoh`] reads Zenoh, the other protocol of
+//! ROS 2.
 //!
-//! No I/O, no clock, no log, no `unsafe`: bytes and a caller-given time in, typed values out. The
-//! kernel program builds this crate without `alloc`.
+//! The crate does no I/O, reads no clock, writes no log and has no `unsafe` code. Bytes and the
+//! caller's time go in, typed values come out. The kernel program builds this crate without
+//! `alloc`.
 
 #![no_std]
 #![forbid(unsafe_code)]

@@ -2,8 +2,8 @@
 //!
 //! The mapping follows the ROS 2 design article 140, as `rmw_fastrtps` and `rmw_cyclonedds`
 //! implement it. ROS names and DDS names are different types, so neither can replace the other by
-//! mistake. All are plain text of at most [`MAX_LEN`] bytes. This module does not check whether a
-//! name is a *valid* ROS name: it shows what is on the wire.
+//! mistake. All names are plain text of at most [`MAX_LEN`] bytes. This module does not check
+//! whether a name is a *valid* ROS name: it keeps the names as they are on the wire.
 
 use alloc::borrow::ToOwned;
 use alloc::boxed::Box;
@@ -15,11 +15,11 @@ use core::fmt;
 use crate::cursor::{Cursor, Reason, WireError};
 use crate::text;
 
-/// Longest name kept, in bytes. The mapping allows 256 characters; a name four times as long is not
-/// ROS.
+/// Maximum length of a name, in bytes. The mapping allows 256 characters; a name of more than four
+/// times that length is not from ROS.
 pub const MAX_LEN: usize = 1024;
 
-/// Defines a name type, so that kinds of names cannot be mixed up.
+/// Defines a type for one kind of names, so that kinds cannot be mixed up.
 macro_rules! name {
     ($(#[$doc:meta])* $name:ident, $what:literal) => {
         $(#[$doc])*
@@ -93,12 +93,12 @@ name!(
 /// The role of a DDS topic in ROS.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Demangled {
-    /// A topic, including those of an action or of service introspection.
+    /// A topic, including the topics of actions and of service introspection.
     Topic(RosName),
-    /// `_buf_cpu` beside a topic (`rmw_fastrtps` 9.4.6 and later): the topic's messages for
-    /// subscribers that support buffers. Holds the topic's name.
+    /// `<topic>/_buf_cpu` (`rmw_fastrtps` 9.4.6 and later): the topic's messages for subscribers
+    /// that support buffers. Holds the topic's name.
     CpuBuffer(RosName),
-    /// `_buf/<subscriber>` beside a topic: references to buffers, not CDR. Holds the topic's name.
+    /// `<topic>/_buf/<subscriber>`: references to buffers, not CDR. Holds the topic's name.
     Buffer(RosName),
     /// Requests of a service.
     ServiceRequest(RosName),
@@ -106,7 +106,7 @@ pub enum Demangled {
     ServiceReply(RosName),
     /// `ros_discovery_info`.
     RosDiscovery,
-    /// Not created by ROS, or with `avoid_ros_namespace_conventions`.
+    /// Not created by ROS, or created with `avoid_ros_namespace_conventions`.
     NotRos,
 }
 
@@ -120,7 +120,7 @@ impl Demangled {
         }
     }
 
-    /// Returns the service of the samples.
+    /// Returns the service of the samples; `None` for topics.
     #[must_use]
     pub const fn service(&self) -> Option<&RosName> {
         match self {
@@ -190,7 +190,8 @@ impl DdsTopic {
     }
 }
 
-/// Returns the topic that a buffer topic belongs to, and whether it is the CPU one.
+/// Returns the topic to which a buffer topic belongs, and whether the buffer topic is the one for
+/// CPU buffers.
 fn buffer_base(name: &str) -> Option<(&str, bool)> {
     if let Some(base) = name
         .strip_suffix("/_buf_cpu")
@@ -317,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn topics_and_services_lose_prefix_and_suffix() {
+    fn topics_and_services_are_demangled_without_prefix_and_suffix() {
         assert_eq!(demangle("rt/a/b"), Demangled::Topic(ros("/a/b")));
         assert_eq!(
             demangle("rq/sRequest"),
@@ -350,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn buffer_topics_count_for_their_base() {
+    fn buffer_topics_belong_to_their_base_topic() {
         assert_eq!(
             demangle("rt/camera/image/_buf_cpu"),
             Demangled::CpuBuffer(ros("/camera/image"))
@@ -387,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn types_demangle() {
+    fn type_names_are_demangled() {
         let dds = |text: &str| DdsType::parse(text).unwrap();
         assert_eq!(
             dds("sensor_msgs::msg::dds_::Imu_").message().as_str(),
@@ -421,7 +422,7 @@ mod tests {
     }
 
     #[test]
-    fn hostile_names_do_not_exist() {
+    fn hostile_names_are_refused() {
         let reason = |text: &str| DdsTopic::parse(text).map_err(|error| error.reason);
         assert_eq!(reason(""), Err(Reason::BadValue));
         assert_eq!(reason("rt/a\"b"), Err(Reason::BadText));
@@ -432,7 +433,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn mangling_comes_back(name in "(/[a-z][a-zA-Z0-9_]{0,8}){1,4}") {
+        fn mangled_names_survive_a_round_trip(name in "(/[a-z][a-zA-Z0-9_]{0,8}){1,4}") {
             let name = ros(&name);
             prop_assert_eq!(DdsTopic::of_topic(&name).demangle(), Demangled::Topic(name.clone()));
             let requests = DdsTopic::of_requests(&name).demangle();
@@ -442,7 +443,7 @@ mod tests {
         }
 
         #[test]
-        fn no_text_makes_it_panic(text in ".{1,40}") {
+        fn no_text_makes_demangling_panic(text in ".{1,40}") {
             if let Ok(topic) = DdsTopic::parse(&text) {
                 let _ = topic.demangle();
             }

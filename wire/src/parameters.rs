@@ -1,6 +1,6 @@
 //! Parameter lists (RTPS 2.5, 9.4.2.11 and 9.6.4): the form of inline QoS and of discovery data.
 //!
-//! An iterator over borrowed bytes. It yields unknown parameters with their length; the caller
+//! [`ParameterList`] iterates over borrowed bytes. It yields unknown parameters, too; the caller
 //! decides whether they matter. "Must understand" is exposed but never a reason to reject a list:
 //! an observer prefers a partial participant to none.
 
@@ -60,9 +60,9 @@ impl ParameterId {
     pub const ENDPOINT_SECURITY_INFO: Self = Self(0x1004);
     pub const PARTICIPANT_SECURITY_INFO: Self = Self(0x1005);
 
-    /// eProsima's; neither Cyclone DDS nor ADLINK's stack uses this number.
+    /// Data sharing of Fast DDS. Neither Cyclone DDS nor ADLINK's stack uses this number.
     pub const FAST_DATASHARING: Self = Self(0x8006);
-    /// eProsima's; Cyclone DDS uses the same number for subscription keys.
+    /// Related sample identity of Fast DDS. Cyclone DDS uses the same number for subscription keys.
     pub const FAST_RELATED_SAMPLE_IDENTITY: Self = Self(0x800f);
 }
 
@@ -130,7 +130,7 @@ impl<'a> ParameterList<'a> {
         let mut cursor = Cursor::new(payload, Endianness::Big);
         let error = cursor.error("encapsulation", Reason::BadMarker);
         let endianness = match cursor.u16("encapsulation")? {
-            // PL_CDR. PL_CDR2 is accepted too: builtin topics have the same form under it.
+            // PL_CDR. PL_CDR2 is accepted too: builtin topics have the same form in both.
             0x0002 | 0x000a => Endianness::Big,
             0x0003 | 0x000b => Endianness::Little,
             _ => return Err(error),
@@ -147,7 +147,7 @@ impl<'a> ParameterList<'a> {
     /// Returns the value of the first parameter with this identifier.
     ///
     /// # Errors
-    /// Fails if the list breaks off before it.
+    /// Fails if the list is malformed before that parameter.
     pub fn find(self, id: ParameterId) -> Result<Option<Cursor<'a>>, WireError> {
         for parameter in self {
             let parameter = parameter?;
@@ -169,7 +169,7 @@ impl<'a> ParameterList<'a> {
                 return Ok(None);
             }
             let value = self.rest.sub("parameter", length)?;
-            // Lengths are multiples of four; a writer with another length pads.
+            // Lengths are multiples of four. After another length, the writer pads the value.
             self.rest
                 .take("parameter padding", length.wrapping_neg() & 3)?;
             if id.known() != ParameterId::PAD {
@@ -213,12 +213,12 @@ mod tests {
     ];
 
     #[test]
-    fn pads_are_passed_and_the_sentinels_length_is_ignored() {
+    fn pads_are_skipped_and_the_length_of_the_sentinel_is_ignored() {
         assert_eq!(inline(&TWO), Ok([(0x0005, 4), (0x800f, 0)].into()));
     }
 
     #[test]
-    fn inline_qos_needs_its_sentinel_and_a_payload_does_not() {
+    fn inline_qos_requires_the_sentinel_and_a_payload_does_not() {
         for length in 0..TWO.len() {
             assert_eq!(inline(&TWO[..length]), Err(Reason::Truncated), "{length}");
         }
@@ -234,13 +234,13 @@ mod tests {
     }
 
     #[test]
-    fn a_length_that_is_not_padded_does_not_shift_what_follows() {
+    fn an_unpadded_length_does_not_shift_the_next_parameter() {
         let bytes = [0x62, 0, 2, 0, b'a', 0, 0, 0, 0x05, 0, 0, 0, 1, 0, 0, 0];
         assert_eq!(inline(&bytes), Ok([(0x0062, 2), (0x0005, 0)].into()));
     }
 
     #[test]
-    fn an_ended_list_stays_ended() {
+    fn a_list_stays_ended_after_its_end_or_an_error() {
         let mut list = ParameterList::inline(Cursor::new(&TWO, Endianness::Little));
         assert_eq!(list.by_ref().count(), 2);
         assert!(list.next().is_none());
@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn only_parameter_lists_are_taken_for_ones() {
+    fn payloads_with_another_encapsulation_are_refused() {
         assert!(ParameterList::encapsulated(&[0, 2, 0, 0]).is_ok());
         for kind in [0x00, 0x01, 0x06, 0x07, 0xff] {
             let error = ParameterList::encapsulated(&[0, kind, 0, 0])
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn must_understand_is_not_part_of_the_number() {
+    fn the_must_understand_bit_is_not_part_of_the_known_id() {
         let tag = ParameterId(0x4014);
         assert!(tag.must_understand() && !tag.is_vendor_specific());
         assert_eq!(tag.known(), ParameterId::DOMAIN_TAG);

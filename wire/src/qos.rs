@@ -1,7 +1,8 @@
 //! Quality of service of endpoints, as discovery announces it.
 //!
 //! An absent policy has a default that depends on the role (DDS 1.4, 2.2.3), so one table for both
-//! is wrong. A policy that an implementation never announces is unknown, not a default.
+//! roles would be wrong. A policy that an implementation never announces is unknown and has no
+//! default.
 
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -23,7 +24,8 @@ pub enum Role {
     Reader,
 }
 
-/// Defines a policy's kind with ROS's words for its values; an unknown value keeps its number.
+/// Defines the kind of a policy with the ROS names of its values. An unknown value keeps its
+/// number.
 macro_rules! kind {
     ($(#[$doc:meta])* $name:ident { $($constant:ident = $value:literal),+ $(,)? }) => {
         $(#[$doc])*
@@ -34,7 +36,7 @@ macro_rules! kind {
         impl $name {
             $(pub const $constant: Self = Self($value);)+
 
-            /// Returns ROS's word for the value; `None` for a value that ROS does not know.
+            /// Returns the ROS name of the value; `None` for a value that ROS does not know.
             #[must_use]
             pub const fn name(self) -> Option<&'static str> {
                 match self {
@@ -43,7 +45,7 @@ macro_rules! kind {
                 }
             }
 
-            /// Returns ROS's word for the value, or `UNKNOWN`.
+            /// Returns the ROS name of the value, or `UNKNOWN`.
             #[must_use]
             pub const fn label(self) -> &'static str {
                 match self.name() {
@@ -53,7 +55,7 @@ macro_rules! kind {
             }
         }
 
-        /// Formats a value without a ROS word as `UNKNOWN`.
+        /// Formats the ROS name of the value, or `UNKNOWN`.
         impl fmt::Display for $name {
             fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 f.pad(self.label())
@@ -63,8 +65,8 @@ macro_rules! kind {
 }
 
 kind!(
-    /// Wire values: unlike the other policies, this one counts from 1 (RTPS 2.5, 9.4.2.11.2; Fast
-    /// DDS and Cyclone DDS agree).
+    /// Whether lost samples are sent again. Unlike those of other policies, the wire values count
+    /// from 1 (RTPS 2.5, 9.4.2.11.2; Fast DDS and Cyclone DDS agree).
     Reliability { BEST_EFFORT = 1, RELIABLE = 2 }
 );
 kind!(
@@ -88,14 +90,14 @@ kind!(
     AccessScope { INSTANCE = 0, TOPIC = 1, GROUP = 2 }
 );
 kind!(
-    /// Number of samples kept.
+    /// Whether all samples are kept, or only the last ones.
     HistoryKind { KEEP_LAST = 0, KEEP_ALL = 1 }
 );
 
 /// History policy.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct History {
-    /// Keep all samples or the last ones.
+    /// Whether all samples are kept, or only the last ones.
     pub kind: HistoryKind,
     /// Number of samples, for [`HistoryKind::KEEP_LAST`].
     pub depth: i32,
@@ -133,11 +135,11 @@ impl DataRepresentation {
     pub const XCDR2: Self = Self(2);
 }
 
-/// Most representations kept per endpoint; three are defined.
+/// Maximum number of representations kept per endpoint; three are defined.
 const MAX_REPRESENTATIONS: u32 = 8;
-/// Most partitions kept per endpoint; ROS 2 uses none.
+/// Maximum number of partitions per endpoint; ROS 2 uses none.
 const MAX_PARTITIONS: usize = 16;
-/// Longest partition name kept.
+/// Maximum length of a partition name, in bytes.
 const MAX_PARTITION_LEN: usize = 256;
 
 /// The policies that an endpoint offers or requests.
@@ -149,17 +151,17 @@ pub struct Qos {
     pub durability: Durability,
     /// History; `None` if the implementation does not announce it (Fast DDS before 3.2).
     pub history: Option<History>,
-    /// Longest time between two samples.
+    /// Maximum time between two samples.
     pub deadline: RtpsDuration,
     /// Age at which samples expire; writers only.
     pub lifespan: RtpsDuration,
     /// Liveliness.
     pub liveliness: Liveliness,
-    /// Time within which liveliness is asserted.
+    /// Maximum time between two assertions of liveliness.
     pub liveliness_lease: RtpsDuration,
     /// Ownership.
     pub ownership: Ownership,
-    /// Least time between two samples that a reader accepts.
+    /// Minimum time between two samples that a reader accepts.
     pub minimum_separation: RtpsDuration,
     /// Delay that the implementation may add to save work.
     pub latency_budget: RtpsDuration,
@@ -167,9 +169,10 @@ pub struct Qos {
     pub destination_order: DestinationOrder,
     /// Presentation of coherent sets.
     pub presentation: Presentation,
-    /// Data representations: a writer uses the first, a reader accepts any; empty is XCDR1.
+    /// Data representations: a writer uses the first one, a reader accepts any of them; empty means
+    /// XCDR1.
     pub representations: Vec<DataRepresentation>,
-    /// Partitions; empty is the default one.
+    /// Partitions; empty means the default partition.
     pub partitions: Vec<Box<str>>,
 }
 
@@ -183,8 +186,9 @@ impl Qos {
                 Role::Reader => Reliability::BEST_EFFORT,
             },
             durability: Durability::VOLATILE,
-            // Not part of the specification's discovery data. Cyclone DDS announces it if it
-            // differs from KEEP_LAST 1; Fast DDS 2.x never does, 3.2 and later always.
+            // The specification's discovery data does not contain the history. Cyclone DDS
+            // announces it if it differs from KEEP_LAST 1. Fast DDS 2.x never announces it, 3.2 and
+            // later always do.
             history: match vendor {
                 VendorId::CYCLONE => Some(History {
                     kind: HistoryKind::KEEP_LAST,
@@ -218,7 +222,7 @@ impl Qos {
     ) -> Result<bool, WireError> {
         match id {
             ParameterId::RELIABILITY => {
-                // Old versions of the specification had 3 for reliable.
+                // Old versions of the specification encoded RELIABLE as 3.
                 self.reliability = match value.u32("PID_RELIABILITY")? {
                     3 => Reliability::RELIABLE,
                     kind => Reliability(kind),
@@ -264,7 +268,7 @@ impl Qos {
     }
 }
 
-/// Reads seconds and 2^-32 fractions.
+/// Reads a duration: seconds and a fraction of 2^-32 seconds.
 pub(crate) fn duration(
     value: &mut Cursor<'_>,
     what: &'static str,
@@ -336,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn liveliness_has_its_lease_behind_the_kind() {
+    fn the_lease_of_liveliness_is_read_after_the_kind() {
         let mut qos = Qos::defaults(Role::Reader, VendorId::EPROSIMA);
         let value = [2, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0x80];
         apply(&mut qos, ParameterId::LIVELINESS, &value).unwrap();
@@ -348,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn presentation_order_and_representation_are_read() {
+    fn presentation_destination_order_and_latency_budget_are_read() {
         let mut qos = Qos::defaults(Role::Writer, VendorId::CYCLONE);
         apply(
             &mut qos,
@@ -378,7 +382,7 @@ mod tests {
     }
 
     #[test]
-    fn representations_are_bounded() {
+    fn a_long_list_of_representations_is_cut() {
         let mut qos = Qos::defaults(Role::Reader, VendorId::CYCLONE);
         let value = [2, 0, 0, 0, 2, 0, 0, 0];
         apply(&mut qos, ParameterId::DATA_REPRESENTATION, &value).unwrap();
@@ -394,7 +398,7 @@ mod tests {
     }
 
     #[test]
-    fn partitions_are_bounded() {
+    fn a_list_of_too_many_partitions_is_refused() {
         let mut qos = Qos::defaults(Role::Reader, VendorId::EPROSIMA);
         let value = *b"\x02\0\0\0\x02\0\0\0a\0\0\0\x03\0\0\0bc\0\0";
         apply(&mut qos, ParameterId::PARTITION, &value).unwrap();

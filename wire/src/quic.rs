@@ -1,14 +1,16 @@
-//! QUIC, which Zenoh can run over: how a connection begins. Everything behind that is encrypted.
+//! Recognizes the start of a QUIC connection, over which Zenoh can run. Only unprotected header
+//! fields are read; everything after them is encrypted.
 
-/// Bytes of a datagram that [`is_initial`] reads.
+/// Number of bytes of a datagram that [`is_initial`] reads.
 pub const HEAD: usize = 6;
-/// Least length of a datagram with an Initial packet (RFC 9000, 14.1).
+/// Minimum length of a datagram with an Initial packet, in bytes (RFC 9000, 14.1).
 const LEAST: u32 = 1200;
-/// Longest connection id (RFC 9000, 17.2).
+/// Maximum length of a connection id, in bytes (RFC 9000, 17.2).
 const LONGEST_ID: u8 = 20;
 
-/// Returns whether a UDP datagram of `length` bytes that begins with `head` has an Initial packet:
-/// a long header of type 0 in version 1 (RFC 9000, 17.2.2), of type 1 in version 2 (RFC 9369, 3.2).
+/// Returns whether a UDP datagram of `length` bytes that begins with `head` has an Initial packet.
+/// Such a packet has a long header: type 0 in version 1 (RFC 9000, 17.2.2), type 1 in version 2
+/// (RFC 9369, 3.2).
 #[must_use]
 pub const fn is_initial(head: [u8; HEAD], length: u32) -> bool {
     let [first, version @ .., id_length] = head;
@@ -17,7 +19,7 @@ pub const fn is_initial(head: [u8; HEAD], length: u32) -> bool {
         0x6b33_43cf => 0x10,
         _ => return false,
     };
-    // Header form, fixed bit and type. The other bits are protected.
+    // Compares header form, fixed bit and type. The other bits are protected.
     first & 0xf0 == 0xc0 | packet_type && id_length <= LONGEST_ID && length >= LEAST
 }
 
@@ -25,13 +27,13 @@ pub const fn is_initial(head: [u8; HEAD], length: u32) -> bool {
 mod tests {
     use super::*;
 
-    /// RFC 9001, A.2.
+    /// The client's Initial packet of RFC 9001, A.2.
     const CLIENT: [u8; HEAD] = [0xc0, 0, 0, 0, 1, 8];
-    /// RFC 9369, A.2.
+    /// The client's Initial packet of RFC 9369, A.2.
     const CLIENT_V2: [u8; HEAD] = [0xd7, 0x6b, 0x33, 0x43, 0xcf, 8];
 
     #[test]
-    fn the_first_packets_of_the_specifications_are_initial() {
+    fn example_packets_of_the_specifications_are_initial_packets() {
         for head in [CLIENT, CLIENT_V2, [0xcf, 0, 0, 0, 1, 0]] {
             assert!(is_initial(head, 1200), "{head:02x?}");
             assert!(!is_initial(head, 1199), "{head:02x?}: too short");
@@ -39,15 +41,15 @@ mod tests {
     }
 
     #[test]
-    fn other_packets_are_no_initial_packets() {
+    fn other_packets_are_not_initial_packets() {
         for head in [
             *b"RTPS\x02\x03",
             [0x40, 0, 0, 0, 1, 8],
             [0x80, 0, 0, 0, 1, 8],
-            // Handshake, and its type in version 2.
+            // Handshake packets of version 1 and of version 2.
             [0xe0, 0, 0, 0, 1, 8],
             [0xf0, 0x6b, 0x33, 0x43, 0xcf, 8],
-            // Version negotiation, a draft, and an id that is too long.
+            // Version negotiation, a draft version, and a connection id that is too long.
             [0xc0, 0, 0, 0, 0, 8],
             [0xc0, 0xff, 0, 0, 0x1d, 8],
             [0xc0, 0, 0, 0, 1, 21],

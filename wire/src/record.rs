@@ -45,10 +45,11 @@ pub mod kind {
 pub mod flag {
     /// The datagram arrived in several IP fragments.
     pub const FRAGMENTED: u16 = 1 << 0;
-    /// Written before the datagram was complete: valid after the [`super::kind::COMPLETE`] record
-    /// or a later record of the same datagram without this bit.
+    /// The record was written before the datagram was complete. It becomes valid with the
+    /// [`super::kind::COMPLETE`] record, or with a later record of the same datagram without this
+    /// bit.
     pub const AHEAD: u16 = 1 << 1;
-    /// Sent by this host.
+    /// This host sent the datagram.
     pub const OUTGOING: u16 = 1 << 2;
     /// `destination` is IPv6 (otherwise IPv4-mapped).
     pub const IPV6: u16 = 1 << 3;
@@ -56,26 +57,27 @@ pub mod flag {
     pub const INLINE_QOS_UNREAD: u16 = 1 << 4;
     /// `stamp_seconds` and `stamp_nanoseconds` hold the payload's bytes 4..12.
     pub const STAMP: u16 = 1 << 5;
-    /// Seen at a socket of this host as a whole datagram, not on an interface: sent if [`OUTGOING`]
-    /// is set, otherwise just before the receive buffer of [`super::Record::socket`].
+    /// The datagram was seen as a whole at a socket of this host, not on an interface. With
+    /// [`OUTGOING`] the socket sent it, otherwise it was about to enter the receive buffer of
+    /// [`super::Record::socket`].
     pub const HOST: u16 = 1 << 6;
-    /// A copy of a record with the same time: the datagram was dropped at the socket's full buffer.
-    /// DATA and DATA_FRAG only.
+    /// A copy of a record with the same time, because the datagram was dropped at the socket's full
+    /// buffer. DATA and DATA_FRAG only.
     pub const SOCKET_FULL: u16 = 1 << 7;
-    /// The datagram never became complete: the kernel gave up waiting for IP fragments. Written at
-    /// that time (after `net.ipv4.ipfrag_time`, 30 s) for the submessages in its first fragment.
-    /// DATA and DATA_FRAG only; `socket` is 0.
+    /// The datagram never became complete: the kernel timed out waiting for IP fragments
+    /// (`net.ipv4.ipfrag_time`, 30 s), or had no memory for them. The record is written then, for
+    /// the submessages in the first fragment. DATA and DATA_FRAG only; `socket` is 0.
     pub const NOT_REASSEMBLED: u16 = 1 << 8;
-    /// Read from shared memory between processes of this host: a sampled view. Missing samples may
-    /// have been sent, unless [`EXACT`] is set.
+    /// The message was read from shared memory between processes of this host, which is sampled.
+    /// Missing samples may have been sent, unless [`EXACT`] is set.
     pub const SHM: u16 = 1 << 9;
-    /// With [`SHM`]: read in the sending process, which shows every message of that process, so
-    /// missing samples were not sent. Written by the kernel program.
+    /// With [`SHM`]: the kernel program read every message in the sending process, so missing
+    /// samples were not sent.
     pub const EXACT: u16 = 1 << 10;
-    /// Carried by a TCP connection of Zenoh: a copy is for another receiver, never a repetition. Of a
-    /// [`crate::host::Piece`]: it is a chunk of such a connection.
+    /// A TCP connection of Zenoh carried the sample: a copy is for another receiver, never a
+    /// repetition. In a [`crate::host::Piece`]: the piece is a chunk of such a connection.
     pub const STREAM: u16 = 1 << 11;
-    /// With [`STREAM`]: sent to a router, which passes it on and is not a subscriber.
+    /// With [`STREAM`]: the sample was sent to a router, which forwards it and is not a subscriber.
     pub const RELAYED: u16 = 1 << 12;
 }
 
@@ -88,8 +90,9 @@ pub mod flag {
 )]
 #[repr(C)]
 pub struct Record {
-    /// Nanoseconds. From the kernel filter: CLOCK_MONOTONIC of the frame that completed the
-    /// datagram, converted to the Unix epoch before the model reads it. Elsewhere: the Unix epoch.
+    /// Time of the frame that completed the datagram, in nanoseconds. The kernel filter writes
+    /// CLOCK_MONOTONIC, which is converted to the Unix epoch before the model reads it. Other
+    /// sources write nanoseconds since the Unix epoch.
     pub time: u64,
     /// Writer GUID, 16 wire bytes.
     pub writer: [u32; 4],
@@ -105,7 +108,7 @@ pub struct Record {
     pub destination_port: u16,
     /// Length of the whole UDP payload.
     pub datagram_len: u16,
-    /// Interface index the frame was seen on; 0 = unknown.
+    /// Index of the interface on which the frame was seen; 0 = unknown.
     pub interface: u32,
     /// Token of a fragmented datagram, unique for some seconds; 0 if not fragmented.
     pub datagram: u32,
@@ -125,7 +128,8 @@ pub struct Record {
     /// Payload bytes 4..8 as a number in the encapsulation's byte order: `Header.stamp.sec` if the
     /// type begins with a header. HEARTBEAT: count. GAP, ACKNACK: numBits.
     pub stamp_seconds: u32,
-    /// Payload bytes 8..12 in the same form: `Header.stamp.nanosec`. GAP, ACKNACK: bitmap word 0.
+    /// Payload bytes 8..12 in the same byte order: `Header.stamp.nanosec`. GAP, ACKNACK: bitmap
+    /// word 0.
     pub stamp_nanoseconds: u32,
     /// DATA_FRAG: fragmentStartingNum, 1-based. GAP, ACKNACK: bitmap word 1.
     pub fragment_start: u32,
@@ -138,7 +142,7 @@ pub struct Record {
     /// Cookie of the socket that receives or sends the datagram (`SO_COOKIE`); 0 = unknown.
     pub socket: u64,
     /// DATA_FRAG: nanoseconds from the first datagram of this record to the last, which is at
-    /// `time`; `u32::MAX` = that or more.
+    /// `time`; saturates at `u32::MAX`.
     pub elapsed: u32,
     /// Source UDP port; 0 = unknown.
     pub source_port: u16,
@@ -149,11 +153,12 @@ pub struct Record {
 const _: () = assert!(size_of::<Record>() == 136 && align_of::<Record>() == 8);
 
 impl Record {
-    /// Most bits of a GAP's or ACKNACK's bitmap in a record; for longer sets (up to 256) the walk
-    /// requires the whole datagram.
+    /// Maximum number of bitmap bits of a GAP or ACKNACK in a record; a set has up to 256. For a
+    /// longer GAP the walk returns [`crate::walk::Step::LongGap`]. A longer ACKNACK is cut.
     pub const BITMAP_BITS: u32 = 160;
 
-    /// Returns the participant that sent it: the reader's for an ACKNACK, otherwise the writer's.
+    /// Returns the participant that sent the submessage: the reader's for an ACKNACK, otherwise the
+    /// writer's.
     #[must_use]
     pub fn sender(&self) -> GuidPrefix {
         if self.is_acknack() {
@@ -163,7 +168,8 @@ impl Record {
         }
     }
 
-    /// Returns the participant that it is sent to; unknown if it is sent to all matched readers.
+    /// Returns the participant to which the submessage is sent; unknown if it is sent to all
+    /// matched readers.
     #[must_use]
     pub fn addressee(&self) -> GuidPrefix {
         if self.is_acknack() {
@@ -179,13 +185,13 @@ impl Record {
         zerocopy::transmute!(self.writer)
     }
 
-    /// Returns the reader, or unknown if it is sent to all matched readers.
+    /// Returns the reader; unknown if the submessage is sent to all matched readers.
     #[must_use]
     pub fn reader(&self) -> Guid {
         zerocopy::transmute!(self.reader)
     }
 
-    /// Returns the time of the first datagram, for a record of fragments from several datagrams.
+    /// Returns the time of the first datagram, if the record covers fragments of several datagrams.
     #[must_use]
     pub const fn began(&self) -> Timestamp {
         Timestamp(self.time.saturating_sub(self.elapsed as u64))
@@ -209,7 +215,7 @@ impl Record {
         self.fragments & 0xffff
     }
 
-    /// DATA_FRAG: returns whether it holds the sample's last fragment.
+    /// DATA_FRAG: returns whether the record holds the sample's last fragment.
     #[inline(always)]
     #[must_use]
     pub const fn ends_sample(&self) -> bool {
@@ -224,7 +230,7 @@ impl Record {
         end as u64 > (self.sample_size as u64).div_ceil(size as u64)
     }
 
-    /// DATA_FRAG: returns whether `next` continues this one, for the same sample and reader.
+    /// DATA_FRAG: returns whether `next` continues this record, for the same sample and reader.
     #[inline(always)]
     #[must_use]
     pub const fn is_followed_by(&self, next: &Self) -> bool {
@@ -243,8 +249,9 @@ impl Record {
             && (self.flags ^ next.flags) & !OF_THE_DATAGRAM == 0
     }
 
-    /// Merges `next` into this DATA_FRAG if it follows: one record then covers fragments of several
-    /// datagrams, with the time of the last. Returns `false` if it does not follow.
+    /// Merges `next` into this DATA_FRAG if its fragments follow. The record then covers fragments
+    /// of several datagrams, with the time of the last. Returns `false` if they do not follow, or
+    /// if the record would cover more than 65,535 fragments.
     #[inline(always)]
     pub const fn extend(&mut self, next: &Self) -> bool {
         let count = self.fragments_in_submessage() + next.fragments_in_submessage();
@@ -261,7 +268,7 @@ impl Record {
         self.fragments = count << 16 | self.fragment_size();
         self.payload_len = self.payload_len.wrapping_add(next.payload_len);
         if self.source_timestamp == 0 {
-            // Cyclone DDS sends INFO_TS with the first fragment only, others with each.
+            // Cyclone DDS sends INFO_TS with the first fragment only, other vendors with each.
             self.source_timestamp = next.source_timestamp;
         }
         true
@@ -272,7 +279,7 @@ impl Record {
         (self.payload_len as u64) << 32 | self.encapsulation as u64
     }
 
-    /// Returns the context of a [`kind::HANDOVER`].
+    /// Returns the state from which user space continues the walk, for a [`kind::HANDOVER`].
     #[must_use]
     pub fn handover(&self) -> Handover {
         Handover {
@@ -311,20 +318,20 @@ pub struct Handover {
     pub timestamp: [u32; 2],
 }
 
-/// Treatment of a writer or reader by the kernel filter: the value of its interest map. Without an
-/// entry it is unknown, and its first datagrams are captured within a budget.
+/// Treatment of a writer or reader by the kernel filter: the value in the interest map. A writer
+/// without an entry is unknown, and its first datagrams are captured within a budget.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 #[repr(u32)]
 pub enum Verdict {
-    /// Classified and of no interest.
+    /// The endpoint is classified and of no interest.
     Ignore = 0,
-    /// One record per submessage, nothing copied.
+    /// One record is written per submessage, and no payload is copied.
     Meter = 1,
-    /// Whole datagrams go to user space.
+    /// Whole datagrams are copied to user space.
     Capture = 2,
 }
 
-/// Returns the GUID in the words of [`Record`] and of the interest map's key.
+/// Returns the GUID as words, as in [`Record`] and in the keys of the interest map.
 #[must_use]
 pub fn guid_words(guid: Guid) -> [u32; 4] {
     zerocopy::transmute!(guid)
@@ -361,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn a_hole_a_repetition_another_sample_and_another_reader_do_not_follow() {
+    fn fragments_after_a_gap_or_of_another_sample_or_reader_are_not_merged() {
         let run = fragments(1, 5, 100);
         let strangers = [
             fragments(7, 1, 1),
@@ -399,7 +406,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sample_of_impossible_size_ends_at_once() {
+    fn a_fragment_size_of_zero_ends_the_sample() {
         assert!(
             Record {
                 fragments: 1 << 16,

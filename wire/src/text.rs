@@ -1,10 +1,10 @@
-//! Untrusted text: read within a limit, and refused if it could break out of a log line, a label or
-//! a terminal.
+//! Reads untrusted text within a limit. Refuses names that could break out of a log line, a label
+//! or a terminal.
 
 use crate::cursor::{Cursor, Reason, WireError};
 
-/// Reads a CDR string: `u32` length including the terminating NUL, the bytes, padding to four. The
-/// characters are not checked; see [`checked`].
+/// Reads a CDR string: a `u32` length that includes the terminating NUL, the bytes, and padding to
+/// four. Does not check the characters, unlike [`name`].
 ///
 /// Accepts more than one NUL at the end (Fast DDS includes one in some lengths); a length of zero
 /// is an empty string. The limit is in bytes of text.
@@ -26,7 +26,7 @@ pub(crate) fn string<'a>(
     Ok(text)
 }
 
-/// Reads a CDR octet sequence: `u32` length, the bytes, padding to four.
+/// Reads a CDR octet sequence: a `u32` length, the bytes, and padding to four.
 pub(crate) fn octets<'a>(
     cursor: &mut Cursor<'a>,
     what: &'static str,
@@ -47,7 +47,7 @@ pub(crate) fn is_plain(text: &str) -> bool {
     !text.chars().any(|c| {
         c.is_control()
             || matches!(c, '"' | '\'' | '`' | '\\')
-            // Line and paragraph separators, and the marks that reorder text on a terminal.
+            // Line and paragraph separators, and the characters that reorder text on a terminal.
             || matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}' | '\u{feff}')
     })
 }
@@ -77,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn a_string_needs_its_terminator() {
+    fn a_string_without_its_terminator_is_refused() {
         assert_eq!(read(b"\x03\0\0\0ab\0\0"), Ok("ab"));
         assert_eq!(read(b"\x02\0\0\0ab\0\0"), Err(Reason::BadText));
         assert_eq!(read(b"\0\0\0\0"), Ok(""));
@@ -85,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn a_length_beyond_the_bytes_is_truncated() {
+    fn a_length_beyond_the_input_is_reported_as_truncated() {
         assert_eq!(read(b"\xff\xff\xff\xffab\0\0"), Err(Reason::Truncated));
         assert_eq!(read(b"\x05\0\0\0ab\0\0"), Err(Reason::Truncated));
     }

@@ -8,7 +8,7 @@ pub const SECOND: u64 = 1_000_000_000;
 /// One millisecond in nanoseconds.
 pub const MILLISECOND: u64 = 1_000_000;
 
-/// Nanoseconds since the Unix epoch. The only clock reading of the agent, always passed in.
+/// Nanoseconds since the Unix epoch. The caller reads the clock and passes the time in.
 ///
 /// Sums and differences with a [`Duration`] saturate at both ends of the 64 bits.
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
@@ -21,7 +21,7 @@ impl Timestamp {
         self.0.wrapping_sub(earlier.0).cast_signed()
     }
 
-    /// Returns seconds with a fraction, for people and for Prometheus.
+    /// Returns the time in seconds with a fraction, for people and for Prometheus.
     #[must_use]
     #[expect(
         clippy::cast_precision_loss,
@@ -38,7 +38,7 @@ impl Timestamp {
         self.0 / SECOND
     }
 
-    /// Returns the distance to `other`, whichever is later.
+    /// Returns the absolute difference between `self` and `other`.
     #[inline]
     #[must_use]
     pub const fn distance(self, other: Self) -> Duration {
@@ -64,7 +64,7 @@ impl Sub<Duration> for Timestamp {
     }
 }
 
-/// The time since an earlier timestamp; zero if it is later.
+/// The time since `earlier`; zero if `earlier` is later.
 impl Sub for Timestamp {
     type Output = Duration;
 
@@ -92,7 +92,7 @@ impl RtpsTime {
     #[must_use]
     pub const fn of(timestamp: Timestamp) -> Self {
         let (seconds, rest) = (timestamp.0 / SECOND, timestamp.0 % SECOND);
-        // Rounds to nearest, as the way back does.
+        // Rounds to nearest, as [`Self::timestamp`] does.
         Self((seconds << 32) | (((rest << 32) + SECOND / 2) / SECOND))
     }
 
@@ -104,7 +104,8 @@ impl RtpsTime {
         }
         let seconds = self.0 >> 32;
         let fraction = self.0 & 0xffff_ffff;
-        // Rounds to nearest: 2^-32 s is finer than a nanosecond, so writers' values survive.
+        // Rounds to nearest: 2^-32 s is finer than a nanosecond, so the writer's nanoseconds
+        // survive.
         let nanoseconds = (fraction * SECOND + (1 << 31)) >> 32;
         Some(Timestamp(seconds * SECOND + nanoseconds))
     }
@@ -145,7 +146,7 @@ impl RtpsDuration {
         }
     }
 
-    /// Returns seconds with a fraction; `None` if it never ends.
+    /// Returns the duration in seconds with a fraction; `None` if it is infinite.
     #[must_use]
     #[expect(
         clippy::cast_precision_loss,
@@ -162,7 +163,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_tenth_of_a_second_is_not_429_milliseconds() {
+    fn the_fraction_of_a_tenth_of_a_second_reads_as_100_milliseconds() {
         assert_eq!(
             RtpsDuration::from_wire(0, 0x1999_999a),
             RtpsDuration::Finite(Duration::from_millis(100))
@@ -170,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn infinite_in_both_spellings() {
+    fn both_encodings_of_an_infinite_duration_read_as_infinite() {
         assert_eq!(
             RtpsDuration::from_wire(i32::MAX, u32::MAX),
             RtpsDuration::Infinite
@@ -182,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn no_time_is_not_the_epoch() {
+    fn a_zero_reads_as_no_time_and_other_times_survive_a_round_trip() {
         assert_eq!(RtpsTime(0).timestamp(), None);
         for nanoseconds in [
             1,

@@ -1,12 +1,13 @@
-//! The walk over one datagram's submessages that decides what happens to it.
+//! The walk over one datagram's submessages, which decides what happens to the datagram.
 //!
-//! Written once: the kernel filter compiles [`step`] and [`fate`] for the BPF target and reads from
-//! a socket buffer; user space reads from a slice. So the unit tests, the fuzzer and the replays
-//! exercise the code that runs in the kernel. That target dictates the style: reads of fixed size,
-//! state in one plain struct, masks instead of branches for the byte order, no formatting.
+//! The kernel filter compiles [`step`] and [`fate`] for the BPF target and reads from a socket
+//! buffer. User space compiles the same source and reads from a slice. So the unit tests, the
+//! fuzzer and the replays exercise the code that runs in the kernel. The BPF target dictates the
+//! style: reads of fixed size, state in one plain struct, masks instead of branches for the byte
+//! order, no formatting.
 //!
-//! It follows the receiver state of RTPS 2.5, 8.3.4 (INFO_SRC, INFO_DST, INFO_TS) and skips unknown
-//! submessages by their length. It reads at most twelve bytes of a payload.
+//! The walk follows the receiver state of RTPS 2.5, 8.3.4 (INFO_SRC, INFO_DST, INFO_TS) and skips
+//! unknown submessages by their length. It reads at most twelve bytes of a payload.
 
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
@@ -18,8 +19,8 @@ use crate::rtps::{SubmessageFlags, SubmessageId};
 /// Source of a walk's bytes: a slice, or a socket buffer in the kernel.
 pub trait Bytes {
     /// Returns `N` words of wire bytes at `offset` of the UDP payload, in memory order; `None` if
-    /// some of them are not present. Every read of the walk is 4-aligned relative to the payload's
-    /// start, as submessages are (RTPS 2.5, 9.4.5.1).
+    /// some of them are not present. In a well-formed message, every read of the walk is 4-aligned
+    /// relative to the payload's start, as submessages are (RTPS 2.5, 9.4.5.1).
     fn words<const N: usize>(&self, offset: u32) -> Option<[u32; N]>;
 }
 
@@ -34,13 +35,13 @@ impl Bytes for &[u8] {
 
 /// Size of the RTPS message header, after which the first submessage begins.
 pub const HEADER_LEN: u32 = 20;
-/// Longest message that is walked. A datagram has at most 65,507 bytes; a shared-memory transport
-/// may be configured for longer messages.
+/// Maximum length of a message that is walked, in bytes. A datagram has at most 65,507 bytes; a
+/// shared-memory transport may be configured for longer messages.
 pub const MAX_MESSAGE: u32 = 32 << 20;
-/// `RTPS` as it lies in memory.
+/// `RTPS` in memory order.
 pub const MAGIC: u32 = u32::from_ne_bytes(*b"RTPS");
 
-/// Parameters of one inline QoS that the walk reads before it stops looking for the end.
+/// Maximum number of parameters of one inline QoS that the walk reads in search of its end.
 const INLINE_QOS_PARAMETERS: u32 = 12;
 const PID_SENTINEL: u32 = ParameterId::SENTINEL.0 as u32;
 const PID_STATUS_INFO: u32 = ParameterId::STATUS_INFO.0 as u32;
@@ -50,7 +51,7 @@ const INFO_SRC: u32 = SubmessageId::INFO_SRC.0 as u32;
 const INFO_DST: u32 = SubmessageId::INFO_DST.0 as u32;
 const PAD: u32 = SubmessageId::PAD.0 as u32;
 
-/// [`SubmessageFlags`] in the form that the walk uses.
+/// [`SubmessageFlags`] as the `u32` words that the walk uses.
 const ENDIANNESS: u32 = SubmessageFlags::ENDIANNESS.0 as u32;
 const INVALIDATE: u32 = SubmessageFlags::INVALIDATE.0 as u32;
 const INLINE_QOS: u32 = SubmessageFlags::INLINE_QOS.0 as u32;
@@ -82,7 +83,8 @@ pub enum Step {
     End = 0,
     /// The next submessage header begins beyond the available bytes.
     Later = 1,
-    /// The next submessage begins here, but the bytes that the walk needs are not all available.
+    /// The next submessage begins among the available bytes, but not all bytes that the walk needs
+    /// are available.
     Split = 2,
     /// A submessage contradicts the datagram's length; the rest is unreadable.
     Malformed = 3,
@@ -94,7 +96,7 @@ pub enum Step {
     LongGap = 6,
 }
 
-/// Selects a byte order without branching: `word` is in memory order, as on the wire.
+/// A byte order that is selected without branching. Words read from the wire are in memory order.
 #[derive(Clone, Copy)]
 struct Order(u32);
 
@@ -149,7 +151,7 @@ impl Walk {
     /// datagram, or outside of it.
     #[inline(always)]
     const fn reach(&self, offset: u32, len: u32, present: u32) -> Reach {
-        // Offsets stay below 2^27: a 16-bit length from a position below `MAX_MESSAGE`.
+        // Offsets stay below 2^27: a 16-bit length is added to a position below `MAX_MESSAGE`.
         let end = offset + len;
         if end > self.datagram_len {
             Reach::Outside
@@ -197,7 +199,7 @@ pub fn step<B: Bytes>(walk: &mut Walk, bytes: &B, present: u32) -> Step {
         return Step::Later;
     }
     let [header] = read!(walk, bytes, present, start, 1);
-    // id, flags, octetsToNextHeader: the first two are octets.
+    // The header has id, flags and octetsToNextHeader. The first two are octets.
     let id = u32::from_be(header) >> 24;
     let flags = u32::from_be(header) >> 16 & 0xff;
     let order = Order::of(flags);
@@ -263,7 +265,8 @@ fn receiver_state<B: Bytes>(
         }
         walk.destination = read!(walk, bytes, present, body, 3);
     } else if id == INFO_SRC {
-        // unused, version and vendor, prefix; the timestamp is reset (RTPS 2.5, 8.3.8.9.4).
+        // The body has an unused word, version and vendor, and the prefix. INFO_SRC resets the
+        // timestamp (RTPS 2.5, 8.3.8.9.4).
         if body + 20 > end {
             return Step::Malformed;
         }
@@ -273,8 +276,8 @@ fn receiver_state<B: Bytes>(
     Step::Passed
 }
 
-/// Sets the fields shared by all endpoint submessages. `reader` and `writer` are entity ids as
-/// read.
+/// Sets the fields shared by all endpoint submessages. `reader` and `writer` are entity ids in
+/// memory order.
 #[inline(always)]
 fn endpoint(walk: &mut Walk, id: u32, flags: u32, writer: u32, reader: u32) {
     let (source, destination) = (walk.source, walk.destination);
@@ -296,19 +299,19 @@ fn endpoint(walk: &mut Walk, id: u32, flags: u32, writer: u32, reader: u32) {
     record.status_info = zero;
 }
 
-/// Returns a zero that the compiler cannot see: it would turn rows of plain zeros into a call of
-/// `memset`, which for the BPF target is a loop over bytes.
+/// Returns a zero that is hidden from the compiler. It would turn several plain zeros into a call
+/// of `memset`, which is a loop over bytes on the BPF target.
 #[inline(always)]
 fn zero() -> u32 {
     core::hint::black_box(0)
 }
 
-/// Length of extraFlags and octetsToInlineQos, which begin a DATA or DATA_FRAG.
+/// Length of extraFlags and octetsToInlineQos at the start of a DATA or DATA_FRAG, in bytes.
 const EXTRA_LEN: u32 = 4;
 
-/// Returns octetsToInlineQos of a DATA or DATA_FRAG whose first word is `extra`. It counts from
-/// after itself to the inline QoS, or to the payload (RTPS 2.5, 9.4.5.4). Later versions may
-/// insert fields, so the walk follows the offset.
+/// Returns octetsToInlineQos of a DATA or DATA_FRAG whose first word is `extra`. The field counts
+/// the octets from its end to the inline QoS, or to the payload (RTPS 2.5, 9.4.5.4). Later versions
+/// may insert fields, so the walk uses the offset.
 #[inline(always)]
 const fn octets_to_inline_qos(order: Order, extra: u32) -> u32 {
     let (_extra_flags, octets) = order.halves(extra);
@@ -383,16 +386,17 @@ fn data<B: Bytes>(
             seen += 1;
         }
     }
-    // Neither Data nor Key: a disposal described by its inline QoS (Fast DDS).
+    // Neither D nor K is set: the inline QoS alone describes a disposal (Fast DDS).
     if !fragment && flags & DATA_OR_KEY == 0 {
         return Step::Endpoint;
     }
     walk.record.payload_len = end - at;
-    // The payload's first bytes are in every DATA, but only in the first fragment.
+    // Every DATA has the payload's first bytes. Of the DATA_FRAGs, only the one with fragment 1 has
+    // them.
     if (!fragment || walk.record.fragment_start == 1) && at + 12 <= end {
         let [encapsulation, seconds, nanoseconds] = read!(walk, bytes, present, at, 3);
         let encapsulation = u32::from_be(encapsulation);
-        // Identifiers are big-endian; the lowest bit means little-endian contents (10.5).
+        // Identifiers are big-endian; the lowest bit means little-endian contents (RTPS 2.5, 10.5).
         let contents = Order::of(encapsulation >> 16);
         walk.record.encapsulation = encapsulation;
         walk.record.stamp_seconds = contents.word(seconds);
@@ -433,7 +437,7 @@ fn heartbeat<B: Bytes>(
     Step::Endpoint
 }
 
-/// Reads GAP and ACKNACK (RTPS 2.5, 9.4.5.6 and 9.4.5.3): both end in a SequenceNumberSet
+/// Reads GAP and ACKNACK (RTPS 2.5, 9.4.5.6 and 9.4.5.3): both contain a SequenceNumberSet
 /// (9.4.2.6).
 #[inline(always)]
 #[expect(
@@ -468,7 +472,7 @@ fn sequence_set<B: Bytes>(
         walk.record.payload_len = order.word(base_high);
         walk.record.encapsulation = order.word(base_low);
     } else {
-        // A reader sends an ACKNACK; its writer belongs to INFO_DST's participant.
+        // A reader sends an ACKNACK. The writer belongs to the participant of INFO_DST.
         endpoint(walk, id, flags, writer, reader);
         walk.record.reader = [walk.source[0], walk.source[1], walk.source[2], reader];
         walk.record.writer = [
@@ -509,11 +513,11 @@ fn sequence_set<B: Bytes>(
 pub enum Fate {
     /// Never of interest.
     Ignore = 0,
-    /// Discovery: the datagram goes to user space whole.
+    /// Discovery: the whole datagram is copied to user space.
     Capture = 1,
-    /// As the interest map decides for the record's writer; an unknown writer is captured at first.
+    /// The interest map decides by the record's writer. An unknown writer is captured at first.
     Writer = 2,
-    /// As the interest map decides for the record's reader; an unknown reader is ignored.
+    /// The interest map decides by the record's reader. An unknown reader is ignored.
     Reader = 3,
 }
 

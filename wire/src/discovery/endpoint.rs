@@ -49,7 +49,8 @@ pub struct EndpointAnnouncement {
 }
 
 impl EndpointAnnouncement {
-    /// Creates an announcement of the identity, topic and type, with the defaults for all else.
+    /// Creates an announcement with this identity, topic and type, and the default of every other
+    /// field.
     #[must_use]
     pub fn new(
         guid: Guid,
@@ -99,7 +100,8 @@ impl EndpointAnnouncement {
         if !fits {
             return Err(bad("PID_ENDPOINT_GUID"));
         }
-        // Cyclone DDS omits it. A different one would assign the endpoint to another participant.
+        // Cyclone DDS omits PID_PARTICIPANT_GUID. A different GUID would assign the endpoint to
+        // another participant.
         if let Some(mut value) = parameters.find(ParameterId::PARTICIPANT_GUID)?
             && Guid::from_bytes(value.array("PID_PARTICIPANT_GUID")?)
                 != Guid::new(guid.prefix, EntityId::PARTICIPANT)

@@ -1,10 +1,10 @@
 //! Discovery data: SPDP announcements of participants and SEDP announcements of endpoints (RTPS
 //! 2.5, 8.5).
 //!
-//! One sample yields one statement: the entity is alive with these properties, or it is gone. The
-//! identity comes from the payload (or its key hash), never from the message's header: a Discovery
-//! Server relays announcements of others. This module keeps no state and invents no default for an
-//! identity. Lists are bounded, and a flag marks truncated ones.
+//! Each sample states that one entity is alive with certain properties, or that it is gone. The
+//! identity comes from the payload (or its key hash), never from the message's header, because a
+//! Discovery Server relays announcements of other participants. This module keeps no state and
+//! invents no default for an identity. Lists are bounded, and a flag marks truncated ones.
 
 mod endpoint;
 mod participant;
@@ -22,7 +22,7 @@ pub use endpoint::EndpointAnnouncement;
 pub use participant::{BuiltinEndpoints, ParticipantAnnouncement, Property};
 pub use user_data::{TypeHash, UserData};
 
-/// The statement of one discovery sample.
+/// Content of one discovery sample.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Discovery<T> {
     /// The entity is alive, with its current properties.
@@ -36,7 +36,8 @@ pub enum Discovery<T> {
     },
 }
 
-/// Parses a sample of the SPDP writer. `vendor` is the sender's, used if the payload has none.
+/// Parses a sample of the SPDP writer. `vendor` is the sender's vendor, which applies if the
+/// payload names none.
 ///
 /// # Errors
 /// Fails if the payload is malformed or does not identify the participant.
@@ -56,8 +57,8 @@ pub fn participant(
     )
 }
 
-/// Parses a sample of the SEDP publications (`role` writer) or subscriptions (`role` reader)
-/// writer. `vendor` is the sender's, used if the payload has none.
+/// Parses a sample of the SEDP writer for publications ([`Role::Writer`]) or subscriptions
+/// ([`Role::Reader`]). `vendor` is the sender's vendor, which applies if the payload names none.
 ///
 /// # Errors
 /// Fails if the payload is malformed or does not identify the endpoint.
@@ -78,9 +79,9 @@ pub fn endpoint(
     )
 }
 
-/// Returns the entity that the sample disposes or unregisters. Cyclone DDS sends the key as a
-/// payload. Fast DDS sends no payload and puts the key hash, which for discovery data is the GUID,
-/// into the inline QoS.
+/// Returns the entity that the sample disposes or unregisters; `None` if the entity is alive.
+/// Cyclone DDS sends the key as a payload. Fast DDS sends no payload and puts the key hash, which
+/// for discovery data is the GUID, into the inline QoS.
 fn gone(
     payload: Payload<'_>,
     inline_qos: &InlineQos,
@@ -110,7 +111,7 @@ fn gone(
         .ok_or(missing)
 }
 
-/// Returns the instance's GUID, from its own parameter or from the key hash beside it.
+/// Returns the instance's GUID, from the parameter `key` or from the key hash in the list.
 fn guid(parameters: ParameterList<'_>, key: ParameterId) -> Result<Option<Guid>, WireError> {
     for id in [key, ParameterId::KEY_HASH] {
         if let Some(mut value) = parameters.find(id)? {
@@ -120,7 +121,7 @@ fn guid(parameters: ParameterList<'_>, key: ParameterId) -> Result<Option<Guid>,
     Ok(None)
 }
 
-/// Returns the vendor that defines these vendor-specific parameters.
+/// Returns the vendor that defines the vendor-specific parameters of the list.
 fn vendor(parameters: ParameterList<'_>, sender: VendorId) -> Result<VendorId, WireError> {
     match parameters.find(ParameterId::VENDORID)? {
         Some(mut value) => Ok(VendorId(value.array("PID_VENDORID")?)),
@@ -128,8 +129,8 @@ fn vendor(parameters: ParameterList<'_>, sender: VendorId) -> Result<VendorId, W
     }
 }
 
-/// Most locators kept of one kind per participant or endpoint. A host with many container bridges
-/// announces one or two per bridge.
+/// Maximum number of locators of one kind that are kept per participant or endpoint. A host with
+/// many container bridges announces one or two per bridge.
 const MAX_LOCATORS: usize = 64;
 
 /// Adds a locator, or sets the truncation flag if the list is full.

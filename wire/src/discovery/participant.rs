@@ -17,13 +17,14 @@ use crate::time::RtpsDuration;
 
 /// Lease of a participant that announces none (RTPS 2.5, 9.6.3.2).
 const DEFAULT_LEASE: RtpsDuration = RtpsDuration::Finite(Duration::from_secs(100));
-/// Most properties kept per participant, and the longest name or value of one.
+/// Maximum number of properties kept per participant, and maximum length of a name or value in
+/// bytes.
 const MAX_PROPERTIES: usize = 32;
 const MAX_PROPERTY_LEN: usize = 256;
-/// Longest entity name, enclave or domain tag.
+/// Maximum length of an entity name, enclave or domain tag, in bytes.
 const MAX_NAME_LEN: usize = 256;
 
-/// Bit set of a participant's discovery endpoints (RTPS 2.5, 9.3.2.12).
+/// Bit set of a participant's builtin endpoints (RTPS 2.5, 9.3.2.12).
 #[derive(Clone, Copy, Default, PartialEq, Eq, Hash, Debug)]
 pub struct BuiltinEndpoints(pub u32);
 
@@ -43,9 +44,9 @@ pub struct ParticipantAnnouncement {
     pub guid: Guid,
     /// Vendor of its DDS implementation.
     pub vendor: VendorId,
-    /// The protocol version it speaks; zero if not announced.
+    /// Its protocol version; zero if not announced.
     pub protocol_version: ProtocolVersion,
-    /// Time without a message after which the participant is gone.
+    /// Lease duration: time without a message after which the participant is gone.
     pub lease: RtpsDuration,
     /// Its domain; `None` from Fast DDS 2.x, where the port implies it.
     pub domain_id: Option<DomainId>,
@@ -53,7 +54,7 @@ pub struct ParticipantAnnouncement {
     pub domain_tag: String,
     /// Its entity name if it is plain text; Fast DDS puts the enclave here.
     pub entity_name: String,
-    /// The ROS enclave; `None` if the participant is not ROS.
+    /// The ROS enclave; `None` if the participant is not one of ROS.
     pub enclave: Option<String>,
     /// Its properties, in announced order.
     pub properties: Vec<Property>,
@@ -61,11 +62,11 @@ pub struct ParticipantAnnouncement {
     pub metatraffic_unicast: Vec<Locator>,
     /// Multicast locators of its discovery endpoints.
     pub metatraffic_multicast: Vec<Locator>,
-    /// Unicast locators of its other endpoints.
+    /// Unicast locators of its user endpoints, unless an endpoint announces others.
     pub default_unicast: Vec<Locator>,
-    /// Multicast locators of its other endpoints.
+    /// Multicast locators of its user endpoints, unless an endpoint announces others.
     pub default_multicast: Vec<Locator>,
-    /// Its discovery endpoints.
+    /// Its builtin endpoints.
     pub builtin_endpoints: BuiltinEndpoints,
     /// Whether it authenticates its peers (DDS Security); its further discovery data may be
     /// encrypted.
@@ -75,7 +76,7 @@ pub struct ParticipantAnnouncement {
 }
 
 impl ParticipantAnnouncement {
-    /// Creates an announcement of nothing but the identity, with the defaults for all else.
+    /// Creates an announcement with this identity and the default of every other field.
     #[must_use]
     pub fn new(guid: Guid, vendor: VendorId) -> Self {
         Self {
@@ -135,7 +136,7 @@ impl ParticipantAnnouncement {
                 self.domain_tag = text::name(&mut value, "PID_DOMAIN_TAG", MAX_NAME_LEN)?.into();
             }
             ParameterId::ENTITY_NAME => {
-                // Not an identity; free text unless ROS set it.
+                // The name is not an identity, and is free text unless ROS set it.
                 match text::name(&mut value, "PID_ENTITY_NAME", MAX_NAME_LEN) {
                     Ok(name) => self.entity_name = name.into(),
                     Err(_) => *truncated = true,
@@ -219,7 +220,8 @@ impl ParticipantAnnouncement {
     }
 }
 
-/// Parses the properties, keeping the readable ones that fit; the others are optional information.
+/// Parses the properties and keeps the readable ones that fit. Properties are optional information,
+/// so the others set the truncation flag only.
 fn properties(
     value: &mut Cursor<'_>,
     properties: &mut Vec<Property>,

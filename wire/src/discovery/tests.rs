@@ -51,7 +51,7 @@ fn udp(locators: &[Locator]) -> Vec<String> {
     locators.iter().map(ToString::to_string).collect()
 }
 
-/// A payload of parameters; each test adds the sentinel.
+/// Returns the start of a payload with a parameter list, which has no sentinel yet.
 fn list(endianness: Endianness) -> Encoder {
     let mut list = Encoder::new(endianness);
     list.raw(&[0, if endianness == Endianness::Big { 2 } else { 3 }, 0, 0]);
@@ -62,7 +62,7 @@ fn guid_of(entity: [u8; 4]) -> Guid {
     Guid::new(PREFIX, EntityId(entity))
 }
 
-/// A writer's announcement with these names.
+/// Returns a writer's announcement with these names.
 fn endpoint_list(topic: &str, type_name: &str) -> Encoder {
     let endianness = Endianness::Little;
     let mut text = Encoder::new(endianness);
@@ -88,7 +88,7 @@ fn participant_list() -> Encoder {
 }
 
 #[test]
-fn a_participant_as_cyclone_dds_announces_it() {
+fn a_participant_of_cyclone_dds_is_parsed() {
     let participant = alive(captured_participant(testing::CYCLONE_SPDP));
     assert_eq!(
         participant.guid.to_string(),
@@ -129,7 +129,7 @@ fn a_participant_as_cyclone_dds_announces_it() {
 }
 
 #[test]
-fn a_participant_as_fast_dds_announces_it() {
+fn a_participant_of_fast_dds_is_parsed() {
     let participant = alive(captured_participant(testing::FAST_SPDP));
     assert_eq!(
         participant.guid.to_string(),
@@ -158,7 +158,7 @@ fn a_participant_as_fast_dds_announces_it() {
 }
 
 #[test]
-fn endpoints_as_fast_dds_announces_them() {
+fn endpoints_of_fast_dds_are_parsed() {
     let [writer] = captured_endpoints(testing::FAST_SEDP_WRITER)
         .try_into()
         .unwrap();
@@ -192,7 +192,7 @@ fn endpoints_as_fast_dds_announces_them() {
 }
 
 #[test]
-fn endpoints_as_cyclone_dds_announces_them() {
+fn endpoints_of_cyclone_dds_are_parsed() {
     let [writer, reader, rosout] = captured_endpoints(testing::CYCLONE_SEDP)
         .into_iter()
         .map(alive)
@@ -218,7 +218,7 @@ fn endpoints_as_cyclone_dds_announces_them() {
 }
 
 #[test]
-fn what_rustdds_announces() {
+fn participants_and_endpoints_of_rustdds_are_parsed() {
     let participant = alive(captured_participant(testing::RUSTDDS_SPDP));
     assert_eq!(
         participant.guid.to_string(),
@@ -258,7 +258,7 @@ fn what_rustdds_announces() {
 }
 
 #[test]
-fn iron_and_later_announce_the_type_hash() {
+fn the_type_hash_of_iron_and_later_is_parsed() {
     let [first, ..] = &captured_endpoints(testing::JAZZY_SEDP)[..] else {
         panic!()
     };
@@ -271,7 +271,7 @@ fn iron_and_later_announce_the_type_hash() {
 }
 
 #[test]
-fn all_four_forms_of_disposal_name_the_participant_or_endpoint() {
+fn all_four_forms_of_disposal_identify_the_participant_or_endpoint() {
     let gone = |text: &str, entity: [u8; 4]| {
         let prefix: Vec<u8> = (0..12)
             .map(|i| u8::from_str_radix(&text[2 * i..2 * i + 2], 16).unwrap())
@@ -287,7 +287,7 @@ fn all_four_forms_of_disposal_name_the_participant_or_endpoint() {
         [Discovery::Gone { guid, status }] => (*guid, *status),
         other => panic!("{other:?}"),
     };
-    // A payload of the key only.
+    // The payload has the key only.
     assert_eq!(
         participant(testing::CYCLONE_SPDP_DISPOSE),
         gone("01101843e6f7a0a9745a36cc", [0, 0, 1, 0xc1])
@@ -296,7 +296,7 @@ fn all_four_forms_of_disposal_name_the_participant_or_endpoint() {
         endpoint(testing::CYCLONE_SEDP_DISPOSE),
         gone("01101843e6f7a0a9745a36cc", [0, 0, 7, 3])
     );
-    // No payload; the key hash is inline.
+    // There is no payload; the key hash is in the inline QoS.
     assert_eq!(
         participant(testing::FAST_SPDP_DISPOSE),
         gone("010f2b7d6a474f3300000000", [0, 0, 1, 0xc1])
@@ -322,12 +322,12 @@ fn a_disposal_without_a_guid_is_an_error() {
         assert_eq!(error.reason, Reason::BadValue);
         assert!(endpoint(Role::Reader, VendorId::EPROSIMA, payload, &status).is_err());
     }
-    // Neither alive nor disposed: a key or no payload, without a status.
+    // Neither alive nor disposed: no payload and no status.
     assert!(participant(VendorId::EPROSIMA, Payload::None, &NO_INLINE_QOS).is_err());
 }
 
 #[test]
-fn identity_is_never_made_up() {
+fn an_announcement_without_a_consistent_guid_is_refused() {
     let reason = |result: Result<EndpointAnnouncement, WireError>| result.unwrap_err().reason;
     let mut nobody = list(Endianness::Little);
     nobody
@@ -379,7 +379,7 @@ fn a_missing_parameter_has_the_default_of_the_specification() {
 }
 
 #[test]
-fn vendor_parameters_are_read_by_the_vendor_of_the_payload() {
+fn the_vendor_of_the_payload_decides_the_meaning_of_vendor_parameters() {
     let mut payload = endpoint_list("rt/a", "A");
     payload.parameter(0x8006, &[1, 0, 0, 0]);
     assert!(
@@ -392,7 +392,7 @@ fn vendor_parameters_are_read_by_the_vendor_of_the_payload() {
             .unwrap()
             .datasharing
     );
-    // The payload's vendor wins over the sender's, at any position in the list.
+    // The payload's vendor overrides the sender's, at any position in the list.
     payload.parameter(0x0016, &[1, 0x10, 0, 0]);
     let endpoint = writer(&payload.bytes, VendorId::EPROSIMA).unwrap();
     assert_eq!(
@@ -402,7 +402,7 @@ fn vendor_parameters_are_read_by_the_vendor_of_the_payload() {
 }
 
 #[test]
-fn security_filters_and_domain_tags_are_noticed() {
+fn security_content_filters_and_domain_tags_are_recognized() {
     let mut payload = participant_list();
     payload.parameter(0x1001, &[0; 8]);
     payload.parameter(0x4014, b"\x05\0\0\0tag1\0\0\0\0");
@@ -451,7 +451,7 @@ fn hostile_names_are_refused_with_their_reason() {
 }
 
 #[test]
-fn lists_are_bounded_and_report_that_they_are_cut() {
+fn long_lists_are_cut_and_marked_as_truncated() {
     let mut payload = participant_list();
     for _ in 0..200 {
         payload.parameter(0x0032, &[1; 24]);
@@ -473,7 +473,7 @@ fn lists_are_bounded_and_report_that_they_are_cut() {
         (32, true)
     );
 
-    // A count larger than the bytes allow.
+    // A count that is larger than the bytes allow.
     let mut payload = participant_list();
     payload.parameter(0x0059, &[0xff; 4]);
     assert_eq!(
@@ -483,7 +483,7 @@ fn lists_are_bounded_and_report_that_they_are_cut() {
 }
 
 #[test]
-fn an_unreadable_property_costs_only_itself() {
+fn an_unreadable_property_does_not_hide_the_others() {
     let mut properties = Encoder::new(Endianness::Little);
     properties
         .u32(2)
@@ -502,7 +502,7 @@ fn an_unreadable_property_costs_only_itself() {
 }
 
 #[test]
-fn a_strange_entity_name_does_not_hide_the_participant() {
+fn an_entity_name_with_a_quote_does_not_hide_the_participant() {
     let mut payload = participant_list();
     payload.parameter(0x0062, b"\x05\0\0\0it's\0\0\0\0");
     let participant = announced(&payload.bytes).unwrap();
@@ -513,14 +513,14 @@ fn a_strange_entity_name_does_not_hide_the_participant() {
 }
 
 #[test]
-fn a_list_that_breaks_off_is_truncated_and_not_incomplete() {
+fn a_list_that_breaks_off_is_reported_as_truncated() {
     let payload = endpoint_list("rt/a", "A").bytes;
     let error = writer(&payload[..payload.len() - 10], VendorId::EPROSIMA).unwrap_err();
     assert_eq!(error.reason, Reason::Truncated);
 }
 
 #[test]
-fn hurt_announcements_never_panic() {
+fn damaged_announcements_never_make_the_parser_panic() {
     for datagram in testing::CAPTURED {
         for (vendor, inline_qos, data) in testing::data(datagram) {
             hurt(data.payload.bytes(), |bytes| {
@@ -536,7 +536,7 @@ fn hurt_announcements_never_panic() {
 
 proptest! {
     #[test]
-    fn endpoints_come_back_as_they_were_announced(
+    fn encoded_endpoints_survive_a_round_trip(
         little in any::<bool>(),
         topic in "rt(/[a-z_]{1,8}){1,3}",
         type_name in "[a-z_]{1,8}::msg::dds_::[A-Z][a-z]{0,8}_",

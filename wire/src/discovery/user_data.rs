@@ -2,10 +2,10 @@
 
 use core::fmt;
 
-/// Most bytes of user data that are read.
+/// Maximum number of bytes of user data that are read.
 const MAX_LEN: usize = 4096;
 
-/// The pairs of one USER_DATA value; borrowed, in any order. NULs and other text are tolerated.
+/// The pairs of one USER_DATA value, borrowed and in any order. NULs and other text are tolerated.
 #[derive(Clone, Copy, Debug)]
 pub struct UserData<'a>(&'a str);
 
@@ -37,7 +37,7 @@ impl<'a> UserData<'a> {
     }
 }
 
-/// A ROS type's hash, version 1 of the scheme (`RIHS01_`), Iron and later.
+/// Hash of a ROS type in version 1 of the scheme (`RIHS01_`), as Iron and later announce it.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TypeHash(pub [u8; 32]);
 
@@ -89,7 +89,7 @@ mod tests {
     const HASH: &str = "RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e";
 
     #[test]
-    fn pairs_in_any_order_with_or_without_a_nul() {
+    fn pairs_are_found_in_any_order_with_or_without_a_nul() {
         assert_eq!(UserData::new(b"enclave=/;\0").find("enclave"), Some("/"));
         assert_eq!(
             UserData::new(b"enclave=/robot;").find("enclave"),
@@ -106,13 +106,13 @@ mod tests {
     }
 
     #[test]
-    fn buffer_endpoints_still_have_their_hash() {
+    fn the_type_hash_of_an_endpoint_with_buffers_is_found() {
         let text = std::format!("BUFBE:cpu=;typehash={HASH};");
         assert_eq!(UserData::new(text.as_bytes()).find("typehash"), Some(HASH));
     }
 
     #[test]
-    fn a_hash_comes_back_as_it_was_written() {
+    fn a_type_hash_survives_a_round_trip_and_other_text_is_refused() {
         assert_eq!(TypeHash::parse(HASH).unwrap().to_string(), HASH);
         for bad in [
             "",

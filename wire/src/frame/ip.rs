@@ -1,7 +1,7 @@
-//! IPv4 (RFC 791) and IPv6 (RFC 8200) down to UDP (RFC 768) and TCP (RFC 9293).
+//! Parses IPv4 (RFC 791) and IPv6 (RFC 8200) packets down to UDP (RFC 768) and TCP (RFC 9293).
 //!
-//! Packets whose lengths make the receiving kernel discard them are errors here, so that nothing
-//! counts that no socket can have received.
+//! A packet whose lengths make the receiving kernel discard it is an error here, because no socket
+//! can have received it.
 
 use super::{Datagram, Fragment, Packet, Payload, Segment};
 use crate::cursor::{Cursor, Reason, WireError};
@@ -9,12 +9,13 @@ use crate::cursor::{Cursor, Reason, WireError};
 const TCP: u8 = 6;
 const UDP: u8 = 17;
 const UDP_HEADER: usize = 8;
-/// Offsets of fragments are limited to 16 bits.
+/// Maximum end of a fragment in its datagram, in bytes: lengths in IP have 16 bits.
 const LARGEST_DATAGRAM: u32 = 65_535;
-/// RFC 8200 has each header once and destination options twice; a few more are accepted.
+/// Maximum number of extension headers. RFC 8200 has each header once and destination options
+/// twice; a few more are accepted.
 const MOST_EXTENSION_HEADERS: usize = 8;
 
-/// Parses an IPv4 packet. `length` is the true length of the cursor's outermost slice.
+/// Parses an IPv4 packet. `length` is the length on the wire of the cursor's outermost slice.
 pub(super) fn v4(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, WireError> {
     let start = cursor;
     let available = length.saturating_sub(cursor.offset());
@@ -45,7 +46,7 @@ pub(super) fn v4(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
     let options = header_length
         .checked_sub(20)
         .ok_or(start.error("IPv4 header length", Reason::BadLength))?;
-    // Segmentation offload shows long TCP segments with a total length of 0.
+    // With segmentation offload, long TCP segments have a total length of 0.
     let total_length = match total_length {
         0 if protocol == TCP => available,
         length => length,
@@ -70,7 +71,7 @@ pub(super) fn v4(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
     })
 }
 
-/// Parses an IPv6 packet. `length` is the true length of the cursor's outermost slice.
+/// Parses an IPv6 packet. `length` is the length on the wire of the cursor's outermost slice.
 pub(super) fn v6(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, WireError> {
     let start = cursor;
     let available = length.saturating_sub(cursor.offset());
@@ -91,7 +92,7 @@ pub(super) fn v6(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
     if !matches!(next_header, TCP | UDP | 0 | 43 | 44 | 51 | 60) {
         return Ok(packet(Payload::Other(next_header)));
     }
-    // As with IPv4, long TCP segments have a length of 0; a jumbogram's option precedes them.
+    // As with IPv4, long TCP segments have a length of 0. A jumbogram's option may precede them.
     let payload_length = match payload_length {
         0 if matches!(next_header, TCP | 0) => available.saturating_sub(40),
         length => length,
@@ -104,14 +105,14 @@ pub(super) fn v6(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
         match next_header {
             UDP => return Ok(packet(Payload::Datagram(body.datagram(true)?))),
             TCP => return Ok(packet(Payload::Segment(body.segment()?))),
-            // Hop-by-hop options, routing, destination options: length in units of 8 after the
-            // first 8 octets.
+            // Hop-by-hop options, routing, destination options: the length counts units of 8 octets
+            // after the first 8.
             0 | 43 | 60 => {
                 let [following, units] = body.peek("IPv6 extension header")?;
                 body.skip("IPv6 extension header", 8 + usize::from(units) * 8)?;
                 next_header = following;
             }
-            // Authentication header (RFC 4302): units of 4, minus 2.
+            // Authentication header (RFC 4302): the length counts units of 4 octets, minus 2.
             51 => {
                 let [following, units] = body.peek("IPv6 authentication header")?;
                 body.skip("IPv6 authentication header", 8 + usize::from(units) * 4)?;
@@ -120,8 +121,7 @@ pub(super) fn v6(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
             44 => {
                 let [following, _, high, low, id @ ..] = body.peek::<8>("IPv6 fragment header")?;
                 body.skip("IPv6 fragment header", 8)?;
-                // The offset's unit is 8 octets, in the upper 13 bits: the masked field is in
-                // bytes.
+                // The upper 13 bits count units of 8 octets, so the masked field is in bytes.
                 let field = u16::from_be_bytes([high, low]);
                 let (offset, more) = (u32::from(field & 0xfff8), field & 1 != 0);
                 if offset == 0 && !more {
@@ -140,7 +140,8 @@ pub(super) fn v6(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
     Err(start.error("IPv6 extension headers", Reason::OverLimit))
 }
 
-/// The bytes after a header: the captured ones may be fewer than the true length.
+/// The bytes after a header, of which the capture may lack the end. `length` is their number on the
+/// wire.
 struct Body<'a> {
     cursor: Cursor<'a>,
     length: usize,
@@ -212,8 +213,8 @@ impl<'a> Body<'a> {
         })
     }
 
-    /// Parses a datagram. `zero_is_all`: IPv6 allows a UDP length of zero for jumbograms (RFC
-    /// 2675), and Linux reads it as "the rest of the packet".
+    /// Parses a UDP datagram. With `zero_is_all`, a UDP length of zero means the rest of the
+    /// packet, as in Linux: IPv6 allows it for jumbograms (RFC 2675).
     fn datagram(mut self, zero_is_all: bool) -> Result<Datagram<'a>, WireError> {
         let start = self.cursor;
         let source_port = self.cursor.u16("UDP source port")?;

@@ -60,7 +60,7 @@ fn ethernet_padding_is_not_payload() {
 }
 
 #[test]
-fn every_link_layer_leads_to_the_same_packet() {
+fn every_link_layer_yields_the_same_packet() {
     let ip = &PADDED[14..];
     let expected = whole(Link::RAW, ip).unwrap().packet;
     let join = |head: &[u8]| [head, ip].concat();
@@ -111,7 +111,7 @@ fn every_link_layer_leads_to_the_same_packet() {
 }
 
 #[test]
-fn a_third_tag_and_other_protocols_are_not_ip() {
+fn a_frame_with_a_third_vlan_tag_or_another_protocol_has_no_packet() {
     let mut tags = PADDED[..12].to_vec();
     for tag in [0x8100_u16, 0x8100, 0x8100] {
         tags.extend_from_slice(&tag.to_be_bytes());
@@ -133,7 +133,7 @@ fn a_third_tag_and_other_protocols_are_not_ip() {
 }
 
 #[test]
-fn a_socket_that_strips_the_link_header_shows_the_same_packet() {
+fn a_socket_that_strips_the_link_header_yields_the_same_packet() {
     let ip = &PADDED[14..];
     let expected = whole(Link::RAW, ip).unwrap().packet;
     let length = u32::try_from(ip.len()).unwrap();
@@ -141,7 +141,7 @@ fn a_socket_that_strips_the_link_header_shows_the_same_packet() {
         parse_cooked(0x0800, PacketType::HOST, ip, length),
         Ok(expected)
     );
-    // Doubly tagged: received frames keep the inner tag, sent frames do not.
+    // Two VLAN tags: received frames keep the inner tag, sent frames do not.
     let inner = [&[0x45, 0x05, 0x08, 0x00], ip].concat();
     assert_eq!(
         parse_cooked(0x8100, PacketType::MULTICAST, &inner, length + 4),
@@ -151,7 +151,7 @@ fn a_socket_that_strips_the_link_header_shows_the_same_packet() {
         parse_cooked(0x88a8, PacketType::OUTGOING, ip, length),
         Ok(expected)
     );
-    // Linux 6.11 and later: the tag is present, its ether type is not named.
+    // Linux 6.11 and later: the tag is present, but the protocol does not name it.
     assert_eq!(
         parse_cooked(0x0800, PacketType::MULTICAST, &inner, length + 4),
         Ok(expected)
@@ -163,7 +163,7 @@ fn a_socket_that_strips_the_link_header_shows_the_same_packet() {
 }
 
 #[test]
-fn a_packet_that_reads_like_a_tag_is_still_a_packet() {
+fn a_packet_that_resembles_a_vlan_tag_is_read_as_a_packet() {
     let mut packet = [
         0x45, 0, 0x08, 0x00, 0x45, 0x45, 0, 0, 64, 17, 0, 0, 10, 0, 0, 1, 10, 0, 0, 2,
     ]
@@ -188,7 +188,7 @@ fn ipv4_options_are_skipped() {
 }
 
 #[test]
-fn ipv4_fragments_have_their_offset_and_length() {
+fn ipv4_fragments_report_their_offset_and_length() {
     let mut frame = PADDED;
     // First part: more fragments, 16 octets.
     frame[17] = 0x24;
@@ -230,7 +230,7 @@ const UDP_V6: [u8; 12] = [
 ];
 
 #[test]
-fn ipv6_extension_headers_are_walked() {
+fn ipv6_extension_headers_are_skipped() {
     let mut body = Vec::new();
     body.extend_from_slice(&[60, 0, 1, 4, 0, 0, 0, 0]); // hop-by-hop
     body.extend_from_slice(&[43, 1, 1, 12, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]); // destination
@@ -271,7 +271,7 @@ fn too_many_ipv6_extension_headers_are_refused() {
 }
 
 #[test]
-fn the_ipv6_fragment_offset_is_already_in_bytes() {
+fn the_masked_ipv6_fragment_offset_is_in_bytes() {
     // Part of a 60 KB datagram at byte 57,920 = 0xe240, more to follow.
     let mut body = [17, 0, 0xe2, 0x41, 0xde, 0xad, 0xbe, 0xef].to_vec();
     body.extend_from_slice(&[0x55; 1448]);
@@ -286,7 +286,7 @@ fn the_ipv6_fragment_offset_is_already_in_bytes() {
 }
 
 #[test]
-fn a_capture_cut_short_keeps_the_true_length() {
+fn a_capture_cut_short_keeps_the_length_on_the_wire() {
     let mut frame = PADDED.to_vec();
     frame[16..18].copy_from_slice(&1020_u16.to_be_bytes());
     frame[38..40].copy_from_slice(&1000_u16.to_be_bytes());
@@ -319,7 +319,7 @@ fn lengths_that_contradict_each_other_are_refused() {
 }
 
 #[test]
-fn truncation_anywhere_is_an_error_or_a_shorter_payload() {
+fn a_truncated_frame_is_an_error_or_has_a_shorter_payload() {
     let headers = 14 + 20 + 8;
     for end in 0..PADDED.len() {
         match parse(Link::ETHERNET, &PADDED[..end], 60) {
@@ -341,7 +341,7 @@ fn truncation_anywhere_is_an_error_or_a_shorter_payload() {
 }
 
 #[test]
-fn one_wrong_byte_never_reads_outside() {
+fn one_wrong_byte_never_causes_a_read_beyond_the_frame() {
     let v6 = ipv6(44, &[&[17, 0, 0, 1, 0, 0, 0, 1][..], &[7; 16]].concat());
     for (link, original) in [(Link::ETHERNET, PADDED.to_vec()), (Link::RAW, v6)] {
         for at in 0..original.len() {
@@ -369,7 +369,7 @@ fn one_wrong_byte_never_reads_outside() {
 
 proptest! {
     #[test]
-    fn any_bytes_on_any_link_never_panic(
+    fn any_bytes_on_any_link_layer_never_make_the_parser_panic(
         link in prop::sample::select(std::vec![0_u16, 1, 12, 101, 108, 113, 228, 229, 276, 9]),
         bytes in prop::collection::vec(any::<u8>(), 0..200),
         length in any::<u32>(),
@@ -379,7 +379,7 @@ proptest! {
     }
 
     #[test]
-    fn packets_built_by_etherparse_are_read(
+    fn packets_built_by_etherparse_are_parsed(
         vlan in 0..3_u8,
         v6 in any::<bool>(),
         ports in any::<(u16, u16)>(),
@@ -424,7 +424,7 @@ proptest! {
 
     /// If both readers accept a damaged frame as a whole UDP datagram, they agree on it.
     #[test]
-    fn we_agree_with_etherparse_on_damaged_frames(
+    fn the_parser_agrees_with_etherparse_on_damaged_frames(
         damage in prop::collection::vec((12..PADDED.len(), any::<u8>()), 1..3),
     ) {
         let mut bytes = PADDED;

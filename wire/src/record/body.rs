@@ -77,12 +77,12 @@ impl Record {
 pub enum Sample<'a> {
     /// The whole sample.
     Data(Data<'a>),
-    /// Consecutive fragments of it.
+    /// Consecutive fragments of the sample.
     DataFrag(DataFrag<'a>),
 }
 
 impl<'a> Sample<'a> {
-    /// Returns the record behind the view.
+    /// Returns the record of the view.
     #[inline]
     #[must_use]
     pub const fn record(self) -> &'a Record {
@@ -113,7 +113,7 @@ impl<'a> Sample<'a> {
         StatusInfo(self.record().status_info)
     }
 
-    /// Returns the bytes of the whole sample's serialized payload, encapsulation included.
+    /// Returns the size of the whole sample's serialized payload in bytes, encapsulation included.
     #[inline]
     #[must_use]
     pub const fn size(self) -> u32 {
@@ -134,7 +134,7 @@ impl<'a> Sample<'a> {
         is_value && self.status_info().0 == StatusInfo::ALIVE.0
     }
 
-    /// Returns whether it holds the sample's first byte.
+    /// Returns whether the record holds the sample's first byte.
     #[inline]
     #[must_use]
     pub const fn is_start(self) -> bool {
@@ -144,7 +144,7 @@ impl<'a> Sample<'a> {
         }
     }
 
-    /// Returns whether it holds the sample's last byte.
+    /// Returns whether the record holds the sample's last byte.
     #[inline]
     #[must_use]
     pub const fn is_end(self) -> bool {
@@ -179,7 +179,7 @@ impl Data<'_> {
         SubmessageFlags(self.0.submessage_flags)
     }
 
-    /// Returns the bytes of serialized payload, encapsulation included.
+    /// Returns the size of the serialized payload in bytes, encapsulation included.
     #[inline]
     #[must_use]
     pub const fn payload_len(self) -> u32 {
@@ -192,7 +192,7 @@ impl Data<'_> {
 pub struct DataFrag<'a>(&'a Record);
 
 impl<'a> DataFrag<'a> {
-    /// Returns the record behind the view.
+    /// Returns the record of the view.
     #[inline]
     #[must_use]
     pub const fn record(self) -> &'a Record {
@@ -206,7 +206,7 @@ impl<'a> DataFrag<'a> {
         SequenceNumber(self.0.sequence_number)
     }
 
-    /// Returns fragmentStartingNum: the number of its first fragment, counted from 1.
+    /// Returns fragmentStartingNum: the number of the first fragment, counted from 1.
     #[inline]
     #[must_use]
     pub const fn starting(self) -> u32 {
@@ -220,14 +220,14 @@ impl<'a> DataFrag<'a> {
         self.0.fragments_in_submessage()
     }
 
-    /// Returns fragmentSize: bytes of every fragment but the sample's last.
+    /// Returns fragmentSize: the size in bytes of every fragment but the sample's last.
     #[inline]
     #[must_use]
     pub const fn fragment_size(self) -> u32 {
         self.0.fragment_size()
     }
 
-    /// Returns sampleSize. It is unverified: nothing may be allocated for it.
+    /// Returns sampleSize, which is unverified: no memory may be allocated for it.
     #[inline]
     #[must_use]
     pub const fn sample_size(self) -> u32 {
@@ -281,7 +281,7 @@ impl<'a> DataFrag<'a> {
 pub struct Heartbeat<'a>(&'a Record);
 
 impl<'a> Heartbeat<'a> {
-    /// Returns the record behind the view.
+    /// Returns the record of the view.
     #[inline]
     #[must_use]
     pub const fn record(self) -> &'a Record {
@@ -310,13 +310,13 @@ impl<'a> Heartbeat<'a> {
     }
 }
 
-/// GAP (RTPS 2.5, 9.4.5.6): the writer will not send the samples from `start` to before `list`'s
-/// base, nor `list`'s members. The span may have any length.
+/// GAP (RTPS 2.5, 9.4.5.6): the writer will not send the samples from `start` up to the base of
+/// `list`, nor the members of `list`. The range may have any length.
 #[derive(Clone, Copy, Debug)]
 pub struct Gap<'a>(&'a Record);
 
 impl<'a> Gap<'a> {
-    /// Returns the record behind the view.
+    /// Returns the record of the view.
     #[inline]
     #[must_use]
     pub const fn record(self) -> &'a Record {
@@ -343,7 +343,7 @@ impl<'a> Gap<'a> {
 pub struct AckNack<'a>(&'a Record);
 
 impl<'a> AckNack<'a> {
-    /// Returns the record behind the view.
+    /// Returns the record of the view.
     #[inline]
     #[must_use]
     pub const fn record(self) -> &'a Record {
@@ -357,7 +357,7 @@ impl<'a> AckNack<'a> {
         SequenceNumber(self.0.sequence_number)
     }
 
-    /// Returns readerSNState, whose members are missing.
+    /// Returns readerSNState, whose members are the missing samples.
     #[inline]
     #[must_use]
     pub const fn missing(self) -> SequenceNumberSet {
@@ -365,13 +365,12 @@ impl<'a> AckNack<'a> {
     }
 }
 
-/// SequenceNumberSet (RTPS 2.5, 9.4.2.6): a base and a bitmap of the numbers from it.
+/// SequenceNumberSet (RTPS 2.5, 9.4.2.6): a base, and a bitmap whose bit 0 is the base.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct SequenceNumberSet {
     /// The number of bit 0.
     pub base: SequenceNumber,
-    /// Length of the bitmap; up to 256, of which the record holds the first
-    /// [`Record::BITMAP_BITS`].
+    /// Length of the bitmap in bits, up to 256. The record holds the first [`Record::BITMAP_BITS`].
     pub num_bits: u32,
     bitmap: [u32; 5],
 }
@@ -427,7 +426,7 @@ mod tests {
     }
 
     #[test]
-    fn a_body_is_read_as_its_kind() {
+    fn a_body_is_read_according_to_its_kind() {
         let record = of_kind(kind::HEARTBEAT);
         let Body::Heartbeat(heartbeat) = record.body() else {
             panic!("{record:?}")
@@ -477,7 +476,7 @@ mod tests {
     }
 
     #[test]
-    fn a_set_holds_as_many_members_as_its_record_and_no_number_beyond_the_largest() {
+    fn a_set_is_cut_to_its_record_and_saturates_at_the_largest_number() {
         let all = Record {
             kind: kind::ACKNACK,
             sequence_number: u64::MAX - 1,
@@ -523,7 +522,7 @@ mod tests {
     }
 
     #[test]
-    fn fragments_have_their_offset_in_the_sample() {
+    fn fragments_report_their_position_in_the_sample() {
         let fragments = |start: u32, count: u32| Record {
             kind: kind::DATA_FRAG,
             fragment_start: start,

@@ -1,5 +1,4 @@
-//! The flags octet of a submessage header (RTPS 2.5, 9.4.5.1.2). The meaning of a bit depends on
-//! the kind.
+//! The flags octet of a submessage header (RTPS 2.5, 9.4.5.1.2).
 
 use crate::cursor::Endianness;
 
@@ -9,7 +8,7 @@ use crate::cursor::Endianness;
 pub struct SubmessageFlags(pub u8);
 
 impl SubmessageFlags {
-    /// E, every kind: the submessage is little-endian.
+    /// E, in every kind: the submessage is little-endian.
     pub const ENDIANNESS: Self = Self(0x01);
     /// Q of DATA and DATA_FRAG (RTPS 2.5, 9.4.5.4 and 9.4.5.5): inline QoS precede the payload.
     pub const INLINE_QOS: Self = Self(0x02);
@@ -58,13 +57,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_lowest_bit_is_the_byte_order_of_every_kind() {
+    fn the_lowest_bit_selects_the_byte_order() {
         assert_eq!(SubmessageFlags(0xfe).endianness(), Endianness::Big);
         assert_eq!(SubmessageFlags(0x01).endianness(), Endianness::Little);
     }
 
     #[test]
-    fn all_requested_bits_must_be_set() {
+    fn flags_contain_others_only_if_all_their_bits_are_set() {
         let (data, key) = (SubmessageFlags::DATA, SubmessageFlags::KEY);
         assert!(data.with(key).contains(data) && data.with(key).contains(data.with(key)));
         assert!(!data.contains(data.with(key)) && !data.contains(key));

@@ -32,16 +32,16 @@ impl StatusInfo {
     }
 }
 
-/// Identity of the change that this one answers (RTPS 2.5 with DDS-RPC 1.0, 7.8.2).
+/// Identity of the change that this change answers (RTPS 2.5 with DDS-RPC 1.0, 7.8.2).
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct SampleIdentity {
-    /// Writer of the other change; rmw_fastrtps puts the client's response reader here.
+    /// Writer of the answered change; rmw_fastrtps puts the client's response reader here.
     pub writer: Guid,
-    /// Sequence number of the other change.
+    /// Sequence number of the answered change.
     pub sequence_number: SequenceNumber,
 }
 
-/// The inline QoS parameters an observer needs.
+/// The inline QoS parameters that an observer needs.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
 pub struct InlineQos {
     /// Key hash of the instance; the GUID itself for discovery data.
@@ -56,7 +56,7 @@ impl InlineQos {
     /// Parses a parameter list; `vendor` decides the meaning of the vendor-specific identifiers.
     ///
     /// # Errors
-    /// Fails if the list is malformed or one of these values is too short.
+    /// Fails if the list is malformed or the value of one of these parameters is too short.
     pub fn parse(parameters: ParameterList<'_>, vendor: VendorId) -> Result<Self, WireError> {
         let mut inline_qos = Self::default();
         for parameter in parameters {
@@ -72,8 +72,8 @@ impl InlineQos {
                 ParameterId::RELATED_SAMPLE_IDENTITY => {
                     inline_qos.related_sample_identity = Some(sample_identity(&mut value)?);
                 }
-                // Fast DDS used this number before the standard one; RTI reads it too. In Cyclone
-                // DDS the same number means subscription keys.
+                // Fast DDS used this id before the standard one, and RTI Connext reads it too. In
+                // Cyclone DDS the same id means subscription keys.
                 ParameterId::FAST_RELATED_SAMPLE_IDENTITY
                     if matches!(vendor, VendorId::EPROSIMA | VendorId::RTI_CONNEXT)
                         && inline_qos.related_sample_identity.is_none() =>

@@ -33,12 +33,12 @@ pub struct Locator {
     pub kind: LocatorKind,
     /// Port, in the transport's own numbering.
     pub port: u32,
-    /// Address; IPv4 is in the last four bytes.
+    /// Address; an IPv4 address is in the last four bytes.
     pub address: [u8; 16],
 }
 
 impl Locator {
-    /// Length on the wire.
+    /// Length on the wire, in bytes.
     pub const LEN: usize = 24;
 
     /// Reads a locator in the cursor's byte order.
@@ -68,7 +68,7 @@ impl Locator {
         Some(SocketAddr::new(address, u16::try_from(self.port).ok()?))
     }
 
-    /// Returns whether it is shared memory, in any vendor's numbering.
+    /// Returns whether the transport is shared memory, in the numbering of any vendor.
     #[must_use]
     pub const fn is_shared_memory(&self) -> bool {
         matches!(

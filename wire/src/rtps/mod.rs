@@ -1,9 +1,9 @@
-//! The vocabulary of RTPS messages: vendors, versions, submessage kinds and flags, locators, inline
+//! The elements of RTPS messages: vendors, versions, submessage kinds and flags, locators, inline
 //! QoS (RTPS 2.5, 8.3 and 9.4).
 //!
-//! [`crate::walk`] reads messages with it, and `rp discover` writes some. This module does not read
-//! a whole message. The tests have a second, complete reader that the walk must agree with:
-//! `tests/oracle`.
+//! [`crate::walk`] reads messages with these types, and `rp discover` writes some. This module does
+//! not read a whole message. The tests have a second, complete reader, `tests/oracle`, with which
+//! the walk must agree.
 
 mod flags;
 mod inline_qos;
@@ -37,7 +37,7 @@ impl VendorId {
     pub const CYCLONE: Self = Self([0x01, 0x10]);
     /// Atostek RustDDS.
     pub const RUSTDDS: Self = Self([0x01, 0x12]);
-    /// Eclipse Zenoh, which is not DDS and has no number of the OMG: all numbers of the OMG begin
+    /// Eclipse Zenoh, which is not DDS and has no number from the OMG: all numbers of the OMG begin
     /// with 1.
     pub const ZENOH: Self = Self(*b"Ze");
 
@@ -155,21 +155,21 @@ impl SequenceNumber {
         Self(self.0.saturating_sub(steps))
     }
 
-    /// Returns how far this number is after `other`; 0 if it is not.
+    /// Returns the number of steps from `other` to this number; 0 if `other` is higher.
     #[inline]
     #[must_use]
     pub const fn steps_since(self, other: Self) -> u64 {
         self.0.saturating_sub(other.0)
     }
 
-    /// Returns how far apart the numbers are, whichever is higher.
+    /// Returns the absolute difference between the numbers.
     #[inline]
     #[must_use]
     pub const fn distance(self, other: Self) -> u64 {
         self.0.abs_diff(other.0)
     }
 
-    /// Iterates over the numbers from this one to before `end`.
+    /// Iterates over the numbers in `self..end`.
     #[inline]
     pub fn until(self, end: Self) -> impl DoubleEndedIterator<Item = Self> {
         (self.0..end.0).map(Self)
@@ -199,7 +199,7 @@ impl AddAssign<u64> for SequenceNumber {
     }
 }
 
-/// The distance from a lower number.
+/// The number of steps from `lower`, which must not be higher.
 impl Sub for SequenceNumber {
     type Output = u64;
 
@@ -259,7 +259,7 @@ impl SubmessageId {
     /// Follows a protected message.
     pub const SRTPS_POSTFIX: Self = Self(0x34);
 
-    /// Returns the specification's name; `None` for an unknown kind.
+    /// Returns the name in the specification; `None` for an unknown kind.
     #[must_use]
     pub const fn name(self) -> Option<&'static str> {
         Some(match self {

@@ -10,30 +10,31 @@ use crate::cursor::{Cursor, Endianness, Reason, WireError};
 /// request and of its reply.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct RequestHeader {
-    /// Number that the client chose for itself, also in its USER_DATA as `clientid`.
+    /// Id that the client chose for itself; its USER_DATA contains the same id as `clientid`.
     pub client_id: [u8; 8],
     /// Number of the request, counted by the client from 1.
     pub sequence_number: SequenceNumber,
 }
 
 impl RequestHeader {
-    /// Bytes of the encapsulation header (RTPS 2.5, 10.2) and of this header.
+    /// Length of the encapsulation header (RTPS 2.5, 10.2) and of this header together, in bytes.
     pub const END: usize = 20;
 
     /// Parses the start of a serialized payload, encapsulation included.
     ///
     /// # Errors
-    /// Fails if the payload is shorter, or its encapsulation is not one of plain CDR.
+    /// Fails if the payload is shorter than [`Self::END`], or its encapsulation is not plain CDR.
     pub fn parse(payload: &[u8]) -> Result<Self, WireError> {
         let mut cursor = Cursor::new(payload, Endianness::Big);
         let encapsulation = cursor.array::<4>("request header")?;
-        // 0000/0001 CDR, 0006/0007 CDR2; an odd number is little-endian.
+        // 0000 and 0001 are CDR, 0006 and 0007 are CDR2. An odd number means little-endian.
         let endianness = match encapsulation {
             [0, 0 | 6, ..] => Endianness::Big,
             [0, 1 | 7, ..] => Endianness::Little,
             _ => return Err(cursor.error("request header", Reason::BadMarker)),
         };
-        // The id is a number: its octets are turned so that both ends yield the same ones.
+        // The id is a number: the octets of a little-endian id are reversed, so that both byte
+        // orders yield the same id.
         let mut client_id = cursor.array::<8>("request header")?;
         let number = cursor.array::<8>("request header")?;
         let number = match endianness {

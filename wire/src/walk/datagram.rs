@@ -13,7 +13,7 @@ use crate::time::Timestamp;
 /// Context of a datagram besides its bytes.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
 pub struct Envelope {
-    /// Nanoseconds since the Unix epoch, of the frame that completed the datagram.
+    /// Time of the frame that completed the datagram, in nanoseconds since the Unix epoch.
     pub time: u64,
     /// Destination address, IPv4-mapped for IPv4.
     pub destination: [u8; 16],
@@ -21,21 +21,21 @@ pub struct Envelope {
     pub destination_port: u16,
     /// Interface index, 0 = unknown.
     pub interface: u32,
-    /// Sent by this host.
+    /// Whether this host sent the datagram.
     pub outgoing: bool,
-    /// Came in several IP fragments.
+    /// Whether the datagram came in several IP fragments.
     pub fragmented: bool,
     /// Source UDP port, 0 = unknown.
     pub source_port: u16,
-    /// Cookie of the socket at which it was seen; 0 = unknown.
+    /// Cookie of the socket at which the datagram was seen; 0 = unknown.
     pub socket: u64,
-    /// Seen at a socket, not on an interface.
+    /// Whether the datagram was seen at a socket, not on an interface.
     pub host: bool,
 }
 
 impl Envelope {
-    /// Returns the context of a datagram that the kernel filter handed over with `record`, complete
-    /// at `time`.
+    /// Returns the context of a datagram that the kernel filter handed over with `record` and that
+    /// is complete at `time`.
     #[must_use]
     pub fn of_handover(record: &Record, time: Timestamp) -> Self {
         Self {
@@ -86,7 +86,7 @@ pub struct Found<'a> {
     pub record: Record,
     /// The whole submessage after its header: fixed fields, inline QoS and payload.
     pub body: &'a [u8],
-    /// Serialized payload of DATA, the fragment bytes of DATA_FRAG; empty for the others.
+    /// Serialized payload of a DATA, or fragment bytes of a DATA_FRAG; empty for other kinds.
     pub payload: &'a [u8],
 }
 
@@ -133,17 +133,17 @@ impl<'a> Found<'a> {
 /// Result of a walk in user space.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Outcome {
-    /// Reached the datagram's end.
+    /// The walk reached the datagram's end.
     Complete,
-    /// No RTPS magic.
+    /// The datagram does not begin with the RTPS magic.
     NotRtps,
     /// A submessage contradicts the datagram's length; everything before it was reported.
     Malformed,
 }
 
-/// Walks a whole datagram, any number of submessages, and passes every endpoint submessage to
-/// `show`. With `handover` the walk continues where the kernel filter stopped; bytes before that
-/// offset are not read. A GAP too long for one record is shown as two.
+/// Walks a whole datagram and passes every endpoint submessage to `show`. With `handover` the walk
+/// continues where the kernel filter stopped, and does not read the bytes before that offset. A GAP
+/// that is too long for one record is passed as two.
 pub fn datagram<'a>(
     payload: &'a [u8],
     envelope: &Envelope,
@@ -212,7 +212,8 @@ fn long_gap_tail(record: &Record, body: &[u8]) -> Record {
     let order = Order::of(record.submessage_flags.into());
     let gap_list_base = u64::from(record.payload_len) << 32 | u64::from(record.encapsulation);
     let base = gap_list_base.wrapping_add(Record::BITMAP_BITS.into());
-    // reader, writer, gapStart, base, numBits, then the five words that the first record holds
+    // The set follows reader, writer, gapStart, base and numBits (28 bytes). The first record holds
+    // its first five words (20 bytes).
     let map = |index: u32| {
         body.words::<1>(28 + 20 + 4 * index)
             .map_or(0, |[word]| order.word(word))

@@ -69,7 +69,7 @@ fn guid(prefix: [u8; 12], entity: [u8; 4]) -> Guid {
 }
 
 #[test]
-fn data_in_either_byte_order_reads_the_same() {
+fn data_reads_the_same_in_either_byte_order() {
     let payload = [0, 1, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0, 0xaa, 0xbb];
     for little in [true, false] {
         let body = data_body(little, 7, &payload);
@@ -89,7 +89,7 @@ fn data_in_either_byte_order_reads_the_same() {
 }
 
 #[test]
-fn every_data_of_a_datagram_is_seen_also_the_fortieth() {
+fn all_forty_data_of_a_datagram_are_reported() {
     let submessages: Vec<_> = (1..=40)
         .map(|sn| submessage(0x15, 5, &data_body(true, sn, &[0, 1, 0, 0])))
         .collect();
@@ -102,7 +102,7 @@ fn every_data_of_a_datagram_is_seen_also_the_fortieth() {
 }
 
 #[test]
-fn the_reader_guid_has_the_prefix_of_info_dst_and_info_src_changes_the_writer() {
+fn info_dst_sets_the_prefix_of_the_reader_and_info_src_that_of_the_writer() {
     let info_source = [&[0; 4][..], &[2, 1, 1, 0x10], &OTHER].concat();
     let bytes = message(&[
         submessage(0x09, 1, &[5, 0, 0, 0, 0, 0, 0, 0x80]),
@@ -139,7 +139,7 @@ fn status_info_is_big_endian_and_inline_qos_is_not_payload() {
     assert_eq!(walk_all(&bytes).1[0].0.payload_len, 8);
 }
 
-/// The inline QoS of a message with one DATA, whose body has `octets` octets of fixed fields.
+/// Returns the inline QoS of a message with one DATA, whose octetsToInlineQos is `octets`.
 fn inline_qos_of(little: bool, octets: u8, tail: &[u8]) -> Result<InlineQos, WireError> {
     let mut body = data_body(little, 9, tail);
     body[if little { 2 } else { 3 }] = octets;
@@ -152,7 +152,7 @@ fn inline_qos_of(little: bool, octets: u8, tail: &[u8]) -> Result<InlineQos, Wir
 }
 
 #[test]
-fn inline_qos_are_read_in_the_submessages_byte_order_behind_octets_to_inline_qos() {
+fn inline_qos_is_read_at_octets_to_inline_qos_in_the_submessages_byte_order() {
     let list = |little: bool| {
         let [key, hash, status, four, end] =
             [0x70_u16, 16, 0x71, 4, 1].map(|number| match little {
@@ -173,14 +173,14 @@ fn inline_qos_are_read_in_the_submessages_byte_order_behind_octets_to_inline_qos
         let inline_qos = inline_qos_of(little, 16, &list(little)).unwrap();
         assert_eq!(inline_qos.key_hash, Some([7; 16]));
         assert_eq!(inline_qos.status_info.0, 3);
-        // A field of a later version precedes them.
+        // A field of a later version precedes the inline QoS.
         let behind = [&b"new!"[..], &list(little)].concat();
         assert_eq!(inline_qos_of(little, 20, &behind), Ok(inline_qos));
     }
 }
 
 #[test]
-fn inline_qos_behind_those_that_the_walk_follows_are_read_and_have_to_be_well_formed() {
+fn inline_qos_beyond_the_limit_of_the_walk_is_read_and_must_be_well_formed() {
     let unknown = [0x00, 0x7a, 0, 0].repeat(INLINE_QOS_PARAMETERS as usize);
     let status = [0x71, 0, 4, 0, 0, 0, 0, 1, 1, 0, 0, 0];
     let inline_qos = inline_qos_of(true, 16, &[&unknown[..], &status].concat()).unwrap();
@@ -196,7 +196,8 @@ fn flags_distinguish_values_from_keys() {
         (0x05, Payload::Data(&bytes)),
         (0x09, Payload::Key(&bytes)),
         (0x01, Payload::None),
-        // The specification does not define this combination; the value carries more information.
+        // The specification does not define this combination; a value carries more information than
+        // a key.
         (0x0d, Payload::Data(&bytes)),
     ] {
         let message = message(&[submessage(0x15, flags, &data_body(true, 1, &bytes))]);
@@ -210,7 +211,7 @@ fn flags_distinguish_values_from_keys() {
 }
 
 #[test]
-fn data_frag_gives_fragment_numbers_and_sizes() {
+fn a_data_frag_yields_fragment_numbers_and_sizes() {
     let head = [
         &[0, 0, 28, 0][..],
         &READER,
@@ -236,7 +237,7 @@ fn data_frag_gives_fragment_numbers_and_sizes() {
 }
 
 #[test]
-fn a_length_of_zero_reaches_the_end_but_not_for_pad_and_info_ts() {
+fn a_length_of_zero_extends_to_the_end_except_for_pad_and_info_ts() {
     let mut last = submessage(0x15, 5, &data_body(true, 1, &[0, 1, 0, 0, 7, 7, 7, 7]));
     last[2..4].copy_from_slice(&[0, 0]);
     let bytes = message(&[submessage(0x01, 1, &[]), submessage(0x09, 3, &[]), last]);
@@ -245,7 +246,7 @@ fn a_length_of_zero_reaches_the_end_but_not_for_pad_and_info_ts() {
 }
 
 #[test]
-fn a_message_longer_than_a_datagram_ends_in_a_sample_of_any_size() {
+fn a_message_longer_than_a_datagram_may_end_in_a_sample_of_any_size() {
     // Fast DDS with shared memory as its only transport: the last submessage has the length 0.
     let short = submessage(0x15, 0x05, &data_body(true, 1, &[0, 1, 0, 0]));
     let body = data_body(true, 2, &[7; 200_000]);
@@ -264,7 +265,7 @@ fn a_message_longer_than_a_datagram_ends_in_a_sample_of_any_size() {
 }
 
 #[test]
-fn a_gap_of_256_becomes_two_records() {
+fn a_gap_of_256_bits_becomes_two_records() {
     let body = [
         &READER[..],
         &WRITER,
@@ -318,7 +319,7 @@ fn only_discovery_is_captured_without_a_request() {
 }
 
 #[test]
-fn the_first_malformed_submessage_ends_the_walk_but_not_what_came_before() {
+fn a_malformed_submessage_ends_the_walk_and_earlier_ones_are_kept() {
     let mut bytes = message(&[
         submessage(0x15, 5, &data_body(true, 1, &[0, 1, 0, 0])),
         submessage(0x15, 5, &data_body(true, 2, &[0, 1, 0, 0])),
@@ -328,7 +329,7 @@ fn the_first_malformed_submessage_ends_the_walk_but_not_what_came_before() {
     assert_eq!((outcome, found.len()), (Outcome::Malformed, 1));
 }
 
-/// A valid message with every kind of submessage, to be cut and damaged.
+/// Returns a valid message with several kinds of submessages, to be cut and damaged.
 fn sampler() -> Vec<u8> {
     let set = [
         &READER[..],
@@ -358,7 +359,7 @@ fn sampler() -> Vec<u8> {
 }
 
 #[test]
-fn every_truncation_and_every_single_byte_corruption_is_survived() {
+fn no_truncation_or_corruption_of_one_byte_makes_the_walk_panic() {
     let whole = sampler();
     assert_eq!(walk_all(&whole).0, Outcome::Complete);
     for len in 0..whole.len() {
@@ -374,10 +375,10 @@ fn every_truncation_and_every_single_byte_corruption_is_survived() {
 }
 
 proptest! {
-    /// The kernel sees a datagram fragment by fragment: stopping anywhere and continuing with more
-    /// bytes must find the same as one pass, unless the walk reports a split.
+    /// The kernel sees a datagram fragment by fragment. A walk that stops anywhere, also within a
+    /// submessage, and continues with more bytes must find the same as one pass.
     #[test]
-    fn pausing_between_fragments_changes_nothing(cuts in proptest::collection::vec(8u32..300, 1..6)) {
+    fn a_paused_walk_finds_the_same_records(cuts in proptest::collection::vec(8u32..300, 1..6)) {
         let bytes = sampler();
         let whole = walk_all(&bytes).1.len();
         let mut walk = Walk::default();
@@ -400,7 +401,7 @@ proptest! {
     }
 
     #[test]
-    fn arbitrary_bytes_never_panic(tail in proptest::collection::vec(any::<u8>(), 0..600)) {
+    fn no_bytes_make_the_walk_panic(tail in proptest::collection::vec(any::<u8>(), 0..600)) {
         let mut bytes = message(&[]);
         bytes.extend(tail);
         walk_all(&bytes);
