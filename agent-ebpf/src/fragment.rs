@@ -1,10 +1,11 @@
-//! Datagrams in several IP fragments: one walk across frames, reported once all fragments have
-//! arrived.
+//! Datagrams in several IP fragments. One walk covers all frames, and its result is reported once
+//! all fragments have arrived.
 //!
 //! Only the first fragment has a UDP header, and submessage headers may lie in any fragment. A
-//! table holds the walk's state between frames. The filter cannot continue alone after discovery
-//! after user data, a header cut in two, or fragments out of order. It then hands the rest of the
-//! datagram and the walk's state to user space, so nothing is decided twice and nothing is missed.
+//! table holds the walk's state between frames. The filter cannot continue alone if discovery data
+//! follows user data, if a header is cut in two, or if fragments are out of order. It then hands
+//! the rest of the datagram and the walk's state to user space. So a verdict is reached exactly
+//! once for each submessage.
 
 use aya_ebpf::{bindings::__sk_buff, helpers::bpf_ktime_get_ns};
 use ros2probe_wire::{
@@ -19,19 +20,18 @@ use crate::{
     verdict::{self, progress},
 };
 
-/// A flow expires after this time: the kernel has given up the datagram, and its identification may
-/// be in use again.
+/// Lifetime of a flow. Afterwards another datagram may have the same identification.
 const FLOW_LIFETIME_NANOSECONDS: u64 = 5_000_000_000;
 
 mod state {
     /// A new flow. Trailing fragments in this state arrived before the first one: the kind of
     /// datagram is unknown, and they are captured within the budget of unclassified writers.
     pub const HEADLESS: u32 = 0;
-    /// RTPS, walked here.
+    /// The datagram is RTPS, and the kernel walks it.
     pub const WALKING: u32 = 1;
     /// All fragments go to user space.
     pub const CAPTURED: u32 = 2;
-    /// Fragments from some point on go to user space.
+    /// The remaining fragments go to user space.
     pub const HANDED_OVER: u32 = 3;
     /// Not RTPS.
     pub const FOREIGN: u32 = 4;
@@ -39,7 +39,7 @@ mod state {
     pub const DONE: u32 = 5;
 }
 
-/// One IP fragment; 1 = keep the frame.
+/// Handles one IP fragment; returns 1 to keep the frame.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn pass(skb: *mut __sk_buff, slot: u32) -> u32 {
@@ -88,7 +88,7 @@ pub extern "C" fn pass(skb: *mut __sk_buff, slot: u32) -> u32 {
 
 /// Returns the flow of the current fragment; creates it if it does not exist or its identification
 /// is reused. The kernel may reuse an LRU entry for another key while this run holds it, and
-/// fragments of one datagram may arrive on two CPUs. In both cases flows are miscounted.
+/// fragments of one datagram may arrive on two CPUs. In both cases a flow is miscounted.
 #[inline(always)]
 fn flow(slot: u32, packet: &Packet) -> Option<&'static Flow> {
     let key = FlowKey {
@@ -124,7 +124,7 @@ fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working<Scratch>, flow: &F
     }
     let begun = scratch.get();
     begun.walk.record.datagram = flow.token.get();
-    // Every fragment seen before this one was captured, so all of them are.
+    // Fragments that arrived before the first one were captured, so the others are, too.
     let alone = flow.seen.get() == begun.packet.len;
     let (base, present) = (begun.packet.body + 8, begun.packet.len - 8);
     let result = if alone {
@@ -133,7 +133,7 @@ fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working<Scratch>, flow: &F
         progress::CAPTURE
     };
     if result >= progress::CAPTURE {
-        // Also if a header is split: user space reads the datagram from its start.
+        // This includes a split header: user space reads the datagram from its start.
         flow.state.set(state::CAPTURED);
         verdict::captured(slot, scratch.get());
         return 1;
@@ -249,7 +249,7 @@ fn hand_over(slot: u32, scratch: &mut Scratch, flow: &Flow) {
     flow.pending.store(record);
 }
 
-/// Writes the last record: all fragments have arrived.
+/// Writes the last record after all fragments have arrived.
 #[inline(always)]
 fn finish(slot: u32, scratch: &mut Scratch, flow: &Flow) {
     let state = flow.state.get();
@@ -278,7 +278,7 @@ fn finish(slot: u32, scratch: &mut Scratch, flow: &Flow) {
     let record = &mut scratch.pending;
     flow.pending.load(record);
     if !pending {
-        // All records were written ahead: this record marks them as valid.
+        // All records were written ahead. This record marks them as valid.
         record.kind = kind::COMPLETE;
         record.datagram = flow.token.get();
         record.flags &= !flag::AHEAD;

@@ -1,9 +1,9 @@
-//! Messages that a process writes to Fast DDS's shared memory, read in that process.
+//! Reads messages that a process writes to the shared memory of Fast DDS, in that process.
 //!
 //! A uprobe runs where the library is about to copy a message: once per message, however many
-//! readers it has. It reads the sender's memory at the addresses passed to the call, never writes,
-//! and never waits: a message on a page that is not resident counts as unreadable. Fast DDS 2.x
-//! passes the message in one piece, 3.x in a list of buffers.
+//! readers it has. It reads the sender's memory at the addresses passed to the call. It never
+//! writes and never waits: a message on a page that is not resident counts as unreadable. Fast DDS
+//! 2.x passes the message in one piece, 3.x in a list of buffers.
 
 use aya_ebpf::{
     helpers::{
@@ -30,21 +30,21 @@ use crate::{
     verdict::{self, progress},
 };
 
-/// Submessages read per message; a message with more is captured.
+/// Maximum number of submessages read per message; a message with more is captured.
 const SUBMESSAGES: u32 = 64;
-/// Bytes of a buffer's description in a list: an address and a length.
+/// Size of a buffer's description in a list, in bytes: an address and a length.
 const BUFFER: u64 = 16;
-/// Buffers visited by one search, and the longest list.
+/// Maximum number of buffers that one search visits, and of buffers in a list.
 const SEARCH: u32 = 64;
 const MAX_BUFFERS: u64 = 4096;
-/// Most pieces of one captured message.
+/// Maximum number of pieces of one captured message.
 const MAX_PIECES: u32 = 256;
-/// Longer messages are metered but not captured: user space reads them as datagrams of at most 64
-/// KiB.
+/// Maximum length of a captured message, in bytes. Longer messages are metered, because user space
+/// reads messages as datagrams of at most 64 KiB.
 const MAX_CAPTURED: u32 = 0xffff;
-/// Larger than any real list of buffers.
+/// Maximum length of a message or buffer, in bytes: larger than any real one.
 const MAX_LEN: u32 = 1 << 28;
-/// Words that the walk reads at once, and the size of the buffer for words that span two buffers.
+/// Maximum number of words in one read of the walk, and length of [`Handed::bridge`].
 const BRIDGE: usize = 8;
 
 /// The current message, by slot.
@@ -54,9 +54,9 @@ static HANDED: PerCpuArray<Handed> = PerCpuArray::with_max_entries(SLOTS, 0);
 /// One message in its sender's memory.
 #[repr(C)]
 struct Handed {
-    /// Address of the list of buffers; 0 = it lies in one piece.
+    /// Address of the list of buffers; 0 = the message lies in one piece.
     list: u64,
-    /// Buffers of the list.
+    /// Number of buffers in the list.
     buffers: u32,
     /// Index of the next buffer to read.
     next: u32,
@@ -100,17 +100,17 @@ impl Bytes for Message {
     }
 }
 
-/// Results of [`shm_find`]; values cross a function boundary as `u32`.
+/// Results of [`shm_find`]. The values are `u32` because they cross a function boundary.
 mod found {
     pub const NOWHERE: u32 = 0;
-    /// In the current buffer.
+    /// The bytes are in the current buffer.
     pub const HERE: u32 = 1;
-    /// In the bridge.
+    /// The bytes are in the bridge.
     pub const BRIDGED: u32 = 2;
 }
 
-/// Handles a call that writes a message, from its saved registers. `in_list`: the second argument
-/// after the object is a list of buffers.
+/// Handles a call that writes a message, from its saved registers. With `in_list`, the call passes
+/// the message as a list of buffers.
 #[inline(always)]
 pub fn look(registers: *const u64, in_list: bool) {
     // The caller allocates the object that the call returns. On x86-64 its address is the first
@@ -165,7 +165,8 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
         } else {
             count(slot, Counter::PiecesLost, 1);
         }
-        // As if a copy had been captured: its submessages of interest become records.
+        // The walk is repeated as if a copy had been captured: submessages of interest become
+        // records.
         let scratch = working.get();
         scratch.count = core::hint::black_box(0);
         scratch.unknown = core::hint::black_box(0);
@@ -187,7 +188,8 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
     1
 }
 
-/// Notes where the message's bytes lie; returns the counter of a message that is not read.
+/// Stores the location of the message's bytes. Returns the counter to increment if the message
+/// cannot be read.
 #[inline(always)]
 fn locate(handed: &mut Handed, address: u64, len: u32, in_list: u32) -> Result<(), Counter> {
     let zero = core::hint::black_box(0);
@@ -212,7 +214,7 @@ fn locate(handed: &mut Handed, address: u64, len: u32, in_list: u32) -> Result<(
     Ok(())
 }
 
-/// Clears the working memory for a message without addresses; returns the message's token.
+/// Clears the working memory for a message without network addresses; returns the message's token.
 #[inline(always)]
 fn clear(scratch: &mut Scratch, slot: u32, now: u64) -> u32 {
     let zero = core::hint::black_box(0);
@@ -235,7 +237,7 @@ fn clear(scratch: &mut Scratch, slot: u32, now: u64) -> u32 {
     record.flags = zero as u16;
     // SAFETY: no preconditions.
     let cpu = unsafe { bpf_get_smp_processor_id() } as u32;
-    // Built as in `host::identify`.
+    // The token has the form of those of `host::identify`.
     scratch.named << 12 | (slot + 1) << 8 | (cpu & 0xff)
 }
 
@@ -319,8 +321,8 @@ pub extern "C" fn shm_capture(slot: u32, len: u32, token: u32) -> u32 {
     0
 }
 
-/// Writes one piece, from `offset` of the message to the end of its buffer at most. Returns its
-/// length, or 0 if it could not be read or did not fit.
+/// Writes one piece, which begins at `offset` of the message and lies in one buffer. Returns the
+/// length of the piece, or 0 if the piece could not be read or did not fit.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_piece(slot: u32, offset: u32) -> u32 {
@@ -340,7 +342,7 @@ pub extern "C" fn shm_piece(slot: u32, offset: u32) -> u32 {
     buffer.piece.offset = offset;
     buffer.piece.len = len;
     let from = handed.address + u64::from(offset.wrapping_sub(handed.start));
-    // SAFETY: the buffer has room for the longest piece; the kernel checks the address.
+    // SAFETY: the buffer can hold the longest piece; the kernel checks the address.
     let loaded = unsafe {
         bpf_probe_read_user(
             buffer.bytes.as_mut_ptr().cast(),
@@ -354,8 +356,8 @@ pub extern "C" fn shm_piece(slot: u32, offset: u32) -> u32 {
     len
 }
 
-/// Finds the buffer with these bytes of the message and makes it the current one. Copies bytes that
-/// span several buffers to the bridge.
+/// Finds the buffer with `len` bytes at `offset` of the message and makes it the current one.
+/// Copies bytes that span several buffers to the bridge.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_find(slot: u32, offset: u32, len: u32) -> u32 {
@@ -363,14 +365,14 @@ pub extern "C" fn shm_find(slot: u32, offset: u32, len: u32) -> u32 {
         return found::NOWHERE;
     };
     if offset < message.start {
-        // Restarts from the first buffer; capturing a message does so only once.
+        // The search restarts from the first buffer. A capture causes only one restart.
         let zero = core::hint::black_box(0);
         (message.next, message.start, message.end) = (zero, zero, zero);
     }
     if shm_move(slot, offset) == 0 {
         return found::NOWHERE;
     }
-    // Looked up again: `shm_move` has held a reference of its own.
+    // The message is looked up again, because `shm_move` has held a reference of its own.
     if handed(slot).is_some_and(|message| offset + len <= message.end) {
         return found::HERE;
     }
@@ -409,7 +411,7 @@ pub extern "C" fn shm_bridge(slot: u32, offset: u32, index: u32) -> u32 {
     1
 }
 
-/// Moves along the list to the buffer with this byte; returns 0 if no buffer holds it.
+/// Moves along the list to the buffer with the byte at `offset`; returns 0 if no buffer holds it.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_move(slot: u32, offset: u32) -> u32 {

@@ -1,9 +1,8 @@
-//! The host hook: whole datagrams at the sockets of this host, whatever fragments the links cut
-//! them into.
+//! The host hook reads whole datagrams at the sockets of this host, however links fragment them.
 //!
 //! A datagram passes once per receiving socket and once per transmission. Its records name the
-//! socket. A captured datagram is written in pieces and only once, however many sockets receive it;
-//! its other copies are metered. The return value for the kernel is not decided here: the entry
+//! socket. A captured datagram is written in pieces and only once, however many sockets receive it.
+//! Its other copies are metered. The return value for the kernel is not decided here: the entry
 //! programs always return 1.
 
 use aya_ebpf::{
@@ -24,12 +23,12 @@ use crate::{
     pieces, verdict,
 };
 
-/// Within this time after a capture, the same bytes at another socket are a copy. The kernel
-/// delivers the copies of one datagram one after the other, in microseconds; a writer waits for an
-/// answer before it repeats itself.
+/// Time after a capture within which the same datagram at another socket is a copy. The kernel
+/// delivers the copies of one datagram within microseconds. A writer waits for an answer before it
+/// repeats a datagram.
 const COPY_NANOSECONDS: u64 = 1_000_000;
-/// A socket that was just seen is not looked up again for this long; the LRU table forgets it if
-/// others fill the table.
+/// Time after which a socket that was seen is looked up again. The LRU table may have evicted the
+/// socket.
 const MET_NANOSECONDS: u64 = 500_000_000;
 const TCP: u8 = 6;
 const ICMPV6: u8 = 58;
@@ -60,8 +59,8 @@ pub extern "C" fn look(skb: *mut __sk_buff, at: u32) -> u32 {
     0
 }
 
-/// Returns whether the packet may be UDP. Most packets here are TCP: the first words decide, read
-/// in place.
+/// Returns whether the packet may be UDP. Most packets here are TCP, so only the first words are
+/// read, in place.
 #[inline(always)]
 fn may_be_udp(skb: *mut __sk_buff) -> bool {
     // SAFETY: the verifier rewrites reads of these fields into the addresses.
@@ -93,7 +92,7 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
     }
     let mut scratch = scratch(slot)?;
     if scratch.get().packet.fragmented != 0 {
-        // Sent by a raw socket; what sockets receive is reassembled.
+        // A raw socket has sent this fragment; received datagrams are reassembled.
         count(slot, Counter::Fragments, 1);
         return None;
     }
@@ -109,7 +108,7 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
         if pieces::capture(skb, slot) != 0 {
             note(scratch.get());
         } else {
-            // User space cannot keep up with all of it: the rest is metered.
+            // The ring is full, so the datagram is metered instead.
             capture = false;
             verdict::meter(skb, slot);
         }
@@ -121,7 +120,7 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
         last.token.set(token);
         last.slot.set(slot);
         last.captured.set(u32::from(capture));
-        // For the kernel, the program's context is the packet itself.
+        // The address of the program's context is that of the kernel's packet.
         last.buffer.set(skb as u64);
     }
     let scratch = scratch.get();
@@ -139,7 +138,7 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
     Some(())
 }
 
-/// Shows a socket to user space, which looks up its process.
+/// Adds a socket to [`SOCKETS`], where user space finds it and looks up its process.
 #[inline(always)]
 pub fn meet(skb: *mut __sk_buff, socket: u64, is_stream: u64) {
     let met = Socket {
@@ -158,15 +157,15 @@ pub fn identify(skb: *mut __sk_buff, slot: u32, named: &mut u32) -> (u32, u64) {
     *named = named.wrapping_add(1);
     // SAFETY: no preconditions.
     let cpu = unsafe { bpf_get_smp_processor_id() } as u32;
-    // Unique among 2^20 datagrams of a CPU if at most 256 CPUs exist. Slots count from one, so the
-    // token is never 0.
+    // The token is unique among 2^20 datagrams of a CPU if at most 256 CPUs exist. Slots count from
+    // one, so the token is never 0.
     let token = *named << 12 | (slot + 1) << 8 | (cpu & 0xff);
     // SAFETY: `skb` is the program's context.
     (token, unsafe { bpf_get_socket_cookie(skb.cast()) })
 }
 
-/// Returns whether a copy of the current datagram was captured just before, compared by the
-/// submessage that requires the capture. Always false on the wire hook.
+/// Returns whether a copy of the current datagram was captured just before. Copies are recognized
+/// by the submessage that requires the capture. The result is always false on the wire hook.
 #[inline(always)]
 pub fn captured_before(slot: u32, scratch: &mut Scratch) -> bool {
     if scratch.repeated != 0 {

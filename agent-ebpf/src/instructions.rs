@@ -12,8 +12,8 @@ pub fn add(to: *mut u64, by: u64) {
     }
 }
 
-/// Returns the same number with its bounds hidden from the optimizer, so that a mask that follows
-/// is kept and every verifier sees it.
+/// Returns the same number with its bounds hidden from the optimizer. So the optimizer keeps a mask
+/// that follows, and every verifier sees the mask.
 #[inline(always)]
 pub fn opaque(value: u32) -> u64 {
     let mut value = u64::from(value);

@@ -1,17 +1,18 @@
 //! Reads the kernel's own structures at offsets that the loader has resolved.
 //!
-//! A wrong address yields zeros, never a fault: the helper refuses it.
+//! A wrong address yields `None`, never a fault: the helper refuses it.
 
 use core::mem::MaybeUninit;
 
 use aya_ebpf::helpers::generated::bpf_probe_read_kernel;
 use ros2probe_wire::host::Layout;
 
-/// Indexed by `host::Layout`. Set by the loader.
+/// Offsets and enumerators, indexed by `host::Layout`. Set by the loader.
 #[unsafe(no_mangle)]
 pub static LAYOUT: [u32; Layout::COUNT] = [Layout::ABSENT; Layout::COUNT];
 
-/// Returns the offset of a member in the running kernel; [`Layout::ABSENT`] if it does not exist.
+/// Returns the offset of a member, or an enumerator, in the running kernel; [`Layout::ABSENT`] if
+/// it does not exist.
 #[inline(always)]
 pub fn place(of: Layout) -> u32 {
     // SAFETY: an index below the array's length.
@@ -20,7 +21,7 @@ pub fn place(of: Layout) -> u32 {
     unsafe { core::ptr::read_volatile(place) }
 }
 
-/// Reads the member at offset `place` of the structure at `address`.
+/// Reads the member `of` of the structure at `address`.
 #[inline(always)]
 pub fn member<T: Copy>(address: u64, of: Layout) -> Option<T> {
     read(address.wrapping_add(u64::from(place(of))))

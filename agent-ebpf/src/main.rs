@@ -1,13 +1,14 @@
-//! The kernel filter: reads copies, returns how many bytes of a frame user space receives, changes
-//! nothing.
+//! The kernel filter reads packets and changes none of them. For a frame on an interface it returns
+//! how many bytes user space receives.
 //!
-//! It is thin on purpose: `ros2probe_wire::walk`, which user space runs too, reads submessages and
-//! decides what happens to them. This crate adds the socket buffer, the maps and the fragments.
-//! Hooks: [`wire`] reads frames on interfaces, [`host_ingress`] and [`host_egress`] read datagrams
-//! at sockets, [`zenoh_ingress`] and [`zenoh_egress`] TCP segments. If enabled, [`shm_handed`] reads messages in the process that sends them.
+//! The crate is thin on purpose: `ros2probe_wire::walk`, which user space runs too, reads
+//! submessages and decides what happens to them. This crate adds the socket buffer, the maps and
+//! the fragments. [`wire`] reads frames on interfaces. [`host_ingress`] and [`host_egress`] read
+//! datagrams at sockets, [`zenoh_ingress`] and [`zenoh_egress`] TCP segments. If enabled,
+//! [`shm_handed`] reads messages in the process that sends them.
 //!
-//! It stays within what Linux 5.10 verifies: bounded loops, global functions that are verified
-//! once, reads of fixed size, no spin lock, no atomics that return a value.
+//! The programs use only what the verifier of Linux 5.10 accepts: bounded loops, global functions
+//! that are verified once, reads of fixed size, no spin lock, no atomics that return a value.
 
 #![no_std]
 #![no_main]
@@ -46,51 +47,50 @@ use crate::{
 
 /// `skb->pkt_type` of a frame that this host sends.
 const PACKET_OUTGOING: u32 = 4;
-/// The loopback device has this index in every network namespace.
+/// Index of the loopback device in every network namespace.
 const LOOPBACK: u32 = 1;
 
-/// Attached to an AF_PACKET SOCK_DGRAM socket; tail-calls [`wire`]. A socket is charged for the
-/// length of its program, and up to Linux 6.7 a program must stay below 20 KB
-/// (`net.core.optmem_max`).
+/// Runs for an AF_PACKET SOCK_DGRAM socket and tail-calls [`wire`]. The kernel charges a socket for
+/// the length of its program, which must stay below 20 KB up to Linux 6.7 (`net.core.optmem_max`).
 #[socket_filter]
 pub fn wire_entry(context: SkBuffContext) -> i64 {
     // SAFETY: index 0 is in the array, and the loader puts a program of the same type there.
     unsafe { WIRE.tail_call(&context, 0) };
-    // Reached only if the array is empty.
+    // This line is reached only if the array is empty.
     0
 }
 
-/// Runs for such a socket: the frame begins at the IP header. Returns the number of bytes that go
-/// into the socket's packet ring: the whole frame or 0.
+/// Runs for the socket of [`wire_entry`]; the frame begins at the IP header. Returns the number of
+/// bytes that go into the socket's packet ring: the whole frame or 0.
 #[socket_filter]
 pub fn wire(context: SkBuffContext) -> i64 {
     frame(context.skb.skb).unwrap_or(0)
 }
 
-/// Runs for a cgroup: a received datagram begins at the IP header, reassembled. Returns 1: the
-/// kernel continues with it.
+/// Runs at a cgroup for a received datagram, which is reassembled and begins at the IP header.
+/// Returns 1, so that the kernel delivers the datagram.
 #[cgroup_skb(ingress)]
 pub fn host_ingress(context: SkBuffContext) -> i32 {
     host::look(context.skb.skb, hook::INGRESS);
     1
 }
 
-/// Runs as [`host_ingress`] does, for a datagram that a socket sends, before it is fragmented.
+/// Runs as [`host_ingress`] does, for a datagram that a socket sends, before fragmentation.
 #[cgroup_skb(egress)]
 pub fn host_egress(context: SkBuffContext) -> i32 {
     host::look(context.skb.skb, hook::EGRESS);
     1
 }
 
-/// Runs as [`host_ingress`] does, beside it, for TCP segments of Zenoh. Linux may show several
-/// segments of a connection as one packet.
+/// Runs in addition to [`host_ingress`], for TCP segments of Zenoh. Linux may merge several
+/// segments of a connection into one packet.
 #[cgroup_skb(ingress)]
 pub fn zenoh_ingress(context: SkBuffContext) -> i32 {
     zenoh::socket(context.skb.skb, hook::INGRESS);
     1
 }
 
-/// Runs as [`zenoh_ingress`] does, for what a socket sends.
+/// Runs as [`zenoh_ingress`] does, for segments that a socket sends.
 #[cgroup_skb(egress)]
 pub fn zenoh_egress(context: SkBuffContext) -> i32 {
     zenoh::socket(context.skb.skb, hook::EGRESS);
@@ -104,29 +104,30 @@ pub fn socket_full(context: RawTracePointContext) -> u32 {
     0
 }
 
-/// Runs for every packet that the kernel drops, with the reason; attached where [`socket_full`] does
-/// not cover IPv6.
+/// Runs for every packet that the kernel drops, with the reason. It is attached on kernels where
+/// [`socket_full`] does not cover IPv6.
 #[raw_tracepoint]
 pub fn no_room_freed(context: RawTracePointContext) -> u32 {
     socket_full::freed(&context);
     0
 }
 
-/// Runs as [`no_room_freed`] does, on kernels that give no reason.
+/// Runs as [`no_room_freed`] does, on kernels that report no drop reason.
 #[raw_tracepoint]
 pub fn no_room_unexplained(context: RawTracePointContext) -> u32 {
     socket_full::unexplained(&context);
     0
 }
 
-/// Runs for every packet that the kernel drops; attached on kernels that give a reason.
+/// Runs for every packet that the kernel drops. It is attached on kernels that report a drop
+/// reason.
 #[raw_tracepoint]
 pub fn not_reassembled(context: RawTracePointContext) -> u32 {
     reassembly::dropped(&context);
     0
 }
 
-/// Runs as [`not_reassembled`] does, on kernels that give no reason.
+/// Runs as [`not_reassembled`] does, on kernels that report no drop reason.
 #[raw_tracepoint]
 pub fn not_reassembled_unexplained(context: RawTracePointContext) -> u32 {
     reassembly::unexplained(&context);
@@ -153,7 +154,7 @@ fn frame(skb: *mut __sk_buff) -> Option<i64> {
     let (pkt_type, interface, segments) =
         unsafe { ((*skb).pkt_type, (*skb).ifindex, (*skb).gso_segs) };
     if interface == LOOPBACK && pkt_type == PACKET_OUTGOING {
-        // Loopback frames pass twice; the received copy counts.
+        // Loopback frames pass twice; only the received copy is read.
         count_outside(Counter::LoopbackCopies, 1);
         return Some(0);
     }

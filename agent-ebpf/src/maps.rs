@@ -22,32 +22,34 @@ use crate::{
     settings::setting,
 };
 
-/// `BPF_F_NO_PREALLOC`: user space alone fills this map, and it is mostly empty. No map of a
-/// tracepoint or uprobe has it: before Linux 6.1 the kernel warns of that, and with PREEMPT_RT it
-/// refuses the program.
+/// `BPF_F_NO_PREALLOC`, for a map that only user space fills and that is mostly empty. No map of a
+/// tracepoint or uprobe has the flag: before Linux 6.1 the kernel warns of it, and with PREEMPT_RT
+/// the kernel refuses the program.
 const NO_PREALLOC: u32 = 1;
 
-/// Most records that the filter writes for one datagram; a datagram with more is captured.
+/// Maximum number of records that the filter writes for one datagram; a datagram with more is
+/// captured.
 pub const RECORDS_PER_DATAGRAM: u32 = 32;
 const _: () = assert!(RECORDS_PER_DATAGRAM.is_power_of_two());
 
-/// Runs of programs that may be active on one CPU, see [`claim_outgoing`]: received datagrams and
-/// frames use the slots below [`OUTGOING_SLOT`], sent datagrams the others.
+/// Number of slots: the maximum number of runs of programs that are active on one CPU, see
+/// [`claim_outgoing`]. Received datagrams and frames use the slots below [`OUTGOING_SLOT`], sent
+/// datagrams the others.
 pub const SLOTS: u32 = 6;
 const _: () = assert!((SLOTS as usize) < COUNTER_SLOTS && COUNTER_SLOTS.is_power_of_two());
 /// First slot for sent datagrams.
 pub const OUTGOING_SLOT: u32 = 2;
-/// Captures remembered per CPU, a power of two.
+/// Number of captures remembered per CPU, a power of two.
 const RECENT_CAPACITY: u32 = 16;
 
 /// Whether to read frames of an interface that is not in [`INTERFACES`]. Set by the loader.
 #[unsafe(no_mangle)]
 pub static NEW_INTERFACES: u32 = 1;
-/// Fill level of the ring, in bytes, from which a record wakes user space; below it user space
+/// Fill level of [`RECORDS`], in bytes, above which a record wakes user space; below it user space
 /// polls. Set by the loader.
 #[unsafe(no_mangle)]
 pub static WAKE_BYTES: u64 = 128 * 1024;
-/// The same for pieces of captured datagrams.
+/// Fill level of [`PIECES`], in bytes, above which a piece wakes user space. Set by the loader.
 #[unsafe(no_mangle)]
 pub static WAKE_PIECE_BYTES: u64 = 512 * 1024;
 
@@ -56,8 +58,8 @@ pub static WAKE_PIECE_BYTES: u64 = 512 * 1024;
 #[unsafe(no_mangle)]
 pub static PREEMPTED: u32 = 1;
 
-/// Whether programs may read packets in place: at a cgroup they may, at an interface they may not.
-/// Set by the loader.
+/// Whether programs may read packets in place: programs at a cgroup may, programs at an interface
+/// may not. Set by the loader.
 #[unsafe(no_mangle)]
 pub static IN_PLACE: u32 = 1;
 
@@ -91,8 +93,8 @@ pub static NEW_FLOW: PerCpuArray<Flow> = PerCpuArray::with_max_entries(1, 0);
 /// Consecutive DATA_FRAGs of incomplete samples.
 #[map]
 pub static RUNS: HashMap<RunKey, Record> = HashMap::with_max_entries(RUN_CAPACITY, 0);
-/// The CPU that last extended a stream's run: a sender that moves to another CPU leaves its run
-/// behind.
+/// The CPU that last extended a stream's run, because a sender that moves to another CPU leaves its
+/// run behind.
 #[map]
 pub static RUN_CPUS: LruHashMap<Stream, u32> = LruHashMap::with_max_entries(RUN_CAPACITY, 0);
 /// Records for user space, read once a second or when the ring is half full.
@@ -124,8 +126,8 @@ static RECENT: PerCpuArray<Recent> = PerCpuArray::with_max_entries(RECENT_CAPACI
 #[map]
 static LAST: PerCpuArray<Last> = PerCpuArray::with_max_entries(1, 0);
 
-/// A value that other runs read and write at the same time, on this CPU or others. No reference to
-/// it exists; it is only copied in and out.
+/// A value that other runs read and write concurrently, on this CPU or others. No reference to the
+/// value exists; it is only copied in and out.
 #[repr(transparent)]
 pub struct Shared<T>(UnsafeCell<T>);
 
@@ -140,14 +142,14 @@ impl<T: Copy> Shared<T> {
         Self(UnsafeCell::new(value))
     }
 
-    /// Returns the number.
+    /// Returns the value.
     #[inline(always)]
     pub fn get(&self) -> T {
         // SAFETY: valid and aligned, as `self` is.
         unsafe { self.0.get().read_volatile() }
     }
 
-    /// Replaces the number.
+    /// Replaces the value.
     #[inline(always)]
     pub fn set(&self, value: T) {
         // SAFETY: as above.
@@ -220,15 +222,15 @@ pub struct Flow {
     pub seen: Shared<u32>,
     /// Total IP payload bytes, 0 until the last fragment arrives.
     pub expected: Shared<u32>,
-    /// Starts of fragments seen, one bit per 8 bytes (RFC 791): a link with a small MTU may cut
-    /// fragments that short.
+    /// Start offsets of the fragments seen, one bit per 8 bytes (RFC 791): a link with a small MTU
+    /// may cut fragments to this length.
     pub starts: [Shared<u64>; 128],
     pub state: Shared<u32>,
     pub has_pending: Shared<u32>,
-    /// Records were written ahead, so user space waits for the completion record.
+    /// Whether records were written ahead, for which user space waits for the completion record.
     pub ahead: Shared<u32>,
     pub token: Shared<u32>,
-    /// Offset in the UDP payload at which the walk continues; `u32::MAX` = nowhere.
+    /// Offset in the UDP payload at which the walk continues; `u32::MAX` = the walk is over.
     pub next: Shared<u32>,
     pub unused: u32,
 }
@@ -245,43 +247,44 @@ pub struct Packet {
     pub len: u32,
     /// Offset of these bytes in the whole IP payload.
     pub offset: u32,
-    /// More fragments follow.
+    /// 1 = more fragments follow.
     pub more: u32,
     pub identification: u32,
     pub fragmented: u32,
     pub ipv6: u32,
     pub outgoing: u32,
     pub interface: u32,
-    /// Seen at a socket, not on an interface.
+    /// 1 = seen at a socket, 0 = seen on an interface.
     pub host: u32,
     pub now: u64,
 }
 
-/// Working memory of one run of a program: too large for the 512 bytes of BPF stack.
+/// Working memory of one run of a program, which is too large for the 512 bytes of the BPF stack.
 #[repr(C)]
 pub struct Scratch {
     pub walk: Walk,
     pub packet: Packet,
     pub records: [Record; RECORDS_PER_DATAGRAM as usize],
-    /// A record of a fragmented datagram on its way to user space.
+    /// The record of a fragmented datagram that is written next.
     pub pending: Record,
-    /// How many of `records` are filled.
+    /// Number of filled elements of `records`.
     pub count: u32,
-    /// User space has classified the endpoint of the last of them.
+    /// Whether user space has classified the endpoint of the last one of `records`.
     pub classified: u32,
-    /// The capture is needed only for an unclassified writer.
+    /// Whether the capture is needed only for an unclassified writer.
     pub unknown: u32,
-    /// Host hook: a copy of the datagram was captured just before.
+    /// Host hook: whether a copy of the datagram was captured just before.
     pub repeated: u32,
-    /// The participant whose message was seen last, and when that was noted in [`PARTICIPANTS`].
+    /// The participant whose message was seen last, and the time of its last note in
+    /// [`PARTICIPANTS`].
     pub heard: [u32; 3],
     pub heard_at: u64,
-    /// Host hook: the socket last looked up in [`SOCKETS`], and when.
+    /// Host hook: the socket last looked up in [`SOCKETS`], and the time of the lookup.
     pub met: u64,
     pub met_at: u64,
-    /// Host hook: tokens issued by this slot.
+    /// Number of tokens issued for this slot.
     pub named: u32,
-    /// Runs that hold this slot, or are about to notice that they do not.
+    /// Number of runs that hold this slot, or have failed to claim it and not withdrawn yet.
     claims: u64,
 }
 
@@ -296,8 +299,8 @@ pub struct Recent {
 }
 
 /// State that the host hook leaves for a program that runs directly afterwards on the same CPU, if
-/// the datagram is not delivered. Its records are still in the slot: only received datagrams use
-/// these slots, one after the other.
+/// the datagram is not delivered. The datagram's records are still in the slot, because only
+/// received datagrams use these slots, one after the other.
 #[repr(C)]
 pub struct Last {
     /// The receiving socket; 0 = the datagram was not RTPS.
@@ -305,18 +308,18 @@ pub struct Last {
     /// The datagram's token: equal to `scratch(slot).walk.record.datagram` unless the slot was
     /// reused.
     pub token: Shared<u32>,
-    /// Slot of the working memory with its records, see `Scratch::count`.
+    /// Slot of the working memory with the datagram's records, see `Scratch::count`.
     pub slot: Shared<u32>,
     /// 1 = captured: the slot holds no records.
     pub captured: Shared<u32>,
     pub unused: u32,
-    /// Address of the kernel's packet, by which a drop of it is recognized.
+    /// Address of the kernel's packet, by which a drop of the packet is recognized.
     pub buffer: Shared<u64>,
     /// The socket whose full buffer was already counted for this datagram.
     pub told: Shared<u64>,
 }
 
-/// One piece, with room for the longest.
+/// A buffer for one piece of the maximum length.
 #[repr(C)]
 pub struct PieceBuffer {
     pub piece: Piece,
@@ -325,17 +328,17 @@ pub struct PieceBuffer {
 
 /// Claims one of the slots for sent datagrams for this run of a program, until [`release`].
 ///
-/// Tasks send those datagrams, and other sending tasks may preempt them (the kernel only keeps them
-/// on their CPU). Atomics that return a value need Linux 5.12. So each run adds itself to the
-/// slot's claims, then reads them. All runs share a CPU and see the additions in one order, so at
-/// most one of them reads 1.
+/// Tasks send such datagrams, and other sending tasks may preempt them (the kernel only keeps a
+/// task on its CPU). Atomics that return a value need Linux 5.12, so each run adds 1 to the slot's
+/// claims and then reads them. All runs share a CPU and see the additions in one order, so at most
+/// one run reads 1.
 #[inline(always)]
 pub fn claim_outgoing() -> Option<u32> {
     claim(OUTGOING_SLOT, SLOTS)
 }
 
-/// Claims a slot as [`claim_outgoing`] does, for frames and received datagrams. Those run with
-/// bottom halves disabled, one after the other, except on kernels that preempt even that.
+/// Claims a slot as [`claim_outgoing`] does, for frames and received datagrams. Programs for these
+/// run with bottom halves disabled, one after the other, except on kernels that preempt such code.
 #[inline(always)]
 pub fn claim_incoming() -> Option<u32> {
     if setting(&PREEMPTED) == 0 {
@@ -377,8 +380,8 @@ pub fn release(slot: u32) {
     }
 }
 
-/// Working memory of a run, in a map. References to it last for one access: functions that are
-/// called in between look it up themselves.
+/// Working memory of a run, in a map. A reference to it lasts for one access, and a called function
+/// looks the memory up itself.
 pub struct Working<T>(*mut T);
 
 impl<T> Clone for Working<T> {
@@ -449,14 +452,14 @@ pub fn run(key: &RunKey) -> Option<&'static Shared<Record>> {
 }
 
 /// Returns the entry for captures with this hash. Runs that interrupt each other here may capture
-/// one copy more, or store half of another run's capture, which matches nothing.
+/// one more copy. They may also store a mixture of two captures, which matches no datagram.
 #[inline(always)]
 pub fn recent(hash: u32) -> Option<&'static Recent> {
     RECENT.get(hash & (RECENT_CAPACITY - 1))
 }
 
-/// Returns this CPU's last received datagram: a CPU handles those one after the other. Packets
-/// dropped between two of them may read it, too.
+/// Returns this CPU's last received datagram. A CPU handles received datagrams one after the other.
+/// A program for a dropped packet may read the value between two of them.
 #[inline(always)]
 pub fn last() -> Option<&'static Last> {
     LAST.get(0)
@@ -489,7 +492,7 @@ fn counter_of(slot: u32, counter: Counter) -> Option<*mut u64> {
 }
 
 /// Copies a whole value from one map to another. Plain assignment would become a call of `memmove`,
-/// a loop over bytes that some verifiers refuse.
+/// which is a loop over bytes that some verifiers refuse.
 #[inline(always)]
 pub fn copy<T: Copy>(from: &T, to: &mut T) {
     // SAFETY: two references, one of them exclusive: valid, aligned and not overlapping.

@@ -1,8 +1,8 @@
-//! Lists which process holds which socket: iterates over the open files of all processes when user
-//! space reads it.
+//! Lists the processes that hold sockets. The program iterates over the open files of all processes
+//! when user space reads the list.
 //!
-//! Writes one `host::Owner` for every file that is a socket with a cookie. A socket gets its cookie
-//! when a program first reads it, as the host hook does for every socket that it sees.
+//! It writes one `host::Owner` for every file that is a socket with a cookie. A socket gets its
+//! cookie when a program first reads it, as the host hook does for every socket that it sees.
 
 use aya_ebpf::helpers::generated::bpf_seq_write;
 use ros2probe_wire::host::{Layout, Owner};
@@ -37,7 +37,7 @@ pub extern "C" fn socket_owners(context: *mut TaskFile) -> i32 {
 
 #[inline(always)]
 fn entry(context: *mut TaskFile) -> Option<()> {
-    // As plain numbers: the verifier attaches its own types to these pointers.
+    // The pointers are read as plain numbers, because the verifier attaches its own types to them.
     let [_, task, _, file]: [u64; 4] = read(context as u64)?;
     if task == 0 || file == 0 {
         // The iteration is complete.
@@ -48,7 +48,7 @@ fn entry(context: *mut TaskFile) -> Option<()> {
     if mode & KIND_OF_FILE != SOCKET {
         return None;
     }
-    // A socket file opened with O_PATH has neither.
+    // The file of a socket that was opened with O_PATH does not refer to the socket.
     let socket: u64 = member(file, Layout::FilePrivate)?;
     if member::<u64>(socket, Layout::SocketFile)? != file {
         return None;
@@ -83,7 +83,7 @@ fn entry(context: *mut TaskFile) -> Option<()> {
 }
 
 /// Reads a socket's drop counter. Linux 6.18 and later count the drops of some kinds of sockets
-/// elsewhere, in two halves.
+/// elsewhere, in two counters.
 #[inline(always)]
 fn drops(sock: u64) -> Option<u32> {
     if place(Layout::SocketDropCounters) != Layout::ABSENT {

@@ -1,4 +1,4 @@
-//! From the socket buffer to an IP payload that is UDP.
+//! Parses a socket buffer down to the IP payload of a UDP packet.
 
 use aya_ebpf::{bindings::__sk_buff, helpers::generated::bpf_skb_load_bytes};
 use core::mem::MaybeUninit;
@@ -11,10 +11,11 @@ use crate::{
     settings::setting,
 };
 
-/// Bytes of a datagram that [`in_place`] reads at most: the verifier requires a bound.
+/// Maximum offset at which [`in_place`] reads, because the verifier requires a bound.
 const IN_PLACE_BYTES: usize = 0x7fff;
 
-/// Where a program sees a packet; values cross a function boundary as `u32`.
+/// The hook at which a program sees a packet. The values are `u32` because they cross a function
+/// boundary.
 pub mod hook {
     /// A frame on an interface.
     pub const WIRE: u32 = 0;
@@ -25,14 +26,14 @@ pub mod hook {
 }
 
 const UDP: u32 = 17;
-/// First two words of an IPv4-mapped address as they lie in memory.
+/// Third word of an IPv4-mapped address, in memory order.
 pub const IPV4_MAPPED: u32 = u32::from_ne_bytes([0, 0, 0xff, 0xff]);
 /// EtherTypes 802.1Q and 802.1ad, as `skb->protocol` holds them.
 const VLAN: u32 = 0x8100_u16.to_be() as u32;
 const SERVICE_VLAN: u32 = 0x88a8_u16.to_be() as u32;
 
-/// The UDP payload as the walk reads it. Payload offset 0 is at `base` of the socket buffer; it
-/// wraps for a trailing IP fragment, whose payload starts before the frame.
+/// The UDP payload as the walk reads it. Payload offset 0 is at `base` of the socket buffer. `base`
+/// wraps for a trailing IP fragment, because the datagram's payload starts before the frame.
 pub struct Payload {
     pub skb: *mut __sk_buff,
     pub base: u32,
@@ -58,7 +59,7 @@ pub fn load<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
 #[inline(always)]
 fn in_place<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
     if setting(&IN_PLACE) == 0 {
-        // Packet taps may not read in place; the verifier skips what follows for them.
+        // Programs at interfaces may not read in place; for them the verifier skips the code below.
         return None;
     }
     let offset = opaque(offset) as usize;
@@ -101,8 +102,8 @@ pub fn is_fragment(slot: u32) -> Option<bool> {
     Some(scratch(slot)?.get().packet.fragmented != 0)
 }
 
-/// Fills in the scratch packet; returns 1 if it is (part of) a UDP datagram. `at` is one of
-/// [`hook`].
+/// Fills in the scratch packet; returns 1 if the packet is a UDP datagram or a fragment of one.
+/// `at` is one of [`hook`].
 // Global (not inlined) functions are verified once each, whatever calls them.
 #[unsafe(no_mangle)]
 #[inline(never)]
@@ -139,8 +140,8 @@ pub extern "C" fn parse(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
     1
 }
 
-/// Returns where the IP header of a frame begins. The kernel strips the outer VLAN tag of received
-/// frames; a second one is still there.
+/// Returns the offset of the IP header in a frame. The kernel strips the outer VLAN tag of received
+/// frames, but not a second one.
 #[inline(always)]
 pub fn start(skb: *mut __sk_buff) -> u32 {
     // SAFETY: the verifier rewrites reads of these fields.
@@ -189,7 +190,8 @@ fn ipv6(skb: *mut __sk_buff, start: u32, packet: &mut Packet) -> Option<()> {
     packet.source = [header[2], header[3], header[4], header[5]];
     packet.destination = [header[6], header[7], header[8], header[9]];
     packet.ipv6 = 1;
-    // Opaque to the compiler: it would turn four zeros in a row into a call of `memset`.
+    // This zero is hidden from the compiler, which would turn four consecutive zeros into a call of
+    // `memset`.
     let zero = core::hint::black_box(0);
     packet.offset = zero;
     packet.more = zero;
@@ -215,8 +217,8 @@ fn ipv6(skb: *mut __sk_buff, start: u32, packet: &mut Packet) -> Option<()> {
         let [word, second]: [u32; 2] = load(skb, at)?;
         let word = u32::from_be(word);
         match next {
-            // Hop-by-hop, routing, destination options: length in 8-byte units beyond the first 8
-            // bytes.
+            // Hop-by-hop, routing, destination options: the length counts 8-byte units beyond the
+            // first 8 bytes.
             0 | 43 | 60 => at += ((word >> 16 & 0xff) + 1) * 8,
             44 => {
                 packet.fragmented = u32::from(word & 0xfff9 != 0);
@@ -227,7 +229,7 @@ fn ipv6(skb: *mut __sk_buff, start: u32, packet: &mut Packet) -> Option<()> {
                 packet.identification = u32::from_be(second);
                 at += 8;
             }
-            // Authentication header: length in 4-byte units beyond the first 8 bytes.
+            // Authentication header: the length counts 4-byte units beyond the first 8 bytes.
             51 => at += ((word >> 16 & 0xff) + 2) * 4,
             _ => return None,
         }

@@ -1,5 +1,5 @@
-//! Captured datagrams for user space, in pieces: a program can copy a bounded length at a time, and
-//! discovery should not reserve room for the longest datagram.
+//! Writes captured datagrams to the ring in pieces. A program can copy only a bounded length at a
+//! time, and a short discovery datagram should not reserve memory for the longest one.
 
 use aya_ebpf::{bindings::__sk_buff, helpers::generated::bpf_skb_load_bytes};
 use ros2probe_wire::{
@@ -16,12 +16,13 @@ use crate::{
     verdict::{AVAILABLE_DATA, FORCE_WAKEUP, NO_WAKEUP},
 };
 
-/// Pieces of the longest UDP datagram.
+/// Maximum number of pieces of a UDP datagram.
 const PIECES_PER_DATAGRAM: u32 = 65_536 / PIECE_BYTES;
 const OF_THE_DATAGRAM: u16 = flag::FRAGMENTED | flag::OUTGOING | flag::IPV6 | flag::HOST;
 
-/// Participants repeat their announcements, so those do not wake user space. Every other captured
-/// datagram is sent once, and user space should read it before what depends on it.
+/// Writer of participant announcements. Participants repeat their announcements, so these do not
+/// wake user space. Every other captured datagram is sent once, and user space should read it
+/// before data that depends on it.
 const SPDP_WRITER: u32 = u32::from_ne_bytes(EntityId::SPDP_WRITER.0);
 
 const _: () = assert!(PIECE_BYTES.is_power_of_two());
@@ -78,7 +79,7 @@ pub extern "C" fn hand_over(skb: *mut __sk_buff, slot: u32, base: u32, offset: u
     };
     buffer.piece.offset = offset;
     buffer.piece.len = len;
-    // SAFETY: the buffer has room for the longest piece.
+    // SAFETY: the buffer can hold the longest piece.
     let loaded = unsafe {
         bpf_skb_load_bytes(
             skb.cast(),
@@ -110,8 +111,8 @@ pub fn publish(slot: u32, buffer: &mut PieceBuffer) -> u32 {
     u32::from(PIECES.output::<[u8]>(bytes, wake).is_ok())
 }
 
-/// Returns the same number, 1 to [`PIECE_BYTES`], in a form whose bounds every verifier sees: a
-/// mask directly before its use, which the optimizer must not remove as redundant.
+/// Returns `len`, which must be 1 to [`PIECE_BYTES`], with bounds that every verifier recognizes.
+/// The mask stands directly before the use, and the optimizer must not remove it as redundant.
 #[inline(always)]
 pub fn bounded(len: u32) -> usize {
     let len = opaque(len);

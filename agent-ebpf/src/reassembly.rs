@@ -1,14 +1,14 @@
 //! Datagrams that never became complete: the kernel timed out waiting for IP fragments, or had no
 //! memory for them.
 //!
-//! Runs for every packet that the kernel drops, and reads only the reason unless the packet is a
-//! fragment. The first fragment of such a datagram names the lost samples. Without it, or if its
-//! first bytes are not in the linear part of the buffer (some network drivers), the datagram is
-//! only counted.
+//! The programs run for every packet that the kernel drops. They read the reason, and the packet
+//! only if the reason does not rule out a fragment. The first fragment of an incomplete datagram
+//! identifies the lost samples. Without it, or if its first bytes are not in the linear part of the
+//! buffer (some network drivers), the datagram is only counted.
 //!
 //! Lack of memory has no drop reason of its own. A first fragment dropped without a reason counts
 //! as refused if its network namespace has used up its memory for fragments. Before Linux 6.2 the
-//! timeout has no reason either: there a dropped first fragment suffices.
+//! timeout has no reason either, so any dropped first fragment counts.
 
 use aya_ebpf::{
     helpers::bpf_ktime_get_ns, macros::map, maps::PerCpuArray, programs::RawTracePointContext,
@@ -34,11 +34,11 @@ const HOP_BY_HOP: u32 = 0;
 const ROUTING: u32 = 43;
 const FRAGMENT: u32 = 44;
 const DESTINATION_OPTIONS: u32 = 60;
-/// Submessages of a first fragment that are read.
+/// Maximum number of submessages that are read from a first fragment.
 const SUBMESSAGES: u32 = 64;
 
-/// Working memory. The kernel drops fragments with bottom halves disabled, one after the other;
-/// they may interrupt the drop of another packet.
+/// Working memory. The kernel drops fragments with bottom halves disabled, one after the other.
+/// Such a drop may interrupt the drop of another packet.
 #[map]
 static INCOMPLETE: PerCpuArray<Incomplete> = PerCpuArray::with_max_entries(1, 0);
 
@@ -49,18 +49,19 @@ struct Incomplete {
     record: Record,
     /// Source, destination and identification of the current datagram.
     name: [u32; 9],
-    /// The same of the previous datagram: its fragments are dropped one after the other.
+    /// `name` of the previous datagram, because the fragments of a datagram are dropped one after
+    /// the other.
     last: [u32; 9],
     ipv6: u32,
-    /// 0 for a datagram's first fragment.
+    /// Offset of the fragment; 0 for a datagram's first one.
     offset: u32,
     /// The fragment header's next header, or the IPv4 protocol.
     protocol: u32,
-    /// More fragments follow.
+    /// 1 = more fragments follow.
     more: u32,
     /// Address of the IP payload.
     body: u64,
-    /// Runs that use this entry, or are about to notice that another one does.
+    /// Number of runs that use this entry, or have failed to claim it and not withdrawn yet.
     claims: u64,
 }
 
@@ -69,7 +70,7 @@ fn incomplete() -> Option<Working<Incomplete>> {
     Working::of(&INCOMPLETE, 0)
 }
 
-/// The linear part of a buffer, from the UDP payload on.
+/// The linear part of a buffer, beginning at the UDP payload.
 struct Linear {
     address: u64,
     len: u32,
@@ -92,7 +93,7 @@ enum Why {
     GaveUp,
     /// Another reason, or an unspecified one.
     Other,
-    /// The kernel gives no reason.
+    /// The kernel reports no reason.
     Unknown,
 }
 
@@ -153,7 +154,8 @@ fn fragment(skb: u64, why: Why) -> Option<()> {
     if parsed.is_none() || this.protocol != UDP {
         return None;
     }
-    // After reassembly, a first fragment has lost its offset and the flag for more fragments.
+    // Reassembly clears the flag for more fragments, so a datagram that was complete is not counted
+    // here.
     if why != Why::GaveUp && (this.offset != 0 || this.more == 0) {
         return None;
     }
@@ -162,7 +164,7 @@ fn fragment(skb: u64, why: Why) -> Option<()> {
     }
     let again = is_again(this);
     if this.offset != 0 {
-        // Dropped after its first fragment, or after another fragment of the same datagram.
+        // If `again` is set, an earlier fragment of the same datagram was dropped and counted.
         if !again {
             count_outside(Counter::NotReassembledUnnamed, 1);
         }
@@ -209,9 +211,9 @@ fn fragment(skb: u64, why: Why) -> Option<()> {
     Some(())
 }
 
-/// Returns whether the namespace has no memory for further fragments: the kernel's own condition,
-/// with a margin for what changed since the kernel tested it. `None` if a kernel structure cannot
-/// be read.
+/// Returns whether the namespace has no memory for further fragments. This is the kernel's own
+/// condition, with a margin for changes since the kernel tested it. `None` if a kernel structure
+/// cannot be read.
 #[inline(always)]
 fn is_full(skb: u64, ipv6: bool) -> Option<bool> {
     let device: u64 = member(skb, Layout::BufferDevice)?;
@@ -230,7 +232,8 @@ fn is_full(skb: u64, ipv6: bool) -> Option<bool> {
 /// current datagram the previous one.
 #[inline(always)]
 fn is_again(this: &mut Incomplete) -> bool {
-    // Word by word: a comparison of arrays would become a call of `memcmp`.
+    // The words are compared one by one, because a comparison of arrays would become a call of
+    // `memcmp`.
     let mut different = 0;
     let mut index = 0;
     while index < this.name.len() {

@@ -2,15 +2,15 @@
 
 use crate::settings::setting;
 
-/// Index of the register file: 0 = x86-64, 1 = AArch64. Set by the loader.
+/// Architecture of the saved registers: 0 = x86-64, 1 = AArch64. Set by the loader.
 #[unsafe(no_mangle)]
 pub static ARCHITECTURE: u32 = 0;
 
-/// Value of [`ARCHITECTURE`].
+/// Value of [`ARCHITECTURE`] for AArch64.
 pub const AARCH64: u32 = 1;
 
-/// Reads a register at this offset of the program's context, in one instruction: the verifier
-/// requires a constant offset.
+/// Reads a register at this offset of the program's context, in one instruction, because the
+/// verifier requires a constant offset.
 macro_rules! register {
     ($registers:expr, $place:literal) => {{
         let value: u64;

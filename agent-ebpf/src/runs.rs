@@ -1,9 +1,9 @@
 //! Joins the DATA_FRAGs of one sample: a point cloud in two thousand fragments becomes one record.
 //!
 //! A run begins with a sample's first fragment and ends with its last, or before a missing
-//! fragment. Everything else (a retransmission, the rest after a gap) is written at once. If the
-//! sender moves to another CPU in the middle, the run is written and a new one starts there. User
-//! space removes runs that have stopped growing; it checks at least once a second.
+//! fragment. All other fragments (a retransmission, the rest after a gap) are written immediately.
+//! If the sender moves to another CPU during a run, the run is written and a new one starts on that
+//! CPU. User space removes runs that have stopped growing; it checks at least once a second.
 
 use aya_ebpf::helpers::bpf_get_smp_processor_id;
 use ros2probe_wire::record::{Record, flag, kind};
@@ -13,8 +13,8 @@ use crate::{
     verdict::write,
 };
 
-/// Writes a record, or keeps it for the fragments that follow if `joins` is set: it must be valid
-/// now and not complete a datagram.
+/// Writes a record. With `joins`, a DATA_FRAG may be kept for the fragments that follow; the record
+/// must then be valid already and not complete a datagram.
 #[inline(always)]
 pub fn give(slot: u32, record: &Record, joins: bool) {
     if record.kind != kind::DATA_FRAG {
@@ -34,10 +34,10 @@ pub fn give(slot: u32, record: &Record, joins: bool) {
     // SAFETY: no preconditions.
     keys.here.cpu = unsafe { bpf_get_smp_processor_id() } as u32;
     let mut goes_on = false;
-    // The key names this CPU, and packet taps run with bottom halves disabled, so nothing else
-    // extends the run. A task that sends may be preempted here. If another task then sends
-    // fragments of the same writer from the same socket, fragments are counted in two records or
-    // not at all.
+    // The key contains this CPU, and programs for received packets run with bottom halves disabled,
+    // so nothing else extends the run. A task that sends may be preempted here. If another task
+    // then sends fragments of the same writer from the same socket, fragments are counted in two
+    // records or not at all.
     if let Some(known) = run(&keys.here) {
         let run = &mut keys.run;
         known.load(run);
@@ -67,7 +67,8 @@ pub fn give(slot: u32, record: &Record, joins: bool) {
     write(slot, record);
 }
 
-/// Returns whether a run starts here: with a sample's first fragments, if more follow.
+/// Returns whether a run starts with the record: it has a sample's first fragments, and more
+/// follow.
 #[inline(always)]
 fn begins(record: &Record) -> bool {
     record.fragment_start == 1 && !record.ends_sample()
@@ -91,7 +92,7 @@ fn take_over(slot: u32, keys: &mut RunKeys, record: &Record) -> bool {
     copy(&keys.here.stream, &mut keys.elsewhere.stream);
     keys.elsewhere.cpu = before;
     // The other CPU does not extend this run, since its next fragment is here. If it writes the run
-    // at the same moment, fragments are reported twice, which counts nothing.
+    // at the same moment, fragments are reported twice, and repeated fragments do not count.
     let Some(known) = run(&keys.elsewhere) else {
         return false;
     };

@@ -1,12 +1,13 @@
-//! Constants that the loader sets before it loads the programs, and the processes they select.
+//! Constants that the loader sets before it loads the programs, and the processes that a constant
+//! selects.
 
 use aya_ebpf::helpers::generated::bpf_get_current_ancestor_cgroup_id;
 
-/// Ancestor control groups that are compared.
+/// Maximum number of ancestor control groups that are compared.
 const LEVELS: i32 = 16;
 
-/// Restricts programs that run in processes to those in or below this control group; 0 = all. Set
-/// by the loader.
+/// Id of the control group in or below which processes are observed; 0 = all processes. Set by the
+/// loader.
 #[unsafe(no_mangle)]
 pub static WITHIN: u64 = 0;
 

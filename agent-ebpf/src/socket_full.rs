@@ -1,12 +1,13 @@
 //! Datagrams dropped at a socket because its receive buffer was full.
 //!
-//! Directly before, on the same CPU and for the same socket, the host hook has read the datagram
-//! and stored what it found. So this module parses nothing and works alike on every kernel. Where
-//! the kernel's types are known it compares the socket. So it never mistakes a datagram that the
-//! hook has not seen (other traffic, a socket outside the hook's cgroup) for another.
+//! Directly before the drop, on the same CPU and for the same socket, the host hook has read the
+//! datagram and stored its findings. So this module parses no RTPS, and works alike on every
+//! kernel. Where the kernel's types are known, it compares the socket. Then it never takes an
+//! unseen datagram (other traffic, a socket outside the hook's cgroup) for one that the hook has
+//! seen.
 //!
-//! Before Linux 6.6 the kernel reports a full buffer for IPv4 only. There this module watches
-//! packets being freed and recognizes the one that the hook has just seen.
+//! Before Linux 6.6 the kernel reports a full buffer for IPv4 only. On such kernels this module
+//! observes all freed packets, and recognizes the one that the hook has just seen.
 
 use aya_ebpf::{helpers::bpf_ktime_get_ns, programs::RawTracePointContext};
 use ros2probe_wire::{
@@ -22,8 +23,8 @@ use crate::{
     verdict::write,
 };
 
-/// Longest time between the hook and an immediate drop. A packet freed later was in the socket's
-/// buffer, or is another packet at the same address.
+/// Maximum time between the hook and an immediate drop. A packet that is freed later was in the
+/// socket's buffer, or is another packet at the same address.
 const AT_ONCE_NANOSECONDS: u64 = 200_000;
 const COMPARED_NANOSECONDS: u64 = 10_000_000;
 
@@ -38,7 +39,7 @@ pub fn refused(context: &RawTracePointContext) {
         socket = member(sk, Layout::SocketCookie).unwrap_or(0);
     }
     if seen == 0 {
-        // Not RTPS, or counted already.
+        // The datagram is not RTPS, or its drop is counted already.
         if last.told.get() != socket {
             refusal(socket);
         }
@@ -76,7 +77,7 @@ pub fn unexplained(context: &RawTracePointContext) {
         return;
     };
     let record = &scratch.get().walk.record;
-    // `refused` has seen a full buffer of IPv4: this is a later packet at the same address.
+    // `refused` handles full buffers of IPv4, so this is a later packet at the same address.
     if record.flags & flag::IPV6 == 0 {
         return;
     }
@@ -106,7 +107,7 @@ fn is_of(buffer: u64, record: &Record) -> Option<()> {
     same.then_some(())
 }
 
-/// Returns the hook's last datagram if this is it and its drop is not counted yet.
+/// Returns the hook's last datagram if `buffer` is its packet and its drop is not counted yet.
 #[inline(always)]
 fn seen(buffer: u64) -> Option<&'static Last> {
     last().filter(|last| last.socket.get() != 0 && last.buffer.get() == buffer)
@@ -145,7 +146,7 @@ pub extern "C" fn undelivered(slot: u32, token: u32, captured: u32) -> u32 {
     };
     let scratch = scratch.get();
     if scratch.walk.record.datagram != token {
-        // Another run took the slot after a preemption, so it holds another datagram.
+        // Another run took the slot after a preemption, so the slot holds another datagram.
         count_outside(Counter::SocketFullUnseen, 1);
         return 0;
     }

@@ -20,20 +20,21 @@ use crate::{
     zenoh,
 };
 
-/// Submessages that one run of the program reads; a datagram with more is captured.
+/// Maximum number of submessages that one run of the program reads; a datagram with more is
+/// captured.
 const SUBMESSAGES: u32 = 64;
-/// Age at which a participant's noted time is renewed: leases last seconds.
+/// Minimum interval between two notes of a participant's time. Leases last seconds.
 const HEARD_NANOSECONDS: u64 = 10_000_000;
 /// `BPF_RB_NO_WAKEUP`, `BPF_RB_FORCE_WAKEUP`, `BPF_RB_AVAIL_DATA`.
 pub const NO_WAKEUP: u64 = 1;
 pub const FORCE_WAKEUP: u64 = 2;
 pub const AVAILABLE_DATA: u64 = 0;
 
-/// Results of [`advance`]; values cross a function boundary as `u32`.
+/// Results of [`advance`]. The values are `u32` because they cross a function boundary.
 pub mod progress {
     /// More submessages may follow in this frame.
     pub const ON: u32 = 0;
-    /// Nothing more in this frame.
+    /// No more submessages can be read in this frame.
     pub const STOP: u32 = 1;
     /// User space must read the datagram.
     pub const CAPTURE: u32 = 2;
@@ -75,8 +76,8 @@ pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32) -> u32 {
     0
 }
 
-/// Walks a datagram again that could not be captured for lack of room, as if a copy had been
-/// captured: its submessages of interest become records.
+/// Walks a datagram again that did not fit the ring, as if a copy had been captured. Its
+/// submessages of interest become records.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn meter(skb: *mut __sk_buff, slot: u32) -> u32 {
@@ -99,8 +100,8 @@ pub extern "C" fn meter(skb: *mut __sk_buff, slot: u32) -> u32 {
     0
 }
 
-/// Reads the UDP and RTPS headers of the current packet and starts the walk; `None` if it is not
-/// RTPS.
+/// Reads the UDP and RTPS headers of the current packet and starts the walk; `None` if the packet
+/// is not RTPS.
 #[inline(always)]
 pub fn begin(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch) -> Option<()> {
     let packet = &scratch.packet;
@@ -175,7 +176,8 @@ pub fn heard(scratch: &mut Scratch, source: [u32; 3], now: u64) {
     scratch.heard_at = now;
 }
 
-/// Walks the submessages that begin before `present`; returns the strongest [`progress`] of them.
+/// Walks the submessages that begin before `present`; returns the [`progress`] of the last one that
+/// was walked, or `CAPTURE` if there are too many.
 #[inline(always)]
 pub fn run(skb: *mut __sk_buff, base: u32, present: u32, slot: u32) -> u32 {
     let mut submessages = 0;
@@ -265,7 +267,7 @@ pub fn endpoint(slot: u32, scratch: &mut Scratch, long_gap: bool) -> u32 {
 }
 
 /// Adds the current submessage to the last record if it holds the next fragments of the same
-/// sample. Returns whether it does. Cyclone DDS sends ten DATA_FRAGs in a datagram.
+/// sample. Returns whether it holds them. Cyclone DDS sends ten DATA_FRAGs in a datagram.
 #[inline(always)]
 fn joins_last(scratch: &mut Scratch) -> bool {
     let record = &scratch.walk.record;
@@ -284,8 +286,8 @@ fn joins_last(scratch: &mut Scratch) -> bool {
         && last.extend(record)
 }
 
-/// Handles a writer that user space has not classified: `CAPTURE` within its budget, then `STOP`
-/// for one record, then `ON` without one.
+/// Handles a writer that user space has not classified. Returns `CAPTURE` within the writer's
+/// budget, then `STOP` for one record, then `ON` for no record.
 #[inline(always)]
 fn unknown(slot: u32, scratch: &mut Scratch, key: [u32; 4]) -> u32 {
     let len = scratch.walk.datagram_len;
@@ -316,14 +318,15 @@ fn unknown(slot: u32, scratch: &mut Scratch, key: [u32; 4]) -> u32 {
     progress::ON
 }
 
-/// Charges bytes of unclassified traffic to the capture budget; returns whether any of it was left.
+/// Charges bytes of unclassified traffic to the capture budget; returns whether any budget was
+/// left.
 #[inline(always)]
 pub fn charge(len: u32) -> bool {
     spend(Budget::CaptureBytes, len)
 }
 
-/// Charges a budget if any of it is left, and returns whether it was. CPUs that race may overdraw
-/// it by a datagram.
+/// Charges a budget if any of it is left; returns whether any was left. Racing CPUs may overdraw
+/// the budget by a datagram.
 #[inline(always)]
 pub fn spend(budget: Budget, amount: u32) -> bool {
     let Some(budget) = BUDGET.get(budget as u32) else {
@@ -336,7 +339,7 @@ pub fn spend(budget: Budget, amount: u32) -> bool {
     left > 0
 }
 
-/// Counts a datagram that goes to user space.
+/// Counts a captured datagram.
 #[inline(always)]
 pub fn captured(slot: u32, scratch: &Scratch) {
     count(slot, Counter::Captured, 1);
@@ -360,7 +363,8 @@ pub extern "C" fn flush(records: u32, flags: u32, slot: u32) -> u32 {
     0
 }
 
-/// Writes one of them: a separate function, so that the verifier checks it once and not in a loop.
+/// Writes one scratch record. The function is separate, so that the verifier checks it once and not
+/// in a loop.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn flush_one(index: u32, flags: u32, slot: u32) -> u32 {

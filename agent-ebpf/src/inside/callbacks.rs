@@ -12,16 +12,17 @@ use crate::{
 };
 
 const SECOND: u64 = 1_000_000_000;
-/// Longest plausible period of a timer, and the distance of its last call.
+/// Maximum plausible period of a timer, and maximum distance of its last call, in nanoseconds.
 const LONGEST: u64 = 86_400 * SECOND;
 const SHORTEST: u64 = 1_000;
-/// Difference of clock readings that is taken for none.
+/// Difference of clock readings that is treated as zero, in nanoseconds.
 const IMPRECISION: u64 = 10_000_000;
-/// Offsets of the period in `rcl_timer_impl_t` that are tried. The last and the next call follow.
+/// First and last offset in `rcl_timer_impl_t` at which the period is searched. The times of the
+/// last and the next call follow the period.
 const FIRST_PLACE: u32 = 32;
 const LAST_PLACE: u32 = 80;
 
-/// The executor begins to execute a handle; 0 = it selects the next one.
+/// Handles the start of the execution of a handle; 0 = the executor selects the next one.
 #[inline(always)]
 pub fn executed(handle: u64) {
     let Some(current) = Current::of_call() else {
@@ -38,7 +39,7 @@ pub fn executed(handle: u64) {
     }
 }
 
-/// A callback begins that handles a message of the same process.
+/// Handles the start of a callback for a message of the same process.
 #[inline(always)]
 pub fn received(callback: u64) {
     let Some(current) = Current::of_call() else {
@@ -54,7 +55,7 @@ pub fn received(callback: u64) {
     }
 }
 
-/// A callback begins.
+/// Handles the start of a callback.
 #[inline(always)]
 pub fn started(callback: u64, within: bool) {
     let Some(current) = Current::of_call() else {
@@ -95,7 +96,8 @@ pub fn started(callback: u64, within: bool) {
     }
 }
 
-/// Adds the time since the message's source timestamp, less the least time until a take.
+/// Adds the time since the message's source timestamp, less the minimum delay of the subscription's
+/// takes.
 #[inline(always)]
 unsafe fn waited_since_source(
     current: &Current,
@@ -123,7 +125,8 @@ unsafe fn waited_since_source(
     }
 }
 
-/// Adds the time since the timer was due. Its structure already has the time of the next call.
+/// Adds the time since the timer was due. The timer's structure already has the time of the next
+/// call.
 #[inline(always)]
 unsafe fn waited_since_due(current: &Current, figures: *mut Figures, timer: u64, now: u64) {
     let structure = read::<u64>(timer);
@@ -161,7 +164,7 @@ unsafe fn waited_since_due(current: &Current, figures: *mut Figures, timer: u64,
     }
 }
 
-/// Finds the offset of the period; 0 if no place looks like one.
+/// Finds the offset of the period; 0 if no offset has a plausible one.
 #[inline(always)]
 fn find_period(structure: u64, now: u64) -> u32 {
     let mut place = FIRST_PLACE;
@@ -175,15 +178,17 @@ fn find_period(structure: u64, now: u64) -> u32 {
     0
 }
 
-/// Returns whether three numbers are a period, a last call just now, and the next one.
+/// Returns whether three numbers can be a period, the time of a call within the last second, and
+/// the time of the next call.
 #[inline(always)]
 fn is_schedule(period: u64, last: u64, next: u64, now: u64) -> bool {
     let is_period = period >= SHORTEST && period <= LONGEST && next > last && next - last <= period;
     is_period && clock_of(last, now).wrapping_sub(last) < SECOND
 }
 
-/// Returns the time by the clock that has given `last`: the steady one, or the system's. It is at
-/// least `last`, from which user space's reading of the clocks may differ by some microseconds.
+/// Returns the current time of the clock from which `last` was read: the steady clock or the
+/// system's. A result slightly before `last` becomes `last`, because the clock differences that
+/// user space sets are imprecise.
 #[inline(always)]
 fn clock_of(last: u64, now: u64) -> u64 {
     let steady = steady(now);
@@ -199,7 +204,7 @@ fn clock_of(last: u64, now: u64) -> u64 {
     }
 }
 
-/// A callback ends.
+/// Handles the end of a callback.
 #[inline(always)]
 pub fn ended(callback: u64) {
     let Some(current) = Current::of_call() else {
@@ -216,7 +221,7 @@ pub fn ended(callback: u64) {
     unsafe {
         add(&raw mut (*figures).count, 1);
         write_volatile(&raw mut (*figures).last, now);
-        // A callback that runs an executor has others within it, and its own start is lost.
+        // A callback that runs an executor contains other callbacks, which overwrite its start.
         if (*thread).callback == callback && now > (*thread).started {
             observe(figures, distribution::INTERVAL, now - (*thread).started);
         }

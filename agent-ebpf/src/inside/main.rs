@@ -1,11 +1,11 @@
-//! Calls of `libtracetools.so` in ROS processes, counted where they happen.
+//! Counts calls of `libtracetools.so` in the ROS processes that make them.
 //!
 //! `rcl`, `rclcpp` and the middlewares call a function of this library for each event, whether a
-//! tracer is installed or not. A uprobe at its entry runs in the process that calls it. The
-//! programs read arguments and, once for each handle, names; they write only their own maps. Nothing
-//! leaves the kernel for each message, except a bounded number of causal publications.
+//! tracer is installed or not. A uprobe at the entry of that function runs in the calling process.
+//! The programs read arguments and, once for each handle, names; they write only their own maps. No
+//! data leaves the kernel for each message, except a bounded number of causal publications.
 //!
-//! They stay within what Linux 5.10 verifies, as the packet filter does.
+//! The programs use only what the verifier of Linux 5.10 accepts, as the packet filter does.
 
 #![no_std]
 #![no_main]
@@ -33,7 +33,7 @@ use ros2probe_wire::inside::announced;
 
 use crate::registers::{is_aarch64, register};
 
-/// Declares a program at a function's entry, with as many of its arguments as named.
+/// Declares programs at the entry of functions. Each program reads as many arguments as it names.
 macro_rules! calls {
     ($($(#[$doc:meta])* $name:ident($($argument:ident),*) { $($body:tt)* })*) => {
         $(
@@ -48,7 +48,7 @@ macro_rules! calls {
     };
 }
 
-/// Binds arguments in order: System V ABI and AAPCS64.
+/// Binds arguments in the order of the System V ABI or of AAPCS64.
 macro_rules! arguments {
     ($context:ident;) => {
         let _ = $context;
@@ -69,15 +69,15 @@ macro_rules! arguments {
     };
 }
 
-/// Most programs that [`called`] runs.
+/// Maximum number of programs that [`called`] runs.
 const PROGRAMS: u32 = 32;
 
 /// The programs of functions, by cookie. Set by user space.
 #[map]
 static CALLS: ProgramArray = ProgramArray::with_max_entries(PROGRAMS, 0);
 
-/// At each function of a library that one link covers: calls the program of that function. Loaded
-/// where such links exist (Linux 6.6).
+/// Runs at each function of a library that one link covers, and calls the program of that function.
+/// It is loaded on kernels with such links (Linux 6.6).
 #[uprobe]
 pub fn called(context: ProbeContext) -> u32 {
     // SAFETY: the context is the kernel's.
@@ -111,7 +111,7 @@ calls! {
     callback_start(callback, intra_process) {
         callbacks::started(callback, intra_process as u8 != 0);
     }
-    /// As `callback_start`, where only received messages are counted.
+    /// As `callback_start`, if only received messages are counted.
     callback_received(callback, intra_process) {
         if intra_process as u8 != 0 {
             callbacks::received(callback);

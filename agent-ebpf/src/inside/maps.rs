@@ -1,4 +1,4 @@
-//! Maps of the programs, and the process that runs them.
+//! Maps of the programs, and the thread in which a program runs.
 
 use core::{arch::asm, mem::MaybeUninit};
 
@@ -17,7 +17,7 @@ use crate::{
     settings::is_within,
 };
 
-/// `BPF_NOEXIST`: the first of two threads that meet a handle creates its figures.
+/// `BPF_NOEXIST`: the first of two threads with a new handle creates its figures.
 const CREATE: u64 = 1;
 
 /// Whether callbacks are observed. Set by the loader.
@@ -39,10 +39,10 @@ static THREADS: LruHashMap<u32, Thread> = LruHashMap::with_max_entries(THREAD_CA
 /// The initial value of a thread; never written.
 #[map]
 static NEW_THREAD: Array<Thread> = Array::with_max_entries(1, 0);
-/// Times of entry of messages in ring buffers.
+/// Times at which messages entered ring buffers.
 #[map]
 pub static WAITING: LruHashMap<Entry, u64> = LruHashMap::with_max_entries(WAITING_CAPACITY, 0);
-/// Names and relations, and causal publications.
+/// Names and relations of handles, and causal publications.
 #[map]
 pub static ANNOUNCEMENTS: RingBuf = RingBuf::with_byte_size(512 * 1024, 0);
 /// Differences of other clocks to CLOCK_MONOTONIC in nanoseconds, by `inside::clock`. Set by user
@@ -54,29 +54,29 @@ static CLOCKS: Array<u64> = Array::with_max_entries(clock::COUNT, 0);
 static INSIDE_COUNTERS: PerCpuArray<[u64; Counter::ALL.len()]> =
     PerCpuArray::with_max_entries(1, 0);
 
-/// The last calls of a thread: an event is explained by those before it.
+/// The last calls of a thread, which explain its next events.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct Thread {
     /// Handle that the executor executes; 0 = none.
     pub executed: u64,
-    /// What the thread took last: a subscription or a buffer; kind 0 = nothing.
+    /// Subscription or buffer from which the thread took a message last; kind 0 = none.
     pub input: Handle,
     /// Source timestamp of the message taken, nanoseconds since the Unix epoch.
     pub source_timestamp: u64,
-    /// Time at which it was taken.
+    /// Time at which the message was taken.
     pub taken: u64,
     /// Time at which the message entered the ring buffer.
     pub entered: u64,
     /// The running callback; 0 = none.
     pub callback: u64,
-    /// Time at which it began.
+    /// Time at which the callback began.
     pub started: u64,
     /// Publisher whose message was passed within the process and may also go to the middleware.
     pub publisher: u64,
 }
 
-/// A place in a ring buffer.
+/// A position in a ring buffer.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct Entry {
@@ -93,8 +93,8 @@ pub struct Current {
 }
 
 impl Current {
-    /// Counts a call, and returns the thread that makes it. `None` if the call is not to be counted
-    /// further.
+    /// Counts a call, and returns the thread that makes it; `None` if only the number of calls is
+    /// counted.
     #[inline(always)]
     pub fn of_call() -> Option<Self> {
         let id = bpf_get_current_pid_tgid();
@@ -121,7 +121,7 @@ impl Current {
         }
     }
 
-    /// Returns the figures of a handle, new ones if necessary.
+    /// Returns the figures of a handle; creates them if necessary.
     #[inline(always)]
     pub fn figures(&self, address: u64, kind: u32) -> Option<*mut Figures> {
         let key = self.handle(address, kind);
@@ -140,7 +140,7 @@ impl Current {
         figures
     }
 
-    /// Returns the figures of a handle that has some.
+    /// Returns the figures of a handle, if they exist.
     #[inline(always)]
     pub fn known_figures(&self, address: u64, kind: u32) -> Option<*mut Figures> {
         HANDLES.get_ptr_mut(&self.handle(address, kind))
@@ -152,7 +152,7 @@ impl Current {
         let _ = HANDLES.remove(&self.handle(address, kind));
     }
 
-    /// Returns the last calls of this thread, empty ones if necessary.
+    /// Returns the last calls of this thread; creates an empty entry if necessary.
     #[inline(always)]
     pub fn thread(&self) -> Option<*mut Thread> {
         if let Some(thread) = THREADS.get_ptr_mut(&self.thread) {
@@ -180,7 +180,7 @@ impl Current {
         }
     }
 
-    /// Returns where the process's structures have a member, by a field of its state; 0 = unknown.
+    /// Returns the offset of `rmw_handle` in this process's rcl structures; 0 = unknown.
     #[inline(always)]
     pub fn rmw_handle_at(&self) -> u32 {
         // SAFETY: a map value pointer checked against null.
@@ -232,7 +232,7 @@ fn create(process: u32) -> Option<*mut Process> {
     state
 }
 
-/// Counts an event at a handle: adds the time since the last one.
+/// Counts an event of a handle and adds the time since the last one to a distribution.
 ///
 /// # Safety
 /// `figures` is a map value.
@@ -243,7 +243,7 @@ pub unsafe fn event(figures: *mut Figures, now: u64) {
         add(&raw mut (*figures).count, 1);
         let last = core::ptr::read_volatile(&raw const (*figures).last);
         core::ptr::write_volatile(&raw mut (*figures).last, now);
-        // The clock may be read by another thread in between.
+        // Another thread may have read the clock in between.
         if last != 0 && now > last {
             observe(figures, distribution::INTERVAL, now - last);
         }
@@ -337,8 +337,8 @@ fn difference(to: u32) -> u64 {
 
 /// Reads a plain value from the memory of the running process; zeros if it cannot be read.
 ///
-/// There is no `Option`: LLVM would keep the value of a failed read on the stack, uninitialized, and
-/// Linux 5.10 refuses a program that loads it.
+/// The function returns no `Option`: LLVM would keep the value of a failed read on the stack,
+/// uninitialized, and Linux 5.10 refuses a program that loads it.
 #[inline(always)]
 pub fn read<T: Copy>(address: u64) -> T {
     let mut value = MaybeUninit::<T>::uninit();

@@ -12,7 +12,7 @@ use crate::{
     settings::setting,
 };
 
-/// A publication: to the middleware, or before that `within` the process.
+/// Handles a publication to the middleware, or the preceding one `within` the process.
 #[inline(always)]
 pub fn published(publisher: u64, within: bool) {
     let Some(current) = Current::of_call() else {
@@ -21,7 +21,7 @@ pub fn published(publisher: u64, within: bool) {
     let now = now();
     let thread = current.known_thread();
     if !within {
-        // The second call for a message that was also passed within the process.
+        // This may be the second call for a message that was also passed within the process.
         if let Some(thread) = thread {
             // SAFETY: a map value pointer checked against null, of the running thread.
             let is_counted = unsafe { (*thread).publisher } == publisher;
@@ -51,7 +51,7 @@ pub fn published(publisher: u64, within: bool) {
     }
 }
 
-/// A take from the middleware, or an attempt.
+/// Handles a take from the middleware, or an attempt.
 #[inline(always)]
 pub fn taken(subscription: u64, source_timestamp: u64, taken: bool) {
     let Some(current) = Current::of_call() else {
@@ -87,8 +87,8 @@ pub fn taken(subscription: u64, source_timestamp: u64, taken: bool) {
     }
 }
 
-/// A message enters a ring buffer. `size`: messages in it afterwards, one too many if one of them
-/// is overwritten.
+/// Handles a message that enters a ring buffer. `size` is the number of messages in the buffer
+/// afterwards, one too many if a message is overwritten.
 #[inline(always)]
 pub fn enqueued(buffer: u64, index: u64, size: u32, overwritten: bool) {
     let Some(current) = Current::of_call() else {
@@ -111,7 +111,8 @@ pub fn enqueued(buffer: u64, index: u64, size: u32, overwritten: bool) {
         }
     }
     if let Some(thread) = current.known_thread() {
-        // SAFETY: as above. The publication that fills the buffers precedes in the same thread.
+        // SAFETY: as above. The publication that fills the buffers precedes this call in the same
+        // thread.
         unsafe {
             let publisher = (*thread).publisher;
             if publisher != 0 {
@@ -122,7 +123,7 @@ pub fn enqueued(buffer: u64, index: u64, size: u32, overwritten: bool) {
     let _ = WAITING.insert(&entry(&current, buffer, index), &now, 0);
 }
 
-/// A message leaves a ring buffer.
+/// Handles a message that leaves a ring buffer.
 #[inline(always)]
 pub fn dequeued(buffer: u64, index: u64, size: u32) {
     let Some(current) = Current::of_call() else {

@@ -1,7 +1,7 @@
 //! Names and relations of handles, each sent to user space once.
 //!
-//! A process that started before the programs has announced its handles already: their names are
-//! then read from its structures, which are checked before they are believed.
+//! A process that started before the programs has created its handles already. The names of such
+//! handles are read from the process's structures, which are checked for plausibility first.
 
 use aya_ebpf::helpers::generated::bpf_probe_read_user_str;
 use ros2probe_wire::inside::{Announcement, Counter, Figures, NAME_BYTES, announced, kind};
@@ -10,12 +10,12 @@ use crate::maps::{ANNOUNCEMENTS, Current, count, now, read};
 
 /// `"rmw_"`, with which every identifier of a middleware begins.
 const RMW: u32 = u32::from_le_bytes(*b"rmw_");
-/// Offset of `rmw_handle` in `rcl_publisher_impl_s` and `rcl_subscription_impl_s`: of Humble, and of
-/// Iron and later.
+/// Offsets of `rmw_handle` in `rcl_publisher_impl_s` and `rcl_subscription_impl_s`: in Humble, and
+/// in Iron and later.
 const RMW_HANDLES: [u32; 2] = [240, 248];
 /// Offset of the topic's name in `rmw_publisher_t` and `rmw_subscription_t`.
 const TOPIC_NAME: u64 = 16;
-/// Attempts to read a name: its page may not be resident.
+/// Maximum number of attempts to read a name, whose page may not be resident.
 const ATTEMPTS: u32 = 16;
 
 /// Announces a publisher at its first publication.
@@ -39,7 +39,7 @@ pub fn subscription(current: &Current, figures: *mut Figures, rmw: u64) {
         return;
     }
     if !is_endpoint(rmw) {
-        // Middlewares take from topics of their own, whose names have no slash.
+        // Middlewares take from topics of their own, whose names do not begin with a slash.
         if is_internal(rmw) {
             // SAFETY: a map value, by the caller.
             unsafe { (*figures).announced = ATTEMPTS };
@@ -51,7 +51,7 @@ pub fn subscription(current: &Current, figures: *mut Figures, rmw: u64) {
     existing(current, figures, announced::SUBSCRIPTION, rmw, rmw);
 }
 
-/// A publisher is created.
+/// Handles the creation of a publisher.
 #[inline(always)]
 pub fn publisher_created(publisher: u64, node: u64, rmw: u64, topic: u64) {
     let Some(current) = Current::of_call() else {
@@ -69,7 +69,7 @@ pub fn publisher_created(publisher: u64, node: u64, rmw: u64, topic: u64) {
     );
 }
 
-/// A subscription is created.
+/// Handles the creation of a subscription.
 #[inline(always)]
 pub fn subscription_created(subscription: u64, node: u64, rmw: u64, topic: u64) {
     let Some(current) = Current::of_call() else {
@@ -87,7 +87,7 @@ pub fn subscription_created(subscription: u64, node: u64, rmw: u64, topic: u64) 
     );
 }
 
-/// A callback is created.
+/// Handles the creation of a callback.
 #[inline(always)]
 pub fn callback_created(what: u32, callback: u64, parent: u64) {
     let Some(current) = Current::of_call() else {
@@ -97,7 +97,7 @@ pub fn callback_created(what: u32, callback: u64, parent: u64) {
     send(&current, what, callback, parent, 0, 0, 0);
 }
 
-/// A ring buffer is created.
+/// Handles the creation of a ring buffer.
 #[inline(always)]
 pub fn buffer_created(buffer: u64, capacity: u64) {
     let Some(current) = Current::of_call() else {
@@ -139,7 +139,7 @@ fn created(
     }
 }
 
-/// Sends the names of an endpoint that existed before.
+/// Sends the names of an endpoint that is older than the programs.
 #[inline(always)]
 fn existing(current: &Current, figures: *mut Figures, what: u32, address: u64, rmw: u64) {
     let (identifier, topic) = (read::<u64>(rmw), read::<u64>(rmw + TOPIC_NAME));
@@ -149,7 +149,7 @@ fn existing(current: &Current, figures: *mut Figures, what: u32, address: u64, r
     }
 }
 
-/// Returns whether a handle's name is to be read, and counts the attempt.
+/// Returns whether a handle's name still has to be read, and counts the attempt.
 #[inline(always)]
 fn is_to_be_announced(figures: *mut Figures) -> bool {
     // SAFETY: a map value, by the callers.
@@ -163,7 +163,7 @@ fn is_to_be_announced(figures: *mut Figures) -> bool {
     true
 }
 
-/// Returns the middleware's handle of a publisher; 0 if it has none.
+/// Returns the middleware's handle of a publisher; 0 if no plausible one is found.
 #[inline(always)]
 fn rmw_handle(current: &Current, publisher: u64) -> u64 {
     let structure = read::<u64>(publisher);
@@ -192,14 +192,14 @@ fn is_endpoint(rmw: u64) -> bool {
     read::<u32>(read(rmw)) == RMW && read::<u8>(read(rmw + TOPIC_NAME)) == b'/'
 }
 
-/// Returns whether an address holds an endpoint whose name does not begin with a slash.
+/// Returns whether an address holds an endpoint of a middleware with any name. The caller has
+/// excluded names that begin with a slash.
 #[inline(always)]
 fn is_internal(rmw: u64) -> bool {
     read::<u32>(read(rmw)) == RMW && read::<u8>(read(rmw + TOPIC_NAME)) != 0
 }
 
-/// Sends an announcement; returns whether the ring has room, and a first name could be read if
-/// there is one.
+/// Sends an announcement. Returns `false` if the ring is full, or if the first name cannot be read.
 #[inline(always)]
 fn send(
     current: &Current,
@@ -241,13 +241,14 @@ fn send(
     true
 }
 
-/// Copies a string of the running process; returns its length with the final zero, or an error.
+/// Copies a string of the running process; returns its length with the terminating zero, or a
+/// negative error.
 #[inline(always)]
 unsafe fn string(to: *mut u8, address: u64) -> i64 {
     if address == 0 {
         return 0;
     }
-    // SAFETY: `to` has room for a name, by the caller; the kernel checks the address.
+    // SAFETY: `to` can hold a name, by the caller; the kernel checks the address.
     let length =
         unsafe { bpf_probe_read_user_str(to.cast(), NAME_BYTES as u32, address as *const _) };
     if length <= 0 {

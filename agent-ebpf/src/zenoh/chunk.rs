@@ -1,4 +1,5 @@
-//! Chunks for user space: a part of a direction's bytes, of which the beginning may be copied.
+//! Writes chunks for user space. A chunk covers consecutive bytes of a direction, of which possibly
+//! only the beginning is copied.
 
 use aya_ebpf::{bindings::__sk_buff, helpers::generated::bpf_skb_load_bytes};
 use core::mem::size_of;
@@ -18,13 +19,13 @@ use crate::{
 
 use super::state::{WINDOW, segment};
 
-/// Most chunks of one packet's bytes: 128 KB.
+/// Maximum number of chunks of one packet, which cover 128 KB.
 const PARTS: u32 = 8;
-/// Wakes user space. Not a bit of [`part`].
+/// Flag that wakes user space. It is not a bit of [`part`].
 pub const WAKE: u32 = 1 << 16;
 
-/// Loads the first bytes of a batch, from `offset` of the payload on, into the window; returns how
-/// many.
+/// Loads the first bytes of the batch at `offset` of the payload into the window; returns their
+/// number.
 #[unsafe(export_name = "zenoh_load_window")]
 #[inline(never)]
 pub extern "C" fn load_window(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
@@ -44,7 +45,7 @@ pub extern "C" fn load_window(skb: *mut __sk_buff, slot: u32, offset: u32) -> u3
 
 #[inline(always)]
 fn load(skb: *mut __sk_buff, buffer: &mut PieceBuffer, from: u32, len: u32) -> bool {
-    // SAFETY: the buffer has room for the longest piece.
+    // SAFETY: the buffer can hold the longest piece.
     let loaded = unsafe {
         bpf_skb_load_bytes(
             skb.cast(),
@@ -56,8 +57,8 @@ fn load(skb: *mut __sk_buff, buffer: &mut PieceBuffer, from: u32, len: u32) -> b
     loaded == 0
 }
 
-/// Passes on the bytes from `offset` of the payload on, all of them; `flags` are those of the first
-/// chunk.
+/// Passes on `len` bytes at `offset` of the payload, and copies all of them. `flags` are those of
+/// the first chunk.
 #[unsafe(export_name = "zenoh_whole")]
 #[inline(never)]
 pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32, offset: u32, len: u32, flags: u32) -> u32 {
@@ -91,8 +92,8 @@ pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32, offset: u32, len: u32, f
     1
 }
 
-/// Passes on the bytes from `offset` of the payload on. `lengths` is the number of bytes, and in its
-/// upper half how many of them are copied.
+/// Passes on bytes at `offset` of the payload. The lower half of `lengths` is their number, the
+/// upper half the number of bytes that are copied.
 #[unsafe(export_name = "zenoh_head")]
 #[inline(never)]
 pub extern "C" fn head(
@@ -107,7 +108,7 @@ pub extern "C" fn head(
     };
     let (len, copied) = (lengths as u32, (lengths >> 32) as u32);
     if PIECES.query(AVAILABLE_DATA) > setting(&WAKE_PIECE_BYTES) / 2 * 3 {
-        // The rest is for datagrams.
+        // The rest of the ring is reserved for datagrams.
         return lost(slot);
     }
     if copied != 0 && (offset != this.window || copied > this.end) {

@@ -1,9 +1,10 @@
-//! Follows one direction of a connection from batch to batch, and passes on what is needed.
+//! Follows one direction of a connection from batch to batch, and passes on the bytes that are
+//! needed.
 //!
-//! A segment that repeats earlier bytes is left out. Missing bytes do not matter within a batch
-//! of which only the head is needed: the next boundary is still known. Otherwise everything is
-//! passed on until a boundary is found again, and also the missing bytes when TCP repeats them. User
-//! space puts segments into their order and continues from there.
+//! A segment that repeats earlier bytes is left out. Missing bytes do not matter within a batch of
+//! which only the head is needed, because the next boundary is still known. Otherwise all bytes are
+//! passed on until a boundary is found again, and so are the missing bytes when TCP retransmits
+//! them. User space restores the order of the segments and reads the batches.
 
 use aya_ebpf::bindings::__sk_buff;
 use core::mem::swap;
@@ -18,15 +19,17 @@ use super::{
     state::{CONNECTIONS, Segment, Window, body, mode, segment as current},
 };
 
-/// Most batches of one packet that are read; of more, everything is passed on.
+/// Maximum number of batches of one packet that are read. The bytes after them are passed on as a
+/// whole.
 const BATCHES: u32 = 64;
-/// Bytes passed on after a boundary was lost, until the connection is left alone.
+/// Maximum number of bytes passed on after a boundary was lost. Then the direction is no longer
+/// followed.
 const GAP_BYTES: u32 = 16 << 20;
-/// At least one chunk of a direction in this time shows that its sender lives.
+/// Maximum time without a chunk of a direction, so that chunks show that its sender is alive.
 const ALIVE_NANOSECONDS: u64 = 1_000_000_000;
-/// Bytes of a batch that is passed on for that reason only.
+/// Number of bytes passed on of a batch that only shows that its sender is alive.
 const ALIVE_BYTES: u32 = 256;
-/// Marks a known first byte of a length.
+/// Bit of `Direction::prefix` that marks a known first byte of a length.
 const SPLIT: u32 = 0x100;
 
 /// Handles a segment of a known direction.
@@ -38,8 +41,8 @@ pub fn segment(skb: *mut __sk_buff, slot: u32) -> u32 {
     let Some(state) = CONNECTIONS.get_ptr_mut(&this.key) else {
         return 0;
     };
-    // SAFETY: a map value pointer checked against null. Segments of one direction follow each other;
-    // runs that race on two CPUs lose a boundary at worst.
+    // SAFETY: a map value pointer checked against null. Segments of one direction follow each
+    // other; at worst, runs that race on two CPUs lose a boundary.
     copy(unsafe { &*state }, &mut this.state);
     if this.len != 0 {
         take(skb, slot);
@@ -125,7 +128,7 @@ extern "C" fn take(skb: *mut __sk_buff, slot: u32) -> u32 {
     0
 }
 
-/// Passes on the rest of a batch that an earlier segment began; `left` bytes of it are missing.
+/// Passes on the rest of a batch that an earlier segment began; `left` bytes of the batch remain.
 #[inline(always)]
 fn finish(skb: *mut __sk_buff, slot: u32, left: u32) {
     let Some(mut this) = current(slot) else {
@@ -153,7 +156,8 @@ fn lose(slot: u32, mut this: Working<Segment>) {
     this.state.guess.is_open = 0;
 }
 
-/// Handles the next batch that begins in the segment; returns 0 if none does, or if it is not one.
+/// Handles the next batch that begins in the segment; returns 0 if no batch begins there, or if the
+/// batch is unreadable.
 #[unsafe(export_name = "zenoh_batch")]
 #[inline(never)]
 extern "C" fn batch(skb: *mut __sk_buff, slot: u32) -> u32 {
@@ -184,7 +188,7 @@ extern "C" fn batch(skb: *mut __sk_buff, slot: u32) -> u32 {
     }
     this.is_judged = 0;
     if total == PREFIX {
-        // Sent in place of the rest of a message that was dropped.
+        // Zenoh sends an empty batch in place of the rest of a message that was dropped.
         this.wanted = 0;
     } else {
         if message::read(slot) == 0 {
@@ -217,7 +221,7 @@ extern "C" fn batch(skb: *mut __sk_buff, slot: u32) -> u32 {
     1
 }
 
-/// Handles a batch of which the last segment had the first byte of the length.
+/// Handles a batch whose length is split: the previous segment had its first byte.
 #[inline(always)]
 fn split(skb: *mut __sk_buff, slot: u32) -> u32 {
     let (Some(mut this), Some(window)) = (current(slot), Window::of(slot)) else {
@@ -244,7 +248,7 @@ fn split(skb: *mut __sk_buff, slot: u32) -> u32 {
     1
 }
 
-/// Passes on the rest of a segment in which no batch begins where one should.
+/// Passes on the rest of a segment that has no readable batch at `offset`.
 #[inline(always)]
 fn unreadable(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
     if let Some(this) = current(slot) {
@@ -255,7 +259,7 @@ fn unreadable(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
     0
 }
 
-/// Handles the end of a direction, and with `is_reset` of the other one, too.
+/// Handles the end of a direction, and with `is_reset` that of the other one, too.
 #[unsafe(export_name = "zenoh_end")]
 #[inline(never)]
 pub extern "C" fn end(skb: *mut __sk_buff, slot: u32, is_reset: u32) -> u32 {

@@ -1,4 +1,5 @@
-//! Reads the header of a batch: which bytes of it are needed, and whether it may be one at all.
+//! Reads the header of a batch: determines which of its bytes are needed, and whether it may be a
+//! batch at all.
 
 use ros2probe_wire::zenoh_stream::{Lanes, PREFIX, message};
 
@@ -7,23 +8,23 @@ use super::{
     state::{WINDOW, Window, chain, segment},
 };
 
-/// Everything of a batch is needed.
+/// All bytes of a batch are needed.
 pub const WHOLE: u32 = u32::MAX;
-/// Bytes of a FRAGMENT that continues a message.
+/// Number of bytes passed on of a FRAGMENT that continues a message.
 const CONTINUATION: u32 = 16;
-/// Priority of data without another one, and of declarations.
+/// Default priority of data, and priority of declarations.
 const DATA: u32 = 5;
 const CONTROL: u32 = 0;
-/// Transport messages.
+/// Ids of transport messages.
 const ID: u32 = message::ID as u32;
 const KEEP_ALIVE: u32 = message::KEEP_ALIVE as u32;
 const FRAME: u32 = message::FRAME as u32;
 const FRAGMENT: u32 = message::FRAGMENT as u32;
 const JOIN: u32 = message::JOIN as u32;
 const LEAST_NETWORK: u32 = message::LEAST_NETWORK as u32;
-/// Most bytes of a number.
+/// Maximum size of a number, in bytes.
 const NUMBER: u32 = 9;
-/// Most extensions of a message.
+/// Maximum number of extensions of a message.
 const EXTENSIONS: u32 = 8;
 
 /// Reads the batch in the window: sets `wanted`, `lane` and `number`. Returns 1 if it may be a
@@ -48,7 +49,7 @@ fn batch(slot: u32) -> Option<()> {
     this.is_shared = 0;
     this.wakes = 0;
     let Some(header) = window.byte(PREFIX, this.end) else {
-        // The segment ends before it.
+        // The segment ends before the header.
         return Some(());
     };
     let kind = header & ID;
@@ -98,7 +99,8 @@ fn batch(slot: u32) -> Option<()> {
     Some(())
 }
 
-/// Handles a header that cannot be read: it is cut by the end of the segment, or it is no header.
+/// Handles a header that cannot be read: it is cut by the end of the segment, or it is not a
+/// header.
 #[inline(always)]
 fn is_cut(slot: u32, kind: u32) -> Option<()> {
     let mut this = segment(slot)?;
@@ -106,14 +108,14 @@ fn is_cut(slot: u32, kind: u32) -> Option<()> {
         return None;
     }
     if kind == FRAGMENT && this.state.chain & chain::OPEN == 0 {
-        // Whose sample it is, is not known: all of it is passed on.
+        // The publisher of the sample is unknown, so the whole sample is passed on.
         this.state.chain = chain::OPEN | chain::WHOLE;
     }
     Some(())
 }
 
-/// Returns whether the batch in the window may be one of a connection of which nothing is known:
-/// stricter than [`read`], which it follows.
+/// Returns whether the window may hold a batch of an unknown connection. This test is stricter than
+/// [`read`], which precedes it.
 #[inline(always)]
 pub fn is_plausible(slot: u32) -> bool {
     let (Some(this), Some(window)) = (segment(slot), Window::of(slot)) else {
@@ -137,8 +139,8 @@ pub fn is_plausible(slot: u32) -> bool {
     header & 0x40 == 0 && next & ID >= LEAST_NETWORK
 }
 
-/// Reads a number of variable length at the reader's position into `value`, whose upper bits are
-/// cut off; returns 0 if it is not in the window.
+/// Reads a number of variable length at the reader's position into `value`, without the bits above
+/// the lowest 32; returns 0 if the number ends after the window.
 #[unsafe(export_name = "zenoh_number")]
 #[inline(never)]
 pub extern "C" fn number(slot: u32) -> u32 {
@@ -156,7 +158,7 @@ pub extern "C" fn number(slot: u32) -> u32 {
             value |= (next & 0x7f) << shift;
         }
         shift += 7;
-        // The ninth byte has no mark.
+        // The ninth byte has no continuation bit.
         if next & 0x80 == 0 || count == NUMBER {
             this.value = value;
             return 1;

@@ -1,10 +1,11 @@
-//! TCP connections of Zenoh: which bytes of them user space needs.
+//! Selects the bytes of Zenoh's TCP connections that user space needs.
 //!
-//! At the sockets ([`socket`]) each direction of a connection is followed from batch to batch. Of a
-//! sample only the head is passed on, of declarations all. On interfaces ([`frame`]) whole frames
-//! are kept. Either way a connection is found by its first batch, or by batches that fit together
-//! ([`search`]). Of QUIC only the first packets are noticed ([`quic`]). Nothing of other connections
-//! is passed on, and few bytes of them are read.
+//! At the sockets ([`socket`]) each direction of a connection is followed from batch to batch. Only
+//! the head of a sample is passed on, but declarations as a whole. On interfaces ([`frame`]) whole
+//! frames are kept. At both hooks a connection is found by its first batch, or by batches with
+//! consecutive sequence numbers ([`search`]). Of QUIC connections only the first packets are
+//! recognized ([`quic`]). No byte of other connections is passed on, and few of their bytes are
+//! read.
 
 mod chunk;
 mod follow;
@@ -51,7 +52,7 @@ struct Header {
 }
 
 /// Handles one packet at a socket; `at` is one of [`hook`].
-// Inlined, as others here: at most eight functions may call one another.
+// Inlined, as other functions here, because the verifier allows at most eight nested calls.
 #[inline(always)]
 pub fn socket(skb: *mut __sk_buff, at: u32) -> Option<()> {
     // SAFETY: the verifier rewrites reads of this field.
@@ -88,7 +89,7 @@ pub fn socket(skb: *mut __sk_buff, at: u32) -> Option<()> {
         if is_known {
             follow::segment(skb, slot);
         } else if search::at_socket(skb, slot) != 0 {
-            // Once for a direction, so this costs nothing per segment.
+            // This call happens once per direction, not per segment.
             meet(skb, key.socket, 1);
             follow::segment(skb, slot);
         }
@@ -122,7 +123,8 @@ fn on_interface(skb: *mut __sk_buff, slot: u32, start: u32) -> Option<()> {
     let low = u64::from(one[3]) + u64::from(other[3]) + u64::from(one[1]) + u64::from(other[1]);
     let high = u64::from(one[2]) + u64::from(other[2]) + u64::from(one[0]) + u64::from(other[0]);
     let key = Key {
-        // The same for both directions. If it is another connection's, too, that one is kept.
+        // The hash is the same for both directions. If another connection has the same hash and
+        // ports, its frames are kept, too.
         socket: low.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ high << 20 ^ u64::from(interface),
         ports: header.source_port << 16 | header.destination_port,
         outgoing: 2,
@@ -143,8 +145,9 @@ fn on_interface(skb: *mut __sk_buff, slot: u32, start: u32) -> Option<()> {
     Some(())
 }
 
-/// Handles a UDP datagram that is not RTPS. On a port of Zenoh, a QUIC connection may begin with it:
-/// at a socket its head is passed on. Returns 1 to keep the frame, on an interface.
+/// Handles a UDP datagram that is not RTPS. On a port of Zenoh, the datagram may begin a QUIC
+/// connection. At a socket, its head is then passed on. On an interface, the function returns 1 to
+/// keep the frame.
 #[unsafe(export_name = "zenoh_quic")]
 #[inline(never)]
 pub extern "C" fn quic(skb: *mut __sk_buff, slot: u32) -> u32 {
@@ -195,13 +198,13 @@ pub extern "C" fn quic(skb: *mut __sk_buff, slot: u32) -> u32 {
     0
 }
 
-/// Returns whether the configuration names one of two ports as one of Zenoh.
+/// Returns whether one of two ports is configured as a port of Zenoh.
 #[inline(always)]
 pub fn is_zenoh_port(ports: u32) -> bool {
     is_port(ports >> 16) || is_port(ports & 0xffff)
 }
 
-/// Returns whether the configuration names the port as one of Zenoh.
+/// Returns whether the port is configured as a port of Zenoh.
 #[inline(always)]
 fn is_port(port: u32) -> bool {
     let ports = setting(&ZENOH_PORTS);
@@ -234,8 +237,8 @@ fn fill(skb: *mut __sk_buff, segment: &mut Segment, header: &Header, key: &Key) 
     segment.now = unsafe { bpf_ktime_get_ns() };
 }
 
-/// Reads the headers; `None` if the packet is not a TCP segment in one piece. IPv6 extension headers
-/// are not read: no TCP stack sends them unasked.
+/// Reads the headers; `None` if the packet is not a TCP segment in one piece. IPv6 extension
+/// headers are not read, because no TCP stack sends them by default.
 #[inline(always)]
 fn header(skb: *mut __sk_buff, start: u32) -> Option<Header> {
     let first: [u32; 5] = load(skb, start)?;

@@ -1,4 +1,5 @@
-//! Reads a PUSH, the message of a sample, up to its payload, and decides what is passed on of it.
+//! Reads a PUSH, the message of a sample, up to its payload, and decides which bytes of the sample
+//! are passed on.
 
 use ros2probe_wire::{
     filter::{Budget, Counter},
@@ -17,22 +18,23 @@ use super::{
 
 const PUSH: u32 = 0x1d;
 const PUT: u32 = 0x01;
-/// Bytes of the payload that go with the head: those before and in `Header.stamp`, and more.
+/// Number of payload bytes that are passed on with the head; they include `Header.stamp`.
 const PAYLOAD: u32 = 32;
-/// Attachments of rmw_zenoh: length, and offset of the gid after its own length.
+/// Attachments of rmw_zenoh: their length, and the offset of the gid in them.
 const PLAIN: [u32; 2] = [33, 17];
 const LABELLED: [u32; 2] = [77, 61];
 const GID: u32 = 16;
 
-/// Reads the PUSH at the reader's position and sets `wanted`, for a FRAME if nothing follows it.
+/// Reads the PUSH at the reader's position and sets `wanted`. In a FRAME, `wanted` is set only if
+/// nothing follows the PUSH.
 #[inline(always)]
 pub fn read(slot: u32, in_frame: bool) -> Option<()> {
     let Some(mut this) = segment(slot) else {
         return None;
     };
     if put(slot).is_none() {
-        // Other messages are needed whole, but not the parts of a long one. So is a header that the
-        // window holds in part.
+        // Other messages in a FRAME are needed as a whole. Of the first part of a long message, and
+        // of a sample whose header exceeds the window, one window is passed on.
         if !in_frame {
             this.wanted = WINDOW;
         } else if this.end == WINDOW && this.is_sample != 0 {
@@ -80,7 +82,7 @@ const METER: u32 = Verdict::Meter as u32;
 const CAPTURE: u32 = Verdict::Capture as u32;
 const UNKNOWN: u32 = 3;
 
-/// Returns the verdict on the publisher that the attachment names.
+/// Returns the verdict on the publisher that the attachment identifies.
 #[unsafe(export_name = "zenoh_verdict")]
 #[inline(never)]
 pub extern "C" fn verdict(slot: u32) -> u32 {
@@ -106,8 +108,8 @@ pub extern "C" fn verdict(slot: u32) -> u32 {
     }
 }
 
-/// Reads a PUSH with a PUT up to the payload; returns `None` if it is something else, or not in the
-/// window.
+/// Reads a PUSH with a PUT up to the payload; returns `None` if the message is another one, or its
+/// header is not in the window.
 #[inline(always)]
 fn put(slot: u32) -> Option<()> {
     let (Some(mut this), Some(window)) = (segment(slot), Window::of(slot)) else {
@@ -149,7 +151,7 @@ fn put(slot: u32) -> Option<()> {
     Some(())
 }
 
-/// Skips bytes with their length before them; returns 0 if they end after the window.
+/// Skips a length and that many bytes; returns 0 if they are longer than the window.
 #[unsafe(export_name = "zenoh_skip")]
 #[inline(never)]
 pub extern "C" fn skip(slot: u32) -> u32 {

@@ -1,8 +1,9 @@
-//! Finds connections of Zenoh: by their first batch, or by batches that fit together.
+//! Finds connections of Zenoh: by their first batch, or by batches with consecutive sequence
+//! numbers.
 //!
-//! A connection that is older than the agent is found where a packet begins with what may be a
-//! batch. From there on batches are read, in this packet and those that follow, until two of them
-//! continue the sequence numbers of their lane. All of this stays in the kernel.
+//! The search in a connection that is older than the agent starts at a packet that may begin with a
+//! batch. It reads batches in this packet and in the next ones, until two of them continue the
+//! sequence numbers of their lane. No data leaves the kernel during the search.
 
 use aya_ebpf::bindings::__sk_buff;
 use ros2probe_wire::{
@@ -22,9 +23,9 @@ use super::{
     state::{CANDIDATES, CONNECTIONS, Direction, Key, Segment, Window, body, mode, note, segment},
 };
 
-/// Most batches of one packet that are read for it.
+/// Maximum number of batches of one packet that the search reads.
 const BATCHES: u32 = 32;
-/// Bytes of TLS that are passed on, once.
+/// Number of bytes of TLS that are passed on, once per direction.
 const TLS_BYTES: u32 = 16;
 
 /// Returns whether the payload may belong to a connection of Zenoh that is not known yet.
@@ -35,7 +36,7 @@ pub fn may_be(skb: *mut __sk_buff, body: u32, len: u32, key: &Key, is_noted: boo
             || is_noted && CANDIDATES.get_ptr_mut(key).is_some())
 }
 
-/// Returns what a payload begins with.
+/// Classifies the start of a payload.
 #[inline(always)]
 fn begins_with(skb: *mut __sk_buff, at: u32, len: u32, ports: u32) -> Beginning {
     if len >= HEAD as u32 {
@@ -50,8 +51,8 @@ fn begins_with(skb: *mut __sk_buff, at: u32, len: u32, ports: u32) -> Beginning 
     Beginning::Other
 }
 
-/// Looks for a boundary in a direction that is not known; returns 1 if it is known now, and the
-/// segment is to be followed.
+/// Searches for a boundary in an unknown direction. Returns 1 if the direction is known now and the
+/// segment must be followed.
 #[unsafe(export_name = "zenoh_at_socket")]
 #[inline(never)]
 pub extern "C" fn at_socket(skb: *mut __sk_buff, slot: u32) -> u32 {
@@ -97,7 +98,7 @@ pub extern "C" fn at_socket(skb: *mut __sk_buff, slot: u32) -> u32 {
     }
 }
 
-/// Looks as [`at_socket`] does, on an interface; returns 1 if the connection is of Zenoh.
+/// Searches as [`at_socket`] does, on an interface. Returns 1 if the connection is of Zenoh.
 #[unsafe(export_name = "zenoh_on_interface")]
 #[inline(never)]
 pub extern "C" fn on_interface(skb: *mut __sk_buff, slot: u32) -> u32 {
@@ -159,7 +160,7 @@ fn know(slot: u32, mut this: Working<Segment>, mode: u32) -> u32 {
     u32::from(CONNECTIONS.insert(&this.key, &this.state, 0).is_ok())
 }
 
-/// Continues the guess about the direction, or begins one; returns 1 once it is certain.
+/// Continues the guess about the direction, or begins one. Returns 1 once the boundary is certain.
 #[inline(always)]
 fn guess(skb: *mut __sk_buff, slot: u32) -> u32 {
     let Some(mut this) = segment(slot) else {
@@ -187,8 +188,9 @@ fn guess(skb: *mut __sk_buff, slot: u32) -> u32 {
     0
 }
 
-/// Reads the batches of the segment as far as they fit those before. Returns 1 once it is certain
-/// that they are batches: at once, or with `to_end` if all up to the end of the segment are.
+/// Reads the batches of the segment as long as each continues the earlier ones. Returns 1 as soon
+/// as the boundary is certain; with `to_end`, all batches up to the end of the segment must also
+/// fit.
 #[unsafe(export_name = "zenoh_judge")]
 #[inline(never)]
 pub extern "C" fn judge(skb: *mut __sk_buff, slot: u32, to_end: u32) -> u32 {
@@ -219,7 +221,7 @@ pub extern "C" fn judge(skb: *mut __sk_buff, slot: u32, to_end: u32) -> u32 {
     0
 }
 
-/// Returns 1 if a batch at this offset fits those before.
+/// Returns 1 if the batch at this offset continues the earlier ones.
 #[unsafe(export_name = "zenoh_fits")]
 #[inline(never)]
 extern "C" fn fits(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {

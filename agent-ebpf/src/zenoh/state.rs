@@ -15,7 +15,8 @@ use crate::{
     maps::{SLOTS, Shared, Working, piece},
 };
 
-/// Bytes of a batch that are read at most: they hold all headers of a sample, and a power of two.
+/// Maximum number of bytes of a batch that are read: enough for all headers of a sample, and a
+/// power of two.
 pub const WINDOW: u32 = 512;
 
 /// TCP ports of Zenoh; 0 = unused. Set by the loader.
@@ -30,13 +31,14 @@ pub static CONNECTIONS: LruHashMap<Key, Direction> =
 #[map]
 pub static CANDIDATES: LruHashMap<Key, Direction> =
     LruHashMap::with_max_entries(CANDIDATE_CAPACITY, 0);
-/// When a socket was last in one of the tables, by hash of its cookie: most are in none, and this is
-/// faster to look up.
+/// Time at which a socket was last in one of the tables, by hash of its cookie. Most sockets are in
+/// neither table, and this array is faster to look up.
 #[map]
 static NOTED: Array<Shared<u32>> = Array::with_max_entries(NOTED_ENTRIES, 0);
-/// A power of two.
+/// Number of entries of [`NOTED`], a power of two.
 const NOTED_ENTRIES: u32 = 16_384;
-/// Jiffies, of which a second has 100 to 1000: longer than the pause between two KEEP_ALIVEs.
+/// Lifetime of an entry in jiffies, of which a second has 100 to 1000: longer than the pause
+/// between two KEEP_ALIVEs.
 const NOTED_JIFFIES: u32 = 600_000;
 /// The current segment, by slot.
 #[map]
@@ -48,11 +50,11 @@ pub mod mode {
     pub const FOLLOWED: u32 = 0;
     /// A boundary was lost: all bytes are passed on until it is found again.
     pub const GAP: u32 = 1;
-    /// Nothing of it can be read.
+    /// No batch of the direction can be read.
     pub const UNREADABLE: u32 = 2;
 }
 
-/// What is passed on of a batch.
+/// The part of a batch that is passed on.
 pub mod body {
     /// The beginning only.
     pub const HEAD: u32 = 0;
@@ -68,7 +70,7 @@ pub mod chain {
     pub const OPEN: u32 = 1;
     /// All fragments of the message are passed on whole.
     pub const WHOLE: u32 = 2;
-    /// None of them is passed on.
+    /// No fragment of the message is passed on.
     pub const SKIPPED: u32 = 4;
 }
 
@@ -80,11 +82,11 @@ pub struct Key {
     pub socket: u64,
     /// Source port and destination port.
     pub ports: u32,
-    /// Whether the socket sends it; 2 on an interface.
+    /// 1 = the socket sends in this direction, 0 = the socket receives, 2 = seen on an interface.
     pub outgoing: u32,
 }
 
-/// Batches of a direction that may be of Zenoh.
+/// The supposed batches of a direction that may be of Zenoh.
 // Aligned, so that it is copied in few steps: the stack is small.
 #[repr(C, align(8))]
 #[derive(Clone, Copy)]
@@ -93,9 +95,9 @@ pub struct Guess {
     pub boundary: u32,
     /// Sequence number of the next byte.
     pub next: u32,
-    /// Whether the other fields hold anything.
+    /// Whether the other fields are valid.
     pub is_open: u32,
-    /// Numbers of their lanes.
+    /// Sequence numbers of the lanes of the batches.
     pub lanes: Lanes,
 }
 
@@ -103,7 +105,7 @@ pub struct Guess {
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct Direction {
-    /// When a chunk was last written.
+    /// Time at which a chunk was last written.
     pub reported: u64,
     /// One of [`mode`].
     pub mode: u32,
@@ -113,7 +115,7 @@ pub struct Direction {
     pub boundary: u32,
     /// Sequence number after the last byte that a chunk covers.
     pub covered: u32,
-    /// What is passed on of the current batch, one of [`body`].
+    /// The part of the current batch that is passed on, one of [`body`].
     pub body: u32,
     /// Bits of [`chain`].
     pub chain: u32,
@@ -123,15 +125,15 @@ pub struct Direction {
     pub pending: u32,
     /// Bytes passed on since a boundary was lost.
     pub gap_bytes: u32,
-    /// Sequence number of the first of the bytes that were missing then.
+    /// Sequence number of the first byte that was missing when the boundary was lost.
     pub hole: u32,
-    /// Number of the bytes that were missing then, which TCP may repeat.
+    /// Number of missing bytes that begin at `hole`, which TCP may retransmit.
     pub hole_len: u32,
     pub unused: u32,
     pub guess: Guess,
 }
 
-/// The current TCP segment, and what is read of its current batch.
+/// The current TCP segment, and the values read from its current batch.
 #[repr(C)]
 pub struct Segment {
     pub key: Key,
@@ -158,16 +160,17 @@ pub struct Segment {
     pub value: u32,
     /// Position after the header of a FRAME or FRAGMENT.
     pub message: u32,
-    /// Content of the extensions.
+    /// Values of the extensions.
     pub priority: u32,
     pub is_first: u32,
     pub is_shared: u32,
-    /// Whether the message is a sample, read or not.
+    /// Whether the message is a sample, even if its header cannot be read.
     pub is_sample: u32,
     /// Offset of the attachment in the window; 0 = none.
     pub attachment: u32,
     pub attachment_len: u32,
-    /// Offset of the sample's payload in the window; 0 = it is not a sample, or not understood.
+    /// Offset of the sample's payload in the window; 0 = the message is not a sample, or is
+    /// unreadable.
     pub payload: u32,
     /// Length of that payload.
     pub payload_len: u32,
@@ -177,9 +180,9 @@ pub struct Segment {
     pub is_judged: u32,
     /// Whether user space should read the batch soon.
     pub wakes: u32,
-    /// Bytes of the batch to be passed on, or `u32::MAX`: all.
+    /// Number of bytes of the batch to pass on; `u32::MAX` = all.
     pub wanted: u32,
-    /// Key of the batch's lane; 0 = the batch is not one of a lane.
+    /// Key of the batch's lane; 0 = the batch has no lane.
     pub lane: u32,
     /// Sequence number in the lane.
     pub number: u32,
@@ -238,7 +241,7 @@ impl Window {
         Some(u32::from(unsafe { *self.0.add(at) }))
     }
 
-    /// Returns four words from `at` on.
+    /// Returns the four words at `at`.
     #[inline(always)]
     pub fn words(self, at: u32) -> [u32; 4] {
         let at = opaque(at) as usize & (WINDOW as usize - 1);
