@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn of_a_process_with_too_many_libraries_the_first_ones_are_known() {
+    fn a_process_with_too_many_libraries_keeps_the_first_ones() {
         let line = |inode| {
             format!("7f0000000000-7f0000001000 r-xp 00000000 fe:00 {inode} /libfastdds.so\n")
         };

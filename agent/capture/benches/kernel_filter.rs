@@ -1,6 +1,7 @@
 //! CPU time of the kernel filter per datagram, by verdict, and of the same walk in user space. The
-//! kernel measures it (BPF_PROG_TEST_RUN). A datagram of many IP fragments runs the program once
-//! per fragment, as on a link of MTU 1500. Every run counts about 25 ns too many. Needs root.
+//! kernel measures the time (BPF_PROG_TEST_RUN). A datagram of many IP fragments runs the program
+//! once per fragment, as on a link of MTU 1500. Every measured run is about 25 ns too long. Needs
+//! root.
 
 #![expect(
     clippy::unwrap_used,
@@ -20,7 +21,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 /// IP payload of a frame at MTU 1500.
 const FRAME: usize = 1480;
-/// Runs of the program before the record ring is emptied: it must not fill up.
+/// Number of runs before the record ring is emptied: the ring must not fill up.
 const BATCH: u32 = 1000;
 const WRITER: Guid = Guid::new(
     GuidPrefix(*b"\x01\x0fbenchbench"),
@@ -36,7 +37,8 @@ fn datagrams() -> [(&'static str, Vec<u8>); 3] {
     ]
 }
 
-/// An RTPS message of INFO_TS and the first fragments, each of `size` bytes, of a large sample.
+/// Returns an RTPS message of INFO_TS and the first fragments, each of `size` bytes, of a large
+/// sample.
 fn fragments(count: u16, size: u16) -> Vec<u8> {
     let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
     bytes.extend_from_slice(&WRITER.prefix.0);

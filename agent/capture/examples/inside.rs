@@ -1,7 +1,8 @@
-//! Checks the programs inside processes on the running kernel: loads them, attaches them to a
-//! library of the functions that is named as argument, calls these functions, and compares counts.
+//! Checks the programs inside processes on the running kernel: loads them, attaches them to the
+//! library that is given as argument, calls its functions, and compares counts.
 //!
-//! Runs also as the first process of a guest: it then mounts what it needs, and powers off.
+//! The example also runs as the first process of a guest. It then mounts what it needs, and powers
+//! off.
 
 #![expect(clippy::print_stdout, reason = "its result")]
 
@@ -19,14 +20,14 @@ use ros2probe_capture::inside::table::ProcessTable;
 use ros2probe_capture::system::Clocks;
 use ros2probe_wire::inside::kind;
 
-/// Calls of each function.
+/// Number of calls of each function.
 const CALLS: u64 = 1000;
 
 fn main() {
     let is_first = std::process::id() == 1;
     if is_first {
         for (kind, place) in [(c"proc", c"/proc"), (c"sysfs", c"/sys")] {
-            // SAFETY: three strings that end with zero, and no data.
+            // SAFETY: the arguments are three strings that end with zero, and no data.
             unsafe { libc::mount(kind.as_ptr(), place.as_ptr(), kind.as_ptr(), 0, ptr::null()) };
         }
     }
@@ -64,7 +65,7 @@ fn check(library: &str, has_callbacks: bool) -> Result<String, Box<dyn Error>> {
         return Err("the library lacks a function".into());
     };
     let length = usize::try_from(file.metadata()?.len())?;
-    // SAFETY: a new mapping at an address of the kernel's choice.
+    // SAFETY: a new mapping at an address of the kernel's choice touches no memory in use.
     let code = unsafe {
         libc::mmap(
             ptr::null_mut(),
@@ -82,7 +83,7 @@ fn check(library: &str, has_callbacks: bool) -> Result<String, Box<dyn Error>> {
         let address = code
             .cast::<u8>()
             .wrapping_add(usize::try_from(offset).unwrap_or(0));
-        // SAFETY: a function without a body, in the mapping above, that ignores its arguments.
+        // SAFETY: the function is in the mapping above, has no body, and ignores its arguments.
         unsafe {
             let function: extern "C" fn(u64, u64, u64, u64) = std::mem::transmute(address);
             function(first, 0, 1, fourth);

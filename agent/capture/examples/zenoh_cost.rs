@@ -1,6 +1,6 @@
 //! Cost of the programs for TCP to connections that are not of Zenoh: bytes per second in one
-//! direction, and exchanges of 100 bytes per second, over loopback in a namespace of its own.
-//! Rounds with the programs and without alternate. Needs root.
+//! direction, and exchanges of 100 bytes per second, over loopback in a separate namespace. Rounds
+//! with and without the programs alternate. Needs root.
 //!
 //! ```text
 //! cargo run --release --workspace --example zenoh_cost -- ROUNDS SECONDS
@@ -24,9 +24,9 @@ use ros2probe_capture::netns;
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_testing::harness::network::Namespace;
 
-/// Bytes of one write.
+/// Size of one write, in bytes.
 const BULK: usize = 65_536;
-/// Bytes of one message of an exchange.
+/// Size of one message of an exchange, in bytes.
 const SMALL: usize = 100;
 
 fn connection() -> [TcpStream; 2] {
@@ -41,7 +41,7 @@ fn connection() -> [TcpStream; 2] {
 /// Returns bytes per second.
 fn bulk(duration: Duration) -> f64 {
     let [mut client, mut server] = connection();
-    // Bytes that look like nothing.
+    // The bytes resemble no known protocol.
     let bytes: Vec<u8> = (0..BULK).map(|at| (at * 31 + at / 251) as u8).collect();
     std::thread::scope(|scope| {
         let reader = scope.spawn(move || {
@@ -114,7 +114,7 @@ fn main() {
     for round in 0..rounds {
         let mut results = [[0.0; 2]; 2];
         for step in 0..2 {
-            // The first of a pair alternates, too.
+            // The order within a pair of rounds alternates, too.
             let with = (round + step) % 2;
             let filter = (with == 1).then(|| {
                 let mut filter = Filter::load_host(&FilterSettings::default()).unwrap();

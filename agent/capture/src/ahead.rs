@@ -42,13 +42,13 @@ struct Waiting {
     records: Bounded<AheadRecords, Vec<Record>>,
     handed_over: bool,
     rest: Option<Reassembled>,
-    /// Time of the frame that completed it.
+    /// Time of the frame that completed the datagram.
     complete: Option<u64>,
 }
 
 impl Ahead {
     /// Accepts a record of source `namespace`. The caller passes handovers to the reassembly; here
-    /// they only announce a rest.
+    /// a handover only announces that the rest of the datagram follows.
     pub fn record(&mut self, namespace: u32, record: Record, ready: impl FnMut(Ready)) {
         let mut ready = ready;
         if record.datagram == 0 {
@@ -105,7 +105,7 @@ impl Ahead {
         self.given_up
     }
 
-    /// Changes the waiting datagram, making room for it if needed.
+    /// Changes the waiting datagram, and gives up the oldest datagrams if a bound is exceeded.
     fn change(&mut self, token: Token, at: Timestamp, change: impl FnOnce(&mut Waiting)) {
         if !self.waiting.contains_key(&token) {
             let oldest = self.oldest.push_back((at, token));
@@ -161,7 +161,7 @@ impl Ahead {
 impl Waiting {
     /// Returns the bytes held.
     fn bytes(&self) -> usize {
-        // A new list does not compile until it is listed here.
+        // A new field does not compile until this pattern names it.
         let Self {
             records,
             handed_over: _,
@@ -209,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn records_sent_ahead_count_once_the_last_one_came_and_bear_its_time() {
+    fn records_sent_ahead_count_when_the_last_one_arrives_and_get_its_time() {
         let mut ahead = Ahead::default();
         taken(
             &mut ahead,
@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn a_datagram_of_another_namespace_is_another_datagram() {
+    fn the_same_token_in_two_namespaces_identifies_two_datagrams() {
         let mut ahead = Ahead::default();
         taken(&mut ahead, record(9, kind::DATA, flag::AHEAD, 1));
         let mut seen = 0;
@@ -234,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn a_storm_of_datagrams_that_never_end_stays_bounded() {
+    fn a_storm_of_incomplete_datagrams_stays_within_the_cap() {
         let mut ahead = Ahead::default();
         for token in 1..10_000 {
             taken(&mut ahead, record(token, kind::DATA, flag::AHEAD, 1));
@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn a_storm_of_long_datagrams_that_never_end_stays_within_its_bytes() {
+    fn a_storm_of_long_incomplete_datagrams_stays_within_the_byte_limit() {
         let mut ahead = Ahead::default();
         for token in 1..1000 {
             for time in 1..2000 {
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn a_datagram_of_too_many_records_keeps_the_first_ones() {
+    fn a_datagram_with_too_many_records_keeps_the_first_ones() {
         let mut ahead = Ahead::default();
         for time in 0..3000 {
             taken(&mut ahead, record(1, kind::DATA, flag::AHEAD, time));

@@ -1,12 +1,12 @@
 //! Wakes a thread that waits for packets: a descriptor that is readable after [`Bell::ring`] until
-//! [`Bell::silence`]. It signals that something waits, not what.
+//! [`Bell::silence`]. It signals that an event occurred, not which one.
 
 use std::io::{self, Read as _, Write as _};
 use std::os::fd::{AsFd as _, BorrowedFd};
 use std::os::unix::net::UnixStream;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Most rings that one call of [`Bell::silence`] takes.
+/// Maximum number of rings that one call of [`Bell::silence`] takes.
 const RINGS: usize = 64;
 
 /// A bell that any thread may ring or wait for.
@@ -40,13 +40,13 @@ impl Bell {
         self.listener.as_fd()
     }
 
-    /// Rings. If its buffer is full, it rings already.
+    /// Rings the bell. If its buffer is full, it rings already.
     pub fn ring(&self) {
         let _ = (&self.ringer).write(&[1]);
         self.rung.store(true, Ordering::Release);
     }
 
-    /// Silences the bell after at most 64 rings; after more it keeps ringing.
+    /// Silences the bell if it rang at most 64 times; otherwise it keeps ringing.
     pub fn silence(&self) {
         if !self.rung.swap(false, Ordering::AcqRel) {
             return;
@@ -67,7 +67,7 @@ mod tests {
     use std::time::Duration;
 
     #[test]
-    fn a_bell_that_rang_often_is_silent_after_some_rounds_and_rings_again() {
+    fn a_bell_with_many_rings_is_silent_after_several_calls_and_can_ring_again() {
         let bell = Bell::new().unwrap();
         let rings = || wait(&[bell.descriptor()], Duration::ZERO).unwrap() == Some(0);
         bell.silence();

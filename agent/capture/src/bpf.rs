@@ -64,7 +64,7 @@ struct UpdateAttributes {
     flags: u64,
 }
 
-/// Loads types in the format BTF.
+/// Loads types in BTF format.
 ///
 /// # Errors
 /// Fails if the kernel refuses them.
@@ -78,11 +78,12 @@ pub(crate) fn load_types(types: &[u8]) -> io::Result<OwnedFd> {
     unsafe { descriptor(BTF_LOAD, &attributes) }
 }
 
-/// Loads a program for [`link_functions`](ros2probe_attach::kernel::link_functions), which aya 0.14 cannot. `license`: as in the object.
-/// `types`: of the object; without them the kernel verifies each global function with its callers.
+/// Loads a program for [`link_functions`](ros2probe_attach::kernel::link_functions), which aya 0.14
+/// cannot load. `license` is that of the object. Without `types` of the object, the kernel verifies
+/// each global function with its callers.
 ///
 /// # Errors
-/// Fails if the verifier refuses the program, or without the capabilities.
+/// Fails if the verifier refuses the program, or if a capability is missing.
 pub(crate) fn load_for_functions(
     name: &str,
     function: &Function,
@@ -141,7 +142,7 @@ pub(crate) fn set_program(
 /// # Errors
 /// Fails if the kernel refuses the link.
 pub(crate) fn create_link(program: u32, target: u32, attach_type: u32) -> io::Result<OwnedFd> {
-    // SAFETY: no pointer.
+    // SAFETY: the attributes contain no pointer.
     unsafe { descriptor(LINK_CREATE, &[program, target, attach_type, 0]) }
 }
 
@@ -150,7 +151,7 @@ pub(crate) fn create_link(program: u32, target: u32, attach_type: u32) -> io::Re
 /// # Errors
 /// Fails if the kernel refuses the iterator.
 pub(crate) fn create_iterator(link: u32) -> io::Result<OwnedFd> {
-    // SAFETY: no pointer.
+    // SAFETY: the attributes contain no pointer.
     unsafe { descriptor(ITER_CREATE, &[link, 0]) }
 }
 
@@ -160,7 +161,7 @@ pub(crate) fn create_iterator(link: u32) -> io::Result<OwnedFd> {
 pub fn failed_lookup() -> io::Error {
     // -1 is never a valid descriptor; key and value are null.
     let attributes = [u32::MAX, 0, 0, 0, 0, 0, 0, 0];
-    // SAFETY: no pointer other than null.
+    // SAFETY: the attributes contain no pointer other than null.
     match unsafe { call(MAP_LOOKUP_ELEM, &attributes) } {
         Ok(_) => io::Error::other("a map that does not exist was found"),
         Err(error) => error,
@@ -184,13 +185,14 @@ fn length<T>(slice: &[T]) -> io::Result<u32> {
 /// # Safety
 /// As for [`call`].
 unsafe fn descriptor<T>(command: c_int, attributes: &T) -> io::Result<OwnedFd> {
-    // SAFETY: the caller's.
+    // SAFETY: the caller meets the conditions of `call`.
     let descriptor = unsafe { call(command, attributes) }?;
     // SAFETY: the command returns a new descriptor, which nothing else owns.
     Ok(unsafe { OwnedFd::from_raw_fd(descriptor) })
 }
 
-/// Calls a command with its attributes. The kernel treats those beyond their size as zero.
+/// Calls a command with its attributes. The kernel treats attributes beyond the passed size as
+/// zero.
 ///
 /// # Safety
 /// Pointers in the attributes are null, or refer to as much memory as the command reads.
@@ -215,7 +217,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lookup_in_no_map_fails_with_ebadf_or_eperm() {
+    fn a_lookup_without_a_map_fails_with_ebadf_or_eperm() {
         let error = failed_lookup().raw_os_error();
         assert!(
             matches!(error, Some(libc::EBADF | libc::EPERM)),

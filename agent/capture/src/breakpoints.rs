@@ -1,9 +1,10 @@
 //! Kernel programs attached to functions of a library, in every process that maps it.
 //!
-//! Linux 6.6 has one link for all functions of a library: it is created and removed in the time of
-//! one function, and needs no capability beyond those that load a program. Earlier kernels have a
-//! perf event for each function, which now needs CAP_SYS_ADMIN, and of which each removal takes
-//! 0.1 s. Either is removed by the kernel when its descriptor is closed, however this process ends.
+//! From Linux 6.6 on, one link covers all functions of a library. It is created and removed as fast
+//! as for one function, and needs no capability beyond those for loading a program. Earlier kernels
+//! need a perf event for each function, which requires CAP_SYS_ADMIN. Each removal of one takes
+//! 0.1 s. The kernel removes links and events when their descriptors are closed, however this
+//! process ends.
 //!
 //! This process loads the programs. The broker attaches them, and returns the descriptors.
 
@@ -26,20 +27,21 @@ use crate::uprobe::attachments::Refusal;
 
 pub use ros2probe_attach::request::Means;
 
-/// A program that calls the others by the cookie of a function: their place in an array.
+/// A program that tail-calls another one: the cookie of a function is its index in a program array.
 #[derive(Clone, Copy)]
 pub(crate) struct Dispatcher {
     pub(crate) program: &'static str,
     pub(crate) array: &'static str,
 }
 
-/// Programs in the kernel, and the maps that remain of their object.
+/// Loaded programs, and the remaining maps of their object.
 pub(crate) struct Breakpoints {
     pub(crate) ebpf: Ebpf,
     /// Functions that have a loaded program.
     pub(crate) calls: Calls,
     means: Means,
-    /// Programs for links, in the order of [`Calls::programs`]. aya has those for perf events.
+    /// Programs for links, in the order of [`Calls::programs`]. Programs for perf events are in
+    /// `ebpf`.
     linked: Vec<OwnedFd>,
     dispatching: Option<Dispatching>,
 }
@@ -47,20 +49,20 @@ pub(crate) struct Breakpoints {
 /// A loaded dispatcher.
 struct Dispatching {
     program: OwnedFd,
-    /// The kernel empties it when it is closed.
+    /// The kernel empties the array when it is closed.
     _array: MapData,
 }
 
-/// The breakpoints in one library; dropping them removes them.
+/// The breakpoints in one library; dropping the value removes them.
 pub struct Attached {
     _descriptors: Vec<OwnedFd>,
-    /// Functions that the library has, by the names in [`Calls::programs`].
+    /// Names of the functions that the library has, as in [`Calls::programs`].
     pub functions: Vec<String>,
 }
 
 impl Breakpoints {
-    /// Loads the programs of `calls` from an `object` whose maps are in `ebpf`, and with links also
-    /// `dispatcher`.
+    /// Loads the programs of `calls` from an `object` whose maps are in `ebpf`. With links, it also
+    /// loads `dispatcher`.
     pub(crate) fn load(
         mut ebpf: Ebpf,
         object: &[u8],
@@ -121,8 +123,8 @@ impl Breakpoints {
         programs.collect()
     }
 
-    /// Lets the broker attach the programs to functions of a library. `calls`: those for which the
-    /// programs are loaded, or a part of them.
+    /// Lets the broker attach the programs to functions of a library. `calls` is the set for which
+    /// the programs are loaded, or a subset.
     ///
     /// # Errors
     /// Returns [`Refusal`] if the broker refuses or cannot be reached.
@@ -155,7 +157,7 @@ impl Breakpoints {
     /// broker: for tests and examples.
     ///
     /// # Errors
-    /// As [`attach::attach`].
+    /// Fails as [`attach::attach`] does.
     pub(crate) fn attach_here(&self, calls: Calls, file: &File) -> Result<Attached, AttachError> {
         let programs = self.programs().unwrap_or_default();
         let dispatcher = self.dispatching.as_ref();
@@ -218,7 +220,7 @@ impl Relocated {
     }
 }
 
-/// Returns the data of a map of the kinds that the objects use.
+/// Returns the data of a map if the objects use maps of its type.
 fn data(map: &Map) -> Option<&MapData> {
     match map {
         Map::Array(data)

@@ -10,7 +10,7 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
 const MOUNTS: &str = "/proc/self/mountinfo";
-/// Inode of the topmost group, which is its id and the same on every host.
+/// Inode of the root group, which is its id and the same on every host.
 const ROOT_INODE: u64 = 1;
 
 /// Why a control group cannot be used.
@@ -58,7 +58,7 @@ impl Cgroup {
     /// Opens the group at `path`.
     ///
     /// # Errors
-    /// Fails if it does not exist or is not a control group.
+    /// Fails if the path does not exist or is not a control group.
     pub fn open(path: &Path) -> Result<Self, CgroupError> {
         let failed = |source| CgroupError::Open {
             path: path.to_path_buf(),
@@ -79,7 +79,7 @@ impl Cgroup {
         })
     }
 
-    /// Returns its path.
+    /// Returns the path of the group.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
@@ -91,8 +91,8 @@ impl Cgroup {
         &self.directory
     }
 
-    /// Returns whether it contains every process of the host: it is the topmost group as seen
-    /// outside of all containers.
+    /// Returns whether the group contains every process of the host: it is the root group, not that
+    /// of a container.
     #[must_use]
     pub const fn is_whole_host(&self) -> bool {
         self.whole_host
@@ -108,7 +108,7 @@ pub fn mount_point() -> Result<PathBuf, CgroupError> {
     topmost(&mounts).ok_or(CgroupError::NotMounted)
 }
 
-/// Returns the mount that shows the hierarchy from `/`, if several mounts exist.
+/// Returns the mount point whose root is closest to the root of the hierarchy.
 #[must_use]
 pub fn topmost(mounts: &[u8]) -> Option<PathBuf> {
     let found = mounts
@@ -132,8 +132,8 @@ struct Mount {
     point: Vec<u8>,
 }
 
-/// Parses a line about this type of file system: number, parent, device, root, mount point,
-/// options, optional fields, a dash, type.
+/// Parses a line about this type of file system. Its fields are number, parent, device, root, mount
+/// point, options, optional fields, a dash, and type.
 fn mount(line: &[u8], file_system: &[u8]) -> Option<Mount> {
     let mut fields = line.split(|byte| *byte == b' ');
     let root = unescape(fields.nth(3)?);
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn of_several_the_one_that_shows_more_is_taken() {
+    fn the_mount_that_shows_most_of_the_hierarchy_is_preferred() {
         let mounts = "\
 31 30 0:26 /docker/abc /sys/fs/cgroup ro - cgroup2 cgroup rw
 40 30 0:26 / /host\\040sys/fs/cgroup ro - cgroup2 cgroup rw
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn this_host_has_one_and_a_directory_is_none() {
+    fn this_host_has_a_cgroup_and_a_plain_directory_is_rejected() {
         let topmost = Cgroup::topmost().unwrap();
         assert!(topmost.path().join("cgroup.procs").exists());
         let other = Cgroup::open(Path::new("/proc")).unwrap_err();

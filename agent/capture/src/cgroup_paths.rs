@@ -1,8 +1,8 @@
 //! Paths of control groups by number: a socket's cgroup is identified by the inode of its
 //! directory.
 //!
-//! Walks the version 2 hierarchy for numbers that are new, and remembers the results, including
-//! numbers without a directory. Bounded in directories and depth; opens no file.
+//! The table walks the version 2 hierarchy for new numbers, and remembers the results, including
+//! numbers without a directory. A walk is bounded in directories and depth, and opens no file.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -10,11 +10,11 @@ use std::os::unix::fs::DirEntryExt as _;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
-/// Most directories per walk.
+/// Maximum number of directories per walk.
 const MAX_DIRECTORIES: usize = 16_384;
-/// Most levels per walk.
+/// Maximum number of levels per walk.
 const MAX_DEPTH: usize = 24;
-/// Hex digits of a container's id, and how many of them tools show.
+/// Number of hex digits of a container's id, and of those that tools show.
 const CONTAINER_ID: usize = 64;
 const CONTAINER_ID_SHOWN: usize = 12;
 
@@ -57,7 +57,7 @@ impl CgroupPaths {
     }
 }
 
-/// Returns a name for people: the first digits of a container's id, else the systemd unit, else the
+/// Returns a readable name: the first digits of a container's id, else the systemd unit, else the
 /// last part of the path.
 #[must_use]
 pub fn short_name(path: &str) -> &str {
@@ -78,7 +78,8 @@ fn container(part: &str) -> Option<&str> {
     is_id.then(|| id.get(..CONTAINER_ID_SHOWN)).flatten()
 }
 
-/// Removes the groups that it finds from `missing`; ends when none is left.
+/// Returns the paths of groups in `missing`, and removes them from it. Ends when `missing` is
+/// empty.
 fn walk(root: &Path, missing: &mut BTreeSet<u64>) -> Vec<(u64, Option<String>)> {
     let mut found = Vec::new();
     if let Ok(metadata) = fs::metadata(root)
@@ -117,7 +118,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_number_becomes_a_path_and_what_is_gone_is_not_looked_for_again() {
+    fn a_number_resolves_to_a_path_and_a_missing_one_is_not_searched_again() {
         let root = tempfile::tempdir().unwrap();
         let service = root.path().join("system.slice/robot.service");
         fs::create_dir_all(&service).unwrap();
@@ -131,7 +132,7 @@ mod tests {
         assert_eq!(groups.path(top), Some("/"));
         assert_eq!(groups.path(below), Some("/system.slice/robot.service"));
         assert_eq!(groups.path(gone), None);
-        // No number is new, so nothing is walked: the changed path stays.
+        // No number is new, so no walk takes place: the old path stays.
         fs::rename(&service, root.path().join("system.slice/other.service")).unwrap();
         groups.refresh(&BTreeSet::from([below, gone]));
         assert_eq!(groups.path(below), Some("/system.slice/robot.service"));
@@ -142,14 +143,14 @@ mod tests {
     }
 
     #[test]
-    fn a_hierarchy_that_is_not_there_has_nothing() {
+    fn a_missing_hierarchy_yields_no_path() {
         let mut groups = CgroupPaths::new(PathBuf::from("/nonexistent"));
         groups.refresh(&BTreeSet::from([1]));
         assert_eq!(groups.path(1), None);
     }
 
     #[test]
-    fn people_read_a_container_or_a_unit() {
+    fn a_short_name_is_a_container_id_or_a_systemd_unit() {
         let id = "0123456789abcdef".repeat(4);
         let short = "0123456789ab";
         for path in [

@@ -3,7 +3,7 @@
 
 use super::system::Clocks;
 
-/// Time servers correct smaller differences gradually.
+/// Minimum change that counts as a step. Time daemons correct smaller differences gradually.
 const STEP_NANOSECONDS: u64 = 100_000_000;
 /// How long packets with an old timestamp may still arrive.
 const LATE_NANOSECONDS: u64 = 1_000_000_000;
@@ -11,7 +11,7 @@ const LATE_NANOSECONDS: u64 = 1_000_000_000;
 /// Difference between the wall clock and the monotonic clock.
 #[derive(Clone, Copy, Debug)]
 pub struct ClockStep {
-    /// Nanoseconds by which the wall clock was ahead at the last update.
+    /// Nanoseconds by which the wall clock was ahead of the monotonic clock at the last update.
     ahead: i64,
     /// Time of the last step, and the sum of all steps at that time.
     noticed: Option<(u64, i64)>,
@@ -61,7 +61,8 @@ mod tests {
     const HOUR: i64 = 3600 * SECOND.cast_signed();
     const STARTED: u64 = 1_700_000_000 * SECOND;
 
-    /// Clocks this many nanoseconds after the start, the wall clock having been set by `step`.
+    /// Returns clocks `monotonic` nanoseconds after the start, with the wall clock set forward by
+    /// `step`.
     fn clocks(monotonic: u64, step: i64) -> Clocks {
         Clocks {
             now: Timestamp((STARTED + monotonic).saturating_add_signed(step)),
@@ -71,10 +72,10 @@ mod tests {
     }
 
     #[test]
-    fn a_step_is_noticed_once_and_remembered_for_a_second_and_slewing_is_none() {
+    fn a_step_is_reported_once_and_kept_for_a_second_and_slewing_is_not_a_step() {
         for step in [HOUR, -HOUR] {
             let mut set = ClockStep::new(&clocks(0, 0));
-            // 500 parts in a million, the fastest correction of a time server.
+            // A time daemon corrects the clock by at most 500 parts in a million.
             let mut now = clocks(SECOND, 500_000);
             assert_eq!((set.update(&mut now), now.step), (0, 0));
             let mut now = clocks(SECOND + SECOND / 4, step);
@@ -88,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn times_from_before_a_step_are_converted_by_the_step() {
+    fn timestamps_from_before_a_step_are_shifted_by_the_step() {
         for step in [HOUR, -HOUR] {
             let mut set = ClockStep::new(&clocks(0, 0));
             let mut now = clocks(5 * SECOND, step);

@@ -8,7 +8,7 @@ use std::error::Error;
 pub struct Reason(pub String);
 
 impl Reason {
-    /// Renders an error and its causes as [`in_words`].
+    /// Renders an error and its causes as [`in_words`] does.
     #[must_use]
     pub fn of(error: &dyn Error) -> Self {
         Self(in_words(error))
@@ -21,7 +21,8 @@ impl Reason {
     }
 }
 
-/// Returns an error and its causes in one line; only the first line of a verifier's log.
+/// Returns an error and its causes in one line. Of a verifier's log, only the first line is
+/// included.
 #[must_use]
 pub fn in_words(error: &dyn Error) -> String {
     let mut words = String::new();

@@ -23,10 +23,10 @@ use super::tracepoints::KernelLayout;
 pub use host_hook::{CapturedPiece, Links};
 pub use uprobe::{Form, Probes};
 
-/// The object built by `agent-ebpf/build.sh`. Aligned, because ELF is read in place.
+/// The object built by `agent-ebpf/build.sh`. It is aligned because the ELF file is read in place.
 static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../agent-ebpf/filter.bpf.o"));
 
-/// Bytes at an address that an ELF header may have.
+/// Bytes with the alignment of an ELF header.
 #[repr(align(8))]
 pub(crate) struct Aligned<T: ?Sized>(pub(crate) T);
 
@@ -92,7 +92,7 @@ pub struct FilterSettings {
     pub zenoh_ports: [u16; PORT_CAPACITY],
 }
 
-/// Returns the ports for the programs; those that do not fit are left out.
+/// Returns the ports in the form that the programs read, without those that do not fit.
 #[must_use]
 pub fn ports(ports: &[u16]) -> [u16; PORT_CAPACITY] {
     let mut all = [0; PORT_CAPACITY];
@@ -112,7 +112,7 @@ impl Default for FilterSettings {
     }
 }
 
-/// One loaded filter with its maps: of the wire hook, or of the host hook.
+/// One loaded filter with its maps: of the wire hook, of the host hook, or of the uprobe.
 pub struct Filter {
     /// The attached program: the wire hook's entry, or the host hook's for received datagrams.
     program: OwnedFd,
@@ -120,7 +120,7 @@ pub struct Filter {
     /// closed.
     _wire: Option<ProgramArray<MapData>>,
     host: Option<host_hook::HostHook>,
-    /// Captured datagrams; host hook only.
+    /// Ring of captured datagrams; `None` for the wire hook.
     pieces: Option<RingBuf<MapData>>,
     interest: HashMap<MapData, [u32; 4], u32>,
     participants: HashMap<MapData, [u32; 3], u64>,
@@ -128,7 +128,7 @@ pub struct Filter {
     budget: Array<MapData, i64>,
     /// Values are [`Record`]s.
     runs: HashMap<MapData, RunKey, [u64; 17]>,
-    /// By slot.
+    /// Counters of each CPU, by slot.
     counters: PerCpuArray<MapData, [[u64; Counter::ALL.len()]; COUNTER_SLOTS]>,
     records: RingBuf<MapData>,
 }
@@ -192,7 +192,7 @@ impl Filter {
         self.records.as_fd()
     }
 
-    /// Sets or removes a writer's or reader's verdict.
+    /// Sets or removes the verdict of a writer or reader.
     ///
     /// # Errors
     /// Fails if the map is full or the kernel refuses the update.
@@ -209,7 +209,7 @@ impl Filter {
         .map_err(failed("INTEREST", "update"))
     }
 
-    /// Starts or stops noting the time of a participant's last message.
+    /// Starts or stops recording the time of a participant's last message.
     ///
     /// # Errors
     /// Fails if the map is full or the kernel refuses the update.
@@ -228,7 +228,7 @@ impl Filter {
     }
 
     /// Iterates over followed participants and the CLOCK_MONOTONIC nanoseconds of their last
-    /// message. Omits participants that have not sent since they are followed.
+    /// message. Omits participants that have sent nothing since they were followed.
     pub fn participants(&self) -> impl Iterator<Item = (GuidPrefix, u64)> + '_ {
         self.participants.iter().filter_map(|entry| {
             let (key, last): ([u32; 3], u64) = entry.ok()?;
@@ -254,7 +254,7 @@ impl Filter {
         absent_is_fine(self.interfaces.remove(&index)).map_err(failed("INTERFACES", "update"))
     }
 
-    /// Sets a budget of unclassified writers.
+    /// Sets a budget of unknown writers.
     ///
     /// # Errors
     /// Fails if the kernel refuses the update.
@@ -353,11 +353,11 @@ fn caused_by(error: &(dyn std::error::Error + 'static), wanted: i32) -> Option<i
     None
 }
 
-/// Entries of a map that only the other hook uses: an LRU map cannot be empty.
+/// Number of entries of a map that the loaded programs do not use: an LRU map cannot be empty.
 const UNUSED: u32 = 64;
 
-/// Opens the object and creates its maps, resizing the named ones. `host`: for the host hook.
-/// `layout`: for programs that read the kernel's structures. `within`: control group of the
+/// Opens the object and creates its maps with the given `sizes`. `host` selects the host hook.
+/// `layout` is for programs that read the kernel's structures. `within` is the control group of the
 /// processes whose shared-memory messages are read; 0 = all.
 fn open(
     settings: &FilterSettings,
@@ -464,7 +464,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_ring_is_a_power_of_two_of_whole_pages_whatever_a_page_is() {
+    fn a_ring_size_is_a_power_of_two_and_whole_pages_for_every_page_size() {
         for page in [4096, 16_384, 65_536] {
             for bytes in [0, 1, 65_536, 65_537, 300_000, 1 << 20] {
                 let size = ring_size_with(bytes, page);

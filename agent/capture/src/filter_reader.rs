@@ -30,7 +30,7 @@ pub const SETTLE_NANOSECONDS: u64 = 50_000_000;
 const STALLED_NANOSECONDS: u64 = 30_000_000;
 /// Datagrams younger than this wait for older records that may still be in the ring.
 const FRESH_NANOSECONDS: u64 = 2_000_000;
-/// Most pieces read per round.
+/// Maximum number of pieces read per round.
 const PIECES_PER_ROUND: usize = 32_768;
 /// The ring is emptied again after this many records passed to the model: a burst fills it while
 /// earlier records are counted.
@@ -72,10 +72,10 @@ impl FilterReader {
     }
 
     /// Reads the rings and passes everything older than [`SETTLE_NANOSECONDS`] to the model.
-    /// Announcements in datagrams are passed at once, the rest in order of time. Everything older
-    /// precedes a datagram: a writer's last samples count before its disposal is read. If a flood
-    /// leaves records in one ring, the other ring waits for it; otherwise a writer's records and
-    /// captured datagrams would be out of order and look like losses.
+    /// Announcements in datagrams are passed immediately, all other data in order of time. Older
+    /// data precedes a datagram, so a writer's last samples count before its disposal is read. If a
+    /// flood leaves records in one ring, the other ring waits for it; otherwise a writer's records
+    /// and captured datagrams would be out of order and look like losses.
     pub fn poll(&mut self, clocks: &Clocks, observer: &mut Observer) {
         let recorded = self.take_records();
         let fresh = clocks.monotonic.saturating_sub(FRESH_NANOSECONDS);
@@ -97,7 +97,7 @@ impl FilterReader {
             .advance(now, |report| observer.input(Input::Zenoh(report)));
     }
 
-    /// Passes everything that still waits to the model, at the end.
+    /// Passes all buffered data to the model at the end.
     pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
         self.take_records();
         self.take_datagrams(clocks, u64::MAX, observer);
@@ -117,7 +117,7 @@ impl FilterReader {
         &mut self.filter
     }
 
-    /// Returns the buffer in which records wait for their turn.
+    /// Returns the buffer that restores the order of records.
     pub const fn order_mut(&mut self) -> &mut ReorderBuffer {
         &mut self.order
     }
@@ -153,7 +153,8 @@ impl FilterReader {
         fresh + self.pieces.bytes()
     }
 
-    /// Reads one round of records; returns the time up to which all were read.
+    /// Reads one round of records. Returns the time of the latest one if the ring may have more,
+    /// else `u64::MAX`.
     fn take_records(&mut self) -> u64 {
         self.order
             .take_records(&mut self.filter, &mut self.copied_bytes)
@@ -167,8 +168,8 @@ impl FilterReader {
         }
     }
 
-    /// Reads datagrams up to `before` in the kernel's clock. Returns the time up to which all were
-    /// read if that is earlier, else `u64::MAX`.
+    /// Reads datagrams up to `before` in the kernel's clock. Returns the time of the newest piece
+    /// read if the ring may have more, else `u64::MAX`.
     fn take_datagrams(&mut self, clocks: &Clocks, before: u64, observer: &mut Observer) -> u64 {
         while let Some((piece, bytes)) = self.fresh.pop_front_if(|(piece, _)| piece.time <= before)
         {
@@ -178,7 +179,7 @@ impl FilterReader {
         }
         let mut newest = 0;
         for _ in 0..PIECES_PER_ROUND {
-            // Every remaining datagram is younger.
+            // Every remaining datagram is newer than those in the queue.
             if self.fresh.is_full() {
                 return u64::MAX;
             }
@@ -221,16 +222,16 @@ impl FilterReader {
                 }
                 continue;
             }
-            // Queued after those that wait: overtaking them would let a sample count by duplicate
-            // fragments whose bytes are still in the ring.
+            // This datagram waits behind the queued ones. Overtaking them would let a sample count
+            // by duplicate fragments whose bytes are still in the ring.
             self.fresh.push_back((piece, bytes.into_owned()));
         }
         newest
     }
 }
 
-/// Passes records and segments up to `until` to the model, at most this many; returns whether that
-/// was all.
+/// Passes at most `most` records and segments up to time `until` to the model. Returns whether none
+/// is left.
 fn deliver(
     (order, streams): (&mut ReorderBuffer, &mut Streams),
     clocks: &Clocks,
@@ -250,7 +251,7 @@ fn deliver(
     false
 }
 
-/// Reads a segment of Zenoh, and passes what it completes to the model.
+/// Reads a segment of Zenoh, and passes the messages that it completes to the model.
 fn read_segment(streams: &mut Streams, segment: &Segment, observer: &mut Observer) {
     streams.chunk(&segment.chunk(), |report| {
         observer.input(Input::Zenoh(report));

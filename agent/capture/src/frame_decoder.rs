@@ -1,8 +1,7 @@
-//! Feeds the model with captured frames: frames to datagrams to the observer, in the frames' own
-//! time.
+//! Decodes captured frames into datagrams, and passes them to the model in the time of the frames.
 //!
-//! The live source reads its frames from the ring itself. Nothing here waits; a replay at a given
-//! speed waits between packets.
+//! The live source reads its frames from the ring itself. The decoder never waits; a replay at a
+//! given speed waits between packets.
 
 use ros2probe_model::observe::input::Input;
 use ros2probe_wire::Timestamp;
@@ -34,10 +33,10 @@ impl FrameDecoder {
         }
     }
 
-    /// Replays the rest of a capture without pauses, and settles the model.
+    /// Replays the rest of a capture without pauses, and ends the model's input.
     ///
     /// # Errors
-    /// Fails if the capture cannot be read further; the packets before that count.
+    /// Fails if the capture cannot be read further; the packets before the error count.
     pub fn run(
         &mut self,
         reader: &mut PcapReader,

@@ -45,7 +45,7 @@ pub enum FollowError {
 /// The observed sockets, and the memory for them.
 #[derive(Clone, Debug)]
 pub struct HostTapSettings {
-    /// Only sockets of this control group and below; `None` = all.
+    /// Control group that is observed, with the groups below it; `None` = all sockets.
     pub cgroup: Option<PathBuf>,
     /// Bytes of the ring for captured datagrams.
     pub ring_bytes: usize,
@@ -65,7 +65,7 @@ pub struct HostTap {
 }
 
 impl HostTap {
-    /// Attaches the hook. Every datagram after the return is seen.
+    /// Attaches the hook. Every datagram after this call is seen.
     ///
     /// # Errors
     /// Fails if a capability is missing, or if the kernel or the machine lacks a requirement.
@@ -85,7 +85,7 @@ impl HostTap {
             let reason = in_words(error);
             tracing::warn!(reason, "connections of Zenoh are not observed");
         }
-        // First, so that no loss behind the hook is missed.
+        // The tracepoints come first, so that no loss behind the hook is missed.
         filter.attach_tracepoints(cgroup.is_whole_host());
         filter.attach(cgroup.directory())?;
         filter.settle();
@@ -102,7 +102,7 @@ impl HostTap {
     }
 
     /// Starts following the control group: the hook is attached again if the group is recreated.
-    /// The topmost group always exists.
+    /// The topmost group is not followed, because it always exists.
     ///
     /// # Errors
     /// Fails if its thread cannot be started.
@@ -130,7 +130,7 @@ impl HostTap {
         self.reattach.as_ref()?.stalled()
     }
 
-    /// Returns how often the hook was attached to another control group since the start.
+    /// Returns the number of attachments to another control group since the start.
     #[must_use]
     pub fn attached_anew(&self) -> u64 {
         self.reattach.as_ref().map_or(0, Reattach::attached_anew)
@@ -148,7 +148,7 @@ impl HostTap {
         self.cgroup.is_whole_host()
     }
 
-    /// Returns the losses behind the hook that this kernel can attribute; `None` if no tracepoint
+    /// Returns which losses behind the hook this kernel can attribute; `None` if no tracepoint
     /// program is attached.
     #[must_use]
     pub fn abilities(&self) -> Option<&Abilities> {
@@ -167,7 +167,7 @@ impl HostTap {
             .follow(self.reader.filter(), clocks.monotonic, observer);
     }
 
-    /// Passes everything that still waits to the model, at the end.
+    /// Passes all buffered data to the model at the end.
     pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
         self.reader.drain(clocks, observer);
     }
@@ -183,7 +183,7 @@ impl HostTap {
         self.reader.filter_mut()
     }
 
-    /// Returns the buffer in which records wait for their turn.
+    /// Returns the buffer that restores the order of records.
     pub const fn order_mut(&mut self) -> &mut ReorderBuffer {
         self.reader.order_mut()
     }

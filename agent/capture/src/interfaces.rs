@@ -1,7 +1,7 @@
 //! The interfaces of a network namespace: lists them, reports changes, and selects those that the
 //! configuration includes.
 //!
-//! Uses rtnetlink (`man 7 rtnetlink`). It changes nothing there and sends nothing to the network.
+//! It uses rtnetlink (`man 7 rtnetlink`), changes no interface, and sends nothing to the network.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -14,10 +14,10 @@ use globset::{Glob, GlobSet, GlobSetBuilder};
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_wire::{Cursor, Endianness, WireError};
 
-/// Longest message of the kernel for one interface.
+/// Maximum size of a kernel message about one interface, in bytes.
 const BUFFER: usize = 64 << 10;
 const IFLA_IFNAME: u16 = 3;
-/// Attempts to read a list that changes while the kernel writes it.
+/// Maximum number of attempts to read a list that changes while the kernel writes it.
 const MOST_ATTEMPTS: u32 = 5;
 
 /// One interface.
@@ -36,9 +36,9 @@ pub struct Interface {
 /// What happened to an interface.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Change {
-    /// It appeared, was renamed, went up or down.
+    /// The interface appeared, was renamed, or went up or down.
     Present(Interface),
-    /// It was deleted or moved to another namespace.
+    /// The interface was deleted or moved to another namespace.
     Gone(Interface),
 }
 
@@ -112,7 +112,7 @@ impl Interfaces {
     /// Returns the changes since the last call. Does not wait.
     ///
     /// # Errors
-    /// Fails if the kernel does; known interfaces stay known.
+    /// Fails if the kernel reports an error; known interfaces stay known.
     pub fn changes(&mut self) -> Result<Vec<Change>, InterfacesError> {
         let mut changes = Vec::new();
         if self.drain(&mut changes)? {
@@ -383,14 +383,14 @@ fn listen() -> Result<OwnedFd, InterfacesError> {
         source: io::Error::last_os_error(),
     };
     let kind = libc::SOCK_RAW | libc::SOCK_CLOEXEC | libc::SOCK_NONBLOCK;
-    // SAFETY: takes no pointers.
+    // SAFETY: the call takes no pointers.
     let fd = unsafe { libc::socket(libc::AF_NETLINK, kind, libc::NETLINK_ROUTE) };
     if fd < 0 {
         return Err(failed("socket(NETLINK_ROUTE)"));
     }
-    // SAFETY: a new descriptor without another owner.
+    // SAFETY: the descriptor is new and has no other owner.
     let socket = unsafe { OwnedFd::from_raw_fd(fd) };
-    // SAFETY: a struct of integers, for which zeros are a value.
+    // SAFETY: the struct has only integers, for which 0 is valid.
     let mut address: libc::sockaddr_nl = unsafe { std::mem::zeroed() };
     address.nl_family = libc::AF_NETLINK as libc::sa_family_t;
     address.nl_groups = libc::RTMGRP_LINK as u32;
@@ -433,7 +433,7 @@ mod tests {
     }
 
     #[test]
-    fn interfaces_are_listed_and_followed() {
+    fn interfaces_are_listed_and_their_changes_are_reported() {
         in_new_namespace(|| {
             let mut interfaces = Interfaces::open().unwrap();
             let lo = interfaces.by_index(1).unwrap().clone();
@@ -476,7 +476,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bridge_port_that_leaves_its_bridge_is_still_there() {
+    fn a_bridge_port_that_leaves_its_bridge_stays_known() {
         in_new_namespace(|| {
             let mut interfaces = Interfaces::open().unwrap();
             ip("link add port type veth peer name far");
@@ -517,7 +517,7 @@ mod tests {
     fn a_flood_of_changes_ends_in_the_right_list() {
         in_new_namespace(|| {
             let mut interfaces = Interfaces::open().unwrap();
-            // Far more than the socket's buffer holds while it is not read.
+            // These are far more messages than the buffer of an unread socket holds.
             let commands: String = (0..400)
                 .flat_map(|number| {
                     [
@@ -548,7 +548,7 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_answer_is_an_error_at_worst() {
+    fn a_malformed_answer_never_causes_a_panic() {
         let mut bytes = Vec::new();
         for (kind, attribute) in [
             (libc::RTM_NEWLINK, &b"\x09\0\x03\0lo\0\0\0\0\0\0"[..]),

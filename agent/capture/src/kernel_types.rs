@@ -1,16 +1,16 @@
-//! Layout of the running kernel's types: offsets of members, values of enumerators. Read from BTF
-//! (Documentation/bpf/btf.rst) in `/sys/kernel/btf/vmlinux`.
+//! Layout of the running kernel's types: offsets of members, values of enumerators. They are read
+//! from BTF (Documentation/bpf/btf.rst) in `/sys/kernel/btf/vmlinux`.
 //!
-//! It only finds offsets, sizes and enumerators. The file is the kernel's own; still every read
-//! is bounded and unreadable content is an error. Kernels differ, so the caller handles missing
-//! members.
+//! The module only finds offsets, sizes and enumerators. Although the kernel provides the file,
+//! every read is bounded, and unreadable content is an error. Kernels differ, so the caller handles
+//! missing members.
 
 use std::io;
 
 /// File with the kernel's types.
 const PATH: &str = "/sys/kernel/btf/vmlinux";
 const MAGIC: u32 = 0xeb9f;
-/// Nesting depth of anonymous structures and unions that a search enters.
+/// Maximum nesting depth of anonymous structures and unions that a search enters.
 const DEPTH: u32 = 8;
 
 /// Kinds of types.
@@ -93,12 +93,12 @@ impl KernelTypes {
     /// Reads the types of the running kernel.
     ///
     /// # Errors
-    /// Fails if the kernel provides none, or in a malformed file.
+    /// Fails if the kernel provides no types, or if the file is malformed.
     pub fn read() -> Result<Self, KernelTypesError> {
         Self::parse(std::fs::read(PATH).map_err(KernelTypesError::Unreadable)?)
     }
 
-    /// Parses the bytes of such a file.
+    /// Parses the bytes of a BTF file.
     ///
     /// # Errors
     /// Returns [`KernelTypesError::Malformed`] if they are malformed.
@@ -132,8 +132,8 @@ impl KernelTypes {
         })
     }
 
-    /// Returns the byte offset of a member in `structure`. Dots lead into members:
-    /// `__sk_common.skc_cookie`. `None` if the member does not exist or is a bit field.
+    /// Returns the byte offset of a member in `structure`. Dots separate nested members:
+    /// `__sk_common.skc_cookie`. Returns `None` if the member does not exist or is a bit field.
     #[must_use]
     pub fn offset(&self, structure: &str, member: &str) -> Option<u32> {
         self.named(structure, &[kind::STRUCT, kind::UNION])
@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_cut_anywhere_or_changed_anywhere_never_panics() {
+    fn a_truncated_or_corrupted_file_never_causes_a_panic() {
         let whole = types();
         for end in 0..whole.len() {
             assert!(KernelTypes::parse(whole[..end].to_vec()).is_err(), "{end}");
@@ -340,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn an_anonymous_type_that_contains_itself_is_left() {
+    fn an_anonymous_type_that_contains_itself_ends_the_search() {
         let mut bytes = types();
         // The union's only member has the union's own type.
         let header = 24;

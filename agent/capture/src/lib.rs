@@ -1,14 +1,14 @@
-//! Sources of the model: datagrams, records of the kernel programs, facts about sockets.
+//! Capture: passes datagrams, records of the kernel programs, and facts about sockets to the model.
 //!
 //! - [`live::LiveSource`] observes this host: at the sockets of a control group ([`host_tap`]), on
 //!   interfaces ([`wire_tap`]), in shared memory of Fast DDS ([`shm`], or with uprobes [`uprobe`]).
 //! - [`pcap::PcapReader`] reads a capture, and [`frame_decoder::FrameDecoder`] passes its packets
 //!   to the model.
 //!
-//! This crate contains all `unsafe` code of user space: rings, maps, `ptrace`-like reads of other
-//! processes. A source changes, delays and drops nothing that it observes, and sends nothing. The
-//! caller passes a function that starts threads ([`threads::Spawn`]), so that sources do not depend
-//! on privileges.
+//! This crate contains `unsafe` code for rings, maps and `ptrace`-like reads of other processes. A
+//! source changes, delays and drops nothing that it observes, and sends nothing. The caller passes
+//! a function that starts threads ([`threads::Spawn`]), so that sources do not depend on
+//! privileges.
 //!
 //! ```no_run
 //! use std::path::Path;

@@ -1,8 +1,8 @@
 //! This host's traffic, read from its taps and passed to the model in capture order.
 //!
-//! Observes sockets if the kernel and the configuration allow it, otherwise interfaces with a tap
-//! per namespace; or both, for interfaces with traffic that no socket receives. Nothing is ever
-//! sent.
+//! The source observes sockets if the kernel and the configuration allow it, otherwise interfaces
+//! with one tap per namespace. It observes both if configured interfaces have traffic that no
+//! socket receives. It sends nothing.
 
 mod open;
 
@@ -40,21 +40,23 @@ use open::{open_exact, open_host, open_inside, open_wires, scope};
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{Observer, Wanted};
 
-/// Capture budget of all unclassified writers per second: enough for a dozen nodes that start at
-/// once, and a bound for a storm of forged writers.
+/// Capture budget of all unknown writers, in bytes per second. It suffices for a dozen nodes that
+/// start simultaneously, and bounds a storm of forged writers.
 const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
-/// Refilled in small portions: a storm during a delay of this process then leaves most of the
-/// record ring to known writers.
+/// Record budget of all unknown writers per tenth of a second. Because refills are small, a storm
+/// during a delay of this process leaves most of the record ring to known writers.
 const UNKNOWN_RECORDS_PER_TENTH: u32 = 410;
-/// Most of these portions at once: a fifth of a ring of the default size.
+/// Maximum number of tenths per refill: a fifth of a ring of the default size.
 const UNKNOWN_PORTIONS: u64 = 4;
-/// How long captures of the host hook are collected: a starting node announces its endpoints one
+/// Time for which captures of the host hook accumulate: a starting node announces its endpoints one
 /// by one, and each round costs CPU time.
 const GATHER: Duration = Duration::from_millis(10);
-/// The same while whole samples are captured: a point cloud fills the ring in a few milliseconds.
+/// Shorter time while whole samples are captured: a point cloud fills the ring in a few
+/// milliseconds.
 const GATHER_PAYLOADS: Duration = Duration::from_millis(2);
 const TENTH: u64 = SECOND / 10;
-/// Longer than any wait for packets.
+/// Time between two rounds that indicates a delay of this process; longer than any wait for
+/// packets.
 const HELD_UP: u64 = 2 * SECOND;
 
 /// Why capturing cannot start or continue.
@@ -93,16 +95,16 @@ pub struct LiveSource {
     inside: Option<Inside>,
     /// Why processes are not observed from inside although that is configured.
     without_inside: Option<String>,
-    /// When the budget of unclassified writers was last refilled.
+    /// Time of the last refill of the byte budget of unknown writers.
     bytes_refilled: u64,
     records_refilled: u64,
-    /// When the model last reported its interest in shared memory.
+    /// Time when the model's requests for shared memory were last passed on.
     wanted_asked: u64,
-    /// Whether the requests may have changed since.
+    /// Whether the last round did not pass the requests on, so that a change may wait.
     wanted_waits: bool,
-    /// When the programs' times of participants were last read for a lease.
+    /// Time when the participants' last messages were last read from the programs, for a lease.
     heard: u64,
-    /// How often the host hook had been attached to a recreated control group.
+    /// Number of attachments to a recreated control group at the last report.
     attached_anew: u64,
     refused_updates: u64,
     clock: Timestamp,
@@ -169,7 +171,7 @@ impl fmt::Display for Stalled {
 pub struct InterfaceCount {
     /// Network namespace as configured; `None` = the agent's own.
     pub namespace: Option<PathBuf>,
-    /// Interface name, or its index if it went away before it was known.
+    /// Interface name; its index if the interface disappeared before the name was known.
     pub name: String,
     /// Frames that passed the filter.
     pub packets: u64,
@@ -335,7 +337,8 @@ impl LiveSource {
         let ready = wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
         let woken = ready.is_some_and(|first| first >= rings) && began.elapsed() < timeout;
         if (self.host.is_some() || self.exact.is_some()) && woken {
-            // Packets arrive in bursts. After a timeout some have had time to accumulate.
+            // Packets arrive in bursts. After a timeout, packets have already had time to
+            // accumulate.
             std::thread::sleep(if observer.wants_payloads() {
                 GATHER_PAYLOADS
             } else {
@@ -383,8 +386,8 @@ impl LiveSource {
         self.apply_wanted(clocks.monotonic, observer);
         self.clock = Timestamp(clocks.now.0.saturating_sub(settle));
         self.report_view(held_up, observer);
-        // Any message renews a lease. If this process did not read for long, its rings may have
-        // been too small for the announcements.
+        // Any message renews a lease. If this process did not read its rings for a long time, the
+        // announcements may not have fit.
         let clock = self.clock;
         let ends = observer.next_expiry().is_some_and(|end| end <= clock);
         let is_due = clocks.monotonic.wrapping_sub(self.heard) >= TENTH;
@@ -397,8 +400,8 @@ impl LiveSource {
         Ok(())
     }
 
-    /// Reports that the traffic is seen from now on, after a time in which it was not, or not all:
-    /// this process or the machine was stopped, or the control group was removed.
+    /// Reports that observation begins again after a gap: this process or the machine was stopped,
+    /// or the control group was removed.
     fn report_view(&mut self, held_up: bool, observer: &mut Observer) {
         let attached_anew = self.attached_anew();
         let is_new = std::mem::replace(&mut self.attached_anew, attached_anew) != attached_anew;
@@ -432,14 +435,14 @@ impl LiveSource {
         }
     }
 
-    /// Passes the model's requests for shared memory to its readers now. Returns whether the programs
-    /// that read every sample are still being attached for them.
+    /// Passes the model's requests for shared memory to its readers immediately. Returns whether
+    /// the programs that read every sample are still being attached.
     pub fn is_attaching(&self, observer: &Observer) -> bool {
         self.want(observer);
         self.exact.as_ref().is_some_and(Uprobe::is_attaching)
     }
 
-    /// Passes everything that still waits to the model, at the end.
+    /// Passes all buffered data to the model at the end.
     pub fn drain(&mut self, observer: &mut Observer) {
         let clocks = Clocks::read();
         self.take_polled(&clocks, observer);
@@ -454,8 +457,8 @@ impl LiveSource {
         }
     }
 
-    /// Passes what was polled in shared memory to the model, or to a buffer: polling may miss a
-    /// sample that uprobes or sockets see, and the next one must not overtake it.
+    /// Passes samples polled in shared memory to the model, or to a buffer. Polling may miss a
+    /// sample that uprobes or sockets see, and a later polled sample must not overtake it.
     fn take_polled(&mut self, clocks: &Clocks, observer: &mut Observer) {
         if let Shm::Running(shared_memory) = &self.shared_memory {
             let exact = self.exact.as_mut().and_then(Uprobe::order_mut);
@@ -464,8 +467,8 @@ impl LiveSource {
         }
     }
 
-    /// Updates the kernel programs' interest maps. Entries that do not fit stay unclassified and
-    /// are counted.
+    /// Updates the kernel programs' interest maps. Endpoints that do not fit stay unknown and are
+    /// counted.
     pub fn apply(&mut self, changes: &[(Guid, Option<Verdict>)]) {
         for (endpoint, verdict) in changes {
             self.each_filter(|filter| filter.set_interest(*endpoint, *verdict));
@@ -475,7 +478,7 @@ impl LiveSource {
         }
     }
 
-    /// Starts or stops noting the time of a participant's last message.
+    /// Starts or stops recording the time of a participant's last message.
     pub fn follow(&mut self, participant: GuidPrefix, follow: bool) {
         self.each_filter(|filter| filter.follow_participant(participant, follow));
     }
@@ -487,7 +490,7 @@ impl LiveSource {
         self.refused_updates + interfaces
     }
 
-    /// Returns the time up to which every capture has been passed to the model.
+    /// Returns the time before which all captured data has been passed to the model.
     #[must_use]
     pub const fn clock(&self) -> Timestamp {
         self.clock
@@ -516,7 +519,7 @@ impl LiveSource {
         })
     }
 
-    /// Returns frames dropped by the kernel, by namespace.
+    /// Returns the number of frames that the kernel dropped in each namespace.
     ///
     /// # Errors
     /// Fails if the kernel's statistics cannot be read.
@@ -533,7 +536,7 @@ impl LiveSource {
             .collect()
     }
 
-    /// Returns the kernel programs' counters, summed.
+    /// Returns the kernel programs' counters, summed over all filters.
     ///
     /// # Errors
     /// Fails if the kernel's counters cannot be read.
@@ -580,13 +583,14 @@ impl LiveSource {
         self.wires.iter().map(WireTap::reassembly_evicted).sum()
     }
 
-    /// Returns the tables of connections of Zenoh: one of the sockets, and one of each namespace.
+    /// Iterates over the tables of Zenoh connections: one for the sockets, and one for each
+    /// namespace.
     pub fn streams(&self) -> impl Iterator<Item = &Streams> {
         let host = self.host.iter().map(|host| host.reader().streams());
         host.chain(self.wires.iter().map(WireTap::streams))
     }
 
-    /// Returns the report of the shared-memory tap, if it exists.
+    /// Returns facts about the shared-memory tap, if it runs.
     #[must_use]
     pub fn shared_memory(&self) -> Option<shm::Facts> {
         match &self.shared_memory {
@@ -601,8 +605,8 @@ impl LiveSource {
         !matches!(self.shared_memory, Shm::Off)
     }
 
-    /// Returns the probes attached to processes that send into shared memory, if they are
-    /// configured and available.
+    /// Returns facts about the probes in processes that send through shared memory; `None` if
+    /// probes are not configured or not available.
     #[must_use]
     pub fn exact(&self) -> Option<UprobeFacts> {
         self.exact.as_ref().map(Uprobe::facts)
@@ -622,16 +626,16 @@ impl LiveSource {
         self.without_exact.as_deref()
     }
 
-    /// Returns which observed object is gone, as a sentence; `None` if all exist. Nothing is seen
-    /// there.
+    /// Returns a sentence about an observed object that no longer exists and yields no data; `None`
+    /// if all exist.
     #[must_use]
     pub fn gone(&self) -> Option<String> {
         let cgroup = self.host.as_ref().and_then(HostTap::detached);
         cgroup.or_else(|| self.wires.iter().find_map(WireTap::gone))
     }
 
-    /// Returns what is not observed yet after the start, as a sentence; `None` if all is. Processes
-    /// that ran before the agent may use a library that is still to be attached to.
+    /// Returns a sentence about what is not observed yet after the start; `None` if everything is
+    /// observed. Processes that started before the agent may use a library that has no probes yet.
     #[must_use]
     pub fn pending(&self) -> Option<String> {
         let exact = self.exact.as_ref().map(|exact| exact.facts().has_inspected);
@@ -644,7 +648,8 @@ impl LiveSource {
         ))
     }
 
-    /// Returns the threads that make no progress: a file or a call of the kernel does not answer.
+    /// Iterates over the parts whose threads make no progress: a file or a system call does not
+    /// return.
     pub fn stalled(&self) -> impl Iterator<Item = Stalled> {
         let shared_memory = match &self.shared_memory {
             Shm::Running(shared_memory) => shared_memory.stalled(),
@@ -663,14 +668,14 @@ impl LiveSource {
         stalled.filter_map(|(part, time)| time.map(|time| Stalled { part, time }))
     }
 
-    /// Returns how often the host hook was attached to a recreated control group.
+    /// Returns the number of attachments of the host hook to a recreated control group.
     #[must_use]
     pub fn attached_anew(&self) -> u64 {
         self.host.as_ref().map_or(0, HostTap::attached_anew)
     }
 
     /// Switches to sampling of shared memory: the programs identify their control group by a
-    /// number, which a recreated group does not have.
+    /// number, and a recreated group has another one.
     fn leave_exact_mode(&mut self, clocks: &Clocks, observer: &mut Observer) {
         if self.attached_anew() > 0
             && let Some(mut exact) = self.exact.take()

@@ -1,4 +1,4 @@
-//! Notices which processes map a library, at that moment.
+//! Detects processes that map a library, when they map it.
 //!
 //! The kernel writes a record for each executable mapping of every process into a ring for each CPU
 //! (`PERF_RECORD_MMAP`, perf_event_open(2)). The broker opens the events, which needs CAP_PERFMON;
@@ -16,7 +16,7 @@ use ros2probe_attach::client::{Broker, BrokerError};
 
 use crate::error_chain::in_words;
 
-/// Pause after mappings of other files: a machine that starts programs without end costs little.
+/// Pause after mappings of other files. It bounds the cost on a machine that starts many programs.
 pub const UNCONCERNED: Duration = Duration::from_millis(2);
 
 /// Pages of records in each ring, a power of two: some 250 mappings, about two starts of a node.
@@ -29,7 +29,7 @@ const MAPPED: u32 = 1;
 const LOST: u32 = 2;
 /// Bytes of a record before the name of the mapped file: the header, two ids, three numbers.
 const BEFORE_NAME: usize = 40;
-/// Most bytes of a record: its length has 16 bits.
+/// Maximum size of a record, in bytes: its length has 16 bits.
 const MAX_RECORD: usize = u16::MAX as usize;
 
 /// The rings of all CPUs.
@@ -38,7 +38,7 @@ pub struct MappingEvents {
     record: Vec<u8>,
 }
 
-/// Why mappings are not noticed.
+/// Why mappings cannot be detected.
 #[derive(Debug, thiserror::Error)]
 pub enum MappingError {
     /// The broker does not open the events.
@@ -54,7 +54,7 @@ pub enum MappingError {
 pub struct NewMappings {
     /// Ids of the processes.
     pub processes: BTreeSet<u32>,
-    /// Whether the kernel had no room for some records, so that processes may be missing.
+    /// Whether the kernel lost records because a ring was full, so that processes may be missing.
     pub is_incomplete: bool,
 }
 
@@ -71,8 +71,8 @@ impl MappingEvents {
         })
     }
 
-    /// Opens the rings for the configuration key `key`. Without them, its thread finds a library at
-    /// its next round.
+    /// Opens the rings for the configuration key `key`. Without them, the thread of that key finds
+    /// a library only in its next round.
     #[must_use]
     pub fn open_or_warn(key: &str, broker: &mut Broker) -> Option<Self> {
         let opened = Self::open(broker);
@@ -86,12 +86,12 @@ impl MappingEvents {
         opened.ok()
     }
 
-    /// Returns descriptors that are readable when a process mapped a file.
+    /// Returns descriptors that are readable when a process has mapped a file.
     pub fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
         self.rings.iter().map(|ring| ring.event.as_fd())
     }
 
-    /// Takes all records. `is_library`: whether a file of this name is of interest.
+    /// Takes all records. `is_library` decides by its name whether a file is of interest.
     pub fn take(&mut self, is_library: impl Fn(&str) -> bool) -> NewMappings {
         let mut new = NewMappings::default();
         for ring in &self.rings {
@@ -109,12 +109,12 @@ impl MappingEvents {
 struct Ring {
     event: OwnedFd,
     start: NonNull<u8>,
-    /// Bytes of a page, and of all records.
+    /// Sizes in bytes of a page, and of all pages of records.
     page: usize,
     size: usize,
 }
 
-// SAFETY: the mapping is owned, and accessed only through this value; it is bound to no thread.
+// SAFETY: the mapping is owned, and accessed only through this value; it belongs to no thread.
 unsafe impl Send for Ring {}
 
 impl Ring {
@@ -145,7 +145,8 @@ impl Ring {
         })
     }
 
-    /// Passes the type and the bytes of each new record, and frees its place.
+    /// Passes the type and the bytes of each new record to `with`, and frees the space of the
+    /// record.
     fn take(&self, record: &mut Vec<u8>, mut with: impl FnMut(u32, &[u8])) {
         let head = self.position(HEAD).load(Ordering::Acquire);
         let mut tail = self.position(TAIL).load(Ordering::Relaxed);
@@ -157,19 +158,19 @@ impl Ring {
             record.resize(usize::from(length).min(MAX_RECORD), 0);
             self.copy(tail, record);
             with(kind, record);
-            // A length of 0 would never end.
+            // A record of length 0 would cause an endless loop.
             tail += u64::from(length).max(8);
         }
         self.position(TAIL).store(tail, Ordering::Release);
     }
 
-    /// Copies bytes that the kernel has written and not yet been given back.
+    /// Copies bytes that the kernel has written and that have not been freed yet.
     fn copy(&self, from: u64, into: &mut [u8]) {
         let size = self.size as u64;
         for (offset, byte) in (from..).zip(into) {
             let place = self.page + usize::try_from(offset % size).unwrap_or(0);
             let place = self.start.as_ptr().wrapping_add(place);
-            // SAFETY: the place is in the mapping, after its first page. The kernel writes only
+            // SAFETY: the address is in the mapping, after its first page. The kernel writes only
             // after the head.
             *byte = unsafe { place.read() };
         }
@@ -178,15 +179,15 @@ impl Ring {
     /// Returns one of the positions in the first page.
     fn position(&self, offset: usize) -> &AtomicU64 {
         let place = self.start.as_ptr().wrapping_add(offset).cast();
-        // SAFETY: both are in the first page, aligned to eight bytes, and changed by the kernel and
-        // by this value only, as the protocol prescribes.
+        // SAFETY: both positions are in the first page, and aligned to eight bytes. Only the kernel
+        // and this value change them, as the protocol prescribes.
         unsafe { AtomicU64::from_ptr(place) }
     }
 }
 
 impl Drop for Ring {
     fn drop(&mut self) {
-        // SAFETY: mapped by `open` with this length, and no borrow of it is left.
+        // SAFETY: `new` mapped this length, and no borrow of the mapping is left.
         unsafe { libc::munmap(self.start.as_ptr().cast(), self.page + self.size) };
     }
 }
@@ -196,7 +197,7 @@ fn process(record: &[u8], is_library: impl Fn(&str) -> bool) -> Option<u32> {
     let process = record.get(8..12)?.try_into().ok().map(u32::from_ne_bytes)?;
     let path = record.get(BEFORE_NAME..)?.split(|byte| *byte == 0).next()?;
     let name = path.rsplit(|byte| *byte == b'/').next()?;
-    // The kernel gives no id to a process outside of the agent's PID namespace.
+    // A record has no id for a process outside of the broker's PID namespace.
     let is_known = process != 0 && process != u32::MAX;
     (is_known && is_library(std::str::from_utf8(name).ok()?)).then_some(process)
 }
@@ -209,7 +210,7 @@ mod tests {
     use crate::system::wait;
 
     #[test]
-    fn a_record_that_is_cut_off_names_no_process() {
+    fn a_truncated_record_yields_no_process() {
         let mut record = [0; 64];
         record[8..12].copy_from_slice(&7_u32.to_ne_bytes());
         record[BEFORE_NAME..BEFORE_NAME + 9].copy_from_slice(b"/l/lib.so");
@@ -223,12 +224,12 @@ mod tests {
     }
 
     #[test]
-    fn a_process_that_maps_a_library_is_noticed_at_once_and_others_are_not() {
+    fn a_process_that_maps_a_library_is_reported_and_others_are_not() {
         let mut events = MappingEvents::open(&mut Broker::here())
             .expect("records of all processes need root: run the tests with sudo");
         let is_library = |name: &str| name.starts_with("libc.so") || name.starts_with("libc-");
         events.take(is_library);
-        // More starts than a ring has room for.
+        // These are more starts than fit a ring.
         for _ in 0..50 {
             let mut child = std::process::Command::new("true").spawn().unwrap();
             let began = Instant::now();

@@ -62,14 +62,14 @@ pub fn within<T: Send>(path: &Path, work: impl FnOnce() -> T + Send) -> Result<T
     })
 }
 
-/// Moves the calling thread permanently.
+/// Moves the calling thread into the namespace permanently.
 fn enter(path: &Path) -> Result<(), NetnsError> {
     let open = |source| NetnsError::Open {
         path: path.to_path_buf(),
         source,
     };
     let namespace = File::open(path).map_err(open)?;
-    // SAFETY: takes no pointers; the descriptor is open. Only this thread is moved.
+    // SAFETY: the call takes no pointers, and the descriptor is open. Only this thread moves.
     if unsafe { libc::setns(namespace.as_raw_fd(), libc::CLONE_NEWNET) } == 0 {
         return Ok(());
     }
@@ -92,7 +92,7 @@ pub(crate) mod tests {
     pub(crate) fn in_new_namespace(test: impl FnOnce() + Send) {
         thread::scope(|scope| {
             let thread = scope.spawn(|| {
-                // SAFETY: takes no pointers; only this thread is moved.
+                // SAFETY: the call takes no pointers, and only this thread moves.
                 let result = unsafe { libc::unshare(libc::CLONE_NEWNET) };
                 assert_eq!(
                     result,
@@ -118,9 +118,9 @@ pub(crate) mod tests {
         assert!(output.status.success(), "ip {arguments}: {output:?}");
     }
 
-    /// Path of the calling thread's namespace.
+    /// Returns the path of the calling thread's namespace.
     fn current() -> PathBuf {
-        // SAFETY: takes no pointers.
+        // SAFETY: the call takes no pointers.
         let thread = unsafe { libc::gettid() };
         PathBuf::from(format!("/proc/{}/task/{thread}/ns/net", std::process::id()))
     }
@@ -143,7 +143,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn mistakes_name_the_path() {
+    fn an_error_names_the_path_of_the_namespace() {
         let missing = within(Path::new("/run/netns/no-such-robot"), || ()).unwrap_err();
         assert_eq!(
             missing.to_string(),
@@ -154,7 +154,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_panic_there_is_an_error_here() {
+    fn a_panic_in_the_other_namespace_becomes_an_error() {
         let result = within(&current(), || panic!("on purpose"));
         assert!(matches!(
             result,

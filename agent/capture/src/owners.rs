@@ -1,7 +1,7 @@
 //! Maps sockets to the processes that hold them.
 //!
-//! Reads all open sockets of all processes at once from the kernel (an iterator over open files,
-//! Linux 5.8). It reads nothing under `/proc` and enters no process. The iterator reports only
+//! One run of a kernel iterator over open files (Linux 5.8) reports the open sockets of all
+//! processes. It reads nothing under `/proc` and enters no process. The iterator reports only
 //! sockets with a cookie, and only requested ones are kept.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -16,7 +16,7 @@ use zerocopy::FromBytes;
 
 use crate::bpf;
 
-/// Most bytes of one run: some 20,000 sockets.
+/// Maximum size of the output of one run, in bytes: some 20,000 sockets.
 const LIMIT: u64 = 1 << 20;
 /// `BPF_TRACE_ITER` of `linux/bpf.h`.
 const TRACE_ITER: u32 = 28;
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn only_wanted_sockets_are_kept_and_the_first_holder_of_a_shared_one() {
+    fn only_requested_sockets_are_kept_with_the_first_holder_of_each() {
         let found = [socket(1, 10), socket(2, 20), socket(2, 21), socket(3, 30)];
         let owners = read(found.as_bytes(), &BTreeSet::from([2, 3, 4]));
         let listed: Vec<_> = owners
@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn drops_are_reported_where_the_kernel_counts_them() {
+    fn drops_are_reported_if_the_kernel_counts_them() {
         let known = host::Owner {
             drops: 7,
             drops_known: 1,
@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn an_entry_that_was_cut_is_left() {
+    fn a_truncated_entry_is_ignored() {
         let found = [socket(1, 10), socket(2, 20)];
         let bytes = found.as_bytes();
         let cut = &bytes[..bytes.len() - 1];

@@ -2,11 +2,11 @@
 //! pcapng, plain or gzipped.
 //!
 //! A capture is as untrusted as its network. Lengths in the file are checked against a cap, and
-//! memory grows with bytes read, never with bytes announced. If the rest of a file is damaged, the
-//! packets before it are delivered and counted. The crate `pcap-file` is not used because it
-//! allocates by block length.
+//! memory grows with the bytes read, never with a length in the file. If the rest of a file is
+//! damaged, the packets before it are delivered and counted. The crate `pcap-file` is not used
+//! because it allocates by block length.
 //!
-//! The reader knows no clock; [`Pacer`] follows the capture's pace.
+//! The reader has no clock; [`Pacer`] computes the waits of a replay.
 
 mod gunzip;
 mod next_generation;
@@ -25,7 +25,8 @@ use gunzip::Gunzip;
 use next_generation::Section;
 pub use pace::{Pacer, Speed};
 
-/// tcpdump's largest snapshot length; no network frame is longer.
+/// Maximum size of a packet, in bytes: tcpdump's largest snapshot length. No network frame is
+/// longer.
 const LONGEST_PACKET: u32 = 262_144;
 const GZIP_MAGIC: [u8; 2] = [0x1f, 0x8b];
 
@@ -88,16 +89,16 @@ pub enum PcapError {
         link_name(*link)
     )]
     UnsupportedLink {
-        /// Link layer of its packets.
+        /// Link layer of the packets.
         link: Link,
     },
-    /// Neither pcap nor pcapng.
+    /// The file is neither pcap nor pcapng.
     #[error("not a capture: it begins with {0:02x?}, which is neither pcap nor pcapng")]
     NotACapture([u8; 4]),
     /// Reading failed (disk, damaged gzip stream).
     #[error("cannot read the capture beyond packet {packets}")]
     Read {
-        /// Packets delivered before.
+        /// Number of packets delivered before the error.
         packets: u64,
         /// Error of the system or the decompressor.
         source: io::Error,
@@ -105,7 +106,7 @@ pub enum PcapError {
     /// The file ends inside a header or a packet.
     #[error("the capture is cut off: it ends inside a {what} after packet {packets}")]
     Truncated {
-        /// Packets delivered before.
+        /// Number of packets delivered before the error.
         packets: u64,
         /// The item that was being read.
         what: &'static str,
@@ -113,19 +114,19 @@ pub enum PcapError {
     /// A length exceeds its limit.
     #[error("a {what} of {length} bytes after packet {packets} exceeds the limit of {limit}")]
     TooLong {
-        /// Packets delivered before.
+        /// Number of packets delivered before the error.
         packets: u64,
         /// The item that was being read.
         what: &'static str,
         /// Length in the file.
         length: u32,
-        /// Largest accepted length.
+        /// Maximum accepted length.
         limit: u32,
     },
     /// The file contradicts itself.
     #[error("the capture is damaged after packet {packets}: {what}")]
     Malformed {
-        /// Packets delivered before.
+        /// Number of packets delivered before the error.
         packets: u64,
         /// Description of the contradiction.
         what: &'static str,
@@ -221,7 +222,7 @@ impl PcapReader {
         self.packets
     }
 
-    /// Returns the link layer of all packets; `None` in pcapng, which has one per interface.
+    /// Returns the link layer of all packets; `None` in pcapng, where each interface has its own.
     #[must_use]
     pub const fn link(&self) -> Option<Link> {
         match &self.format {
@@ -240,8 +241,8 @@ impl PcapReader {
         }
     }
 
-    /// Returns the next packet, or `None` at the end. Not an iterator, because packets borrow the
-    /// buffer.
+    /// Returns the next packet, or `None` at the end. The reader is not an iterator, because
+    /// packets borrow the buffer.
     ///
     /// # Errors
     /// Fails if the rest of the file cannot be read. After an error the reader is at its end.
@@ -358,7 +359,7 @@ pub fn link_name(link: Link) -> String {
 }
 
 /// Returns the link layer without the upper half of the field, which describes frame check
-/// sequences: the IP length cuts those off.
+/// sequences: the length in the IP header excludes them.
 fn link_of(field: u32) -> Link {
     let [.., high, low] = field.to_be_bytes();
     Link(u16::from_be_bytes([high, low]))
@@ -421,8 +422,8 @@ fn read_exactly(
     Ok(())
 }
 
-/// Maps a read error. A truncated gzip stream has its own kind of error, but is an early end like
-/// any other.
+/// Maps a read error. A truncated gzip stream has its own kind of error, but counts as an early end
+/// like any other.
 fn failed(source: io::Error, what: &'static str, packets: u64) -> PcapError {
     if source.kind() == io::ErrorKind::UnexpectedEof {
         PcapError::Truncated { packets, what }

@@ -1,8 +1,8 @@
 //! Assembles captured datagrams that the host hook delivers in pieces.
 //!
-//! Pieces of one datagram arrive in order, with others between them. If the rest of a datagram is
-//! missing, the ring was full: the datagram is discarded and counted. Bounded in number, and so in
-//! bytes. Contents are not interpreted.
+//! Pieces of one datagram arrive in order, with pieces of others between them. If later pieces are
+//! missing, the ring was full: the datagram is discarded and counted. The number of incomplete
+//! datagrams is bounded, and therefore their bytes. Contents are not interpreted.
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
@@ -12,18 +12,19 @@ use ros2probe_wire::host::{PIECE_BYTES, Piece};
 
 use crate::tables::{FreshDatagrams, OpenPieces};
 
-/// A program writes all pieces within microseconds, unless it loses its CPU.
+/// Lifetime of an incomplete datagram. A program writes all pieces within microseconds, unless it
+/// loses its CPU.
 const LIFETIME_NANOSECONDS: u64 = 1_000_000_000;
-/// Buffers are freed after this long without a datagram in several pieces.
+/// Time without a datagram in several pieces after which buffers are freed.
 const KEPT_NANOSECONDS: u64 = 10_000_000_000;
 
-/// Incomplete datagrams, the oldest first: those of programs that run at the same time, and those
-/// whose rest is lost.
+/// Incomplete datagrams, the oldest first: datagrams that several CPUs write at the same time, and
+/// datagrams with lost pieces.
 #[derive(Debug, Default)]
 pub struct PieceAssembler {
     open: Bounded<OpenPieces, VecDeque<Open>>,
     given_up: u64,
-    /// Empty buffers. In new ones, the kernel would have to clear each page.
+    /// Empty buffers for reuse. In a new buffer, the kernel would have to clear each page.
     spare: Vec<Vec<u8>>,
     /// Time of the latest datagram in several pieces, in the kernel's clock.
     used: u64,
@@ -50,7 +51,7 @@ impl PieceAssembler {
             .iter()
             .position(|open| open.first.datagram == piece.datagram);
         if piece.offset == 0 {
-            // The token is in use again: the rest of the other datagram is lost.
+            // The token is reused, so the remaining pieces of the other datagram are lost.
             self.give_up(open);
             if !fits {
                 self.given_up += 1;
@@ -110,7 +111,7 @@ impl PieceAssembler {
         self.given_up
     }
 
-    /// Returns the bytes of incomplete datagrams, and those kept for others.
+    /// Returns the bytes of incomplete datagrams, and of buffers for reuse.
     #[must_use]
     pub fn bytes(&self) -> usize {
         let open: usize = self.open.iter().map(|open| open.bytes.len()).sum();
@@ -152,7 +153,7 @@ mod tests {
         }
     }
 
-    /// Content in which adjacent bytes of a datagram differ.
+    /// Returns content in which adjacent bytes of a datagram differ.
     fn content(datagram: u32, offset: u32, len: u32) -> Vec<u8> {
         (offset..offset + len)
             .map(|at| (at * 7 + at / 256 + datagram) as u8)
@@ -179,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn the_largest_datagrams_of_two_cpus_come_whole_when_their_pieces_mingle() {
+    fn interleaved_pieces_of_two_cpus_yield_both_datagrams_whole() {
         let mut wholes = PieceAssembler::default();
         let (one, two) = (pieces(1, 65_507), pieces(2, 65_507));
         assert_eq!(one.len(), 4);
@@ -209,13 +210,13 @@ mod tests {
         assert_eq!(wholes.given_up(), 1);
         wholes.advance(LIFETIME_NANOSECONDS + 1);
         assert_eq!((wholes.bytes(), wholes.given_up()), (0, 2));
-        // A rest that arrives later is ignored.
+        // A piece that arrives later is ignored.
         assert!(wholes.piece(&all[1].0, &all[1].1).is_none());
         assert_eq!(wholes.given_up(), 2);
     }
 
     #[test]
-    fn a_token_that_comes_again_begins_anew() {
+    fn a_reused_token_starts_a_new_datagram() {
         let mut wholes = PieceAssembler::default();
         let (old, new) = (pieces(1, 40_000), pieces(1, 20_000));
         assert!(wholes.piece(&old[0].0, &old[0].1).is_none());
@@ -226,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn more_than_there_is_room_for_push_out_the_oldest() {
+    fn datagrams_beyond_the_cap_evict_the_oldest_one() {
         let mut wholes = PieceAssembler::default();
         for token in 0..1000 {
             let all = pieces(token, 65_507);
@@ -238,7 +239,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_pieces_yield_only_true_datagrams(
+        fn arbitrary_pieces_yield_only_datagrams_with_correct_content(
             sequence in proptest::collection::vec(
                 (0_u32..3, 0_u32..5, 0_u32..4, 0_u32..3),
                 0..60,

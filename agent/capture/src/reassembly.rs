@@ -1,13 +1,13 @@
 //! Reassembles UDP datagrams from IP fragments.
 //!
-//! Memory holds bytes that arrived, never bytes that were announced. Flows and bytes are capped,
-//! and the oldest flow is evicted first. A finished datagram is remembered for a while, so that a
-//! duplicate fragment does not open it again. Fragments never wait longer than in the receiving
-//! kernel.
+//! Memory holds bytes that arrived; a length in a header allocates nothing. Flows and bytes are
+//! capped, and the oldest flow is evicted first. A finished datagram is remembered for a while, so
+//! that a duplicate fragment does not open it again. Fragments never wait longer than in the
+//! receiving kernel.
 //!
 //! The kernel filter walks fragmented datagrams itself. If it cannot continue, it hands the
 //! datagram over: it reports the next submessage and captures only the remaining fragments. Such a
-//! datagram is complete when everything from there to its end has arrived.
+//! datagram is complete when everything from that submessage to the end has arrived.
 
 mod flow;
 
@@ -27,16 +27,16 @@ const UDP_HEADER: u32 = 8;
 /// Limits of memory and time.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Limits {
-    /// Bytes of all unfinished datagrams together, bookkeeping included.
+    /// Maximum bytes of all unfinished datagrams together, bookkeeping included.
     pub bytes: usize,
-    /// Unfinished datagrams.
+    /// Maximum number of unfinished datagrams.
     pub flows: usize,
-    /// Nanoseconds an unfinished datagram is kept. Linux: `ipfrag_time`, 30 s.
+    /// Nanoseconds for which an unfinished datagram is kept. Linux: `ipfrag_time`, 30 s.
     pub timeout: u64,
-    /// Finished datagrams remembered.
+    /// Maximum number of finished datagrams that are remembered.
     pub remembered: usize,
-    /// Nanoseconds a finished datagram is remembered. Duplicates arrive within milliseconds, while
-    /// a busy sender reuses an IPv4 identification after seconds.
+    /// Nanoseconds for which a finished datagram is remembered. Duplicates arrive within
+    /// milliseconds, while a busy sender reuses an IPv4 identification after seconds.
     pub remember: u64,
 }
 
@@ -52,15 +52,15 @@ impl Default for Limits {
     }
 }
 
-/// Key shared by the fragments of one datagram. They take the same path, so a copy on another
-/// interface or in the other direction is another flow.
+/// Key shared by the fragments of one datagram. All of them take the same path, so a copy on
+/// another interface or in the other direction belongs to another flow.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct FlowKey {
     /// Number of the source (network namespace, capture) that saw them.
     pub namespace: u32,
     /// Index of the interface; 0 when unknown.
     pub interface: u32,
-    /// Sent by this host.
+    /// Whether this host sent the datagram.
     pub outgoing: bool,
     /// Source address, IPv4-mapped for IPv4.
     pub source: [u8; 16],
@@ -97,7 +97,7 @@ impl Reassembled {
     /// Returns the bytes held.
     #[must_use]
     pub fn held(&self) -> usize {
-        // A new list does not compile until it is listed here.
+        // A new field does not compile until this pattern names it.
         let Self {
             transport,
             handover: _,
@@ -231,8 +231,8 @@ impl Reassembly {
             Placed::Nothing => self.counters.duplicate += 1,
             Placed::Contradiction => {
                 self.counters.contradictory += 1;
-                // The identification is in use again, and the rest of the old datagram is lost. The
-                // kernel filter has just seen a handed-over datagram itself: that one stays.
+                // The identification is reused, and the remaining fragments of the old datagram are
+                // lost. A handed-over datagram stays, because the kernel filter has just seen it.
                 if !handed_over {
                     self.close(&key);
                     let flow = self.open(at, key)?;
@@ -310,7 +310,8 @@ impl Reassembly {
         self.order.first_key_value().map(|(_, key)| *key)
     }
 
-    /// Returns the flow of this key; creates it if needed, evicting the oldest one.
+    /// Returns the flow of this key, and creates it if needed. At the cap, the oldest flow is
+    /// evicted.
     fn open(&mut self, at: Timestamp, key: FlowKey) -> Option<&mut Flow> {
         if !self.flows.contains_key(&key) {
             if self.flows.is_full()
@@ -335,7 +336,8 @@ impl Reassembly {
         Some(flow)
     }
 
-    /// Returns the datagram of the flow if it is complete, and otherwise makes room.
+    /// Returns the datagram of the flow if it is complete. Otherwise evicts the oldest flows until
+    /// the bytes are within the cap.
     fn finish(&mut self, key: FlowKey) -> Option<Reassembled> {
         let complete = self.flows.get(&key)?.complete();
         if complete.is_none() {
@@ -379,8 +381,8 @@ fn handed_over(flow: &Flow, transport: Vec<u8>, record: &Record) -> Reassembled 
     }
 }
 
-/// Returns `None` if the UDP header is unreadable or claims more bytes than exist: no socket
-/// received it.
+/// Returns `None` if the UDP header is unreadable or its length exceeds the bytes that exist: no
+/// socket received such a datagram.
 fn whole(flow: &Flow, mut transport: Vec<u8>, total: u32) -> Option<Reassembled> {
     let mut cursor = Cursor::new(&transport, Endianness::Big);
     let source_port = cursor.u16("UDP source port").ok()?;

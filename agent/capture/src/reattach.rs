@@ -1,9 +1,9 @@
 //! Follows the control group at the configured path. The kernel detaches the host hook from a
 //! removed group; a group recreated at the path gets the hook again.
 //!
-//! Runs in its own thread: attaching takes `CAP_NET_ADMIN`, which no other thread keeps. The
-//! thread's system call filter allows creating links as the only use of it. It creates and changes
-//! no control group.
+//! The work runs in a separate thread: attaching takes `CAP_NET_ADMIN`, which no other thread
+//! keeps. The thread's system call filter allows the creation of links as the only use of that
+//! capability. The thread creates and changes no control group.
 
 use std::fs::{self, File};
 use std::io::{self, PipeReader, PipeWriter};
@@ -23,14 +23,14 @@ use crate::threads::{Progress, Spawn, Task};
 
 /// Interval of checks while the directory above the group is not watched.
 const EVERY: Duration = Duration::from_secs(1);
-/// The same while it is: a group that appears there or goes is noticed at once. Only the removal or
-/// the mount of a directory further up waits so long.
+/// Interval of checks while it is watched: inotify reports a group that appears there or is
+/// removed. Only the removal or the mount of a directory further up waits for a check.
 const EVERY_WATCHED: Duration = Duration::from_secs(10);
 
 /// Device and inode of a directory, unique per control group.
 pub type Identity = (u64, u64);
 
-/// Handle of the thread, which ends when this is dropped.
+/// Handle of the thread, which ends when the handle is dropped.
 pub struct Reattach {
     shared: Arc<Shared>,
     /// Closed to end the thread.
@@ -42,7 +42,7 @@ pub struct Reattach {
 struct Shared {
     /// Why the hook is not attached.
     detached: Mutex<Option<String>>,
-    /// How often the hook was attached again.
+    /// Number of times that the hook was attached again.
     attached_anew: AtomicU64,
     progress: Progress,
 }
@@ -50,7 +50,7 @@ struct Shared {
 /// State of the thread.
 struct Follow {
     path: PathBuf,
-    /// The group with the hook; `None` = none.
+    /// The group with the hook; `None` = the hook is not attached.
     attached: Option<Identity>,
     links: Links,
     /// The links; dropping them detaches the hook.
@@ -106,7 +106,7 @@ impl Reattach {
         self.shared.progress.stalled()
     }
 
-    /// Returns how often the hook was attached to another group since the start.
+    /// Returns the number of attachments to another group since the start.
     #[must_use]
     pub fn attached_anew(&self) -> u64 {
         self.shared.attached_anew.load(Ordering::Acquire)
@@ -116,11 +116,11 @@ impl Reattach {
 impl Drop for Reattach {
     fn drop(&mut self) {
         self.end = None;
-        // A stalled thread is left to the end of the process.
+        // A stalled thread is not joined: it ends with the process.
         if let Some(thread) = self.thread.take()
             && self.shared.progress.stalled().is_none()
         {
-            // The thread has ended in any case; its result is not needed.
+            // The result of the thread is not needed.
             let _ = thread.join();
         }
     }

@@ -2,18 +2,19 @@
 //!
 //! Records come from the kernel program's ring or, for a datagram captured whole, from the walk
 //! over its bytes; either path may be faster. A retransmission must not overtake the gap that it
-//! fills, since it would count as a sample that was never missing. So every record waits until both
-//! paths have had their time. The buffer decides nothing and knows no writer.
+//! fills, since it would count as a sample that was never missing. Therefore every record waits
+//! until records of both paths must have arrived. The buffer decides nothing and knows no writer.
 //!
-//! A full socket buffer is reported after its datagram but must be counted before it: such records
-//! precede all records of their time or later. For a captured datagram the kernel reports only the
-//! token. The datagram's records are then passed twice, first as not delivered.
+//! The kernel reports a full socket buffer after the datagram, but the model must count it before.
+//! Records of full socket buffers therefore precede all records of the same or a later time. For a
+//! captured datagram the kernel reports only the token. The datagram's records are then passed
+//! twice, first as not delivered.
 //!
-//! Records from polling shared memory wait here, too: a uprobe or a socket may see samples that
-//! polling misses. A message is polled after it was sent, so its own record comes first.
+//! Records from polling shared memory also wait here: a uprobe or a socket may see samples that
+//! polling misses. A message is polled after it was sent, so the record of its sending comes first.
 //!
-//! Segments of Zenoh wait with the records, since the model's clock is that of the records. Their
-//! content is read at their turn.
+//! Segments of Zenoh wait with the records, because the model's clock follows the records. Their
+//! content is read when they leave the buffer.
 
 use std::collections::{HashSet, VecDeque};
 
@@ -32,11 +33,11 @@ use crate::tables::{
     PolledRecords, SegmentBytes, UndeliveredDatagrams, WaitingRecords, WalkedRecords,
 };
 
-/// Capacity for records that is kept while none wait; memory beyond it is freed after a burst.
+/// Maximum capacity that an empty queue keeps. A larger queue is freed after a burst.
 const KEPT: usize = 512;
-/// Most records read per round: several rings of the default size.
+/// Maximum number of records read per round: several rings of the default size.
 const RECORDS_PER_ROUND: usize = 32_768;
-/// How much later than the report of its drop a captured datagram may be read.
+/// Maximum delay of a captured datagram after the report of its drop.
 const LATE_NANOSECONDS: u64 = 1_000_000_000;
 
 /// The records of one tap.
@@ -65,7 +66,7 @@ struct Walked {
     at: u64,
     /// The record, with its time in the wall clock.
     record: Record,
-    /// Whether it was already passed as not delivered.
+    /// Whether the record was already passed as not delivered.
     no_room_reported: bool,
 }
 
@@ -81,13 +82,13 @@ pub struct Segment {
 /// The next record or segment in order, with its time in the wall clock.
 #[derive(Debug)]
 pub enum Next {
-    /// Written by the kernel program.
+    /// A record written by the kernel program.
     Kernel(Record),
-    /// Found in a captured datagram.
+    /// A record found in a captured datagram.
     Walked(Record),
-    /// Polled in shared memory.
+    /// A record polled in shared memory.
     Polled(Record),
-    /// Of a connection of Zenoh.
+    /// A segment of a connection of Zenoh.
     Segment(Segment),
 }
 
@@ -108,8 +109,9 @@ impl Segment {
 
 impl ReorderBuffer {
     /// Takes records from the kernel's ring, at most one round: a flood may refill the ring as fast
-    /// as it is emptied. Records without room stay in the ring. Returns the time up to which all
-    /// records were read, `u64::MAX` if none is left. Adds the bytes read to `copied_bytes`.
+    /// as it is emptied. Records stay in the ring while the buffer is full. Returns the time of the
+    /// latest record if the ring may have more, else `u64::MAX`. Adds the bytes read to
+    /// `copied_bytes`.
     pub fn take_records(&mut self, filter: &mut Filter, copied_bytes: &mut u64) -> u64 {
         for _ in 0..RECORDS_PER_ROUND {
             if self.is_full() {
@@ -147,8 +149,8 @@ impl ReorderBuffer {
         bounded::note::<WaitingRecords>(self.waiting());
     }
 
-    /// Accepts a record of a captured datagram, with its time in the wall clock and the same time
-    /// in the kernel's clock as `at`; returns it if too many wait.
+    /// Accepts a record of a captured datagram, with its time in the wall clock. `at` is the same
+    /// time in the kernel's clock. Returns the record if too many wait.
     #[must_use]
     pub fn walked(&mut self, at: u64, record: Record) -> Option<Record> {
         let left = self.walked.push_back(Walked {
@@ -159,16 +161,16 @@ impl ReorderBuffer {
         left.map(|walked| walked.record)
     }
 
-    /// Accepts a record of a polled message, with its time in the wall clock and the same time in
-    /// the kernel's clock as `at`; returns it if too many wait.
+    /// Accepts a record of a polled message, with its time in the wall clock. `at` is the same time
+    /// in the kernel's clock. Returns the record if too many wait.
     #[must_use]
     pub fn polled(&mut self, at: u64, record: Record) -> Option<Record> {
         let left = self.polled.push_back((at, record));
         left.map(|(_, record)| record)
     }
 
-    /// Accepts a segment of Zenoh, with its time in the wall clock and the same time in the kernel's
-    /// clock as `at`. The caller then reads the segments of [`Self::excess_segment`].
+    /// Accepts a segment of Zenoh, with its time in the wall clock. `at` is the same time in the
+    /// kernel's clock. The caller then reads the segments of [`Self::excess_segment`].
     pub fn segment(&mut self, at: u64, chunk: &Chunk<'_>) {
         let segment = Segment {
             at,
@@ -191,9 +193,9 @@ impl ReorderBuffer {
         Some(segment)
     }
 
-    /// Passes the announcements in a captured datagram to the model. The datagram's records of user
-    /// data wait for their turn; `at` is its time in the kernel's clock. `complete` adds to each
-    /// record what the bytes do not contain.
+    /// Passes the announcements in a captured datagram to the model. Its records of user data wait
+    /// in this buffer; `at` is the time of the datagram in the kernel's clock. `complete` adds
+    /// facts to each record that the bytes do not contain.
     pub fn datagram(
         &mut self,
         at: u64,
@@ -211,7 +213,7 @@ impl ReorderBuffer {
         });
     }
 
-    /// As [`Self::datagram`], for a message that was polled in shared memory.
+    /// Does the same as [`Self::datagram`] for a message that was polled in shared memory.
     pub fn polled_message(
         &mut self,
         at: u64,
@@ -233,13 +235,13 @@ impl ReorderBuffer {
         self.kernel.len() + self.socket_full.len()
     }
 
-    /// Returns whether there is no room for further records of the kernel's ring.
+    /// Returns whether the buffer accepts no further records of the kernel's ring.
     fn is_full(&self) -> bool {
         self.waiting() >= WaitingRecords::CAP
     }
 
-    /// Removes and returns the oldest record or segment, if it is not younger than `until` in the kernel's
-    /// clock.
+    /// Removes and returns the oldest record or segment, unless it is younger than `until` in the
+    /// kernel's clock.
     pub fn next(&mut self, clocks: &Clocks, until: u64) -> Option<Next> {
         let kernel = self.kernel.front().map(|record| record.time);
         let walked = self.walked.front().map(|walked| walked.at);
@@ -311,7 +313,7 @@ impl ReorderBuffer {
         }
     }
 
-    /// Forgets reports older than a second before `until`, whose records have arrived.
+    /// Forgets reports from more than a second before `until`: their records have arrived.
     fn forget_undelivered(&mut self, until: u64) {
         let before = until.saturating_sub(LATE_NANOSECONDS);
         while let Some((_, token)) = self.undelivered.pop_front_if(|(at, _)| *at < before) {
@@ -382,7 +384,7 @@ mod tests {
         }
     }
 
-    /// A captured record with its time in the kernel's clock.
+    /// Returns a captured record with its time in the kernel's clock.
     fn captured(number: u64, milliseconds: u64) -> (u64, Record) {
         let clocks = clocks(milliseconds);
         let record = Record {
@@ -396,7 +398,7 @@ mod tests {
         assert!(order.walked(at, record).is_none());
     }
 
-    /// Sequence numbers, negative for records of a full socket buffer.
+    /// Returns the sequence numbers of due records, negative for records of a full socket buffer.
     fn numbers(order: &mut ReorderBuffer, clocks: &Clocks) -> Vec<i64> {
         std::iter::from_fn(|| order.next(clocks, clocks.monotonic.saturating_sub(SETTLE)))
             .map(|next| {
@@ -416,8 +418,8 @@ mod tests {
     #[test]
     fn a_retransmission_in_a_captured_frame_does_not_overtake_the_gap_it_fills() {
         let mut order = ReorderBuffer::default();
-        // 10 was lost; it is retransmitted in a frame that user space reads before the record of
-        // 11.
+        // Sample 10 was lost. It is retransmitted in a frame that user space reads before the
+        // record of sample 11.
         walked(&mut order, captured(10, 30));
         order.kernel(of_the_kernel(9, 1));
         order.kernel(of_the_kernel(11, 20));
@@ -428,7 +430,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_buffer_is_reported_before_the_records_of_its_time_and_later() {
+    fn a_full_socket_buffer_is_reported_before_records_of_the_same_or_a_later_time() {
         let mut order = ReorderBuffer::default();
         order.kernel(of_the_kernel(1, 5));
         order.kernel(of_the_kernel(2, 10));
@@ -438,7 +440,7 @@ mod tests {
         order.kernel(socket_full(2, 10));
         walked(&mut order, captured(4, 12));
         assert_eq!(numbers(&mut order, &clocks(200)), [1, -2, 2, -3, 3, 4]);
-        // The arrival waits in a run and has the time of the last fragment.
+        // The record of the arrival waits in a run and has the time of the last fragment.
         order.kernel(socket_full(7, 300));
         order.kernel(of_the_kernel(6, 299));
         order.kernel(of_the_kernel(7, 320));
@@ -447,7 +449,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_of_a_captured_datagram_are_first_reported_as_not_delivered() {
+    fn samples_of_an_undelivered_datagram_are_first_reported_as_not_delivered() {
         for pieces_first in [true, false] {
             let mut order = ReorderBuffer::default();
             let heartbeat = |(at, record)| {
@@ -488,9 +490,9 @@ mod tests {
     }
 
     #[test]
-    fn a_polled_message_overtakes_none_that_its_sender_was_seen_to_send_before() {
+    fn a_polled_message_does_not_overtake_earlier_messages_of_its_sender() {
         let mut order = ReorderBuffer::default();
-        // 199 and 200 are read at once, 171 and 198 pass the ring.
+        // Samples 199 and 200 are polled in one round; 171 and 198 arrive through the ring.
         for (number, at) in [(170, 1), (199, 40), (200, 44)] {
             let (at, record) = captured(number, at);
             assert!(order.polled(at, record).is_none());
@@ -503,7 +505,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_was_set_holds_nothing_up() {
+    fn a_step_of_the_wall_clock_delays_no_record() {
         let mut order = ReorderBuffer::default();
         let (_, back) = captured(1, 3_600_000);
         let at = clocks(10).monotonic_of(Timestamp(back.time));
@@ -543,7 +545,7 @@ mod tests {
     }
 
     #[test]
-    fn segments_of_zenoh_are_not_ahead_of_records() {
+    fn zenoh_segments_and_records_leave_the_buffer_in_order_of_time() {
         let mut order = ReorderBuffer::default();
         for (number, milliseconds) in [(1, 10), (2, 30), (3, 110)] {
             let (at, chunk) = segment(number, milliseconds, b"four");
@@ -572,7 +574,7 @@ mod tests {
     }
 
     #[test]
-    fn segments_beyond_the_cap_are_passed_on_before_their_turn_in_their_order() {
+    fn segments_beyond_the_byte_cap_are_passed_on_early_and_in_order() {
         let mut order = ReorderBuffer::default();
         let bytes = vec![0; 10_000];
         let mut early = Vec::new();
@@ -599,7 +601,7 @@ mod tests {
     }
 
     #[test]
-    fn large_segments_behind_small_ones_stay_within_the_bytes() {
+    fn large_segments_after_small_ones_stay_within_the_byte_cap() {
         let mut order = ReorderBuffer::default();
         let large = vec![0; 60_000];
         for number in 0..100_000 {
@@ -629,7 +631,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_reports_of_a_full_socket_buffer_make_room() {
+    fn reports_of_full_socket_buffers_beyond_the_cap_evict_the_oldest() {
         let mut order = ReorderBuffer::default();
         for datagram in 0..100_000 {
             order.kernel(undelivered(datagram, 1));

@@ -25,13 +25,13 @@ use turns::Turns;
 pub use block::{Frames, RingFrame};
 pub use turns::Block;
 
-/// TPACKET_V3 requires a frame size too, but packs frames tightly.
+/// Frame size for TPACKET_V3, which requires one but packs frames tightly.
 const NOMINAL_FRAME: usize = 2048;
-/// Bytes of a block. The largest frame, a 64 KiB datagram on loopback, fits with its header and the
-/// block's. A block changes hands when it is full or [`Settings::retire`] old, so the number of
-/// blocks limits how long the reader may be delayed: many small blocks are better.
+/// Size of a block, in bytes. The largest frame, a 64 KiB datagram on loopback, fits with its
+/// header and the block's. The kernel releases a block when it is full or [`Settings::retire`] old,
+/// so the number of blocks limits the delay of the reader. Many small blocks are therefore better.
 const BLOCK: usize = 128 << 10;
-/// Default memory of a ring.
+/// Default size of a ring, in bytes.
 const MEMORY: usize = 4 << 20;
 /// Pause between polls of a socket that repeatedly reports an error.
 const ERROR_PAUSE: Duration = Duration::from_millis(10);
@@ -69,7 +69,7 @@ impl Settings {
 /// The kernel's counters of this socket.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
 pub struct Statistics {
-    /// Frames that passed the filter, including those dropped for lack of room.
+    /// Frames that passed the filter, including those dropped for lack of space.
     pub packets: u64,
     /// Frames dropped because every block waited for the reader.
     pub drops: u64,
@@ -168,9 +168,9 @@ impl Ring {
             "PACKET_RX_RING",
         )?;
         let memory = Mapping::new(&socket, block_size * settings.blocks)?;
-        // SAFETY: as many blocks are mapped from the start of a page, in whole pages each, until
-        // the mapping is dropped; `turns` is dropped before it. The other side is the kernel, which
-        // follows the TPACKET_V3 protocol.
+        // SAFETY: the mapping holds this many blocks of whole pages, and starts at a page. `turns`
+        // is dropped before the mapping. The other side is the kernel, which follows the TPACKET_V3
+        // protocol.
         let turns = unsafe { Turns::new(memory.start.cast(), block_size, settings.blocks) };
         let ring = Self {
             turns,
@@ -222,7 +222,7 @@ impl Ring {
         if poll.revents & !libc::POLLIN != 0 {
             self.statistics.socket_errors += 1;
             let mut pending: c_int = 0;
-            // Reading the error clears it; otherwise poll would return at once forever.
+            // Reading the error clears it; otherwise every poll would return immediately.
             get(
                 &self.socket,
                 libc::SOL_SOCKET,
@@ -275,7 +275,7 @@ struct Mapping {
     length: usize,
 }
 
-// SAFETY: the mapping is owned, and accessed only through the ring that owns it; it is bound to no
+// SAFETY: the mapping is owned, and accessed only through the ring that owns it; it belongs to no
 // thread.
 unsafe impl Send for Mapping {}
 
@@ -303,7 +303,7 @@ impl Mapping {
 
 impl Drop for Mapping {
     fn drop(&mut self) {
-        // SAFETY: mapped by `new` with this length, and no borrow of it is left.
+        // SAFETY: `new` mapped this length, and no borrow of the mapping is left.
         unsafe { libc::munmap(self.start.as_ptr(), self.length) };
     }
 }
@@ -315,8 +315,8 @@ fn page_bytes() -> Option<usize> {
     usize::try_from(unsafe { libc::sysconf(libc::_SC_PAGESIZE) }).ok()
 }
 
-/// Returns the kernel's request for the ring in blocks of whole pages, and the size of its blocks.
-/// `None` if the numbers overflow.
+/// Returns the request to the kernel for a ring in blocks of whole pages, and the size of a block.
+/// Returns `None` if the numbers overflow.
 fn request(settings: Settings, page: usize) -> Option<(libc::tpacket_req3, usize)> {
     let block_size = settings.block_size.max(1).checked_next_multiple_of(page)?;
     let length = block_size.checked_mul(settings.blocks)?;
@@ -340,12 +340,12 @@ fn request(settings: Settings, page: usize) -> Option<(libc::tpacket_req3, usize
 /// Creates a socket with protocol 0, which receives nothing until it is bound.
 fn create() -> Result<OwnedFd, RingError> {
     let kind = libc::SOCK_DGRAM | libc::SOCK_CLOEXEC | libc::SOCK_NONBLOCK;
-    // SAFETY: takes no pointers.
+    // SAFETY: the call takes no pointers.
     let fd = unsafe { libc::socket(libc::AF_PACKET, kind, 0) };
     if fd < 0 {
         return Err(last("socket(AF_PACKET)"));
     }
-    // SAFETY: a new descriptor without another owner.
+    // SAFETY: the descriptor is new and has no other owner.
     Ok(unsafe { OwnedFd::from_raw_fd(fd) })
 }
 

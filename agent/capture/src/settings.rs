@@ -8,25 +8,25 @@ use serde::Deserialize;
 /// Packet sources and their memory.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CaptureSettings {
-    /// At the sockets of this host, or on the wire.
+    /// Whether packets are captured at the sockets of this host or on interfaces.
     pub source: SourceChoice,
-    /// Only sockets of this cgroup; `None` = the whole host.
+    /// Cgroup whose sockets are observed; `None` = the whole host.
     pub cgroup: Option<PathBuf>,
-    /// Interface globs that are observed in addition to the host's sockets.
+    /// Globs of interfaces that are observed in addition to the host's sockets.
     pub mirror_interfaces: Vec<String>,
-    /// Interface globs to observe; empty = all.
+    /// Globs of observed interfaces; empty = all.
     pub include_interfaces: Vec<String>,
-    /// Interface globs that are never observed.
+    /// Globs of interfaces that are never observed.
     pub exclude_interfaces: Vec<String>,
-    /// Further network namespaces.
+    /// Further network namespaces to observe.
     pub network_namespaces: Vec<PathBuf>,
-    /// Packet ring of each network namespace.
+    /// Size of the packet ring of each network namespace.
     pub ring_bytes: usize,
-    /// Ring for measurement records.
+    /// Size of the ring for measurement records.
     pub record_ring_bytes: usize,
-    /// Settings of shared memory.
+    /// Settings for shared memory.
     pub shm: ShmSettings,
-    /// What is observed inside processes.
+    /// Observation inside processes.
     pub inside: InsideChoice,
     /// Socket of the process that attaches breakpoints, if one listens there.
     pub broker: PathBuf,
@@ -53,13 +53,13 @@ pub enum InsideChoice {
 /// How shared memory is observed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ShmSettings {
-    /// Whether it is observed.
+    /// Whether shared memory is observed.
     pub mode: ShmMode,
     /// Whether every message is read in the process that sends it.
     pub exact: ExactChoice,
-    /// Share of one CPU for it, in percent.
+    /// Share of one CPU for reading shared memory, in percent.
     pub cpu_percent: f64,
-    /// The same while single samples are delivered.
+    /// Share of one CPU while every sample is delivered, in percent.
     pub reading_cpu_percent: f64,
 }
 
@@ -102,7 +102,7 @@ pub enum SourceChoice {
 }
 
 impl SourceChoice {
-    /// As written in the file.
+    /// Returns the name of the choice in the configuration file.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {

@@ -1,8 +1,8 @@
 //! The sockets seen by the host hook: the processes that hold them, their control groups, and their
-//! unattributed drops. Passed to the model when something changes.
+//! unattributed drops. Changes are passed to the model.
 //!
-//! Queries rarely: visiting all open files of the host is expensive. Keeps at most as many sockets
-//! as the hook remembers.
+//! Queries are rare, because visiting all open files of the host is expensive. The table has at
+//! most as many sockets as the hook remembers.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -18,13 +18,13 @@ use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Observer;
 use ros2probe_model::report::snapshot::SocketFacts;
 
-/// Interval of looking for new sockets: every second round of an idle agent.
+/// Interval of searches for new sockets: every second round of an idle agent.
 const PERIOD: u64 = 19 * SECOND / 10;
-/// Least interval while a connection of Zenoh begins, which may last for less than a second.
+/// Minimum interval while a connection of Zenoh begins, which may last for less than a second.
 const SOON: u64 = SECOND / 10;
-/// Interval of reading all owners again: sockets are closed, and count their drops.
+/// Interval of reading all owners again, because sockets are closed and their drops increase.
 const ALL_PERIOD: u64 = 15 * SECOND;
-/// Most queries for the owner of a socket that was not found.
+/// Maximum number of queries for an owner that was not found.
 const MOST_QUESTIONS: u8 = 3;
 
 /// State of all sockets.
@@ -40,10 +40,10 @@ pub struct Sockets {
 #[derive(Debug, Default)]
 struct Known {
     owner: Option<Owner>,
-    /// Drops before the socket was known, attributed or not.
+    /// Unattributed drops when the socket's owner was first found.
     dropped_before: Option<u64>,
     questions: u8,
-    /// Value at the last report to the model.
+    /// Value of the hook's counter at the last report to the model.
     rcvbuf_errors: u64,
     reported: Option<SocketFacts>,
 }
@@ -61,7 +61,7 @@ impl Sockets {
         }
     }
 
-    /// Queries if it is due, and passes changes to the model.
+    /// Queries the kernel if a query is due, and passes changes to the model.
     pub fn follow(&mut self, filter: &Filter, now: u64, observer: &mut Observer) {
         let is_awaited = observer.awaits_holders();
         let interval = if is_awaited { SOON } else { PERIOD };
@@ -110,7 +110,7 @@ impl Sockets {
         });
     }
 
-    /// Returns all owners, if a query is worthwhile.
+    /// Returns the owners of all sockets; `None` if no query is due or the query fails.
     fn owners(
         &mut self,
         inside: Option<&Tracepoints>,
@@ -235,13 +235,13 @@ mod tests {
         assert_eq!(look(&mut all, 100, 0), 0);
         assert_eq!(look(&mut all, 110, 10), 0);
         assert_eq!(look(&mut all, 125, 20), 5);
-        // Attributed since the counter was read.
+        // Further drops were attributed after the owner's counter was read.
         assert_eq!(drops(&all, 40), 0);
         assert_eq!(look(&mut all, 125, 20), 5);
     }
 
     #[test]
-    fn segments_that_tcp_drops_are_no_datagrams() {
+    fn segments_that_tcp_drops_do_not_count_as_datagrams() {
         let socket = Socket {
             is_stream: 1,
             ..Socket::default()
@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn a_socket_without_a_holder_is_reported_as_closed_and_not_requested_again() {
+    fn a_socket_without_a_holder_is_reported_as_closed_and_not_queried_again() {
         let mut observer = Observer::new(Settings::default());
         let mut all = Sockets::new(PathBuf::from("/sys/fs/cgroup"));
         let met = sockets(&[1, 2], 0);

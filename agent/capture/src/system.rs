@@ -12,9 +12,9 @@ use std::time::Duration;
 use ros2probe_wire::Timestamp;
 use rustix::process::{DumpableBehavior, set_dumpable_behavior};
 
-/// Most attempts to read the clocks.
+/// Maximum number of attempts to read the clocks.
 const READINGS: usize = 8;
-/// Nanoseconds between two clock readings that count as simultaneous.
+/// Maximum time between two clock readings that count as simultaneous, in nanoseconds.
 const CLOSE: u64 = 5_000;
 
 /// Waits until one of `descriptors` is readable or in error, a signal arrives, or the timeout
@@ -36,7 +36,8 @@ pub fn wait(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> io::Result<Opt
         tv_nsec: timeout.subsec_nanos().into(),
     };
     let count = libc::nfds_t::try_from(poll.len()).unwrap_or(0);
-    // SAFETY: `poll` holds `count` entries; it and the time outlive the call; no signal mask.
+    // SAFETY: `poll` holds `count` entries. `poll` and `timeout` outlive the call; no signal mask
+    // is passed.
     let ready = unsafe { libc::ppoll(poll.as_mut_ptr(), count, &raw const timeout, ptr::null()) };
     if ready < 0 {
         let error = io::Error::last_os_error();
@@ -61,19 +62,19 @@ impl DirectoryWatch {
     /// # Errors
     /// Fails if the kernel's limit of watches per user is reached.
     pub fn new() -> io::Result<Self> {
-        // SAFETY: has no preconditions.
+        // SAFETY: the call has no preconditions.
         let descriptor = unsafe { libc::inotify_init1(libc::IN_CLOEXEC | libc::IN_NONBLOCK) };
         if descriptor < 0 {
             return Err(io::Error::last_os_error());
         }
-        // SAFETY: a new descriptor without another owner.
+        // SAFETY: the descriptor is new and has no other owner.
         let descriptor = unsafe { OwnedFd::from_raw_fd(descriptor) };
         Ok(Self {
             events: descriptor.into(),
         })
     }
 
-    /// Adds a directory, while it exists. Returns whether it is watched.
+    /// Adds a directory. Returns `false` if it does not exist or cannot be watched.
     pub fn add(&mut self, directory: &Path) -> bool {
         self.add_with(directory, libc::IN_CREATE)
     }
@@ -93,7 +94,7 @@ impl DirectoryWatch {
         unsafe { libc::inotify_add_watch(descriptor, path.as_ptr(), mask) >= 0 }
     }
 
-    /// Takes the names of files created since the last call. Returns whether `matters` accepts one.
+    /// Takes the names reported since the last call. Returns whether `matters` accepts one of them.
     pub fn created(&mut self, matters: impl Fn(&str) -> bool) -> bool {
         let (mut any, mut events) = (false, [0; 4096]);
         while let Ok(read @ 1..) = self.events.read(&mut events) {
@@ -104,14 +105,14 @@ impl DirectoryWatch {
 }
 
 impl AsFd for DirectoryWatch {
-    /// Returns a descriptor that is readable when a file was created.
+    /// Returns a descriptor that is readable when a watched directory has changed.
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.events.as_fd()
     }
 }
 
-/// Returns the names in inotify(7) events: 16 bytes, the last four of which are the length of the
-/// name that follows, padded with zeros.
+/// Returns the names in inotify(7) events. An event has 16 bytes, of which the last four are the
+/// length of the name that follows. The name is padded with zeros.
 fn names(mut events: &[u8]) -> impl Iterator<Item = &str> {
     std::iter::from_fn(move || {
         let (head, rest) = events.split_first_chunk::<16>()?;
@@ -124,7 +125,7 @@ fn names(mut events: &[u8]) -> impl Iterator<Item = &str> {
 }
 
 /// Allows threads of this process to call [`run_first`] after privileges are dropped. Returns
-/// whether they may: this process sets the limit, or the service manager has set it.
+/// whether the limit permits it: this process or the service manager has set the limit.
 pub fn allow_running_first() -> bool {
     let mut limit = libc::rlimit {
         rlim_cur: 1,
@@ -149,10 +150,10 @@ pub fn run_first(first: bool) -> io::Result<()> {
         true => (libc::SCHED_FIFO, 1),
         false => (libc::SCHED_OTHER, 0),
     };
-    // SAFETY: plain integers, for which 0 is valid; musl has more of them than glibc.
+    // SAFETY: the struct has only integers, for which 0 is valid; musl has more of them than glibc.
     let mut parameter: libc::sched_param = unsafe { std::mem::zeroed() };
     parameter.sched_priority = sched_priority;
-    // SAFETY: has no preconditions.
+    // SAFETY: the call has no preconditions.
     let this_thread = unsafe { libc::pthread_self() };
     // SAFETY: the thread is the calling one; `parameter` outlives the call.
     match unsafe { libc::pthread_setschedparam(this_thread, policy, &raw const parameter) } {
@@ -161,8 +162,8 @@ pub fn run_first(first: bool) -> io::Result<()> {
     }
 }
 
-/// Makes the memory of this process unreadable for processes without `CAP_SYS_PTRACE`, also for
-/// those of the same user, and its end leave no core file. A change of the user undoes this.
+/// Makes the memory of this process unreadable for processes without `CAP_SYS_PTRACE`, even of the
+/// same user, and prevents core dumps. A later change of the user undoes this setting.
 ///
 /// # Errors
 /// Fails if the system call is refused.
@@ -170,17 +171,17 @@ pub fn hide_memory() -> io::Result<()> {
     Ok(set_dumpable_behavior(DumpableBehavior::NotDumpable)?)
 }
 
-/// Returns free memory to the system. Reading the kernel's types takes some 15 MB that glibc's
-/// allocator would keep while the agent lives; musl's returns large pieces by itself.
+/// Returns free memory to the system. Reading the kernel's types takes some 15 MB, which glibc's
+/// allocator would keep while the agent runs. The allocator of musl returns large pieces by itself.
 pub fn give_back_memory() {
     #[cfg(target_env = "gnu")]
-    // SAFETY: has no preconditions and touches free memory only.
+    // SAFETY: the call has no preconditions and touches free memory only.
     unsafe {
         libc::malloc_trim(0);
     }
 }
 
-/// Packets are at most this old when they are read, unless this process was delayed.
+/// Maximum age of packets when they are read, unless this process was delayed.
 const RECENT_NANOSECONDS: i64 = 1_000_000_000;
 
 /// The kernel filter's clock and the wall clock, read at the same time.
@@ -227,16 +228,17 @@ impl Clocks {
         (clocks, within)
     }
 
-    /// Converts a monotonic time to a wall-clock time. Wrong by the step if the wall clock was set
-    /// in between.
+    /// Converts a monotonic time to a wall-clock time. The result is wrong by the step if the wall
+    /// clock was set in between.
     #[must_use]
     pub const fn calendar(&self, monotonic: u64) -> Timestamp {
         let ago = self.monotonic.wrapping_sub(monotonic);
         Timestamp(self.now.0.wrapping_sub(ago))
     }
 
-    /// Returns the monotonic time of an event with this wall-clock time. Just after the clock was
-    /// set, the time may belong to the clock before the step.
+    /// Returns the wall-clock time of an event with the timestamp `calendar`. Just after the clock
+    /// was set, a timestamp from before the step is corrected. A timestamp that is not recent
+    /// becomes now.
     #[must_use]
     pub const fn stamped(&self, calendar: Timestamp) -> Timestamp {
         if self.step == 0 || self.is_recent(calendar) {
@@ -263,8 +265,8 @@ impl Clocks {
     }
 }
 
-/// Returns CLOCK_MONOTONIC_RAW less CLOCK_MONOTONIC in nanoseconds, modulo 2^64: the closest of
-/// several readings.
+/// Returns CLOCK_MONOTONIC_RAW minus CLOCK_MONOTONIC in nanoseconds, modulo 2^64. The closest of
+/// several readings counts.
 #[must_use]
 pub fn raw_difference() -> u64 {
     let read = || {
@@ -298,11 +300,11 @@ pub fn thread_cpu() -> u64 {
 /// The kernel's state of its clock, `adjtimex(2)`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ClockState {
-    /// Whether a program keeps it synchronised.
+    /// Whether a program keeps the clock synchronised.
     pub synchronised: bool,
     /// Estimated error in microseconds.
     pub estimated_error: i64,
-    /// Largest error in microseconds.
+    /// Maximum error in microseconds.
     pub maximum_error: i64,
 }
 
@@ -330,7 +332,7 @@ fn nanoseconds(clock: libc::clockid_t) -> u64 {
         tv_sec: 0,
         tv_nsec: 0,
     };
-    // SAFETY: `time` is a live local; all three clocks always exist.
+    // SAFETY: `time` is a live local; each clock that callers pass always exists.
     unsafe { libc::clock_gettime(clock, &raw mut time) };
     let seconds = u64::try_from(time.tv_sec).unwrap_or(0);
     let nanoseconds = u64::try_from(time.tv_nsec).unwrap_or(0);
@@ -346,7 +348,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn waiting_ends_with_the_time_and_with_data() {
+    fn waiting_ends_at_the_timeout_or_when_data_arrives() {
         let (mut one, two) = UnixStream::pair().unwrap();
         let descriptors = [one.as_fd(), two.as_fd()];
         let waited = wait(&descriptors, Duration::from_millis(1)).unwrap();
@@ -360,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    fn a_created_file_ends_the_sleep_and_is_reported_once() {
+    fn a_created_file_ends_the_wait_and_is_reported_once() {
         let directory = tempfile::tempdir().unwrap();
         let mut watch = DirectoryWatch::new().unwrap();
         let is_created = |watch: &mut DirectoryWatch, timeout, name: &str| {
@@ -381,7 +383,7 @@ mod tests {
     }
 
     #[test]
-    fn a_removed_directory_ends_the_sleep_where_removals_are_reported() {
+    fn a_removed_directory_ends_the_wait_if_removals_are_reported() {
         let directory = tempfile::tempdir().unwrap();
         let group = directory.path().join("group");
         std::fs::create_dir(&group).unwrap();
@@ -393,7 +395,7 @@ mod tests {
     }
 
     #[test]
-    fn a_closed_pipe_ends_the_sleep() {
+    fn a_closed_pipe_ends_the_wait() {
         let watch = DirectoryWatch::new().unwrap();
         let (ended, end) = io::pipe().unwrap();
         drop(end);

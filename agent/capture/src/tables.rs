@@ -1,4 +1,4 @@
-//! Declarations of the capture's tables: what foreign input can fill, and how far.
+//! Declarations of the capture's tables: collections that foreign input can fill, and their bounds.
 
 use ros2probe_model::facts::bounded::CONFIGURED;
 use ros2probe_model::facts::bounded::Rule::Oldest;

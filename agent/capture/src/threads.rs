@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use crate::system::monotonic;
 
-/// Time without progress after which a thread counts as stalled. Readiness turns within 5 s.
+/// Time without progress after which a thread counts as stalled. Readiness must change within 5 s.
 const STALLED_AFTER: Duration = Duration::from_secs(4);
 
 /// Task of a thread, which determines the privileges that it keeps.
@@ -23,32 +23,34 @@ pub enum Task {
     Inside,
 }
 
-/// Starts a thread with only the privileges of its task, and returns after the others are dropped.
+/// Starts a thread with only the privileges of its task, and returns when it has dropped the
+/// others.
 ///
-/// Fails if the system has no thread left, or if the thread cannot be confined.
+/// Fails if the thread cannot be spawned or confined.
 pub type Spawn = fn(Task, Builder, Box<dyn FnOnce() + Send>) -> io::Result<JoinHandle<()>>;
 
-/// Progress of a thread, for its observers. A thread that works on one step for too long is stalled:
-/// a file or a call of the kernel does not answer. One that waits for something to do is not.
+/// Progress of a thread, for other threads that watch it. A thread is stalled if one step takes too
+/// long because a file or a system call does not return. A thread that waits for work is not
+/// stalled.
 #[derive(Debug, Default)]
 pub struct Progress {
-    /// Begin of the present step, in nanoseconds of the monotonic clock; 0 = the thread waits, or
+    /// Start of the current step, in nanoseconds of the monotonic clock; 0 = the thread waits, or
     /// has not started.
     step: AtomicU64,
 }
 
 impl Progress {
-    /// Notes that the thread begins its next step.
+    /// Records that the thread begins its next step.
     pub fn step(&self) {
         self.step.store(monotonic().max(1), Ordering::Release);
     }
 
-    /// Notes that the thread waits for something to do, or ends.
+    /// Records that the thread waits for work, or ends.
     pub fn rest(&self) {
         self.step.store(0, Ordering::Release);
     }
 
-    /// Returns the length of a step that takes too long; `None` if there is progress.
+    /// Returns how long the current step has taken if the thread is stalled; otherwise `None`.
     #[must_use]
     pub fn stalled(&self) -> Option<Duration> {
         self.stalled_at(monotonic())

@@ -1,7 +1,7 @@
 //! Programs for losses that the host hook cannot see: at full receive buffers and in reassembly.
-//! Another one lists the processes that hold a socket.
+//! Another program lists the processes that hold a socket.
 //!
-//! All of them are optional. A program that this kernel does not support is skipped, and
+//! All programs are optional. A program that this kernel does not support is skipped, and
 //! [`Abilities`] holds the reason.
 
 use aya::programs::raw_trace_point::RawTracePointLink;
@@ -13,7 +13,7 @@ use super::error_chain::{Reason, in_words};
 use super::kernel_types::KernelTypes;
 use super::owners::Owners;
 
-/// The losses that this kernel can attribute, or the reason why not.
+/// Facts that this kernel can provide; an error is the reason why it cannot.
 #[derive(Clone, Debug)]
 pub struct Abilities {
     /// Datagrams dropped at a full socket buffer, by writer and sequence number.
@@ -28,17 +28,18 @@ pub struct Abilities {
 #[derive(Debug)]
 pub struct KernelLayout {
     array: [u32; Layout::COUNT],
-    /// Why they are unknown altogether.
+    /// Why no type is known; `None` if types were read.
     unknown: Option<Reason>,
 }
 
-/// The enumeration of drop reasons: Linux 5.17; those for fragments: 6.2.
+/// Enumeration of drop reasons, since Linux 5.17. Reasons for fragments exist since 6.2.
 const REASONS: &str = "skb_drop_reason";
 
 /// First release that reports IPv6 datagrams dropped at a full socket buffer.
 const REPORTS_IPV6: (u32, u32) = (6, 6);
 
-/// Kernel name of each entry: a member of a structure, an enumerator, or a structure whose size is read.
+/// Kernel name of each entry: a member of a structure, an enumerator, or a structure whose size is
+/// read.
 const TABLE: [(Layout, &str, &str); Layout::COUNT] = [
     (Layout::BufferHead, "sk_buff", "head"),
     (Layout::BufferTail, "sk_buff", "tail"),
@@ -136,7 +137,7 @@ impl KernelLayout {
         loader.override_global("LAYOUT", &self.array, true);
     }
 
-    /// Checks that all of these are known; otherwise returns the reason why a program cannot run.
+    /// Checks that all entries of `layout` are known; otherwise returns why a program cannot run.
     fn need(&self, layout: &[Layout]) -> Result<(), Reason> {
         if let Some(unknown) = &self.unknown {
             return Err(unknown.clone());
@@ -174,13 +175,13 @@ impl Tracepoints {
         }
     }
 
-    /// Returns the losses that can be attributed.
+    /// Returns the facts that this kernel can provide.
     #[must_use]
     pub const fn abilities(&self) -> &Abilities {
         &self.abilities
     }
 
-    /// Returns the table of sockets' owners, if it is available.
+    /// Returns the iterator over owners of sockets, if it is available.
     #[must_use]
     pub const fn owners(&self) -> Option<&Owners> {
         self.owners.as_ref()
@@ -273,7 +274,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_place_has_its_name_once() {
+    fn every_layout_entry_has_exactly_one_name() {
         for index in 0..Layout::COUNT {
             let named = TABLE
                 .iter()
@@ -283,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reason_names_what_the_kernel_does_not_have() {
+    fn a_reason_names_the_missing_kernel_type() {
         let mut layout = KernelLayout {
             array: [7; Layout::COUNT],
             unknown: None,

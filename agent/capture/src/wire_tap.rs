@@ -2,7 +2,7 @@
 //! path of their output to the model.
 //!
 //! Frames and records arrive through two rings, either of which may be faster; both are merged by
-//! time. Nothing is ever sent.
+//! time. The tap sends nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::os::fd::{AsFd as _, BorrowedFd};
@@ -67,15 +67,15 @@ pub struct WireTapSettings {
 pub struct WireTap {
     path: Option<PathBuf>,
     /// Device and inode of the namespace at the path. The socket keeps the namespace alive, so no
-    /// other one gets the same identity.
+    /// other namespace gets the same identity.
     identity: Option<Identity>,
-    /// The path is gone or names another namespace.
+    /// Whether the path is gone or names another namespace.
     is_gone: bool,
     ring: Ring,
     filter: Filter,
     interfaces: Interfaces,
     selection: Selection,
-    /// Frames captured by interface index.
+    /// Number of captured frames by interface index.
     packets: BTreeMap<u32, u64>,
     frames: FrameAssembly,
     refused_interfaces: u64,
@@ -139,8 +139,9 @@ impl WireTap {
         self.path.as_deref()
     }
 
-    /// Logs if the path is gone or names another namespace: frames there are not seen, and entering
-    /// it would take privileges that were dropped. Logs again when the original one is back.
+    /// Logs if the path is gone or names another namespace. Frames in the new namespace are not
+    /// seen, because entering it would take privileges that were dropped. Logs again when the first
+    /// one is back.
     pub fn check_namespace(&mut self) {
         let Some(path) = &self.path else { return };
         let is_gone = identity(path) != self.identity;
@@ -159,7 +160,7 @@ impl WireTap {
         }
     }
 
-    /// Returns which object is gone, as a sentence: the namespace, or an interface that the
+    /// Returns a sentence about an object that is gone: the namespace, or an interface that the
     /// configuration names. `None` if all exist.
     #[must_use]
     pub fn gone(&self) -> Option<String> {
@@ -191,7 +192,7 @@ impl WireTap {
     }
 
     /// Reads everything available, and passes everything older than [`SETTLE_NANOSECONDS`] to the
-    /// model. Connections of Zenoh in `at_sockets` are left out: they are reported from there.
+    /// model. Zenoh connections in `at_sockets` are left out: the host tap reports them.
     ///
     /// # Errors
     /// Fails if the kernel refuses to continue.
@@ -213,7 +214,7 @@ impl WireTap {
         Ok(())
     }
 
-    /// Passes everything that still waits to the model, at the end.
+    /// Passes all buffered data to the model at the end.
     pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
         self.frames.take_records(&mut self.filter);
         self.frames.take_stalled(&mut self.filter, clocks.monotonic);
@@ -231,7 +232,7 @@ impl WireTap {
         &mut self.filter
     }
 
-    /// Iterates over captured frames by interface name, or by index if the interface went away
+    /// Iterates over captured frames by interface name, or by index if the interface disappeared
     /// before its name was known.
     pub fn packets(&self) -> impl Iterator<Item = (String, u64)> + '_ {
         self.packets.iter().map(|(index, packets)| {
@@ -271,7 +272,7 @@ impl WireTap {
         self.frames.reassembly.bytes()
     }
 
-    /// Returns the number of datagrams discarded for lack of room.
+    /// Returns the number of datagrams discarded because of the caps.
     #[must_use]
     pub const fn reassembly_evicted(&self) -> u64 {
         self.frames.reassembly.counters().evicted
@@ -289,8 +290,8 @@ impl WireTap {
         self.refused_interfaces
     }
 
-    /// Applies changes of interfaces. A failed listing is repeated at the next call. An interface
-    /// that is gone leaves no state: containers come and go for years.
+    /// Applies changes of interfaces. A failed listing is repeated at the next call. A removed
+    /// interface leaves no state, because containers come and go for years.
     fn follow_interfaces(&mut self) {
         let changes = self.interfaces.changes().unwrap_or_default();
         if !changes.is_empty() {
@@ -313,19 +314,19 @@ impl WireTap {
         }
     }
 
-    /// Reads frames. Their announcements are passed to the model at once, the rest in order of
-    /// time. Everything older precedes a frame: a writer's last samples count before its disposal
-    /// is read.
+    /// Reads frames. Their announcements are passed to the model immediately, all other data in
+    /// order of time. Older data precedes a frame, so a writer's last samples count before its
+    /// disposal is read.
     fn take_frames(
         &mut self,
         clocks: &Clocks,
         at_sockets: Option<&Streams>,
         observer: &mut Observer,
     ) -> Result<(), WireTapError> {
-        // Clears the error that the socket reports when a link goes down; otherwise waiting would
-        // return at once.
+        // Clears the error that the socket reports when a link goes down; otherwise every wait
+        // would return immediately.
         self.ring.wait(Duration::ZERO)?;
-        // At most one full ring: a flood must not starve everything else.
+        // At most one full ring is read, so that a flood does not starve other work.
         for _ in 0..self.ring.blocks() {
             let Some(block) = self.ring.block() else {
                 break;
@@ -379,12 +380,12 @@ impl IncludedInterfaces {
     }
 }
 
-/// One tap's frames and records on their way to the model.
+/// State of one tap's frames and records before they reach the model.
 struct FrameAssembly {
     number: u32,
     reassembly: Reassembly,
     ahead: Ahead,
-    /// Records that wait for their turn.
+    /// Records that wait for older ones.
     order: ReorderBuffer,
     /// Connections of Zenoh.
     streams: Streams,
@@ -392,8 +393,8 @@ struct FrameAssembly {
 }
 
 impl FrameAssembly {
-    /// Reads one round of records; returns the time up to which all were read. [`Self::deliver`]
-    /// decides what is passed to the model.
+    /// Reads one round of records. Returns the time of the latest one if the ring may have more,
+    /// else `u64::MAX`. [`Self::deliver`] decides what is passed to the model.
     fn take_records(&mut self, filter: &mut Filter) -> u64 {
         self.order.take_records(filter, &mut self.copied_bytes)
     }
@@ -406,7 +407,7 @@ impl FrameAssembly {
         }
     }
 
-    /// Passes the records and segments up to a time of the filter's clock to the model.
+    /// Passes the records and segments up to `until`, in the filter's clock, to the model.
     fn deliver(
         &mut self,
         clocks: &Clocks,
@@ -450,7 +451,7 @@ impl FrameAssembly {
             .advance(now, |report| observer.input(Input::Zenoh(report)));
     }
 
-    /// Reads a segment of Zenoh, and passes what it completes to the model.
+    /// Reads a segment of Zenoh, and passes the messages that it completes to the model.
     fn read_segment(
         &mut self,
         segment: &Waiting,
@@ -586,7 +587,7 @@ mod tests {
     use crate::netns::tests::{in_new_namespace, ip};
 
     #[test]
-    fn an_interface_that_the_configuration_names_is_missed_until_it_is_there_again() {
+    fn a_configured_interface_is_reported_as_gone_until_it_exists_again() {
         in_new_namespace(|| {
             let names = ["one", "never", "patt*"].map(str::to_owned);
             let selection = Selection::new(&names, &[]).unwrap();

@@ -48,7 +48,7 @@ pub struct Links {
     zenoh: Option<[OwnedFd; 2]>,
 }
 
-/// One piece of a captured datagram, read in place; dropping it frees its room in the ring.
+/// One piece of a captured datagram, read in place; dropping it frees its space in the ring.
 pub struct CapturedPiece<'a>(RingBufItem<'a>);
 
 impl CapturedPiece<'_> {
@@ -103,7 +103,7 @@ impl Filter {
     /// # Errors
     /// Returns [`FilterError::AttachNotPermitted`] without CAP_NET_ADMIN, and
     /// [`FilterError::Attach`] if the directory is not such a cgroup or another program on it
-    /// excludes further ones. Then nothing is attached.
+    /// excludes further ones. In both cases, nothing is attached.
     pub fn attach(&mut self, cgroup: &File) -> Result<(), FilterError> {
         let mut links = self.links()?.create(cgroup)?;
         if let Some(host) = &mut self.host {
@@ -112,8 +112,8 @@ impl Filter {
         Ok(())
     }
 
-    /// Returns what is needed to attach the host hook to another cgroup, even after this filter is
-    /// dropped.
+    /// Returns the programs for attaching the host hook to another cgroup, even after this filter
+    /// is dropped.
     ///
     /// # Errors
     /// Fails on the wire hook, and if no more descriptors are available.
@@ -145,7 +145,7 @@ impl Filter {
         }
     }
 
-    /// Frees what further attaching would need. Attached programs stay.
+    /// Frees memory that only further attaching would need. Attached programs stay.
     pub fn settle(&mut self) {
         if let Some(host) = &mut self.host {
             host.programs = None;

@@ -1,9 +1,9 @@
 //! The probe on Fast DDS's path into shared memory, from user space: loads it, attaches it to
 //! libraries.
 //!
-//! Attached to a library's file, it puts a breakpoint into the code of every process that maps the
-//! file. The kernel inserts and removes the breakpoint, also if this process is killed, because a
-//! probe lives as long as its descriptor. Nothing is written to `uprobe_events`.
+//! A probe attached to a library's file puts a breakpoint into the code of every process that maps
+//! the file. The kernel inserts and removes the breakpoint, also if this process is killed, because
+//! a probe lives as long as its descriptor. Nothing is written to `uprobe_events`.
 
 use std::fs::File;
 use std::os::fd::AsFd as _;
@@ -55,8 +55,8 @@ impl Filter {
 }
 
 impl Probes {
-    /// Lets the broker attach to a library: every message that its processes put into shared memory
-    /// is then seen.
+    /// Lets the broker attach to a library. From then on, every message that processes with this
+    /// library put into shared memory is seen.
     ///
     /// # Errors
     /// Returns why the broker refuses.

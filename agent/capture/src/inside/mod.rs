@@ -1,11 +1,12 @@
-//! What happens inside ROS processes, whatever their middleware: messages, also those that never
-//! leave a process, and callbacks.
+//! Observes messages and callbacks inside ROS processes, with any middleware. This includes
+//! messages that never leave a process.
 //!
-//! It puts breakpoints into code of other processes, which cost them some microseconds for each
-//! call. By default, those that run for each message or callback are there only while a client
-//! needs calls; those where a process creates its nodes and endpoints stay. The kernel programs
-//! aggregate; a thread reads their tables once a second, resolves names, and leaves a report for the
-//! model. It changes nothing in the processes and never waits for them.
+//! The source puts breakpoints into the code of other processes, which costs them some microseconds
+//! for each call. By default, breakpoints for each message or callback exist only while a client
+//! needs calls. Breakpoints at the creation of nodes and endpoints stay. The kernel programs
+//! aggregate. A thread reads their tables once a second, resolves names, and leaves a report for
+//! the model. Apart from the breakpoints, it changes nothing in the processes, and it never waits
+//! for them.
 
 pub mod names;
 mod observation;
@@ -36,7 +37,7 @@ use crate::threads::{Progress, Spawn, Task};
 use crate::uprobe::attachments::LibraryFacts;
 use crate::uprobe::{self, UprobeError};
 
-/// Calls per second of all processes above which the programs are detached.
+/// Maximum calls per second of all processes. Above it, the programs are detached.
 pub const MAX_HITS: u64 = 200_000;
 
 /// The kernel programs, and the thread that attaches and reads them.
@@ -57,7 +58,7 @@ pub struct Facts {
     pub libraries: Vec<LibraryFacts>,
     /// Whether the processes that ran before this source have been inspected.
     pub has_inspected: bool,
-    /// Why nothing is attached at present; `None` = the libraries in use are.
+    /// Why nothing is attached at present; `None` = the libraries in use have probes.
     pub detached: Option<String>,
     /// Whether calls are observed on demand, and no client needs them.
     pub is_resting: bool,
@@ -72,7 +73,7 @@ struct Shared {
     facts: Mutex<Facts>,
     /// Whether a client needs calls, if they are observed on demand.
     wanted: AtomicBool,
-    /// Rings when that changes. Without it, the thread notices within a second.
+    /// Rings when `wanted` changes. Without the bell, the thread notices a change within a second.
     bell: Option<Bell>,
     progress: Arc<Progress>,
     stop: AtomicBool,
@@ -87,8 +88,8 @@ struct Work {
 }
 
 impl Inside {
-    /// Loads the programs, and attaches them to installed libraries. `cgroup`: only for processes of
-    /// this control group.
+    /// Loads the programs, and attaches them to installed libraries. `cgroup` restricts them to
+    /// processes of this control group.
     ///
     /// # Errors
     /// Fails if a capability is missing, or if the kernel has no uprobes.
@@ -105,12 +106,13 @@ impl Inside {
             FilterError::Program(_) if within.is_some() => UprobeError::InsideScope(error),
             error => error.into(),
         })?;
-        // The thread reports what the kernel refuses.
+        // The thread repeats this call every round, and logs its errors.
         let _ = tables.set_clocks(&Clocks::read());
         let progress = Arc::new(Progress::default());
         let is_on_demand = choice == InsideChoice::Auto;
         let mut probes = Probes::new(programs, is_on_demand, &progress);
-        // A node announces its publishers once: installed libraries are attached in advance.
+        // A node announces its publishers only once, so the probes are attached to installed
+        // libraries in advance.
         probes.install(Instant::now(), &mut broker);
         progress.rest();
         let scope = cgroup.map_or(Scope::AllProcesses, |path| {
@@ -141,7 +143,7 @@ impl Inside {
         })
     }
 
-    /// Starts the thread, once, with only the privileges that it needs.
+    /// Starts the thread with only the privileges that it needs. Later calls have no effect.
     ///
     /// # Errors
     /// Fails if the thread cannot be started.
@@ -163,7 +165,7 @@ impl Inside {
         rounds.take()
     }
 
-    /// Sets whether a client needs calls. Matters only if they are observed on demand.
+    /// Sets whether a client needs calls. The setting matters only if calls are observed on demand.
     pub fn want(&self, wanted: bool) {
         let shared = &self.shared;
         let is_on_demand = shared.facts().is_on_demand;
@@ -198,8 +200,8 @@ impl Shared {
         self.wanted.load(Ordering::Acquire)
     }
 
-    /// Returns whether the model has not taken earlier reports. Figures are cumulative, so a round
-    /// that is left out loses nothing.
+    /// Returns whether earlier reports still wait for the model. Figures are cumulative, so
+    /// skipping a round loses nothing.
     fn is_late(&self) -> bool {
         let rounds = self.rounds.lock();
         rounds.unwrap_or_else(PoisonError::into_inner).is_full()
@@ -227,7 +229,7 @@ mod tests {
     use ros2probe_model::facts::calls::report::Report;
 
     #[test]
-    fn reports_beyond_those_that_may_wait_are_left_out() {
+    fn reports_beyond_the_cap_of_waiting_reports_are_dropped() {
         let shared = Shared {
             rounds: Mutex::default(),
             facts: Mutex::default(),

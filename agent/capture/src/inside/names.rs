@@ -11,7 +11,7 @@ use ros2probe_wire::inside::{Announcement, Figures, Handle, announced, kind};
 
 use crate::tables::InsideNames;
 
-/// Longest chain of relations.
+/// Maximum length of a chain of relations.
 const DEPTH: usize = 8;
 
 /// Names that a process has announced.
@@ -20,7 +20,8 @@ pub struct Names {
     known: Bounded<InsideNames, HashMap<(Of, u64), Named>>,
 }
 
-/// Kinds of objects: addresses of different kinds may be equal, because one contains the other.
+/// Kinds of objects. Objects of two kinds may have the same address, because one contains the
+/// other.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 enum Of {
     Node,
@@ -36,9 +37,9 @@ enum Of {
     Service,
     StateMachine,
     Buffer,
-    /// Intra-process buffer that owns a ring buffer, by the ring buffer.
+    /// Intra-process buffer that owns a ring buffer, by the address of the ring buffer.
     Owner,
-    /// Subscription of rclcpp, by the intra-process buffer.
+    /// Subscription of rclcpp, by the address of its intra-process buffer.
     Owned,
 }
 
@@ -52,7 +53,7 @@ enum Named {
         name: Arc<str>,
         middleware: Option<Arc<str>>,
     },
-    /// Another object.
+    /// A relation to another object.
     Is(Of, u64),
     Period(Duration),
     Capacity(u32),
@@ -61,7 +62,7 @@ enum Named {
 /// Topic, node and middleware of an endpoint.
 #[derive(Clone, Debug)]
 pub struct Endpoint {
-    /// ROS name of its topic, or its service's name.
+    /// ROS name of the topic or service.
     pub name: Arc<str>,
     /// Its node, if announced.
     pub node: Option<NodeName>,
@@ -142,7 +143,7 @@ impl Names {
         None
     }
 
-    /// Follows relations to an object that is not a relation.
+    /// Follows relations to an object that is not itself a relation.
     fn resolve(&self, of: Of, address: u64) -> Option<(Of, u64, &Named)> {
         let mut at = (of, address);
         for _ in 0..DEPTH {
@@ -188,7 +189,7 @@ impl Names {
         self.endpoint(Of::Subscription, address)
     }
 
-    /// Returns the topic and node of a ring buffer's subscription, or the topic of its publisher.
+    /// Returns the topic and node of a ring buffer's subscription, else the topic of its publisher.
     #[must_use]
     pub fn buffer(&self, address: u64, publisher: Handle) -> Option<Endpoint> {
         let subscription = self.endpoint(Of::Owner, address);
@@ -220,7 +221,7 @@ impl Names {
         }
     }
 
-    /// Returns what triggers a callback, and its node. `topic_of` returns the endpoint of a ring
+    /// Returns the trigger of a callback, and its node. `topic_of` returns the endpoint of a ring
     /// buffer.
     #[must_use]
     pub fn trigger(
@@ -284,7 +285,7 @@ fn joined(namespace: &str, name: &str) -> String {
     format!("{slash}{namespace}/{name}")
 }
 
-/// Returns the text before the final zero.
+/// Returns the text before the first zero byte.
 #[must_use]
 pub fn text(bytes: &[u8]) -> String {
     let end = bytes.iter().position(|byte| *byte == 0);
@@ -313,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn a_callback_leads_to_its_subscription_s_topic_and_node() {
+    fn a_callback_resolves_to_the_topic_and_node_of_its_subscription() {
         let mut names = Names::default();
         let mut node = announcement(announced::NODE, 1, 0, 0, "lidar");
         node.second[..7].copy_from_slice(b"/robot1");
@@ -335,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn relations_in_a_circle_end() {
+    fn a_cycle_of_relations_ends_the_search() {
         let mut names = Names::default();
         names.announce(&announcement(announced::SUBSCRIPTION_OBJECT, 1, 2, 0, ""));
         names.known.insert(
@@ -357,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_nodes_are_joined_and_text_ends_with_zero() {
+    fn node_names_are_joined_and_text_ends_at_the_first_zero() {
         assert_eq!(joined("/", "talker"), "/talker");
         assert_eq!(joined("/robot1", "talker"), "/robot1/talker");
         assert_eq!(joined("robot1", "talker"), "/robot1/talker");

@@ -22,29 +22,29 @@ use crate::uprobe::processes::Processes;
 
 /// Interval of reports.
 const EVERY: Duration = Duration::from_secs(1);
-/// How long to collect announcements before they are read.
+/// Time for which announcements accumulate before they are read.
 const GATHER: Duration = Duration::from_millis(250);
 /// Time for which the programs stay detached after all calls exceeded their budget.
 const PAUSE: Duration = Duration::from_secs(60);
-/// Intervals of looking for processes that have ended while no calls are observed: each needs the
+/// Intervals between checks for ended processes while no calls are observed. Each check needs the
 /// broker, which otherwise ends.
 const REVIEW: Duration = Duration::from_secs(600);
 const REVIEW_OF_MANY: Duration = Duration::from_secs(60);
-/// Known processes that are many: half of those that the programs can have.
+/// Number of known processes for the shorter interval: half of those that the programs can have.
 const MANY: usize = PROCESS_CAPACITY as usize / 2;
-/// Rounds after which rates are known: two reports of the calls of a second each.
+/// Number of rounds after which rates are known: two reports, each of the calls of a second.
 const ROUNDS_OF_RATES: u32 = 3;
 
 /// The breakpoints in all libraries.
 pub(super) struct Probes {
-    /// Those that stay: at all functions, or at those of initialization alone.
+    /// Probes that stay: at all functions, or only at functions of initialization.
     lasting: Attachments<Attached>,
-    /// At the functions of runtime, if calls are observed on demand.
+    /// Probes at functions of runtime, if calls are observed on demand.
     on_demand: Option<Attachments<Attached>>,
 }
 
 impl Probes {
-    /// Creates probes in no library.
+    /// Creates probes that are attached to no library.
     pub(super) fn new(programs: Programs, is_on_demand: bool, progress: &Arc<Progress>) -> Self {
         let programs = Arc::new(programs);
         let at = |meaning, part| {
@@ -70,12 +70,13 @@ impl Probes {
         }
     }
 
-    /// Attaches to installed libraries what stays.
+    /// Attaches the lasting probes to installed libraries.
     pub(super) fn install(&mut self, now: Instant, broker: &mut Broker) {
         self.lasting.install(Library::Tracing, now, broker);
     }
 
-    /// Attaches to the libraries in use. `to_calls`: also to what is observed on demand.
+    /// Attaches the lasting probes to the libraries in use; with `to_calls`, also the on-demand
+    /// probes.
     fn follow(&mut self, processes: &Processes, to_calls: bool, now: Instant, broker: &mut Broker) {
         self.lasting.follow(processes, now, broker);
         if let Some(on_demand) = self.on_demand.as_mut().filter(|_| to_calls) {
@@ -84,7 +85,7 @@ impl Probes {
         }
     }
 
-    /// Detaches from calls.
+    /// Detaches the probes at calls.
     fn detach(&mut self) {
         self.at_calls_mut().clear();
     }
@@ -98,7 +99,7 @@ impl Probes {
         self.on_demand.as_ref().unwrap_or(&self.lasting)
     }
 
-    /// Returns the libraries in use.
+    /// Returns facts about the libraries in use.
     fn facts(&self, is_resting: bool) -> Vec<LibraryFacts> {
         match is_resting {
             true => self.lasting.facts(),
@@ -130,15 +131,15 @@ struct Observation {
     processes: Processes,
     table: ProcessTable,
     mappings: Option<MappingEvents>,
-    /// When the programs were detached because of the budget of all calls.
+    /// Time when the programs were detached because of the budget of all calls.
     suspended_at: Option<Instant>,
     /// Whether calls are observed on demand, and no client needs them.
     is_resting: bool,
-    /// Rounds since calls are observed.
+    /// Number of rounds since the observation of calls began.
     rounds: u32,
     last_round: Instant,
     last_review: Instant,
-    /// Whether the broker did not answer last time: it may start later than this process.
+    /// Whether the broker did not answer the last request: it may start later than this process.
     lacks_broker: bool,
 }
 
@@ -162,7 +163,8 @@ impl Observation {
         }
     }
 
-    /// Attaches to what processes use, and reads the tables; then waits for the next round, or rests.
+    /// Attaches to libraries in use, and reads the tables. Then waits for the next round, or
+    /// becomes idle.
     fn look(&mut self, shared: &Shared) {
         let now = Instant::now();
         if std::mem::take(&mut self.is_resting) {
@@ -194,7 +196,8 @@ impl Observation {
         self.wait(shared, now + EVERY);
     }
 
-    /// Finds processes and attaches to their libraries. Returns why the broker did not answer.
+    /// Finds processes and attaches to their libraries. Returns the error if the broker did not
+    /// answer.
     fn find(&mut self, now: Instant, to_calls: bool) -> Option<String> {
         let broker = &mut self.broker;
         let found = self.processes.find(false, broker);
@@ -230,7 +233,7 @@ impl Observation {
         }
     }
 
-    /// Forgets the calls so far; the next ones begin anew.
+    /// Becomes idle: forgets the calls so far, so that later calls are counted from zero.
     fn begin_rest(&mut self, shared: &Shared, failed: Option<String>) {
         if let Err(error) = self.tables.forget_calls() {
             let reason = in_words(&error);
@@ -247,7 +250,8 @@ impl Observation {
         self.report(shared, failed);
     }
 
-    /// Waits until a client needs calls, and follows which processes begin.
+    /// Waits at most one round for a client to need calls, and reads announcements of new
+    /// processes.
     fn rest(&mut self, shared: &Shared) {
         let now = Instant::now();
         let interval = match self.lacks_broker {
@@ -268,8 +272,8 @@ impl Observation {
         self.broker.rest();
     }
 
-    /// Waits until `end`, or until the demand changes. Reads announcements during the wait: their
-    /// ring could overflow.
+    /// Waits until `end`, or until the demand changes. Reads announcements during the wait, because
+    /// their ring could overflow.
     fn wait(&mut self, shared: &Shared, end: Instant) {
         let mut gathers_until = Instant::now();
         while let Some(event) = self.next_event(shared, gathers_until, end) {
@@ -288,7 +292,7 @@ impl Observation {
         }
     }
 
-    /// Attaches to a library that a process has just mapped.
+    /// Attaches probes to a library that a process has just mapped.
     fn meet_mapped(&mut self) {
         let new = self.take_mapped();
         if !new.is_incomplete && new.processes.is_empty() {
@@ -310,8 +314,8 @@ impl Observation {
         new.unwrap_or_default()
     }
 
-    /// Waits until `end` for the next event, for announcements only from `gathers_until` on; returns
-    /// `None` at the end.
+    /// Waits until `end` for the next event, and returns `None` at the end. Announcements count as
+    /// an event only after `gathers_until`.
     fn next_event(&self, shared: &Shared, gathers_until: Instant, end: Instant) -> Option<Event> {
         loop {
             let now = Instant::now();
@@ -352,7 +356,7 @@ impl Observation {
         showing.map(|(process, _)| process).collect()
     }
 
-    /// Sets the difference of the clocks for the programs, and returns their reading.
+    /// Sets the clock differences for the programs, and returns the readings.
     fn set_clocks(&mut self) -> Clocks {
         let clocks = Clocks::read();
         if let Err(error) = self.tables.set_clocks(&clocks) {
@@ -388,6 +392,6 @@ enum Event {
     Mapped,
     /// Many announcements wait.
     Announced,
-    /// A client needs calls, or the last one no longer does.
+    /// The first client needs calls, or the last one no longer needs them.
     Demanded,
 }

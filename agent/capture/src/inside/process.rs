@@ -1,4 +1,4 @@
-//! Facts of an observed process: start, name and CPU time.
+//! Facts about an observed process: start, name and CPU time.
 
 use std::sync::Arc;
 use std::time::Duration;

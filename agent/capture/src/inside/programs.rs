@@ -1,6 +1,6 @@
 //! The programs attached to the functions of `libtracetools.so`, and their tables.
 //!
-//! Attached to a library's file, a program runs in every process that maps the file. A probe lives
+//! A program attached to a library's file runs in every process that maps the file. A probe lives
 //! as long as its descriptor: the kernel removes the breakpoint when this process ends, however it
 //! ends.
 
@@ -21,9 +21,9 @@ use crate::filter::{Aligned, FilterError, absent_is_fine, failed, take};
 use crate::system::{Clocks, raw_difference};
 use crate::uprobe::attachments::Refusal;
 
-/// The object built by `agent-ebpf/build.sh`. Aligned, because ELF is read in place.
+/// The object built by `agent-ebpf/build.sh`. It is aligned because the ELF file is read in place.
 static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../../agent-ebpf/inside.bpf.o"));
-/// The program of links, which calls the others.
+/// The program that links attach. It tail-calls the other programs.
 const DISPATCHER: Dispatcher = Dispatcher {
     program: "called",
     array: "CALLS",
@@ -31,7 +31,7 @@ const DISPATCHER: Dispatcher = Dispatcher {
 type FiguresWords = [u64; size_of::<Figures>() / 8];
 type ProcessWords = [u64; size_of::<Process>() / 8];
 type HandleWords = [u64; size_of::<Handle>() / 8];
-/// `Thread` and `Entry` of the programs.
+/// Words of `Thread` and `Entry` in the kernel programs.
 type ThreadWords = [u64; 9];
 type EntryWords = [u64; 2];
 const _: () = assert!(size_of::<Figures>().is_multiple_of(8));
@@ -48,14 +48,14 @@ pub struct Tables {
     announcements: RingBuf<MapData>,
     /// The last calls of each thread.
     threads: HashMap<MapData, u32, ThreadWords>,
-    /// Times of entry of messages in ring buffers.
+    /// Times at which messages entered ring buffers.
     waiting: HashMap<MapData, EntryWords, u64>,
 }
 
-/// The probes in one library; dropping them removes the breakpoints.
+/// The probes in one library; dropping the value removes the breakpoints.
 pub struct Attached {
     _attached: breakpoints::Attached,
-    /// The library reports messages that enter ring buffers.
+    /// Whether the library reports messages that enter ring buffers.
     pub shows_intra_process: bool,
 }
 
@@ -97,7 +97,7 @@ pub fn load(
 }
 
 impl Programs {
-    /// Lets the broker attach to the functions that a library has, or to those of a `part`.
+    /// Lets the broker attach the programs to a library's functions, or only to those of `part`.
     ///
     /// # Errors
     /// Returns why the broker refuses.
@@ -152,7 +152,7 @@ impl Tables {
         Some(with(&item))
     }
 
-    /// Reads the other clocks, and sets their differences to CLOCK_MONOTONIC.
+    /// Sets the differences of the wall clock and of CLOCK_MONOTONIC_RAW to CLOCK_MONOTONIC.
     ///
     /// # Errors
     /// Fails if the kernel refuses the update.
@@ -193,7 +193,7 @@ impl Tables {
     }
 
     /// Iterates over the figures of all handles. The iteration may end early if the programs remove
-    /// a handle during it; figures are cumulative, so the next one has the rest.
+    /// a handle during it. Figures are cumulative, so the next iteration includes the rest.
     pub fn figures(&self) -> impl Iterator<Item = (Handle, Figures)> + '_ {
         let entries = self.handles.iter().filter_map(Result::ok);
         entries.map(|(handle, words)| (zerocopy::transmute!(handle), zerocopy::transmute!(words)))
@@ -208,8 +208,8 @@ impl Tables {
         absent_is_fine(self.handles.remove(&key)).map_err(failed("HANDLES", "remove"))
     }
 
-    /// Forgets all calls so far, while the programs of [`Calls::Runtime`] are detached: later ones
-    /// have nothing to do with them. What is announced stays announced.
+    /// Forgets all calls so far, while the programs of [`Calls::Runtime`] are detached: later calls
+    /// are unrelated to them. Announced objects stay announced.
     ///
     /// # Errors
     /// Fails if the kernel refuses an update.

@@ -24,9 +24,9 @@ use super::programs::Tables;
 use crate::system::Clocks;
 use crate::tables::{CausalHops, InsideBuffers, NewNodes, ReportedHandles, Transitions};
 
-/// Calls per second of one process above which its calls are no longer counted.
+/// Maximum calls per second of one process. Above it, its calls are no longer counted.
 pub const MAX_PROCESS_HITS: u64 = 50_000;
-/// Least time over which calls per second are evaluated: a shorter time may contain only a burst.
+/// Minimum time over which calls per second are evaluated: a shorter time may contain only a burst.
 const JUDGED_OVER: Duration = Duration::from_millis(500);
 /// Rounds after which a process outside of the control group is inspected again.
 const RECHECK: u32 = 5;
@@ -45,7 +45,7 @@ pub struct ProcessTable {
 /// Result of one round.
 #[derive(Debug)]
 pub struct Round {
-    /// What has changed.
+    /// Changes since the last report.
     pub report: Report,
     /// Publications during callbacks, in the order of their time.
     pub publications: Vec<CausalPublication>,
@@ -59,21 +59,22 @@ pub struct Round {
 struct Observed {
     /// `None` if the process had ended before it was inspected, or if the broker did not answer.
     stat: Option<Stat>,
-    /// Whether it had ended before it was inspected. Another process may have its id by now.
+    /// Whether the process had ended before it was inspected. Another process may have its id by
+    /// now.
     had_ended: bool,
     domain: DomainId,
     names: Names,
     new_nodes: Bounded<NewNodes, Vec<NodeName>>,
-    /// Calls when they were last evaluated.
+    /// Number of calls at the last evaluation.
     hits: u64,
     is_suspended: bool,
-    /// What was last reported of each handle.
+    /// Last reported state of each handle.
     reported: Bounded<ReportedHandles, HashMap<Handle, Mark>>,
     /// Publisher of each ring buffer.
     buffers: Bounded<InsideBuffers, HashMap<u64, Handle>>,
 }
 
-/// Distinguishes two states of figures.
+/// Figures that distinguish two states of a handle.
 type Mark = [u64; 5];
 
 impl Observed {
@@ -82,8 +83,8 @@ impl Observed {
         self.names.buffer(address, publisher.unwrap_or_default())
     }
 
-    /// Remembers the publisher of a ring buffer. A process may create and destroy buffers without
-    /// end.
+    /// Remembers the publisher of a ring buffer. The table is bounded, because a process may create
+    /// and destroy buffers without end.
     fn note_buffer(&mut self, address: u64, publisher: Handle) {
         if self.buffers.insert(address, publisher).is_some() {
             self.forget_reported();
@@ -96,13 +97,13 @@ impl Observed {
         }
     }
 
-    /// Lets the next round report all handles again.
+    /// Makes the next round report all handles again.
     fn forget_reported(&mut self) {
         self.reported.clear();
         self.buffers.clear();
     }
 
-    /// Lets the next round report everything again.
+    /// Makes the next round report everything again.
     fn forget_reports(&mut self) {
         self.forget_reported();
         self.new_nodes.clear();
@@ -138,7 +139,7 @@ impl ProcessTable {
         self.known.is_empty()
     }
 
-    /// Reads the announcements that wait. `broker` knows the processes.
+    /// Reads the waiting announcements. `broker` provides facts about the processes.
     pub fn drain(&mut self, tables: &mut Tables, clocks: &Clocks, broker: &mut Broker) {
         while let Some(item) = tables.next_announcement(Item::read) {
             self.note(item, clocks, broker);
@@ -173,10 +174,11 @@ impl ProcessTable {
         }
     }
 
-    /// Returns the state of a process, new if necessary. The kernel's table bounds their number.
+    /// Returns the state of a process, and creates it if necessary. The kernel's table bounds the
+    /// number of processes.
     fn observe(&mut self, process: u32, broker: &mut Broker) -> &mut Observed {
         self.known.entry(process).or_insert_with(|| {
-            // Without an answer it has no name, and its domain is taken for 0.
+            // Without an answer, the process has no name, and its domain is assumed to be 0.
             let states = broker.activities(&[process]);
             let had_ended = states.as_ref().is_ok_and(Vec::is_empty);
             let state = states.unwrap_or_default().into_iter().next();
@@ -192,7 +194,7 @@ impl ProcessTable {
         })
     }
 
-    /// Lets the next round report everything again, after [`Tables::forget_calls`].
+    /// Makes the next round report everything again, after [`Tables::forget_calls`].
     pub fn forget_reports(&mut self) {
         self.hops.clear();
         for observed in self.known.values_mut() {
@@ -278,14 +280,14 @@ impl ProcessTable {
             let report = self.process(*id, process, states.as_ref());
             reports.insert(*id, report);
         }
-        // A process that has ended makes no further calls, so these figures are its last.
+        // A process that has ended makes no further calls, so the following figures are final.
         let ended: HashSet<_> = reports
             .iter()
             .filter(|(_, report)| report.has_ended)
             .map(|(id, _)| *id)
             .collect();
         let mut figures: Vec<_> = tables.figures().collect();
-        // Publishers name their buffers, and buffers their callbacks.
+        // Buffers need the names of publishers, and callbacks need those of buffers.
         figures.sort_unstable_by_key(|(handle, _)| handle.kind);
         self.drain(tables, clocks, broker);
         for (handle, figures) in &figures {
@@ -326,8 +328,8 @@ impl ProcessTable {
         }
     }
 
-    /// Returns the report of a process without its handles. `states`: of the processes that have
-    /// not ended, if known.
+    /// Returns the report of a process without its handles. `states` has the running processes, if
+    /// known.
     fn process(
         &mut self,
         id: u32,
@@ -472,7 +474,7 @@ impl ProcessTable {
                     node,
                     trigger,
                     thread: figures.thread,
-                    // Where callbacks are not observed, only their begin is.
+                    // Without observation of callbacks, only their starts are counted.
                     calls: figures.count.max(figures.within),
                     last,
                     durations: durations(figures, distribution::INTERVAL),
@@ -483,7 +485,7 @@ impl ProcessTable {
             }
             _ => None,
         };
-        // The name of a handle may follow.
+        // Without a name, the handle is reported later.
         if is_known.is_some() {
             observed.note_reported(handle, mark);
         }
@@ -513,7 +515,7 @@ impl ProcessTable {
     }
 }
 
-/// An item of the ring.
+/// An item of the announcement ring.
 enum Item {
     Announcement(Box<Announcement>),
     Hop(inside::Hop),
@@ -585,7 +587,7 @@ mod tests {
     }
 
     #[test]
-    fn handles_that_come_and_go_without_end_are_reported_again() {
+    fn handles_beyond_the_cap_cause_a_new_report_of_all_handles() {
         let mut observed = Observed::default();
         let handle = |address| Handle {
             address,

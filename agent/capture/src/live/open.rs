@@ -14,7 +14,8 @@ use crate::inside::Inside;
 use crate::reassembly::Limits;
 use crate::settings::{CaptureSettings, ExactChoice, InsideChoice, SourceChoice};
 
-/// Least share of a namespace: one fragmented datagram fits, however many namespaces share the cap.
+/// Minimum bytes of a namespace: one fragmented datagram fits, however many namespaces share the
+/// cap.
 const LEAST_REASSEMBLY: usize = 1 << 17;
 
 /// Returns the shared memory that belongs to the observed sockets or namespaces.
@@ -104,7 +105,7 @@ pub(super) fn open_wires(
     limits: Limits,
     selection: Selection,
 ) -> Result<Vec<WireTap>, CaptureError> {
-    // Together they stay within the cap.
+    // All namespaces together stay within the cap.
     let share = limits.bytes / (1 + settings.network_namespaces.len());
     let limits = Limits {
         bytes: share.max(LEAST_REASSEMBLY),

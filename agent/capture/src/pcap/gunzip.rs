@@ -5,11 +5,11 @@ use std::io::{self, Read};
 use flate2::read::MultiGzDecoder;
 use ros2probe_wire::{ExpandsTooFar, Expansion};
 
-/// Limit of expansion, beyond [`Expansion::FREE`]. Captures of images of one colour stay below;
-/// gzip reaches 1032.
+/// Maximum factor of expansion beyond [`Expansion::FREE`]. Captures of images of one colour stay
+/// below it; gzip reaches 1032.
 const FACTOR: u64 = 100;
 
-/// A decompressor that fails where the bytes so far do not explain their expansion.
+/// A decompressor that fails when its output exceeds the limit for the compressed bytes so far.
 pub(super) struct Gunzip<R: Read> {
     decoder: MultiGzDecoder<Compressed<R>>,
     expanded: u64,

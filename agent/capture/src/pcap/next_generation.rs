@@ -19,7 +19,7 @@ const OBSOLETE_PACKET: u32 = 2;
 const SIMPLE_PACKET: u32 = 3;
 const ENHANCED_PACKET: u32 = 6;
 
-/// Longest block: a packet with its options and comments.
+/// Maximum size of a block, in bytes: a packet with its options and comments.
 const LONGEST_BLOCK: u32 = LONGEST_PACKET + 65_536;
 const MOST_INTERFACES: usize = 4096;
 const LONGEST_NAME: usize = 256;

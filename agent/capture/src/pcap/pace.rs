@@ -1,6 +1,6 @@
 //! Replay at the pace of the capture, a multiple of it, or without pauses.
 //!
-//! It only computes how long to wait; the caller waits, and decides what interrupts it.
+//! The pacer only computes the wait. The caller waits, and decides what interrupts the wait.
 
 use std::str::FromStr;
 use std::time::{Duration, Instant};
@@ -12,7 +12,7 @@ use ros2probe_wire::Timestamp;
 pub enum Speed {
     /// Without waiting.
     Max,
-    /// This many times as fast as it was captured.
+    /// Multiple of the speed of the capture.
     Times(f64),
 }
 
@@ -53,14 +53,15 @@ impl Pacer {
     }
 
     /// Returns the time from `now` until the packet captured at `time` is due. The first packet is
-    /// due at once and sets the pace; a late packet, or one older than the first, is due at once.
+    /// due immediately and sets the pace. A late packet, or one older than the first, is also due
+    /// immediately.
     pub fn delay(&mut self, time: Timestamp, now: Instant) -> Duration {
         let Speed::Times(factor) = self.speed else {
             return Duration::ZERO;
         };
         let (first, started) = *self.anchor.get_or_insert((time, now));
         let since_first = Duration::from_nanos(time.0.saturating_sub(first.0));
-        // Overflows for a capture of centuries at a very low speed: wait forever.
+        // A capture of centuries at a very low speed overflows: the wait is then unlimited.
         let due = Duration::try_from_secs_f64(since_first.as_secs_f64() / factor)
             .unwrap_or(Duration::MAX);
         due.saturating_sub(now.saturating_duration_since(started))
@@ -72,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn packets_keep_their_distance_divided_by_the_speed() {
+    fn packets_keep_their_intervals_divided_by_the_speed() {
         let start = Instant::now();
         let mut pacer = Pacer::new("2".parse().unwrap());
         assert_eq!(pacer.delay(Timestamp(5_000_000_000), start), Duration::ZERO);
@@ -91,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn an_absurd_distance_does_not_overflow() {
+    fn an_extreme_interval_does_not_overflow() {
         let start = Instant::now();
         let mut pacer = Pacer::new(Speed::Times(f64::MIN_POSITIVE));
         pacer.delay(Timestamp(0), start);

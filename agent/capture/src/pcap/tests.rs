@@ -190,7 +190,7 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn pcap_reads_the_same_in_every_dress() {
+fn pcap_files_read_the_same_in_every_byte_order_resolution_and_compression() {
     for endianness in [Endianness::Big, Endianness::Little] {
         for nanoseconds in [false, true] {
             let file = classic(endianness, nanoseconds);
@@ -210,7 +210,7 @@ fn pcap_reads_the_same_in_every_dress() {
 }
 
 #[test]
-fn pcapng_blocks_interfaces_and_resolutions() {
+fn pcapng_packets_have_the_link_layer_and_time_resolution_of_their_interface() {
     for endianness in [Endianness::Big, Endianness::Little] {
         let (packets, error) = read(&next_generation(endianness));
         assert!(error.is_none(), "{error:?}");
@@ -233,7 +233,7 @@ fn pcapng_blocks_interfaces_and_resolutions() {
 }
 
 #[test]
-fn a_second_section_starts_over_in_its_own_byte_order() {
+fn a_second_section_has_its_own_byte_order_and_interfaces() {
     let mut file = next_generation(Endianness::Little);
     file.extend(next_generation(Endianness::Big));
     let mut reader = PcapReader::new(io::Cursor::new(file), Expansion::Limited).unwrap();
@@ -250,7 +250,7 @@ fn a_second_section_starts_over_in_its_own_byte_order() {
 }
 
 #[test]
-fn a_file_cut_anywhere_delivers_what_precedes_the_cut() {
+fn a_truncated_file_delivers_the_packets_before_the_cut() {
     for file in [
         classic(Endianness::Little, false),
         next_generation(Endianness::Big),
@@ -279,7 +279,7 @@ fn a_file_cut_anywhere_delivers_what_precedes_the_cut() {
 }
 
 #[test]
-fn one_wrong_byte_ends_the_file_at_worst() {
+fn a_corrupted_byte_never_causes_a_panic_or_extra_packets() {
     for file in [
         classic(Endianness::Big, true),
         next_generation(Endianness::Little),
@@ -296,7 +296,7 @@ fn one_wrong_byte_ends_the_file_at_worst() {
 }
 
 #[test]
-fn announced_lengths_are_not_believed() {
+fn an_excessive_length_in_the_file_is_rejected() {
     let mut file = classic(Endianness::Little, false);
     file[32..36].copy_from_slice(&0x7fff_ffff_u32.to_le_bytes());
     let (_, error) = read(&file);
@@ -353,7 +353,8 @@ fn fragments_of_a_real_capture_become_a_datagram() {
     );
 }
 
-/// Returns frames, datagrams (whole or reassembled), and the reassembly's counters.
+/// Returns the number of frames and of datagrams (whole or reassembled), and the reassembly's
+/// counters.
 fn datagrams(path: &Path) -> (u64, u64, reassembly::Counters) {
     let mut reader = PcapReader::open(path, Expansion::Limited).unwrap();
     let mut reassembly = Reassembly::new(Limits::default());
@@ -393,7 +394,7 @@ fn census(path: &Path) -> (u64, u64, u64, u64) {
 }
 
 #[test]
-fn real_captures_hold_what_another_decoder_counted() {
+fn real_captures_contain_the_packets_that_another_decoder_counted() {
     // Ethernet and cooked v2; the numbers are in wire/tests/data/README.md.
     assert_eq!(
         census(&data("cyclonedds-qos-mismatch.pcap.gz")),
@@ -410,7 +411,7 @@ fn real_captures_hold_what_another_decoder_counted() {
 }
 
 #[test]
-fn a_small_capture_that_expands_to_gigabytes_of_empty_packets_ends_soon() {
+fn a_small_capture_that_expands_too_far_ends_with_an_error() {
     // The header of a capture, and empty packets.
     const PACKETS: usize = 8 << 20;
     let mut file = GzEncoder::new(Vec::new(), Compression::fast());

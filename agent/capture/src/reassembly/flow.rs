@@ -16,11 +16,11 @@ pub(super) struct Flow {
     pub(super) first_seen: Timestamp,
     pub(super) last_seen: Timestamp,
     pub(super) handover: Option<Record>,
-    /// Sorted, neither overlapping nor touching.
+    /// Sorted pieces, which neither overlap nor touch.
     pieces: Vec<Piece>,
     /// Length of the datagram with its UDP header, known after the last fragment.
     total: Option<u32>,
-    /// First byte that is missing in a truncated capture.
+    /// Offset of the first byte that is missing in a truncated capture.
     first_unknown: Option<u32>,
     /// Capacity of all pieces.
     held: usize,
@@ -36,11 +36,11 @@ struct Piece {
 /// Result of adding a fragment.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) enum Placed {
-    /// Bytes that were missing.
+    /// The fragment added missing bytes.
     New,
-    /// No new bytes.
+    /// The fragment added no bytes.
     Nothing,
-    /// It cannot belong to the same datagram. The flow is unchanged.
+    /// The fragment cannot belong to the same datagram. The flow is unchanged.
     Contradiction,
 }
 
@@ -71,7 +71,7 @@ impl Flow {
         ENTRIES + self.held + self.pieces.capacity() * size_of::<Piece>()
     }
 
-    /// Adds a fragment. Of overlapping bytes, the first ones are kept.
+    /// Adds a fragment. Where fragments overlap, the earlier bytes are kept.
     pub(super) fn place(&mut self, at: Timestamp, fragment: &Fragment<'_>) -> Placed {
         let (start, end) = (fragment.offset, fragment.end());
         let seen = self.pieces.last().map_or(0, Piece::end);
@@ -114,8 +114,8 @@ impl Flow {
         (piece.start <= from && to <= piece.end()).then_some((from, to))
     }
 
-    /// Returns the bytes up to `to`, with zeros before `from`, without those missing in the
-    /// capture.
+    /// Returns the bytes up to `to`, or up to the first byte that is missing in the capture. Bytes
+    /// before `from` are zeros.
     pub(super) fn take(&mut self, from: u32, to: u32) -> Vec<u8> {
         let index = self.first_ending_after(from);
         let Some(piece) = self.pieces.get_mut(index) else {
@@ -198,7 +198,7 @@ impl Flow {
         };
         self.held = self.held.saturating_sub(piece.bytes.capacity());
         piece.bytes.extend_from_slice(bytes);
-        // Bytes of the fragment that are missing in the capture.
+        // Zeros replace bytes of the fragment that are missing in the capture.
         piece.bytes.resize(size(to.saturating_sub(piece.start)), 0);
         piece.bytes.extend_from_slice(&joined);
         self.held += piece.bytes.capacity();

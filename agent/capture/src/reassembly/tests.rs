@@ -18,7 +18,7 @@ fn key(id: u32) -> FlowKey {
     }
 }
 
-/// UDP header 7401 -> 7400 and `length` bytes of payload that differ from place to place.
+/// Returns a UDP header (7401 to 7400) and `length` bytes of payload that depend on their position.
 fn transport(length: usize, seed: usize) -> Vec<u8> {
     let total = u16::try_from(length + 8).unwrap();
     let mut bytes = vec![0x1c, 0xe9, 0x1c, 0xe8];
@@ -69,7 +69,7 @@ fn assert_empty(reassembly: &Reassembly) {
 }
 
 #[test]
-fn any_order_gives_the_datagram_once() {
+fn fragments_in_any_order_yield_the_datagram_once() {
     let bytes = transport(60_000, 0);
     let parts = fragments(&bytes);
     let mut reversed = parts.clone();
@@ -112,7 +112,7 @@ fn a_late_repeated_fragment_does_not_reopen_a_datagram() {
 }
 
 #[test]
-fn overlapping_fragments_are_harmless() {
+fn overlapping_fragments_yield_the_datagram() {
     let bytes = transport(4000, 0);
     let parts = [
         fragment(&bytes, 800, 1600),
@@ -128,7 +128,7 @@ fn overlapping_fragments_are_harmless() {
 }
 
 #[test]
-fn a_reused_identification_starts_over() {
+fn a_reused_identification_starts_a_new_datagram() {
     let (old, new) = (transport(4000, 0), transport(4000, 1));
     let mut reassembly = Reassembly::new(Limits::default());
     assert_eq!(feed(&mut reassembly, 1, &fragments(&old)[..2]), []);
@@ -150,7 +150,7 @@ fn a_reused_identification_starts_over() {
 }
 
 #[test]
-fn copies_on_other_interfaces_do_not_mix() {
+fn fragments_of_different_interfaces_and_directions_do_not_mix() {
     let bytes = transport(4000, 0);
     let mut reassembly = Reassembly::new(Limits::default());
     let mut done = 0;
@@ -168,7 +168,7 @@ fn copies_on_other_interfaces_do_not_mix() {
 }
 
 #[test]
-fn a_datagram_with_a_hole_times_out() {
+fn a_datagram_with_a_missing_fragment_times_out() {
     let bytes = transport(4000, 0);
     let mut reassembly = Reassembly::new(Limits::default());
     assert_eq!(feed(&mut reassembly, 1, &fragments(&bytes)[1..]), []);
@@ -183,7 +183,7 @@ fn a_datagram_with_a_hole_times_out() {
 }
 
 #[test]
-fn the_oldest_goes_first_when_there_are_too_many() {
+fn datagrams_beyond_the_cap_evict_the_oldest_flow() {
     let bytes = transport(4000, 0);
     let limits = Limits {
         flows: 3,
@@ -200,7 +200,7 @@ fn the_oldest_goes_first_when_there_are_too_many() {
 }
 
 #[test]
-fn memory_follows_what_came_and_not_what_was_announced() {
+fn memory_depends_on_received_bytes_and_not_on_the_announced_length() {
     let bytes = transport(65_000, 0);
     let tail = fragment(&bytes, 65_000, 65_008);
     let mut reassembly = Reassembly::new(Limits::default());
@@ -243,7 +243,7 @@ fn finished_datagrams_are_remembered_within_a_cap() {
 }
 
 #[test]
-fn a_handed_over_tail_is_a_datagram_whichever_comes_first() {
+fn a_handover_and_its_fragments_yield_a_datagram_in_either_order() {
     let bytes = transport(10_000, 0);
     let parts = fragments(&bytes);
     let record = handover(5000, 10_000);
@@ -296,7 +296,7 @@ fn a_handover_survives_fragments_that_contradict_it() {
 }
 
 #[test]
-fn a_handovers_key_is_its_fragments_key() {
+fn a_handover_has_the_flow_key_of_its_fragments() {
     let record = Record {
         interface: 3,
         flags: flag::OUTGOING,
@@ -316,7 +316,7 @@ fn a_handovers_key_is_its_fragments_key() {
 }
 
 #[test]
-fn a_capture_cut_short_gives_the_head_and_the_true_length() {
+fn a_truncated_capture_yields_the_first_bytes_and_the_true_length() {
     let bytes = transport(4000, 0);
     let cut = |part: &Fragment<'_>| Fragment {
         bytes: &bytes[..0],
@@ -340,7 +340,7 @@ fn a_capture_cut_short_gives_the_head_and_the_true_length() {
 }
 
 #[test]
-fn an_impossible_udp_length_is_not_delivered() {
+fn a_datagram_with_an_impossible_udp_length_is_not_delivered() {
     for length in [0_u16, 7, 4009] {
         let mut bytes = transport(4000, 0);
         bytes[4..6].copy_from_slice(&length.to_be_bytes());
@@ -353,7 +353,7 @@ fn an_impossible_udp_length_is_not_delivered() {
 
 proptest! {
     #[test]
-    fn shuffled_fragments_of_many_datagrams_all_arrive(
+    fn shuffled_fragments_of_many_datagrams_yield_every_datagram(
         lengths in prop::collection::vec(1500..9000_usize, 1..6),
         order in any::<prop::sample::Index>(),
         seed in any::<u64>(),
@@ -385,7 +385,7 @@ proptest! {
     }
 
     #[test]
-    fn nonsense_stays_within_the_caps(
+    fn arbitrary_fragments_stay_within_the_caps(
         parts in prop::collection::vec(
             (0..6_u32, 0..8191_u32, 1..3000_u32, any::<bool>(), 0..3000_usize, 0..20_u64, 0..9_u8),
             1..200,

@@ -1,7 +1,7 @@
 //! Parses one block of a TPACKET_V3 ring (`linux/if_packet.h`) as plain bytes.
 //!
-//! Offsets in a block come from the kernel; still none is followed out of the block. A wrong offset
-//! ends the block and is reported.
+//! Offsets in a block come from the kernel, but every offset is checked against the block. A wrong
+//! offset ends the block and is reported.
 
 use std::mem::{offset_of, size_of};
 
@@ -31,13 +31,13 @@ const _: () = assert!(offset_of!(tpacket3_hdr, tp_mac) == 24);
 /// One frame in the ring.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct RingFrame<'a> {
-    /// Time at which the kernel saw it.
+    /// Time at which the kernel saw the frame.
     pub time: Timestamp,
     /// The captured bytes, beginning at the network header.
     pub bytes: &'a [u8],
     /// Length of the frame from the network header.
     pub length: u32,
-    /// Index of the interface it was seen on.
+    /// Index of the interface on which the frame was seen.
     pub interface: u32,
     /// Recipient of the frame; outgoing if this host sends it.
     pub packet_type: PacketType,
@@ -166,12 +166,12 @@ pub(super) mod tests {
         block[at..at + 4].copy_from_slice(&value.to_ne_bytes());
     }
 
-    /// Two frames of 5 and 7 bytes.
+    /// Returns a block with two frames of 5 and 7 bytes.
     fn block() -> Vec<u8> {
         block_of(&[b"first", b"another"])
     }
 
-    /// A block as the kernel lays it out; the last frame has a VLAN tag.
+    /// Returns a block as the kernel lays it out; the last frame has a VLAN tag.
     pub(in crate::ring) fn block_of(frames: &[&[u8]]) -> Vec<u8> {
         let mut block = vec![0; 48];
         put(&mut block, STATUS, libc::TP_STATUS_USER);
@@ -239,7 +239,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_block_cut_anywhere_ends_early_and_reports_it() {
+    fn a_truncated_block_ends_early_and_reports_damage() {
         let bytes = block();
         for end in 0..bytes.len() {
             let mut frames = Frames::new(&bytes[..end]);
@@ -257,7 +257,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_step_that_does_not_lead_forward_ends_the_block() {
+    fn a_frame_offset_that_does_not_advance_ends_the_block() {
         for step in [0, 16, u32::MAX] {
             let mut bytes = block();
             put(&mut bytes, 48, step);
@@ -270,7 +270,7 @@ pub(super) mod tests {
 
     proptest! {
         #[test]
-        fn damage_never_leads_out_of_the_block(
+        fn corrupted_bytes_never_lead_out_of_the_block(
             damage in prop::collection::vec((0..231_usize, any::<u8>()), 1..8),
         ) {
             let mut bytes = block();

@@ -1,4 +1,4 @@
-//! Live tests in network namespaces of their own. Needs root.
+//! Live tests in separate network namespaces. They need root.
 
 use std::net::UdpSocket;
 use std::time::Instant;
@@ -18,7 +18,7 @@ const SMALL: Settings = Settings {
     retire: Duration::from_millis(10),
 };
 
-/// Generous for a busy machine.
+/// Timeout of a test; generous for a busy machine.
 const PATIENCE: Duration = Duration::from_secs(20);
 
 /// UDP payloads, by interface.
@@ -89,14 +89,14 @@ fn filter(keep: i32) -> OwnedFd {
     // SAFETY: BPF_PROG_LOAD with a zero-padded attribute whose pointers outlive the call.
     let fd = unsafe { libc::syscall(libc::SYS_bpf, 5, &raw const load, size_of::<Load>()) };
     assert!(fd >= 0, "{}", io::Error::last_os_error());
-    // SAFETY: just made.
+    // SAFETY: the descriptor is new and has no other owner.
     unsafe { OwnedFd::from_raw_fd(i32::try_from(fd).unwrap()) }
 }
 
 #[test]
-fn a_socket_that_may_hold_as_little_as_up_to_linux_6_7_takes_the_kernel_filter() {
+fn the_kernel_filter_fits_the_option_memory_of_a_socket_up_to_linux_6_7() {
     in_new_namespace(|| {
-        // Since Linux 6.8 each network namespace has its own value, 128 KB; before, the host's
+        // Since Linux 6.8, each network namespace has its own value, 128 KB. Before, the host's
         // value applies.
         let _ = std::fs::write("/proc/sys/net/core/optmem_max", "20480");
         let filter = Filter::load(&FilterSettings::default()).unwrap();
@@ -148,7 +148,7 @@ fn frames_on_loopback_arrive_with_kernel_time_and_direction() {
 }
 
 #[test]
-fn the_ring_goes_round_many_times_without_losing_a_frame() {
+fn a_ring_that_wraps_many_times_loses_no_frame() {
     in_new_namespace(|| {
         let mut ring = Ring::open(SMALL, None).unwrap();
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
@@ -181,7 +181,7 @@ fn the_ring_goes_round_many_times_without_losing_a_frame() {
 }
 
 #[test]
-fn asking_for_a_block_that_is_not_ready_changes_nothing() {
+fn a_request_for_a_block_that_is_not_ready_changes_nothing() {
     in_new_namespace(|| {
         let mut ring = Ring::open(SMALL, None).unwrap();
         for _ in 0..7 {
@@ -211,7 +211,7 @@ fn frames_that_a_slow_reader_misses_are_counted_once() {
         assert_eq!(ring.statistics().unwrap(), first);
         let kept = sent(&mut ring, Duration::from_millis(100)).len();
         assert!(kept > 10, "{kept}");
-        // Blocks went back to the kernel, which has room again.
+        // The kernel has the blocks back, and can store frames again.
         socket.send_to(b"again", "127.0.0.1:7400").unwrap();
         sent_until(&mut ring, |payloads| {
             payloads
@@ -223,7 +223,7 @@ fn frames_that_a_slow_reader_misses_are_counted_once() {
 }
 
 #[test]
-fn the_filter_cuts_frames_and_keeps_their_length() {
+fn a_truncating_filter_keeps_the_original_length_of_frames() {
     in_new_namespace(|| {
         let program = filter(28);
         let mut ring = Ring::open(SMALL, Some(program.as_fd())).unwrap();
@@ -265,11 +265,11 @@ fn a_link_that_goes_down_does_not_make_the_reader_spin() {
         ip("link add gone type veth peer name far");
         ip("link set gone up");
         ip("link set far up");
-        // SAFETY: a terminated string.
+        // SAFETY: the argument is a terminated string.
         let index = unsafe { libc::if_nametoindex(c"gone".as_ptr()) };
         let index = i32::try_from(index).unwrap();
-        // The kernel reports to sockets bound to the interface only; the agent's are not bound, and
-        // still must not spin.
+        // The kernel reports only to sockets bound to the interface. The agent's sockets are not
+        // bound, and must not spin either.
         let mut bound = Ring::open_on(SMALL, None, index).unwrap();
         let mut unbound = Ring::open(SMALL, None).unwrap();
         sent(&mut bound, Duration::from_millis(50));
@@ -314,7 +314,7 @@ fn impossible_sizes_are_refused() {
 }
 
 #[test]
-fn blocks_are_whole_pages_whatever_a_page_is() {
+fn blocks_have_whole_pages_for_every_page_size() {
     for page in [4096, 16_384, 65_536] {
         for (wanted, given) in [(1, page), (page + 1, 2 * page), (BLOCK, BLOCK)] {
             let settings = Settings {
@@ -333,7 +333,7 @@ fn blocks_are_whole_pages_whatever_a_page_is() {
 }
 
 #[test]
-fn any_amount_of_memory_makes_a_ring_for_the_largest_frames() {
+fn a_ring_of_any_memory_size_fits_the_largest_frames() {
     assert_eq!(Settings::with_memory(4 << 20), Settings::default());
     for (memory, block_size, blocks) in [
         (0, 128 << 10, 2),
@@ -406,7 +406,7 @@ fn fragments_from_the_ring_become_datagrams_in_both_ip_versions() {
 }
 
 #[test]
-fn without_the_capability_the_error_names_it() {
+fn a_missing_capability_is_named_in_the_error() {
     let thread = std::thread::spawn(|| {
         let mut sets = capabilities(None).unwrap();
         sets.effective = CapabilitySet::empty();

@@ -1,7 +1,7 @@
-//! Ownership of a ring's blocks, each passed between the kernel and its reader by one word.
+//! Ownership of a ring's blocks. One word passes each block between the kernel and its reader.
 //!
-//! Uses no socket and no system call. Over plain memory, with a thread in place of the kernel, it
-//! behaves the same; the tests run it that way under Miri.
+//! The module uses no socket and no system call. It behaves the same over plain memory with a
+//! thread in place of the kernel, which is how the tests run it under Miri.
 
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -18,15 +18,15 @@ pub(super) struct Turns {
     next: usize,
 }
 
-/// A block of frames on loan from the kernel. Frames are dropped while the reader holds all blocks,
-/// so it should not be kept for long.
+/// A block of frames that user space owns until it is dropped. The kernel drops frames while all
+/// blocks wait for the reader, so a block should not be held for long.
 #[derive(Debug)]
 pub struct Block<'a> {
     turns: &'a mut Turns,
 }
 
-// SAFETY: the caller of `new` guarantees that the memory outlives this value; it is accessed only
-// through this value and bound to no thread.
+// SAFETY: the caller of `new` guarantees that the memory outlives this value. It is accessed only
+// through this value and belongs to no thread.
 unsafe impl Send for Turns {}
 
 impl Turns {
@@ -34,10 +34,10 @@ impl Turns {
     ///
     /// # Safety
     /// `start` is aligned to 8. `block_size` is a multiple of 8 and at least the size of a block's
-    /// header. `blocks`, not 0, times `block_size` bytes are mapped while the value lives. Only the
-    /// other side accesses them besides this value. It writes into a block only while its status
-    /// does not have `TP_STATUS_USER`, after having read that with acquire, and before setting it
-    /// with release.
+    /// header. `blocks` is not 0, and `blocks` times `block_size` bytes are mapped while the value
+    /// lives. Only the other side accesses them besides this value. The other side writes into a
+    /// block only while the block's status does not have `TP_STATUS_USER`. It does so after reading
+    /// the status with acquire, and before setting the flag with release.
     pub(super) const unsafe fn new(start: NonNull<u8>, block_size: usize, blocks: usize) -> Self {
         Self {
             start,
@@ -75,13 +75,13 @@ impl Turns {
         unsafe { self.start.byte_add(self.next * self.block_size) }
     }
 
-    /// Returns the word that passes the next block.
+    /// Returns the status word of the next block.
     fn status(&self) -> &AtomicU32 {
         // SAFETY: a block is longer than its header, which has the word (STATUS, a multiple of 4).
         let word = unsafe { self.start().byte_add(STATUS) };
-        // SAFETY: aligned and mapped, as guaranteed to `new`, while `self` lives. Kernel and user
-        // space both access it as one 32-bit word; the kernel does not write it while user space
-        // owns the block.
+        // SAFETY: the caller of `new` guarantees that the word is aligned and mapped while `self`
+        // lives. Kernel and user space access it as one 32-bit word. The kernel does not write it
+        // while user space owns the block.
         unsafe { AtomicU32::from_ptr(word.cast().as_ptr()) }
     }
 }
@@ -95,9 +95,9 @@ impl Block<'_> {
 
     fn bytes(&self) -> &[u8] {
         let start = self.turns.start();
-        // SAFETY: the block is mapped while the ring lives, which this borrows. It belongs to user
-        // space since `Turns::block` saw TP_STATUS_USER. Until the drop, neither the kernel nor
-        // this process writes to it. Any bytes are valid `u8`.
+        // SAFETY: the block is mapped while the ring lives, and `self` borrows the ring. The block
+        // belongs to user space since `Turns::block` saw TP_STATUS_USER. Until the drop, neither
+        // the kernel nor this process writes to it. Any bytes are valid `u8`.
         unsafe { std::slice::from_raw_parts(start.as_ptr(), self.turns.block_size) }
     }
 }
@@ -138,17 +138,17 @@ mod tests {
         }
 
         fn turns(&self) -> Turns {
-            // SAFETY: length and alignment are as required, and every test frees it last.
+            // SAFETY: length and alignment are as required, and every test frees the memory last.
             unsafe { Turns::new(self.0, BLOCK, BLOCKS) }
         }
 
-        /// Acts as the kernel: waits for its turn, fills the block, passes it on.
+        /// Acts as the kernel: waits until the block is free, fills it, and releases it.
         fn fill(&self, index: usize, bytes: &[u8]) {
-            // SAFETY: within the memory.
+            // SAFETY: the block is within the memory.
             let block = unsafe { self.0.byte_add(index * BLOCK) };
-            // SAFETY: within the block, after its start.
+            // SAFETY: the word is within the block, after its start.
             let word = unsafe { block.byte_add(STATUS) };
-            // SAFETY: aligned, and accessed as an atomic by both sides.
+            // SAFETY: the word is aligned, and both sides access it as an atomic.
             let status = unsafe { AtomicU32::from_ptr(word.cast().as_ptr()) };
             while status.load(Ordering::Acquire) & libc::TP_STATUS_USER != 0 {
                 thread::yield_now();
@@ -156,9 +156,9 @@ mod tests {
             let (head, tail) = (&bytes[..STATUS], &bytes[STATUS + 4..]);
             // SAFETY: the kernel's side owns the block, since the reader has released it.
             unsafe { block.copy_from_nonoverlapping(NonNull::from(head).cast(), head.len()) };
-            // SAFETY: within the block, after the status.
+            // SAFETY: the address is within the block, after the status.
             let behind = unsafe { word.byte_add(4) };
-            // SAFETY: as above.
+            // SAFETY: the kernel's side still owns the block.
             unsafe { behind.copy_from_nonoverlapping(NonNull::from(tail).cast(), tail.len()) };
             status.store(libc::TP_STATUS_USER, Ordering::Release);
         }
@@ -166,7 +166,7 @@ mod tests {
         /// Frees the memory after every use of it.
         fn free(self) {
             let words = std::ptr::slice_from_raw_parts_mut(self.0.cast().as_ptr(), Self::WORDS);
-            // SAFETY: from `new`, and no longer used.
+            // SAFETY: the memory is from `new`, and no longer used.
             drop(unsafe { Box::<[u64]>::from_raw(words) });
         }
     }
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn a_block_is_the_readers_until_it_is_dropped_and_then_the_next_ones_turn_comes() {
+    fn the_reader_owns_a_block_until_it_is_dropped_and_then_gets_the_next_one() {
         let memory = Memory::new();
         let mut turns = memory.turns();
         assert!(turns.block().is_none());
@@ -195,7 +195,7 @@ mod tests {
         assert_eq!(next(&mut turns), [b"first"]);
         assert_eq!(next(&mut turns), [&b"second"[..], b"third"]);
         assert!(turns.block().is_none());
-        // Not the first again: the third is next, then the first.
+        // The reader does not return to the first block: the third block is next.
         memory.fill(0, &block_of(&[b"again"]));
         assert!(turns.block().is_none());
         memory.fill(2, &block_of(&[]));

@@ -24,14 +24,15 @@ pub struct Descriptor {
 /// A cell as it was read.
 #[derive(Clone, Copy, PartialEq, Eq, Default, Debug)]
 pub struct Cell {
-    /// Number of listeners that have not read it yet; also 0 while it is being filled.
+    /// Number of listeners that have not read the message yet; also 0 while the cell is being
+    /// filled.
     pub references: u32,
     /// The message.
     pub descriptor: Descriptor,
 }
 
 impl Cell {
-    /// Bytes of a cell.
+    /// Size of a cell, in bytes.
     pub const LEN: usize = 20;
 
     /// Parses the bytes of a cell.
@@ -87,7 +88,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_cell_is_four_fields_one_behind_the_other() {
+    fn a_cell_is_parsed_as_four_consecutive_fields() {
         let bytes: [u8; 20] = std::array::from_fn(|index| index as u8);
         let cell = Cell::parse(bytes);
         assert_eq!(cell.references, 0x0302_0100);

@@ -1,8 +1,8 @@
 //! The verdict on a message in shared memory: the kernel filter's rules, on the same walk.
 //!
-//! Messages are ignored, metered as records, or captured whole. Messages of unclassified writers
-//! are captured, then metered, each within a budget. Only the parts that the walk needs are read:
-//! the first 256 bytes for a point cloud's fragment.
+//! Messages are ignored, metered as records, or captured whole. Messages of unknown writers are
+//! captured, then metered, each within a budget. Only the parts that the walk needs are read: the
+//! first 256 bytes for a point cloud's fragment.
 
 use std::collections::HashMap;
 
@@ -15,22 +15,22 @@ use ros2probe_wire::{EntityId, Guid};
 
 use crate::tables::UnknownShmWriters;
 
-/// Submessages read per message; a message with more is captured.
+/// Maximum number of submessages read per message; a message with more is captured.
 const SUBMESSAGES: usize = 64;
-/// Budget of all unclassified writers per second: bytes captured, and records.
+/// Budget of all unknown writers per second: bytes captured, and records.
 const CAPTURE_PER_SECOND: i64 = 4 << 20;
 const RECORDS_PER_SECOND: i64 = 4096;
 
 /// What happens to a message.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum MessageVerdict {
-    /// Discarded: none of its submessages is of interest.
+    /// The message is discarded: none of its submessages is of interest.
     Ignored,
-    /// The appended records are valid.
+    /// The message is metered: the appended records are valid.
     Metered,
-    /// User space must read it whole.
+    /// The message is captured: user space must read it whole.
     Captured,
-    /// It is not an RTPS message.
+    /// The message is not an RTPS message.
     Foreign,
 }
 
@@ -38,18 +38,18 @@ pub enum MessageVerdict {
 #[derive(Debug)]
 pub struct MessageClassifier {
     interest: HashMap<[u32; 4], Verdict>,
-    /// Bytes captured of unclassified writers.
+    /// Number of captured bytes of each unknown writer.
     unknown: Bounded<UnknownShmWriters, HashMap<[u32; 4], u32>>,
     capture_left: i64,
     records_left: i64,
     refilled: u64,
-    /// The last captured message announces endpoints or perhaps nodes, and more announcements may
-    /// follow.
+    /// Whether the last captured message announces endpoints or perhaps nodes, and more
+    /// announcements may follow.
     pub announces: bool,
-    /// It belongs to a writer of discovery.
+    /// Whether the last captured message belongs to a writer of discovery.
     pub is_builtin: bool,
-    /// It belongs to a writer whose messages are captured whole: a participant's nodes, or samples
-    /// that are read.
+    /// Whether the last captured message belongs to a writer whose messages are captured whole: a
+    /// participant's nodes, or samples that are read.
     pub is_wanted: bool,
 }
 
@@ -70,7 +70,7 @@ impl Default for MessageClassifier {
 }
 
 impl MessageClassifier {
-    /// Sets the verdict of a writer or reader; `None` = unclassified.
+    /// Sets the verdict of a writer or reader; `None` = unknown.
     pub fn set(&mut self, guid: Guid, verdict: Option<Verdict>) {
         let key = guid_words(guid);
         match verdict {
@@ -80,7 +80,7 @@ impl MessageClassifier {
         self.unknown.remove(&key);
     }
 
-    /// Refills the budget of unclassified writers for the next second.
+    /// Refills the budget of unknown writers for the next second.
     pub fn refill(&mut self, now: u64) {
         if now.saturating_sub(self.refilled) >= SECOND {
             self.refilled = now;
@@ -88,8 +88,9 @@ impl MessageClassifier {
         }
     }
 
-    /// Judges a message of `length` bytes. Appends records based on `template`, which holds the
-    /// fields of the whole message; they are valid if the message is metered.
+    /// Returns the verdict on a message of `length` bytes. Appends records based on `template`,
+    /// which holds the fields of the whole message. The records are valid if the message is
+    /// metered.
     pub fn classify<B: Bytes>(
         &mut self,
         message: &B,
@@ -159,7 +160,7 @@ impl MessageClassifier {
         }
     }
 
-    /// Captures within the writer's budget, then meters within the common one.
+    /// Captures within the writer's budget, then meters within the common budget.
     fn unknown(&mut self, writer: [u32; 4], length: u32) -> Verdict {
         let is_datagram = length <= u16::MAX.into();
         if is_datagram
@@ -194,7 +195,7 @@ mod tests {
         Guid::from_bytes(bytes)
     }
 
-    /// A message with samples of writers.
+    /// Returns a message with samples of writers.
     pub(super) fn message(samples: &[([u8; 4], u32)]) -> Vec<u8> {
         let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
         bytes.extend([9; 12]);
@@ -238,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn discovery_is_captured_whatever_else_there_is() {
+    fn a_message_with_discovery_is_captured_whatever_else_it_contains() {
         let mut rules = MessageClassifier::default();
         rules.set(guid(WRITER), Some(Verdict::Meter));
         let participant = message(&[(WRITER, 1), ([0, 1, 0, 0xc2], 1)]);
@@ -273,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_writer_is_captured_then_metered_then_nothing() {
+    fn an_unknown_writer_is_captured_then_metered_then_ignored() {
         let mut rules = MessageClassifier::default();
         let message = message(&[(WRITER, 1)]);
         let mut counts = [0; 3];

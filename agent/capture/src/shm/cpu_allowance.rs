@@ -1,10 +1,10 @@
 //! CPU allowance for listing directories and opening ports.
 //!
 //! A process that constantly creates and deletes files makes the tap list directories without end.
-//! Files that are not ports make it open them without end. Both wait when the allowance is used up.
-//! It reads no clock.
+//! Files that are not ports make it open files without end. Listing and opening wait when the
+//! allowance is used up. This module reads no clock.
 
-/// Most CPU nanoseconds saved, so that a starting robot is found at once.
+/// Maximum CPU time that is saved, in nanoseconds, so that a starting robot is found immediately.
 pub const SAVINGS: u64 = 1_000_000_000;
 /// Reciprocal of the share: 1 % of a CPU.
 pub const SHARE: u64 = 100;
@@ -14,7 +14,7 @@ pub const SHARE: u64 = 100;
 pub struct CpuAllowance {
     /// Nanoseconds left; negative after overspending.
     left: i64,
-    /// Time of that value, on the monotonic clock.
+    /// Time when `left` was computed, on the monotonic clock.
     at: u64,
 }
 
@@ -28,7 +28,7 @@ impl Default for CpuAllowance {
 }
 
 impl CpuAllowance {
-    /// Returns whether anything is left at `now`, in nanoseconds of the monotonic clock.
+    /// Returns whether CPU time is left at `now`, in nanoseconds of the monotonic clock.
     pub fn is_left(&mut self, now: u64) -> bool {
         let gained = now.saturating_sub(self.at) / SHARE;
         if gained > 0 {
@@ -52,7 +52,7 @@ mod tests {
     use ros2probe_wire::time::SECOND;
 
     #[test]
-    fn listings_that_are_always_wanted_cost_no_more_than_their_share() {
+    fn constant_listing_costs_no_more_than_its_share() {
         for cost in [1_000, 3_000_000, 700_000_000] {
             let (mut allowance, mut now, mut spent) = (CpuAllowance::default(), SECOND, 0);
             while now < 101 * SECOND {
@@ -62,7 +62,8 @@ mod tests {
                 }
                 now += cost.min(1_000_000);
             }
-            // The savings, the share of a hundred seconds, and one listing in progress.
+            // The bound is the savings, the share of a hundred seconds, and one listing in
+            // progress.
             let most = SAVINGS + 101 * SECOND / SHARE + cost;
             assert!(spent <= most, "{cost}: {spent}");
             assert!(spent > SECOND / 2, "{cost}: {spent}");

@@ -18,20 +18,20 @@ use ros2probe_model::facts::bounded::Bounded;
 const SHARED_MEMORY: &str = "/dev/shm";
 /// Prefixes of file names: Fast DDS 2.x, 3.x.
 const PREFIXES: [&str; 2] = ["fastrtps_", "fastdds_"];
-/// Most entries read per directory.
+/// Maximum number of entries read per directory.
 const MAX_LISTED: usize = 65_536;
 /// Granularity of directory timestamps: a directory that changed more recently may change again
 /// without a new timestamp.
 const COARSE: Duration = Duration::from_secs(1);
-/// Number of rounds in which a new process may still be mounting directories; afterwards it is
-/// inspected only once per this many rounds.
+/// Number of rounds in which a new process may still be mounting directories. Afterwards it is
+/// inspected only once in [`ROUNDS`] rounds.
 const MOUNTING_ROUNDS: u32 = 5;
 const ROUNDS: u32 = 32;
-/// Levels of cgroups and processes of a scope that are visited.
+/// Maximum number of levels of cgroups that are read.
 const DEPTH: usize = 8;
-/// Rounds after a new process in which it may still move to a cgroup in scope.
+/// Number of rounds in which a new process may still move to a cgroup in scope.
 const MOVING_ROUNDS: u32 = 3;
-/// Most rounds without a new process that use the same list of processes.
+/// Maximum number of rounds without a new process that use the same list of processes.
 const SAME_ROUNDS: u32 = 5;
 
 /// Device and inode of a directory of shared memory.
@@ -57,7 +57,7 @@ pub enum Name {
 /// One directory of shared memory.
 #[derive(Debug)]
 pub struct ShmDirectory {
-    /// A path that currently reaches it.
+    /// A path that currently reaches the directory.
     pub path: PathBuf,
     /// Files by name, with their inodes.
     pub files: Bounded<DirectoryFiles, HashMap<Name, u64>>,
@@ -89,7 +89,7 @@ pub struct ShmDirectories {
     /// The processes in scope when they were last listed.
     listed: Bounded<ScopeProcesses, Vec<u32>>,
     newest: NewestProcess,
-    /// Visited processes with their directory and the number of visits.
+    /// Inspected processes with their directory and the number of inspections.
     processes: HashMap<u32, (Option<ShmDirectoryId>, u32)>,
     /// Whether a process may still be mounting directories.
     is_mounting: bool,
@@ -98,7 +98,7 @@ pub struct ShmDirectories {
 }
 
 impl Scope {
-    /// Returns its processes. Unknown for a list of directories.
+    /// Returns the processes in scope; none for a list of directories.
     #[must_use]
     pub fn processes(&self) -> Bounded<ScopeProcesses, Vec<u32>> {
         match self {
@@ -177,8 +177,9 @@ impl ShmDirectories {
         }
     }
 
-    /// Finds the directories of shared memory as [`Self::find`] does, unless no process is new: a
-    /// directory whose path led through an ended process may be missed for some rounds.
+    /// Finds the directories of shared memory as [`Self::find`] does, if a process may be new.
+    /// Otherwise, a directory whose path led through an ended process may be missed for some
+    /// rounds.
     pub fn find_new(&mut self) {
         self.newest.look();
         if self.newest.lists || self.is_mounting || matches!(self.scope, Scope::Directories(_)) {
@@ -192,8 +193,8 @@ impl ShmDirectories {
         self.go_through_scope();
     }
 
-    /// Returns whether each directory's path still reaches it: the process that it leads through may
-    /// have ended, while others use the directory.
+    /// Returns whether each directory's path still reaches it. A path may lead through a process
+    /// that has ended, while other processes use the directory.
     #[must_use]
     pub fn are_reachable(&self) -> bool {
         let mut directories = self.directories.values();
@@ -228,11 +229,11 @@ impl ShmDirectories {
         any
     }
 
-    /// Visits the processes in scope. They are listed again if there may be others.
+    /// Inspects the processes in scope. They are listed again if there may be new ones.
     fn go_through_processes(&mut self) {
         if self.newest.lists {
             self.listed = self.scope.processes();
-            // The agent itself may be in a cgroup in scope, but shares nothing.
+            // The agent itself may be in a cgroup in scope, but has no shared memory.
             if matches!(self.scope, Scope::Cgroup(_)) {
                 self.listed.retain(|pid| *pid != std::process::id());
             }
@@ -250,7 +251,7 @@ impl ShmDirectories {
             self.is_mounting |= met <= MOUNTING_ROUNDS;
             let is_settled = met > MOUNTING_ROUNDS && met % ROUNDS != pid % ROUNDS;
             let directory = match known.and_then(|id| self.directories.get_mut(&id)) {
-                // Its path may lead through another process, which may have ended.
+                // The path of the directory may lead through another process, which may have ended.
                 Some(directory) if is_settled && (directory.seen || directory.path.exists()) => {
                     directory.seen = true;
                     known
@@ -396,15 +397,15 @@ impl ShmDirectory {
     }
 }
 
-/// Tracks the newest process, so that processes are listed only if there may be others.
+/// Tracks the newest process, so that processes are listed only if there may be new ones.
 #[derive(Debug, Default)]
 struct NewestProcess {
     /// `/proc/loadavg`, open for further reads.
     file: Option<File>,
     id: Option<u32>,
-    /// Whether the processes are to be listed.
+    /// Whether the next round lists the processes.
     lists: bool,
-    /// Rounds since another one was seen, and since the processes were listed.
+    /// Number of rounds since the newest process changed, and since the processes were listed.
     rounds: u32,
     same: u32,
 }
@@ -419,7 +420,7 @@ impl NewestProcess {
         self.note(newest);
     }
 
-    /// Decides whether the processes are to be listed, given the id of the newest one.
+    /// Decides from the id of the newest process whether the next round lists the processes.
     fn note(&mut self, newest: Option<u32>) {
         let is_new = newest.is_none() || newest != self.id;
         self.id = newest;
@@ -477,7 +478,7 @@ mod tests {
     use crate::tables::tests::assert_driven;
 
     #[test]
-    fn processes_are_listed_again_after_a_new_one_and_now_and_then() {
+    fn processes_are_listed_after_a_new_process_and_at_intervals() {
         let mut newest = NewestProcess::default();
         let mut lists = |id, rounds: u32| {
             let rounds = (0..rounds).filter(|_| {
@@ -490,17 +491,17 @@ mod tests {
         assert_eq!(lists(Some(7), 4 * SAME_ROUNDS), 4);
         assert_eq!(lists(Some(8), 1), 1);
         assert_eq!(lists(Some(8), MOVING_ROUNDS), 3);
-        // Unknown: always.
+        // If the id is unknown, the processes are always listed.
         assert_eq!(lists(None, 40), 40);
         newest.look();
         let (file, id) = (newest.file.as_ref().unwrap(), newest.id.unwrap());
-        // Read again, not remembered.
+        // The id is read again, not remembered.
         std::process::Command::new("true").status().unwrap();
         assert_ne!(newest_process(file).unwrap(), id);
     }
 
     #[test]
-    fn names_of_ports_and_segments_are_read_and_written() {
+    fn names_of_ports_and_segments_are_parsed_and_formatted() {
         for name in [
             "fastrtps_port7411",
             "fastdds_port7661",
@@ -512,7 +513,7 @@ mod tests {
     }
 
     #[test]
-    fn locks_semaphores_data_sharing_and_nonsense_are_left_alone() {
+    fn names_of_other_files_are_not_parsed() {
         for name in [
             "fastrtps_port7411_el",
             "fastrtps_port7411_sl",
@@ -532,7 +533,7 @@ mod tests {
     }
 
     #[test]
-    fn files_that_come_and_go_are_noticed_also_within_one_tick_of_the_clock() {
+    fn created_and_removed_files_are_noticed_within_one_tick_of_the_clock() {
         let directory = tempfile::tempdir().unwrap();
         let mut directories =
             ShmDirectories::new(Scope::Directories(vec![directory.path().to_path_buf()]));
@@ -568,7 +569,7 @@ mod tests {
     }
 
     #[test]
-    fn files_of_living_processes_are_found_among_more_forged_ones_than_are_kept() {
+    fn files_of_live_processes_are_kept_among_forged_ones_beyond_the_cap() {
         let directory = tempfile::tempdir().unwrap();
         let file = |name: &str| fs::File::create(directory.path().join(name)).unwrap();
         for number in 0..DirectoryFiles::CAP + 500 {
@@ -622,7 +623,7 @@ mod tests {
     }
 
     #[test]
-    fn of_more_entries_than_are_looked_through_those_of_files_that_were_known_stay() {
+    fn known_files_stay_in_a_directory_with_more_entries_than_are_read() {
         let directory = tempfile::tempdir_in(SHARED_MEMORY).unwrap();
         let path = |name: &str| directory.path().join(name);
         let flood = |numbers: std::ops::Range<usize>| {
@@ -638,7 +639,7 @@ mod tests {
         let mut directories =
             ShmDirectories::new(Scope::Directories(vec![directory.path().to_path_buf()]));
         directories.find();
-        // In either order in which the file system lists the directory.
+        // The files are found in either order in which the file system lists the directory.
         make(real[0]);
         flood(0..MAX_LISTED - real.len());
         make(real[1]);
@@ -656,7 +657,7 @@ mod tests {
         flood(MAX_LISTED..MAX_LISTED + 2 * DirectoryFiles::CAP);
         directories.left_out = 0;
         directories.list();
-        // One for all unread entries, plus the files beyond the cap.
+        // One is counted for all unread entries, and one for each file beyond the cap.
         let left_out = usize::try_from(directories.left_out).unwrap();
         let bound = 1 + MAX_LISTED - DirectoryFiles::CAP..=1 + MAX_LISTED;
         assert!(bound.contains(&left_out), "{left_out}");
@@ -667,7 +668,7 @@ mod tests {
     }
 
     #[test]
-    fn a_user_who_makes_too_many_files_hides_none_of_another_user() {
+    fn a_user_with_too_many_files_hides_no_file_of_another_user() {
         let directory = tempfile::tempdir().unwrap();
         let file = |name: &str| directory.path().join(name);
         for number in 0..DirectoryFiles::CAP + 500 {
@@ -685,7 +686,7 @@ mod tests {
     }
 
     #[test]
-    fn a_directory_that_another_is_mounted_over_is_left_for_the_other() {
+    fn a_directory_is_replaced_by_another_one_at_the_same_path() {
         let above = tempfile::tempdir().unwrap();
         let path = above.path().join("shm");
         fs::create_dir(&path).unwrap();
@@ -700,7 +701,7 @@ mod tests {
             );
         };
         assert_only("fastrtps_port7411");
-        // Another directory at the same path, as after a mount.
+        // Another directory is at the same path, as after a mount.
         fs::rename(&path, above.path().join("below")).unwrap();
         fs::create_dir(&path).unwrap();
         fs::write(path.join("fastrtps_port7413"), "").unwrap();
@@ -708,7 +709,7 @@ mod tests {
     }
 
     #[test]
-    fn a_directory_whose_process_ended_is_reached_through_another_one() {
+    fn a_directory_whose_process_ended_is_reached_through_another_process() {
         let group = tempfile::tempdir().unwrap();
         let sleeper = || std::process::Command::new("sleep").arg("60").spawn();
         let (mut first, mut second) = (sleeper().unwrap(), sleeper().unwrap());
@@ -742,7 +743,7 @@ mod tests {
     }
 
     #[test]
-    fn this_hosts_shared_memory_is_found_once_however_many_processes_have_it() {
+    fn the_shared_memory_of_this_host_is_found_once_for_all_processes() {
         let mut directories = ShmDirectories::new(Scope::AllProcesses);
         directories.find();
         let own = directories

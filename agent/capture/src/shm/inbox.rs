@@ -9,7 +9,7 @@ use ros2probe_wire::record::{Record, Sample};
 use crate::bell::Bell;
 use crate::tables::{InboxBytes, InboxItems};
 
-/// Bytes from which the worker is woken: a camera fills them in a fifth of a second.
+/// Number of waiting bytes that wakes the worker: a camera fills it in a fifth of a second.
 const WAKE_BYTES: usize = 1 << 20;
 
 /// One item of the queue.
@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn fragments_that_follow_each_other_wait_as_one() {
+    fn consecutive_fragments_wait_as_one_record() {
         let inbox = Inbox::default();
         let mut found = vec![fragment(1), fragment(2)];
         inbox.put(&mut found);
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_of_one_writer_stay_apart() {
+    fn samples_of_one_writer_are_not_merged() {
         let inbox = Inbox::default();
         let sample = |number| {
             Item::Record(Record {
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn the_inbox_rings_once_enough_bytes_wait_and_is_silent_after_they_are_taken() {
+    fn the_bell_rings_when_enough_bytes_wait_and_is_silent_after_they_are_taken() {
         let inbox = Inbox::with_bell();
         let message = |length| Item::Message {
             time: 0,
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn items_without_room_are_counted() {
+    fn items_beyond_the_cap_are_counted() {
         let inbox = Inbox::default();
         let message = || Item::Message {
             time: 0,
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_beyond_the_bytes_that_may_wait_are_refused_and_counted() {
+    fn messages_beyond_the_byte_cap_are_refused_and_counted() {
         let inbox = Inbox::default();
         let message = || Item::Message {
             time: 1,

@@ -1,9 +1,9 @@
 //! Traffic between processes of one host through Fast DDS's shared memory, read and never written.
 //!
-//! A separate thread polls the ports (see [`tap`]), so that its sleeps and process scans do not
-//! delay the capture, nor the capture its polls. The view is sampled: messages overwritten before a
-//! poll are not seen, but sequence numbers show that they existed. The thread opens files for
-//! reading, takes no lock, registers nowhere and wakes no process.
+//! A separate thread polls the ports (see [`tap`]), so that polls, process scans and the capture do
+//! not delay each other. The view is sampled: messages overwritten before a poll are not seen, but
+//! sequence numbers show that they existed. The thread opens files for reading, takes no lock,
+//! registers nowhere and wakes no process.
 
 pub mod cell;
 pub mod classifier;
@@ -46,10 +46,10 @@ use ros2probe_model::observe::observer::{Observer, Wanted};
 
 /// Interval at which the counters are published.
 const REPORT: u64 = 200_000_000;
-/// Length of one sleep while it is paused.
+/// Length of one sleep while polling is paused.
 const PAUSE: Duration = Duration::from_millis(50);
 
-/// Polls in close succession between two readings of their CPU time.
+/// Number of polls in close succession between two readings of their CPU time.
 const ACCOUNT_EVERY: u64 = 16;
 
 /// Handle of the thread that polls shared memory.
@@ -65,7 +65,7 @@ pub struct SharedMemory {
 pub struct Facts {
     /// Counters of the tap.
     pub counters: Counters,
-    /// CPU time of its thread, seconds.
+    /// CPU time of the tap's thread, in seconds.
     pub cpu_seconds: f64,
     /// Number of polls.
     pub looks: u64,
@@ -83,14 +83,14 @@ struct Shared {
     wanted: AtomicU8,
     facts: Mutex<Facts>,
     progress: Progress,
-    /// Every message is seen by the probes instead.
+    /// Whether polling is paused, because the probes see every message.
     is_paused: AtomicBool,
     stop: AtomicBool,
 }
 
 impl SharedMemory {
-    /// Starts polling, within shares of a CPU. The thread keeps the capabilities of the caller that
-    /// it needs.
+    /// Starts polling, within shares of a CPU. The thread keeps those capabilities of the caller
+    /// that it needs.
     ///
     /// # Errors
     /// Fails if the thread cannot be started.
@@ -127,7 +127,7 @@ impl SharedMemory {
             .store(true, Ordering::Release);
     }
 
-    /// Pauses or resumes polling, while the probes see everything in the sending processes.
+    /// Pauses polling while the probes see every message in the sending processes, or resumes it.
     pub fn pause(&self, is_paused: bool) {
         self.shared.is_paused.store(is_paused, Ordering::Release);
     }
@@ -139,7 +139,7 @@ impl SharedMemory {
     }
 
     /// Passes everything found since the last call to the model. With `order`, records of user data
-    /// wait there for their turn.
+    /// wait in that buffer for older ones.
     pub fn poll(
         &self,
         clocks: &Clocks,
@@ -218,11 +218,11 @@ impl Drop for SharedMemory {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Release);
         self.end = None;
-        // A stalled thread is left to the end of the process.
+        // A stalled thread is not joined: it ends with the process.
         if let Some(thread) = self.thread.take()
             && self.shared.progress.stalled().is_none()
         {
-            // The thread has ended in any case; its result is not needed.
+            // The result of the thread is not needed.
             let _ = thread.join();
         }
     }
@@ -247,7 +247,7 @@ fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget, ended: &Pi
     let mut tap = Tap::new(directories, calendar);
     let cpus = std::thread::available_parallelism().map_or(1, usize::from);
     let mut interval = PollInterval::new(budget).on(cpus);
-    // Without inotify, a newcomer is noticed at the next listing.
+    // Without inotify, a new file is noticed at the next listing.
     let mut watch = DirectoryWatch::new().ok();
     let mut watched: HashMap<ShmDirectoryId, PathBuf> = HashMap::new();
     let mut watches_all = false;
@@ -305,7 +305,7 @@ fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget, ended: &Pi
                     host");
             }
         }
-        // If files appear without end, events about them wait as well.
+        // While listing has used up its CPU share, events about new files wait as well.
         let Some(watch) = watch.as_mut().filter(|_| tap.may_list(now)) else {
             shared.progress.rest();
             std::thread::sleep(sleep);
@@ -324,7 +324,7 @@ fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget, ended: &Pi
             let paths = watched.values();
             watches_all = paths.filter(|path| !watch.add(path)).count() == 0;
         }
-        // Creation of a file ends the sleep, and nothing else is to be noticed.
+        // The creation of a file ends the sleep, so an idle tap may sleep longer.
         let sleep = idle.map_or(sleep, |idle| sleep.max(Duration::from_nanos(idle)));
         let before = thread_cpu();
         shared.progress.rest();

@@ -1,8 +1,9 @@
 //! Detects whether the process that created a file of shared memory is alive.
 //!
 //! Fast DDS holds an flock on `<file>_el` (exclusive) or `<file>_sl` (shared) while it uses the
-//! file. The kernel lists locks in `/proc/locks` by device and inode, so this module opens and
-//! locks nothing: participants take these locks themselves to find files of dead processes.
+//! file. Participants take these locks themselves to find files of dead processes, so this module
+//! opens and locks nothing. It reads `/proc/locks`, where the kernel lists locks by device and
+//! inode.
 
 use std::collections::HashSet;
 use std::fs;
@@ -21,7 +22,7 @@ type FileId = (u32, u32, u64);
 /// A snapshot of this host's locks.
 #[derive(Debug, Default)]
 pub struct Locks {
-    /// `None` if they cannot be read completely.
+    /// The locked files; `None` if the list cannot be read completely.
     held: Option<HashSet<FileId>>,
 }
 
@@ -86,7 +87,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_of_the_list_names_the_file_whose_lock_is_held() {
+    fn a_line_of_the_lock_list_identifies_the_locked_file() {
         let line = "12: FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF";
         assert_eq!(file_of(line), Some((0, 0x1a, 5678)));
         for other in [

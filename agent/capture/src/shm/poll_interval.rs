@@ -1,15 +1,15 @@
 //! How long the tap sleeps between two polls.
 //!
-//! Waking up dominates the cost of a poll. So it polls again soon after finding many messages, and
-//! ever more slowly after finding none. It extends every sleep until it stays within its share of a
-//! CPU. It reads no clock.
+//! Waking up dominates the cost of a poll. Therefore the tap polls again soon after finding many
+//! messages, and ever more slowly after finding none. Every sleep is extended until the tap stays
+//! within its share of a CPU. This module reads no clock.
 
 use std::time::Duration;
 
-/// Sleep during bursts of messages, and the longest sleep while a topic is measured.
+/// Sleep during bursts of messages, and maximum sleep while a topic is measured, in seconds.
 const BURST: f64 = 100e-6;
 const WATCHING: f64 = 1e-3;
-/// Longest sleep if only discovery is needed, and after a quiet period.
+/// Maximum sleep if only discovery is needed, and after a quiet period.
 const NAMES: f64 = 5e-3;
 const QUIET: f64 = 10e-3;
 /// Sleep if nothing is needed: an occasional poll, since the latest messages stay readable.
@@ -20,14 +20,14 @@ const QUIET_AFTER: f64 = 3.0;
 const SLOWER: f64 = 1.5;
 /// Interval at which the CPU share is computed.
 const ACCOUNT: f64 = 0.1;
-/// Sleep during discovery while the credit is whole: each participant announces its names once, and
-/// reuses the buffer some 50 us later. Short sleeps see more than busy polling: the scheduler prefers
-/// threads that wake up.
+/// Sleep during discovery while the credit is full: each participant announces its names once, and
+/// reuses the buffer some 50 us later. Short sleeps see more than busy polling: the scheduler
+/// prefers threads that wake up.
 const MEETING: f64 = 10e-6;
-/// Longest sleep during discovery, at the end of the credit.
+/// Maximum sleep during discovery, at the end of the credit.
 const SELDOM: f64 = 500e-6;
-/// Time of busy polling after each announcement, and after each message that is needed: they arrive
-/// in bursts.
+/// Time of busy polling after each announcement, and after each message that is needed: messages
+/// arrive in bursts.
 const BURSTS: f64 = 200e-6;
 /// Duration of close polling after a participant creates its files, and after each announcement.
 const PARTICIPANT_WATCH: f64 = 0.3;
@@ -36,22 +36,24 @@ const ANNOUNCEMENT_WATCH: f64 = 0.1;
 /// CPU while topics are measured, a minute in which a robot starts costs less than 2.5 % of a CPU.
 const CREDIT: f64 = 0.4;
 const CREDIT_PER_SECOND: f64 = 0.002;
-/// Longest sleep while every message is needed. In a burst a sender reuses its buffers after some
-/// 100 us, and its reader is faster than that.
+/// Maximum sleep while every message is needed. In a burst, a sender reuses its buffers after some
+/// 100 us, and its readers are faster than that.
 const EVERY: f64 = 50e-6;
 const EARLY_WAKE: f64 = 20e-6;
-/// CPU time that may be saved for that, so that a short recording is complete, and overdrawn.
+/// Maximum CPU time that is saved for such polls, so that a short recording is complete, and
+/// maximum overdraft.
 const SAVINGS: f64 = 5.0;
 const OVERDRAFT: f64 = 0.25;
-/// Longest sleep, at any cost.
+/// Maximum sleep, whatever a poll costs.
 const LONGEST: f64 = 50e-3;
 
 /// Purpose of the tap at a given time.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Need {
-    /// Nothing that can pass here is measured, and no name is missing. Newcomers are noticed.
+    /// No topic that may use shared memory is measured, and no name is missing. New participants
+    /// are noticed.
     Nothing,
-    /// Nothing is measured; node names and endpoints may be announced.
+    /// No topic is measured; node names and endpoints may be announced.
     Names,
     /// A topic is measured.
     Watching,
@@ -89,7 +91,7 @@ pub struct PollInterval {
     was_close: bool,
     /// CPU time left for close polling.
     credit: f64,
-    /// Rest of the budget while every message is needed, with the time and the CPU time at which it
+    /// Remaining budget while every message is needed, with the time and the CPU time at which it
     /// was computed.
     savings: f64,
     spent: (f64, f64),
@@ -125,12 +127,12 @@ impl PollInterval {
         }
     }
 
-    /// Starts close polling for a moment, within the credit: a participant is starting.
+    /// Starts close polling for a moment, within the credit, because a participant is starting.
     pub fn newcomer(&mut self, now: f64) {
         self.watch_closely(now + PARTICIPANT_WATCH);
     }
 
-    /// Extends close polling: an announcement was read, and more may follow.
+    /// Extends close polling, because an announcement was read and more may follow.
     pub fn announcement(&mut self, now: f64) {
         self.watch_closely(now + ANNOUNCEMENT_WATCH);
         if self.has_company && self.credit > CREDIT / 2.0 {
@@ -138,7 +140,7 @@ impl PollInterval {
         }
     }
 
-    /// Returns whether it polls closely because a participant is starting.
+    /// Returns whether the tap polls closely because a participant is starting.
     #[must_use]
     pub fn is_watching_closely(&self, now: f64) -> bool {
         now < self.meeting_until
@@ -159,7 +161,7 @@ impl PollInterval {
             if now < self.awake_until {
                 return Duration::ZERO;
             }
-            // The start of a whole robot uses up the credit slowly. It repeats its names: each
+            // The start of a whole robot uses up the credit slowly. A robot repeats its names: each
             // participant sends them to every later one.
             let rest = self.credit / CREDIT;
             self.sleep = (MEETING / rest.powi(4)).min(SELDOM);
@@ -167,7 +169,7 @@ impl PollInterval {
         }
         self.meeting_until = now;
         if (need == Need::Every) != (self.need == Need::Every) {
-            // The budget changes: forget the measured cost.
+            // The budget changes, so the measured cost is forgotten.
             (self.stretch, self.accounted) = (1.0, (now, cpu));
             let saved = (now - self.spent.0) * self.budget.every;
             self.savings = (self.savings + saved).min(SAVINGS);
@@ -200,8 +202,8 @@ impl PollInterval {
     }
 
     /// Returns the sleep while every message is needed: shorter for a moment after each message,
-    /// which may start a burst. It always sleeps, because it preempts the processes whose messages
-    /// it reads.
+    /// which may start a burst. The sleep is never 0, because the thread preempts the processes
+    /// whose messages it reads.
     fn sleep_little(&mut self, now: f64, cpu: f64, found: usize) -> Duration {
         let (then, used) = std::mem::replace(&mut self.spent, (now, cpu));
         let saved = (now - then) * self.budget.every - (cpu - used);
@@ -240,7 +242,7 @@ impl PollInterval {
             Need::Every => self.budget.every,
             Need::Nothing | Need::Names | Need::Watching => self.budget.watching,
         };
-        // Wakes up less often by the factor of the excess, but gradually.
+        // The tap wakes up less often by the factor of the excess, but gradually.
         let wanted = share / budget;
         let correction = wanted.clamp(0.8, 1.5);
         self.stretch = (self.stretch * correction).clamp(1.0, LONGEST / BURST);
@@ -291,7 +293,7 @@ mod tests {
                         every: 1.0,
                     });
                     let (share, _) = run(&mut interval, 20.0, cost, Need::Watching, |_| burst);
-                    // A poll of 200 us every 50 ms is 0.4 %, the least possible share.
+                    // A poll of 200 us every 50 ms takes 0.4 %, the minimum share.
                     assert!(share <= budget * 1.1, "{budget} {cost} {burst}: {share}");
                 }
             }
@@ -307,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn where_little_is_needed_it_looks_seldom() {
+    fn the_tap_polls_rarely_while_it_finds_no_message() {
         let polls = |need| {
             let mut interval = PollInterval::new(BUDGET);
             run(&mut interval, 20.0, 5e-6, need, |_| 0).1
@@ -318,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn after_a_new_participant_it_polls_closely_for_a_limited_time() {
+    fn a_new_participant_causes_close_polling_for_a_limited_time() {
         let mut interval = PollInterval::new(BUDGET);
         interval.newcomer(100.0);
         let microseconds = |interval: &mut PollInterval, now, cpu| {
@@ -336,16 +338,16 @@ mod tests {
             now += 0.01;
             cpu += if close { 0.003 } else { 0.0 };
         }
-        // The credit plus the growth of a hundred seconds.
+        // The bound is the credit plus its growth in a hundred seconds.
         assert!(cpu <= 0.61, "{cpu}");
     }
 
     #[test]
-    fn the_start_of_a_robot_is_watched_to_its_end_and_costs_no_more_than_the_credit() {
+    fn the_start_of_a_robot_is_polled_closely_within_the_credit() {
         for cost in [8e-6, 25e-6] {
             let mut interval = PollInterval::new(BUDGET).on(2);
             let (mut now, mut cpu, mut polls, mut longest) = (100.0, 0.0, 0_u32, Duration::ZERO);
-            // Its nodes start within 6 s, and user data flows.
+            // The nodes of the robot start within 6 s, and user data flows.
             while now < 160.0 {
                 if now < 106.0 {
                     interval.newcomer(now);
@@ -362,13 +364,13 @@ mod tests {
             // Without credit it polls as while a topic is measured, within that share.
             assert!(longest.as_micros() <= 5000, "{cost} {longest:?}");
             assert!(polls > 10_000, "{cost} {polls}");
-            // 3 % of a CPU, with room for the rest of the agent.
+            // The whole agent may take 3 % of a CPU, of which other threads need a part.
             assert!(cpu <= 0.025 * 60.0, "{cost} {cpu}");
         }
     }
 
     #[test]
-    fn after_each_announcement_of_a_newcomer_it_stays_awake_where_others_have_a_cpu() {
+    fn an_announcement_causes_busy_polling_if_other_processes_have_a_cpu() {
         for cpus in [1, 2] {
             let mut interval = PollInterval::new(BUDGET).on(cpus);
             interval.newcomer(100.0);
@@ -379,12 +381,12 @@ mod tests {
                 interval.sleep(now, cpu, 1, Need::Names).as_micros()
             };
             let awake = if cpus > 1 { 0 } else { 10 };
-            // Other messages are no reason.
+            // Other messages cause no busy polling.
             assert_eq!(microseconds(100.0, false, 0.0), 10);
             assert_eq!(microseconds(100.001, true, 0.0), awake);
             assert_eq!(microseconds(100.001_1, false, 0.0), awake);
             assert_eq!(microseconds(100.001_3, false, 0.0), 10);
-            // Nor are announcements once half of the credit is spent.
+            // Announcements cause none once half of the credit is spent.
             assert_eq!(microseconds(100.002, false, 0.2), 160);
             assert_eq!(microseconds(100.003, true, 0.2), 160);
         }
@@ -396,7 +398,7 @@ mod tests {
         let mut interval = PollInterval::new(BUDGET).on(2);
         let (share, looks) = run(&mut interval, 10.0, 8e-6, Need::Every, idle);
         assert!(looks > 15_000.0 && share < 0.16, "{looks} {share}");
-        // A hundred thousand messages per second, and expensive polls.
+        // The load is a hundred thousand messages per second, with cheap and with expensive polls.
         for cost in [8e-6, 60e-6] {
             let mut interval = PollInterval::new(BUDGET).on(2);
             (interval.need, interval.savings) = (Need::Every, 0.0);
@@ -409,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn after_a_message_that_is_wanted_it_looks_again_soon_while_the_budget_allows_it() {
+    fn a_needed_message_causes_an_early_poll_within_the_budget() {
         let mut interval = PollInterval::new(BUDGET).on(2);
         let mut microseconds =
             |now, cpu, found| interval.sleep(now, cpu, found, Need::Every).as_micros();
@@ -423,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn a_burst_is_followed_closely_and_then_left_alone() {
+    fn sleeps_are_short_after_a_burst_and_then_grow() {
         let mut interval = PollInterval::new(BUDGET);
         assert_eq!(
             interval.sleep(0.01, 0.0, 5, Need::Watching).as_micros(),

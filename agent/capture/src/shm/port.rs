@@ -2,8 +2,8 @@
 //!
 //! Reads PortNode, ring and cells of Fast DDS 2.3 to 3.6 and follows the write position like a
 //! listener, without being one: it counts no reference and pops nothing. A writer first moves
-//! `write_p`, then fills the cell, and sets its reference counter last. So a cell counts as filled
-//! if it is referenced or if it differs from its content one round before.
+//! `write_p`, then fills the cell, and sets its reference counter last. Therefore a cell counts as
+//! filled if it is referenced or if it differs from its content one round before.
 
 use ros2probe_model::facts::bounded::Bounded;
 
@@ -23,7 +23,7 @@ const CAPACITY: u64 = 36;
 const TOTAL_CELLS: u64 = 8;
 /// A cell that is not filled after this time stays unfilled: its writer died.
 const UNFILLED_NANOSECONDS: u64 = 100_000_000;
-/// Attempts to read a ring while no writer moves it.
+/// Maximum number of attempts to read a ring without a concurrent write.
 const ATTEMPTS: usize = 3;
 /// Interval over which a port's rate is measured; each interval decays the peak by an eighth.
 const PACE_NANOSECONDS: u64 = 100_000_000;
@@ -49,14 +49,14 @@ pub struct Port {
     bytes: Vec<u8>,
 }
 
-/// Result of one poll of a port besides messages.
+/// Result of one poll of a port, in addition to messages.
 #[derive(Clone, Copy, PartialEq, Eq, Default, Debug)]
 pub struct PortPoll {
     /// Messages announced since the previous poll.
     pub pushed: u64,
-    /// Messages among them that were overwritten before they were read.
+    /// Announced messages that were overwritten before they were read.
     pub overwritten: u64,
-    /// Messages announced but never filled in.
+    /// Announced messages that were never filled in.
     pub unfilled: u64,
     /// Whether the pause was long enough for the ring to wrap around unnoticed.
     pub is_uncertain: bool,
@@ -239,7 +239,8 @@ impl Layout {
 }
 
 impl PeakRate {
-    /// Returns whether two rounds, which look like none, may have passed at the recent rate.
+    /// Returns whether the ring may have wrapped around twice at the recent rate, which looks like
+    /// no message.
     fn may_lap(&self, elapsed: u64, capacity: u32) -> bool {
         let pushed = u128::from(self.peak) * u128::from(elapsed) / 1_000_000_000;
         pushed >= 2 * u128::from(capacity)
@@ -303,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn the_node_is_found_where_other_architectures_have_it() {
+    fn the_node_is_found_at_the_offsets_of_other_architectures() {
         for node in [0x40, 0x100, 0x110, 0x400] {
             let image = PortImage::new(7411, 8, node);
             assert!(Port::attach(image.bytes(), 7411, 0).is_some(), "{node:#x}");
@@ -325,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn a_listener_that_is_quicker_hides_nothing() {
+    fn a_message_that_a_listener_has_already_read_is_found() {
         let mut image = PortImage::new(7411, 8, 0x100);
         let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
         image.push(descriptor(1));
@@ -334,7 +335,7 @@ mod tests {
     }
 
     #[test]
-    fn an_entry_that_is_being_filled_is_awaited_for_a_limited_time() {
+    fn a_cell_that_is_being_filled_is_awaited_for_a_limited_time() {
         let mut image = PortImage::new(7411, 8, 0x100);
         let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
         let begun = image.begin_push();
@@ -362,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gap_in_which_the_ring_may_have_gone_round_twice_is_uncertain() {
+    fn a_pause_in_which_the_ring_may_have_wrapped_twice_is_uncertain() {
         let mut image = PortImage::new(7411, 8, 0x100);
         let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
         for step in 1..=200 {
@@ -370,14 +371,14 @@ mod tests {
             let (_, seen) = poll(&mut port, &image, u64::from(step) * SECOND / 100);
             assert!(!seen.is_uncertain);
         }
-        // 100 per second: 16 take 160 ms.
+        // At 100 messages per second, 16 messages take 160 ms.
         let now = 2 * SECOND;
         assert!(!poll(&mut port, &image, now + 150_000_000).1.is_uncertain);
         assert!(poll(&mut port, &image, now + 500_000_000).1.is_uncertain);
     }
 
     #[test]
-    fn a_ring_with_more_cells_than_are_kept_is_none() {
+    fn a_ring_with_too_many_cells_is_rejected() {
         let capacity = PortCells::CAP as u32;
         let image = PortImage::new(7411, capacity, 0x100);
         assert!(Port::attach(image.bytes(), 7411, 0).is_some());
@@ -387,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn a_port_that_is_cut_off_or_contradicts_itself_is_none() {
+    fn a_truncated_or_inconsistent_port_is_rejected() {
         let image = PortImage::new(7411, 8, 0x100);
         let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
         for end in 0..image.bytes().len() {
@@ -402,7 +403,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn reading_any_ring_ends_and_stays_within_it(
+        fn reading_an_arbitrary_ring_ends_and_stays_within_its_bounds(
             damage in proptest::collection::vec((0_usize..1200, any::<[u8; 4]>()), 0..60),
             later in proptest::collection::vec((0_usize..1200, any::<[u8; 4]>()), 0..60),
         ) {

@@ -2,8 +2,8 @@
 //!
 //! Reads BufferNode of Fast DDS 2.3 to 3.6. A participant reuses a buffer as soon as its last
 //! listener has released it, and this reader is not a listener. The buffer's validity id is raised
-//! before the buffer is freed. So the id is read before and after the content, which counts only if
-//! both match the port's announcement.
+//! before the buffer is freed. Therefore the id is read before and after the content. The content
+//! counts only if both ids match the port's announcement.
 
 use std::cell::RefCell;
 
@@ -17,7 +17,8 @@ const SIZE: u64 = 8;
 const DATA: u64 = 12;
 /// Bits of the status word that hold the validity id.
 const VALIDITY: u64 = 0xff_ffff;
-/// Holds an RTPS header, INFO_DST, INFO_TS and the head of a DATA or DATA_FRAG.
+/// Size of one read, in bytes: an RTPS header, INFO_DST, INFO_TS and the head of a DATA or
+/// DATA_FRAG fit.
 const WINDOW: usize = 256;
 
 /// A message in a segment, valid at the time it was found.
@@ -26,14 +27,14 @@ pub struct Buffer {
     node: u64,
     validity: u32,
     data: u64,
-    /// Its length.
+    /// Length of the message in bytes.
     pub length: u32,
 }
 
 /// Why a message cannot be read.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Refusal {
-    /// Its buffer has been reused.
+    /// The buffer of the message has been reused.
     Expired,
     /// The descriptor is invalid: the message lies outside of the file, or is longer than the
     /// limit.
@@ -62,7 +63,7 @@ impl Buffer {
         if u64::from(validity) & VALIDITY != u64::from(descriptor.validity) {
             return Err(Refusal::Expired);
         }
-        // The other fields may belong to the next use, if that just began.
+        // The other fields may belong to the next use of the buffer, if it has just begun.
         let refused = if buffer.is_valid(source) {
             Refusal::Malformed
         } else {
@@ -84,8 +85,8 @@ impl Buffer {
         status.is_some_and(|status| status & VALIDITY == u64::from(self.validity))
     }
 
-    /// Reads the whole message; returns `false` if the file ends before it does. Allocates at most
-    /// the size of the file. Check [`Self::is_valid`] afterwards.
+    /// Reads the whole message; returns `false` if the file ends before the message. Allocates at
+    /// most the size of the file. The caller must check [`Self::is_valid`] afterwards.
     pub fn read<S: Source + ?Sized>(&self, source: &S, into: &mut Vec<u8>) -> bool {
         let last = u64::from(self.length).saturating_sub(1);
         if !source.read(self.data.saturating_add(last), &mut [0]) {
@@ -137,7 +138,7 @@ impl<S: Source + ?Sized> Bytes for Message<'_, S> {
                 .as_chunks::<4>();
             let mut read = [0; N];
             for (read, word) in read.iter_mut().zip(words) {
-                // In memory order, as the walk expects.
+                // The walk expects words in memory order.
                 *read = u32::from_ne_bytes(*word);
             }
             Some(read)
@@ -188,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn a_buffer_that_was_used_again_is_refused() {
+    fn a_reused_buffer_is_expired() {
         let mut image = SegmentImage::new([1; 8], 1 << 16);
         let old = image.put(b"old");
         let buffer = Buffer::find(image.bytes(), &old).unwrap();
@@ -198,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn one_that_is_used_again_while_it_is_looked_at_is_expired_and_not_malformed() {
+    fn a_buffer_reused_during_a_read_is_expired_and_not_malformed() {
         /// Returns other bytes at each read after the first.
         struct Changing(Vec<u8>, Vec<u8>, Counter<u32>);
         impl Source for Changing {
@@ -239,7 +240,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn reading_any_segment_is_bounded(
+        fn reading_an_arbitrary_segment_stays_within_its_bytes(
             bytes in proptest::collection::vec(any::<u8>(), 0..400),
             node in 0_u32..500,
             validity in 0_u32..4,

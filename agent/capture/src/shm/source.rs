@@ -1,18 +1,18 @@
 //! Byte source of the readers of Fast DDS's layout: a file of shared memory, or bytes in a test.
 //!
-//! Untrusted processes write during reads. So everything is read in bounded pieces with `pread`,
-//! and nothing is mapped. A truncated file gives a short read where a mapping would give SIGBUS,
-//! and no reference into changing memory ever exists. A read costs 0.4 us, waking up costs 20 us
-//! (measured on one machine), so a mapping would save little. Each `pread` takes and releases the
-//! page with fully ordered atomics, so successive reads are ordered; the checks that read a word
-//! before and after a copy rely on that.
+//! Untrusted processes write during reads. Therefore everything is read in bounded pieces with
+//! `pread`, and nothing is mapped. A truncated file gives a short read where a mapping would give
+//! SIGBUS, and no reference into changing memory ever exists. A read costs 0.4 us, waking up costs
+//! 20 us (measured on one machine), so a mapping would save little. Each `pread` takes and releases
+//! the page with fully ordered atomics, so successive reads are ordered. Checks that read a word
+//! before and after a copy rely on this order.
 
 use std::fs::File;
 use std::io;
 use std::os::unix::fs::{FileExt as _, MetadataExt as _, OpenOptionsExt as _};
 use std::path::Path;
 
-/// Bytes at offsets.
+/// Bytes that can be read at an offset.
 pub trait Source {
     /// Fills `into` from `offset`; returns `false` if some of the bytes do not exist.
     fn read(&self, offset: u64, into: &mut [u8]) -> bool;
@@ -74,13 +74,13 @@ impl SharedFile {
         })
     }
 
-    /// Returns the identity of the open file, whichever file its name refers to now.
+    /// Returns the inode of the open file, whichever file its name refers to now.
     #[must_use]
     pub const fn inode(&self) -> u64 {
         self.inode
     }
 
-    /// Returns the user that owns the file.
+    /// Returns the user id of the file's owner.
     #[must_use]
     pub const fn user(&self) -> u32 {
         self.user
@@ -109,7 +109,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_that_is_truncated_under_us_reads_short() {
+    fn a_read_beyond_the_end_of_a_truncated_file_fails() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("f");
         fs::write(&path, vec![7; 10_000]).unwrap();
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn a_removed_file_is_unlinked() {
+    fn a_removed_file_counts_as_unlinked() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("f");
         fs::write(&path, "x").unwrap();
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn only_regular_files_are_opened_and_none_is_awaited() {
+    fn only_regular_files_are_opened_and_a_pipe_does_not_block() {
         let directory = tempfile::tempdir().unwrap();
         let (file, link) = (directory.path().join("f"), directory.path().join("l"));
         fs::write(&file, "x").unwrap();
@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_end_where_they_end() {
+    fn a_read_beyond_the_end_of_a_slice_fails() {
         let bytes = [1, 2, 3, 4, 5, 6, 7, 8, 9];
         assert_eq!(bytes.word(5), Some(0x0908_0706));
         assert_eq!(bytes.word(6), None);

@@ -1,8 +1,8 @@
 //! Polls all ports, reads the announced messages and passes on those of interest.
 //!
-//! Never writes, locks or registers: participants cannot detect it. A message that several ports
-//! announce is read once. Silent ports are polled less often, so that a hundred idle ones cost
-//! little. The caller sleeps between polls.
+//! The tap never writes, locks or registers, so participants cannot detect it. A message that
+//! several ports announce is read once. Silent ports are polled less often, so that a hundred idle
+//! ports cost little. The caller sleeps between polls.
 
 mod recent_messages;
 
@@ -26,19 +26,20 @@ use crate::tables::{AbandonedPorts, Ports, Segments};
 use recent_messages::{Identity, RecentMessages};
 use ros2probe_model::facts::bounded::Bounded;
 
-/// Most messages read per poll; the rest of a flood is read in the next.
+/// Maximum number of messages per poll. The next poll reads the rest of a flood.
 const MAX_PER_POLL: usize = 2048;
 const MAX_PER_URGENT_POLL: usize = 64;
-/// Most ports read per urgent poll: what is announced to all participants is in every port.
+/// Maximum number of ports per urgent poll: an announcement to all participants is in every port.
 const PORTS_PER_URGENT_POLL: usize = 8;
-/// Bytes of a message in which the announcement of a participant's nodes begins.
+/// Size of the part of a message in which an announcement of a participant's nodes begins, in
+/// bytes.
 const BEGIN: usize = 4096;
-/// Silence after which a port is polled less often, and that interval.
+/// Silence after which a port is polled less often, and the interval of those polls.
 const SILENT_AFTER: u64 = 2_000_000_000;
 const SILENT_EVERY: u64 = 10_000_000;
 /// Pause before another attempt to open a segment.
 const RETRY: u64 = 50_000_000;
-/// Interval of listing directories and visiting processes.
+/// Interval of listing directories.
 const LIST_EVERY: u64 = 100_000_000;
 /// Interval of polling a port that is not initialized yet.
 const TRY_EVERY: u64 = 1_000_000;
@@ -52,7 +53,7 @@ pub struct Tap {
     ports: Bounded<Ports, Vec<Open>>,
     /// Ports that are listed but not initialized yet.
     unborn: Vec<(PortKey, PathBuf)>,
-    /// Ports of dead processes, with their inodes: they are tried again at the next scan.
+    /// Ports of dead processes, with their inodes. They are tried again after the next search.
     abandoned: Bounded<AbandonedPorts, HashSet<(PortKey, u64)>>,
     segments: Bounded<Segments, HashMap<SegmentKey, Segment>>,
     remembered: RecentMessages,
@@ -92,21 +93,21 @@ pub struct Counters {
     pub announced: u64,
     /// Messages read, each counted once.
     pub read: u64,
-    /// Messages among them that were captured whole.
+    /// Messages read that were captured whole.
     pub captured: u64,
     /// Bytes of the captured messages.
     pub captured_bytes: u64,
-    /// Announced, but overwritten in the ring or reused before they were read.
+    /// Messages that were overwritten in the ring or in a reused buffer before they were read.
     pub missed: u64,
-    /// Announced but never filled in: their writer died.
+    /// Messages that were announced but never filled in, because their writer died.
     pub unfilled: u64,
-    /// In segments that could not be opened.
+    /// Messages in segments that could not be opened.
     pub unreachable: u64,
-    /// Malformed or not RTPS.
+    /// Messages that are malformed or not RTPS.
     pub malformed: u64,
-    /// Read but discarded: their process was already dead.
+    /// Messages that were read but discarded, because their process was already dead.
     pub abandoned: u64,
-    /// Polls so late that a ring may have wrapped around unnoticed.
+    /// Number of polls so late that a ring may have wrapped around unnoticed.
     pub uncertain: u64,
     /// Files and directories skipped because of a cap.
     pub left_out: u64,
@@ -127,7 +128,7 @@ struct Open {
 enum Segment {
     /// An open file with a unique number: another file may get the same name and inode later.
     Open(SharedFile, u64),
-    /// Could not be opened at this time.
+    /// A file that could not be opened at this time.
     Missing(u64),
 }
 
@@ -137,7 +138,7 @@ struct Reading {
     monotonic: u64,
     /// Wall clock after the announcement was read, so never before the message was sent.
     calendar: u64,
-    /// Whether it was announced since the previous poll.
+    /// Whether the message was announced since the previous poll.
     is_timely: bool,
 }
 
@@ -182,8 +183,8 @@ impl Tap {
         self.allowance.spend(nanoseconds);
     }
 
-    /// Lists directories and polls every port at the next poll, even silent ones. If no directory is
-    /// known, looks for the one with the new file.
+    /// Makes the next poll list directories and poll every port, even silent ones. If no directory
+    /// is known, the poll also searches for directories.
     pub fn expect_participant(&mut self) {
         self.listed = 0;
         if self.directories.directories.is_empty() {
@@ -226,8 +227,8 @@ impl Tap {
         !self.ports.is_empty()
     }
 
-    /// Returns the nanoseconds from `now` to the next search for directories if nothing else is to
-    /// be done until a file is created: no port exists, and none waits to be opened.
+    /// Returns the nanoseconds from `now` to the next search for directories; `None` if a port
+    /// exists or waits to be opened. In between, only a created file requires a poll.
     #[must_use]
     pub fn idle(&self, now: u64) -> Option<u64> {
         let is_idle = self.ports.is_empty() && self.unborn.is_empty() && !self.is_hurried;
@@ -321,7 +322,8 @@ impl Tap {
                 }
             }
             None => {
-                // Truncated or overwritten; if it becomes a port again, the next listing finds it.
+                // The file was truncated or overwritten. If it becomes a port again, the next
+                // listing finds it.
                 self.counters.malformed += 1;
                 self.ports.remove(index);
             }
@@ -450,7 +452,7 @@ impl Tap {
         self.segments.insert(key, segment);
     }
 
-    /// Opens new files and closes those that are gone or were replaced.
+    /// Opens new files and closes files that are gone or were replaced.
     fn scan(&mut self, now: u64, found: &mut Vec<Item>) {
         let every = if self.is_hurried {
             URGENT_FIND_EVERY
@@ -504,8 +506,8 @@ impl Tap {
         self.attach(now, found);
     }
 
-    /// Opens ports that were initialized. Their existing messages count only if the sending process
-    /// lives: files of a killed process stay until another one reuses their names.
+    /// Opens ports that have been initialized. Their existing messages count only if the sending
+    /// process lives: files of a killed process stay until another process reuses their names.
     fn attach(&mut self, now: u64, found: &mut Vec<Item>) {
         self.tried = now;
         let mut attached = Vec::new();
@@ -519,7 +521,7 @@ impl Tap {
             }
             let (_, _, number) = key;
             let Some((port, backlog)) = Port::attach(&file, number, now) else {
-                // Not initialized yet, or of an unknown layout.
+                // The port is not initialized yet, or has an unknown layout.
                 self.unborn.push((key, path));
                 continue;
             };
@@ -535,7 +537,7 @@ impl Tap {
                 calendar: (self.calendar)(),
                 is_timely: false,
             };
-            // Read first: names are overwritten within 50 us.
+            // Messages are read first, because names are overwritten within 50 us.
             let read = backlog.iter().map(|descriptor| {
                 let mut items = Vec::new();
                 self.read(key, descriptor, reading, &mut items);
@@ -599,8 +601,8 @@ impl Tap {
     }
 }
 
-/// Returns whether a sample in this message may announce the nodes of its participant: it begins
-/// with the participant's GUID.
+/// Returns whether a sample in this message may announce the nodes of its participant: such a
+/// sample begins with the participant's GUID.
 fn may_announce_nodes(message: &[u8]) -> bool {
     let Some(prefix) = message.get(8..20).and_then(|bytes| bytes.try_into().ok()) else {
         return false;

@@ -1,7 +1,7 @@
 //! Probes in the libraries that processes use.
 //!
-//! Attached once to a file, a probe is in every process that maps it, including later ones. A
-//! library that no process uses is detached only after a while, so that a restarted robot is seen
+//! A probe attached to a file is active in every process that maps the file, including later ones.
+//! The probe of an unused library is removed only after a while, so that a restarted robot is seen
 //! from its first message.
 
 use std::collections::BTreeMap;
@@ -34,7 +34,7 @@ pub struct Attachments<P> {
     is_installed: bool,
 }
 
-/// Lets the broker attach to a library.
+/// Function that lets the broker attach a probe to a library.
 pub type Attach<P> = Box<dyn FnMut(&mut Broker, Place) -> Result<P, Refusal> + Send>;
 
 struct Known<P> {
@@ -43,11 +43,11 @@ struct Known<P> {
     processes: usize,
     used: Instant,
     tried: Instant,
-    /// Attached before any process used it, and kept.
+    /// Whether the probe was attached before any process used the library, and is kept.
     is_installed: bool,
 }
 
-/// Why a library is not attached.
+/// Why a library has no probe.
 #[derive(Debug, thiserror::Error)]
 pub enum Refusal {
     /// The broker refuses, or cannot be reached.
@@ -61,16 +61,16 @@ pub enum Refusal {
 /// State of one library.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LibraryFacts {
-    /// Its path in the file system of a process that uses it.
+    /// Path of the library in the file system of a process that uses it.
     pub path: PathBuf,
     /// Number of processes that use it.
     pub processes: usize,
-    /// Why it is not attached; `None` if it is.
+    /// Why the library has no probe; `None` if it has one.
     pub refused: Option<String>,
 }
 
 impl<P> Attachments<P> {
-    /// Creates attachments of nothing. `meaning`: what it means that a library is attached.
+    /// Creates a table without libraries. `meaning` is the log text for an attached library.
     #[must_use]
     pub fn new(meaning: &'static str, attach: Attach<P>) -> Self {
         Self {
@@ -93,8 +93,8 @@ impl<P> Attachments<P> {
         self.is_installed = false;
     }
 
-    /// Attaches to installed libraries that no process uses yet, once after the creation and after each
-    /// [`Self::clear`]. Without an answer of the broker, the next call tries again.
+    /// Attaches to installed libraries that no process uses yet, once after the creation and after
+    /// each [`Self::clear`]. Without an answer of the broker, the next call tries again.
     pub fn install(&mut self, library: Library, now: Instant, broker: &mut Broker) {
         if self.is_installed {
             return;
@@ -125,7 +125,7 @@ impl<P> Attachments<P> {
                     };
                     self.libraries.insert(id, library);
                 }
-                // Reported when a process uses the library.
+                // The refusal is reported when a process uses the library.
                 Err(Refusal::Broker(BrokerError::Refused(_)) | Refusal::Program(_)) => {}
                 Err(Refusal::Broker(_)) => {
                     self.is_installed = false;
@@ -135,7 +135,7 @@ impl<P> Attachments<P> {
         }
     }
 
-    /// Attaches to new libraries, and detaches those that have been unused for a while.
+    /// Attaches to new libraries, and detaches from libraries that have been unused for a while.
     pub fn follow(&mut self, processes: &Processes, now: Instant, broker: &mut Broker) {
         for library in self.libraries.values_mut() {
             library.processes = 0;
@@ -189,7 +189,7 @@ impl<P> Attachments<P> {
         }
     }
 
-    /// Returns the libraries in use.
+    /// Returns facts about the libraries in use.
     #[must_use]
     pub fn facts(&self) -> Vec<LibraryFacts> {
         let in_use = |library: &&Known<P>| library.processes > 0;

@@ -1,10 +1,10 @@
 //! Every message into Fast DDS's shared memory, read in the process that sends it.
 //!
 //! A breakpoint in the code of other processes costs them some microseconds per message. By default
-//! it is there while processes start, which announce their names once, and while a client reads
-//! messages. Nothing is sampled then: the kernel program reads a message before it is copied, so
-//! names, samples and losses are as exact as at a socket. It sees messages passed to the transport,
-//! even those that a full port or segment then refuses.
+//! it exists while processes start, because they announce their names once, and while a client
+//! reads messages. Nothing is sampled in these times: the kernel program reads a message before it
+//! is copied, so names, samples and losses are as exact as at a socket. The program sees every
+//! message passed to the transport, even if a full port or segment then refuses it.
 
 pub mod attachments;
 pub mod processes;
@@ -30,10 +30,10 @@ use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Observer;
 use rustix::thread::{CapabilitySet, capabilities};
 
-/// Factor by which the rings are larger: a process can write a hundred thousand messages per
-/// second, ten times the rate of a socket. It writes a whole image at the speed of memory.
+/// Factor of the rings' sizes. A process can write a hundred thousand messages per second, ten
+/// times the rate of a socket. It writes a whole image at the speed of memory.
 const RINGS: usize = 4;
-/// Bytes above which the ring of captured messages is not made larger.
+/// Maximum size to which the ring of captured messages is enlarged, in bytes.
 const LARGE_RING: usize = 16 << 20;
 
 /// Why messages cannot be read in the processes that send them.
@@ -54,7 +54,7 @@ pub enum UprobeError {
     /// The kernel does not expose a process's control group to programs.
     #[error("uprobes limited to one control group (capture.cgroup) need Linux 5.16")]
     Scope(#[source] FilterError),
-    /// The same, for the programs inside processes.
+    /// The kernel does not expose a process's control group to the programs inside processes.
     #[error("observing the processes of one control group (capture.cgroup) needs Linux 5.16")]
     InsideScope(#[source] FilterError),
     /// The kernel programs cannot be loaded.
@@ -64,7 +64,7 @@ pub enum UprobeError {
 
 /// Returns the capabilities that the broker needs, apart from those that load programs: for events
 /// of mapped files, and for reading mapped files of other users' processes. Perf events need the
-/// wider one on recent kernels.
+/// wider CAP_SYS_ADMIN on recent kernels.
 fn needed() -> [(CapabilitySet, &'static str); 2] {
     let events = match Means::of_this_kernel() {
         Means::Links => (CapabilitySet::PERFMON, "CAP_PERFMON"),
@@ -73,16 +73,16 @@ fn needed() -> [(CapabilitySet, &'static str); 2] {
     [events, (CapabilitySet::SYS_PTRACE, "CAP_SYS_PTRACE")]
 }
 
-/// Returns the capabilities that the broker can use: those required, and one for opening a mapped
-/// file that another one has replaced.
+/// Returns the capabilities that the broker can use: the required ones, and one for opening a
+/// mapped file that was replaced.
 #[must_use]
 pub fn useful() -> CapabilitySet {
     let required: CapabilitySet = needed().iter().map(|(one, _)| *one).collect();
     required | CapabilitySet::CHECKPOINT_RESTORE
 }
 
-/// Returns the broker that listens at `socket`. Without a socket, a process with its privileges
-/// starts one as a child.
+/// Returns a client of the broker that listens at `socket`. If the socket does not exist, a process
+/// with the required capabilities starts the broker as a child.
 ///
 /// # Errors
 /// Fails if the child cannot be started.
@@ -96,7 +96,7 @@ pub(crate) fn broker(socket: &Path) -> Result<Broker, UprobeError> {
 /// Returns the names of required capabilities that `effective` lacks.
 #[must_use]
 pub fn lacking(effective: CapabilitySet) -> Vec<&'static str> {
-    // The older, wider capability includes its successor.
+    // CAP_SYS_ADMIN includes CAP_PERFMON.
     let inherited = match effective.contains(CapabilitySet::SYS_ADMIN) {
         true => CapabilitySet::PERFMON,
         false => CapabilitySet::empty(),
@@ -122,9 +122,10 @@ pub struct Uprobe {
 }
 
 impl Uprobe {
-    /// Loads the programs, and attaches them to installed libraries. `on_demand`: they are detached
-    /// while no process starts, and [`Self::want`] does not need them. `cgroup`: only for processes of this control group. `broker`: socket of the
-    /// process that attaches.
+    /// Loads the programs, and attaches them to installed libraries. With `on_demand`, they are
+    /// detached while no process starts and [`Self::want`] does not need them. `cgroup` restricts
+    /// them to processes of this control group. `broker` is the socket of the process that attaches
+    /// them.
     ///
     /// # Errors
     /// Fails if the programs may not be loaded, or if the kernel has no uprobes.
@@ -172,27 +173,27 @@ impl Uprobe {
         self.reader.descriptors()
     }
 
-    /// Sets whether every sample of a writer that may use shared memory is needed. Matters only if
-    /// programs are attached on demand.
+    /// Sets whether every sample of a writer that may use shared memory is needed. The setting
+    /// matters only if programs are attached on demand.
     pub fn want(&self, wanted: bool) {
         self.search.want(wanted);
     }
 
-    /// Returns whether the programs are wanted, and not yet in all processes that can have them.
+    /// Returns whether the programs are needed, but not yet attached in all processes that can have
+    /// them.
     #[must_use]
     pub fn is_attaching(&self) -> bool {
         self.search.is_attaching()
     }
 
-    /// Returns the buffer in which records from polling wait for their turn; `None` while no process
-    /// is observed.
+    /// Returns the buffer that orders records from polling; `None` while no process is observed.
     pub fn order_mut(&mut self) -> Option<&mut ReorderBuffer> {
         let is_attached = self.was_attached || self.search.is_attached();
         is_attached.then(|| self.reader.order_mut())
     }
 
-    /// Passes the messages found to the model and, after the programs are detached, that no more
-    /// will be found.
+    /// Passes the messages found to the model. After the programs are detached, also reports that
+    /// no more will be found.
     pub fn poll(&mut self, clocks: &Clocks, observer: &mut Observer) {
         let is_attached = self.search.is_attached();
         self.reader.poll(clocks, observer);
@@ -203,7 +204,7 @@ impl Uprobe {
         self.was_attached = is_attached;
     }
 
-    /// Passes everything that still waits to the model, at the end.
+    /// Passes all buffered data to the model at the end.
     pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
         self.reader.drain(clocks, observer);
     }
@@ -225,7 +226,7 @@ impl Uprobe {
         &self.reader
     }
 
-    /// Returns the attached libraries, and which processes are not covered.
+    /// Returns facts about the attached libraries, and about processes that are not covered.
     #[must_use]
     pub fn facts(&self) -> Facts {
         self.search.facts()

@@ -1,7 +1,7 @@
-//! Finds the processes that use a library, and the files of it.
+//! Finds the processes that use a library, and the library files that they map.
 //!
-//! The broker reads the maps of new processes, of young ones for a while, and of the others
-//! occasionally: a library may be loaded late. It reads no process memory.
+//! The broker reads the maps of new processes every time, and those of older ones occasionally: a
+//! library may be loaded late. It reads no process memory.
 
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::fs;
@@ -17,8 +17,8 @@ use ros2probe_model::facts::bounded::Bounded;
 
 /// File that lists the holders of locks.
 const LOCKS: &str = "/proc/locks";
-/// Number of rounds in which a new process may still be loading libraries; afterwards it is
-/// inspected only once per this many rounds.
+/// Number of rounds in which a new process may still be loading libraries. Afterwards it is
+/// inspected only once in [`ROUNDS`] rounds.
 const LOADING_ROUNDS: u32 = 10;
 const ROUNDS: u32 = 32;
 
@@ -43,7 +43,7 @@ pub struct Processes {
 struct Process {
     met: u32,
     use_of_it: Use,
-    /// Its map cannot be read for lack of permission.
+    /// Whether its maps cannot be read for lack of permission.
     is_closed: bool,
 }
 
@@ -94,10 +94,10 @@ impl Processes {
         }
     }
 
-    /// Visits processes. `all`: includes those that recently did not use the library.
+    /// Inspects processes. With `all`, includes processes that did not use the library so far.
     ///
     /// # Errors
-    /// Fails if the broker cannot be reached. The processes are then those of the last visit.
+    /// Fails if the broker cannot be reached. The result of the last call then stays.
     pub fn find(&mut self, all: bool, broker: &mut Broker) -> Result<(), BrokerError> {
         let in_scope = self.in_scope(broker)?;
         let is_asked = |pid: &u32| {
@@ -130,7 +130,7 @@ impl Processes {
         Ok(())
     }
 
-    /// Visits processes that have just mapped a library, if they are in scope.
+    /// Inspects processes that have just mapped a library, if they are in scope.
     ///
     /// # Errors
     /// Fails if the broker cannot be reached.
@@ -145,7 +145,7 @@ impl Processes {
         }
         for (pid, used) in broker.users(self.library, &pids)?.used {
             let process = Process {
-                // It may load further libraries.
+                // The process may load further libraries.
                 met: 0,
                 use_of_it: used.into(),
                 is_closed: false,
@@ -155,7 +155,7 @@ impl Processes {
         Ok(())
     }
 
-    /// Visits processes that have mapped a library.
+    /// Inspects processes that have mapped a library, and all processes if records were lost.
     ///
     /// # Errors
     /// Fails if the broker cannot be reached.
@@ -182,7 +182,7 @@ impl Processes {
         }
     }
 
-    /// Returns the processes in scope. The agent itself cannot see those of other users.
+    /// Returns the processes in scope. The agent itself cannot see processes of other users.
     fn in_scope(&self, broker: &mut Broker) -> Result<Vec<u32>, BrokerError> {
         match &self.scope {
             Scope::AllProcesses | Scope::Networks(_) => broker.processes(),
@@ -190,7 +190,7 @@ impl Processes {
         }
     }
 
-    /// Iterates over the processes that use Fast DDS.
+    /// Iterates over the processes that use the library.
     pub fn using(&self) -> impl Iterator<Item = (u32, &Use)> {
         self.known
             .iter()
@@ -198,8 +198,8 @@ impl Processes {
             .map(|(pid, process)| (*pid, &process.use_of_it))
     }
 
-    /// Returns a process that cannot be inspected and may use Fast DDS, because it holds one of its
-    /// locks. Without a list of locks, every such process may use it.
+    /// Returns a process that cannot be inspected and may use Fast DDS, because it holds a lock as
+    /// Fast DDS does. Without a list of locks, every such process may use Fast DDS.
     #[must_use]
     pub fn closed(&self) -> Option<u32> {
         let mut closed = self.known.iter().filter(|(_, process)| process.is_closed);
@@ -230,7 +230,7 @@ mod tests {
     use ros2probe_attach::mapped::LibraryId;
 
     #[test]
-    fn of_a_process_with_too_many_libraries_the_first_ones_are_known() {
+    fn a_process_with_too_many_libraries_keeps_the_first_ones() {
         let libraries = (1..=1000).map(|inode| Mapped {
             id: LibraryId {
                 device: "fe:00".to_owned(),
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn holders_of_locks_are_read() {
+    fn the_holder_of_a_file_lock_is_parsed() {
         assert_eq!(
             holder("1: FLOCK  ADVISORY  WRITE 4711 00:1a:5 0 EOF"),
             Some(4711)
@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn this_process_is_met_and_uses_none_of_it() {
+    fn this_process_is_found_and_does_not_use_fast_dds() {
         let mut processes = Processes::new(Scope::AllProcesses, Library::FastDds);
         processes.find(true, &mut Broker::here()).unwrap();
         let own = std::process::id();

@@ -1,7 +1,7 @@
-//! The thread that finds the libraries in use and attaches to them.
+//! The thread that finds the libraries in use and attaches probes to them.
 //!
-//! Attached once to a file, a probe is in every process that maps it, including later ones. A
-//! library that no process uses is detached only after a while, so that a restarted robot is seen
+//! A probe attached to a file is active in every process that maps the file, including later ones.
+//! The probe of an unused library is removed only after a while, so that a restarted robot is seen
 //! from its first message. The broker reads other processes for the thread.
 
 use std::collections::BTreeSet;
@@ -27,9 +27,9 @@ use crate::shm::directories::{Name, Scope, ShmDirectories};
 use crate::system::{DirectoryWatch, wait};
 use crate::threads::{Progress, Spawn, Task};
 
-/// Interval of visiting processes if nothing happens.
+/// Interval of inspecting processes without an event.
 const EVERY: Duration = Duration::from_secs(1);
-/// How long to collect events: a starting participant creates several files at once.
+/// Time for which events accumulate: a starting participant creates several files together.
 const GATHER: Duration = Duration::from_millis(20);
 /// Time after the start of a process in which its names are announced, each once.
 const STARTING: Duration = Duration::from_secs(10);
@@ -46,12 +46,12 @@ pub struct LibrarySearch {
     thread: Option<JoinHandle<()>>,
 }
 
-/// The attached libraries, and which processes are not covered.
+/// The attached libraries, and the reason why processes are not covered.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Facts {
     /// Libraries in use.
     pub libraries: Vec<LibraryFacts>,
-    /// Why some process may send without being seen; `None` = all are covered.
+    /// Why messages of some process may not be seen; `None` = all processes are covered.
     pub uncovered: Option<String>,
     /// Whether the running processes have been inspected, or need not be.
     pub has_inspected: bool,
@@ -61,16 +61,16 @@ pub struct Facts {
 
 struct Shared {
     facts: Mutex<Facts>,
-    /// Also set until the first search ends: that takes a moment, and installed libraries are
-    /// attached.
+    /// Whether all processes are covered. Also set until the first search ends: it takes a moment,
+    /// and installed libraries already have probes.
     covers_all: AtomicBool,
     /// Whether every message is needed.
     wanted: AtomicBool,
-    /// Rings when that changes. Without it, the thread notices within a second.
+    /// Rings when `wanted` changes. Without the bell, the thread notices a change within a second.
     bell: Option<Bell>,
     /// Whether any probe may be attached.
     attached: AtomicBool,
-    /// Whether all processes have been visited since the probes were last wanted.
+    /// Whether all processes have been inspected since the probes were last requested.
     visited: AtomicBool,
     /// Whether probes are attached only while processes start, and while every message is needed.
     on_demand: bool,
@@ -103,14 +103,14 @@ impl Default for Facts {
 }
 
 impl LibrarySearch {
-    /// Attaches to installed libraries before the thread starts. `on_demand`: the thread detaches when
-    /// no process has started for a while and not every message is needed.
+    /// Attaches to installed libraries before the thread starts. With `on_demand`, the thread
+    /// detaches when no process has started for a while and not every message is needed.
     #[must_use]
     pub fn new(probes: Probes, scope: Scope, mut broker: Broker, on_demand: bool) -> Self {
         let progress = Arc::new(Progress::default());
         let mut attachments = attachments(probes, Arc::clone(&progress));
-        // A participant announces its names once, within a tenth of a second: installed libraries
-        // are attached in advance.
+        // A participant announces its names once, within a tenth of a second, so probes are
+        // attached to installed libraries in advance.
         attachments.install(Library::FastDds, Instant::now(), &mut broker);
         progress.rest();
         let shared = Arc::new(Shared {
@@ -131,7 +131,7 @@ impl LibrarySearch {
         }
     }
 
-    /// Starts the search, once, in a thread without privileges.
+    /// Starts the search in a thread without privileges. Later calls have no effect.
     ///
     /// # Errors
     /// Fails if the thread cannot be started.
@@ -145,14 +145,14 @@ impl LibrarySearch {
         let spawned = spawn(Task::Probes, thread, work);
         if spawned.is_err() {
             let facts = self.shared.facts.lock();
-            // Nothing will be inspected, so there is nothing to wait for.
+            // No process will be inspected, so readiness must not wait for it.
             facts.unwrap_or_else(PoisonError::into_inner).has_inspected = true;
         }
         self.thread = Some(spawned?);
         Ok(())
     }
 
-    /// Sets whether every message is needed, if probes are attached on demand.
+    /// Sets whether every message is needed. Without effect if probes are not attached on demand.
     pub fn want(&self, wanted: bool) {
         let shared = &self.shared;
         if !shared.on_demand || shared.wanted.swap(wanted, Ordering::AcqRel) == wanted {
@@ -162,7 +162,8 @@ impl LibrarySearch {
         shared.ring();
     }
 
-    /// Returns whether the probes are wanted, and not yet in all processes that can have them.
+    /// Returns whether the probes are needed, but not yet attached in all processes that can have
+    /// them.
     #[must_use]
     pub fn is_attaching(&self) -> bool {
         let shared = &self.shared;
@@ -175,7 +176,7 @@ impl LibrarySearch {
         self.shared.attached.load(Ordering::Acquire)
     }
 
-    /// Returns the attached libraries, and which processes are not covered.
+    /// Returns facts about the attached libraries, and about processes that are not covered.
     #[must_use]
     pub fn facts(&self) -> Facts {
         let facts = self.shared.facts.lock();
@@ -188,8 +189,8 @@ impl LibrarySearch {
         self.shared.progress.stalled()
     }
 
-    /// Returns whether every process that uses Fast DDS's shared memory is covered. A stalled thread
-    /// meets no new ones.
+    /// Returns whether every process that uses Fast DDS's shared memory is covered. A stalled
+    /// thread finds no new processes, so the result is then `false`.
     #[must_use]
     pub fn covers_all(&self) -> bool {
         self.shared.covers_all.load(Ordering::Acquire) && self.stalled().is_none()
@@ -199,7 +200,7 @@ impl LibrarySearch {
 impl Drop for LibrarySearch {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Release);
-        // Otherwise it wakes within a second, too long for a shutdown.
+        // Without the bell, the thread wakes within a second, which is too long for a shutdown.
         self.shared.ring();
         drop(self.thread.take());
     }
@@ -276,7 +277,7 @@ struct Followed {
     processes: Processes,
     attachments: Attachments<Attached>,
     broker: Broker,
-    /// Why the broker did not answer last time.
+    /// Why the broker did not answer the last request.
     failed: Option<String>,
     mappings: Option<MappingEvents>,
     /// End of the time in which a process that has started announces its names.
@@ -285,11 +286,11 @@ struct Followed {
 
 impl Followed {
     fn find(&mut self, all: bool, now: Instant) {
-        // Before anything else: a process that starts announces its names at once.
+        // Installed libraries come first: a process that starts announces its names immediately.
         self.install(now);
         let found = self.processes.find(all, &mut self.broker);
         self.failed = found.err().map(|error| in_words(&error));
-        // The broker may come after the agent.
+        // The broker may have started after the agent.
         self.install(now);
         self.attachments
             .follow(&self.processes, now, &mut self.broker);
@@ -299,7 +300,7 @@ impl Followed {
         facts(&self.attachments, &self.processes, self.failed.clone())
     }
 
-    /// Attaches to installed libraries, and notices which processes map others.
+    /// Attaches to installed libraries, and opens the events of mapped files.
     fn install(&mut self, now: Instant) {
         if self.failed.is_some() {
             return;
@@ -311,7 +312,7 @@ impl Followed {
         }
     }
 
-    /// Detaches from everything, so that the broker may end.
+    /// Detaches from all libraries, so that the broker may end.
     fn rest(&mut self) {
         self.attachments.clear();
         self.broker.rest();
@@ -343,7 +344,7 @@ impl Followed {
         new.unwrap_or_default()
     }
 
-    /// Waits until a file is created, at most `limit`, and returns whether one was. Attaches to
+    /// Waits at most `limit` for a created file, and returns whether one was created. Attaches to
     /// libraries that processes map in that time.
     fn wait_attaching(
         &mut self,
@@ -420,7 +421,7 @@ fn attachments(probes: Probes, progress: Arc<Progress>) -> Attachments<Attached>
     )
 }
 
-/// `failed`: why the broker does not answer.
+/// Returns the facts of a search. `failed` is the reason why the broker does not answer.
 fn facts(
     attachments: &Attachments<Attached>,
     processes: &Processes,
@@ -485,7 +486,7 @@ mod tests {
     }
 
     #[test]
-    fn a_library_beyond_the_cap_is_reported_as_uncovered_until_another_is_no_longer_used() {
+    fn a_library_beyond_the_cap_is_uncovered_until_another_one_is_detached() {
         let directory = tempfile::tempdir().unwrap();
         let program = ros2probe_testing::harness::peer::built("handed").unwrap();
         for number in 0..=Libraries::CAP {
@@ -515,7 +516,7 @@ mod tests {
             "{uncovered}"
         );
 
-        // The last one has no probe; the first is detached, and its place is used.
+        // The last library has no probe. It gets one after the first library is detached.
         used.libraries.remove(0);
         let fewer = Processes::of(process, used);
         let later = start + RETRY + LINGER + EVERY;

@@ -1,9 +1,9 @@
 //! Follows the TCP connections of Zenoh: segments in, batches out.
 //!
-//! A connection is one of Zenoh if it begins with an INIT. One that is older than the agent is
-//! recognized by batches in a row that fit together. Retransmissions are dropped, and segments out
-//! of order wait for the missing ones. After a gap, the next boundary of a batch is searched for. Of
-//! other connections only the addresses are kept.
+//! A connection is one of Zenoh if it begins with an INIT. A connection that is older than the
+//! agent is recognized by consecutive batches that fit together. Retransmissions are dropped, and
+//! segments out of order wait for the missing ones. After a gap, the next boundary of a batch is
+//! searched for. For other connections, only the addresses are kept.
 
 mod chunks;
 mod search;
@@ -32,21 +32,21 @@ const EXAMINATION_INTERVAL: Duration = Duration::from_millis(100);
 pub struct Chunk<'a> {
     /// Time of the segment.
     pub time: Timestamp,
-    /// The direction.
+    /// Direction of the connection.
     pub stream: StreamId,
     /// TCP sequence number of its first byte, or of the SYN.
     pub sequence_number: u32,
-    /// Whether the connection begins.
+    /// Whether the connection begins with this chunk.
     pub syn: bool,
-    /// Whether the sender sends nothing after this, or aborts the connection.
+    /// Whether the sender sends nothing after this chunk, or aborts the connection.
     pub end: bool,
     /// Whether the source knows that a batch begins here, on a connection of Zenoh.
     pub is_boundary: bool,
-    /// The bytes before it that the source has not passed on.
+    /// What is known about missing bytes before the chunk.
     pub before: Before,
-    /// Captured beginning of the bytes.
+    /// The captured bytes, which are the first ones of the chunk.
     pub bytes: &'a [u8],
-    /// Number of the bytes.
+    /// Length of the chunk in bytes.
     pub length: u32,
 }
 
@@ -68,28 +68,28 @@ impl Chunk<'_> {
     }
 }
 
-/// What is known of missing bytes before a chunk.
+/// What is known about missing bytes before a chunk.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Before {
-    /// Nothing: they may arrive later.
+    /// Nothing is known: the bytes may arrive later.
     #[default]
     Unknown,
-    /// They were left out because they are not needed.
+    /// The bytes were left out because they are not needed.
     Skipped,
-    /// They will not arrive.
+    /// The bytes will not arrive.
     Lost,
 }
 
-/// What happened to segments and batches.
+/// Counters of segments and batches.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
-    /// Batches.
+    /// Number of batches.
     pub batches: u64,
-    /// Bytes that repeat earlier ones.
+    /// Number of bytes that repeat earlier ones.
     pub retransmitted_bytes: u64,
-    /// Times that bytes were missing.
+    /// Number of gaps, where bytes were missing.
     pub gaps: u64,
-    /// Bytes before a boundary was found.
+    /// Number of bytes before a boundary was found.
     pub unsynchronized_bytes: u64,
 }
 
@@ -99,12 +99,12 @@ pub struct Streams {
     /// TCP ports of Zenoh.
     ports: Vec<u16>,
     streams: Bounded<Counted<ZenohStreams>, HashMap<StreamId, Box<Stream>>>,
-    /// Streams of each flow: two if both sockets are of this host.
+    /// Number of streams of each flow: two if both sockets are on this host.
     flows: HashMap<Flow, usize>,
-    /// The order in which to evict, with streams that may be gone.
+    /// Streams in the order of eviction, including some that have ended.
     order: Bounded<ZenohOrder, VecDeque<StreamId>>,
     bytes: Sum<Counted<ZenohStreamBytes>>,
-    /// When they were last examined for segments that wait too long.
+    /// Time of the last examination for segments that wait too long.
     examined: Timestamp,
     counters: Counters,
 }
@@ -130,7 +130,7 @@ impl Streams {
         }
     }
 
-    /// Adds a piece and reports what it completes.
+    /// Adds a chunk and reports the events that result.
     pub fn chunk(&mut self, chunk: &Chunk<'_>, mut report: impl FnMut(&StreamReport<'_>)) {
         let id = chunk.stream;
         let mut pass = |event: StreamEvent<'_>| {
@@ -190,8 +190,8 @@ impl Streams {
         }
     }
 
-    /// Reports a UDP datagram of `length` bytes with which a QUIC connection of Zenoh begins. Returns
-    /// whether it is one: a QUIC Initial packet on a port of Zenoh.
+    /// Reports a UDP datagram of `length` bytes with which a QUIC connection of Zenoh begins.
+    /// Returns whether the datagram is one: a QUIC Initial packet on a port of Zenoh.
     pub fn datagram(
         &self,
         (time, mut stream): (Timestamp, StreamId),
@@ -211,7 +211,7 @@ impl Streams {
         if !head.is_some_and(|head| quic::is_initial(*head, length)) {
             return false;
         }
-        // The client's port differs for each connection, whose end is not visible.
+        // The client's port is omitted: it differs for each connection, whose end is not visible.
         match is_to_zenoh {
             true => source.port = 0,
             false => destination.port = 0,
@@ -224,8 +224,8 @@ impl Streams {
         true
     }
 
-    /// Gives up segments that have waited too long for the missing ones. May be called as often as
-    /// the caller likes.
+    /// Gives up missing bytes for which segments have waited too long. The interval between calls
+    /// does not matter.
     pub fn advance(&mut self, now: Timestamp, mut report: impl FnMut(&StreamReport<'_>)) {
         if now.distance(self.examined) < EXAMINATION_INTERVAL {
             return;
@@ -255,19 +255,20 @@ impl Streams {
         self.flows.contains_key(flow)
     }
 
-    /// Returns what happened to segments and batches.
+    /// Returns the counters of segments and batches.
     #[must_use]
     pub const fn counters(&self) -> Counters {
         self.counters
     }
 
-    /// Returns the number of bytes that wait.
+    /// Returns the number of held bytes.
     #[must_use]
     pub const fn bytes(&self) -> usize {
         self.bytes.used()
     }
 
-    /// Returns the rows of the metrics. A connection that a cap removes leaves both tables.
+    /// Returns the facts of both tables for metrics. A connection that a cap removes leaves both
+    /// tables.
     #[must_use]
     pub fn tables(&self) -> [TableFacts; 2] {
         [self.streams.facts(), self.bytes.facts()]
@@ -295,8 +296,8 @@ impl Streams {
         }
     }
 
-    /// Drops a connection: first the oldest that is not known to be one of Zenoh, otherwise the
-    /// oldest.
+    /// Drops a connection: the oldest one that is not known to be of Zenoh, otherwise the oldest
+    /// one of all.
     fn evict(&mut self) {
         let known = |id: &StreamId| self.streams.get(id).map(|stream| stream.is_zenoh());
         let stranger = self.order.iter().position(|id| known(id) == Some(false));

@@ -1,7 +1,7 @@
 //! Searches for the boundary of a batch, at the beginning of a connection or inside it.
 //!
-//! Segments of small messages begin with a batch. From such a place on, bytes are collected as long
-//! as they can be read as batches. The rules are those of the kernel programs
+//! Segments of small messages begin with a batch. From the start of such a segment, bytes are
+//! collected as long as they can be read as batches. The rules are those of the kernel programs
 //! ([`ros2probe_wire::zenoh_stream`]).
 
 use ros2probe_model::facts::bounded::Bounded;
@@ -10,36 +10,37 @@ use ros2probe_wire::zenoh_stream::{Beginning, Lanes, message};
 
 use crate::tables::SearchedBytes;
 
-/// What the bytes look like.
+/// Assessment of the collected bytes.
 pub enum Looks {
-    /// Batches, from the first of these bytes on.
+    /// The bytes are batches, beginning with the first byte.
     Zenoh(Vec<u8>),
     /// More bytes are needed.
     Undecided,
-    /// A handshake of TLS on a port of Zenoh.
+    /// A TLS handshake on a port of Zenoh.
     Tls,
     /// Something else.
     Other,
 }
 
-/// Bytes from a place where a batch may begin.
+/// Bytes collected from a position where a batch may begin.
 #[derive(Debug, Default)]
 pub struct Search {
     held: Bounded<SearchedBytes, Vec<u8>>,
 }
 
 impl Search {
-    /// Returns the number of bytes collected.
+    /// Returns the capacity for collected bytes, in bytes.
     pub fn held(&self) -> usize {
         self.held.capacity()
     }
 
-    /// Adds the bytes of a segment. If `begins`, the connection begins with the first of them all.
+    /// Adds the bytes of a segment. With `begins`, the first collected byte is the first of the
+    /// connection.
     pub fn add(&mut self, bytes: &[u8], length: usize, begins: bool, is_port: bool) -> Looks {
         let was_empty = self.held.is_empty();
         let is_whole = bytes.len() >= length;
         if begins {
-            // The first bytes suffice for TLS, of which the programs pass on no more.
+            // The first bytes suffice to recognize TLS, and the programs pass on no more of it.
             let looks = match self.held.extend_from_slice(bytes) {
                 true => self.begin(is_port),
                 false => Looks::Other,
@@ -72,7 +73,7 @@ impl Search {
         looks
     }
 
-    /// Judges the first bytes of a connection.
+    /// Assesses the first bytes of a connection.
     fn begin(&mut self, is_port: bool) -> Looks {
         let Some(head) = self.held.first_chunk() else {
             return match self.held.get(2) {
@@ -80,7 +81,7 @@ impl Search {
                 _ => Looks::Undecided,
             };
         };
-        // The segments that follow have the rest of an INIT.
+        // The rest of an INIT may be in later segments.
         match Beginning::of(*head, u32::MAX, is_port) {
             Beginning::Init | Beginning::OtherVersion => Looks::Zenoh(self.held.take()),
             Beginning::Tls => Looks::Tls,
@@ -122,7 +123,7 @@ impl Search {
     }
 }
 
-/// Returns whether this batch may follow those before.
+/// Returns whether this batch may follow the earlier ones.
 fn continues(lanes: &mut Lanes, batch: &[u8]) -> bool {
     let mut is_empty = true;
     let mut follows = |lane: Lane, number| {

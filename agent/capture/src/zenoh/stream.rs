@@ -11,29 +11,29 @@ use super::search::{Looks, Search};
 use super::{Before, Chunk, Counters};
 use crate::tables::{SegmentsAhead, SegmentsAheadBytes};
 
-/// Farthest that a segment may be ahead of the missing bytes: the largest TCP window.
+/// Maximum distance of a segment from the next expected byte: the largest TCP window.
 const WINDOW: u32 = 1 << 30;
-/// Time after which missing bytes were not captured. TCP sends them again before, but late if the
+/// Time after which missing bytes are given up. TCP sends them again earlier, but late if the
 /// receiver does not read.
 const WAIT: Duration = Duration::from_secs(10);
-/// Bytes of the length before each batch.
+/// Size of the length field before each batch, in bytes.
 const PREFIX: usize = 2;
-/// Most batches without a message in a row, of which Zenoh sends one when it drops the rest of a
-/// message. More of them are zeros of something else.
+/// Maximum number of consecutive batches without a message. Zenoh sends one when it drops the rest
+/// of a message. More of them are zeros of other data.
 const MAX_EMPTY: usize = 64;
 
-/// What became of a chunk.
+/// Result of taking a chunk.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Took {
-    /// It was read, or waits.
+    /// The chunk was read, or waits for earlier bytes.
     Chunk,
-    /// The connection is not of Zenoh, as far as can be seen.
+    /// The connection does not appear to be one of Zenoh.
     NotZenoh,
     /// The connection begins as TLS on a port of Zenoh.
     Tls,
 }
 
-/// Where the next byte belongs.
+/// Position of the next byte.
 #[derive(Debug)]
 enum Position {
     /// Inside the connection, with no boundary found yet.
@@ -49,11 +49,11 @@ enum Position {
 /// A batch of which some bytes have arrived.
 #[derive(Debug, Default)]
 struct Partial {
-    /// Captured bytes from the length prefix on.
+    /// Captured bytes, beginning with the length prefix.
     captured: Vec<u8>,
     /// Bytes that have arrived, captured or not.
     arrived: usize,
-    /// Batches without a message before it.
+    /// Number of consecutive batches without a message before this one.
     empty: usize,
 }
 
@@ -68,7 +68,7 @@ struct Ahead {
 }
 
 impl Ahead {
-    /// Returns the bytes that it takes, with those of an allocation.
+    /// Returns the memory of the segment in bytes, including the overhead of an allocation.
     const fn held(&self) -> usize {
         size_of::<Self>() + 32 + self.bytes.len()
     }
@@ -86,7 +86,7 @@ pub struct Stream {
     ahead_bytes: Sum<SegmentsAheadBytes>,
     /// When the first segment began to wait.
     waiting_since: Timestamp,
-    /// Whether batches were read in it, or it is encrypted on a port of Zenoh.
+    /// Whether batches were read in the stream, or it uses TLS on a port of Zenoh.
     was_zenoh: bool,
     is_zenoh_port: bool,
 }
@@ -110,17 +110,17 @@ impl Stream {
         }
     }
 
-    /// Returns whether this SYN is the one that began the stream, sent again.
+    /// Returns whether this SYN is a retransmission of the one that began the stream.
     pub const fn began_with(&self, chunk: &Chunk<'_>) -> bool {
         self.first == chunk.sequence_number
     }
 
-    /// Returns whether batches were read in it, or it is encrypted on a port of Zenoh.
+    /// Returns whether batches were read in the stream, or it uses TLS on a port of Zenoh.
     pub const fn is_zenoh(&self) -> bool {
         self.was_zenoh
     }
 
-    /// Returns the bytes that it holds.
+    /// Returns the number of held bytes.
     pub fn held(&self) -> usize {
         let partial = match &self.position {
             Position::Searching(search) | Position::Beginning(search) => search.held(),
@@ -140,7 +140,7 @@ impl Stream {
         !self.ahead.is_empty() && now > self.waiting_since + WAIT
     }
 
-    /// Takes a chunk, or keeps it until the bytes before it are there.
+    /// Reads a chunk, or keeps it until the bytes before it have arrived.
     pub fn take(
         &mut self,
         chunk: &Chunk<'_>,
@@ -200,7 +200,7 @@ impl Stream {
         self.catch_up(counters, report);
     }
 
-    /// Continues at a later byte: those before will not arrive.
+    /// Continues at a later byte, because the bytes before it will not arrive.
     fn lost(
         &mut self,
         start: u32,
@@ -217,7 +217,7 @@ impl Stream {
         }
     }
 
-    /// Goes on at a later byte: whole batches before it are not needed.
+    /// Continues at a later byte, because whole batches before it are not needed.
     fn skip_to(&mut self, start: u32) {
         if start.wrapping_sub(self.next) < WINDOW {
             self.next = start;
@@ -241,7 +241,7 @@ impl Stream {
         self.ahead.insert(position, ahead);
     }
 
-    /// Reads the segments that waited for the last one.
+    /// Reads the waiting segments that continue the bytes read so far.
     fn catch_up(&mut self, counters: &mut Counters, report: &mut impl FnMut(StreamEvent<'_>)) {
         while let Some(first) = self.ahead.front() {
             let (start, before) = (first.sequence_number, first.before);
@@ -289,7 +289,7 @@ impl Stream {
         let length = usize::try_from(length - repeated).unwrap_or(usize::MAX);
         if is_boundary && repeated == 0 {
             if matches!(&self.position, Position::Batch(partial) if partial.arrived > 0) {
-                // The source knows better.
+                // The source knows that a batch begins here, so the previous one is incomplete.
                 counters.gaps += 1;
                 report(StreamEvent::Gap);
             }
@@ -366,7 +366,8 @@ impl Stream {
 }
 
 impl Partial {
-    /// Reads bytes of which the beginning was captured. Returns whether the boundaries are known.
+    /// Reads `length` bytes, of which the first ones were captured. Returns whether the boundaries
+    /// are known.
     fn read(
         &mut self,
         mut bytes: &[u8],
@@ -418,7 +419,7 @@ impl Partial {
         true
     }
 
-    /// Returns the length of the batch, once both bytes of it were captured.
+    /// Returns the length of the batch; `None` until both of its bytes are captured.
     fn prefix(&self) -> Option<u16> {
         let prefix = self.captured.first_chunk()?;
         Some(u16::from_le_bytes(*prefix))

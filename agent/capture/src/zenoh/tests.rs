@@ -9,7 +9,7 @@ use crate::pcap::PcapReader;
 use crate::tables::tests::assert_driven;
 use crate::tables::{SearchedBytes, SegmentsAhead, SegmentsAheadBytes};
 
-/// What a replay of a capture reports.
+/// Events that a replay of a capture reports.
 #[derive(Default, PartialEq, Eq, Debug)]
 struct Reported {
     batches: Vec<(Flow, Vec<u8>)>,
@@ -114,7 +114,7 @@ fn a_capture_has_as_many_batches_as_an_independent_decoder_found() {
 }
 
 #[test]
-fn segments_out_of_order_or_again_change_nothing() {
+fn reordered_and_repeated_segments_yield_the_same_batches() {
     let segments = segments();
     let (expected, _) = follow(&segments);
     let data = |segment: &Segment| !segment.bytes.is_empty() && !segment.end && !segment.syn;
@@ -138,7 +138,7 @@ fn segments_out_of_order_or_again_change_nothing() {
 }
 
 #[test]
-fn after_a_gap_the_next_boundary_is_found_soon() {
+fn the_next_batch_boundary_is_found_soon_after_a_gap() {
     let mut segments = segments();
     let (expected, _) = follow(&segments);
     let busiest = |segment: &Segment| segment.bytes.len() > 300;
@@ -199,7 +199,7 @@ fn connections_of_other_protocols_are_ignored_and_tls_is_reported() {
         segment(80, 9, &[]),
         segment(80, 10, request),
         segment(81, 10, request),
-        // The bytes between are not passed on.
+        // The source does not pass on the bytes between.
         segment(7447, 90_000, &[]),
         segment(443, 90_000, &[]),
         segment(80, 90_000, &[]),
@@ -210,7 +210,7 @@ fn connections_of_other_protocols_are_ignored_and_tls_is_reported() {
 
 proptest! {
     #[test]
-    fn any_segments_are_bounded(
+    fn arbitrary_segments_keep_the_count_of_held_bytes_correct(
         segments in prop::collection::vec(
             (0..4_u16, any::<u32>(), any::<(bool, bool, bool)>(), prop::collection::vec(any::<u8>(), 0..80), 0..100_000_u32),
             0..200,
@@ -242,7 +242,7 @@ proptest! {
     }
 }
 
-/// A chunk of the connection from this port.
+/// Returns a chunk of the connection from this port.
 fn chunk(port: u16, sequence_number: u32, bytes: &[u8]) -> Chunk<'_> {
     use ros2probe_model::facts::route::Destination;
     let source = Destination {
@@ -269,7 +269,7 @@ fn chunk(port: u16, sequence_number: u32, bytes: &[u8]) -> Chunk<'_> {
 }
 
 #[test]
-fn more_directions_than_there_is_room_for_push_out_the_oldest_stranger() {
+fn directions_beyond_the_cap_evict_the_oldest_one_of_another_protocol() {
     let mut streams = Streams::default();
     let zenoh = Chunk {
         is_boundary: true,
@@ -288,7 +288,7 @@ fn more_directions_than_there_is_room_for_push_out_the_oldest_stranger() {
 }
 
 #[test]
-fn unfinished_batches_keep_within_their_bytes() {
+fn unfinished_batches_stay_within_the_byte_cap() {
     let mut streams = Streams::default();
     let begun = [&[0xff, 0xff][..], &[5; 65_000]].concat();
     for port in 1..400 {
@@ -330,7 +330,7 @@ fn missing_bytes_are_given_up_when_the_cap_of_waiting_bytes_is_reached() {
     };
     streams.chunk(&first, |_| {});
     let segment = vec![0; 1 << 16];
-    // Each segment takes some bytes besides its own.
+    // Each segment takes memory in addition to its bytes.
     for number in 0..63 {
         streams.chunk(&chunk(1, 100 + (number << 16), &segment), |_| {});
     }
@@ -342,12 +342,12 @@ fn missing_bytes_are_given_up_when_the_cap_of_waiting_bytes_is_reached() {
 }
 
 #[test]
-fn bytes_that_may_be_batches_are_collected_up_to_three_of_the_largest() {
+fn possible_batches_are_collected_up_to_three_times_the_maximum_size() {
     let mut streams = Streams::default();
     let mut next = 1;
     let mut most = 0;
     for lane in 0..6 {
-        // Fragments of lanes that have no other one.
+        // Each fragment is on a lane without another one.
         let header = [0xff, 0xff, 0xe6, 1, 0x31, lane];
         for part in [&header[..], &[0; 65_535 - 4]] {
             streams.chunk(&chunk(1, next, part), |_| {});
@@ -355,14 +355,14 @@ fn bytes_that_may_be_batches_are_collected_up_to_three_of_the_largest() {
             most = most.max(streams.bytes());
         }
     }
-    // Memory is reserved ahead.
+    // The buffer reserves memory in advance.
     assert!((3 * 65_537..=6 * 65_537).contains(&most), "{most} bytes");
     assert_eq!(streams.counters().batches, 0);
     assert_driven::<SearchedBytes>();
 }
 
 #[test]
-fn connections_that_ended_leave_the_order_once_it_is_full() {
+fn ended_connections_leave_the_eviction_order_when_it_is_full() {
     let mut streams = Streams::default();
     for turn in 0..20_000 {
         let stays = turn % 8 == 0;
@@ -380,9 +380,9 @@ fn connections_that_ended_leave_the_order_once_it_is_full() {
     assert_driven::<ZenohOrder>();
 }
 
-/// Zenoh sends one in place of the rest of a message that it drops.
+/// Zenoh sends such a batch in place of the rest of a message that it drops.
 #[test]
-fn a_batch_without_a_message_is_no_gap_and_a_run_of_zeros_is() {
+fn an_empty_batch_is_not_a_gap_but_a_run_of_zeros_is() {
     let first = [4, 0, 0x25, 1, 0x1d, 3, 0, 0, 4, 0, 0x25, 2, 0x1d, 3];
     for parts in 1..first.len() {
         let (mut streams, mut reported) = (Streams::default(), Reported::default());
@@ -406,7 +406,7 @@ fn a_batch_without_a_message_is_no_gap_and_a_run_of_zeros_is() {
 }
 
 #[test]
-fn bytes_left_out_on_purpose_are_no_gap_and_lost_ones_are() {
+fn skipped_bytes_are_not_a_gap_but_lost_bytes_are() {
     let frame = |number| [4, 0, 0x25, number, 0x1d, 3];
     let mut streams = Streams::default();
     let mut reported = Reported::default();
@@ -435,7 +435,7 @@ fn bytes_left_out_on_purpose_are_no_gap_and_lost_ones_are() {
     );
 }
 
-/// A UDP datagram over IPv4 between these ports, as a raw packet.
+/// Returns a UDP datagram over IPv4 between these ports, as a raw packet.
 fn datagram(source_port: u16, destination_port: u16, payload: &[u8]) -> Vec<u8> {
     let length = |header: usize| u16::try_from(payload.len() + header).unwrap().to_be_bytes();
     let mut bytes = vec![0x45, 0];
@@ -482,7 +482,7 @@ fn quic_in(datagrams: &[(u16, u16, Vec<u8>)]) -> u64 {
     quic.map(|(_, connections)| connections).sum()
 }
 
-/// An Initial packet as RFC 9001, A.2 pads it, in this version.
+/// Returns an Initial packet as RFC 9001, A.2 pads it, in this version.
 fn initial(version: [u8; 4]) -> Vec<u8> {
     let first = if version == [0, 0, 0, 1] { 0xc3 } else { 0xd3 };
     let mut bytes = [&[first][..], &version, &[8]].concat();
@@ -491,7 +491,7 @@ fn initial(version: [u8; 4]) -> Vec<u8> {
 }
 
 #[test]
-fn quic_is_named_on_a_port_of_zenoh_in_a_capture() {
+fn quic_on_a_port_of_zenoh_in_a_capture_is_reported() {
     for version in [[0, 0, 0, 1], [0x6b, 0x33, 0x43, 0xcf]] {
         let packet = initial(version);
         assert_eq!(quic_in(&[(50_000, 7447, packet.clone())]), 1);
@@ -503,7 +503,7 @@ fn quic_is_named_on_a_port_of_zenoh_in_a_capture() {
 }
 
 #[test]
-fn other_datagrams_on_a_port_of_zenoh_are_no_quic() {
+fn other_datagrams_on_a_port_of_zenoh_do_not_count_as_quic() {
     let short_header = [&[0x43][..], &[0x5a; 1251]].concat();
     let draft = initial([0xff, 0, 0, 0x1d]);
     let cut = initial([0, 0, 0, 1])[..1199].to_vec();
@@ -511,7 +511,7 @@ fn other_datagrams_on_a_port_of_zenoh_are_no_quic() {
     for payload in [short_header, draft, cut, rtps, vec![], vec![0xc0]] {
         assert_eq!(quic_in(&[(50_000, 7447, payload)]), 0);
     }
-    // Scouting, and HTTP/3.
+    // The ports are those of scouting and of HTTP/3.
     for port in [7446, 443] {
         assert_eq!(quic_in(&[(50_000, port, initial([0, 0, 0, 1]))]), 0);
     }
@@ -519,7 +519,7 @@ fn other_datagrams_on_a_port_of_zenoh_are_no_quic() {
 
 proptest! {
     #[test]
-    fn random_datagrams_are_no_quic(bytes in proptest::collection::vec(any::<u8>(), 0..1500)) {
+    fn random_datagrams_are_not_quic(bytes in proptest::collection::vec(any::<u8>(), 0..1500)) {
         prop_assert_eq!(quic_in(&[(50_000, 7447, bytes)]), 0);
     }
 }

@@ -25,7 +25,7 @@ fn writer(number: u32) -> Guid {
 }
 
 #[test]
-fn the_interest_map_takes_so_many_and_refuses_the_next() {
+fn endpoints_beyond_the_cap_of_the_interest_map_are_refused() {
     let mut kernel = Kernel::load();
     let mut put = |number| {
         kernel
@@ -56,7 +56,7 @@ fn participants_beyond_the_cap_are_refused() {
 }
 
 #[test]
-fn so_many_interfaces_are_judged_and_the_next_is_refused() {
+fn interfaces_beyond_the_cap_are_refused() {
     let mut kernel = Kernel::load();
     let taken = (1_000_000..1_010_000)
         .take_while(|index| kernel.filter.accept_interface(*index, true).is_ok())
@@ -68,7 +68,7 @@ fn so_many_interfaces_are_judged_and_the_next_is_refused() {
 }
 
 #[test]
-fn an_unknown_writer_is_captured_up_to_its_bytes_and_again_after_many_others() {
+fn an_unknown_writer_gets_a_new_capture_budget_after_many_other_writers() {
     let mut kernel = Kernel::load();
     let frame = |number, sn| program_run::data(writer(number), sn, 1000);
     let captured = |kernel: &mut Kernel, number| {
@@ -91,7 +91,7 @@ fn an_unknown_writer_is_captured_up_to_its_bytes_and_again_after_many_others() {
 }
 
 #[test]
-fn a_fragmented_datagram_is_forgotten_after_the_capped_number_of_others() {
+fn a_fragmented_datagram_is_forgotten_after_too_many_others() {
     let mut kernel = Kernel::load();
     let metered = writer(0);
     kernel.set_interest(&BTreeMap::from([(metered, Verdict::Meter)]));
@@ -116,7 +116,7 @@ fn a_fragmented_datagram_is_forgotten_after_the_capped_number_of_others() {
 }
 
 #[test]
-fn runs_beyond_the_table_are_a_record_for_each_fragment() {
+fn runs_beyond_the_cap_yield_a_record_for_each_fragment() {
     let mut kernel = Kernel::load();
     let all: BTreeMap<_, _> = (0..2 * RUN_CAPACITY)
         .map(|number| (writer(number), Verdict::Meter))
@@ -135,12 +135,12 @@ fn runs_beyond_the_table_are_a_record_for_each_fragment() {
 }
 
 #[test]
-fn captured_datagrams_beyond_those_that_may_wait_stay_in_the_ring() {
+fn captured_datagrams_beyond_the_cap_stay_in_the_ring() {
     let mut kernel = Kernel::load_hook(Hook::Ingress);
     kernel.set_interest(&BTreeMap::from([(writer(0), Verdict::Capture)]));
     let mut intake = FilterReader::new(kernel.filter, &[]);
     let mut observer = Observer::new(Settings::default());
-    // All datagrams are younger than this, so none is read.
+    // All datagrams are younger than this reading, so none is read.
     let before = Clocks::read();
     for number in 1..=100 {
         let message = program_run::message(writer(0), number..=number, 16);
@@ -157,7 +157,7 @@ fn captured_datagrams_beyond_those_that_may_wait_stay_in_the_ring() {
 }
 
 #[test]
-fn records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_is_counted() {
+fn records_beyond_the_cap_stay_in_the_ring_and_lost_ones_are_counted() {
     use ros2probe_wire::time::SECOND;
     const SAMPLES: u32 = 32;
     let mut kernel = Kernel::load_hook(Hook::Ingress);
@@ -180,7 +180,7 @@ fn records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_i
         sent += SAMPLES;
         sent
     };
-    // All records are younger than this, so none is settled.
+    // All records are younger than this reading, so none is settled.
     let before = Clocks::read();
     while counter(&intake, Counter::RecordsLost) == 0 {
         for _ in 0..50 {
@@ -192,7 +192,8 @@ fn records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_i
     assert_eq!(taken, WaitingRecords::CAP);
     assert_eq!(observer.snapshot(before.now).records, 0);
 
-    // Afterwards there is room again: records left in the ring count too, and so do new ones.
+    // Afterwards the buffer accepts records again: those left in the ring count, and so do new
+    // ones.
     let mut later = Clocks::read();
     later.now = Timestamp(later.now.0 + SECOND);
     later.monotonic += SECOND;

@@ -1,7 +1,7 @@
 //! The kernel program against the user-space walk: the same records, byte for byte.
 //!
 //! Every frame of every capture goes through the loaded program (BPF_PROG_TEST_RUN: no interface,
-//! no socket) and through the reassembly and walk of user space. Needs root.
+//! no socket) and through the reassembly and walk of user space. The tests need root.
 
 mod captures;
 mod fragments;
@@ -21,7 +21,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 use captures::{captures, ip_packets};
 
 #[test]
-fn the_host_hook_lets_everything_pass() {
+fn the_host_hook_drops_no_packet() {
     let writer = Guid::new(GuidPrefix(*b"\x01\x0fpasspasspa"), EntityId([0, 0, 1, 3]));
     let mut noise = 1_u32;
     let mut random = || {
@@ -69,7 +69,7 @@ fn the_verified_host_programs_can_only_return_one() {
         for (at, [code, registers, low, high, immediate @ ..]) in main.iter().enumerate() {
             let (class, offset) = (code & 7, i16::from_le_bytes([*low, *high]));
             if *code == EXIT {
-                // r0 = 1, in 32 or 64 bits.
+                // The instruction sets r0 to 1, in 32 or 64 bits.
                 let [before, registers, _, _, value @ ..] = main[at - 1];
                 assert!(matches!(before, 0xb4 | 0xb7), "{hook:?}: {main:02x?}");
                 assert_eq!((registers & 0x0f, value), (0, [1, 0, 0, 0]), "{hook:?}");
@@ -101,7 +101,7 @@ fn an_unknown_writer_is_captured_until_its_budget_ends_then_metered_then_only_co
 }
 
 #[test]
-fn thirty_two_samples_in_one_datagram_become_records_and_more_make_it_captured() {
+fn up_to_32_samples_in_a_datagram_become_records_and_more_cause_a_capture() {
     let writer = Guid::new(GuidPrefix(*b"\x01\x10packspacks"), EntityId([0, 0, 1, 3]));
     let mut kernel = Kernel::load();
     kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
@@ -128,7 +128,7 @@ fn thirty_two_samples_in_one_datagram_become_records_and_more_make_it_captured()
 }
 
 #[test]
-fn consecutive_fragments_in_one_datagram_are_one_record_however_many() {
+fn any_number_of_consecutive_fragments_in_a_datagram_is_one_record() {
     let writer = Guid::new(GuidPrefix(*b"\x01\x10manyfrags "), EntityId([0, 0, 1, 3]));
     let reports = |kernel: &mut Kernel, number, starts: Vec<u32>, of| {
         let seen = kernel.frame(&program_run::data_frags(writer, number, starts, of, 16));
@@ -142,7 +142,7 @@ fn consecutive_fragments_in_one_datagram_are_one_record_however_many() {
     };
     let mut kernel = Kernel::load();
     kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
-    // More than the records of a datagram.
+    // These are more fragments than a datagram has records.
     let all: Vec<u32> = (1..=40).collect();
     assert_eq!(reports(&mut kernel, 1, all.clone(), 40), [(1, 1, 40)]);
     let later: Vec<u32> = (1..=5).chain(7..=12).collect();
@@ -151,7 +151,7 @@ fn consecutive_fragments_in_one_datagram_are_one_record_however_many() {
     let back = reports(&mut kernel, 3, vec![9, 10, 3, 4, 4], 40);
     assert_eq!(back, [(3, 9, 2), (3, 3, 2), (3, 4, 1)]);
 
-    // Each submessage of an unclassified writer is charged.
+    // Each submessage of an unknown writer is charged to the budget.
     kernel.forget_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
     kernel.set_unknown_budget(0, 3);
     let before = kernel.counter(Counter::MeteredUnknown);
@@ -161,7 +161,7 @@ fn consecutive_fragments_in_one_datagram_are_one_record_however_many() {
 }
 
 #[test]
-fn an_acknack_is_metered_by_its_reader() {
+fn an_acknack_is_metered_if_its_reader_is_metered() {
     let reader = Guid::new(GuidPrefix(*b"\x01\x0freaderread"), EntityId([0, 0, 7, 4]));
     let mut payload = b"RTPS\x02\x03\x01\x0f".to_vec();
     payload.extend_from_slice(&reader.prefix.0);
@@ -226,7 +226,7 @@ fn a_change_of_any_source_of_the_kernel_object_is_noticed() {
             assert!(is_listed, "{name}");
         }
     }
-    // Files that a hand-written list once omitted.
+    // A hand-written list once omitted these files.
     for name in [
         "frame.rs",
         "parameters.rs",
@@ -253,7 +253,7 @@ fn a_change_of_any_source_of_the_kernel_object_is_noticed() {
         let command = command.args(["-c", arguments]).current_dir(&copied);
         command.output().unwrap().status.success()
     };
-    // The list as it would be just after a build.
+    // The script writes the list as it would be just after a build.
     let sums = "for list in filter inside; do list=$list.bpf.sha256
                 { head -n 1 $list; sed 1d $list | cut -c67- | xargs sha256sum; } > new && mv new $list
                 done";

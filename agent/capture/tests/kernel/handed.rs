@@ -1,6 +1,6 @@
 //! The probe on the path into shared memory, tested on a program that passes messages as Fast DDS
-//! does: the kernel reads the same bytes, in one piece and in a list of buffers, however they are
-//! cut. Needs root and a kernel with uprobes.
+//! does. The kernel reads the same bytes, in one piece and in a list of buffers, however they are
+//! cut. The tests need root and a kernel with uprobes.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -123,7 +123,7 @@ fn hand(sender: &mut Process, message: &[u8], lengths: &[usize]) -> Result<()> {
     sender.wait_for("handed", PATIENCE)
 }
 
-/// Returns ways to cut a message of this length. Fast DDS cuts before payloads and their padding.
+/// Returns divisions of a message of this length. Fast DDS cuts before payloads and their padding.
 fn cuts(form: Form, length: usize) -> Vec<Vec<usize>> {
     if form == Form::Whole {
         return vec![vec![length]];
@@ -157,7 +157,7 @@ fn metered_records_equal_those_of_user_space() -> Result<()> {
                 handing.talker.message(SAMPLES_WRITER, 1, &[0; 320]).len() - 320 + size,
             ) {
                 let mut message = handing.talker.sample(size);
-                // Preceded by INFO_TS, so that a timestamp is in force.
+                // INFO_TS precedes the submessage, so that a timestamp is in force.
                 let time = [9, 1, 8, 0, 1, 0, 0, 0, 2, 0, 0, 0];
                 let at = 20;
                 message.splice(at..at, time);
@@ -209,7 +209,7 @@ fn captured_messages_are_whole() -> Result<()> {
                 expected.push(message.clone());
             }
         }
-        // An unannounced writer: captured, too.
+        // The message of an unannounced writer is captured, too.
         let long = handing.talker.message(SAMPLES_WRITER, 1, &vec![7; 65_000]);
         let cut = match form {
             Form::Whole => vec![long.len()],
@@ -226,7 +226,7 @@ fn captured_messages_are_whole() -> Result<()> {
 }
 
 #[test]
-fn messages_that_a_full_ring_has_no_room_for_are_metered() -> Result<()> {
+fn messages_are_metered_while_the_ring_is_full() -> Result<()> {
     for form in [Form::Whole, Form::List] {
         let mut handing = Handing::new(form)?;
         handing.want(Verdict::Capture)?;
@@ -263,11 +263,11 @@ fn messages_that_a_full_ring_has_no_room_for_are_metered() -> Result<()> {
 }
 
 #[test]
-fn longer_messages_than_datagrams_count_and_what_is_unreadable_is_counted() -> Result<()> {
+fn messages_longer_than_datagrams_count_and_unreadable_ones_are_counted() -> Result<()> {
     for form in [Form::Whole, Form::List] {
         let mut handing = Handing::new(form)?;
         handing.want(Verdict::Meter)?;
-        // A length of 0: the submessage extends to the end.
+        // A length of 0 means that the submessage extends to the end.
         let mut long = handing.talker.message(SAMPLES_WRITER, 5, &vec![7; 40_000]);
         long.splice(22..24, [0, 0]);
         long.extend(vec![7; 100_000]);
@@ -282,7 +282,7 @@ fn longer_messages_than_datagrams_count_and_what_is_unreadable_is_counted() -> R
             .map(|record| (record.sequence_number, record.payload_len))
             .collect();
         assert_eq!(found, [(5, 140_000)]);
-        // Too long to be captured.
+        // The message is too long to be captured.
         handing.want(Verdict::Capture)?;
         handing.hand(&long, &cut)?;
         let records = handing.records();
@@ -305,7 +305,7 @@ fn longer_messages_than_datagrams_count_and_what_is_unreadable_is_counted() -> R
 }
 
 #[test]
-fn processes_of_other_control_groups_and_those_behind_the_probe_s_end_are_not_seen() -> Result<()> {
+fn messages_of_other_cgroups_and_messages_after_detaching_are_not_seen() -> Result<()> {
     let mut handing = Handing::new(Form::Whole)?;
     handing.want(Verdict::Meter)?;
     let message = handing.talker.sample(100);

@@ -1,5 +1,5 @@
 //! The host hook on real sockets: traffic is seen whole, each copy with its socket, nothing is
-//! dropped, and nothing stays behind. Needs root.
+//! dropped, and nothing stays behind. The tests need root.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
@@ -103,10 +103,10 @@ fn member(observed: &Observed, host: &Namespace, port: u16) -> Result<UdpSocket>
 
 /// Opens a socket on a shared port.
 fn shared(port: u16) -> io::Result<UdpSocket> {
-    // SAFETY: no preconditions.
+    // SAFETY: the call has no preconditions.
     let socket = unsafe { libc::socket(libc::AF_INET, libc::SOCK_DGRAM | libc::SOCK_CLOEXEC, 0) };
     assert!(socket >= 0, "socket: {}", io::Error::last_os_error());
-    // SAFETY: a new descriptor without another owner.
+    // SAFETY: the descriptor is new and has no other owner.
     let socket = unsafe { OwnedFd::from_raw_fd(socket) };
     let on = 1_u32;
     let address = libc::sockaddr_in {
@@ -115,7 +115,7 @@ fn shared(port: u16) -> io::Result<UdpSocket> {
         sin_addr: libc::in_addr { s_addr: 0 },
         sin_zero: [0; 8],
     };
-    // SAFETY: the option has the size given.
+    // SAFETY: the option has the given size.
     let set = unsafe {
         libc::setsockopt(
             socket.as_raw_fd(),
@@ -125,7 +125,7 @@ fn shared(port: u16) -> io::Result<UdpSocket> {
             4,
         )
     };
-    // SAFETY: the address has the size given.
+    // SAFETY: the address has the given size.
     let bound = unsafe { libc::bind(socket.as_raw_fd(), (&raw const address).cast(), 16) };
     if (set, bound) != (0, 0) {
         return Err(io::Error::last_os_error());
@@ -135,7 +135,7 @@ fn shared(port: u16) -> io::Result<UdpSocket> {
 
 fn cookie(socket: &UdpSocket) -> u64 {
     let (mut cookie, mut size) = (0_u64, 8);
-    // SAFETY: the value has the size given.
+    // SAFETY: the value has the given size.
     let result = unsafe {
         libc::getsockopt(
             socket.as_raw_fd(),
@@ -149,7 +149,7 @@ fn cookie(socket: &UdpSocket) -> u64 {
     cookie
 }
 
-/// Two hosts with an IPv6 address each.
+/// Returns two hosts with an IPv6 address each.
 fn link() -> Result<Link> {
     let link = Link::new()?;
     for (host, address) in [(&link.robot, "fd99::1/64"), (&link.monitor, "fd99::2/64")] {
@@ -161,7 +161,7 @@ fn link() -> Result<Link> {
     Ok(link)
 }
 
-/// A DATA in a datagram of `size` varying bytes.
+/// Returns a DATA in a datagram of `size` varying bytes.
 fn payload(number: u32, size: usize) -> Vec<u8> {
     let mut bytes = program_run::message(WRITER, number..=number, size - 44);
     for (at, byte) in bytes.iter_mut().enumerate().skip(44) {
@@ -170,7 +170,7 @@ fn payload(number: u32, size: usize) -> Vec<u8> {
     bytes
 }
 
-/// Sender's and receiver's addresses on a veth pair and on loopback.
+/// Returns the addresses of sender and receiver on a veth pair and on loopback.
 fn ways(link: &Link) -> [(&Namespace, String, &Namespace, String); 4] {
     let (robot, monitor) = (&link.robot, &link.monitor);
     [
@@ -187,7 +187,7 @@ fn ways(link: &Link) -> [(&Namespace, String, &Namespace, String); 4] {
 }
 
 #[test]
-fn every_datagram_is_one_record_on_its_way_out_and_one_on_its_way_in() -> Result<()> {
+fn a_datagram_is_one_record_at_its_sender_and_one_at_its_receiver() -> Result<()> {
     let link = link()?;
     for (host, from, other, to) in ways(&link) {
         let (mut out, mut into) = (
@@ -236,7 +236,7 @@ fn every_datagram_is_one_record_on_its_way_out_and_one_on_its_way_in() -> Result
 }
 
 #[test]
-fn captured_datagrams_arrive_to_the_byte_up_to_the_longest() -> Result<()> {
+fn captured_datagrams_of_all_sizes_arrive_byte_for_byte() -> Result<()> {
     let link = link()?;
     for (host, from, other, to) in ways(&link) {
         let mut out = Observed::new(Verdict::Capture)?;
@@ -273,7 +273,7 @@ fn captured_datagrams_arrive_to_the_byte_up_to_the_longest() -> Result<()> {
 }
 
 #[test]
-fn two_sockets_in_one_group_are_two_records_and_one_capture() -> Result<()> {
+fn two_sockets_in_a_multicast_group_yield_two_records_or_one_capture() -> Result<()> {
     let host = Namespace::alone()?;
     let mut observed = Observed::new(Verdict::Meter)?;
     let members = [
@@ -329,7 +329,7 @@ fn two_sockets_in_one_group_are_two_records_and_one_capture() -> Result<()> {
 }
 
 #[test]
-fn a_full_ring_costs_captures_and_nothing_else() -> Result<()> {
+fn a_full_ring_loses_captures_and_nothing_else() -> Result<()> {
     let host = Namespace::alone()?;
     let mut observed = Observed::new(Verdict::Capture)?;
     let sender = observed.socket(&host, "127.0.0.1:0")?;
@@ -352,7 +352,7 @@ fn a_full_ring_costs_captures_and_nothing_else() -> Result<()> {
 }
 
 #[test]
-fn a_socket_in_use_is_remembered_while_more_than_there_is_room_for_come_and_go() -> Result<()> {
+fn a_socket_in_use_stays_known_while_more_sockets_than_the_cap_come_and_go() -> Result<()> {
     const AT_ONCE: usize = 500;
     use ros2probe_wire::time::SECOND;
     let cpus = std::thread::available_parallelism()?.get();
@@ -421,8 +421,8 @@ fn a_socket_in_use_is_remembered_while_more_than_there_is_room_for_come_and_go()
     Ok(())
 }
 
-/// Returns the numbers of programs on a cgroup, in both directions (BPF_PROG_QUERY). The hook has two
-/// in each: for UDP and for TCP.
+/// Returns the numbers of programs on a cgroup, in both directions (BPF_PROG_QUERY). The hook has
+/// two in each direction: for UDP and for TCP.
 fn attached(cgroup: &Path) -> Result<[usize; 2]> {
     let directory = File::open(cgroup)?;
     let count = |direction| {
@@ -459,7 +459,7 @@ impl CgroupSkbPrograms {
             unused: 0,
             more: [0; 3],
         };
-        // SAFETY: the attribute has the size given, the array that it names the number of places.
+        // SAFETY: the attribute has the given size, and its array has the given number of entries.
         let result = unsafe {
             libc::syscall(
                 libc::SYS_bpf,
@@ -489,7 +489,7 @@ fn delivered(sender: &UdpSocket, receiver: &UdpSocket) -> Result<usize> {
 }
 
 #[test]
-fn other_programs_keep_their_places_and_everything_is_delivered() -> Result<()> {
+fn other_programs_stay_attached_and_every_datagram_is_delivered() -> Result<()> {
     let link = link()?;
     let mut other = Observed::new(Verdict::Meter)?;
     let sender = other.socket(&link.robot, "[fd99::1]:0")?;
@@ -501,7 +501,7 @@ fn other_programs_keep_their_places_and_everything_is_delivered() -> Result<()> 
     assert_eq!(delivered(&sender, &receiver)?, sent);
     assert_eq!(other.records().len(), 2 * sent);
 
-    // Ours is attached second, and a third one after it.
+    // The filter of this test is attached second, and a third one after it.
     let mut ours = Filter::load_host(&FilterSettings::default())?;
     ours.set_interest(WRITER, Some(Verdict::Meter))?;
     ours.attach(&File::open(&path)?)?;

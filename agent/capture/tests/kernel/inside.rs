@@ -1,5 +1,5 @@
 //! Datagrams lost inside this host, attributed to their samples: in full receive buffers and in
-//! reassembly; and the processes that hold a socket. Needs root.
+//! reassembly. Further tests find the processes that hold a socket. All need root.
 
 mod full_buffers;
 mod reassembly;
@@ -98,14 +98,14 @@ fn shared_socket(address: SocketAddr) -> UdpSocket {
     } else {
         libc::AF_INET6
     };
-    // SAFETY: takes no pointers.
+    // SAFETY: the call takes no pointers.
     let descriptor = unsafe { libc::socket(domain, libc::SOCK_DGRAM | libc::SOCK_CLOEXEC, 0) };
     assert!(descriptor >= 0);
-    // SAFETY: a new descriptor without another owner.
+    // SAFETY: the descriptor is new and has no other owner.
     let socket = unsafe { UdpSocket::from_raw_fd(descriptor) };
     set(&socket, libc::SO_REUSEADDR, 1);
     let (storage, len) = raw(address);
-    // SAFETY: a socket address of the length given.
+    // SAFETY: the address has the given length.
     let bound = unsafe { libc::bind(descriptor, storage.as_ptr().cast(), len) };
     assert_eq!(bound, 0, "{address}: {}", std::io::Error::last_os_error());
     socket
@@ -161,7 +161,7 @@ fn cookie(socket: &UdpSocket) -> u64 {
 }
 
 #[test]
-fn a_socket_is_known_by_process_name_inode_and_drops() {
+fn a_socket_has_a_process_name_an_inode_and_a_drop_count() {
     let observed = Observed::new();
     let abilities = observed.filter.tracepoints().unwrap().abilities();
     assert!(abilities.owners.is_ok(), "{abilities:?}");
@@ -179,7 +179,7 @@ fn a_socket_is_known_by_process_name_inode_and_drops() {
 }
 
 #[test]
-fn a_socket_of_another_network_and_process_id_namespace_is_known_by_both_its_process_ids() {
+fn a_socket_of_a_container_has_the_process_ids_of_both_pid_namespaces() {
     let observed = Observed::new();
     let host = Namespace::alone().unwrap();
     let bind = || UdpSocket::bind("127.0.0.1:0").unwrap();
@@ -187,7 +187,7 @@ fn a_socket_of_another_network_and_process_id_namespace_is_known_by_both_its_pro
     let cookie = cookie(&socket);
     // A thread's children belong to the PID namespace that it has created.
     let contained = std::thread::spawn(|| {
-        // SAFETY: takes no pointers.
+        // SAFETY: the call takes no pointers.
         assert_eq!(unsafe { libc::unshare(libc::CLONE_NEWPID) }, 0);
         let mut sleep = Command::new("sleep");
         sleep

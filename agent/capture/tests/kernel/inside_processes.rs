@@ -31,7 +31,7 @@ struct Process {
 }
 
 impl Robot {
-    /// `defines`: such as `-DHUMBLE`.
+    /// Builds the program with compiler options `defines`, such as `-DHUMBLE`.
     fn new(place: u32, defines: &[&str], has_callbacks: bool) -> Self {
         Self::by(Means::of_this_kernel(), place, defines, has_callbacks)
     }
@@ -91,7 +91,7 @@ impl Robot {
         )
     }
 
-    /// Returns what is reported of a process.
+    /// Returns the report of a process.
     fn report(&mut self, process: &Process) -> ProcessReport {
         let id = process.child.id();
         let reports = self.round().report.processes;
@@ -122,7 +122,7 @@ impl Drop for Process {
     }
 }
 
-/// Returns what this kernel can do, and what each kernel can; the first again if there is no other.
+/// Returns the means of this kernel, and the means that every kernel has; they may be the same.
 fn means() -> [Means; 2] {
     [Means::of_this_kernel(), Means::PerfEvents]
 }
@@ -132,11 +132,11 @@ fn milliseconds(duration: Duration) -> f64 {
 }
 
 #[test]
-fn messages_of_a_running_process_are_counted_and_named_at_either_offset() {
+fn messages_of_a_process_older_than_the_probes_are_counted_and_named() {
     for (place, means) in [240, 248].into_iter().zip(means()) {
         let mut robot = Robot::by(means, place, &[], false);
         let mut process = robot.start();
-        // Attached while it runs: it has announced nothing.
+        // The programs are attached while the process runs, so it has announced nothing.
         process.run("publish 5");
         robot.attach();
         process.run("publish 1000");
@@ -168,12 +168,12 @@ fn messages_of_a_running_process_are_counted_and_named_at_either_offset() {
 }
 
 #[test]
-fn each_message_within_a_process_and_beyond_counts_once() {
+fn a_message_within_a_process_and_beyond_it_counts_once() {
     let mut robot = Robot::new(248, &[], false);
     robot.attach();
     let mut process = robot.start();
     process.run("init");
-    // Without subscriptions in the process, then with some, then with no others.
+    // The process publishes to other processes, then to all, then only to itself.
     process.run("publish 10");
     process.run("both 100");
     process.run("enqueue 50");
@@ -187,7 +187,7 @@ fn each_message_within_a_process_and_beyond_counts_once() {
 }
 
 #[test]
-fn overwritten_messages_are_exactly_those_that_the_subscription_lacks() {
+fn overwritten_messages_equal_those_that_the_subscription_misses() {
     for has_init in [true, false] {
         let mut robot = Robot::new(248, &[], true);
         let mut process = robot.start();
@@ -222,7 +222,7 @@ fn overwritten_messages_are_exactly_those_that_the_subscription_lacks() {
 }
 
 #[test]
-fn without_ring_buffers_messages_within_a_process_show_in_callbacks() {
+fn messages_within_a_process_without_ring_buffers_appear_in_callbacks() {
     for has_callbacks in [false, true] {
         let mut robot = Robot::new(240, &["-DHUMBLE"], has_callbacks);
         robot.attach();
@@ -336,7 +336,7 @@ fn a_killed_process_leaves_its_last_figures_and_no_entry() {
 }
 
 #[test]
-fn no_breakpoint_is_left_once_the_probes_are_gone() {
+fn no_breakpoint_remains_after_the_probes_are_removed() {
     for means in means() {
         let mut robot = Robot::by(means, 248, &[], true);
         robot.attach();
@@ -374,7 +374,7 @@ fn breakpoint(program: &TracedProgram, process: &Process) -> bool {
 }
 
 #[test]
-fn handles_that_point_to_nothing_are_bounded_and_counted() {
+fn handles_with_invalid_addresses_are_bounded_and_counted() {
     let mut robot = Robot::new(248, &[], true);
     robot.attach();
     let mut hostile = robot.start();
@@ -398,7 +398,7 @@ fn handles_that_point_to_nothing_are_bounded_and_counted() {
 }
 
 #[test]
-fn processes_without_end_are_bounded_and_forgotten() {
+fn endlessly_created_processes_are_bounded_and_forgotten() {
     let mut robot = Robot::new(248, &[], false);
     robot.attach();
     let mut process = robot.start();
@@ -439,7 +439,7 @@ fn a_process_beyond_its_budget_is_no_longer_counted_until_it_slows_down() {
 }
 
 #[test]
-fn calls_of_a_moment_are_judged_with_those_of_the_time_after_it() {
+fn calls_in_a_very_short_time_are_evaluated_with_later_calls() {
     let mut robot = Robot::new(240, &[], false);
     robot.attach();
     let mut process = robot.start();

@@ -1,5 +1,5 @@
-//! The kernel programs, run by the kernel itself: on packets of a test, and on sockets in network
-//! namespaces. Needs root.
+//! Tests of the kernel programs, which the kernel itself runs: on packets of a test, and on sockets
+//! in network namespaces. They need root.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,

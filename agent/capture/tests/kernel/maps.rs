@@ -1,5 +1,5 @@
-//! The maps of tracepoints and uprobes. Before Linux 6.1 the kernel warns of a program of this kind
-//! whose hash table allocates as it grows. With PREEMPT_RT it refuses the program.
+//! Tests of the maps of tracepoints and uprobes. Before Linux 6.1, the kernel warns about such a
+//! program if its hash table allocates as it grows. With PREEMPT_RT, it refuses the program.
 
 use std::fs::{self, File};
 use std::os::fd::AsRawFd as _;
@@ -18,7 +18,7 @@ use ros2probe_testing::harness::network::Namespace;
 const HASH: &str = "1";
 /// `BPF_F_NO_PREALLOC`.
 const NO_PREALLOC: u32 = 1;
-/// Most listings of programs.
+/// Number of listings of programs.
 const LISTINGS: usize = 20;
 
 #[test]
@@ -37,7 +37,7 @@ fn tables_of_tracepoints_and_uprobes_are_allocated_beforehand() -> Result<()> {
         kinds.all(|kind| checked.iter().any(|name| name.starts_with(kind)))
     };
     let mut checked = Vec::new();
-    // A listing may skip a program while another test's are unloaded.
+    // A listing may skip a program while programs of another test are unloaded.
     for _ in 0..LISTINGS {
         check(&mut checked)?;
         if is_checked(&checked) {
@@ -48,7 +48,7 @@ fn tables_of_tracepoints_and_uprobes_are_allocated_beforehand() -> Result<()> {
     Ok(())
 }
 
-/// Checks the maps of every loaded program of these kinds.
+/// Checks the maps of every loaded tracepoint or uprobe program.
 fn check(checked: &mut Vec<String>) -> Result<()> {
     let prefixes = ["socket_full", "no_room", "not_reassemble", "shm_handed"];
     let inside = ["rcl", "rmw_", "callback_"];

@@ -1,5 +1,5 @@
-//! The programs for TCP on real sockets: connections of Zenoh are followed batch for batch, of
-//! others nothing leaves the kernel. Needs root.
+//! The programs for TCP on real sockets: connections of Zenoh are followed batch by batch, and
+//! nothing of other connections leaves the kernel. The tests need root.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -257,7 +257,7 @@ fn of_direction<'a>(sent: impl Iterator<Item = &'a Sent>, direction: usize) -> V
         .collect()
 }
 
-/// Checks that these are the batches: all of them, and as much of each as is needed.
+/// Checks that exactly these batches were seen, and as much of each as is needed.
 fn check(seen: &Seen, sent: &[&Vec<u8>], case: &str) -> Result<()> {
     ensure!(seen.gaps == 0, "{case}: {} gaps", seen.gaps);
     ensure!(
@@ -329,7 +329,7 @@ fn each_batch_of_a_recorded_system_is_seen_once_at_its_sender() -> Result<()> {
 }
 
 #[test]
-fn packets_that_split_and_join_batches_anywhere_change_nothing() -> Result<()> {
+fn packets_that_split_and_join_batches_yield_the_same_batches() -> Result<()> {
     for capture in [LIFECYCLE, POINTS] {
         let mut observed = Observed::new()?;
         let connections = connections(capture)?;
@@ -349,7 +349,7 @@ fn packets_that_split_and_join_batches_anywhere_change_nothing() -> Result<()> {
             .iter()
             .enumerate()
             .map(|(index, (_, batch))| {
-                // As if the rest of a message was dropped, now and then.
+                // An empty batch now and then stands for the rest of a message that was dropped.
                 let empty: &[u8] = if index % 7 == 6 { &[0, 0] } else { &[] };
                 [&with_prefix(batch), empty].concat()
             })
@@ -357,7 +357,7 @@ fn packets_that_split_and_join_batches_anywhere_change_nothing() -> Result<()> {
         let init = &on_the_wire[0];
         let rest = on_the_wire[1..].concat();
         for size in [1, 2, 3, 1460, 32_768, 62_464, 65_483, 200_000] {
-            // Every byte alone takes a system call.
+            // Each piece takes a system call, so their number is limited.
             let rest = &rest[..rest.len().min(size * 4000)];
             let mut connection = observed.connect("127.0.0.1:0")?;
             pass(&mut connection, true, init)?;
@@ -402,7 +402,7 @@ fn random(seed: u64, length: usize) -> Vec<u8> {
 }
 
 #[test]
-fn nothing_of_other_connections_leaves_the_kernel() -> Result<()> {
+fn no_bytes_of_other_connections_leave_the_kernel() -> Result<()> {
     let mut observed = Observed::new()?;
     let request = b"GET /index.html HTTP/1.1\r\nHost: robot\r\nAccept: */*\r\n\r\n".to_vec();
     let lines: Vec<u8> = (0..5_000)
@@ -499,7 +499,7 @@ fn is_data(batch: &[u8]) -> bool {
     matches!(batch[0] & 0x9f, 5 | 6)
 }
 
-/// A PUSH in a FRAME: number of the FRAME, gid of the publisher, and payload.
+/// Returns a PUSH in a FRAME: number of the FRAME, gid of the publisher, and payload.
 fn push(number: u8, gid: [u8; 16], payload: &[u8]) -> Vec<u8> {
     let mut batch = vec![0x25, number, 0x1d, 3, 0x81, 0x43, 33];
     batch.extend_from_slice(&u64::from(number).to_le_bytes());

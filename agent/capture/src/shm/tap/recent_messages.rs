@@ -6,14 +6,14 @@ use ros2probe_model::facts::bounded::Bounded;
 
 use crate::tables::RememberedMessages;
 
-/// The latest messages by position.
+/// Identities of the latest messages.
 #[derive(Default)]
 pub(super) struct RecentMessages {
     pub(super) set: HashSet<Identity>,
     pub(super) order: Bounded<RememberedMessages, VecDeque<Identity>>,
 }
 
-/// One use of one buffer.
+/// One use of one buffer, which holds one message.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) struct Identity {
     pub(super) serial: u64,
@@ -37,7 +37,7 @@ mod tests {
     use crate::tables::tests::assert_driven;
 
     #[test]
-    fn the_oldest_message_is_forgotten() {
+    fn messages_beyond_the_cap_evict_the_oldest_one() {
         let identity = |serial| Identity {
             serial,
             node: 0,

@@ -25,7 +25,7 @@ fn writer() -> Guid {
     Guid::from_bytes(bytes)
 }
 
-/// A message with one sample of that writer.
+/// Returns a message with one sample of that writer.
 fn sample(number: u32) -> Vec<u8> {
     let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
     bytes.extend([9; 12]);
@@ -97,7 +97,8 @@ impl Host {
         numbers.collect()
     }
 
-    /// Open files of this host; the images' own files, which are open for writing, are not counted.
+    /// Returns the number of open files of this host, without the images' own files, which are open
+    /// for writing.
     fn descriptors(&self) -> usize {
         let open = fs::read_dir("/proc/self/fd").unwrap().flatten();
         let open = open.filter(|entry| {
@@ -126,7 +127,7 @@ fn a_sample_that_several_ports_announce_is_found_once() {
 }
 
 #[test]
-fn discovery_is_handed_on_whole_with_the_port_it_came_by() {
+fn a_discovery_message_is_passed_on_whole_with_its_port() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7410), host.segment(1));
     host.poll_after(SECOND);
@@ -157,7 +158,7 @@ fn a_message_of_200_kilobytes_in_one_buffer_is_captured_whole() {
         panic!("{found:?}");
     };
     assert_eq!(bytes, &message);
-    // Metered, the message is one sample of that size.
+    // When metered, the message is one sample of that size.
     host.tap.classifier.set(writer(), Some(Verdict::Meter));
     port.push(segment.put(&message));
     let found = host.find_after(MILLISECOND);
@@ -169,11 +170,11 @@ fn a_message_of_200_kilobytes_in_one_buffer_is_captured_whole() {
 }
 
 #[test]
-fn a_message_bears_the_time_after_it_was_announced_and_not_that_of_the_look_s_beginning() {
+fn the_time_of_a_message_is_read_after_its_announcement() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(SECOND);
-    // It is sent while the poll is in progress.
+    // The message is sent while the poll is in progress.
     let clock = Rc::clone(&host.calendar);
     host.tap.calendar = Box::new(move || clock.replace(clock.get() + 1000));
     port.push(segment.put(&sample(1)));
@@ -187,7 +188,7 @@ fn a_message_bears_the_time_after_it_was_announced_and_not_that_of_the_look_s_be
 }
 
 #[test]
-fn while_every_message_is_wanted_a_silent_port_is_looked_at_each_time() {
+fn a_silent_port_is_polled_every_time_while_every_message_is_needed() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(SECOND);
@@ -203,7 +204,7 @@ fn while_every_message_is_wanted_a_silent_port_is_looked_at_each_time() {
     port.push(segment.put(&sample(6)));
     assert_eq!(host.find_after(MILLISECOND).len(), 1);
     assert!(!host.tap.take_discovery_seen());
-    // Its buffer is reused before a port at rest would be polled.
+    // The buffer is reused before a silent port would be polled.
     segment.free(descriptor);
 }
 
@@ -236,7 +237,7 @@ fn lock_of(path: &Path, lives: bool) -> fs::File {
 }
 
 #[test]
-fn files_of_a_killed_process_are_no_port_and_their_messages_no_traffic() {
+fn files_of_a_killed_process_yield_neither_a_port_nor_messages() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     let locks = [port.path(host.path()), segment.path(host.path())];
@@ -244,7 +245,7 @@ fn files_of_a_killed_process_are_no_port_and_their_messages_no_traffic() {
     port.push(segment.put(&sample(1)));
     assert_eq!(host.poll_after(SECOND), [0; 0]);
     assert!(!host.tap.has_ports() && !host.tap.take_discovery_seen());
-    // Another process has taken over its port and received a message of a living one.
+    // A live process has taken over the port, and received a message of a live process.
     let mut living = host.segment(2);
     let lives = [port.path(host.path()), living.path(host.path())];
     let lives = lives.each_ref().map(|path| lock_of(path, true));
@@ -257,7 +258,7 @@ fn files_of_a_killed_process_are_no_port_and_their_messages_no_traffic() {
 }
 
 #[test]
-fn a_message_of_a_live_process_to_the_port_of_a_killed_one_counts() {
+fn a_message_of_a_live_process_to_the_port_of_a_killed_process_counts() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     let _dead = lock_of(&port.path(host.path()), false);
@@ -268,7 +269,7 @@ fn a_message_of_a_live_process_to_the_port_of_a_killed_one_counts() {
 }
 
 #[test]
-fn a_buffer_that_was_used_again_is_missed_and_not_misread() {
+fn a_message_in_a_reused_buffer_is_missed_and_not_misread() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(SECOND);
@@ -280,7 +281,7 @@ fn a_buffer_that_was_used_again_is_missed_and_not_misread() {
 }
 
 #[test]
-fn a_restarted_participants_new_files_are_taken_and_the_old_ones_let_go() {
+fn files_of_a_restarted_participant_replace_the_old_ones() {
     let mut host = Host::new();
     for round in 1..=5 {
         let (mut port, mut segment) = (host.port(7411), host.segment(1));
@@ -288,7 +289,7 @@ fn a_restarted_participants_new_files_are_taken_and_the_old_ones_let_go() {
         port.push(segment.put(&sample(round)));
         assert_eq!(host.poll_after(MILLISECOND), [u64::from(round)]);
         assert_eq!(host.descriptors(), 2);
-        // Each process removes the files of the previous one: the same names, other files.
+        // Each process removes the files of the previous one. The new files have the same names.
         fs::remove_file(port.path(host.path())).unwrap();
         fs::remove_file(segment.path(host.path())).unwrap();
     }
@@ -299,7 +300,7 @@ fn a_restarted_participants_new_files_are_taken_and_the_old_ones_let_go() {
 }
 
 #[test]
-fn a_segment_that_changes_its_owner_while_its_port_stays_is_opened_anew() {
+fn a_replaced_segment_is_opened_again_while_its_port_stays() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(SECOND);
@@ -322,7 +323,7 @@ fn segment_descriptor(_: &SegmentImage, number: u32) -> Descriptor {
 }
 
 #[test]
-fn a_port_that_is_truncated_under_us_is_let_go_and_found_again_when_it_is_whole() {
+fn a_truncated_port_is_closed_and_its_successor_is_opened() {
     let mut host = Host::new();
     let (port, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(SECOND);
@@ -352,7 +353,7 @@ fn a_port_that_is_truncated_under_us_is_let_go_and_found_again_when_it_is_whole(
 }
 
 #[test]
-fn idle_ports_are_polled_rarely_and_none_is_missed() {
+fn an_idle_port_is_polled_rarely_until_it_has_a_message() {
     let mut host = Host::new();
     let mut ports: Vec<_> = (0..128).map(|index| host.port(7411 + 2 * index)).collect();
     let mut segment = host.segment(1);
@@ -392,7 +393,7 @@ fn a_flood_at_one_port_does_not_starve_the_others() {
 }
 
 #[test]
-fn files_that_come_and_go_without_end_cost_no_more_than_listing_may() {
+fn constantly_expected_files_cost_no_more_than_the_share_for_listing() {
     let mut host = Host::new();
     for number in 0..2000 {
         fs::write(host.path().join(format!("fastrtps_port{number}")), "").unwrap();
@@ -414,7 +415,7 @@ fn files_that_come_and_go_without_end_cost_no_more_than_listing_may() {
 }
 
 #[test]
-fn garbage_links_and_directories_with_the_right_names_are_left_alone() {
+fn garbage_links_and_directories_with_names_of_ports_are_ignored() {
     let mut host = Host::new();
     let file = |name: &str| host.path().join(name);
     fs::write(file("fastrtps_port7411"), vec![0xa5; 100_000]).unwrap();
@@ -426,7 +427,7 @@ fn garbage_links_and_directories_with_the_right_names_are_left_alone() {
     host.poll_after(SECOND);
     let counters = host.tap.counters();
     assert_eq!((counters.ports, counters.directories), (1, 1));
-    // It announces a message without a segment, and one in a file that is not a segment.
+    // The port announces a message without a segment, and one in a file that is not a segment.
     port.push(Descriptor {
         segment: SegmentId([2; 8]),
         node: 16,
@@ -469,7 +470,7 @@ proptest! {
 }
 
 #[test]
-fn ports_and_segments_beyond_the_caps_are_left_out_and_one_user_s_keep_out_no_other_s() {
+fn ports_and_segments_beyond_the_caps_are_left_out_without_excluding_a_user() {
     let mut host = Host::new();
     let crowd: Vec<_> = (0..600).map(|number| host.port(20_000 + number)).collect();
     host.poll_after(SECOND);
@@ -508,7 +509,7 @@ fn ports_of_dead_processes_beyond_the_cap_are_opened_again() {
     let numbers: Vec<_> = (20_000..20_000 + AbandonedPorts::CAP as u32 + 10).collect();
     for group in numbers.chunks(400) {
         let ports: Vec<_> = group.iter().map(|number| host.port(*number)).collect();
-        // Not a search, which forgets the ports of dead processes.
+        // A search would forget the ports of dead processes, so it is postponed.
         host.tap.found = host.now + 1000 * SECOND;
         host.poll_after(100 * SECOND);
         for port in ports {
@@ -520,7 +521,7 @@ fn ports_of_dead_processes_beyond_the_cap_are_opened_again() {
 }
 
 #[test]
-fn user_data_of_an_unknown_writer_is_no_announcement_and_its_participant_s_nodes_are() {
+fn only_node_names_of_an_unknown_writer_count_as_discovery() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(SECOND);
@@ -539,7 +540,7 @@ fn user_data_of_an_unknown_writer_is_no_announcement_and_its_participant_s_nodes
 }
 
 #[test]
-fn an_urgent_poll_reads_a_few_ports_and_the_next_ones_read_the_others() {
+fn an_urgent_poll_reads_some_ports_and_the_next_polls_read_the_others() {
     let mut host = Host::new();
     let mut segment = host.segment(1);
     let mut ports: Vec<_> = (0..24).map(|index| host.port(7411 + 2 * index)).collect();

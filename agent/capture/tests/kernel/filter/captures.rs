@@ -25,7 +25,8 @@ pub(super) fn captures() -> Vec<PathBuf> {
     );
     // Truncated captures cannot be passed to the kernel as frames.
     found.retain(|path| !path.to_string_lossy().contains("snap256"));
-    // It has a datagram of 300 submessages, more than a program reads: user space reads the rest.
+    // This capture has a datagram of 300 submessages, which exceeds a program: user space reads the
+    // rest.
     found.retain(|path| !path.to_string_lossy().contains("announced-late"));
     found.sort();
     found
@@ -64,13 +65,13 @@ pub(super) fn ip_packets(path: &Path) -> Vec<IpPacket> {
         };
         let bytes = &captured.bytes[header..];
         let pieces = match packet.payload {
-            // A program run accepts a page at most: cut the packet as a link with a smaller MTU
-            // would.
+            // A program run accepts a page at most, so the packet is cut as by a link with a
+            // smaller MTU.
             Payload::Datagram(udp) if bytes.len() > 3000 => {
                 let id = u32::try_from(packets.len()).unwrap() % 60_000;
                 program_run::fragments(udp.payload, 2960, false, id)
             }
-            // A long segment of TCP, such as a page of metrics; both sides ignore it.
+            // The packet is a long TCP segment, such as a page of metrics; both sides ignore it.
             _ if bytes.len() > 3000 => continue,
             _ => vec![bytes.to_vec()],
         };
@@ -130,7 +131,7 @@ fn user_space() -> UserSpace {
     }
 }
 
-/// The filter's expected verdict on a whole datagram, stated independently.
+/// Returns the expected verdict of the filter on a whole datagram, computed independently.
 fn expected(
     payload: &[u8],
     envelope: &Envelope,
@@ -391,7 +392,7 @@ fn metered_records(
 
 #[test]
 fn the_host_hook_makes_the_same_records_of_every_capture_in_both_directions() {
-    // The kernel takes half a second to verify a program: load it once.
+    // The kernel takes half a second to verify a program, so each is loaded only once.
     let mut kernels = [Hook::Ingress, Hook::Egress].map(|hook| (hook, Kernel::load_hook(hook)));
     for path in captures() {
         let all = endpoints(&ip_packets(&path));

@@ -1,4 +1,5 @@
-//! Datagrams in IP fragments: samples in later ones, headers cut in two, and holes.
+//! Datagrams in IP fragments: samples in later fragments, headers cut in two, and missing
+//! fragments.
 
 use super::*;
 
@@ -28,11 +29,11 @@ fn show(kernel: &mut Kernel, fragments: &[Vec<u8>], order: &[usize]) -> (Vec<Rec
 }
 
 #[test]
-fn samples_in_later_fragments_are_found_and_count_only_when_all_fragments_came() {
+fn samples_in_later_fragments_count_only_when_all_fragments_have_arrived() {
     let writer = Guid::new(GuidPrefix(*b"\x01\x10fragmented"), EntityId([0, 0, 1, 3]));
     let mut kernel = Kernel::load();
     kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
-    // Submessages of 496 bytes from offset 20: no header crosses a cut.
+    // The submessages have 496 bytes from offset 20, so no header crosses a cut.
     let payload = program_run::message(writer, 1..=9, 472);
     for ipv6 in [false, true] {
         let (records, kept) = fragmented(&mut kernel, &payload, ipv6, &[0, 1, 2, 3]);
@@ -67,7 +68,7 @@ fn two_fragments_that_begin_within_512_bytes_of_each_other_both_count() {
     };
     let all: Vec<u64> = (1..=9).collect();
     for ipv6 in [false, true] {
-        // Half a submessage in each fragment.
+        // Each fragment has half a submessage.
         let id = kernel.next_identification();
         let fragments = program_run::fragments(&payload, 248, ipv6, id);
         let order: Vec<_> = (0..fragments.len()).collect();
@@ -85,7 +86,7 @@ fn two_fragments_that_begin_within_512_bytes_of_each_other_both_count() {
         let (records, _) = show(&mut kernel, &fragments, &order[..order.len() - 1]);
         assert!(records.is_empty(), "IPv6 {ipv6}: the last one is missing");
     }
-    // A link with an MTU 8 bytes smaller cuts them off each fragment.
+    // A link with an MTU that is 8 bytes smaller cuts 8 bytes off each fragment.
     let id = kernel.next_identification();
     let fragments = program_run::fragments_of(&payload, &[1472, 8], false, id);
     let order: Vec<_> = (0..fragments.len()).collect();
@@ -94,7 +95,7 @@ fn two_fragments_that_begin_within_512_bytes_of_each_other_both_count() {
 }
 
 #[test]
-fn a_header_cut_in_two_and_fragments_out_of_order_are_handed_over() {
+fn a_split_header_or_reordered_fragments_cause_a_handover() {
     let writer = Guid::new(GuidPrefix(*b"\x01\x10cutheaders"), EntityId([0, 0, 1, 3]));
     let mut kernel = Kernel::load();
     kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
@@ -129,7 +130,7 @@ fn a_header_cut_in_two_and_fragments_out_of_order_are_handed_over() {
 }
 
 #[test]
-fn discovery_behind_user_data_in_a_later_fragment_is_captured() {
+fn discovery_after_user_data_in_a_later_fragment_is_captured() {
     let prefix = GuidPrefix(*b"\x01\x10behindbehi");
     let writer = Guid::new(prefix, EntityId([0, 0, 1, 3]));
     let mut kernel = Kernel::load();
@@ -154,7 +155,7 @@ fn discovery_behind_user_data_in_a_later_fragment_is_captured() {
 }
 
 #[test]
-fn a_sample_in_many_datagrams_is_one_record_and_a_hole_ends_it() {
+fn a_sample_in_many_datagrams_is_one_record_up_to_a_missing_fragment() {
     let writer = Guid::new(GuidPrefix(*b"\x01\x12manyframes"), EntityId([0, 0, 1, 3]));
     let mut kernel = Kernel::load();
     kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
@@ -183,7 +184,7 @@ fn a_sample_in_many_datagrams_is_one_record_and_a_hole_ends_it() {
 }
 
 #[test]
-fn a_sender_that_moves_to_another_cpu_leaves_no_fragments_behind() {
+fn a_sender_that_moves_to_another_cpu_loses_no_fragments() {
     let cpus = std::thread::available_parallelism().unwrap().get();
     assert!(
         cpus >= 2,

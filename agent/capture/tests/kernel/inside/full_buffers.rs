@@ -20,7 +20,7 @@ fn samples(payload: &[u8]) -> FragmentNumbers {
     found
 }
 
-/// A message with one DATA_FRAG: one fragment of `size` bytes.
+/// Returns a message with one DATA_FRAG: one fragment of `size` bytes.
 fn fragment(talker: &Talker, number: u32, start: u32, size: u16) -> Vec<u8> {
     let mut bytes = talker.header();
     bytes.extend_from_slice(&[0x16, 1]);
@@ -54,7 +54,7 @@ fn full_buffers(host: &Namespace) -> (u64, u64) {
 }
 
 #[test]
-fn only_datagrams_without_room_in_a_socket_are_named() {
+fn only_datagrams_dropped_at_a_full_socket_are_reported() {
     let (mut observed, link, mut talker, writer) = observed_link(4, Verdict::Meter);
     let robot = link.robot.address();
     let monitor = link.monitor.address();
@@ -67,7 +67,7 @@ fn only_datagrams_without_room_in_a_socket_are_named() {
         let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
         let before = full_buffers(&link.monitor);
         let mut sent = FragmentNumbers::new();
-        // Half of them fit again.
+        // Half of the datagrams fit again.
         let mut got = FragmentNumbers::new();
         for round in 0..2 {
             for _ in 0..150 {
@@ -93,7 +93,7 @@ fn only_datagrams_without_room_in_a_socket_are_named() {
         assert_eq!(refused.len(), missing.len());
         assert_eq!(fragment_numbers(seen.iter().copied()), sent);
         for record in &refused {
-            // Each cancels one arrival: the same record except for the flag.
+            // Each loss cancels one arrival: the records are equal except for the flag.
             let arrival = Record {
                 flags: record.flags & !flag::SOCKET_FULL,
                 ..**record
@@ -112,7 +112,7 @@ fn only_datagrams_without_room_in_a_socket_are_named() {
 }
 
 #[test]
-fn without_btf_full_sockets_are_reported_while_every_socket_is_seen() {
+fn full_sockets_are_reported_without_btf_if_every_socket_is_seen() {
     let settings = FilterSettings {
         kernel_types: false,
         ..FilterSettings::default()
@@ -156,7 +156,7 @@ fn without_btf_full_sockets_are_reported_while_every_socket_is_seen() {
 }
 
 #[test]
-fn of_two_sockets_in_one_group_only_the_full_one_is_reported() {
+fn only_the_full_one_of_two_sockets_in_a_group_is_reported() {
     let (mut observed, link, mut talker, writer) = observed_link(5, Verdict::Meter);
     let group = Ipv4Addr::new(239, 255, 0, 7);
     let join = |socket: &UdpSocket| {
@@ -207,7 +207,7 @@ fn of_two_sockets_in_one_group_only_the_full_one_is_reported() {
 }
 
 #[test]
-fn of_samples_in_pieces_the_lost_fragments_are_named() {
+fn lost_fragments_of_a_large_sample_are_reported() {
     let (mut observed, link, talker, writer) = observed_link(6, Verdict::Meter);
     let to = format!("{}:7411", link.monitor.address());
     let receiver = observed.socket(&link.monitor, &to);
@@ -242,7 +242,7 @@ fn of_samples_in_pieces_the_lost_fragments_are_named() {
 }
 
 #[test]
-fn a_captured_datagram_that_found_no_room_is_reported_by_its_token() {
+fn a_captured_datagram_dropped_at_a_full_socket_is_reported_by_its_token() {
     let (mut observed, link, mut talker, _) = observed_link(7, Verdict::Capture);
     let to = format!("{}:7411", link.monitor.address());
     let receiver = observed.socket(&link.monitor, &to);
@@ -333,7 +333,7 @@ fn send_at_once(
 }
 
 #[test]
-fn losses_on_several_cpus_at_once_beside_other_full_sockets_stay_apart() {
+fn losses_from_several_cpus_are_not_mixed_with_those_of_other_sockets() {
     const SAMPLES: usize = 2_000;
     let mut observed = Observed::with(&FilterSettings {
         record_ring_bytes: 8 << 20,

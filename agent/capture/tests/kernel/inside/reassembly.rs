@@ -1,4 +1,4 @@
-//! Datagrams that the kernel gives up reassembling.
+//! Datagrams whose reassembly the kernel gives up.
 
 use super::*;
 
@@ -12,11 +12,11 @@ fn hurry(host: &Namespace) {
     .unwrap();
 }
 
-/// Longer than that timeout.
+/// Wait that is longer than this timeout.
 const GIVEN_UP: Duration = Duration::from_millis(2500);
 
 #[test]
-fn a_datagram_that_lacks_its_last_fragment_is_named() {
+fn a_datagram_without_its_last_fragment_is_reported() {
     let mut observed = Observed::new();
     let link = Link::new().unwrap();
     hurry(&link.monitor);
@@ -61,7 +61,7 @@ fn a_datagram_that_lacks_its_last_fragment_is_named() {
 }
 
 #[test]
-fn without_its_first_fragment_a_datagram_is_counted_once_and_cannot_be_named() {
+fn a_datagram_without_its_first_fragment_is_counted_but_not_identified() {
     let mut observed = Observed::new();
     let link = Link::new().unwrap();
     hurry(&link.monitor);
@@ -77,13 +77,13 @@ fn without_its_first_fragment_a_datagram_is_counted_once_and_cannot_be_named() {
         wire.carry(&talker.sample(30_000)).unwrap();
     }
     assert_eq!(observed.records(writer, GIVEN_UP), []);
-    // Parallel tests may lose some at the same time, but not one per fragment.
+    // Parallel tests may lose datagrams at the same time, but not one per fragment.
     let unnamed = observed.counted(Counter::NotReassembledUnnamed) - before;
     assert!((5..20).contains(&unnamed), "{unnamed}");
 }
 
 #[test]
-fn one_that_too_many_others_have_overtaken_is_named_when_it_is_given_up() {
+fn a_datagram_with_fragments_too_far_apart_is_reported_when_given_up() {
     static HELD: Mutex<Vec<Vec<u8>>> = Mutex::new(Vec::new());
     let mut observed = Observed::new();
     let link = Link::new().unwrap();
@@ -115,7 +115,7 @@ fn one_that_too_many_others_have_overtaken_is_named_when_it_is_given_up() {
 }
 
 #[test]
-fn fragments_that_the_kernel_has_no_memory_for_are_named_at_once() {
+fn fragments_dropped_for_lack_of_memory_are_reported_immediately() {
     let (mut observed, link, mut talker, writer) = observed_link(12, Verdict::Meter);
     let monitor = link.monitor.address();
     for (family, from, to) in [
@@ -152,7 +152,7 @@ fn fragments_that_the_kernel_has_no_memory_for_are_named_at_once() {
             .iter()
             .filter(|record| record.flags & flag::NOT_REASSEMBLED != 0)
             .collect();
-        // The first one waits; the others did not fit.
+        // The first datagram waits; the others did not fit.
         let expected: FragmentNumbers = (some + 1..some + 5)
             .map(|number| (number.into(), 0))
             .collect();
@@ -166,7 +166,7 @@ fn fragments_that_the_kernel_has_no_memory_for_are_named_at_once() {
 }
 
 #[test]
-fn over_ipv6_and_multicast_it_is_named_likewise() {
+fn an_incomplete_datagram_over_ipv6_or_multicast_is_reported() {
     let group = Ipv4Addr::new(239, 255, 0, 8);
     let (mut observed, link, mut talker, writer) = observed_link(3, Verdict::Meter);
     hurry(&link.monitor);

@@ -1,9 +1,9 @@
-//! Hostile streams, a full ring, and more connections than there is room for.
+//! Hostile streams, a full ring, and more connections than the caps.
 
 use super::*;
 
 #[test]
-fn hostile_streams_cost_bounded_copies_and_are_delivered() -> Result<()> {
+fn hostile_streams_cause_bounded_copies_and_are_delivered() -> Result<()> {
     let mut observed = Observed::new()?;
     let endless = [
         &0xffff_u16.to_le_bytes()[..],
@@ -28,7 +28,7 @@ fn hostile_streams_cost_bounded_copies_and_are_delivered() -> Result<()> {
         }
         let copied: usize = observed.chunks().iter().map(|(_, bytes)| bytes.len()).sum();
         println!("stream {number}: {copied} of {} bytes copied", bytes.len());
-        // A connection without boundaries is left alone after 16 MB.
+        // A connection without boundaries is ignored after 16 MB.
         ensure!(
             copied <= bytes.len().min(17 << 20) + 4096,
             "{number}: {copied}"
@@ -38,7 +38,7 @@ fn hostile_streams_cost_bounded_copies_and_are_delivered() -> Result<()> {
 }
 
 #[test]
-fn a_full_ring_loses_chunks_that_user_space_knows_of() -> Result<()> {
+fn user_space_detects_the_chunks_that_a_full_ring_lost() -> Result<()> {
     let mut observed = Observed::with(&FilterSettings {
         piece_ring_bytes: 65_536,
         ..FilterSettings::default()
@@ -74,7 +74,7 @@ fn a_full_ring_loses_chunks_that_user_space_knows_of() -> Result<()> {
     Ok(())
 }
 
-/// Opens so many connections to one server.
+/// Opens `count` connections to one server.
 fn connect_many(observed: &Observed, count: usize) -> Result<Vec<[TcpStream; 2]>> {
     let files = libc::rlimit {
         rlim_cur: 16_384,
@@ -95,7 +95,7 @@ fn connect_many(observed: &Observed, count: usize) -> Result<Vec<[TcpStream; 2]>
 }
 
 #[test]
-fn more_connections_than_there_is_room_for_push_out_idle_ones() -> Result<()> {
+fn connections_beyond_the_cap_evict_idle_ones() -> Result<()> {
     let mut observed = Observed::new()?;
     let mut all = connect_many(&observed, 3000)?;
     for connection in &mut all {
@@ -122,7 +122,7 @@ fn more_connections_than_there_is_room_for_push_out_idle_ones() -> Result<()> {
 }
 
 #[test]
-fn more_candidates_than_there_is_room_for_push_out_the_oldest() -> Result<()> {
+fn candidates_beyond_the_cap_evict_the_oldest_one() -> Result<()> {
     const CONNECTIONS: u64 = 2_000;
     const ROUNDS: u64 = 3;
     let observed = Observed::new()?;
@@ -139,7 +139,7 @@ fn more_candidates_than_there_is_room_for_push_out_the_oldest() -> Result<()> {
     let candidates = observed.counter(Counter::ZenohCandidates)?;
     let found = observed.counter(Counter::ZenohConnections)?;
     println!("{candidates} candidates, {found} of {CONNECTIONS} found");
-    // How many the kernel keeps is its affair. What it cannot keep begins anew in each later round.
+    // The kernel decides how many candidates it keeps. The others begin anew in each later round.
     let room = u64::from(CANDIDATE_CAPACITY);
     let begun_anew = (ROUNDS - 1) * (CONNECTIONS - room);
     assert!(

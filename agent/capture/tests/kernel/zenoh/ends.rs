@@ -1,10 +1,9 @@
-//! The ends of connections, and those that cannot be read.
+//! Ends of connections, and connections that cannot be read.
 
 use super::*;
 
 #[test]
-fn the_end_of_a_connection_is_reported_once_by_each_sender_or_by_the_one_that_resets_it()
--> Result<()> {
+fn the_end_of_a_connection_is_reported_by_each_sender_and_a_reset_at_least_once() -> Result<()> {
     for is_reset in [false, true] {
         let mut observed = Observed::new()?;
         let mut connection = observed.connect("127.0.0.1:0")?;
@@ -13,7 +12,7 @@ fn the_end_of_a_connection_is_reported_once_by_each_sender_or_by_the_one_that_re
         }
         let [client, server] = connection;
         if is_reset {
-            // Unread bytes at the close: the kernel resets the connection.
+            // With unread bytes at the close, the kernel resets the connection.
             (&server).write_all(&with_prefix(&[4]))?;
             while client.peek(&mut [0; 3])? < 3 {}
         }
@@ -32,7 +31,7 @@ fn the_end_of_a_connection_is_reported_once_by_each_sender_or_by_the_one_that_re
 }
 
 #[test]
-fn tls_and_other_versions_are_named_on_a_port_of_zenoh_only() -> Result<()> {
+fn tls_and_other_versions_are_reported_only_on_a_port_of_zenoh() -> Result<()> {
     let mut observed = Observed::new()?;
     let hello = [
         b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03".as_slice(),
@@ -53,7 +52,7 @@ fn tls_and_other_versions_are_named_on_a_port_of_zenoh_only() -> Result<()> {
             let Some(out) = out else { continue };
             assert_eq!(out.unseen, if is_tls { vec![Unseen::Tls] } else { vec![] });
             assert_eq!(out.batches.len(), usize::from(!is_tls));
-            // The port is in use again at once.
+            // The port is reused immediately.
             rst_on_close(&connection[1]);
             drop(connection);
             let ended: u64 = observed.seen().values().map(|seen| seen.ended).sum();
@@ -63,14 +62,14 @@ fn tls_and_other_versions_are_named_on_a_port_of_zenoh_only() -> Result<()> {
     Ok(())
 }
 
-/// Lets the close of a socket reset the connection, so that it leaves no state.
+/// Makes the close of a socket reset the connection, so that it leaves no state.
 fn rst_on_close(socket: &TcpStream) {
     use std::os::fd::AsRawFd as _;
     let linger = libc::linger {
         l_onoff: 1,
         l_linger: 0,
     };
-    // SAFETY: the option has the size given.
+    // SAFETY: the option has the given size.
     let set = unsafe {
         libc::setsockopt(
             socket.as_raw_fd(),

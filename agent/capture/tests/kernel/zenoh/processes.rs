@@ -1,4 +1,4 @@
-//! The processes of sessions, by the owners of their sockets.
+//! Processes of sessions, found by the owners of their sockets.
 
 use super::*;
 

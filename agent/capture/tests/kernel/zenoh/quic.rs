@@ -1,4 +1,4 @@
-//! Connections over QUIC, of which nothing but the first datagrams can be recognized.
+//! Connections over QUIC, of which only the first datagrams can be recognized.
 
 use super::tapped::Tapped;
 use super::*;
@@ -32,7 +32,7 @@ fn exchange(address: &str, port: u16, bytes: &[u8]) -> Result<()> {
 }
 
 #[test]
-fn quic_is_named_at_sockets_on_a_port_of_zenoh_only() -> Result<()> {
+fn quic_at_sockets_is_reported_only_on_a_port_of_zenoh() -> Result<()> {
     let mut observed = Observed::new()?;
     for address in ["127.0.0.1", "[::1]"] {
         for (port, bytes, is_quic) in datagrams() {
@@ -50,7 +50,7 @@ fn quic_is_named_at_sockets_on_a_port_of_zenoh_only() -> Result<()> {
                 let seen = (chunk.time, chunk.stream);
                 observed.streams.datagram(seen, &head, chunk.length, note);
             }
-            // Each datagram at its sender and at its receiver.
+            // Each datagram is reported at its sender and at its receiver.
             assert_eq!(
                 reported.len(),
                 if is_quic { 4 } else { 0 },
@@ -67,7 +67,7 @@ fn quic_is_named_at_sockets_on_a_port_of_zenoh_only() -> Result<()> {
 }
 
 #[test]
-fn quic_is_named_on_interfaces_on_a_port_of_zenoh_only() -> Result<()> {
+fn quic_on_interfaces_is_reported_only_on_a_port_of_zenoh() -> Result<()> {
     for address in ["127.0.0.1", "[::1]"] {
         for (port, bytes, is_quic) in datagrams() {
             let mut tapped = Tapped::new()?;

@@ -31,7 +31,7 @@ impl Tapped {
         netns::within(&self.host.network(), || connect(address))?
     }
 
-    /// Reads until so many batches were read, or for a while.
+    /// Reads until this many batches were read, or for at most five seconds.
     fn read(&mut self, batches: u64, at_sockets: Option<&Streams>) -> Result<u64> {
         let deadline = Instant::now() + Duration::from_secs(5);
         while self.tap.streams().counters().batches < batches && Instant::now() < deadline {
@@ -48,7 +48,7 @@ impl Tapped {
 }
 
 #[test]
-fn frames_of_connections_of_zenoh_pass_on_any_port_and_no_others() -> Result<()> {
+fn only_frames_of_zenoh_connections_pass_on_any_port() -> Result<()> {
     for address in ["127.0.0.1:0", "[::1]:0", "127.0.0.1:7447"] {
         let mut tapped = Tapped::new()?;
         let mut connection = tapped.connect(address)?;
@@ -90,7 +90,7 @@ fn a_connection_older_than_the_tap_is_found_on_any_port() -> Result<()> {
 }
 
 #[test]
-fn a_connection_that_is_seen_at_the_sockets_is_not_reported_on_the_wire_again() -> Result<()> {
+fn a_connection_seen_at_the_sockets_is_not_reported_again_on_the_wire() -> Result<()> {
     let mut tapped = Tapped::new()?;
     let mut connection = tapped.connect("127.0.0.1:0")?;
     let [client, server] = [connection[0].local_addr()?, connection[1].local_addr()?];

@@ -1,4 +1,4 @@
-//! Verdicts on publishers: what is passed on of their messages.
+//! Verdicts on publishers determine which of their messages are passed on.
 
 use super::*;
 
@@ -7,7 +7,7 @@ fn endpoint(gid: [u8; 16]) -> ros2probe_wire::Guid {
 }
 
 #[test]
-fn verdicts_on_publishers_decide_what_is_passed_on() -> Result<()> {
+fn verdicts_on_publishers_decide_which_messages_are_passed_on() -> Result<()> {
     use ros2probe_wire::record::Verdict;
     let mut observed = Observed::new()?;
     let gids = [[1; 16], [2; 16], [3; 16], [4; 16]];
@@ -28,14 +28,14 @@ fn verdicts_on_publishers_decide_what_is_passed_on() -> Result<()> {
         pass(&mut connection, true, &with_prefix(&batch))?;
         sent.push(batch);
     }
-    // Two messages in one batch, of a publisher that is ignored.
+    // A publisher that is ignored sends two messages in one batch.
     let two = [
         push(40, gids[0], &payload),
         push(41, gids[0], &payload)[2..].to_vec(),
     ]
     .concat();
     pass(&mut connection, true, &with_prefix(&two))?;
-    // A message in fragments of each publisher; the fragments have no extensions.
+    // Each publisher sends a message in fragments; the fragments have no extensions.
     let mut number = 42;
     let mut fragments = Vec::new();
     for gid in gids {
@@ -89,7 +89,7 @@ fn verdicts_on_publishers_decide_what_is_passed_on() -> Result<()> {
 }
 
 #[test]
-fn an_ignored_publisher_shows_once_a_second_that_it_lives() -> Result<()> {
+fn an_ignored_publisher_is_passed_on_about_once_a_second() -> Result<()> {
     use ros2probe_wire::record::Verdict;
     let mut observed = Observed::new()?;
     observed
