@@ -11,8 +11,8 @@ use crate::kernel;
 use crate::library::{self, LibraryError};
 use crate::request::Means;
 
-/// File in which the kernel announces uprobes. Older interfaces leave probes behind when a process
-/// is killed.
+/// File with the kernel's type of perf events for uprobes. Older interfaces leave probes behind
+/// when a process is killed.
 const KIND: &str = "/sys/bus/event_source/devices/uprobe/type";
 
 /// Why programs are not attached.
@@ -43,15 +43,15 @@ pub enum AttachError {
 /// Breakpoints in one library.
 #[derive(Debug)]
 pub struct Attached {
-    /// Closing them removes the breakpoints.
+    /// Descriptors of the breakpoints; closing them removes the breakpoints.
     pub descriptors: Vec<OwnedFd>,
     /// Names of the functions that the library has.
     pub functions: Vec<String>,
 }
 
-/// Attaches programs to the functions of `calls` that a library has. With links, `programs` is the
-/// one that calls the others; with perf events, and for shared memory, there is one for each of
-/// [`Calls::programs`].
+/// Attaches programs to the functions of `calls` that a library has. With links, `programs` is only
+/// the one that calls the others. With perf events, and for shared memory, there is one for each
+/// entry of [`Calls::programs`].
 ///
 /// # Errors
 /// Fails if the library has none of the functions, or if the kernel refuses.
@@ -68,7 +68,7 @@ pub fn attach(
     let found = places(file, calls)?;
     let functions = found.values().map(|place| place.function.to_owned());
     let functions = functions.collect();
-    // Refers to the inspected file, even if its path now names another one.
+    // This path refers to the inspected file, even if the file's own path now names another one.
     let path = format!("/proc/self/fd/{}", file.as_raw_fd());
     let path = CString::new(path).map_err(|error| AttachError::Kernel(error.into()))?;
     let program = |index: usize| programs.get(index).copied();

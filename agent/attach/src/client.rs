@@ -24,13 +24,13 @@ use crate::server::answer::answer;
 pub const COMMAND: &str = "attach";
 /// Whether this program has [`COMMAND`].
 static HAS_COMMAND: AtomicBool = AtomicBool::new(false);
-/// Time to wait for an answer. The broker itself gives up earlier.
+/// Maximum time to wait for an answer. The broker itself gives up earlier.
 const ANSWERS_WITHIN: Duration = PATIENCE.saturating_add(Duration::from_secs(1));
 /// Pause before another attempt to connect.
 const RETRY: Duration = Duration::from_secs(5);
 
-/// Declares that this program runs the broker with [`COMMAND`]. Any other program would start a copy of
-/// itself that does something else.
+/// Declares that this program runs the broker with [`COMMAND`]. Any other program would start a
+/// copy of itself that does something else.
 pub fn declare_command() {
     HAS_COMMAND.store(true, Ordering::Relaxed);
 }
@@ -38,7 +38,7 @@ pub fn declare_command() {
 /// Why the broker did not answer.
 #[derive(Debug, thiserror::Error)]
 pub enum BrokerError {
-    /// Nothing listens at its socket.
+    /// Nothing listens at the broker's socket.
     #[error(
         "cannot connect to the broker at {} (systemctl start ros2probe-attach.socket, unless it is \
          masked, or start the agent as root)", path.display()
@@ -50,16 +50,16 @@ pub enum BrokerError {
         #[source]
         source: io::Error,
     },
-    /// It ended, and was started with the agent.
+    /// The broker was started with the agent, and has ended.
     #[error("the broker has ended: restart the agent")]
     Ended,
-    /// It closed the connection.
+    /// The broker closed the connection.
     #[error("the broker closed the connection: it accepts the user of its option --user, and root")]
     Closed,
-    /// It did not answer in time, or not in this protocol.
+    /// The broker did not answer in time, or not in this protocol.
     #[error("the broker did not answer")]
     Answer(#[source] io::Error),
-    /// It refuses the request, for this reason.
+    /// The broker refuses the request, for this reason.
     #[error("{0}")]
     Refused(String),
 }
@@ -85,7 +85,7 @@ enum Reach {
 /// Processes that use a library.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Users {
-    /// With their use of it.
+    /// Processes with their use of the library.
     pub used: Vec<(u32, Use)>,
     /// Processes that the broker may not read.
     pub closed: Vec<u32>,
@@ -103,12 +103,12 @@ impl Broker {
         }
     }
 
-    /// Starts a broker with the privileges of the calling thread: this program with [`COMMAND`]. It
-    /// ends with the client.
+    /// Starts a broker with the privileges of the calling thread: this program with [`COMMAND`].
+    /// The broker ends with the client.
     ///
     /// # Errors
-    /// Fails if no process can be started, or if this program has not [declared](declare_command) the
-    /// command.
+    /// Fails if no process can be started, or if this program has not [declared](declare_command)
+    /// the command.
     pub fn start() -> io::Result<Self> {
         if !HAS_COMMAND.load(Ordering::Relaxed) {
             let reason = "this program does not contain the broker";
@@ -128,8 +128,8 @@ impl Broker {
         })
     }
 
-    /// Answers with the rights of the calling process, without a broker, deadlines or forks: for
-    /// tests and examples.
+    /// Returns a client that answers requests with the rights of the calling process, without a
+    /// broker, deadlines or forks: for tests and examples.
     #[must_use]
     pub const fn here() -> Self {
         Self {
@@ -140,14 +140,15 @@ impl Broker {
         }
     }
 
-    /// Closes the connection. The packaged broker ends some time after the last one has closed.
+    /// Closes the connection. The packaged broker ends some time after its last connection has
+    /// closed.
     pub fn rest(&mut self) {
         if matches!(self.reach, Reach::Socket(_)) {
             self.socket = None;
         }
     }
 
-    /// Returns all processes of the host.
+    /// Returns the ids of all processes of the host.
     ///
     /// # Errors
     /// Fails if the broker refuses, or cannot be reached.
@@ -249,7 +250,7 @@ impl Broker {
         Ok(events)
     }
 
-    /// Passes each part of an answer with its descriptors.
+    /// Sends a request, and passes each part of the answer with its descriptors to `with`.
     fn ask(
         &mut self,
         request: Request,
@@ -281,7 +282,7 @@ impl Broker {
             number,
             content: request,
         };
-        // The packaged broker may have ended for lack of requests since the last one.
+        // The packaged broker may have ended since the last request, for lack of requests.
         let is_connected = self.socket.is_some();
         let sent = send(self.connected()?, &message, descriptors, SendFlags::empty());
         let sent = match sent {
@@ -306,7 +307,7 @@ impl Broker {
                 Ok(None) => return Err(self.lost(io::ErrorKind::UnexpectedEof.into())),
                 Err(error) => return Err(self.lost(error)),
             };
-            // A late answer to an earlier request, which the broker had given up.
+            // This is a late answer to an earlier request, which the broker had given up.
             if answer.number < number {
                 continue;
             }
@@ -317,7 +318,7 @@ impl Broker {
         }
     }
 
-    /// Returns the error of a connection that is of no more use.
+    /// Drops a connection that has failed, and returns the error.
     fn lost(&mut self, error: io::Error) -> BrokerError {
         self.socket = None;
         match self.reach {
@@ -428,7 +429,7 @@ fn pair() -> io::Result<(OwnedFd, OwnedFd)> {
 fn open(path: &Path) -> io::Result<OwnedFd> {
     let flags = SocketFlags::CLOEXEC;
     let socket = socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)?;
-    // A broker with too many connections accepts later.
+    // These timeouts are also for the connect: a broker with too many connections accepts later.
     bounded(&socket)?;
     connect(&socket, &SocketAddrUnix::new(path)?)?;
     Ok(socket)

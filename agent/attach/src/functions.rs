@@ -1,5 +1,5 @@
-//! The closed list: libraries of which the broker reads mappings, and functions to which it
-//! attaches.
+//! The closed lists of libraries whose mappings the broker reads, and of functions to which it
+//! attaches programs.
 
 use serde::{Deserialize, Serialize};
 
@@ -10,12 +10,12 @@ const FAST_DDS: [&str; 2] = ["libfastrtps.so", "libfastdds.so"];
 /// The library through which ROS 2 reports its calls.
 const TRACING: [&str; 1] = ["libtracetools.so"];
 
-/// Begin of the names of functions in `libtracetools.so`.
+/// Prefix of the names of functions in `libtracetools.so`.
 const PREFIX: &str = "ros_trace_";
 /// The function that reports messages entering a ring buffer, since Iron. Without it, only
 /// callbacks show messages within a process.
 pub const ENQUEUE: &str = "rclcpp_ring_buffer_enqueue";
-/// Program at `callback_start` where only messages are observed and [`ENQUEUE`] does not exist.
+/// Program at `callback_start` if only messages are observed and the library lacks [`ENQUEUE`].
 const RECEIVED: (&str, &str) = ("callback_received", "callback_start");
 
 /// Functions of messages, with programs of the same name.
@@ -35,7 +35,7 @@ const MESSAGES: [&str; 14] = [
     "rclcpp_subscription_init",
     "rclcpp_subscription_callback_added",
 ];
-/// Functions of callbacks, likewise.
+/// Functions of callbacks, with programs of the same name.
 const CALLBACKS: [&str; 11] = [
     "callback_start",
     "callback_end",
@@ -49,8 +49,9 @@ const CALLBACKS: [&str; 11] = [
     "rcl_lifecycle_state_machine_init",
     "rcl_lifecycle_transition",
 ];
-/// Of both, those that a process calls for each message or callback: the runtime events of
-/// `ros2_tracing`. It calls the others when it creates or configures something.
+/// Functions of messages and callbacks that a process calls for each message or callback: the
+/// runtime events of `ros2_tracing`. A process calls the other functions when it creates or
+/// configures something.
 const RUNTIME: [&str; 10] = [
     "rcl_publish",
     "rmw_take",
@@ -65,7 +66,7 @@ const RUNTIME: [&str; 10] = [
 ];
 
 /// `SharedMemTransport::copy_to_shared_buffer`, called once per message that goes into shared
-/// memory; `send` above it is called for all other messages, too. The parameters follow in the
+/// memory. Its caller `send` is called for all other messages, too. The parameters follow in the
 /// mangled name.
 pub const COPY: &str = "_ZN8eprosima7fastdds4rtps18SharedMemTransport21copy_to_shared_bufferE";
 /// `(unsigned char const*, unsigned int, ..)`: Fast DDS 2.x.
@@ -73,7 +74,7 @@ pub(crate) const WHOLE: &str = "PKhj";
 /// `(std::vector<NetworkBuffer> const&, unsigned int, ..)`: Fast DDS 3.x.
 pub(crate) const LIST: &str = "RKSt6vectorINS1_13NetworkBuffer";
 
-/// A library of which processes are listed.
+/// A library whose users the broker can list.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Library {
@@ -103,12 +104,12 @@ pub enum Calls {
     SharedMemory,
     /// Messages that are published and taken.
     Messages,
-    /// The same, callbacks, timers and lifecycle transitions.
+    /// Messages, callbacks, timers and lifecycle transitions.
     Callbacks,
-    /// Of [`Self::Callbacks`], the creation of nodes and of what they have, and lifecycle
-    /// transitions.
+    /// The part of [`Self::Callbacks`] for the creation of nodes and their entities, and for
+    /// lifecycle transitions.
     Initialization,
-    /// Of [`Self::Callbacks`], what happens for each message or callback.
+    /// The part of [`Self::Callbacks`] that runs for each message or callback.
     Runtime,
 }
 
@@ -126,7 +127,7 @@ impl Calls {
 
     /// Returns the programs with the functions to which they belong. Programs of shared memory
     /// belong to one function, each for another form of its parameters. Parts of
-    /// [`Self::Callbacks`] have its programs.
+    /// [`Self::Callbacks`] have the same programs.
     #[must_use]
     pub fn programs(self) -> Vec<(&'static str, &'static str)> {
         let same = |name: &&'static str| (*name, *name);
@@ -139,8 +140,8 @@ impl Calls {
         }
     }
 
-    /// Returns how many programs come with a request: with links one program calls the others, but
-    /// for shared memory.
+    /// Returns the number of programs that come with a request. With links, one program calls the
+    /// others, except for shared memory.
     #[must_use]
     pub fn expected(self, means: Means) -> usize {
         match (self.library(), means) {
@@ -180,7 +181,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_name_with_a_version_is_the_library_and_a_similar_one_is_not() {
+    fn a_versioned_name_matches_the_library_and_a_similar_name_does_not() {
         for (library, name, is_it) in [
             (Library::FastDds, "libfastrtps.so", true),
             (Library::FastDds, "libfastdds.so.3.1", true),
@@ -198,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn callbacks_include_messages() {
+    fn the_programs_of_callbacks_include_those_of_messages() {
         let callbacks = Calls::Callbacks.programs();
         let mut messages = Calls::Messages.programs();
         messages.retain(|(program, _)| *program != RECEIVED.0);

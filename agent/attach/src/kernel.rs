@@ -6,9 +6,9 @@ use std::os::fd::{AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
 
 use rustix::process::Pid;
 
-/// Command, program attach type and flags of `linux/bpf.h` and `linux/perf_event.h`.
+/// Command, attach type and flags of `linux/bpf.h` and `linux/perf_event.h`.
 const LINK_CREATE: libc::c_int = 28;
-/// Attach type of programs that one link puts at many functions.
+/// Attach type of programs that one link attaches to many functions.
 pub const TRACE_UPROBE_MULTI: u32 = 48;
 const PERF_SET_BPF: libc::c_ulong = 0x4004_2408;
 const PERF_ENABLE: libc::c_ulong = 0x2400;
@@ -17,7 +17,8 @@ const CLOSE_ON_EXEC: libc::c_ulong = 1 << 3;
 /// `PERF_TYPE_SOFTWARE` and `PERF_COUNT_SW_DUMMY`: an event that never occurs.
 const SOFTWARE: u64 = 1;
 const DUMMY: u64 = 9;
-/// Bits of `struct perf_event_attr`: records of executable mappings, and a wake-up after some bytes.
+/// Bits of `struct perf_event_attr`: records of executable mappings, and a wake-up after some
+/// bytes.
 const RECORD_MAPPINGS: u64 = 1 << 8;
 const WAKE_BY_BYTES: u64 = 1 << 14;
 /// Sizes of `struct perf_event_attr`, PERF_ATTR_SIZE_VER0 and PERF_ATTR_SIZE_VER1.
@@ -42,12 +43,12 @@ struct FunctionsAttributes {
     unused: u32,
 }
 
-/// Attaches a program to instructions of a file in all processes, one cookie for each (Linux 6.6).
-/// Closing the descriptor removes them together.
+/// Attaches a program to instructions of a file in all processes, with one cookie for each
+/// instruction (Linux 6.6). Closing the descriptor removes all of the breakpoints.
 ///
 /// # Errors
-/// Fails if the kernel has no such links, if the program is not one for them, or if an offset is
-/// not an instruction.
+/// Fails if the kernel has no such links, if the program has another attach type, or if an offset
+/// is not an instruction.
 pub fn link_functions(
     program: BorrowedFd<'_>,
     path: &CStr,
@@ -79,11 +80,11 @@ pub fn link_functions(
     descriptor(link)
 }
 
-/// Puts a program at one instruction of a file in all processes, by a perf event of this type.
-/// Closing the descriptor removes it.
+/// Attaches a program to one instruction of a file in all processes, by a perf event of type
+/// `kind`. Closing the descriptor removes the breakpoint.
 ///
 /// # Errors
-/// Fails without the privilege, or if the offset is not an instruction.
+/// Fails if the privilege is missing, or if the offset is not an instruction.
 pub fn probe_function(
     program: BorrowedFd<'_>,
     kind: u32,
@@ -104,7 +105,7 @@ pub fn probe_function(
     let event = perf_event(&attributes, 0)?;
     // SAFETY: both requests take a number and access no memory.
     let set = unsafe { libc::ioctl(event.as_raw_fd(), PERF_SET_BPF as _, program.as_raw_fd()) };
-    // SAFETY: the same.
+    // SAFETY: the request takes a number and accesses no memory.
     if set < 0 || unsafe { libc::ioctl(event.as_raw_fd(), PERF_ENABLE as _, 0) } < 0 {
         return Err(io::Error::last_os_error());
     }
@@ -116,7 +117,8 @@ pub fn probe_function(
 /// # Errors
 /// Fails without CAP_PERFMON, or if the kernel has no such events.
 pub fn mapping_event(cpu: i32) -> io::Result<OwnedFd> {
-    // Type and size, config, period, types of samples and of reads, flags, bytes before a wake-up.
+    // The values are type and size, config, period, types of samples and of reads, flags, and bytes
+    // before a wake-up.
     let attributes: [u64; 9] = [
         SOFTWARE | FIRST_SIZE << 32,
         DUMMY,
@@ -153,7 +155,7 @@ fn perf_event(attributes: &[u64; 9], cpu: i32) -> io::Result<OwnedFd> {
 /// another PID namespace.
 ///
 /// # Errors
-/// Fails if it is not a connected unix socket.
+/// Fails if the socket is not a connected unix socket.
 pub(crate) fn peer(socket: BorrowedFd<'_>) -> io::Result<(u32, u32)> {
     let mut credentials = libc::ucred {
         pid: 0,
@@ -186,16 +188,16 @@ pub(crate) fn peer(socket: BorrowedFd<'_>) -> io::Result<(u32, u32)> {
 /// # Safety
 /// The process must have one thread, so that the child may do what the parent could.
 pub(crate) unsafe fn fork() -> io::Result<Option<Pid>> {
-    // SAFETY: the caller's.
+    // SAFETY: the caller ensures that the process has one thread.
     match unsafe { libc::fork() } {
         child if child < 0 => Err(io::Error::last_os_error()),
         child => Ok(Pid::from_raw(child)),
     }
 }
 
-/// Ends a child process at once, without handlers of the process that it is a copy of.
+/// Ends a child process immediately, without the exit handlers that it has from its parent.
 pub(crate) fn end_fork(code: i32) -> ! {
-    // SAFETY: runs no code of this process.
+    // SAFETY: the call runs no code of this process.
     unsafe { libc::_exit(code) }
 }
 

@@ -1,12 +1,12 @@
 //! The broker: the only process with rights over other processes.
 //!
-//! The agent cannot read other processes, and cannot put breakpoints into them. The broker answers a
-//! closed list of [requests](request::Request) over a unix socket, and verifies everything that a
-//! request names. Descriptors of what it attached go to the agent, and the broker
-//! keeps none: whichever of the two is killed, the kernel removes the breakpoints with the agent.
+//! The agent cannot read other processes, and cannot put breakpoints into them. The broker answers
+//! a closed list of [requests](request::Request) over a unix socket, and verifies everything that a
+//! request names. It passes the descriptors of breakpoints to the agent, and keeps none. Therefore
+//! the kernel removes the breakpoints with the agent, whichever of the two is killed.
 //!
-//! Each request runs in a fork with a deadline. A file or memory that never answers blocks the fork
-//! alone, which is left behind.
+//! Each request runs in a fork with a deadline. A file or memory that never answers blocks only the
+//! fork, which is left behind.
 
 pub mod attach;
 pub mod client;

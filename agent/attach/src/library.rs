@@ -1,9 +1,9 @@
-//! Finds functions of a library in its symbol table, above all the one of Fast DDS that copies a
-//! message into shared memory.
+//! Finds functions of a library in its symbol table, above all the function of Fast DDS that copies
+//! a message into shared memory.
 //!
-//! The file is untrusted, perhaps a container's: every read is bounded, nothing is mapped, and no
-//! more is allocated than the file holds. Reads ELF64 of this machine (System V ABI, gABI chapters
-//! 4 and 5): symbols, strings and loadable segments only.
+//! The file is untrusted, because it may belong to a container: every read is bounded, nothing is
+//! mapped, and no more is allocated than the file holds. Only symbols, strings and loadable
+//! segments of ELF64 for this machine are read (System V ABI, gABI chapters 4 and 5).
 
 use std::fs::File;
 use std::io;
@@ -27,15 +27,15 @@ const SYMBOLS: u32 = 2;
 const DYNAMIC_SYMBOLS: u32 = 11;
 const LOADED: u32 = 1;
 const IS_FUNCTION: u8 = 2;
-/// Most sections and segments of a header table.
+/// Maximum number of sections, and of segments, in a header table.
 const MAX_ENTRIES: u16 = 1024;
-/// Longest table. Fast DDS has some ten thousand symbols with one or two megabytes of names; with
-/// all debugging symbols, ten times that.
+/// Maximum size of a table, in bytes. Fast DDS has some ten thousand symbols with one or two
+/// megabytes of names; with all debugging symbols, ten times that.
 const MAX_TABLE: u64 = 16 << 20;
 const MAX_NAMES: u64 = 32 << 20;
-/// Most bytes of all symbols and names of a library: one table of each kind of the largest size.
+/// Maximum number of bytes of all symbols and names: one table of each kind of the maximum size.
 const MAX_READ: u64 = 2 * (MAX_TABLE + MAX_NAMES);
-/// Longest name of a function that is compared.
+/// Maximum length of a function's name that is compared, in bytes.
 const MAX_NAME: usize = 512;
 /// x86-64: `endbr64`, the landing pad of indirect calls. The kernel single-steps a breakpoint on
 /// it, which is slow, but emulates the `push` that follows.
@@ -44,9 +44,9 @@ const LANDING: [u8; 4] = [0xf3, 0x0f, 0x1e, 0xfa];
 /// How a library's function receives its message.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Form {
-    /// In one piece (Fast DDS 2.x).
+    /// The message is in one piece (Fast DDS 2.x).
     Whole,
-    /// In a list of buffers (Fast DDS 3.x).
+    /// The message is in a list of buffers (Fast DDS 3.x).
     List,
 }
 
@@ -78,7 +78,7 @@ pub enum LibraryError {
     /// A length or offset exceeds the file.
     #[error("not a library: {0}")]
     Malformed(WireError),
-    /// Not ELF, or too large for a library.
+    /// The file is not ELF for this machine, or too large for a library.
     #[error("not a library for this machine")]
     Foreign,
     /// The library was built without symbols, or the function has another name.
@@ -116,7 +116,7 @@ struct Segment {
 /// Finds the function that copies messages into shared memory.
 ///
 /// # Errors
-/// Fails if the file is malformed, or does not name the function.
+/// Fails if the file is malformed, or has no symbol of the function.
 pub fn find(file: &File) -> Result<Entry, LibraryError> {
     let mut found = None;
     let header = visit(file, |name, address| {
@@ -133,8 +133,8 @@ pub fn find(file: &File) -> Result<Entry, LibraryError> {
     Ok(Entry { offset, form })
 }
 
-/// Returns the offset in the file of each function of these names, in the same order; `None` for
-/// one that the library does not have.
+/// Returns the offset in the file of each function of these names, in the same order; `None` for a
+/// function that the library does not have.
 ///
 /// # Errors
 /// Fails if the file is malformed.
@@ -154,7 +154,7 @@ pub fn functions(file: &File, names: &[&str]) -> Result<Vec<Option<u64>>, Librar
     offsets.collect()
 }
 
-/// Calls `with` with the name, and what follows it, and the address of each function of a library.
+/// Calls `with` for each function of a library, with the bytes from its name on, and its address.
 fn visit(file: &File, mut with: impl FnMut(&[u8], u64)) -> Result<Header, LibraryError> {
     let bytes: [u8; HEADER] = array(file, 0)?;
     let header = Header::read(&bytes)?;
@@ -191,7 +191,7 @@ struct Header {
 
 impl Header {
     fn read(bytes: &[u8]) -> Result<Self, LibraryError> {
-        // Magic, 64 bits, little-endian.
+        // The magic is followed by the codes for 64 bits and little-endian.
         if !bytes.starts_with(b"\x7fELF\x02\x01") {
             return Err(LibraryError::Foreign);
         }
@@ -339,7 +339,7 @@ mod tests {
     const OF_2: &str = "PKhjRKNSt6chrono10time_pointE";
     const OF_3: &str = "RKSt6vectorINS1_13NetworkBufferESaIS4_EEjRKNSt6chronoE";
 
-    /// A library with one segment, loaded at 0x1000, whose first 0x200 bytes are tables.
+    /// Returns a library with one segment, loaded at 0x1000, whose first 0x200 bytes are tables.
     fn image(name: &str, code: &[u8]) -> Vec<u8> {
         let mut names = vec![0];
         names.extend(name.as_bytes());
@@ -394,7 +394,7 @@ mod tests {
     }
 
     #[test]
-    fn the_function_of_either_generation_is_found_behind_its_landing_pad() {
+    fn the_function_of_fast_dds_2_and_3_is_found_after_its_landing_pad() {
         for (parameters, form) in [(OF_2, Form::Whole), (OF_3, Form::List)] {
             let name = format!("{FUNCTION}{parameters}");
             let entry = |offset| Entry { offset, form };
@@ -418,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn no_file_is_read_beyond_its_end() {
+    fn a_truncated_file_is_an_error_and_a_corrupted_one_causes_no_panic() {
         let good = image(&format!("{FUNCTION}{OF_2}"), &LANDING);
         for length in (0..good.len()).step_by(7) {
             assert!(found(&good[..length]).is_err(), "{length}");
@@ -433,7 +433,7 @@ mod tests {
     }
 
     #[test]
-    fn names_without_an_end_cost_a_bounded_part_of_their_table() {
+    fn a_name_without_an_end_is_cut_to_the_maximum_length() {
         let mut file = tempfile::tempfile().unwrap();
         file.write_all(&image(&"x".repeat(50_000), &LANDING))
             .unwrap();
@@ -443,7 +443,7 @@ mod tests {
     }
 
     #[test]
-    fn tables_that_repeat_a_part_of_the_file_are_read_within_a_budget() {
+    fn tables_beyond_the_budget_of_bytes_are_rejected() {
         let mut bytes = image(&format!("{FUNCTION}{OF_2}"), &LANDING);
         let sections = bytes.len() as u64;
         bytes[40..48].copy_from_slice(&sections.to_le_bytes());
@@ -468,7 +468,7 @@ mod tests {
     }
 
     #[test]
-    fn the_one_of_this_machine_is_found_where_it_is_installed() {
+    fn the_function_is_found_in_the_installed_library_of_this_machine() {
         let directories = ["/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu"];
         let libraries = directories
             .iter()

@@ -13,9 +13,9 @@ use crate::functions::Library;
 const SHARED: [&str; 2] = ["/dev/shm/fastrtps_", "/dev/shm/fastdds_"];
 /// Suffix of a replaced or removed file.
 const DELETED: &str = " (deleted)";
-/// Most bytes read of one process's map: some forty thousand mappings.
+/// Maximum number of bytes read of one process's map: some forty thousand mappings.
 const MAX_TEXT: u64 = 4 << 20;
-/// Most files of the library in one process; further ones are left out.
+/// Maximum number of files of the library in one process; further ones are left out.
 pub const MAX_LIBRARIES: usize = 65;
 
 /// Device and inode of a library's file, as in the processes' maps.
@@ -34,9 +34,9 @@ pub struct LibraryId {
 pub struct Mapped {
     /// Identity of the file.
     pub id: LibraryId,
-    /// Its path in the process's own file system.
+    /// Path of the file in the process's own file system.
     pub path: PathBuf,
-    /// Its first address range, as the kernel writes it.
+    /// First address range of the file, as the kernel writes it.
     pub range: String,
 }
 
@@ -46,7 +46,7 @@ pub struct Mapped {
 pub struct Use {
     /// At most [`MAX_LIBRARIES`] files of the library.
     pub libraries: Vec<Mapped>,
-    /// Whether it maps files of Fast DDS's shared memory.
+    /// Whether the process maps files of Fast DDS's shared memory.
     pub shares: bool,
 }
 
@@ -56,7 +56,7 @@ impl Use {
     pub fn parse(text: &str, library: Library) -> Self {
         let mut found = Self::default();
         for line in text.lines() {
-            // Range, permissions, offset, device, inode; the rest is the path.
+            // A line has range, permissions, offset, device and inode; the rest is the path.
             let Some(path) = line.find('/').and_then(|at| line.get(at..)) else {
                 continue;
             };
@@ -84,7 +84,7 @@ impl Use {
     /// Reads the map of a process.
     ///
     /// # Errors
-    /// Fails if the process has ended, or without the right to inspect it.
+    /// Fails if the process has ended, or if the right to inspect it is missing.
     pub fn read(process: u32, library: Library) -> io::Result<Self> {
         let mut bytes = Vec::new();
         let file = File::open(format!("/proc/{process}/maps"))?;
@@ -92,8 +92,8 @@ impl Use {
         Ok(Self::parse(&String::from_utf8_lossy(&bytes), library))
     }
 
-    /// Returns whether the process uses the library at all. One that links Fast DDS statically maps
-    /// its shared memory.
+    /// Returns whether the process uses the library at all. A process that links Fast DDS
+    /// statically maps its shared memory.
     #[must_use]
     pub fn is_any(&self) -> bool {
         self.shares || !self.libraries.is_empty()

@@ -13,13 +13,13 @@ use serde::de::DeserializeOwned;
 
 use crate::request::{MAX_DESCRIPTORS, MAX_PACKET};
 
-/// Bytes of the ancillary data with the most descriptors.
+/// Size of the ancillary data with the maximum number of descriptors, in bytes.
 const ANCILLARY: usize = rustix::cmsg_space!(ScmRights(MAX_DESCRIPTORS));
 
 /// Sends a message in one packet.
 ///
 /// # Errors
-/// Fails if it is too long, or if the peer has closed the socket.
+/// Fails if the message is too long, or if the peer has closed the socket.
 pub(crate) fn send<T: Serialize>(
     socket: BorrowedFd<'_>,
     message: &T,

@@ -12,15 +12,15 @@ use crate::functions::Library;
 use crate::mapped::{Mapped, Use};
 use crate::request::Place;
 
-/// A file whose open blocks is not a library.
+/// Flags that keep an open from blocking: a file whose open blocks is not a library.
 const UNBLOCKED: OFlags = OFlags::NONBLOCK.union(OFlags::NOCTTY);
-/// Beginning of the names of file systems in user space.
+/// Prefix of the names of file systems in user space.
 const USER_SPACE: &str = "fuse";
-/// Most bytes read of a process's mounts.
+/// Maximum number of bytes read of a process's mounts.
 const MAX_MOUNTS: u64 = 1 << 20;
 /// Types of file systems that answer without another process or host (`linux/magic.h`, statfs(2)):
-/// ext4, xfs, btrfs, f2fs, tmpfs, ramfs, squashfs, erofs, ZFS. While the kernel attaches to a file that
-/// never answers, no process of the host can fork.
+/// ext4, xfs, btrfs, f2fs, tmpfs, ramfs, squashfs, erofs, ZFS. While the kernel attaches to a file
+/// that never answers, no process of the host can fork.
 const LOCAL: [u32; 9] = [
     0xef53,
     0x5846_5342,
@@ -43,28 +43,28 @@ const INSTALLED: [&str; 5] = [
     "/usr/local/lib",
 ];
 const DISTRIBUTIONS: &str = "/opt/ros";
-/// Most ROS distributions that are visited.
+/// Maximum number of ROS distributions whose libraries are listed.
 const MAX_DISTRIBUTIONS: usize = 64;
 
 /// Why a library's file is not used.
 #[derive(Debug, thiserror::Error)]
 pub enum OpenError {
-    /// It cannot be opened.
+    /// The file cannot be opened.
     #[error("cannot open the library")]
     Open(#[source] io::Error),
-    /// Its path is a directory or a device.
+    /// The path is a directory or a device.
     #[error("not a file")]
     NoFile,
-    /// The process does not map such a file of the library.
+    /// The process does not map this file as the library.
     #[error("process {0} does not map it")]
     NotMapped(u32),
     /// The path is in none of the usual directories, or has another name than the library.
     #[error("not a library in one of the usual directories: {}", .0.display())]
     NotInstalled(PathBuf),
-    /// Its file system may never answer.
+    /// The file system of the library may never answer.
     #[error("the library is on a file system ({0}) that may hang: install it on a local disk")]
     MayNotAnswer(String),
-    /// Its path in the process's file system names another file by now.
+    /// The path in the process's file system now names another file.
     #[error("the library file was replaced: restart the process")]
     Replaced,
 }
@@ -72,7 +72,7 @@ pub enum OpenError {
 /// Opens a library's file, and returns its path for the log.
 ///
 /// # Errors
-/// Fails if the place is not one of the library, or if the file cannot be opened.
+/// Fails if the place is not a file of the library, or if the file cannot be opened.
 pub fn open(place: &Place, library: Library) -> Result<(File, PathBuf), OpenError> {
     match place {
         Place::Installed(path) => {
@@ -137,8 +137,8 @@ fn open_installed(path: &Path, library: Library) -> Result<File, OpenError> {
 }
 
 /// Opens the file that a process maps, even if its path now names another one. Only root may use
-/// `map_files` of another user's process: else the path in the process's file system must still
-/// name that file.
+/// `map_files` of another user's process. Without root, the path in the process's file system must
+/// still name that file.
 fn open_mapped(process: u32, mapped: &Mapped) -> Result<File, OpenError> {
     let file = format!("/proc/{process}/map_files/{}", mapped.range);
     match plain(openat(CWD, &file, flags(), Mode::empty())) {
@@ -149,8 +149,9 @@ fn open_mapped(process: u32, mapped: &Mapped) -> Result<File, OpenError> {
     }
 }
 
-/// Follows no link: the kernel has resolved the path, so a link was put there later. Behind
-/// `/proc/<pid>/root` an absolute link would lead to files of the host.
+/// Opens a mapped file by its path, and follows no link. The kernel has resolved the path, so a
+/// link was created later. Behind `/proc/<pid>/root`, an absolute link would lead to files of the
+/// host.
 fn open_by_path(refused: io::Error, process: u32, mapped: &Mapped) -> Result<File, OpenError> {
     let mut names = Vec::new();
     for component in mapped.path.components() {
@@ -178,7 +179,8 @@ fn open_by_path(refused: io::Error, process: u32, mapped: &Mapped) -> Result<Fil
     }
 }
 
-/// A link, or a file in place of a directory, was put there after the library was mapped.
+/// Maps an error of `openat`. A link, or a file in place of a directory, appeared after the library
+/// was mapped.
 fn not_opened(error: Errno) -> OpenError {
     match error {
         Errno::LOOP | Errno::NOTDIR | Errno::NOENT => OpenError::Replaced,
@@ -186,8 +188,8 @@ fn not_opened(error: Errno) -> OpenError {
     }
 }
 
-/// Fails unless the file is on a local file system. Layers of an overlay are so if only root can have
-/// mounted it: `process`, which maps the file, is then in the broker's user namespace.
+/// Fails unless the file is on a local file system. An overlay counts as local if only root can
+/// have mounted it: `process`, which maps the file, is then in the broker's user namespace.
 fn check_file_system(file: &File, process: Option<u32>) -> Result<(), OpenError> {
     let kind = fstatfs(file)
         .map_err(|error| OpenError::Open(error.into()))?
@@ -298,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn a_link_on_the_way_to_a_library_is_not_followed() {
+    fn a_link_in_the_path_of_a_library_is_not_followed() {
         let directory = tempfile::tempdir().unwrap();
         let elsewhere = tempfile::tempdir().unwrap();
         let name = "libtracetools.so";

@@ -15,15 +15,15 @@ use crate::mapped::{LibraryId, Use};
 pub const SOCKET: &str = "/run/ros2probe-attach.sock";
 /// First release of Linux with links of many functions.
 const HAS_LINKS: (u32, u32) = (6, 6);
-/// Most bytes of a packet.
+/// Maximum size of a packet, in bytes.
 pub const MAX_PACKET: usize = 64 << 10;
-/// Most processes that one request names.
+/// Maximum number of processes that one request names.
 pub const MAX_PROCESSES: usize = 1024;
-/// Most descriptors of one packet, `SCM_MAX_FD` of the kernel.
+/// Maximum number of descriptors in one packet, `SCM_MAX_FD` of the kernel.
 pub const MAX_DESCRIPTORS: usize = 253;
 /// Time in which a request is answered. A fork that needs longer is killed.
 pub const PATIENCE: Duration = Duration::from_secs(4);
-/// The same for an environment, which is short.
+/// Time in which a request for an environment is answered. An environment is short.
 const PATIENCE_OF_ENVIRONMENT: Duration = Duration::from_millis(500);
 
 /// A request with its number, which its answers repeat.
@@ -36,14 +36,14 @@ pub struct Numbered<T> {
     pub content: T,
 }
 
-/// What the broker does on request; nothing else.
+/// The requests that the broker accepts.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {
     /// Ids of all processes of this host, in parts of [`Answer::Processes`].
     Processes,
-    /// Which of these processes use a library, in parts of [`Answer::Uses`]. Processes that do not
-    /// use it are left out.
+    /// Processes among the given ones that use a library, in parts of [`Answer::Uses`]. Processes
+    /// that do not use it are left out.
     Uses {
         /// The library.
         library: Library,
@@ -57,7 +57,7 @@ pub enum Request {
     },
     /// Domain in the environment of a process that uses one of the libraries: [`Answer::Domain`].
     Domain {
-        /// Its id.
+        /// Id of the process.
         process: u32,
     },
     /// Attaches the programs of the request to functions of a library:
@@ -75,7 +75,7 @@ pub enum Request {
 }
 
 impl Request {
-    /// Returns the time in which it is answered.
+    /// Returns the time in which the request is answered.
     #[must_use]
     pub const fn patience(&self) -> Duration {
         match self {
@@ -89,7 +89,7 @@ impl Request {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Place {
-    /// In one of the [usual directories](crate::open::installed) of this host.
+    /// A file in one of the [usual directories](crate::open::installed) of this host.
     Installed(PathBuf),
     /// A file that a process maps.
     Mapped {
@@ -100,19 +100,19 @@ pub enum Place {
     },
 }
 
-/// How programs are put at functions.
+/// Means of attaching programs to functions.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Means {
     /// One link for all functions of a library, since Linux 6.6. The cookie of a function is its
-    /// place in [`Calls::programs`].
+    /// index in [`Calls::programs`].
     Links,
     /// One perf event for each function.
     PerfEvents,
 }
 
 impl Means {
-    /// Returns the best that this kernel has.
+    /// Returns the best means that this kernel has.
     #[must_use]
     pub fn of_this_kernel() -> Self {
         match kernel::release() {
@@ -128,9 +128,9 @@ impl Means {
 pub enum Answer {
     /// Process ids.
     Processes(Vec<u32>),
-    /// Processes that use a library, and those whose mappings cannot be read.
+    /// Processes that use a library, and processes whose mappings cannot be read.
     Uses {
-        /// Processes with their use of it.
+        /// Processes with their use of the library.
         used: Vec<(u32, Use)>,
         /// Processes that the broker may not read.
         closed: Vec<u32>,
@@ -142,14 +142,14 @@ pub enum Answer {
     /// The descriptors of the breakpoints come with this answer. Closing them removes the
     /// breakpoints.
     Attached {
-        /// The functions that the library has, by the names in [`Calls::functions`].
+        /// The functions that the library has, by their names in [`Calls::programs`].
         functions: Vec<String>,
     },
     /// The descriptors of the perf events come with this answer.
     Mappings,
     /// No more parts follow.
     End,
-    /// Why the broker does not do it.
+    /// The broker refuses the request, for this reason.
     Refused(String),
 }
 
@@ -168,9 +168,9 @@ impl Answer {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Activity {
-    /// Its id.
+    /// Id of the process.
     pub process: u32,
-    /// Its name.
+    /// Name of the process.
     pub name: String,
     /// CPU time so far, user and system, in nanoseconds.
     pub cpu_nanoseconds: u64,

@@ -1,8 +1,9 @@
 //! Accepts connections, and answers requests.
 //!
-//! Each connection has a process of its own, and each request of it a child process with a deadline.
-//! Descriptors of a client, files and memory can block any of them, which delays that client alone. A
-//! child that never ends, because the kernel waits in it, becomes a child of the broker.
+//! Each connection has a separate process, and each of its requests has a child process with a
+//! deadline. Descriptors of a client, files and memory can block any of these processes, which
+//! delays only that client. A child that never ends, because the kernel waits in it, becomes a
+//! child of the broker.
 //!
 //! None of these processes has a second thread.
 
@@ -24,29 +25,30 @@ use crate::kernel;
 use crate::message::{receive, send};
 use crate::request::{Answer, Numbered, Request};
 
-/// Most connections. The sources of one agent need two, and further ones wait.
+/// Maximum number of connections. The sources of one agent need two, and further connections wait.
 pub const MAX_CONNECTIONS: usize = 8;
-/// Requests of a connection per second, and at once. Further ones wait in the socket.
+/// Maximum number of requests of a connection per second. Further requests wait in the socket.
 pub const RATE: f64 = 1000.0;
-/// The domain of each process of a starting robot is one request.
+/// Maximum burst of requests: the domain of each process of a starting robot is one request.
 pub const BURST: f64 = 1000.0;
-/// The same for requests whose answers have descriptors, which the client keeps.
+/// Maximum number per second of requests whose answers have descriptors, which the client keeps.
 pub const ATTACHMENT_RATE: f64 = 5.0;
-/// A client that attaches to all libraries of a host does so at once.
+/// Maximum burst of such requests: a client may attach to all libraries of a host together.
 pub const ATTACHMENT_BURST: f64 = 250.0;
-/// Most requests of a connection that never ended. Until one of them ends, further ones are refused.
+/// Maximum number of requests of a connection that never end. Until one of them ends, further
+/// requests are refused.
 pub const MAX_STUCK: usize = 4;
 /// Pause after the kernel refused a connection or a process.
 const PAUSE: Duration = Duration::from_millis(200);
-/// Longest wait of the broker, which then counts its children.
+/// Maximum wait of the broker, which then counts its children.
 const ROUND: Duration = Duration::from_secs(1);
 
 /// The peer of a connection (SO_PEERCRED, unix(7)).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Peer {
-    /// Its process id; 0 in another PID namespace.
+    /// Process id of the peer; 0 in another PID namespace.
     pub process: u32,
-    /// Its user id.
+    /// User id of the peer.
     pub user: u32,
 }
 
@@ -79,7 +81,7 @@ pub fn serve(listener: OwnedFd, users: &[u32], idle: Duration) -> io::Result<()>
     Ok(())
 }
 
-/// Reaps children that have ended, and returns whether others are left.
+/// Reaps children that have ended, and returns whether other children are left.
 fn reap(connections: &mut Vec<Pid>) -> bool {
     loop {
         match wait(WaitOptions::NOHANG) {
@@ -147,7 +149,7 @@ pub fn serve_one(socket: OwnedFd) -> io::Result<()> {
     Connection::new(socket, peer).serve()
 }
 
-/// Runs the rest of a child process, and ends it also after a panic.
+/// Runs `work` in a child process, and ends the process, also after a panic.
 fn in_child(work: impl FnOnce() -> io::Result<()>) -> ! {
     struct End;
     impl Drop for End {
@@ -156,7 +158,7 @@ fn in_child(work: impl FnOnce() -> io::Result<()>) -> ! {
         }
     }
     let _end = End;
-    // It must not outlive its parent.
+    // The child must not outlive its parent.
     let bound = set_parent_process_death_signal(Some(Signal::KILL));
     let done = bound.map_err(io::Error::from).and_then(|()| work());
     kernel::end_fork(i32::from(done.is_err()))
@@ -179,7 +181,7 @@ fn ready(source: Option<BorrowedFd<'_>>, limit: Duration) -> io::Result<bool> {
     Ok(polled.iter().any(|each| !each.revents().is_empty()))
 }
 
-/// A bucket of tokens: this many per second, and at once.
+/// A token bucket with a rate per second and a maximum burst.
 struct Tokens {
     left: f64,
     rate: f64,
@@ -209,7 +211,7 @@ impl Tokens {
     }
 }
 
-/// A connection with its requests, in a process of its own.
+/// A connection with its requests, in a separate process.
 struct Connection {
     socket: OwnedFd,
     peer: Peer,
@@ -306,7 +308,7 @@ impl Connection {
         self.refuse(number, reason)
     }
 
-    /// Answers in the child process.
+    /// Answers a request in the child process.
     fn answer(&self, request: Numbered<Request>, given: &[OwnedFd]) -> io::Result<()> {
         let number = request.number;
         let answered = answer::answer(self.peer, request.content, given, &mut |content, owned| {
@@ -328,7 +330,7 @@ impl Connection {
     fn refuse(&self, number: u64, reason: String) -> io::Result<()> {
         let content = Answer::Refused(reason);
         let answer = Numbered { number, content };
-        // A client that reads nothing has no use for it.
+        // A client that reads nothing does not need the refusal.
         match send(self.socket.as_fd(), &answer, &[], SendFlags::DONTWAIT) {
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => Ok(()),
             sent => sent,
@@ -348,14 +350,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn beside_requests_that_never_end_others_are_refused() {
+    fn requests_are_refused_while_too_many_earlier_ones_never_end() {
         let kind = SocketType::SEQPACKET;
         let pair = socketpair(AddressFamily::UNIX, kind, SocketFlags::CLOEXEC, None);
         let (own, other) = pair.unwrap();
         let peer = peer(&own).unwrap();
         assert_eq!(peer.process, std::process::id());
         let mut connection = Connection::new(own, peer);
-        // Children that run: they stand for those that the kernel does not end.
+        // These running children stand for processes that the kernel does not end.
         let mut children: Vec<_> = (0..MAX_STUCK)
             .map(|_| {
                 std::process::Command::new("sleep")

@@ -1,4 +1,4 @@
-//! What a fork does for a request. It trusts nothing that the request names.
+//! Answers a request in a fork. Nothing that the request names is trusted.
 
 use std::fmt::Write as _;
 use std::fs::{self, File};
@@ -15,34 +15,34 @@ use crate::mapped::{Mapped, Use};
 use crate::open::open;
 use crate::request::{Activity, Answer, MAX_DESCRIPTORS, MAX_PROCESSES, Means, Place, Request};
 
-/// Process ids in one packet.
+/// Number of process ids in one packet.
 const IDS: usize = 4096;
-/// Libraries in one packet, each with a short path.
+/// Number of libraries in one packet, each with a short path.
 const LIBRARIES: usize = 16;
-/// Most characters of a path. It is shown, and not opened.
+/// Maximum number of characters of a path, which is shown and not opened.
 const MAX_PATH: usize = 256;
-/// States of processes in one packet.
+/// Number of states of processes in one packet.
 const STATES: usize = 128;
-/// Most ids of processes: a host has this many unless configured otherwise.
+/// Maximum number of process ids: a host has this many unless configured otherwise.
 const MAX_IDS: usize = 1 << 16;
-/// Time for the maps of one request. Those that are left count as unreadable.
+/// Time for the maps of one request. The remaining processes count as unreadable.
 const MAPS_WITHIN: Duration = Duration::from_secs(2);
-/// Most bytes of `/proc/<pid>/stat`, and of an environment.
+/// Maximum number of bytes of `/proc/<pid>/stat`, and of an environment.
 const MAX_STAT: u64 = 4096;
 const MAX_ENVIRONMENT: u64 = 256 << 10;
 /// Variable with the domain of a ROS process.
 const DOMAIN: &[u8] = b"ROS_DOMAIN_ID=";
-/// Longest description of a cause.
+/// Maximum number of characters of the description of a cause.
 const MAX_REASON: usize = 1024;
 
-/// Takes each part of an answer with its descriptors.
+/// Function that takes each part of an answer with its descriptors.
 pub(crate) type Sink<'a> = &'a mut dyn FnMut(Answer, Vec<OwnedFd>) -> io::Result<()>;
 
-/// Answers a request with the rights of the calling process. `given`: descriptors that came with
-/// it.
+/// Answers a request with the rights of the calling process. `given` has the descriptors that came
+/// with the request.
 ///
 /// # Errors
-/// Fails if the sink does, or if `/proc` cannot be read.
+/// Fails if the sink fails, or if `/proc` cannot be read.
 pub(crate) fn answer(
     peer: Peer,
     request: Request,
@@ -99,7 +99,7 @@ fn uses(library: Library, processes: &[u32], sink: Sink<'_>) -> io::Result<()> {
 fn used(process: u32, used: Use, sink: Sink<'_>) -> io::Result<()> {
     let shares = used.shares;
     let libraries: Vec<_> = used.libraries.into_iter().map(shortened).collect();
-    // One that links the library statically has none.
+    // A process that links the library statically has no library.
     let none = libraries.is_empty().then_some(&[][..]);
     for part in libraries.chunks(LIBRARIES).chain(none) {
         let libraries = part.to_vec();
@@ -182,7 +182,7 @@ fn mappings(peer: Peer, sink: Sink<'_>) -> io::Result<()> {
     }
 }
 
-/// Returns the domain of a process that uses ROS 2. Its environment is read for nothing else, and
+/// Returns the domain of a process that uses ROS 2. The environment is read for nothing else, and
 /// not of other processes.
 fn domain(process: u32) -> Option<u32> {
     let uses = |library| Use::read(process, library).is_ok_and(|used| used.is_any());
@@ -209,7 +209,7 @@ fn activity(process: u32) -> Option<Activity> {
     let mut bytes = Vec::new();
     let file = File::open(format!("/proc/{process}/stat")).ok()?;
     file.take(MAX_STAT).read_to_end(&mut bytes).ok()?;
-    // A name may be of any bytes.
+    // A name may contain any bytes.
     let text = String::from_utf8_lossy(&bytes);
     parsed(process, &text, kernel::ticks_per_second())
 }
@@ -254,7 +254,7 @@ fn cpus(list: &str) -> impl Iterator<Item = i32> {
     })
 }
 
-/// Returns an error with its causes.
+/// Returns an error with its causes in one line, cut to [`MAX_REASON`].
 fn in_words(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();
@@ -271,14 +271,14 @@ mod tests {
     use crate::request::Numbered;
 
     #[test]
-    fn cpus_are_those_of_the_list() {
+    fn a_list_of_cpus_is_parsed_into_numbers() {
         assert_eq!(cpus("0-3,5\n").collect::<Vec<_>>(), [0, 1, 2, 3, 5]);
         assert_eq!(cpus("0\n").collect::<Vec<_>>(), [0]);
         assert_eq!(cpus("").count(), 0);
     }
 
     #[test]
-    fn a_name_with_parentheses_is_read_whole() {
+    fn a_process_name_with_parentheses_is_read_whole() {
         let text = "42 (a) b (c) S 1 1 1 0 -1 0 0 0 0 0 250 50 0 0 20 0 1 0 777 0";
         let activity = parsed(42, text, 100).unwrap();
         assert_eq!(activity.name, "a) b (c");
@@ -291,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn the_domain_is_that_of_the_environment() {
+    fn the_domain_is_read_from_the_environment() {
         assert_eq!(domain_in(b"A=1\0ROS_DOMAIN_ID=42\0B=2\0"), 42);
         for without in [
             &b"A=1\0"[..],
