@@ -429,7 +429,7 @@ fn pair() -> io::Result<(OwnedFd, OwnedFd)> {
 fn open(path: &Path) -> io::Result<OwnedFd> {
     let flags = SocketFlags::CLOEXEC;
     let socket = socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)?;
-    // These timeouts are also for the connect: a broker with too many connections accepts later.
+    // The timeouts also bound the connect: a broker with too many connections accepts later.
     bounded(&socket)?;
     connect(&socket, &SocketAddrUnix::new(path)?)?;
     Ok(socket)

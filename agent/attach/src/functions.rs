@@ -159,8 +159,8 @@ impl Calls {
         }
     }
 
-    /// Returns whether a program is left out, because another one at a function that the library
-    /// has reports the same.
+    /// Returns whether a program is left out, because a program at another function of the library
+    /// reports the same.
     pub(crate) fn leaves_out(program: &str, has: impl Fn(&str) -> bool) -> bool {
         program == RECEIVED.0 && has(ENQUEUE)
     }

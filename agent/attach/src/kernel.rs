@@ -186,7 +186,7 @@ pub(crate) fn peer(socket: BorrowedFd<'_>) -> io::Result<(u32, u32)> {
 /// Fails if no process can be created.
 ///
 /// # Safety
-/// The process must have one thread, so that the child may do what the parent could.
+/// The process must have one thread, so that the child may run any code.
 pub(crate) unsafe fn fork() -> io::Result<Option<Pid>> {
     // SAFETY: the caller ensures that the process has one thread.
     match unsafe { libc::fork() } {

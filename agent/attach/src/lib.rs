@@ -3,7 +3,8 @@
 //! The agent cannot read other processes, and cannot put breakpoints into them. The broker answers
 //! a closed list of [requests](request::Request) over a unix socket, and verifies everything that a
 //! request names. It passes the descriptors of breakpoints to the agent, and keeps none. Therefore
-//! the kernel removes the breakpoints with the agent, whichever of the two is killed.
+//! the kernel removes the breakpoints when the agent ends, even if the broker or the agent is
+//! killed.
 //!
 //! Each request runs in a fork with a deadline. A file or memory that never answers blocks only the
 //! fork, which is left behind.

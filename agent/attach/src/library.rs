@@ -1,7 +1,7 @@
 //! Finds functions of a library in its symbol table, above all the function of Fast DDS that copies
 //! a message into shared memory.
 //!
-//! The file is untrusted, because it may belong to a container: every read is bounded, nothing is
+//! The file is untrusted, because it may belong to a container. Every read is bounded, nothing is
 //! mapped, and no more is allocated than the file holds. Only symbols, strings and loadable
 //! segments of ELF64 for this machine are read (System V ABI, gABI chapters 4 and 5).
 
@@ -134,7 +134,7 @@ pub fn find(file: &File) -> Result<Entry, LibraryError> {
 }
 
 /// Returns the offset in the file of each function of these names, in the same order; `None` for a
-/// function that the library does not have.
+/// function that does not exist.
 ///
 /// # Errors
 /// Fails if the file is malformed.
@@ -154,7 +154,8 @@ pub fn functions(file: &File, names: &[&str]) -> Result<Vec<Option<u64>>, Librar
     offsets.collect()
 }
 
-/// Calls `with` for each function of a library, with the bytes from its name on, and its address.
+/// Calls `with` for each function of a library, with the bytes that begin with its name, and its
+/// address.
 fn visit(file: &File, mut with: impl FnMut(&[u8], u64)) -> Result<Header, LibraryError> {
     let bytes: [u8; HEADER] = array(file, 0)?;
     let header = Header::read(&bytes)?;
@@ -335,7 +336,7 @@ mod tests {
 
     use super::*;
 
-    /// The rest of the mangled name in a 2.x and in a 3.x library.
+    /// The end of the mangled name in a 2.x and in a 3.x library.
     const OF_2: &str = "PKhjRKNSt6chrono10time_pointE";
     const OF_3: &str = "RKSt6vectorINS1_13NetworkBufferESaIS4_EEjRKNSt6chronoE";
 
@@ -406,7 +407,7 @@ mod tests {
     }
 
     #[test]
-    fn a_library_without_the_function_is_reported() {
+    fn a_library_without_the_function_is_rejected() {
         let newer = format!("{FUNCTION}RKNS1_10OtherThingE");
         for name in ["_ZN4sendE", &newer] {
             assert!(matches!(

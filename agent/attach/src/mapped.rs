@@ -93,7 +93,7 @@ impl Use {
     }
 
     /// Returns whether the process uses the library at all. A process that links Fast DDS
-    /// statically maps its shared memory.
+    /// statically maps only its shared memory.
     #[must_use]
     pub fn is_any(&self) -> bool {
         self.shares || !self.libraries.is_empty()

@@ -89,7 +89,7 @@ pub fn open(place: &Place, library: Library) -> Result<(File, PathBuf), OpenErro
             check_mount(*process, &mapped.id.device)?;
             let file = open_mapped(*process, &mapped)?;
             check_file_system(&file, Some(*process))?;
-            // The process may have mapped another file there in between.
+            // The process may have mapped another file at this address in between.
             let now = Use::read(*process, library).map_err(OpenError::Open)?;
             match now.libraries.contains(&mapped) {
                 true => Ok((file, mapped.path)),
@@ -206,7 +206,7 @@ fn check_file_system(file: &File, process: Option<u32>) -> Result<(), OpenError>
     }
 }
 
-/// Fails if a library is on a file system in user space. Opening such a file may wait without end.
+/// Fails if a library is on a file system in user space. Opening such a file may block forever.
 fn check_mount(process: u32, device: &str) -> Result<(), OpenError> {
     let mut text = Vec::new();
     // Without the list, the library is opened: it usually lies on a disk.

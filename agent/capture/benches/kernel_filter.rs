@@ -1,7 +1,7 @@
 //! CPU time of the kernel filter per datagram, by verdict, and of the same walk in user space. The
 //! kernel measures the time (BPF_PROG_TEST_RUN). A datagram of many IP fragments runs the program
-//! once per fragment, as on a link of MTU 1500. Every measured run is about 25 ns too long. Needs
-//! root.
+//! once per fragment, as on a link of MTU 1500. Every measured run is about 25 ns too long. The
+//! benchmark needs root.
 
 #![expect(
     clippy::unwrap_used,
@@ -28,7 +28,7 @@ const WRITER: Guid = Guid::new(
     EntityId([0, 0, 0x11, 3]),
 );
 
-/// Datagrams as the DDS implementations send them.
+/// Returns datagrams as the DDS implementations send them.
 fn datagrams() -> [(&'static str, Vec<u8>); 3] {
     [
         ("320 B DATA", program_run::message(WRITER, 1..=1, 320)),

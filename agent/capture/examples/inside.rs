@@ -1,4 +1,4 @@
-//! Checks the programs inside processes on the running kernel: loads them, attaches them to the
+//! Checks the programs inside processes on the running kernel. It loads them, attaches them to the
 //! library that is given as argument, calls its functions, and compares counts.
 //!
 //! The example also runs as the first process of a guest. It then mounts what it needs, and powers
@@ -43,7 +43,7 @@ fn main() {
     let version = std::fs::read_to_string("/proc/sys/kernel/osrelease");
     println!("checked on {}", version.unwrap_or_default().trim());
     if is_first {
-        // SAFETY: the first process of a guest ends it.
+        // SAFETY: the call takes no pointer. The first process of a guest ends the guest.
         unsafe { libc::reboot(libc::RB_POWER_OFF) };
     }
 }

@@ -1,6 +1,6 @@
-//! Cost of the programs for TCP to connections that are not of Zenoh: bytes per second in one
-//! direction, and exchanges of 100 bytes per second, over loopback in a separate namespace. Rounds
-//! with and without the programs alternate. Needs root.
+//! Cost of the programs for TCP to connections that are not of Zenoh, over loopback in a separate
+//! namespace. It is measured in bytes per second in one direction, and in exchanges of 100 bytes
+//! per second. Rounds with and without the programs alternate. The example needs root.
 //!
 //! ```text
 //! cargo run --release --workspace --example zenoh_cost -- ROUNDS SECONDS

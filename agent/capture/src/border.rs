@@ -5,7 +5,7 @@ use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Observer;
 use ros2probe_wire::Record;
 
-/// Passes a record of a complete datagram to the model. Its time is wall time.
+/// Passes a record of a complete datagram to the model. The record has wall-clock time.
 pub fn observe(observer: &mut Observer, record: &Record) {
     let observation = Observation::of(record, observer.wall_clock());
     observer.input(Input::Observation(&observation));

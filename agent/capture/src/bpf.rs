@@ -118,7 +118,7 @@ pub(crate) fn load_for_functions(
 /// Sets an entry of an array of programs.
 ///
 /// # Errors
-/// Fails if the program cannot be called from those that use the array.
+/// Fails if the program cannot be called from the programs that use the array.
 pub(crate) fn set_program(
     array: BorrowedFd<'_>,
     index: u32,
@@ -183,7 +183,7 @@ fn length<T>(slice: &[T]) -> io::Result<u32> {
 /// Calls a command that returns a new descriptor.
 ///
 /// # Safety
-/// As for [`call`].
+/// The conditions are those of [`call`].
 unsafe fn descriptor<T>(command: c_int, attributes: &T) -> io::Result<OwnedFd> {
     // SAFETY: the caller meets the conditions of `call`.
     let descriptor = unsafe { call(command, attributes) }?;

@@ -2,7 +2,7 @@
 //!
 //! From Linux 6.6 on, one link covers all functions of a library. It is created and removed as fast
 //! as for one function, and needs no capability beyond those for loading a program. Earlier kernels
-//! need a perf event for each function, which requires CAP_SYS_ADMIN. Each removal of one takes
+//! need a perf event for each function, which requires CAP_SYS_ADMIN. The removal of an event takes
 //! 0.1 s. The kernel removes links and events when their descriptors are closed, however this
 //! process ends.
 //!

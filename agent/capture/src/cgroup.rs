@@ -1,6 +1,7 @@
 //! Finds the control group hierarchy (v2) to which the host hook is attached.
 //!
-//! Reads `/proc/self/mountinfo` (`man 5 proc_pid_mountinfo`). Mounts and creates nothing.
+//! The module reads `/proc/self/mountinfo` (`man 5 proc_pid_mountinfo`), and mounts and creates
+//! nothing.
 
 use std::ffi::OsString;
 use std::fs::{self, File};

@@ -1,5 +1,5 @@
 //! Detects a step of the wall clock, or a suspended machine, by comparison with the monotonic
-//! clock. It reads no clock.
+//! clock. This module reads no clock.
 
 use super::system::Clocks;
 

@@ -1,8 +1,8 @@
 //! The kernel filter from user space: loads it, sets its interest map, reads its records.
 //!
 //! The object is committed beside its source (`agent-ebpf/`), so no BPF toolchain is needed here.
-//! Needs CAP_BPF and CAP_PERFMON (CAP_SYS_ADMIN before Linux 5.8); attaching the host hook to a
-//! cgroup also needs CAP_NET_ADMIN.
+//! Loading needs CAP_BPF and CAP_PERFMON (CAP_SYS_ADMIN before Linux 5.8). Attaching the host hook
+//! to a cgroup also needs CAP_NET_ADMIN.
 
 mod host_hook;
 mod uprobe;
@@ -114,7 +114,8 @@ impl Default for FilterSettings {
 
 /// One loaded filter with its maps: of the wire hook, of the host hook, or of the uprobe.
 pub struct Filter {
-    /// The attached program: the wire hook's entry, or the host hook's for received datagrams.
+    /// Entry of the wire hook, the host hook's program for received datagrams, or the uprobe's
+    /// first program.
     program: OwnedFd,
     /// The wire hook's program, which its entry tail-calls; the kernel empties the array when it is
     /// closed.

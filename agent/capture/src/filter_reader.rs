@@ -74,7 +74,7 @@ impl FilterReader {
     /// Reads the rings and passes everything older than [`SETTLE_NANOSECONDS`] to the model.
     /// Announcements in datagrams are passed immediately, all other data in order of time. Older
     /// data precedes a datagram, so a writer's last samples count before its disposal is read. If a
-    /// flood leaves records in one ring, the other ring waits for it; otherwise a writer's records
+    /// flood leaves records in one ring, the other ring waits for it. Otherwise a writer's records
     /// and captured datagrams would be out of order and look like losses.
     pub fn poll(&mut self, clocks: &Clocks, observer: &mut Observer) {
         let recorded = self.take_records();
@@ -146,7 +146,7 @@ impl FilterReader {
         self.pieces.given_up()
     }
 
-    /// Returns the bytes held for incomplete datagrams.
+    /// Returns the bytes held for datagrams that are incomplete or wait.
     #[must_use]
     pub fn waiting_bytes(&self) -> usize {
         let fresh: usize = self.fresh.iter().map(|(_, bytes)| bytes.len()).sum();

@@ -216,7 +216,8 @@ impl Interfaces {
         request.extend_from_slice(&libc::RTM_GETLINK.to_ne_bytes());
         request.extend_from_slice(&(NLM_F_REQUEST | NLM_F_DUMP).to_ne_bytes());
         request.extend_from_slice(&self.sequence.to_ne_bytes());
-        // Our port, assigned by the kernel; then an ifinfomsg that requests every interface.
+        // The port is 0, because the kernel assigns it. An ifinfomsg follows that requests every
+        // interface.
         request.extend_from_slice(&[0; 4 + 16]);
         self.socket
             .write_all(&request)
@@ -267,7 +268,7 @@ impl Selection {
     }
 
     /// Returns whether an interface is observed before its name is known. Interfaces outside of
-    /// `include` must not be observed even briefly, nor those in `exclude`.
+    /// `include` or in `exclude` must not be observed even briefly.
     #[must_use]
     pub fn accepts_unknown(&self) -> bool {
         self.include.is_empty() && self.exclude.is_empty()
@@ -514,7 +515,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_of_changes_ends_in_the_right_list() {
+    fn the_list_is_correct_after_a_flood_of_changes() {
         in_new_namespace(|| {
             let mut interfaces = Interfaces::open().unwrap();
             // These are far more messages than the buffer of an unread socket holds.

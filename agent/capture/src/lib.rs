@@ -1,7 +1,7 @@
 //! Capture: passes datagrams, records of the kernel programs, and facts about sockets to the model.
 //!
-//! - [`live::LiveSource`] observes this host: at the sockets of a control group ([`host_tap`]), on
-//!   interfaces ([`wire_tap`]), in shared memory of Fast DDS ([`shm`], or with uprobes [`uprobe`]).
+//! - [`live::LiveSource`] observes this host: sockets of a control group ([`host_tap`]), interfaces
+//!   ([`wire_tap`]), and shared memory of Fast DDS ([`shm`], or with uprobes [`uprobe`]).
 //! - [`pcap::PcapReader`] reads a capture, and [`frame_decoder::FrameDecoder`] passes its packets
 //!   to the model.
 //!

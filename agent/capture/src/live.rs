@@ -577,7 +577,7 @@ impl LiveSource {
         self.readers().map(FilterReader::waiting_bytes).sum()
     }
 
-    /// Returns the number of datagrams discarded because of too many fragments.
+    /// Returns the number of datagrams discarded because of the caps of IP reassembly.
     #[must_use]
     pub fn reassembly_evicted(&self) -> u64 {
         self.wires.iter().map(WireTap::reassembly_evicted).sum()

@@ -29,7 +29,7 @@ const MAPPED: u32 = 1;
 const LOST: u32 = 2;
 /// Bytes of a record before the name of the mapped file: the header, two ids, three numbers.
 const BEFORE_NAME: usize = 40;
-/// Maximum size of a record, in bytes: its length has 16 bits.
+/// Maximum size of a record, in bytes: its length field has 16 bits.
 const MAX_RECORD: usize = u16::MAX as usize;
 
 /// The rings of all CPUs.

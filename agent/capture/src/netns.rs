@@ -88,7 +88,7 @@ pub(crate) mod tests {
 
     use super::*;
 
-    /// Runs a test in a network namespace of its own, with `lo` up.
+    /// Runs a test in a new network namespace, with `lo` up.
     pub(crate) fn in_new_namespace(test: impl FnOnce() + Send) {
         thread::scope(|scope| {
             let thread = scope.spawn(|| {

@@ -64,7 +64,7 @@ pub struct Captured<'a> {
     /// Link layer of the bytes.
     pub link: Link,
     /// Number of the interface within the capture: always 0 in pcap, the index of its description
-    /// in pcapng. Not an interface index of the capturing host.
+    /// in pcapng. It is not an interface index of the capturing host.
     pub interface: u32,
     /// The captured bytes.
     pub bytes: &'a [u8],

@@ -86,7 +86,7 @@ impl PieceAssembler {
         Some((whole.first, Cow::Owned(whole.bytes)))
     }
 
-    /// Takes back the buffer of a datagram that was read, to use it again.
+    /// Keeps the buffer of a datagram that was read, for reuse.
     pub fn reuse(&mut self, mut buffer: Vec<u8>) {
         if buffer.capacity() > PIECE_BYTES as usize && self.spare.len() < FreshDatagrams::CAP {
             buffer.clear();

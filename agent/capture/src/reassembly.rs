@@ -1,8 +1,8 @@
 //! Reassembles UDP datagrams from IP fragments.
 //!
-//! Memory holds bytes that arrived; a length in a header allocates nothing. Flows and bytes are
-//! capped, and the oldest flow is evicted first. A finished datagram is remembered for a while, so
-//! that a duplicate fragment does not open it again. Fragments never wait longer than in the
+//! Memory is allocated for bytes that have arrived, never for a length in a header. Flows and bytes
+//! are capped, and the oldest flow is evicted first. A finished datagram is remembered for a while,
+//! so that a duplicate fragment does not open it again. Fragments never wait longer than in the
 //! receiving kernel.
 //!
 //! The kernel filter walks fragmented datagrams itself. If it cannot continue, it hands the
@@ -56,7 +56,7 @@ impl Default for Limits {
 /// another interface or in the other direction belongs to another flow.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct FlowKey {
-    /// Number of the source (network namespace, capture) that saw them.
+    /// Number of the source (network namespace, capture) that saw the fragments.
     pub namespace: u32,
     /// Index of the interface; 0 when unknown.
     pub interface: u32,

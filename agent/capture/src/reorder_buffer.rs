@@ -11,7 +11,7 @@
 //! twice, first as not delivered.
 //!
 //! Records from polling shared memory also wait here: a uprobe or a socket may see samples that
-//! polling misses. A message is polled after it was sent, so the record of its sending comes first.
+//! polling misses. A message is polled after it was sent, so a record from its sender comes first.
 //!
 //! Segments of Zenoh wait with the records, because the model's clock follows the records. Their
 //! content is read when they leave the buffer.

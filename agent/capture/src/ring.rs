@@ -5,7 +5,7 @@
 //! It is bound to no interface, so that it also sees interfaces that appear later. It never sends.
 //! The filter decides which frames are kept, and how much of each.
 //!
-//! Only this module and `turns` access memory shared with the kernel: a [`Block`] is lent to its
+//! Only this module and `turns` access memory shared with the kernel. A [`Block`] is lent to its
 //! reader and returns to the kernel when it is dropped. [`block`] reads a block as plain bytes.
 
 pub mod block;
@@ -168,9 +168,9 @@ impl Ring {
             "PACKET_RX_RING",
         )?;
         let memory = Mapping::new(&socket, block_size * settings.blocks)?;
-        // SAFETY: the mapping holds this many blocks of whole pages, and starts at a page. `turns`
-        // is dropped before the mapping. The other side is the kernel, which follows the TPACKET_V3
-        // protocol.
+        // SAFETY: the mapping holds `settings.blocks` blocks of whole pages, and starts at a page.
+        // `turns` is dropped before the mapping. The other side is the kernel, which follows the
+        // TPACKET_V3 protocol.
         let turns = unsafe { Turns::new(memory.start.cast(), block_size, settings.blocks) };
         let ring = Self {
             turns,

@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn earlier_and_attributed_drops_are_not_unidentified() {
+    fn earlier_and_attributed_drops_do_not_count_as_unidentified() {
         let mut observer = Observer::new(Settings::default());
         let mut all = Sockets::new(PathBuf::from("/sys/fs/cgroup"));
         let drops = |all: &Sockets, rcvbuf_errors| {

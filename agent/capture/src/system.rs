@@ -406,7 +406,7 @@ mod tests {
     }
 
     #[test]
-    fn a_monotonic_time_a_second_ago_is_a_calendar_time_a_second_ago() {
+    fn a_monotonic_time_converts_to_the_calendar_time_of_the_same_moment() {
         let clocks = Clocks::read();
         let then = clocks.calendar(clocks.monotonic - 1_000_000_000);
         assert_eq!(clocks.now.nanoseconds_since(then), 1_000_000_000);

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use crate::system::monotonic;
 
-/// Time without progress after which a thread counts as stalled. Readiness must change within 5 s.
+/// Time without progress after which a thread counts as stalled. Readiness then changes within 5 s.
 const STALLED_AFTER: Duration = Duration::from_secs(4);
 
 /// Task of a thread, which determines the privileges that it keeps.

@@ -141,7 +141,7 @@ impl WireTap {
 
     /// Logs if the path is gone or names another namespace. Frames in the new namespace are not
     /// seen, because entering it would take privileges that were dropped. Logs again when the first
-    /// one is back.
+    /// namespace is back.
     pub fn check_namespace(&mut self) {
         let Some(path) = &self.path else { return };
         let is_gone = identity(path) != self.identity;

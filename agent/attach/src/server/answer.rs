@@ -99,7 +99,7 @@ fn uses(library: Library, processes: &[u32], sink: Sink<'_>) -> io::Result<()> {
 fn used(process: u32, used: Use, sink: Sink<'_>) -> io::Result<()> {
     let shares = used.shares;
     let libraries: Vec<_> = used.libraries.into_iter().map(shortened).collect();
-    // A process that links the library statically has no library.
+    // A process that links the library statically has no file of it.
     let none = libraries.is_empty().then_some(&[][..]);
     for part in libraries.chunks(LIBRARIES).chain(none) {
         let libraries = part.to_vec();

@@ -32,7 +32,7 @@ const REVIEW: Duration = Duration::from_secs(600);
 const REVIEW_OF_MANY: Duration = Duration::from_secs(60);
 /// Number of known processes for the shorter interval: half of those that the programs can have.
 const MANY: usize = PROCESS_CAPACITY as usize / 2;
-/// Number of rounds after which rates are known: two reports, each of the calls of a second.
+/// Number of rounds after which rates are known: two reports that each cover a second of calls.
 const ROUNDS_OF_RATES: u32 = 3;
 
 /// The breakpoints in all libraries.

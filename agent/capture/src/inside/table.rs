@@ -1,4 +1,4 @@
-//! The observed processes: their names, budgets, and what has changed since the last report.
+//! The observed processes: their names, budgets, and changes since the last report.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -28,7 +28,7 @@ use crate::tables::{CausalHops, InsideBuffers, NewNodes, ReportedHandles, Transi
 pub const MAX_PROCESS_HITS: u64 = 50_000;
 /// Minimum time over which calls per second are evaluated: a shorter time may contain only a burst.
 const JUDGED_OVER: Duration = Duration::from_millis(500);
-/// Rounds after which a process outside of the control group is inspected again.
+/// Number of rounds after which a process outside of the control group is inspected again.
 const RECHECK: u32 = 5;
 
 /// The observed processes.
@@ -235,8 +235,8 @@ impl ProcessTable {
         self.known.retain(|id, _| present.contains(id));
     }
 
-    /// Reads everything once. `elapsed`: time since the last round. `shows_intra_process`: whether a
-    /// process's library reports every step of messages within it.
+    /// Reads everything once. `elapsed`: time since the last round. `shows_intra_process`: whether
+    /// a process's library reports every step of messages within it.
     pub fn round(
         &mut self,
         tables: &mut Tables,

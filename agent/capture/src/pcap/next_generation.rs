@@ -223,7 +223,7 @@ impl Section {
 }
 
 impl Interface {
-    /// Returns `None` if the resolution of its clock is too fine.
+    /// Returns `None` if the resolution of the interface's clock is too fine.
     fn read(mut cursor: Cursor<'_>) -> Result<Option<Self>, WireError> {
         let link = Link(cursor.u16("interface's link type")?);
         cursor.u16("interface's reserved field")?;

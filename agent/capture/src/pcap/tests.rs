@@ -135,7 +135,7 @@ fn next_generation(endianness: Endianness) -> Vec<u8> {
             .raw(b"hi")
             .u32(0);
     });
-    // 1024 units per second.
+    // The resolution is 1024 units per second.
     file.block(6, |body| {
         body.u32(1).u32(0).u32(1536).u32(3).u32(3).raw(b"two");
     });
@@ -412,7 +412,7 @@ fn real_captures_contain_the_packets_that_another_decoder_counted() {
 
 #[test]
 fn a_small_capture_that_expands_too_far_ends_with_an_error() {
-    // The header of a capture, and empty packets.
+    // The file has the header of a capture, and empty packets.
     const PACKETS: usize = 8 << 20;
     let mut file = GzEncoder::new(Vec::new(), Compression::fast());
     let header = [0xa1b2_c3d4_u32, 0x0002_0004, 0, 0, 65_535, 1];
@@ -436,7 +436,7 @@ fn a_small_capture_that_expands_too_far_ends_with_an_error() {
     };
     assert!(file.len() < 1 << 20, "{}", file.len());
     let (packets, end) = read(Expansion::Limited);
-    // 64 MiB are free.
+    // The limit does not apply to the first 64 MiB.
     assert!(packets > 4 << 20 && packets < PACKETS, "{packets}");
     let end = end.unwrap();
     assert!(end.contains("more than 100 times its size"), "{end}");

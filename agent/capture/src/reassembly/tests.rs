@@ -136,7 +136,7 @@ fn a_reused_identification_starts_a_new_datagram() {
     assert_eq!(done.len(), 1);
     assert_eq!(done[0].payload(), &new[8..]);
     assert_eq!(reassembly.counters().contradictory, 1);
-    // A shorter datagram after the middle of a longer one.
+    // A shorter datagram follows the middle of a longer one.
     let short = transport(1600, 2);
     assert_eq!(feed(&mut reassembly, 2, &fragments(&old)[1..2]), []);
     let done = feed(
@@ -247,7 +247,7 @@ fn a_handover_and_its_fragments_yield_a_datagram_in_either_order() {
     let bytes = transport(10_000, 0);
     let parts = fragments(&bytes);
     let record = handover(5000, 10_000);
-    // 5000 + 8 lies in the fourth part.
+    // Byte 5000 + 8 is in the fourth fragment.
     for record_at in 0..=4 {
         let mut reassembly = Reassembly::new(Limits::default());
         let mut done = Vec::new();

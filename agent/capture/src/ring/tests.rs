@@ -323,7 +323,7 @@ fn blocks_have_whole_pages_for_every_page_size() {
             };
             let (request, block_size) = request(settings, page).unwrap();
             assert_eq!(block_size, given, "{wanted} bytes in pages of {page}");
-            // Requirements of packet_set_ring().
+            // packet_set_ring() has these requirements.
             let (size, frame) = (request.tp_block_size, request.tp_frame_size);
             assert_eq!(size as usize, block_size);
             assert!(frame > 0 && frame % libc::TPACKET_ALIGNMENT as u32 == 0);

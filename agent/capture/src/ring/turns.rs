@@ -14,7 +14,7 @@ pub(super) struct Turns {
     start: NonNull<u8>,
     block_size: usize,
     blocks: usize,
-    /// Block that the kernel hands over next.
+    /// Index of the block that the kernel hands over next.
     next: usize,
 }
 
@@ -212,7 +212,7 @@ mod tests {
         thread::scope(|scope| {
             let kernel = Memory(memory.0);
             scope.spawn(move || {
-                // Moves the whole value, not only the pointer in it.
+                // This moves the whole value, not only the pointer in it.
                 let kernel = kernel;
                 for number in 0..NUMBERS {
                     let bytes = block_of(&[&payload(number), b"", &payload(number ^ 1)]);

@@ -1,8 +1,8 @@
 //! One entry of a port's ring: the buffer and segment that hold a message.
 //!
-//! Layout: MultiProducerConsumerRingBuffer's cell with a BufferDescriptor, Fast DDS 2.3 to 3.6
-//! (constant 5 of its shared-memory ABI), 20 bytes: reference counter, segment id, offset of the
-//! buffer's node in the segment, validity id.
+//! The layout is a cell of MultiProducerConsumerRingBuffer with a BufferDescriptor, 20 bytes, in
+//! Fast DDS 2.3 to 3.6 (constant 5 of its shared-memory ABI). The fields are reference counter,
+//! segment id, offset of the buffer's node in the segment, and validity id.
 
 use std::fmt;
 

@@ -53,7 +53,7 @@ pub struct MessageClassifier {
     pub is_wanted: bool,
 }
 
-/// Starts without classified endpoints.
+/// Creates a classifier without known endpoints.
 impl Default for MessageClassifier {
     fn default() -> Self {
         Self {

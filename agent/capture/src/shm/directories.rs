@@ -357,8 +357,8 @@ impl ShmDirectory {
         files.into_iter().collect()
     }
 
-    /// Selects from too many files: first those of living processes, then an equal number per user,
-    /// oldest first, so that no user can hide another's files.
+    /// Selects from too many files: first files of living processes, then an equal number per user,
+    /// oldest first. No user can hide another's files in this way.
     fn choose(&self, files: Vec<(Name, u64)>, locks: &[(Name, u64)]) -> Vec<(Name, u64)> {
         let device = fs::metadata(&self.path).map_or(0, |metadata| metadata.dev());
         let held = Locks::read();
@@ -437,8 +437,8 @@ impl NewestProcess {
     }
 }
 
-/// Returns the id of the process or thread created last in this PID namespace or below, the last
-/// word of `/proc/loadavg` (proc_loadavg(5)); `None` if it is unknown.
+/// Returns the id of the process or thread created last in this PID namespace or below; `None` if
+/// it is unknown. The id is the last word of `/proc/loadavg` (proc_loadavg(5)).
 fn newest_process(loadavg: &File) -> Option<u32> {
     let mut line = [0; 128];
     let len = loadavg.read_at(&mut line, 0).ok()?;

@@ -21,7 +21,7 @@ pub enum Item {
     Message {
         /// Time of reading, in nanoseconds since the Unix epoch.
         time: u64,
-        /// Port that announced it.
+        /// Port that announced the message.
         port: u16,
         /// The message.
         bytes: Vec<u8>,

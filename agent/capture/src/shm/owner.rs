@@ -69,7 +69,7 @@ impl Locks {
     }
 }
 
-/// Returns the file of a line such as `1: FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF`; a process
+/// Returns the file of a line such as `1: FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF`. A process
 /// that waits for a lock (`1: -> FLOCK ...`) holds no lock.
 fn file_of(line: &str) -> Option<FileId> {
     let mut words = line.split_whitespace().skip(1);

@@ -32,16 +32,16 @@ const BURSTS: f64 = 200e-6;
 /// Duration of close polling after a participant creates its files, and after each announcement.
 const PARTICIPANT_WATCH: f64 = 0.3;
 const ANNOUNCEMENT_WATCH: f64 = 0.1;
-/// CPU credit for close polling: its maximum, and its growth per second. Together with the share of a
-/// CPU while topics are measured, a minute in which a robot starts costs less than 2.5 % of a CPU.
+/// CPU credit for close polling: its maximum, and its growth per second. With the share of a CPU
+/// while topics are measured, a minute in which a robot starts costs less than 2.5 % of a CPU.
 const CREDIT: f64 = 0.4;
 const CREDIT_PER_SECOND: f64 = 0.002;
 /// Maximum sleep while every message is needed. In a burst, a sender reuses its buffers after some
 /// 100 us, and its readers are faster than that.
 const EVERY: f64 = 50e-6;
 const EARLY_WAKE: f64 = 20e-6;
-/// Maximum CPU time that is saved for such polls, so that a short recording is complete, and
-/// maximum overdraft.
+/// Maximum CPU time that is saved for polls while every message is needed, so that a short
+/// recording is complete, and maximum overdraft.
 const SAVINGS: f64 = 5.0;
 const OVERDRAFT: f64 = 0.25;
 /// Maximum sleep, whatever a poll costs.
@@ -361,7 +361,7 @@ mod tests {
                 now += slept.as_secs_f64() + cost;
                 cpu += cost;
             }
-            // Without credit it polls as while a topic is measured, within that share.
+            // Without credit, the tap polls as while a topic is measured, within the same share.
             assert!(longest.as_micros() <= 5000, "{cost} {longest:?}");
             assert!(polls > 10_000, "{cost} {polls}");
             // The whole agent may take 3 % of a CPU, of which other threads need a part.

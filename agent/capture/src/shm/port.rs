@@ -1,7 +1,7 @@
 //! A port: the ring that announces messages to the participants that listen there.
 //!
 //! Reads PortNode, ring and cells of Fast DDS 2.3 to 3.6 and follows the write position like a
-//! listener, without being one: it counts no reference and pops nothing. A writer first moves
+//! listener. It is not a listener: it counts no reference and pops nothing. A writer first moves
 //! `write_p`, then fills the cell, and sets its reference counter last. Therefore a cell counts as
 //! filled if it is referenced or if it differs from its content one round before.
 

@@ -31,8 +31,8 @@ const MAX_PER_POLL: usize = 2048;
 const MAX_PER_URGENT_POLL: usize = 64;
 /// Maximum number of ports per urgent poll: an announcement to all participants is in every port.
 const PORTS_PER_URGENT_POLL: usize = 8;
-/// Size of the part of a message in which an announcement of a participant's nodes begins, in
-/// bytes.
+/// Number of bytes at the start of a message in which an announcement of its participant's nodes
+/// begins.
 const BEGIN: usize = 4096;
 /// Silence after which a port is polled less often, and the interval of those polls.
 const SILENT_AFTER: u64 = 2_000_000_000;
@@ -227,8 +227,9 @@ impl Tap {
         !self.ports.is_empty()
     }
 
-    /// Returns the nanoseconds from `now` to the next search for directories; `None` if a port
-    /// exists or waits to be opened. In between, only a created file requires a poll.
+    /// Returns the nanoseconds from `now` to the next search for directories. In between, only a
+    /// created file requires a poll. Returns `None` if a port exists or waits to be opened, or if
+    /// the next poll is urgent.
     #[must_use]
     pub fn idle(&self, now: u64) -> Option<u64> {
         let is_idle = self.ports.is_empty() && self.unborn.is_empty() && !self.is_hurried;

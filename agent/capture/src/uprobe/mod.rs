@@ -2,9 +2,9 @@
 //!
 //! A breakpoint in the code of other processes costs them some microseconds per message. By default
 //! it exists while processes start, because they announce their names once, and while a client
-//! reads messages. Nothing is sampled in these times: the kernel program reads a message before it
-//! is copied, so names, samples and losses are as exact as at a socket. The program sees every
-//! message passed to the transport, even if a full port or segment then refuses it.
+//! reads messages. In these times nothing is sampled, because the kernel program reads a message
+//! before it is copied. Names, samples and losses are as exact as at a socket. The program sees
+//! every message passed to the transport, even if a full port or segment then refuses it.
 
 pub mod attachments;
 pub mod processes;
@@ -62,9 +62,9 @@ pub enum UprobeError {
     Filter(#[from] FilterError),
 }
 
-/// Returns the capabilities that the broker needs, apart from those that load programs: for events
-/// of mapped files, and for reading mapped files of other users' processes. Perf events need the
-/// wider CAP_SYS_ADMIN on recent kernels.
+/// Returns the capabilities that the broker needs, apart from those that load programs. They are
+/// for events of mapped files, and for reading mapped files of other users' processes. Perf events
+/// need the wider CAP_SYS_ADMIN on recent kernels.
 fn needed() -> [(CapabilitySet, &'static str); 2] {
     let events = match Means::of_this_kernel() {
         Means::Links => (CapabilitySet::PERFMON, "CAP_PERFMON"),
@@ -232,8 +232,8 @@ impl Uprobe {
         self.search.facts()
     }
 
-    /// Returns for how long the thread that attaches probes has made no progress; `None` if it makes
-    /// progress.
+    /// Returns for how long the thread that attaches probes has made no progress; `None` if it
+    /// makes progress.
     #[must_use]
     pub fn stalled(&self) -> Option<Duration> {
         self.search.stalled()

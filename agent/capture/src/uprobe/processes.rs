@@ -1,6 +1,6 @@
 //! Finds the processes that use a library, and the library files that they map.
 //!
-//! The broker reads the maps of new processes every time, and those of older ones occasionally: a
+//! The broker reads the maps of new processes in every round, of older ones occasionally: a
 //! library may be loaded late. It reads no process memory.
 
 use std::collections::{BTreeSet, HashMap, HashSet};
@@ -198,8 +198,8 @@ impl Processes {
             .map(|(pid, process)| (*pid, &process.use_of_it))
     }
 
-    /// Returns a process that cannot be inspected and may use Fast DDS, because it holds a lock as
-    /// Fast DDS does. Without a list of locks, every such process may use Fast DDS.
+    /// Returns a process that cannot be inspected and may use Fast DDS, because it holds a lock of
+    /// the kind that Fast DDS takes. Without a list of locks, every such process may use Fast DDS.
     #[must_use]
     pub fn closed(&self) -> Option<u32> {
         let mut closed = self.known.iter().filter(|(_, process)| process.is_closed);

@@ -152,7 +152,8 @@ impl LibrarySearch {
         Ok(())
     }
 
-    /// Sets whether every message is needed. Without effect if probes are not attached on demand.
+    /// Sets whether every message is needed. The setting matters only if probes are attached on
+    /// demand.
     pub fn want(&self, wanted: bool) {
         let shared = &self.shared;
         if !shared.on_demand || shared.wanted.swap(wanted, Ordering::AcqRel) == wanted {

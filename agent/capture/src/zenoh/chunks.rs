@@ -47,7 +47,8 @@ impl<'a> Chunk<'a> {
         }
     }
 
-    /// Reads a chunk and the bytes that follow it in the ring. `time` is its time in the wall clock.
+    /// Reads a chunk and the bytes that follow it in the ring. `time` is its time in the wall
+    /// clock.
     #[must_use]
     pub fn of_piece(piece: &Piece, bytes: &'a [u8], time: Timestamp) -> Self {
         let is = |bit| piece.chunk & bit != 0;

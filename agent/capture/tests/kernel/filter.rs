@@ -59,7 +59,7 @@ fn the_host_hook_drops_no_packet() {
 }
 
 #[test]
-fn the_verified_host_programs_can_only_return_one() {
+fn the_verified_host_programs_can_only_return_1() {
     const EXIT: u8 = 0x95;
     const CALL: u8 = 0x85;
     for hook in [Hook::Ingress, Hook::Egress] {
@@ -83,7 +83,7 @@ fn the_verified_host_programs_can_only_return_one() {
 }
 
 #[test]
-fn an_unknown_writer_is_captured_until_its_budget_ends_then_metered_then_only_counted() {
+fn an_unknown_writer_is_captured_within_its_budget_then_metered_then_counted() {
     let mut kernel = Kernel::load();
     let writer = Guid::new(GuidPrefix(*b"\x01\x0fsomebodyxx"), EntityId([0, 0, 1, 3]));
     let frame = |sn| program_run::data(writer, sn, 1000);

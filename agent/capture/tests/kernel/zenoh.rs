@@ -228,8 +228,8 @@ fn pass(connection: &mut [TcpStream; 2], by_client: bool, bytes: &[u8]) -> Resul
     Ok(())
 }
 
-/// Returns what was seen of each direction of a connection: sent and received by the client, then by
-/// the server.
+/// Returns what was seen of each direction of a connection: sent and received by the client, then
+/// by the server.
 fn directions<'a>(
     seen: &'a BTreeMap<StreamId, Seen>,
     connection: &[TcpStream; 2],
@@ -250,7 +250,7 @@ fn directions<'a>(
     ])
 }
 
-/// Returns the batches of a direction, by its place in the result of [`directions`].
+/// Returns the batches of a direction, by its index in the result of [`directions`].
 fn of_direction<'a>(sent: impl Iterator<Item = &'a Sent>, direction: usize) -> Vec<&'a Vec<u8>> {
     sent.filter(|(by_client, _)| *by_client == (direction < 2))
         .map(|(_, batch)| batch)
