@@ -16,21 +16,19 @@ pub use by_owner::{ByOwner, HeapBytes};
 pub use collections::Collection;
 pub use ledger::{Use, ledger};
 
-/// Cap of a table whose size is a key of the configuration or follows from one.
+/// Placeholder for a cap that is a key of the configuration or derives from one.
 pub const CONFIGURED: usize = usize::MAX;
 
 /// Size and cap of a bounded table.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TableFacts {
-    /// `participants`, `endpoints`, `topics`, `nodes`, `writers`, `unknown_writers`, `samples`,
-    /// `reassembly`, `interest`, `deliveries`, `sockets`, `diagnoses`, `spans`, `calls`,
-    /// `chains`, `chain_messages`, `payloads`, `history`.
+    /// Name of the table, such as `participants`; also the label `table` of metrics.
     pub table: &'static str,
     /// Number of entries (bytes for `reassembly` and `payloads`).
     pub size: u64,
-    /// Cap.
+    /// Maximum of `size`.
     pub limit: u64,
-    /// Bytes and their cap, of a table with both.
+    /// Bytes in use and their cap; `None` for a table without a cap in bytes.
     pub bytes: Option<(u64, u64)>,
     /// Entries dropped because of the cap.
     pub evictions: u64,
@@ -43,37 +41,36 @@ pub struct Table {
     pub name: &'static str,
     /// Meaning of the entries.
     pub what: &'static str,
-    /// Largest number of entries.
+    /// Maximum number of entries.
     pub entries: usize,
-    /// Largest number of bytes, including those of the table itself. `None` if the size of an entry
+    /// Maximum number of bytes, including those of the table itself. `None` if the size of an entry
     /// has a bound of its own.
     pub bytes: Option<usize>,
-    /// Effect of a cap.
+    /// Effect when a cap is reached.
     pub rule: Rule,
-    /// Effect in words, where those of the rule do not suffice.
+    /// Description of the effect; empty if that of the rule suffices.
     pub effect: &'static str,
-    /// Metric, or table with series, that counts what a cap refused or removed.
+    /// Metric, or table with series, that counts the refused and removed entries.
     pub reported: &'static str,
 }
 
-/// Effect of a cap on a newcomer.
+/// Effect of a full table on a new entry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rule {
-    /// The newcomer is left out.
+    /// The new entry is left out.
     LeaveOut,
     /// The first entry is dropped: the oldest of a list, the smallest of a tree.
     Oldest,
-    /// The owner with the most bytes loses entries. If that is the newcomer's own, the newcomer is
-    /// left out.
+    /// The owner with the most bytes loses entries. A new entry of that owner is left out.
     LargestOwner,
 }
 
-/// Name of a declaration, as a type.
+/// A declaration of a table, as a type.
 pub trait Declared {
     /// The declaration.
     const TABLE: Table;
 
-    /// Returns the largest number of entries.
+    /// Returns the maximum number of entries.
     fn cap(&self) -> usize {
         Self::TABLE.entries
     }
@@ -105,7 +102,7 @@ pub struct Sum<D> {
 }
 
 impl Table {
-    /// A declaration whose fields apply where they are not given.
+    /// The default values of the fields.
     pub const DEFAULT: Self = Self {
         name: "",
         what: "",
@@ -116,7 +113,7 @@ impl Table {
         reported: "",
     };
 
-    /// Returns the effect of a cap in words, as documented.
+    /// Returns the documented description of what happens at a cap.
     #[must_use]
     pub const fn in_words(&self) -> &'static str {
         match self.rule {
@@ -163,17 +160,17 @@ impl<D: Declared> Default for Counted<D> {
 }
 
 impl<D: Declared, C: Collection> Bounded<D, C> {
-    /// Returns whether a newcomer meets the cap.
+    /// Returns whether the container has reached its cap.
     pub fn is_full(&self) -> bool {
         self.inner.length() >= self.declared.cap()
     }
 
-    /// Counts a newcomer for which the caller knows that there is no room.
+    /// Counts one entry that the cap refused or removed.
     pub fn refuse(&mut self) {
         self.refuse_all(1);
     }
 
-    /// Counts entries for which the caller knows that there is no room.
+    /// Counts entries that the cap refused or removed.
     pub fn refuse_all(&mut self, entries: u64) {
         ledger::refused(&D::TABLE, entries);
         self.declared.count(entries);
@@ -184,8 +181,8 @@ impl<D: Declared, C: Collection> Bounded<D, C> {
         std::mem::take(&mut self.inner)
     }
 
-    /// Returns whether an entry has room that is added next unless the container has it already. The
-    /// rule is not applied: nothing leaves.
+    /// Returns whether the entry is present, according to `has`, or fits. A refusal is counted.
+    /// Nothing is removed, whatever the rule.
     fn has_room_for(&mut self, has: impl Fn(&C) -> bool) -> bool {
         let is_full = self.is_full();
         if (is_full || cfg!(debug_assertions)) && !has(&self.inner) {
@@ -198,8 +195,8 @@ impl<D: Declared, C: Collection> Bounded<D, C> {
         true
     }
 
-    /// Adds an entry and applies the rule. Returns the entry that had no room: the oldest, or the
-    /// newcomer.
+    /// Adds an entry and applies the rule. Returns the entry that the cap refused or removed: the
+    /// new one or the oldest.
     pub fn add(&mut self, entry: C::Entry) -> Option<C::Entry> {
         let is_full = self.is_full() && !self.inner.replaces(&entry);
         if is_full {
@@ -220,7 +217,7 @@ impl<D: Declared, C: Collection> Bounded<D, C> {
 }
 
 impl<D: Declared, C: Collection> Bounded<Counted<D>, C> {
-    /// Creates an empty container with a cap of the configuration.
+    /// Creates an empty container with a cap from the configuration.
     #[must_use]
     pub fn capped(cap: usize) -> Self {
         let mut bounded = Self::default();
@@ -228,7 +225,7 @@ impl<D: Declared, C: Collection> Bounded<Counted<D>, C> {
         bounded
     }
 
-    /// Returns the row of the metrics.
+    /// Returns size, cap and evictions for the metrics.
     pub fn facts(&self) -> TableFacts {
         self.declared.facts(self.inner.length())
     }
@@ -245,7 +242,7 @@ impl<D: Declared> Sum<D> {
         self.used >= self.declared.cap()
     }
 
-    /// Returns what can be added.
+    /// Returns the amount that can be added.
     pub fn room(&self) -> usize {
         self.declared.cap().saturating_sub(self.used)
     }
@@ -258,7 +255,7 @@ impl<D: Declared> Sum<D> {
     /// Adds to the sum.
     pub fn add(&mut self, count: usize) {
         self.used += count;
-        // Above the cap, the caller removes entries before anything else happens.
+        // The sum may exceed the cap until the caller removes entries.
         let cap = self.declared.cap();
         ledger::filled(&D::TABLE, self.used.min(cap), cap);
     }
@@ -273,12 +270,12 @@ impl<D: Declared> Sum<D> {
         self.used = 0;
     }
 
-    /// Counts what the cap refused or removed.
+    /// Counts one entry that the cap refused or removed.
     pub fn refuse(&mut self) {
         self.refuse_all(1);
     }
 
-    /// Counts entries for which the caller knows that there is no room.
+    /// Counts entries that the cap refused or removed.
     pub fn refuse_all(&mut self, entries: u64) {
         ledger::refused(&D::TABLE, entries);
         self.declared.count(entries);
@@ -286,7 +283,7 @@ impl<D: Declared> Sum<D> {
 }
 
 impl<D: Declared> Sum<Counted<D>> {
-    /// Creates a sum of zero with a cap of the configuration.
+    /// Creates a sum of zero with a cap from the configuration.
     #[must_use]
     pub fn capped(cap: usize) -> Self {
         let mut sum = Self::default();
@@ -294,7 +291,7 @@ impl<D: Declared> Sum<Counted<D>> {
         sum
     }
 
-    /// Returns the row of the metrics.
+    /// Returns sum, cap and evictions for the metrics.
     pub fn facts(&self) -> TableFacts {
         self.declared.facts(self.used)
     }
@@ -351,14 +348,14 @@ where
     }
 }
 
-/// Notes a sum in the ledger that the caller computes and keeps within the cap.
+/// Records in the ledger a sum that the caller computes and keeps within the cap.
 #[inline]
 pub fn note<D: Declared>(sum: usize) {
     ledger::filled(&D::TABLE, sum, D::TABLE.entries);
 }
 
-/// Declares tables: a type for each, and their list `ALL`. The comment is the meaning of the
-/// entries; fields that are not given are those of [`Table::DEFAULT`].
+/// Declares tables: a type for each, and their list `ALL`. The doc comment describes the entries.
+/// Omitted fields have the values of [`Table::DEFAULT`].
 #[macro_export]
 macro_rules! tables {
     ($(#[doc = $what:literal] $name:ident { $($field:ident: $value:expr),* $(,)? })*) => {
@@ -368,7 +365,7 @@ macro_rules! tables {
             pub struct $name;
 
             impl $name {
-                /// Largest number of entries.
+                /// Maximum number of entries.
                 #[allow(dead_code, reason = "a container may suffice that knows it")]
                 pub const CAP: usize = <Self as $crate::facts::bounded::Declared>::TABLE.entries;
             }
@@ -408,7 +405,7 @@ mod tests {
     use declared::{Few, Ring};
 
     #[test]
-    fn the_oldest_leaves_a_list_and_a_tree() {
+    fn a_full_list_or_tree_drops_its_oldest_entry() {
         let mut list: Bounded<Ring, VecDeque<u32>> = Bounded::default();
         let left: Vec<_> = (0..5).filter_map(|number| list.push_back(number)).collect();
         assert_eq!((left, list.len()), (vec![0, 1], 3));
@@ -424,7 +421,7 @@ mod tests {
     }
 
     #[test]
-    fn a_newcomer_is_left_out_and_counted_and_a_known_key_has_room() {
+    fn a_full_map_refuses_new_keys_and_updates_known_keys() {
         let mut map: Bounded<Counted<Few>, HashMap<u32, u32>> = Bounded::capped(2);
         assert!(map.insert(1, 1).is_none() && map.insert(2, 1).is_none());
         assert_eq!(map.insert(3, 1), Some((3, 1)));
@@ -438,7 +435,7 @@ mod tests {
     }
 
     #[test]
-    fn the_ledger_has_the_largest_length_and_what_had_no_room() {
+    fn the_ledger_records_the_largest_length_and_the_refused_entries() {
         let mut list: Bounded<Few, Vec<u32>> = Bounded::default();
         for number in 0..5 {
             list.push(number);

@@ -25,7 +25,7 @@ pub enum Entity {
 /// Kind of the change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Event {
-    /// Announced for the first time, or again after it had gone.
+    /// Announced for the first time, or again after its removal.
     Appeared,
     /// Announced with other properties.
     Changed,

@@ -3,8 +3,8 @@
 //!
 //! Findings are computed when discovery changes, topic by topic. Endpoints with equal properties
 //! are grouped. Both the computing steps and the list of findings are bounded, and omitted findings
-//! are counted. A finding is a value, so comparing two lists yields the changes ([`changes`]). The
-//! severity of a finding is decided elsewhere.
+//! are counted. A finding is a value, so comparing two lists yields the changes ([`changes`]). A
+//! finding has no severity; the surfaces assign it.
 
 mod matching;
 
@@ -99,7 +99,8 @@ pub enum Diagnosis {
         /// GUID of the client's writer.
         writer: Guid,
     },
-    /// A node whose endpoints or names are in several domains, so nodes of one domain miss some.
+    /// A node whose endpoints or names are in several domains. Nodes of one domain cannot reach all
+    /// of its endpoints.
     NodeInSeveralDomains {
         /// Fully qualified name.
         node: NodeName,
@@ -114,7 +115,7 @@ pub enum Diagnosis {
         topic: Option<TopicKey>,
         /// The callback.
         callback: Owner,
-        /// What triggers it.
+        /// Trigger of the callback.
         trigger: Trigger,
         /// 99th percentile of its duration.
         duration: Duration,
@@ -129,7 +130,7 @@ pub enum Diagnosis {
         topic: Option<TopicKey>,
         /// The callback.
         callback: Owner,
-        /// What triggers it.
+        /// Trigger of the callback.
         trigger: Trigger,
         /// 99th percentile of its wait.
         wait: Duration,
@@ -140,7 +141,7 @@ pub enum Diagnosis {
         topic: TopicKey,
         /// The subscription's queue.
         queue: Owner,
-        /// Overwritten messages of 1000 that entered the queue.
+        /// Overwritten messages per 1000 that entered the queue.
         overwritten_permille: u64,
     },
     /// A process takes its messages so slowly that the middleware drops some from the queue of its
@@ -150,9 +151,9 @@ pub enum Diagnosis {
         topic: TopicKey,
         /// The subscription.
         queue: Owner,
-        /// Lost messages of 1000 that arrived.
+        /// Lost messages per 1000 that arrived.
         lost_permille: u64,
-        /// Messages that the queue keeps, if that is announced.
+        /// Maximum number of messages in the queue, if announced.
         depth: Option<u64>,
     },
     /// A process makes more calls than its budget allows, and they are no longer counted.
@@ -173,13 +174,13 @@ pub enum Diagnosis {
         /// Input with the same rate, whose stamps are older.
         input: TopicName,
     },
-    /// A configured chain takes longer than it may.
+    /// A configured chain exceeds its maximum latency.
     SlowChain {
         /// Last topic of the chain.
         topic: TopicKey,
         /// First topic of the chain.
         from: TopicName,
-        /// Longest time that it may take.
+        /// Maximum latency of the chain.
         max_latency: Duration,
     },
 }
@@ -295,7 +296,8 @@ impl Diagnosis {
         }
     }
 
-    /// Compares identities only, without details. Consistent with the order of the list.
+    /// Compares identities only, without details. The result is consistent with the order of the
+    /// list.
     #[must_use]
     pub fn cmp_identity(&self, other: &Self) -> Ordering {
         let place = |diagnosis: &Self| {
@@ -374,7 +376,7 @@ impl Unmatched {
     }
 }
 
-/// Returns the differences between two sorted lists, in their order.
+/// Returns the differences between two sorted lists, in the order of the lists.
 pub fn changes<'a>(
     before: &'a [Diagnosis],
     after: &'a [Diagnosis],
@@ -434,7 +436,7 @@ mod tests {
     }
 
     #[test]
-    fn two_lists_yield_added_changed_and_removed_findings() {
+    fn comparing_two_lists_yields_added_changed_and_removed_findings() {
         let before = [
             duplicate("/b"),
             unmatched("/a", 1, Unmatched::NoEndpoint),
@@ -459,7 +461,7 @@ mod tests {
     }
 
     #[test]
-    fn identity_agrees_with_the_order_of_the_list() {
+    fn comparing_identities_gives_the_order_of_the_list() {
         let mut all = [
             unmatched("/b", 1, Unmatched::NoEndpoint),
             unmatched("/a", 2, Unmatched::Qos),

@@ -41,12 +41,13 @@ pub struct Offered {
 pub struct Sample<T = Timestamp> {
     /// Its topic.
     pub topic: Arc<Topic>,
-    /// Capture time of the completing datagram. If the sample waited for a lower number, the time
-    /// at which that arrived or was given up. It never decreases for one writer.
+    /// Capture time of the datagram that completed the sample. If the sample waited for a lower
+    /// number, it is the time at which that number arrived or was given up. It never decreases for
+    /// one writer.
     pub time: T,
     /// GUID of its writer.
     pub writer: Guid,
-    /// Its sequence number, counted by the writer.
+    /// Its sequence number, assigned by the writer.
     pub sequence_number: SequenceNumber,
     /// INFO_TS: time of writing, by the writer's clock.
     pub source_timestamp: Option<Timestamp>,
@@ -54,7 +55,8 @@ pub struct Sample<T = Timestamp> {
     pub header_stamp: Option<(i32, u32)>,
     /// Size of the serialized payload in bytes, including encapsulation and padding.
     pub size: u32,
-    /// Sampled from shared memory: missing numbers before it may still have been sent.
+    /// Whether it was sampled from shared memory. Missing numbers before it may then have been
+    /// sent.
     pub sampled: bool,
     /// The payload, including encapsulation; `None` if the request excludes payloads.
     pub payload: Option<Bytes>,
@@ -104,7 +106,7 @@ pub enum MissedReason {
     Lost,
     /// It arrived before its writer's announcement and was not sent again.
     Unannounced,
-    /// It was counted, but its bytes were not captured or found no memory.
+    /// It was counted, but its bytes were not captured or were dropped for lack of memory.
     NotCaptured,
     /// The subscription's reader was too slow.
     QueueFull,

@@ -2,7 +2,7 @@
 //! lost samples, changes of expectations.
 //!
 //! Events are facts; the surface adds names, severities and attributes. Each class has its own
-//! bound per second, so a storm of one class leaves room for the others. Events beyond the bound
+//! bound per second, so a storm of one class does not displace the others. Events beyond the bound
 //! are counted. Seconds follow the source's clock, so a capture yields the same events at any
 //! replay speed.
 
@@ -24,13 +24,13 @@ use crate::facts::tables::{LosingReceivers, LossBursts, WaitingEvents};
 use crate::facts::wall_clock::WallClock;
 use crate::facts::watch::WatchState;
 
-/// Largest number of events per class and second of the source's clock.
+/// Maximum number of events per class and second of the source's clock.
 const MOST: u16 = 512;
 /// Number of waiting events above which they should be taken before further input.
 const MANY: usize = 1024;
-/// Longest text kept in an event, such as a topic's name.
+/// Maximum length of a text in an event, such as a topic's name, in bytes.
 pub(crate) const TEXT: usize = 256;
-/// Longest list kept in an event, such as the participants of a duplicate node.
+/// Maximum length of a list in an event, such as the participants of a duplicate node.
 const LIST: usize = 8;
 
 /// An event.
@@ -225,8 +225,8 @@ impl Events {
     pub fn push(&mut self, at: ModelTime, kind: EventKind) {
         let quota = self.classes.entry(kind.class()).or_default();
         let second = at.whole_seconds();
-        // A late decision may belong to the second before. An earlier second means that the clock
-        // was set.
+        // A late decision may belong to the previous second. A second before that means that the
+        // clock was set.
         if second != quota.second && second.checked_add(1) != Some(quota.second) {
             (quota.second, quota.in_second) = (second, 0);
         }
@@ -308,7 +308,7 @@ impl Events {
         Some(burst)
     }
 
-    /// Sets the topic of the burst of a writer that is gone.
+    /// Sets the topic of the burst of a writer that was removed.
     pub fn name(&mut self, writer: Guid, domain_id: DomainId, topic: &DdsName) {
         if let Some(burst) = self.bursts.get_mut(&writer) {
             burst.losses.topic = Some((domain_id, topic.clone()));
@@ -338,14 +338,14 @@ impl Events {
     }
 }
 
-/// Returns the text, truncated to the longest that is kept.
+/// Returns the text, truncated to the maximum length in an event.
 #[must_use]
 pub fn bounded(text: &str) -> &str {
     text.get(..text.floor_char_boundary(TEXT))
         .unwrap_or_default()
 }
 
-/// Returns the finding, with its lists truncated to the longest that are kept.
+/// Returns the finding, with its lists truncated to the maximum length in an event.
 #[must_use]
 pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
     let mut finding = finding.clone();
@@ -399,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn losses_of_one_writer_are_reported_once_until_the_burst_ends() {
+    fn losses_of_one_writer_become_one_event_when_the_burst_ends() {
         let mut events = Events::default();
         events.lose(&loss(guid(1), 10, 5, 7));
         events.lose(&loss(guid(2), 11, 1, 1));
@@ -440,7 +440,7 @@ mod tests {
     }
 
     #[test]
-    fn a_storm_of_one_class_leaves_room_for_the_others_and_is_counted() {
+    fn a_storm_of_one_class_is_counted_and_does_not_displace_the_others() {
         let mut events = Events::default();
         for number in 0..MOST + 7 {
             events.push(ModelTime::from_nanoseconds(number.into()), node("/a"));
@@ -492,7 +492,7 @@ mod tests {
     }
 
     #[test]
-    fn more_receivers_that_lose_than_are_compared_stay_bounded() {
+    fn losing_receivers_beyond_the_cap_are_not_compared() {
         let mut events = Events::default();
         for number in 0..100 {
             let receiver = Receiver::Participant(GuidPrefix([number; 12]));
@@ -503,7 +503,7 @@ mod tests {
     }
 
     #[test]
-    fn kept_texts_are_cut_between_characters() {
+    fn long_texts_are_truncated_between_characters() {
         let long: TopicName = "\u{e9}".repeat(5_000).into();
         assert_eq!(bounded(&long).len(), TEXT);
         assert_eq!(long.bounded(TEXT).len(), TEXT);

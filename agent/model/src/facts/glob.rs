@@ -30,7 +30,7 @@ fn covers_tokens(pattern: &str, name: &str) -> bool {
     };
     let (between, last) = others.rsplit_once(ANY_TOKENS).unwrap_or(("", others));
     if last.is_empty() {
-        // `**` covers these tokens; the groups before it match the rest.
+        // The final `**` covers the last tokens; the groups before it match the others.
         let Some(end) = rest.rfind('/') else {
             return false;
         };
@@ -45,7 +45,8 @@ fn covers_tokens(pattern: &str, name: &str) -> bool {
     strip_tokens(after, last) == Some("") && strip_runs(rest, between).is_some()
 }
 
-/// Returns the rest of `name` after the first positions at which these groups match in order.
+/// Returns the rest of `name` after the first positions at which the groups of `runs` match in
+/// order.
 fn strip_runs<'a>(name: &'a str, runs: &str) -> Option<&'a str> {
     let mut rest = name;
     for run in runs.split(ANY_TOKENS).filter(|run| !run.is_empty()) {
@@ -123,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn stars_stand_for_characters_and_double_stars_for_tokens() {
+    fn a_star_matches_characters_and_a_double_star_matches_tokens() {
         for (pattern, name, expected) in [
             ("/points", "/points", true),
             ("/points", "/points2", false),
@@ -156,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pattern_full_of_stars_costs_no_more_than_its_text() {
+    fn a_pattern_full_of_stars_is_matched_in_a_short_time() {
         let pattern = format!("/{}", "*a".repeat(127));
         let name = format!("/{}b", "a".repeat(253));
         // A backtracking matcher would not finish here, and an automaton would take megabytes.
@@ -165,7 +166,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_pattern_covers_what_an_automaton_finds(
+        fn any_pattern_matches_the_same_names_as_an_automaton(
             pattern in "(/(\\*\\*|[ab*]{1,4})){1,6}",
             name in "[ab]{0,2}(/[ab]{0,4}){0,7}",
         ) {
@@ -176,7 +177,7 @@ mod tests {
         }
 
         #[test]
-        fn no_name_or_pattern_makes_it_panic(pattern in ".{0,40}", name in ".{0,40}") {
+        fn arbitrary_names_and_patterns_do_not_panic(pattern in ".{0,40}", name in ".{0,40}") {
             let _ = covers(&pattern, &name);
         }
     }

@@ -89,7 +89,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_list_can_be_searched() {
+    fn listed_types_begin_with_a_header_and_others_do_not() {
         assert!(OTHERS.is_sorted());
         for name in [
             "sensor_msgs/msg/Imu",
@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn simulated_time_is_no_latency() {
+    fn stamps_in_simulated_time_are_ignored() {
         let now = Timestamp(1_795_143_000_000_000_000);
         assert_eq!(stamp_time((12, 0), now), None);
         assert_eq!(stamp_time((-1, 0), now), None);

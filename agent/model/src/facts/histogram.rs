@@ -33,8 +33,8 @@ impl Histogram {
         }
     }
 
-    /// Creates a histogram from another kind of distribution: `up_to` returns the number of values
-    /// of at most a bound, `range` the smallest and largest value in seconds. Values just below a
+    /// Creates a histogram from another kind of distribution. `up_to` returns the number of values
+    /// up to a bound. `range` is the smallest and largest value in seconds. Values just below a
     /// bound may be counted above it.
     #[must_use]
     pub fn of(up_to: impl Fn(f64) -> u64, count: u64, sum: f64, range: (f64, f64)) -> Self {
@@ -95,12 +95,13 @@ impl Histogram {
         self.maximum = self.maximum.max(other.maximum);
     }
 
-    /// Returns the values added since `earlier`, an older state of this histogram. Its range is as
-    /// narrow as both states show: exact for a single value, and for a new extreme.
+    /// Returns the values added since `earlier`, an older state of this histogram. The range of the
+    /// result is as narrow as the two states allow. It is exact for a single value and for a new
+    /// extreme.
     #[must_use]
     pub fn since(&self, earlier: &Self) -> Self {
         let mut difference = *self;
-        // The histogram was reset, so all values are new.
+        // After a reset, all values are new.
         if self.count() < earlier.count() {
             return difference;
         }
@@ -115,8 +116,8 @@ impl Histogram {
         difference
     }
 
-    /// Estimates the value below which this share of the values lies: values are spread evenly
-    /// between the bounds of a bucket, within the range. Above the last bound it lies between that
+    /// Estimates the quantile `part`, from 0 to 1. Values are assumed to be spread evenly within
+    /// each bucket, limited to the range. Above the last bound, the estimate lies between that
     /// bound and the largest value. Returns `None` if the histogram is empty.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "counts far below 2^52")]
@@ -174,7 +175,7 @@ impl Histogram {
         let mut least = self.minimum.max(lowest.0).min(lowest.1);
         let mut largest = self.maximum.max(highest.0).min(highest.1);
         if is_largest_open {
-            // All others are as small as they can be.
+            // The bound assumes that all other values are as small as possible.
             let start = highest.0.max(least);
             let all = self
                 .filled()
@@ -183,7 +184,7 @@ impl Histogram {
             largest = largest.min((self.sum - others).max(start));
         }
         if is_least_open {
-            // All others are as large as they can be.
+            // The bound assumes that all other values are as large as possible.
             let others = (self.count() - 1) as f64 * largest;
             least = least.max((self.sum - others).min(lowest.1));
         }
@@ -220,7 +221,7 @@ mod tests {
         histogram
     }
 
-    /// Fails if a quantile lies outside of the range, or decreases.
+    /// Fails if a quantile lies outside the range, or decreases.
     fn check(histogram: &Histogram) {
         let Some((least, largest)) = histogram.range() else {
             assert_eq!((histogram.count(), histogram.quantile(0.5)), (0, None));
@@ -235,7 +236,7 @@ mod tests {
         }
     }
 
-    /// Seconds of any magnitude, and what no clock shows.
+    /// Seconds of any magnitude, and values such as NaN that no clock shows.
     fn any_seconds() -> impl Strategy<Value = f64> {
         let usual = (-9.0..9.0_f64).prop_map(|power| 10_f64.powf(power));
         prop_oneof![6 => usual, 1 => any::<f64>(), 1 => Just(f64::NAN), 1 => Just(f64::INFINITY)]
@@ -243,7 +244,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_value_stops_a_quantile(
+        fn any_values_have_quantiles_within_their_range(
             first in prop::collection::vec(any_seconds(), 0..20),
             then in prop::collection::vec(any_seconds(), 0..20),
             is_fine: bool,
@@ -294,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bound_belongs_to_its_own_bucket() {
+    fn a_value_equal_to_a_bound_counts_below_it() {
         let mut histogram = Histogram::default();
         histogram.observe(0.001);
         histogram.observe(0.0011);
@@ -321,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn later_counts_are_a_difference() {
+    fn since_returns_only_values_added_later() {
         let mut histogram = Histogram::default();
         histogram.observe(0.0015);
         let earlier = histogram;
@@ -338,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn merging_adds_up() {
+    fn a_merge_adds_counts_and_sums_and_widens_the_range() {
         let (mut one, mut two) = (Histogram::default(), Histogram::default());
         one.observe(0.01);
         two.observe(3.0);

@@ -47,7 +47,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn identities_are_the_same_as_in_the_last_version() {
+    fn identities_do_not_change_between_versions() {
         let mut identity = Identity::of(b"kind");
         identity.add(b"one");
         assert_eq!(
@@ -57,7 +57,7 @@ mod tests {
     }
 
     #[test]
-    fn neighbours_get_identities_apart_in_every_part() {
+    fn adjacent_inputs_get_identities_that_differ_in_every_part() {
         let bits = |number: u64| {
             let mut identity = Identity::of(b"kind");
             identity.add(&number.to_be_bytes());

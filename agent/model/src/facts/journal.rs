@@ -77,7 +77,7 @@ impl Journal {
         self.discovery.push_back(event);
     }
 
-    /// Keeps samples that subscriptions will not receive until the next [`Self::take_missing`].
+    /// Records samples that subscriptions will not receive, until the next [`Self::take_missing`].
     pub fn leave_missing(&mut self, missing: Missing) {
         if let Some(last) = self.missing.last_mut()
             && (last.writer, last.reason) == (missing.writer, missing.reason)
@@ -95,8 +95,8 @@ impl Journal {
         self.missing.take()
     }
 
-    /// Adds a loss, extending the last entry if the loss continues it. It becomes an event unless
-    /// its receivers report it.
+    /// Adds a loss, extending the last entry if the loss continues it. The loss becomes an event
+    /// unless its receivers report it.
     pub fn lose(&mut self, loss: Loss, has_receivers: bool) {
         if !has_receivers {
             self.events.lose(&loss);

@@ -52,7 +52,7 @@ pub struct Row {
     pub reached: &'static str,
     /// Metric with more details than `ros2probe_limit_reached_total`; empty without one.
     pub metric: &'static str,
-    /// Largest memory per entry in bytes, for names of usual length, including two snapshots and
+    /// Maximum memory per entry in bytes, for names of usual length, including two snapshots and
     /// two metrics pages; 1 if the limit counts bytes.
     pub bytes: usize,
 }
@@ -328,16 +328,17 @@ impl Limits {
     /// of viewers are included.
     pub const BESIDE: usize = 33 << 20;
 
-    /// Memory of Zenoh at its caps, in bytes: tables with a cap in bytes (42 MiB), messages in
-    /// FRAGMENTs (20 MiB), and batches and segments that wait for their rest (20 MiB).
+    /// Memory of Zenoh at its caps, in bytes. It consists of tables with a cap in bytes (42 MiB),
+    /// messages in FRAGMENTs (20 MiB), and incomplete batches and waiting segments (20 MiB).
     pub const ZENOH: usize = 82 << 20;
 
-    /// Memory of the last messages of transient-local writers, in bytes: kept ones (16 MiB), those in
-    /// pieces (4 MiB), and the writers.
+    /// Memory of the last messages of transient-local writers, in bytes: kept messages (16 MiB),
+    /// incomplete ones (4 MiB), and the writers.
     pub const LATCHED: usize = 21 << 20;
 
-    /// Memory of calls inside processes at the caps of their tables, in bytes: processes, handles
-    /// and what snapshots and pages have of them (69 MiB), and the kernel's tables (7 MiB).
+    /// Memory of calls inside processes at the caps of their tables, in bytes. Processes and
+    /// handles, with their copies in snapshots and pages, take 69 MiB, and the kernel's tables 7
+    /// MiB.
     pub const INSIDE: usize = 76 << 20;
 
     /// Returns the memory in bytes that all limits together allow.

@@ -1,7 +1,7 @@
 //! Lost samples, and where they were lost as far as this host can observe.
 //!
-//! Causes are mutually exclusive: a sample with several has the one nearest to the reader. The
-//! counts of all causes therefore add up to the losses.
+//! Causes are mutually exclusive: a sample with several causes counts for the one nearest to the
+//! reader. The counts of all causes therefore add up to the losses.
 
 use std::net::SocketAddr;
 

@@ -1,15 +1,15 @@
-//! The loss of a topic, as a subscriber means it: the share that its worst subscriber lost.
+//! The loss of a topic: the share of samples that its worst subscriber lost.
 //!
 //! [`LossShare::worst`] is the only definition. Expectations, events, history, API and clients use
-//! its result. A subscriber loses a sample wherever it was lost: before this host, in reassembly or
-//! in the buffer of its socket. Where no delivery is observed, as for shared memory, the samples
-//! that a writer sent and that did not reach this host are the loss.
+//! its result. A subscriber's loss includes every cause: before this host, in reassembly, and in
+//! the buffer of its socket. Where no delivery is observed, as for shared memory, the loss is the
+//! sent samples that did not reach this host.
 
-/// Number of seconds in which the worst subscriber is chosen, and over which expectations about
-/// loss are evaluated.
+/// Number of seconds over which the worst subscriber is chosen and expectations about loss are
+/// evaluated.
 pub const SECONDS: usize = crate::facts::rate::SECONDS as usize;
 
-/// Samples that a subscriber expected, and those among them that it lost.
+/// Numbers of samples that a subscriber expected and lost.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LossShare {
     /// Lost samples.
@@ -18,7 +18,7 @@ pub struct LossShare {
     pub expected: u64,
 }
 
-/// The share of each of the last seconds, from counters that are read once a second.
+/// The loss share of each of the last seconds, from counters that are read once a second.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct RecentLoss {
     /// The counters at the end of the last second.
@@ -38,7 +38,7 @@ pub struct TopicLoss {
     pub window: LossShare,
     /// Samples that did not reach this host.
     pub(crate) unreached: RecentLoss,
-    /// Share of subscribers of a writer that left in this second.
+    /// Largest loss of a writer that left in this second.
     pub(crate) departed: LossShare,
 }
 
@@ -59,14 +59,14 @@ impl LossShare {
         self.ratio().is_some_and(|ratio| ratio > maximum)
     }
 
-    /// Adds the counts of the same subscriber.
+    /// Adds other counts of the same subscriber.
     pub const fn add(&mut self, other: Self) {
         self.lost += other.lost;
         self.expected += other.expected;
     }
 
-    /// Returns the item whose first share has the highest ratio, the first among equals. Subscribers
-    /// that expected nothing have no share.
+    /// Returns the subscriber with the highest ratio, and the first of several equal ones.
+    /// Subscribers that expected nothing are ignored.
     pub fn worst<T>(subscribers: impl Iterator<Item = (Self, T)>) -> Option<(Self, T)> {
         let losers = subscribers.filter(|(share, _)| share.expected > 0);
         losers.reduce(|worst, each| {
@@ -78,7 +78,7 @@ impl LossShare {
         })
     }
 
-    /// Returns whether the ratio is higher. Both shares expect samples.
+    /// Returns whether the ratio is higher than that of `than`. Both shares must expect samples.
     fn is_worse(self, than: Self) -> bool {
         let product = |lost: u64, expected: u64| u128::from(lost) * u128::from(expected);
         product(self.lost, than.expected) > product(than.lost, self.expected)
@@ -86,8 +86,8 @@ impl LossShare {
 }
 
 impl RecentLoss {
-    /// Ends a second at which the counters have these values. A sample that arrives after it was
-    /// counted as lost is subtracted from the seconds before.
+    /// Ends a second with the counters at `now`. A sample that arrives after it was counted as lost
+    /// is subtracted from earlier seconds.
     pub fn end_second(&mut self, now: LossShare) {
         self.last = (self.last + 1) % SECONDS;
         let lost = now.lost.saturating_sub(self.before.lost);
@@ -106,12 +106,12 @@ impl RecentLoss {
         }
     }
 
-    /// Begins to count at these values.
+    /// Starts counting at `now`.
     pub const fn begin(&mut self, now: LossShare) {
         self.before = now;
     }
 
-    /// Returns the share since the last second ended, for counters with these values.
+    /// Returns the share between the end of the last second and `now`.
     #[must_use]
     pub const fn since(&self, now: LossShare) -> LossShare {
         LossShare {
@@ -120,7 +120,7 @@ impl RecentLoss {
         }
     }
 
-    /// Merges the seconds of `other`, whose counters are added to these.
+    /// Adds the seconds and counters of `other`.
     pub fn absorb(&mut self, other: &Self) {
         self.before.add(other.before);
         for back in 0..SECONDS {
@@ -157,8 +157,8 @@ impl RecentLoss {
 }
 
 impl TopicLoss {
-    /// Ends a second, with the window and the last second of each subscriber, and the counters of
-    /// samples that did not reach this host.
+    /// Ends a second. `subscribers` has the window and the last second of each subscriber.
+    /// `unreached` counts samples that did not reach this host.
     pub fn end_second(
         &mut self,
         subscribers: impl Iterator<Item = (LossShare, LossShare)>,
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn a_repair_is_taken_from_the_second_that_counted_the_loss() {
+    fn a_late_sample_is_subtracted_from_the_second_that_counted_its_loss() {
         let mut recent = RecentLoss::default();
         recent.end_second(share_of(3, 10));
         recent.end_second(share_of(3, 20));
@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn merged_counters_keep_their_seconds_apart() {
+    fn merged_counters_are_added_second_by_second() {
         let (mut one, mut other) = (RecentLoss::default(), RecentLoss::default());
         one.end_second(share_of(1, 10));
         other.end_second(share_of(2, 20));

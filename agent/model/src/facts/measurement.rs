@@ -1,4 +1,4 @@
-//! Counts of a writer, a topic and a delivery, and the time that samples spent in each stage. These
+//! Counts of a writer, a topic and a delivery, and the time that samples spent in each stage. All
 //! are plain values that can be added; the measuring modules fill them.
 
 use crate::facts::histogram::Histogram;
@@ -11,7 +11,7 @@ use crate::facts::model_time::ModelTime;
 pub struct Measurement {
     /// Samples received whole, without duplicates.
     pub messages: u64,
-    /// Their payload bytes, including encapsulation (as `ros2 topic bw` counts).
+    /// Payload bytes of all messages, including encapsulation (as `ros2 topic bw` counts).
     pub bytes: u64,
     /// Samples settled as lost: a gap that was neither excused nor filled in time.
     pub lost: u64,
@@ -46,11 +46,11 @@ pub struct Measurement {
     pub implausible_latency: u64,
     /// Jumps of the sequence number that a single record suggests but does not prove.
     pub sequence_jumps: u64,
-    /// Part of `messages`, `bytes` and `lost` that belongs to an earlier time than the second in which
-    /// it was added: figures per second leave it out.
+    /// Part of `messages`, `bytes` and `lost` that belongs to seconds before the one in which it
+    /// was added. Figures per second omit it.
     pub earlier: EarlierCounts,
     /// Present if some samples were read from shared memory. Messages are then counted by the span
-    /// of their numbers, and times are those of the samples that were read.
+    /// of their numbers, and times come from the samples that were read.
     pub sampled: Option<SampledFacts>,
 }
 
@@ -73,19 +73,19 @@ pub struct SampledFacts {
     pub seen: u64,
     /// Samples that were written, by their sequence numbers.
     pub span: u64,
-    /// How often the polling gap was so long that a sample may have been missed unnoticed.
+    /// Number of polling gaps so long that a sample may have been missed unnoticed.
     pub uncertain: u64,
 }
 
 /// Samples of one or several deliveries. No field except `pending` and `awaited` ever decreases.
 ///
 /// `messages - history + lost() + irrelevant` is the number of samples that were decided since the
-/// delivery began. `awaited` has those that are not decided.
+/// delivery began. `awaited` is the number of samples that are not yet decided.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Delivered {
     /// Samples that arrived (or left) whole, without duplicates.
     pub messages: u64,
-    /// Their payload bytes, including encapsulation.
+    /// Payload bytes of all messages, including encapsulation.
     pub bytes: u64,
     /// Part of `messages`: samples older than the delivery, as late joiners request them.
     pub history: u64,

@@ -13,12 +13,12 @@ use ros2probe_wire::time::{SECOND, nanoseconds};
 pub struct ModelTime(u64);
 
 impl ModelTime {
-    /// The earliest time, before anything is seen.
+    /// The earliest time, before any observation.
     pub const ZERO: Self = Self(0);
     /// The latest time.
     pub const MAX: Self = Self(u64::MAX);
 
-    /// Returns a time by its nanoseconds, which are not those of the wall clock.
+    /// Creates a time from nanoseconds of model time, not of the wall clock.
     #[must_use]
     pub const fn from_nanoseconds(nanoseconds: u64) -> Self {
         Self(nanoseconds)
@@ -37,13 +37,13 @@ impl ModelTime {
         self.0.wrapping_sub(earlier.0).cast_signed()
     }
 
-    /// Returns the begin of a second, by its number.
+    /// Returns the start of the second with this number.
     #[must_use]
     pub const fn of_second(second: u64) -> Self {
         Self(second.saturating_mul(SECOND))
     }
 
-    /// Returns the number of the second that it belongs to.
+    /// Returns the number of the second that contains the time.
     #[inline]
     #[must_use]
     pub const fn whole_seconds(self) -> u64 {
@@ -60,8 +60,8 @@ impl ModelTime {
         Self(self.0 - rest)
     }
 
-    /// Returns the first multiple of `interval` that is not earlier; the time itself if the interval
-    /// is zero.
+    /// Returns the first multiple of `interval` that is not earlier; the time itself if the
+    /// interval is zero.
     #[must_use]
     pub fn round_up(self, interval: Duration) -> Self {
         let begin = self.round_down(interval);

@@ -129,7 +129,7 @@ name!(
 );
 
 impl TopicName {
-    /// Returns the DDS name as the name of a topic that has none in ROS.
+    /// Returns the DDS name as the name of a topic without a ROS name.
     #[must_use]
     pub fn of_dds(name: &DdsName) -> Self {
         Self(name.shared())

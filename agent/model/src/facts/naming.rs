@@ -16,7 +16,7 @@ pub struct Naming {
     pub name: TopicName,
     /// Role of the topic in ROS.
     pub kind: TopicKind,
-    /// Hidden by ROS convention.
+    /// Whether the topic is hidden by ROS convention.
     pub hidden: bool,
     /// Whether the endpoint belongs to a buffer topic and is not a publisher of the base topic.
     pub is_buffer: bool,

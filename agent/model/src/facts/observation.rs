@@ -1,7 +1,7 @@
-//! What the model counts: one submessage that a source saw, with its time, endpoints and path.
+//! The unit that the model counts: one submessage that a source saw, with time, endpoints and path.
 //!
-//! A message of Zenoh is an observation of a DATA. The kernel's record, whose words and flags have
-//! several meanings, ends in the module `record`; the rest of the model sees these types.
+//! A Zenoh message becomes an observation of a DATA. Words and flags of the kernel's record have
+//! several meanings. Only the module `record` reads them; the rest of the model uses these types.
 
 mod record;
 
@@ -32,20 +32,20 @@ pub enum Observation {
     Presence(Head),
 }
 
-/// What all observations have: the time, the endpoints and the path.
+/// Fields that all observations have: the time, the endpoints and the path.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Head {
     /// Time of the last datagram.
     pub at: ModelTime,
-    /// Nanoseconds from the first datagram to the last; `u32::MAX` = that or more.
+    /// Nanoseconds from the first datagram to the last; `u32::MAX` means at least that many.
     pub elapsed: u32,
     /// The writer.
     pub writer: Guid,
-    /// The reader; unknown if it is sent to all matched readers.
+    /// The reader; unknown for a submessage to all matched readers.
     pub reader: Guid,
     /// Where it was seen.
     pub path: Path,
-    /// Whether it was leaving its host.
+    /// Direction of the datagram: sent or received.
     pub direction: Direction,
     /// Cookie of the socket that sends or receives it; 0 = unknown.
     pub socket: u64,
@@ -66,12 +66,13 @@ pub enum Path {
     Socket,
     /// In shared memory of this host.
     SharedMemory {
-        /// Whether its sender was observed, which shows every message. Polling misses some.
+        /// Whether a probe in the sender saw it. A probe sees every message; polling misses some.
         exact: bool,
     },
     /// On a TCP connection of Zenoh: a copy is for another receiver, never a repetition.
     Stream {
-        /// Whether it leads to a router, which passes messages on and is no subscriber.
+        /// Whether the connection leads to a router, which forwards messages and is not a
+        /// subscriber.
         relayed: bool,
         /// Whether it was seen at a socket of this host, not on an interface.
         at_socket: bool,
@@ -89,16 +90,16 @@ pub struct Sample {
     pub source_timestamp: RtpsTime,
     /// PID_STATUS_INFO of the inline QoS, [`StatusInfo::ALIVE`] if absent (RTPS 2.5, 9.6.4.9).
     pub status_info: StatusInfo,
-    /// Whether the payload is a value, not a key or nothing.
+    /// Whether the payload is a value, not a key and not empty.
     pub has_value: bool,
     /// Whether the beginning of the payload is known; a long inline QoS hides it.
     pub has_known_begin: bool,
     /// `std_msgs/Header.stamp` as seconds and nanoseconds, if the payload begins with one. `None`
     /// if the payload's first bytes were not seen or cannot be a stamp.
     pub header_stamp: Option<(i32, u32)>,
-    /// Whether the kernel delivered the datagram.
+    /// What the kernel did with the datagram.
     pub fate: DatagramFate,
-    /// The submessage.
+    /// The submessage and its sizes.
     pub content: Content,
 }
 
@@ -110,7 +111,7 @@ pub enum Content {
         /// Bytes of serialized payload, encapsulation included.
         size: u32,
     },
-    /// Consecutive fragments of it.
+    /// Consecutive fragments of the sample.
     DataFrag(DataFrag),
 }
 
@@ -132,8 +133,8 @@ pub struct DataFrag {
 pub enum DatagramFate {
     /// It was passed on.
     Passed,
-    /// The receiving socket's buffer was full. The observation precedes another one of the same
-    /// arrival, which reports it as passed on.
+    /// The receiving socket's buffer was full. A second observation of the same arrival follows,
+    /// which reports it as passed on.
     SocketFull,
     /// Some of its IP fragments never arrived.
     NotReassembled,
@@ -150,8 +151,8 @@ pub struct Heartbeat {
     pub last: SequenceNumber,
 }
 
-/// GAP (RTPS 2.5, 9.4.5.6): the writer will not send the samples from `start` to before `list`'s
-/// base, nor `list`'s members. The span may have any length.
+/// GAP (RTPS 2.5, 9.4.5.6): the writer will not send the samples from `start` up to the base of
+/// `list`, exclusive, nor the members of `list`. The span may have any length.
 #[derive(Clone, Copy, Debug)]
 pub struct Gap {
     /// When and where it was seen.
@@ -202,7 +203,7 @@ impl Observation {
         }
     }
 
-    /// Returns the participant that it is sent to; unknown if it is sent to all matched readers.
+    /// Returns the addressed participant; unknown for a submessage to all matched readers.
     #[must_use]
     pub const fn addressee(&self) -> GuidPrefix {
         match self {
@@ -219,7 +220,7 @@ impl Head {
         self.at - Duration::from_nanos(self.elapsed.into())
     }
 
-    /// Returns whether it was leaving its host.
+    /// Returns whether it was sent, not received.
     #[must_use]
     pub fn is_sent(&self) -> bool {
         self.direction == Direction::Sent
@@ -241,13 +242,13 @@ impl Head {
         matches!(self.path, Path::SharedMemory { .. })
     }
 
-    /// Returns whether it was seen by polling shared memory, where others may have been missed.
+    /// Returns whether it was seen by polling shared memory, which may miss other messages.
     #[must_use]
     pub fn is_polled(&self) -> bool {
         self.path == Path::SharedMemory { exact: false }
     }
 
-    /// Returns whether it was seen in the sending process, which shows every message.
+    /// Returns whether a probe in the sending process saw it. A probe sees every message.
     #[must_use]
     pub fn is_exact(&self) -> bool {
         self.path == Path::SharedMemory { exact: true }
@@ -280,8 +281,8 @@ impl Head {
 }
 
 impl Sample {
-    /// Returns the bytes of the whole sample's serialized payload, encapsulation included. For
-    /// DATA_FRAG it is unverified: nothing may be allocated for it.
+    /// Returns the size of the whole sample's serialized payload in bytes, including encapsulation.
+    /// For DATA_FRAG it is unverified, so no memory may be allocated in proportion to it.
     #[must_use]
     pub const fn size(&self) -> u32 {
         match self.content {
@@ -314,7 +315,7 @@ impl Sample {
         }
     }
 
-    /// Returns whether its datagram was passed on; otherwise it is no transmission.
+    /// Returns whether its datagram was passed on. Otherwise it does not count as a transmission.
     #[must_use]
     pub fn is_delivered(&self) -> bool {
         self.fate == DatagramFate::Passed

@@ -1,7 +1,8 @@
 //! Counts of the last seconds, for displayed rates and for expectations.
 //!
-//! Only whole seconds contribute to a rate, so a periodic topic neither flickers nor reads high at
-//! its start. Exact counters are elsewhere; this module forgets after [`SECONDS`].
+//! Only whole seconds contribute to a rate, so the rate of a periodic topic neither flickers nor
+//! starts too high. This module keeps counts for [`SECONDS`] only; exact counters are in the
+//! measurements.
 
 use crate::facts::model_time::ModelTime;
 /// Length of the window in seconds, one slot each.
@@ -43,7 +44,7 @@ pub struct Sum {
 }
 
 impl Sum {
-    /// Returns the part that is sent from `since` to `until`, if all is sent evenly until `now`.
+    /// Returns the part sent from `since` to `until`, assuming an even rate from `since` to `now`.
     fn part(self, since: ModelTime, until: ModelTime, now: ModelTime) -> Self {
         let span = (now - since).as_nanos();
         let elapsed = (until - since).as_nanos().min(span);
@@ -60,7 +61,7 @@ impl Sum {
 }
 
 impl Slot {
-    /// Adds what was sent until now, except what is counted already.
+    /// Adds `sent` without `counted`, the part that is already counted.
     const fn send(&mut self, sent: Sum, counted: Sum) {
         self.messages += sent.messages - counted.messages;
         self.bytes = self.bytes.saturating_add(sent.bytes - counted.bytes);
@@ -90,14 +91,14 @@ impl Window {
         &mut self.slots[slot]
     }
 
-    /// Begins to count at `now`: what was counted before contributes to no rate.
+    /// Clears all counts and starts counting at `now`.
     pub fn begin(&mut self, now: ModelTime) {
         *self = Self::default();
         self.turn(now);
     }
 
-    /// Adds what was sent evenly after `since`, the last message at `now`. Returns the part that
-    /// belongs to seconds before the last one.
+    /// Spreads `sent` evenly from `since` to `now`, the time of the last message. Returns the part
+    /// that belongs to seconds before the last whole second.
     pub fn spread(&mut self, sent: Sum, since: ModelTime, now: ModelTime) -> Sum {
         self.turn(now);
         let current = now.whole_seconds();
@@ -145,7 +146,7 @@ impl Window {
         (sum, end - start)
     }
 
-    /// Clears the slots of seconds without counts.
+    /// Advances to the second of `now` and clears the slots of seconds without counts.
     fn turn(&mut self, now: ModelTime) {
         let second = now.whole_seconds();
         if self.began == 0 {
@@ -183,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn a_steady_topic_has_its_rate_from_the_second_second_on() {
+    fn a_steady_topic_has_its_exact_rate_after_one_whole_second() {
         let mut window = Window::default();
         let now = fill(&mut window, 100_300, 5, 400);
         let (sum, seconds) = window.sum(now, SECONDS);
@@ -191,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn bandwidth_is_not_five_percent_high_in_a_small_window() {
+    fn a_window_of_one_second_does_not_overestimate_the_rate() {
         let mut window = Window::default();
         let now = fill(&mut window, 100_001, 50, 20 * 12);
         let (sum, seconds) = window.sum(now, 1);
@@ -214,11 +215,11 @@ mod tests {
     }
 
     #[test]
-    fn messages_of_a_long_gap_are_spread_over_it() {
+    fn messages_after_a_long_gap_are_spread_over_the_gap() {
         let mut window = Window::default();
         let at = |milliseconds: u64| ModelTime::from_nanoseconds(milliseconds * 1_000_000);
         window.second(at(100_000)).messages += 1;
-        // 50 Hz, of which nothing is seen for 14 s.
+        // A topic of 50 Hz is not seen for 14 s.
         let sent = |messages| Sum {
             messages,
             bytes: 100 * messages,
@@ -229,7 +230,7 @@ mod tests {
         assert!(sum.bytes.abs_diff(100 * sum.messages) <= 100, "{sum:?}");
         assert_eq!(seconds, SECONDS);
         assert!((649..=651).contains(&earlier.messages), "{earlier:?}");
-        // All of it is counted once.
+        // Each message is counted once.
         let (last, _) = window.sum(at(115_000), 2);
         assert_eq!(earlier.messages + last.messages, 702);
         // The first message of a writer.
@@ -247,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn a_window_that_begins_anew_forgets_what_was_counted() {
+    fn a_restarted_window_forgets_earlier_counts() {
         let mut window = Window::default();
         let now = fill(&mut window, 100_000, 10, 1000);
         window.begin(now);

@@ -7,7 +7,8 @@ use ros2probe_wire::GuidPrefix;
 /// The direction of a delivery.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum Direction {
-    /// The samples left this host. Losses are not counted, because unsent samples have no receiver.
+    /// The samples left this host. A gap is not a loss here, because no receiver awaits unsent
+    /// samples.
     Sent,
     /// The samples arrived at a receiver.
     Received,
@@ -91,7 +92,7 @@ impl Route {
 pub enum Receiver {
     /// A participant, on any route.
     Participant(GuidPrefix),
-    /// The receivers at the end of this route.
+    /// The receivers of this route.
     Route(Route),
 }
 
@@ -104,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn a_destination_is_printed_as_parsed_and_knows_multicast() {
+    fn a_destination_prints_as_parsed_and_recognizes_multicast() {
         for text in ["10.0.0.2:7411", "239.255.0.1:7401", "[fe80::1]:7411"] {
             assert_eq!(destination(text).socket_address().to_string(), text);
         }

@@ -1,4 +1,4 @@
-//! Topics whose samples a subscription requests, and in what depth.
+//! Topics whose samples a subscription requests, and how much of each sample it receives.
 //!
 //! A selection is matched against topics as they appear. It affects measurement only in that
 //! requested topics are measured; the watchlist has its own patterns.
@@ -15,7 +15,7 @@ use crate::facts::naming::Naming;
 use crate::facts::topic_kind::TopicKind;
 use crate::facts::watch::{PatternError, check_pattern};
 
-/// Largest compiled size of a regular expression in bytes. Matching may use the same amount again.
+/// Maximum compiled size of a regular expression in bytes. Matching may use the same amount again.
 const REGEX_BYTES: usize = 256 << 10;
 
 /// Domain and DDS name, which identify a topic.
@@ -30,14 +30,14 @@ pub enum Depth {
     Payloads,
 }
 
-/// A way to select topics.
+/// A criterion that selects topics.
 #[derive(Clone, Debug)]
 pub enum Choice {
     /// Every topic that `ros2 topic list` shows.
     All,
     /// One topic by its ROS name, even if hidden, or by its DDS name.
     Name(String),
-    /// Topics by their domains and DDS names, of which there may be thousands.
+    /// Topics by their domains and DDS names, possibly thousands.
     Topics(BTreeSet<TopicKey>),
     /// `*` within a token, `**` across tokens; covers hidden topics if it names a hidden token.
     Glob(String),
@@ -88,7 +88,7 @@ pub struct Candidate<'a> {
     pub name: &'a str,
     /// DDS name.
     pub dds_name: &'a DdsName,
-    /// Hidden by ROS convention.
+    /// Whether the topic is hidden by ROS convention.
     pub hidden: bool,
 }
 
@@ -148,7 +148,8 @@ impl Choice {
 
     fn covers(&self, topic: &Candidate<'_>, hidden: bool) -> bool {
         let (is_ros, dds_name) = (topic.kind.is_ros_topic(), topic.dds_name);
-        // The ROS name of a request topic is the service's, which a topic may have as well.
+        // A request topic has the ROS name of its service, which an ordinary topic may have as
+        // well.
         let name = if is_ros {
             topic.name
         } else {
@@ -182,7 +183,7 @@ impl Selection {
     /// Parses names and globs.
     ///
     /// # Errors
-    /// Returns the first that is neither.
+    /// Returns the error of the first text that is neither.
     pub fn named<'a>(patterns: impl IntoIterator<Item = &'a str>) -> Result<Self, ChoiceError> {
         let include: Result<_, _> = patterns.into_iter().map(Choice::parse).collect();
         Ok(Self {
@@ -200,7 +201,7 @@ impl Selection {
         }
     }
 
-    /// Returns whether it covers topics by patterns, so that further ones may appear.
+    /// Returns whether the selection has patterns, which may cover further topics.
     #[must_use]
     pub fn is_open(&self) -> bool {
         let by_name = |choice: &Choice| matches!(choice, Choice::Name(_) | Choice::Topics(_));
@@ -328,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn services_and_foreign_topics_go_by_their_exact_names() {
+    fn services_and_non_ros_topics_are_selected_only_by_exact_name() {
         for dds_name in [
             "rq/addRequest",
             "rr/addReply",

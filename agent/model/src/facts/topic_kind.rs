@@ -84,8 +84,8 @@ impl TopicKind {
         }
     }
 
-    /// Returns whether it is a request or reply topic of a service, whose ROS name a topic may have
-    /// as well.
+    /// Returns whether it is a request or reply topic of a service. An ordinary topic may have the
+    /// same ROS name.
     #[must_use]
     pub const fn is_service(self) -> bool {
         matches!(self, Self::ServiceRequest | Self::ServiceReply)
@@ -107,7 +107,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn kinds_are_in_the_order_of_their_labels_and_found_by_them() {
+    fn kinds_are_sorted_by_label_and_found_by_label() {
         assert!(TopicKind::ALL.is_sorted_by_key(|kind| kind.label()));
         assert!(TopicKind::ALL.is_sorted());
         for kind in TopicKind::ALL {

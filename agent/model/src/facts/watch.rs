@@ -39,46 +39,46 @@ pub enum Retain {
     Last,
 }
 
-/// Expectations of a topic; `None` expects nothing.
+/// Expectations of a topic; a field that is `None` expects nothing.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Expectations {
-    /// Smallest rate, in messages per second.
+    /// Minimum rate, in messages per second.
     pub min_rate_hz: Option<f64>,
-    /// Largest rate, in messages per second.
+    /// Maximum rate, in messages per second.
     pub max_rate_hz: Option<f64>,
-    /// Window of both rates, in seconds; `None` for one of at least three messages (1 to 10 s).
+    /// Window of both rates in seconds; `None` for one of at least three messages (1 to 10 s).
     pub window_s: Option<u32>,
-    /// Largest share of messages that the worst subscriber may lose, from 0 to 1; see
+    /// Maximum share of messages that the worst subscriber may lose, from 0 to 1; see
     /// [`LossShare`](crate::facts::loss_share::LossShare).
     pub max_loss_ratio: Option<f64>,
-    /// Longest time from INFO_TS to the capture.
+    /// Maximum time from INFO_TS to the capture.
     pub max_latency: Option<Duration>,
-    /// Longest time without a message.
+    /// Maximum time without a message.
     pub max_silence: Option<Duration>,
-    /// Smallest number of publishers.
+    /// Minimum number of publishers.
     pub publishers: Option<u32>,
-    /// Smallest number of subscribers.
+    /// Minimum number of subscribers.
     pub subscribers: Option<u32>,
 }
 
 /// Expectations in the units of the configuration and of the API.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ExpectationValues {
-    /// Smallest rate, in messages per second.
+    /// Minimum rate, in messages per second.
     pub min_rate_hz: Option<f64>,
-    /// Largest rate, in messages per second.
+    /// Maximum rate, in messages per second.
     pub max_rate_hz: Option<f64>,
-    /// Window of both rates, in seconds; `None` for one of at least three messages (1 to 10 s).
+    /// Window of both rates in seconds; `None` for one of at least three messages (1 to 10 s).
     pub window_s: Option<u32>,
-    /// Largest share of messages that the worst subscriber may lose, from 0 to 1.
+    /// Maximum share of messages that the worst subscriber may lose, from 0 to 1.
     pub max_loss_ratio: Option<f64>,
-    /// Longest time from INFO_TS to the capture, in milliseconds.
+    /// Maximum time from INFO_TS to the capture, in milliseconds.
     pub max_latency_ms: Option<f64>,
-    /// Longest time without a message, in seconds.
+    /// Maximum time without a message, in seconds.
     pub max_silence_s: Option<f64>,
-    /// Smallest number of publishers.
+    /// Minimum number of publishers.
     pub publishers: Option<u32>,
-    /// Smallest number of subscribers.
+    /// Minimum number of subscribers.
     pub subscribers: Option<u32>,
 }
 
@@ -111,7 +111,7 @@ pub enum PatternError {
     ManyStars,
 }
 
-/// Why values are not expectations of a watch.
+/// Why values are invalid as expectations of a watch.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum ExpectationError {
     /// A value is out of its range.
@@ -121,12 +121,12 @@ pub enum ExpectationError {
         key: &'static str,
         /// The value.
         value: f64,
-        /// The least valid value.
+        /// The smallest valid value.
         low: f64,
         /// The largest valid value.
         high: f64,
     },
-    /// The largest rate, in Hz, is below the least one.
+    /// The maximum rate is below the minimum rate, both in Hz.
     #[error("max_rate_hz is {high}, below min_rate_hz, which is {low}")]
     CrossedRates {
         /// `min_rate_hz`.
@@ -134,7 +134,7 @@ pub enum ExpectationError {
         /// `max_rate_hz`.
         high: f64,
     },
-    /// A window has no rate that is measured over it.
+    /// A window has a length, but no rate is measured over it.
     #[error("window_s needs min_rate_hz or max_rate_hz")]
     WindowWithoutRate,
 }
@@ -273,11 +273,11 @@ impl TryFrom<ExpectationValues> for Expectations {
     }
 }
 
-/// Largest number of stars in a glob; `**` counts as two.
+/// Maximum number of stars in a glob; `**` counts as two.
 pub const MAX_STARS: usize = 16;
-/// Largest number of globs in a watchlist, since each new topic is matched against all of them.
+/// Maximum number of globs in a watchlist; each new topic is matched against all of them.
 pub const MAX_GLOBS: usize = 256;
-/// Largest total length of the globs in a watchlist, in bytes.
+/// Maximum total length of the globs in a watchlist, in bytes.
 pub const MAX_GLOB_BYTES: usize = 16 << 10;
 
 /// Valid ranges of expectations, as in the configuration's schema.
@@ -422,7 +422,7 @@ impl Watchlist {
             watch.is_some_and(|watch| glob::covers(&watch.pattern, topic))
         };
         let globs = self.globs.iter().copied().filter(covers);
-        // A hostile topic's name may equal a glob; then matching the glob has decided already.
+        // A hostile topic's name may equal a glob, which was matched above.
         let named = self.patterns.get(topic).into_iter().flatten().copied();
         let named =
             named.filter(|place| self.watches.get(*place).is_some_and(|it| it.is_literal()));
@@ -517,7 +517,7 @@ mod tests {
     }
 
     #[test]
-    fn one_star_stays_within_its_token_and_two_cross_them() {
+    fn one_star_stays_within_a_token_and_two_stars_cross_tokens() {
         let list = watchlist(&["/camera/*/image_raw", "/**", "/points", "/camera/**"]);
         assert_eq!(
             list.matching(DomainId(0), "/camera/left/image_raw"),
@@ -548,7 +548,7 @@ mod tests {
     }
 
     #[test]
-    fn globs_that_take_too_long_are_refused_together() {
+    fn globs_that_are_too_many_or_too_long_in_total_are_refused() {
         let full_of_stars = format!("/{}", "*a".repeat(120));
         assert_eq!(check_pattern(&full_of_stars), Err(PatternError::ManyStars));
         let names = (0..5000).map(|number| format!("/topic_{number}"));
@@ -565,7 +565,7 @@ mod tests {
     }
 
     #[test]
-    fn a_domain_narrows_an_entry() {
+    fn an_entry_with_a_domain_covers_only_that_domain() {
         let watch = Watch {
             domain_id: Some(DomainId(5)),
             ..Watch::named("/points").unwrap()
@@ -576,7 +576,7 @@ mod tests {
     }
 
     #[test]
-    fn hostile_topic_names_match_or_not_but_never_fail() {
+    fn hostile_topic_names_do_not_panic() {
         let list = watchlist(&["/**", "/a/*/b"]);
         for name in [
             "",

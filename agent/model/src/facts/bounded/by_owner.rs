@@ -1,5 +1,5 @@
-//! Tables whose entries have an owner, for example a connection. An owner can be forgotten at once,
-//! and cannot take the room of the others.
+//! Tables whose entries have an owner, for example a connection. All entries of an owner can be
+//! removed together, and no owner can use up the capacity of the others.
 
 use std::borrow::Borrow;
 use std::collections::{BTreeMap, BTreeSet};
@@ -62,7 +62,7 @@ impl HeapBytes for Arc<str> {
 #[derive(Debug)]
 pub struct ByOwner<D, O, K, V> {
     shares: BTreeMap<O, Share<K, V>>,
-    /// Owners by their bytes.
+    /// Owners, sorted by their bytes.
     by_bytes: BTreeSet<(usize, O)>,
     entries: usize,
     bytes: usize,
@@ -84,8 +84,8 @@ impl<D: Declared, O: Ord + Copy, K: Ord + HeapBytes, V: HeapBytes> ByOwner<D, O,
         None => usize::MAX,
     };
 
-    /// Adds an entry, or replaces it. `beside` are the bytes that it takes in other tables. Returns
-    /// whether there was room.
+    /// Adds or replaces an entry. `beside` is its size in other tables, in bytes. Returns whether
+    /// the entry was added.
     pub fn insert(&mut self, owner: O, key: K, value: V, beside: usize) -> bool {
         self.remove(owner, &key);
         // Half of a node of the tree may be empty.
@@ -160,7 +160,7 @@ impl<D: Declared, O: Ord + Copy, K: Ord + HeapBytes, V: HeapBytes> ByOwner<D, O,
         entries.map(|(key, (value, _))| (key, value))
     }
 
-    /// Returns the size for the snapshot.
+    /// Returns size, caps and evictions for the snapshot.
     #[must_use]
     pub const fn facts(&self) -> TableFacts {
         TableFacts {
@@ -172,8 +172,9 @@ impl<D: Declared, O: Ord + Copy, K: Ord + HeapBytes, V: HeapBytes> ByOwner<D, O,
         }
     }
 
-    /// Removes an entry of the owner with the most bytes, if these are more than `newcomer`, the
-    /// bytes that the newcomer's owner would have. Returns whether one was removed.
+    /// Removes an entry of the owner with the most bytes, if that owner has more than `newcomer`
+    /// bytes. `newcomer` is what the owner of the new entry would have. Returns whether an entry
+    /// was removed.
     fn make_room(&mut self, newcomer: usize) -> bool {
         if D::TABLE.rule == Rule::LeaveOut {
             return false;
@@ -248,7 +249,7 @@ mod tests {
         "x".repeat(length).into()
     }
 
-    /// Asserts that the sums are those of the entries, within the caps.
+    /// Asserts that the sums equal those of the entries and are within the caps.
     fn check<D: Declared>(table: &ByOwner<D, u32, u32, Arc<str>>) {
         let bytes: usize = table.shares.values().map(|share| share.bytes).sum();
         let entries: usize = table.shares.values().map(|share| share.entries.len()).sum();
@@ -274,7 +275,7 @@ mod tests {
         }
         assert_eq!(table.of(1).count(), 10);
         assert!(table.of(2).count() > 10);
-        // A third one gets its share from the largest.
+        // A third owner gets space from the largest owner.
         assert!((0..10).all(|key| table.insert(3, key, text(100), 0)));
         assert_eq!((table.of(1).count(), table.of(3).count()), (10, 10));
         check(&table);
@@ -282,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn a_newcomer_of_the_largest_owner_is_left_out() {
+    fn a_new_entry_of_the_largest_owner_is_refused() {
         let mut table: ByOwner<Fair, _, _, _> = ByOwner::default();
         assert!(table.insert(1, 1, text(10_000), 0));
         assert!(!table.insert(1, 2, text(10_000), 0));
@@ -292,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn without_fair_shares_the_first_entries_stay() {
+    fn a_full_table_without_fair_shares_keeps_its_first_entries() {
         let mut table: ByOwner<First, _, _, _> = ByOwner::default();
         let room = (0..200_u32).filter(|key| table.insert(*key, *key, text(0), 0));
         let room = room.count();
@@ -303,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn entries_are_capped_although_they_are_small() {
+    fn small_entries_are_refused_above_the_maximum_number() {
         let mut table: ByOwner<First, _, _, _> = ByOwner::default();
         assert_eq!(
             (0..200_u32)
@@ -314,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn removed_and_replaced_entries_give_their_bytes_back() {
+    fn removed_and_replaced_entries_free_their_bytes() {
         let mut table: ByOwner<Fair, _, _, _> = ByOwner::default();
         for turn in 0..1000 {
             assert!(table.insert(turn % 3, turn % 5, text(turn as usize), 0));
@@ -335,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_of_an_entry_in_other_tables_count() {
+    fn bytes_in_other_tables_count_toward_the_cap() {
         let mut table: ByOwner<First, _, _, _> = ByOwner::default();
         let room = (0..100_u32).filter(|key| table.insert(0, *key, (), 5_000));
         assert_eq!(room.count(), 3);

@@ -1,5 +1,5 @@
-//! The methods of bounded containers: those that add an entry apply the cap, the others are those
-//! of the standard library.
+//! Methods of bounded containers. Methods that add an entry apply the cap. Most others forward to
+//! the standard library.
 
 use std::borrow::Borrow;
 use std::collections::{
@@ -17,13 +17,13 @@ pub trait Collection: Default {
     /// One entry.
     type Entry;
 
-    /// Whether there is a first entry that can be dropped.
+    /// Whether the container has an order, so that a full one can drop its first entry.
     const HAS_ORDER: bool;
 
     /// Returns the number of entries.
     fn length(&self) -> usize;
 
-    /// Returns whether this entry takes the place of another one.
+    /// Returns whether this entry would replace an existing one.
     fn replaces(&self, entry: &Self::Entry) -> bool;
 
     /// Adds an entry.
@@ -90,7 +90,7 @@ collection!(
 macro_rules! forward {
     ($(fn $name:ident($($argument:ident: $of:ty),*) $(-> $returned:ty)?;)*) => {
         $(
-            /// As the standard library's.
+            /// Forwards to the method of the standard library.
             #[inline]
             pub fn $name(&mut self, $($argument: $of),*) $(-> $returned)? {
                 self.inner.$name($($argument),*)
@@ -114,7 +114,7 @@ impl<D: Declared, T> Bounded<D, Vec<T>> {
         fn drain(range: impl RangeBounds<usize>) -> std::vec::Drain<'_, T>;
     }
 
-    /// Adds all these entries, or none. Returns whether they had room.
+    /// Adds all of `entries`, or none if they exceed the cap. Returns whether they were added.
     pub fn extend_from_slice(&mut self, entries: &[T]) -> bool
     where
         T: Clone,
@@ -130,12 +130,12 @@ impl<D: Declared, T> Bounded<D, Vec<T>> {
         has_room
     }
 
-    /// Adds an entry. Returns it if there is no room.
+    /// Adds an entry. Returns it if the vector is full.
     pub fn push(&mut self, entry: T) -> Option<T> {
         self.add(entry)
     }
 
-    /// Adds an entry at this place. Returns it if there is no room.
+    /// Inserts an entry at `index`. Returns it if the vector is full.
     pub fn insert(&mut self, index: usize, entry: T) -> Option<T> {
         let left = self.add(entry);
         if left.is_none() {
@@ -165,7 +165,7 @@ impl<D: Declared, T> Bounded<D, VecDeque<T>> {
         fn retain_mut(keep: impl FnMut(&mut T) -> bool);
     }
 
-    /// Adds an entry at this place. Returns it if there is no room.
+    /// Inserts an entry at `index`. Returns it if the deque is full.
     pub fn insert(&mut self, index: usize, entry: T) -> Option<T> {
         if self.is_full() {
             self.refuse();
@@ -176,7 +176,7 @@ impl<D: Declared, T> Bounded<D, VecDeque<T>> {
         None
     }
 
-    /// Adds the newest entry. Returns the entry that has no room.
+    /// Appends an entry. Returns the entry that the cap refused or removed.
     pub fn push_back(&mut self, entry: T) -> Option<T> {
         self.add(entry)
     }
@@ -197,7 +197,7 @@ impl<D: Declared, K: Ord> Bounded<D, BTreeSet<K>> {
         std::mem::replace(&mut self.inner, kept)
     }
 
-    /// Adds an entry. Returns whether it is new and has room.
+    /// Adds an entry. Returns whether the set has grown.
     pub fn insert(&mut self, key: K) -> bool {
         let before = self.inner.len();
         self.add(key).is_none() && self.inner.len() > before
@@ -211,7 +211,7 @@ impl<D: Declared, K: Hash + Eq, S: BuildHasher + Default> Bounded<D, HashSet<K, 
         fn retain(keep: impl FnMut(&K) -> bool);
     }
 
-    /// Adds an entry. Returns whether it is new and has room.
+    /// Adds an entry. Returns whether the set has grown.
     pub fn insert(&mut self, key: K) -> bool {
         let before = self.inner.len();
         self.add(key).is_none() && self.inner.len() > before
@@ -231,7 +231,7 @@ impl<D: Declared, K: Ord, V> Bounded<D, BTreeMap<K, V>> {
         fn retain(keep: impl FnMut(&K, &mut V) -> bool);
     }
 
-    /// As the standard library's.
+    /// Forwards to the method of the standard library.
     #[inline]
     pub fn get_mut<Q: Ord + ?Sized>(&mut self, key: &Q) -> Option<&mut V>
     where
@@ -246,12 +246,13 @@ impl<D: Declared, K: Ord, V> Bounded<D, BTreeMap<K, V>> {
         std::mem::replace(&mut self.inner, kept)
     }
 
-    /// Adds or replaces an entry. Returns the entry that has no room.
+    /// Adds or replaces an entry. Returns the entry that the cap refused or removed.
     pub fn insert(&mut self, key: K, value: V) -> Option<(K, V)> {
         self.add((key, value))
     }
 
-    /// Returns the value of this key, which is added if it is missing. `None` if there is no room.
+    /// Returns the value of this key, and adds it if it is missing. Returns `None` if the map is
+    /// full.
     pub fn get_or_insert_with(&mut self, key: K, value: impl FnOnce() -> V) -> Option<&mut V> {
         self.has_room_for(|map| map.contains_key(&key))
             .then(|| self.inner.entry(key).or_insert_with(value))
@@ -267,7 +268,7 @@ impl<D: Declared, K: Hash + Eq, V, S: BuildHasher + Default> Bounded<D, HashMap<
         fn retain(keep: impl FnMut(&K, &mut V) -> bool);
     }
 
-    /// As the standard library's.
+    /// Forwards to the method of the standard library.
     #[inline]
     pub fn get_mut<Q: Hash + Eq + ?Sized>(&mut self, key: &Q) -> Option<&mut V>
     where
@@ -276,12 +277,13 @@ impl<D: Declared, K: Hash + Eq, V, S: BuildHasher + Default> Bounded<D, HashMap<
         self.inner.get_mut(key)
     }
 
-    /// Adds or replaces an entry. Returns the entry that has no room.
+    /// Adds or replaces an entry. Returns the new entry if the map is full.
     pub fn insert(&mut self, key: K, value: V) -> Option<(K, V)> {
         self.add((key, value))
     }
 
-    /// Returns the value of this key, which is added if it is missing. `None` if there is no room.
+    /// Returns the value of this key, and adds it if it is missing. Returns `None` if the map is
+    /// full.
     pub fn get_or_insert_with(&mut self, key: K, value: impl FnOnce() -> V) -> Option<&mut V> {
         self.has_room_for(|map| map.contains_key(&key))
             .then(|| self.inner.entry(key).or_insert_with(value))

@@ -1,7 +1,7 @@
-//! Use of each table in debug builds: the largest length of a container, and what had no room.
+//! Use of each table in debug builds: the largest length of a container, and the refused entries.
 //!
-//! Tests read it to know that every declared table was driven to its cap. It belongs to the thread,
-//! as an observer does. Release builds keep no ledger.
+//! Tests read the ledger to check that every declared table reached its cap. Each thread has its
+//! own ledger. Release builds keep no ledger.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -13,7 +13,7 @@ use super::Table;
 pub struct Use {
     /// Largest number of entries of one container.
     pub largest: usize,
-    /// Its cap.
+    /// Cap of that container.
     pub cap: usize,
     /// Number of entries that a cap refused or removed.
     pub refused: u64,
@@ -44,7 +44,7 @@ pub fn ledger() -> BTreeMap<&'static str, Use> {
     LEDGER.with_borrow(Clone::clone)
 }
 
-/// Notes the length of a container after it grew.
+/// Records the length of a container after it grew.
 #[inline]
 pub(super) fn filled(table: &Table, entries: usize, cap: usize) {
     if cfg!(debug_assertions) {
@@ -57,7 +57,7 @@ pub(super) fn filled(table: &Table, entries: usize, cap: usize) {
     }
 }
 
-/// Notes entries without room.
+/// Records refused or removed entries.
 #[inline]
 pub(super) fn refused(table: &Table, entries: u64) {
     if cfg!(debug_assertions) {

@@ -1,8 +1,8 @@
-//! A distribution of durations, cumulative: four buckets for each power of two.
+//! A cumulative distribution of durations, with four buckets for each power of two.
 //!
-//! The range always lies in the buckets in use and is in order. Every constructor restores that.
-//! The kernel programs update range and buckets without a lock, and a difference of two states
-//! knows the buckets only. The last bucket has no upper bound but the largest duration.
+//! The range is always ordered and lies within the buckets in use. Every constructor ensures this,
+//! because the kernel programs update range and buckets without a lock. A difference of two states
+//! knows only the buckets. The last bucket has no upper bound but the largest duration.
 
 use std::time::Duration;
 
@@ -10,7 +10,7 @@ use ros2probe_wire::inside::{BUCKETS, bucket, bucket_start};
 
 use crate::facts::histogram::Histogram;
 
-/// A bucket's count in the kernel has this many values.
+/// Number of values of a bucket's count in the kernel, after which it wraps to zero.
 const WRAP: u64 = 1 << 32;
 
 /// A distribution of durations.
@@ -26,7 +26,7 @@ pub struct Durations {
 /// A bucket in use.
 #[derive(Clone, Copy)]
 struct Filled {
-    /// Least and largest duration that it holds.
+    /// Smallest and largest duration of the bucket.
     start: u64,
     end: u64,
     count: u64,
@@ -44,7 +44,7 @@ impl Default for Durations {
 
 impl Durations {
     /// Creates a distribution from the kernel's counts, and from sum, minimum and maximum in
-    /// nanoseconds. These may be of another moment than the counts.
+    /// nanoseconds. The counts may have been read at another time than these three values.
     #[must_use]
     pub fn new(counts: &[u32; BUCKETS], sum: u64, minimum: u64, maximum: u64) -> Self {
         let counts = Box::new(counts.map(u64::from));
@@ -71,7 +71,7 @@ impl Durations {
         self.counts.iter().copied().fold(0, u64::saturating_add)
     }
 
-    /// Returns their sum.
+    /// Returns the sum of the durations.
     #[must_use]
     pub const fn sum(&self) -> Duration {
         Duration::from_nanos(self.sum)
@@ -84,10 +84,10 @@ impl Durations {
         Some((Duration::from_nanos(least), Duration::from_nanos(largest)))
     }
 
-    /// Estimates the duration below which this share of all lies: between the bounds of a bucket,
-    /// which differ by a quarter at most, and within the range. In the last bucket, from 15 s on,
-    /// it lies between the bucket's start and the largest duration. Returns `None` if the
-    /// distribution is empty.
+    /// Estimates the quantile `part`, from 0 to 1. The estimate lies within the range and within
+    /// the bucket of the exact value, whose bounds differ by at most a quarter. The last bucket
+    /// begins at 15 s and ends at the largest duration. Returns `None` if the distribution is
+    /// empty.
     #[must_use]
     #[expect(
         clippy::cast_precision_loss,
@@ -117,8 +117,9 @@ impl Durations {
         Some(Duration::from_nanos(value.max(least).min(largest)))
     }
 
-    /// Returns the durations added since `earlier`, an older state of this distribution. Its range
-    /// is as narrow as both states show: exact for a single duration, and for a new extreme.
+    /// Returns the durations added since `earlier`, an older state of this distribution. The range
+    /// of the result is as narrow as the two states allow. It is exact for a single duration and
+    /// for a new extreme.
     #[must_use]
     pub fn since(&self, earlier: &Self) -> Self {
         if self.count() < earlier.count() {
@@ -134,20 +135,20 @@ impl Durations {
         let is_new_largest = before.is_none_or(|(_, before)| largest > before);
         let is_new_least = before.is_none_or(|(before, _)| least < before);
         let mut since = Self::of(counts, sum, (least, largest));
-        // A sum that has reached its end, or begun again at zero, shows nothing.
+        // A sum that saturated or wrapped to zero narrows nothing.
         if earlier.sum <= self.sum && self.sum < u64::MAX {
             since.narrow(!is_new_least, !is_new_largest);
         }
         since
     }
 
-    /// Continues the counts of `earlier`, the state of the same handle in the report before. The
-    /// kernel's counts of 32 bits begin again at zero.
+    /// Continues the counts of `earlier`, the state of the same handle in the previous report. The
+    /// kernel's counts of 32 bits wrap to zero.
     pub fn continue_from(&mut self, earlier: &Self) {
         let mut is_wrapped = false;
         for (count, before) in self.counts.iter_mut().zip(earlier.counts.iter()) {
             let added = (*count % WRAP + WRAP - before % WRAP) % WRAP;
-            // A larger difference is that of another object at the same address.
+            // A larger difference means another object at the same address.
             if *count < *before && added < WRAP / 2 {
                 *count = before.saturating_add(added);
                 is_wrapped = true;
@@ -172,15 +173,15 @@ impl Durations {
         self.range = Some((range.0.min(least), range.1.max(largest)));
     }
 
-    /// Returns the number of durations in the buckets before that of this duration in nanoseconds:
-    /// exact if it is the start of a bucket.
+    /// Returns the number of durations in the buckets below that of `nanoseconds`. The number is
+    /// exact if `nanoseconds` is the start of a bucket.
     #[must_use]
     pub fn up_to(&self, nanoseconds: u64) -> u64 {
         let below = self.counts.iter().take(bucket(nanoseconds));
         below.copied().fold(0, u64::saturating_add)
     }
 
-    /// Returns the number of durations that are certainly longer: those in higher buckets.
+    /// Returns the number of durations in the buckets above that of `limit`. All of them exceed it.
     #[must_use]
     pub fn above(&self, limit: Duration) -> u64 {
         let nanoseconds = u64::try_from(limit.as_nanos()).unwrap_or(u64::MAX);
@@ -188,7 +189,7 @@ impl Durations {
         above.copied().fold(0, u64::saturating_add)
     }
 
-    /// Returns the sum if each duration counts with `limit` at most: exact if none is longer.
+    /// Returns the sum of the durations, each cut to `limit`. It is exact if none is longer.
     #[must_use]
     pub fn sum_within(&self, limit: Duration) -> Duration {
         let limit = u64::try_from(limit.as_nanos()).unwrap_or(u64::MAX);
@@ -204,8 +205,8 @@ impl Durations {
         Duration::from_nanos(sum.min(self.sum))
     }
 
-    /// Returns the durations in the buckets of the metrics. A bucket across a bound belongs to the
-    /// next one, so that a duration is never shown too short.
+    /// Returns the durations in the buckets of the metrics. A bucket that straddles a bound counts
+    /// above it, so that no duration appears shorter than it is.
     #[must_use]
     #[expect(
         clippy::cast_possible_truncation,
@@ -219,7 +220,7 @@ impl Durations {
         Histogram::of(up_to, self.count(), self.sum().as_secs_f64(), range)
     }
 
-    /// Creates a distribution whose range and sum the counts allow.
+    /// Creates a distribution whose range and sum are corrected to what the counts allow.
     fn of(counts: Box<[u64; BUCKETS]>, sum: u64, (minimum, maximum): (u64, u64)) -> Self {
         let mut durations = Self {
             counts,
@@ -236,20 +237,20 @@ impl Durations {
         durations
     }
 
-    /// Narrows the ends of the range that are not exact by the sum of all durations.
+    /// Narrows the inexact ends of the range by the sum of all durations.
     fn narrow(&mut self, is_least_open: bool, is_largest_open: bool) {
         let (Some((least, largest)), Some((lowest, highest))) = (self.range, self.ends()) else {
             return;
         };
         let (mut least, mut largest) = (least, largest);
         if is_largest_open {
-            // All others are as short as they can be.
+            // The bound assumes that all other durations are as short as possible.
             let start = highest.start.max(least);
             let others = self.sums().0.saturating_sub(start);
             largest = largest.min(self.sum.saturating_sub(others).max(start));
         }
         if is_least_open {
-            // All others are as long as they can be.
+            // The bound assumes that all other durations are as long as possible.
             let others = (self.count() - 1).saturating_mul(largest);
             let shortest = self.sum.saturating_sub(others).min(lowest.end);
             least = least.max(shortest);
@@ -257,7 +258,7 @@ impl Durations {
         self.range = Some((least.min(largest), largest));
     }
 
-    /// Returns the least and the largest sum that counts and range allow.
+    /// Returns the smallest and the largest sum that counts and range allow.
     fn sums(&self) -> (u64, u64) {
         let Some((least, largest)) = self.range else {
             return (0, 0);
@@ -270,7 +271,7 @@ impl Durations {
         (low, high)
     }
 
-    /// Returns the buckets in use, in their order.
+    /// Returns the buckets in use, in ascending order.
     fn filled(&self) -> impl DoubleEndedIterator<Item = Filled> + '_ {
         let bounds = |index: usize| match index + 1 {
             BUCKETS => (bucket_start(index), u64::MAX),
@@ -313,7 +314,7 @@ mod tests {
         (0_u32..=64, any::<u64>()).prop_map(|(bits, any)| any.checked_shr(bits).unwrap_or(0))
     }
 
-    /// Fails if a quantile lies outside of the range or of its own bucket, or decreases.
+    /// Fails if a quantile lies outside the range or its own bucket, or decreases.
     fn check(durations: &Durations) {
         let Some((least, largest)) = durations.range() else {
             assert_eq!((durations.count(), durations.quantile(0.5)), (0, None));
@@ -335,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn quantiles_lie_within_a_quarter_of_the_truth() {
+    fn quantiles_differ_from_exact_values_by_at_most_a_quarter() {
         let mut durations = Durations::default();
         for microseconds in 1..=1000 {
             durations.observe(Duration::from_micros(microseconds));
@@ -351,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn later_counts_are_a_difference_and_merged_counts_a_sum() {
+    fn since_returns_the_difference_and_merge_the_sum() {
         let mut durations = Durations::default();
         durations.observe(Duration::from_millis(1));
         let earlier = durations.clone();
@@ -374,7 +375,8 @@ mod tests {
         durations.observe(Duration::from_secs(41));
         let since = durations.since(&earlier);
         assert_eq!(since.quantile(0.5), Some(Duration::from_secs(41)));
-        // Of several, the last bucket's start and the largest are known.
+        // For several durations, only the start of the last bucket and the largest duration are
+        // known.
         let hour = of(&[20 * SECOND, 25 * SECOND, 3_600 * SECOND]);
         let median = hour.quantile(0.5).unwrap();
         let bounds = Duration::from_secs(15)..=Duration::from_secs(3_600);
@@ -384,7 +386,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shorter_call_after_a_long_one_is_not_as_long() {
+    fn shorter_calls_after_a_long_one_do_not_get_its_duration() {
         let mut durations = of(&[3_600_000_000_000, 1_000_000]);
         let earlier = durations.clone();
         durations.observe(Duration::from_secs(20));
@@ -398,7 +400,7 @@ mod tests {
     }
 
     #[test]
-    fn a_call_longer_than_the_window_takes_all_of_it_and_no_more() {
+    fn a_call_longer_than_the_window_counts_as_one_whole_window() {
         let window = Duration::from_secs(10);
         let durations = of(&[3_600_000_000_000]);
         assert_eq!(durations.sum_within(window), window);
@@ -407,7 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn kernel_counts_that_begin_again_at_zero_continue() {
+    fn kernel_counts_that_wrap_to_zero_continue() {
         let mut counts = [0; BUCKETS];
         let index = bucket(1_000_000);
         counts[index] = u32::MAX - 1;
@@ -425,7 +427,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_durations_stop_a_quantile(
+        fn any_durations_have_quantiles_within_their_range(
             first in prop::collection::vec(any_duration(), 0..20),
             then in prop::collection::vec(any_duration(), 0..20),
         ) {
@@ -450,7 +452,7 @@ mod tests {
 
         /// The kernel's figures are read while other threads change them.
         #[test]
-        fn no_figures_of_the_kernel_stop_a_quantile(
+        fn inconsistent_figures_of_the_kernel_still_yield_quantiles(
             counts in prop::collection::vec(prop_oneof![3 => Just(0_u32), 1 => any::<u32>()], BUCKETS),
             later in prop::collection::vec(prop_oneof![3 => Just(0_u32), 1 => any::<u32>()], BUCKETS),
             sums in any::<[u64; 2]>(),

@@ -22,7 +22,7 @@ pub struct InsideFacts {
     pub publishers: Vec<Publisher>,
     /// Subscriptions that take from the middleware.
     pub subscriptions: Vec<Subscription>,
-    /// Queues of these subscriptions, as far as their arrivals are known.
+    /// Queues of subscriptions whose arrivals are known.
     pub reader_queues: Vec<ReaderQueue>,
     /// Ring buffers of intra-process subscriptions.
     pub buffers: Vec<Buffer>,
@@ -37,9 +37,9 @@ pub struct InsideFacts {
 pub struct ObservedProcess {
     /// Process id in the initial namespace.
     pub id: u32,
-    /// Its name.
+    /// Process name.
     pub name: Option<Arc<str>>,
-    /// Its domain.
+    /// Domain of the process.
     pub domain_id: DomainId,
     /// CPU time per second over the last window; 1 is one CPU. `None` before the second report.
     pub cpu: Option<f64>,
@@ -49,9 +49,9 @@ pub struct ObservedProcess {
     pub calls: u64,
     /// Calls that were not counted because of too many handles.
     pub refused: u64,
-    /// Its calls exceed the budget and are not counted.
+    /// Whether its calls exceed the budget and are not counted.
     pub is_suspended: bool,
-    /// Its library reports every step of intra-process messages.
+    /// Whether its library reports every step of intra-process messages.
     pub shows_intra_process: bool,
     /// Its nodes, as far as they are known.
     pub nodes: Vec<NodeName>,
@@ -79,7 +79,7 @@ pub struct Quantiles {
     pub p50: Duration,
     /// 99th percentile.
     pub p99: Duration,
-    /// Largest duration; that of its bucket if an earlier one was larger.
+    /// Largest duration; an upper bound if a longer one occurred before the window.
     pub maximum: Duration,
 }
 
@@ -98,9 +98,9 @@ pub struct Publisher {
     pub within_process: u64,
     /// Publications per second over the last window.
     pub rate_hz: Option<f64>,
-    /// Time of the last one.
+    /// Time of the last publication.
     pub last: ModelTime,
-    /// Time between consecutive ones, over the last window.
+    /// Time between consecutive publications, over the last window.
     pub interval: Quantiles,
 }
 
@@ -140,33 +140,33 @@ pub struct Buffer {
     pub dequeued: u64,
     /// Share of the messages of the last window that were overwritten.
     pub overwritten_ratio: Option<f64>,
-    /// Messages in the buffer after the last entry.
+    /// Messages in the buffer after the last insertion.
     pub depth: u32,
-    /// The largest of these.
+    /// Maximum of `depth` so far.
     pub max_depth: u32,
     /// Capacity, if known.
     pub capacity: Option<u32>,
     /// Messages put into the buffer per second over the last window.
     pub rate_hz: Option<f64>,
-    /// Time of the last entry.
+    /// Time of the last insertion.
     pub last: ModelTime,
     /// Time that messages spent in the buffer, over the last window.
     pub waiting: Quantiles,
 }
 
-/// The queue of a process's subscriptions with one topic, between the network and the call that
-/// takes.
+/// The queue of a process's subscriptions to one topic, between the network and the calls that take
+/// messages.
 #[derive(Clone, Debug)]
 pub struct ReaderQueue {
-    /// Process, the first of its subscriptions, and the node of all.
+    /// Process, handle of its first subscription, and node.
     pub owner: Owner,
     /// Its topic.
     pub topic: TopicName,
     /// The only writer whose messages arrive; `None` if there are several.
     pub writer: Option<Guid>,
-    /// Messages that it keeps, if that is announced.
+    /// Maximum number of messages in the queue, if announced.
     pub depth: Option<u64>,
-    /// Messages that arrived since the agent compares.
+    /// Messages that arrived since the comparison with taken messages began.
     pub arrived: u64,
     /// Messages among them that were taken.
     pub taken: u64,
@@ -179,7 +179,7 @@ pub struct ReaderQueue {
 pub struct Callback {
     /// Identity and node.
     pub owner: Owner,
-    /// What triggers it.
+    /// Trigger of the callback.
     pub trigger: Trigger,
     /// Thread of its last call.
     pub thread: u32,
@@ -195,7 +195,7 @@ pub struct Callback {
     pub last: ModelTime,
     /// Duration of calls, over the last window.
     pub duration: Quantiles,
-    /// Time from being ready to the start, over the last window.
+    /// Time from ready to start of each call, over the last window.
     pub wait: Quantiles,
     /// Durations of all calls.
     pub durations: Arc<Durations>,
@@ -214,17 +214,17 @@ pub struct LifecycleState {
     pub node: Option<NodeName>,
     /// Label of the state.
     pub state: Arc<str>,
-    /// Label of the state before.
+    /// Label of the previous state.
     pub before: Arc<str>,
     /// Time of the transition.
     pub at: ModelTime,
 }
 
-/// Sums of a topic over all processes, also those that have ended. No count ever decreases.
+/// Sums of a topic over all processes, including ended ones. No count ever decreases.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct TopicCounts {
-    /// Messages published. Humble does not report messages within a process: there it is at least
-    /// the number of receptions of one callback.
+    /// Messages published. ROS 2 Humble does not report messages within a process. There, the count
+    /// is at least the number of receptions of one callback.
     pub published: u64,
     /// Messages among them passed directly to subscriptions in the same process.
     pub within_process: u64,
@@ -236,21 +236,21 @@ pub struct TopicCounts {
     pub enqueued: u64,
     /// Messages among them overwritten before they were taken.
     pub overwritten: u64,
-    /// Messages taken from these buffers.
+    /// Messages taken from buffers of intra-process subscriptions.
     pub dequeued: u64,
     /// Calls of callbacks for messages of the same process.
     pub receptions: u64,
 }
 
-/// What processes show of a topic.
+/// Figures of a topic from inside processes.
 #[derive(Clone, Debug, Default)]
 pub struct TopicInside {
-    /// Sums.
+    /// Counts over all processes.
     pub counts: TopicCounts,
     /// Messages of the topic: those published in observed processes, or those that one subscription
-    /// took, if more.
+    /// took if they are more.
     pub messages: u64,
-    /// These messages per second over the last window.
+    /// Rate of `messages` per second over the last window.
     pub rate_hz: f64,
     /// Time of the last message.
     pub last: Option<ModelTime>,
@@ -258,14 +258,14 @@ pub struct TopicInside {
     pub publishers: usize,
     /// Live subscriptions and buffers in observed processes.
     pub subscriptions: usize,
-    /// Messages in the buffers after the last entries.
+    /// Messages in the buffers after the last insertions.
     pub depth: u64,
     /// Time from the source timestamp to the take, of all messages.
     pub latency: Arc<Durations>,
     /// Time that messages spent in buffers.
     pub waiting: Arc<Durations>,
-    /// Messages that arrived at observed processes and were never taken; `None` if arrivals and
-    /// takes of no process can be compared.
+    /// Messages that arrived at observed processes and were never taken. `None` if no process
+    /// allows a comparison of arrived and taken messages.
     pub lost_in_queues: Option<u64>,
 }
 

@@ -1,4 +1,4 @@
-//! Calls inside processes, as values: what the source of uprobes reports, and what a snapshot shows.
+//! Calls inside processes, as values: reports of the uprobes, and what a snapshot shows.
 
 pub mod durations;
 pub mod facts;

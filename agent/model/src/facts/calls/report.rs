@@ -1,4 +1,4 @@
-//! What a source reports about calls inside processes: cumulative figures, once a second.
+//! Reports of a source about calls inside processes: cumulative figures, once a second.
 
 use std::fmt;
 use std::sync::Arc;
@@ -17,7 +17,7 @@ pub struct Report {
     pub at: Timestamp,
     /// Whether callbacks are observed, and not only messages.
     pub has_callbacks: bool,
-    /// Processes with changes, and those that have ended since.
+    /// Processes with changes, and processes that have ended since the last report.
     pub processes: Vec<ProcessReport>,
     /// Lifecycle transitions since the last report.
     pub transitions: Vec<Transition>,
@@ -38,12 +38,12 @@ pub struct ProcessReport {
     pub hits: u64,
     /// Calls that were not counted because there were too many handles.
     pub refused: u64,
-    /// The process exceeds its budget, and its calls are no longer counted.
+    /// Whether the process exceeds its budget, so that its calls are no longer counted.
     pub is_suspended: bool,
-    /// The process has ended; these are its last figures.
+    /// Whether the process has ended. The figures are then its last ones.
     pub has_ended: bool,
-    /// Its library reports every step of intra-process messages (rclcpp of Iron and later), not
-    /// only their callbacks.
+    /// Whether its library reports every step of intra-process messages (rclcpp of Iron and later),
+    /// not only their callbacks.
     pub shows_intra_process: bool,
     /// Nodes that it created while it was observed.
     pub nodes: Vec<NodeName>,
@@ -72,9 +72,9 @@ pub struct PublisherReport {
     pub published: u64,
     /// Messages among them passed directly to subscriptions in the same process.
     pub within_process: u64,
-    /// Time of the last one.
+    /// Time of the last publication.
     pub last: Timestamp,
-    /// Time between consecutive ones.
+    /// Time between consecutive publications.
     pub intervals: Durations,
 }
 
@@ -116,13 +116,13 @@ pub struct BufferReport {
     pub overwritten: u64,
     /// Messages taken.
     pub dequeued: u64,
-    /// Messages in the buffer after the last entry.
+    /// Messages in the buffer after the last insertion.
     pub depth: u32,
-    /// The largest of these so far.
+    /// Maximum of `depth` so far.
     pub max_depth: u32,
     /// Capacity, if the process created the buffer while it was observed.
     pub capacity: Option<u32>,
-    /// Time of the last entry.
+    /// Time of the last insertion.
     pub last: Timestamp,
     /// Time that messages spent in the buffer.
     pub waiting: Durations,
@@ -135,29 +135,31 @@ pub struct CallbackReport {
     pub handle: u64,
     /// Its node, if known.
     pub node: Option<NodeName>,
-    /// What triggers it.
+    /// Trigger of the callback.
     pub trigger: Trigger,
     /// Thread of its last call.
     pub thread: u32,
     /// Completed calls.
     pub calls: u64,
-    /// End of the last one.
+    /// End of the last call.
     pub last: Timestamp,
     /// Duration of the calls.
     pub durations: Durations,
-    /// Time from being ready to the start: since a timer was due, since a message entered its ring
-    /// buffer, or since its source timestamp beyond the least such time seen.
+    /// Time from ready to start. A timer is ready when it is due, and an intra-process message when
+    /// it enters the ring buffer. For other messages, it is the time since the source timestamp
+    /// minus the smallest such time seen.
     pub waits: Durations,
     /// Periods in which a timer was not called.
     pub skipped: u64,
 }
 
-/// What triggers a callback.
+/// Trigger of a callback.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Trigger {
     /// Messages from the middleware.
     Subscription(TopicName),
-    /// Messages from the same process; the topic is unknown if the process was started before.
+    /// Messages from the same process; the topic is unknown if the process started before its
+    /// observation.
     IntraProcess(Option<TopicName>),
     /// A timer; the period is unknown if its structure cannot be read.
     Timer(Option<Duration>),
@@ -218,9 +220,9 @@ pub struct Transition {
     pub process: u32,
     /// The node, if the process created it while it was observed.
     pub node: Option<NodeName>,
-    /// Label of the state before.
+    /// Label of the state before the transition.
     pub start: Arc<str>,
-    /// Label of the state after.
+    /// Label of the state after the transition.
     pub goal: Arc<str>,
     /// Time of the transition.
     pub at: Timestamp,

@@ -60,8 +60,8 @@ pub struct Offer<'a> {
 }
 
 impl Offer<'_> {
-    /// Returns whether the implementations have a protocol in common, without which endpoints do
-    /// not know each other.
+    /// Returns whether both implementations use the same protocol, RTPS or Zenoh. Otherwise the
+    /// endpoints cannot discover each other.
     #[must_use]
     pub fn shares_protocol(self, other: Self) -> bool {
         (self.vendor == VendorId::ZENOH) == (other.vendor == VendorId::ZENOH)
@@ -107,7 +107,7 @@ impl Policy {
     }
 
     fn is_satisfied(self, offered: &Qos, requested: &Qos) -> bool {
-        /// Returns whether the offer is at least the request. Undefined values always are.
+        /// Returns whether the offer is at least the request. Undefined values always suffice.
         fn at_least(offered: (u32, Option<&str>), requested: (u32, Option<&str>)) -> bool {
             offered.1.is_none() || requested.1.is_none() || offered.0 >= requested.0
         }
@@ -200,7 +200,7 @@ pub fn verdict(offered: Offer<'_>, requested: Offer<'_>) -> Verdict {
     }
 }
 
-/// Returns an upper bound of the steps that [`verdict`] takes for these two.
+/// Returns an upper bound of the steps that [`verdict`] takes for these two endpoints.
 #[must_use]
 pub fn effort(offered: &Qos, requested: &Qos) -> usize {
     let length = |qos: &Qos| -> usize { qos.partitions.iter().map(|name| name.len() + 1).sum() };
@@ -246,7 +246,7 @@ fn meet(pattern: &str, name: &str) -> bool {
         return pattern == name && !is_pattern(name);
     }
     let (mut pattern, mut name) = (pattern.chars(), name.chars());
-    // Where to resume after the last star: in the pattern, and one character further in the name.
+    // Positions in pattern and name at which matching resumes after the last star.
     let mut retry: Option<(Chars<'_>, Chars<'_>)> = None;
     loop {
         let mut next = pattern.clone();
@@ -315,14 +315,14 @@ mod tests {
     }
 
     #[test]
-    fn defaults_match() {
+    fn endpoints_with_default_qos_match() {
         assert_eq!(policies(&qos(Role::Writer), &qos(Role::Reader)), []);
     }
 
     /// Breaks each policy alone, then swaps both endpoints. The swapped pair matches, except for
-    /// ownership, which must be equal.
+    /// ownership and data representation, which must be equal.
     #[test]
-    fn each_policy_is_named() {
+    fn each_violated_policy_is_reported() {
         let weak = qos(Role::Writer);
         let breaking: [(Policy, Demand); 10] = [
             (Policy::Durability, |qos| {
@@ -374,7 +374,7 @@ mod tests {
     }
 
     #[test]
-    fn several_policies_are_all_named() {
+    fn all_of_several_violated_policies_are_reported() {
         let (mut writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
         writer.reliability = Reliability::BEST_EFFORT;
         reader.reliability = Reliability::RELIABLE;
@@ -384,7 +384,7 @@ mod tests {
     }
 
     #[test]
-    fn fast_dds_lets_three_policies_pass_among_its_own() {
+    fn two_fast_dds_endpoints_ignore_three_policies() {
         let (writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
         reader.presentation.is_ordered = true;
         reader.destination_order = DestinationOrder::BY_SOURCE_TIMESTAMP;
@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn zenoh_delivers_whatever_the_qos_are() {
+    fn two_zenoh_endpoints_match_whatever_their_qos() {
         let (mut writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
         writer.reliability = Reliability::BEST_EFFORT;
         reader.reliability = Reliability::RELIABLE;
@@ -411,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn unknown_values_are_no_incompatibility() {
+    fn unknown_values_do_not_prevent_a_match() {
         let (writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
         reader.durability = Durability(9);
         reader.ownership = Ownership(7);
@@ -420,7 +420,7 @@ mod tests {
     }
 
     #[test]
-    fn a_writer_uses_its_first_representation_and_a_reader_accepts_any() {
+    fn a_reader_matches_if_it_lists_the_first_representation_of_the_writer() {
         let (mut writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
         writer.representations = vec![DataRepresentation::XCDR2, DataRepresentation::XCDR1];
         assert_eq!(policies(&writer, &reader), [Policy::DataRepresentation]);
@@ -431,7 +431,7 @@ mod tests {
     }
 
     #[test]
-    fn a_nanosecond_of_rounding_is_no_difference() {
+    fn a_difference_of_one_nanosecond_does_not_prevent_a_match() {
         let (mut writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
         writer.deadline = RtpsDuration::Finite(Duration::from_nanos(100_000_001));
         reader.deadline = RtpsDuration::Finite(Duration::from_nanos(100_000_000));
@@ -441,7 +441,7 @@ mod tests {
     }
 
     #[test]
-    fn partitions_meet_by_name_or_by_one_sides_pattern() {
+    fn partitions_match_by_name_or_by_the_pattern_of_one_side() {
         let within = |names: &[&str]| {
             let mut qos = qos(Role::Writer);
             qos.partitions = names.iter().map(|name| (*name).into()).collect();
@@ -497,7 +497,7 @@ mod tests {
     proptest! {
         /// Compares with a second implementation, written after the specification's table.
         #[test]
-        fn the_rules_are_those_of_the_specification(offered in any_qos(), requested in any_qos()) {
+        fn verdicts_agree_with_the_specification(offered in any_qos(), requested in any_qos()) {
             let used = *offered.representations.first().unwrap_or(&DataRepresentation::XCDR1);
             let mut read = requested.representations.clone();
             if read.is_empty() {
@@ -525,7 +525,7 @@ mod tests {
 
         /// Checks that "at least" is transitive. Representations and ownership have no order.
         #[test]
-        fn at_least_is_an_order(mut three in proptest::array::uniform3(any_qos())) {
+        fn matching_is_transitive(mut three in proptest::array::uniform3(any_qos())) {
             for qos in &mut three {
                 qos.representations.clear();
             }

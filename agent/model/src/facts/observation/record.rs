@@ -1,4 +1,4 @@
-//! Conversion from the kernel's record. No other file of the model names it.
+//! Conversion from the kernel's record. No other file of the model uses that type.
 
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::record::{self, Body, Record, flag};
@@ -122,7 +122,7 @@ impl Sample {
     }
 }
 
-/// Returns the bytes of four words that hold wire bytes.
+/// Returns four words as the wire bytes that they hold.
 fn bytes(words: [u32; 4]) -> [u8; 16] {
     let words = words.map(u32::to_ne_bytes);
     let mut bytes = [0; 16];

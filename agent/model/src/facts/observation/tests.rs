@@ -1,4 +1,4 @@
-//! Observations of records, for the tests of the layers above, and the tests of the conversion.
+//! Observations from records, for the tests of higher layers, and tests of the conversion.
 
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{flag, guid_words, kind};
@@ -8,12 +8,12 @@ use ros2probe_wire::{EntityId, Timestamp};
 use super::*;
 use crate::facts::wall_clock::WallClock;
 
-/// Returns the observation of a record, whose time is taken as the model's.
+/// Returns the observation of a record, whose time is used as model time.
 pub(crate) fn observed(record: &Record) -> Observation {
     Observation::of(record, WallClock::default())
 }
 
-/// Returns the sample of a record, whose time is taken as the model's.
+/// Returns the sample of a record, whose time is used as model time.
 pub(crate) fn sample(record: &Record) -> Sample {
     *observed(record).sample().unwrap()
 }
@@ -55,7 +55,7 @@ fn of_data(flags: u16) -> Record {
 }
 
 #[test]
-fn each_kind_of_a_record_has_its_own_numbers() {
+fn each_kind_of_record_converts_to_its_own_fields() {
     let data = sample(&of_data(flag::STAMP));
     assert_eq!(data.content, Content::Data { size: 2 });
     assert!(data.is_message() && data.is_start() && data.is_end() && data.is_delivered());
@@ -84,7 +84,7 @@ fn each_kind_of_a_record_has_its_own_numbers() {
 }
 
 #[test]
-fn a_reader_sends_acknacks_and_a_writer_all_else() {
+fn an_acknack_has_the_reader_as_sender_and_all_else_the_writer() {
     for kind in [kind::DATA, kind::HEARTBEAT, kind::GAP, kind::ACKNACK] {
         let shown = observed(&of_kind(kind));
         let (sender, addressee) = match kind {
@@ -97,7 +97,7 @@ fn a_reader_sends_acknacks_and_a_writer_all_else() {
 }
 
 #[test]
-fn bits_of_a_record_are_one_path_and_one_fate() {
+fn flags_of_a_record_determine_one_path_and_one_fate() {
     let stream = |relayed, at_socket| Path::Stream { relayed, at_socket };
     for (flags, path) in [
         (0, Path::Wire),
@@ -122,7 +122,7 @@ fn bits_of_a_record_are_one_path_and_one_fate() {
 }
 
 #[test]
-fn a_sender_on_this_host_is_evident_on_some_paths() {
+fn some_paths_prove_that_the_sender_is_on_this_host() {
     for (flags, interface, leaves) in [
         (0, 2, false),
         (0, LOOPBACK, true),
@@ -140,7 +140,7 @@ fn a_sender_on_this_host_is_evident_on_some_paths() {
 }
 
 #[test]
-fn a_socket_distinguishes_routes_only_where_it_receives() {
+fn a_socket_is_part_of_a_route_only_if_it_receives() {
     let address = "10.0.0.2:7411".parse::<std::net::SocketAddr>().unwrap();
     let route = |flags| {
         let record = Record {
@@ -168,7 +168,7 @@ fn a_socket_distinguishes_routes_only_where_it_receives() {
 }
 
 #[test]
-fn fragments_begin_with_their_first_datagram_in_the_time_of_the_model() {
+fn began_returns_the_model_time_of_the_first_datagram() {
     let record = Record {
         time: 50,
         elapsed: 30,
