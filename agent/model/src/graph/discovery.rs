@@ -1,9 +1,10 @@
 //! Discovered participants, their endpoints and their nodes.
 //!
-//! Identity is read from payloads. A participant is removed, with its endpoints and nodes, when it
-//! is disposed or its lease expires. An endpoint lives on its own: a repeated announcement of its
-//! participant does not change it. Every table is capped. During a flood of forged announcements,
-//! existing entries stay and a newcomer of no higher priority is refused until an entry is free.
+//! Identities come from payloads, because a packet's sender may relay announcements of others. A
+//! participant is removed, with its endpoints and nodes, when it is disposed or its lease expires.
+//! A repeated announcement of a participant does not change its endpoints. Every table is capped.
+//! In a full table, a new entry replaces only silent entries or entries with a lower priority.
+//! Forged announcements therefore do not displace real entries.
 
 mod disposals;
 mod endpoints;
@@ -44,8 +45,8 @@ use pending::PendingTable;
 pub use priority::Priority;
 
 const PENDING_FOR: Duration = Duration::from_secs(60);
-/// Longest topic or type name: `string<256>` in the builtin topics of DDS. Longer names are
-/// rejected to bound memory.
+/// Maximum length of a topic or type name: `string<256>` in the builtin topics of DDS. Longer names
+/// are rejected to bound memory.
 const MAX_NAME_LEN: usize = 256;
 
 /// Capacities of the tables.
@@ -77,7 +78,7 @@ struct PendingEndpoint {
     announcement: Box<EndpointAnnouncement>,
 }
 
-/// Samples of `ros_discovery_info` that wait for their participant.
+/// Nodes of a `ros_discovery_info` sample that wait for their participant.
 #[derive(Debug)]
 struct PendingNodes {
     at: ModelTime,
@@ -155,7 +156,7 @@ impl Discovery {
         &self.endpoints
     }
 
-    /// Returns the rows of the metrics: participants, endpoints and nodes.
+    /// Returns size, cap and evictions of the tables of participants, endpoints and nodes.
     #[must_use]
     pub fn tables(&self) -> [TableFacts; 3] {
         [
@@ -176,7 +177,7 @@ impl Discovery {
         std::mem::take(&mut self.changes)
     }
 
-    /// Returns whether this participant exists, or waits for a free entry.
+    /// Returns whether this participant exists, waits for a free entry, or has waiting endpoints.
     #[must_use]
     pub fn knows(&self, prefix: GuidPrefix) -> bool {
         let mut waiting = self.pending_endpoints.range(endpoints_of(prefix));
@@ -202,8 +203,8 @@ impl Discovery {
         self.node_victims = Victims::default();
     }
 
-    /// Records a packet of this participant and renews its lease. Returns whether its priority
-    /// increased, as [`Self::learn`] does.
+    /// Records a packet of this participant and renews its lease. Returns whether `evidence` would
+    /// raise its priority in [`Self::learn`].
     pub fn seen(&mut self, prefix: GuidPrefix, at: ModelTime, evidence: Priority) -> bool {
         let priority = match self.participants.get_mut(&prefix) {
             Some(participant) => {
@@ -216,7 +217,7 @@ impl Discovery {
         priority.is_some_and(|priority| priority.or(evidence) != priority)
     }
 
-    /// Raises the priority of a participant. Returns whether it is admitted because of it.
+    /// Raises the priority of a participant. Returns whether the participant is thereby admitted.
     pub fn learn(
         &mut self,
         prefix: GuidPrefix,
@@ -236,7 +237,7 @@ impl Discovery {
         self.enter(prefix, participant, priority.or(evidence), at, journal)
     }
 
-    /// Updates which participants a socket of this host sends for.
+    /// Updates for which participants a socket of this host sends.
     pub fn locate(&mut self, is_local: impl Fn(&GuidPrefix) -> bool) {
         for (prefix, participant) in &mut self.participants {
             participant.local = is_local(prefix);
@@ -308,7 +309,7 @@ impl Discovery {
         self.remove(guid.prefix, origin.at, Some(Event::Disposed), journal);
     }
 
-    /// Returns the end of the lease that ends first, as far as participants were heard.
+    /// Returns the earliest end of a lease, unless further packets renew it.
     pub fn next_expiry(&self) -> Option<ModelTime> {
         let participants = self.participants.values();
         participants
@@ -337,7 +338,7 @@ impl Discovery {
         self.pending_nodes.retain(|_, pending| fresh(pending.at));
     }
 
-    /// Adds a new participant and returns true, or keeps it waiting if the table is full.
+    /// Adds a new participant and returns true. If the table is full, the participant waits.
     fn enter(
         &mut self,
         prefix: GuidPrefix,
@@ -362,7 +363,8 @@ impl Discovery {
         true
     }
 
-    /// Removes a participant with its endpoints and nodes. `event` is `None` for a silent eviction.
+    /// Removes a participant with its endpoints and nodes. `event` is `None` for an eviction, which
+    /// is not an event.
     fn remove(
         &mut self,
         prefix: GuidPrefix,
@@ -399,7 +401,7 @@ impl Discovery {
         }
     }
 
-    /// Changes a participant's domain after a more reliable source, with its endpoints and nodes.
+    /// Moves a participant with its endpoints and nodes to a domain from a more reliable source.
     fn move_to(&mut self, prefix: GuidPrefix, domain_id: DomainId, source: DomainSource) {
         let Some(participant) = self.participants.get_mut(&prefix) else {
             return;

@@ -1,8 +1,8 @@
-//! Reassembly of discovery samples from DATA_FRAGs. Cyclone DDS fragments from 1344 bytes on, and
-//! `ros_discovery_info` of a participant with a few nodes exceeds that.
+//! Reassembly of discovery samples from DATA_FRAGs. Cyclone DDS fragments samples of 1344 bytes and
+//! more, and `ros_discovery_info` of a participant with a few nodes exceeds that size.
 //!
-//! Only samples that the model reads are reassembled here; measured ones are not. Memory is bounded
-//! by the bytes that arrived and a budget; the oldest sample is dropped first.
+//! Only samples that the model reads are reassembled here, not measured ones. Memory grows only
+//! with bytes that arrived, up to a budget. Above it, the oldest sample is dropped.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -11,7 +11,7 @@ use crate::facts::observation::{self, DataFrag};
 use crate::facts::tables::{DiscoveryBytes, DiscoverySamples};
 use ros2probe_wire::{Guid, SequenceNumber};
 
-/// Largest sample in bytes, far above any discovery data.
+/// Maximum size of a sample in bytes, far above any discovery data.
 const MAX_SAMPLE: u32 = 256 * 1024;
 /// Memory per fragment in addition to its bytes.
 const OVERHEAD: usize = 64;
@@ -41,7 +41,7 @@ impl DiscoveryFragments {
         self.place(sample).is_some()
     }
 
-    /// Returns the missing fragments of a sample that has some, counted from 1.
+    /// Returns the numbers of the missing fragments of an unfinished sample, counted from 1.
     pub fn missing(&self, writer: Guid, number: SequenceNumber) -> impl Iterator<Item = u32> + '_ {
         let mut samples = self.samples.iter();
         let sample = samples.find(|each| (each.writer, each.number) == (writer, number));
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn fragments_in_any_order_and_several_at_once_make_the_payload() {
+    fn fragments_in_any_order_and_in_groups_form_the_payload() {
         let payload: Vec<u8> = (0..=249).collect();
         let mut discovery_fragments = DiscoveryFragments::default();
         assert_eq!(
@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn a_claimed_size_allocates_nothing_and_a_storm_stays_in_the_budget() {
+    fn a_storm_of_claimed_sizes_stays_within_the_budget() {
         let mut discovery_fragments = DiscoveryFragments::default();
         assert_eq!(
             put(
@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn large_samples_that_never_end_keep_within_the_bytes() {
+    fn large_unfinished_samples_stay_within_the_budget() {
         let mut discovery_fragments = DiscoveryFragments::default();
         for number in 0..1000 {
             put(

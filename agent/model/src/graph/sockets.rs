@@ -1,4 +1,4 @@
-//! Facts about this host's sockets from outside the packets: their owners, and drops of
+//! Facts about this host's sockets that packets do not contain: their owners, and drops of
 //! unidentified datagrams.
 //!
 //! The capture side reads these facts from the kernel. The table is bounded: when it is full, a new
@@ -10,7 +10,7 @@ use crate::facts::tables::KnownSockets;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Facts about one socket from outside the packets.
+/// Facts about one socket that packets do not contain.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct SocketFacts {
     /// `SO_COOKIE`.
@@ -56,7 +56,7 @@ impl Sockets {
         self.sockets.remove(&cookie).is_some()
     }
 
-    /// Removes a socket that may be open, because the kernel's table dropped it.
+    /// Removes a socket that the kernel's table dropped, although it may be open.
     pub fn forget(&mut self, cookie: u64) {
         self.sockets.refuse();
         self.remove(cookie);
@@ -73,7 +73,7 @@ impl Sockets {
         self.sockets.values()
     }
 
-    /// Returns the row of the metrics.
+    /// Returns size, cap and evictions for the metrics.
     pub fn table(&self) -> TableFacts {
         self.sockets.facts()
     }
@@ -89,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_table_keeps_whom_it_knows() {
+    fn a_full_table_refuses_new_sockets_and_updates_known_ones() {
         let mut sockets = Sockets::new(2);
         let socket = |cookie, drops| SocketFacts {
             cookie,

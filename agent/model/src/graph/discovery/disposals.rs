@@ -1,4 +1,4 @@
-//! Recent disposals: delayed copies of an announcement or samples must not bring the entity back.
+//! Recent disposals, so that delayed announcements or samples do not bring the entity back.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -10,9 +10,9 @@ use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::LatestDisposals;
 
-/// Announcements older than a disposal are ignored for this long after it.
+/// Time after a disposal during which older announcements are ignored.
 const STALE_WITHIN: Duration = Duration::from_millis(500);
-/// Samples that were already sent arrive within this time.
+/// Time after a disposal during which samples that were sent before may still arrive.
 const UNDER_WAY: Duration = Duration::from_secs(2);
 
 /// The latest disposals, oldest first.

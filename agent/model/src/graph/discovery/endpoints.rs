@@ -25,7 +25,7 @@ use crate::facts::model_time::ModelTime;
 
 impl Discovery {
     /// Records the SEDP announcement of an endpoint. `evidence` is the priority known for its
-    /// participant. Returns whether the participant is admitted because of it.
+    /// participant. Returns whether the participant is thereby admitted.
     pub fn endpoint(
         &mut self,
         announcement: EndpointAnnouncement,

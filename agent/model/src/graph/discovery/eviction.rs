@@ -1,14 +1,15 @@
-//! Eviction from full tables: which entry makes room for a newcomer.
+//! Eviction from full tables: which entry is removed for a new one.
 //!
-//! Silent entries go first. An entry is silent after 5 s if it existed for less than 2 s, otherwise
-//! after 90 s; one with a socket on this host never is. Other entries only go for a newcomer of
-//! higher priority: the lowest priority first, and among equals the longest silence.
+//! Silent entries are evicted first. An entry is silent after 5 s if it existed for less than 2 s,
+//! otherwise after 90 s. An entry with a socket on this host is never silent. Other entries are
+//! evicted only for a new entry with a higher priority: first the lowest priority, and among equals
+//! the longest silence.
 //!
-//! Names and user data can be forged, too. Without a socket on this host, newcomers displace
-//! established entries only until such newcomers fill half of the table.
+//! Names and user data can be forged, too. New entries without a socket on this host displace
+//! established entries only until such new entries fill half of the table.
 //!
-//! A search visits the whole table, and a flood would trigger one per packet. So one search serves
-//! many newcomers, and the rate of searches is limited.
+//! A search visits the whole table, and a flood would trigger one per packet. Therefore one search
+//! serves many new entries, and the rate of searches is limited.
 
 use std::time::Duration;
 
@@ -30,7 +31,7 @@ pub(super) const MAX_SILENCE: Duration = Duration::from_secs(90);
 /// Minimum time between two searches of a full table; it grows with the number of entries.
 const SEARCH: Duration = Duration::from_millis(100);
 const SEARCH_EACH: Duration = Duration::from_micros(10);
-/// Largest number of candidates of each kind that one search finds.
+/// Maximum number of candidates of each kind per search.
 const FOUND: usize = 64;
 
 /// Candidates that a search of one table found.
@@ -57,7 +58,7 @@ struct Victim {
     guid: Guid,
 }
 
-/// An entry for which the table has no room.
+/// A new entry for a full table.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Newcomer {
     pub(super) guid: Guid,
@@ -120,7 +121,7 @@ impl Victims {
         self.search_after = now + SEARCH.max(SEARCH_EACH.saturating_mul(visited));
     }
 
-    /// Returns the next entry to evict for this newcomer.
+    /// Returns the next entry to evict for the new one.
     fn next(&mut self, discovery: &Discovery, table: Table, newcomer: Newcomer) -> Option<Guid> {
         let Newcomer { guid, priority } = newcomer;
         // A packet since the search makes an entry active again.
@@ -167,7 +168,7 @@ impl Victim {
 }
 
 impl Discovery {
-    /// Evicts an entry for this newcomer from a full table; returns false if every entry stays.
+    /// Evicts an entry from a full table for the new one. Returns false if no entry may be evicted.
     pub(super) fn evict_for(&mut self, table: Table, newcomer: Newcomer, now: ModelTime) -> bool {
         let mut victims = std::mem::take(self.victims(table));
         if now >= victims.search_after {
@@ -211,12 +212,12 @@ impl Discovery {
         match table {
             Table::Participants => self.caps.participants,
             Table::Endpoints => self.caps.endpoints,
-            // Victims are participants, which give up all of their nodes.
+            // Victims are participants, which lose all of their nodes.
             Table::Nodes => self.caps.participants,
         }
     }
 
-    /// Returns the priority of an entry, or `None` if it is gone.
+    /// Returns the priority of an entry, or `None` if it was removed.
     fn priority(&self, guid: Guid) -> Option<Priority> {
         let priority = self.participants.get(&guid.prefix)?.priority();
         if guid.entity == EntityId::PARTICIPANT {

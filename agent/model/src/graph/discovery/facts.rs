@@ -20,7 +20,7 @@ use crate::facts::names::{DdsName, NodeName, TypeName};
 use crate::facts::naming::Naming;
 use crate::facts::tables::ParticipantEndpoints;
 
-/// Largest number of addresses kept per participant and kind.
+/// Maximum number of addresses kept per participant and kind.
 pub(super) const ADDRESSES: usize = 16;
 
 /// Source of a participant's domain, from the least to the most reliable.
@@ -44,7 +44,7 @@ pub struct Origin {
     pub at: ModelTime,
     /// GUID prefix of the sender, which may relay another participant's announcement.
     pub sender: GuidPrefix,
-    /// Sequence number, counted by the sender's writer.
+    /// Sequence number, assigned by the sender's writer.
     pub sequence_number: SequenceNumber,
     /// Destination address, IPv4-mapped for IPv4.
     pub destination: [u8; 16],
@@ -65,7 +65,7 @@ pub struct ParticipantProxy {
     pub process_name: Option<Arc<str>>,
     /// Process id, or its low 16 bits.
     pub process_id: Option<u32>,
-    /// Lease.
+    /// Lease duration.
     pub lease: RtpsDuration,
     /// Whether it announces DDS security.
     pub secured: bool,
@@ -93,7 +93,7 @@ pub struct Participant {
     pub restored: Option<ModelTime>,
     /// Its domain.
     pub domain_id: DomainId,
-    /// First announcement.
+    /// Time of the first announcement.
     pub first_seen: ModelTime,
     /// Time of its last packet.
     pub last_seen: ModelTime,
@@ -140,9 +140,10 @@ pub struct Endpoint {
     pub type_hash: Option<TypeHash>,
     /// Quality of service.
     pub qos: Arc<Qos>,
-    /// First announcement.
+    /// Time of the first announcement.
     pub first_seen: ModelTime,
-    /// Whether it accepts shared memory; `None` if it announces nothing, as its participant does.
+    /// Whether it accepts shared memory. `None` if it announces nothing; its participant's value
+    /// then applies.
     pub shared_memory: Option<bool>,
     /// Whether it supports data sharing with endpoints on its host.
     pub data_sharing: bool,
@@ -191,11 +192,12 @@ impl Participant {
         self.last_seen = self.last_seen.max(at);
     }
 
-    /// Returns the end of its lease, unless it is heard before; `None` = never.
+    /// Returns the end of its lease if no further packet arrives; `None` means never.
     pub(super) fn lease_end(&self) -> Option<ModelTime> {
         let lease = match self.proxy.lease {
             RtpsDuration::Finite(lease) => lease,
-            // It may have stopped while no agent ran, so its infinite lease is limited.
+            // The participant may have stopped while no agent ran, so its infinite lease is
+            // limited.
             RtpsDuration::Infinite => self.restored.map(|_| MAX_SILENCE)?,
         };
         Some(self.last_seen + lease)
@@ -252,8 +254,9 @@ pub(super) fn named(nodes: &[Node]) -> usize {
 }
 
 /// Returns the participant's domain and its source. Without an announced domain, it follows from
-/// the destination port (RTPS 2.5, 9.6.2.3: 7400 + 250 d, multicast + 0, unicast + 10 + 2 p). Ports
-/// from 32768 on are mostly ephemeral, so the domain is then assumed to be 0.
+/// the destination port (RTPS 2.5, 9.6.2.3). For domain d, the multicast port is 7400 + 250 d, and
+/// unicast ports are 7410 + 250 d + 2 p. Ports of 32768 and above are mostly ephemeral, so the
+/// domain is then assumed to be 0.
 pub(super) fn domain(announced: Option<DomainId>, origin: &Origin) -> (DomainId, DomainSource) {
     const EPHEMERAL: u16 = 32_768;
     if let Some(domain_id) = announced.filter(|domain_id| *domain_id <= DomainId::MAX) {
@@ -275,7 +278,7 @@ pub(super) fn domain(announced: Option<DomainId>, origin: &Origin) -> (DomainId,
 }
 
 impl Endpoint {
-    /// Returns the names of its topic; `None` if that is not a valid name.
+    /// Returns the names of its topic; `None` if the name is invalid.
     #[must_use]
     pub fn naming(&self) -> Option<Naming> {
         let topic = DdsTopic::parse(&self.topic).ok()?;

@@ -1,9 +1,9 @@
 //! Discovery state as plain data that outlives the agent.
 //!
 //! Most announcements are sent once, so an agent that restarts on a running robot would know GUIDs
-//! without names. Restored entries are valid for one lease; a participant that sends a packet
-//! within it stays, with all its entries. Encoding and files are the caller's task. Restored data
-//! is validated like any other external input.
+//! without names. Restored entries are valid for one lease. A participant that sends a packet
+//! within that time stays, with all its entries. Encoding and files are the caller's task. Restored
+//! data is validated like any other external input.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -105,7 +105,7 @@ struct Matching {
     representations: Vec<i16>,
 }
 
-/// Largest number of data representations restored per endpoint.
+/// Maximum number of data representations restored per endpoint.
 const MAX_REPRESENTATIONS: usize = 8;
 
 impl Discovery {
@@ -389,7 +389,7 @@ impl Matching {
 }
 
 impl Default for Matching {
-    /// Returns the properties of nearly all endpoints.
+    /// Returns the properties that nearly all endpoints have.
     fn default() -> Self {
         Self::of(&Qos::defaults(Role::Writer, VendorId::EPROSIMA))
     }
@@ -481,7 +481,7 @@ mod tests {
     }
 
     #[test]
-    fn only_whole_pairs_of_digits_are_bytes() {
+    fn hexadecimal_text_without_two_digits_per_byte_is_refused() {
         assert_eq!(hexadecimal("010f"), Some([1, 15]));
         assert_eq!(hexadecimal("FFa0"), Some([255, 160]));
         for wrong in ["", "01", "010", "010f00", "01g0", "+1+1", "01 f"] {

@@ -34,8 +34,8 @@ impl<D: Declared + Default, K: Copy + Ord, T> PendingTable<D, K, T> {
         }
     }
 
-    /// Inserts or replaces an entry. Returns whether an entry was dropped for it; that is the new
-    /// entry if all others have a higher priority.
+    /// Inserts or replaces an entry. Returns whether an entry was dropped: another one, or the new
+    /// one if all others have a higher priority.
     pub(super) fn put(&mut self, key: K, priority: Priority, value: T) -> bool {
         self.remove(&key);
         let is_full = self.entries.is_full();
@@ -116,7 +116,7 @@ mod tests {
     };
 
     #[test]
-    fn the_oldest_of_the_least_worth_goes_first_and_nothing_worth_more_than_the_newcomer() {
+    fn a_full_table_drops_the_oldest_entry_of_the_lowest_priority() {
         let mut waiting: PendingTable<Waiting, _, _> = PendingTable::new();
         assert!(!waiting.put(1, WATCHED, 'a'));
         assert!(!waiting.put(2, Priority::NOTHING, 'b'));

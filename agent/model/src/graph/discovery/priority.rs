@@ -1,16 +1,16 @@
 //! Priorities of entries in a full table.
 //!
-//! An announcement costs a forger one packet, so a full table must not keep out real newcomers:
-//! entries of higher priority displace those of lower priority.
+//! An announcement costs a forger one packet, but a full table must not keep out real participants.
+//! Therefore entries of higher priority displace those of lower priority.
 
 /// Evidence that a participant or endpoint is real; the first field has the most weight.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Priority {
-    /// Its topic, or the topic of one of the participant's endpoints, is watched by exact name.
+    /// Whether its topic, or that of an endpoint of the participant, is watched by exact name.
     pub watched: bool,
-    /// A socket on this host sends for its participant, which a remote forger cannot fake.
+    /// Whether a socket on this host sends for its participant, which a remote forger cannot fake.
     pub local: bool,
-    /// Its participant has sent user data.
+    /// Whether its participant has sent user data.
     pub sends: bool,
 }
 
@@ -22,7 +22,7 @@ impl Priority {
         sends: false,
     };
 
-    /// Returns the combined evidence of both.
+    /// Returns the combined evidence.
     #[must_use]
     pub const fn or(self, other: Self) -> Self {
         Self {
@@ -38,7 +38,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_watched_name_counts_more_than_a_local_socket_and_that_more_than_user_data() {
+    fn a_watched_name_outranks_a_local_socket_which_outranks_user_data() {
         let priority = |watched, local, sends| Priority {
             watched,
             local,

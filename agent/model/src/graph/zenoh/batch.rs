@@ -1,5 +1,5 @@
 //! Transport messages of a batch: INIT identifies the sender, OPEN has its lease, a FRAME contains
-//! network messages, and FRAGMENTs are parts of one.
+//! network messages, and FRAGMENTs are parts of one network message.
 
 use std::time::Duration;
 
@@ -15,11 +15,11 @@ use super::messages::attachment;
 use super::stream::{StreamId, Unseen};
 use crate::facts::model_time::ModelTime;
 
-/// Room for the messages in FRAGMENTs below which stale ones are given up: one large message.
+/// Free memory for messages in FRAGMENTs below which stale ones are given up: one large message.
 const ROOM: usize = 4 << 20;
-/// Time without a FRAGMENT after which a message is given up if room is needed.
+/// Time without a FRAGMENT after which a message is given up if memory is needed.
 const STALE: Duration = Duration::from_secs(10);
-/// Least time between two searches for such messages.
+/// Minimum time between two searches for stale messages.
 const GIVE_UP_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Zenoh {
@@ -37,7 +37,7 @@ impl Zenoh {
         };
         direction.last_seen = place.time;
         if let Some(owner) = direction.owner(stream).filter(|_| !is_known) {
-            // It is a connection from saved state.
+            // The connection is known from saved state.
             show(Shown::Owner(stream.socket, owner.guid_prefix()));
         }
         if let Some(session) = direction.session() {
@@ -66,7 +66,7 @@ impl Zenoh {
                 Ok(Message::Close(_)) => self.leave(stream, place.time),
                 Ok(Message::Oam(_) | Message::KeepAlive | Message::Frame(_) | Message::Join(_)) => {
                 }
-                // The capture left out the end of the batch on purpose.
+                // The capture omitted the end of the batch on purpose.
                 Err(error) if error.reason == Reason::Truncated => {}
                 Err(error) => show(Shown::Malformed(error.reason)),
             }

@@ -1,4 +1,4 @@
-//! Begin and end of connections, with the tokens and sessions that end with them.
+//! Start and end of connections, with the tokens and sessions that end with them.
 
 use std::time::Duration;
 
@@ -13,26 +13,26 @@ use crate::facts::model_time::ModelTime;
 
 /// Lease that rmw_zenoh configures.
 const LEASE: Duration = Duration::from_secs(60);
-/// Part of its lease after which a sender is silent. It sends several times in each lease, and the
-/// other end closes the connection after all of it.
+/// Part of its lease after which a sender is silent. A live sender sends several times in each
+/// lease, and the other end closes the connection after the whole lease.
 const SILENT: f64 = 0.9;
 
 impl Zenoh {
-    /// Returns the other direction, seen at the same place or, on the loopback interface, at the
-    /// other socket.
+    /// Returns the opposite direction, seen at the same socket or interface or, on the loopback
+    /// interface, at the other socket.
     pub(super) fn opposite(&self, stream: &StreamId) -> Option<&StreamState> {
         let known = self.directions.get(&stream.reversed());
         let known = known.map(|direction| &**direction);
         known.or_else(|| self.elsewhere(stream).map(|(_, direction)| direction))
     }
 
-    /// Returns the other direction, and the place at which it was seen last.
+    /// Returns the opposite direction, and the stream in which it was last seen.
     fn elsewhere(&self, stream: &StreamId) -> Option<(&StreamId, &StreamState)> {
         let place = self.flows.get(&stream.flow.reversed())?;
         Some((place, self.directions.get(place)?))
     }
 
-    /// Returns the socket to which a direction of the loopback interface leads, if its session is
+    /// Returns the receiving socket of a direction on the loopback interface, if its session is
     /// known; else 0.
     pub(super) fn receiving_socket(&self, stream: &StreamId) -> u64 {
         let other = self.elsewhere(stream).filter(|_| stream.is_loopback());
@@ -78,21 +78,21 @@ impl Zenoh {
         self.unseen.retain(|(_, other)| *other != connection);
     }
 
-    /// Records that the sender leaves the connection. If it is the first to do so and has no other
-    /// connection, its session has ended. Its declarations end with the connection. If the other end
-    /// has been silent for its lease, that one has left first.
+    /// Records that the sender leaves the connection. If it is the first end to leave and has no
+    /// other connection, its session has ended. Its declarations end with the connection. If the
+    /// other end has been silent for its lease, that end has left first.
     pub(super) fn leave(&mut self, stream: &StreamId, now: ModelTime) {
         if let Some(silent) = self.silent_end(stream, now)
             && let Some(direction) = self.directions.get_mut(&silent)
         {
-            // Nothing will be seen of it.
+            // No end of the silent direction will be captured.
             direction.has_ended = true;
             self.leave_now(&silent, now);
         }
         self.leave_now(stream, now);
     }
 
-    /// As [`Self::leave`], whether or not the other end has been silent.
+    /// Does the same as [`Self::leave`], without a check whether the other end has been silent.
     fn leave_now(&mut self, stream: &StreamId, now: ModelTime) {
         if self.remembered.sender(stream.flow).is_some() {
             self.direction(stream);
@@ -123,7 +123,7 @@ impl Zenoh {
         }
     }
 
-    /// Returns the other direction if its sender has been silent for its lease.
+    /// Returns the opposite direction if its sender has been silent for its lease.
     fn silent_end(&self, stream: &StreamId, now: ModelTime) -> Option<StreamId> {
         if self.directions.get(stream)?.has_left {
             return None;
@@ -161,7 +161,7 @@ impl Zenoh {
         self.unseen.insert((reason, flow.connection()));
     }
 
-    /// Forgets a direction with what it declares. A token lives on until it is undeclared or its
+    /// Removes a direction with its declarations. A token stays until it is undeclared or its
     /// session ends.
     fn remove(&mut self, stream: &StreamId) {
         let Some(known) = self.directions.remove(stream) else {
@@ -176,7 +176,7 @@ impl Zenoh {
     }
 }
 
-/// Returns the lease of a session that a connection shows.
+/// Returns the longest lease that a session announced on its connections.
 pub(super) fn lease(
     directions: &HashMap<StreamId, Box<StreamState>>,
     session: ZenohId,

@@ -1,7 +1,7 @@
 //! Which connections declare which tokens.
 //!
-//! A router passes on the tokens of all sessions to each of them, so there are far more of these
-//! pairs than tokens or connections. Both are numbers here.
+//! A router forwards the tokens of all sessions to each session, so there are far more pairs than
+//! tokens or connections. Tokens and connections are therefore numbers in the pairs.
 
 use std::collections::BTreeSet;
 use std::ops::Bound;
@@ -11,7 +11,7 @@ use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, ByOwner};
 use crate::facts::tables::{ZenohDeclared, ZenohTokenIds};
 
-/// Number of a token, never used again.
+/// Number of a token, never reused.
 pub(super) type TokenNumber = u64;
 
 /// Bytes of a pair in the second index.
@@ -77,7 +77,7 @@ impl Declared {
         pairs.map(|(_, direction)| *direction)
     }
 
-    /// Returns whether a direction declares a token.
+    /// Returns whether any direction declares a token.
     pub(super) fn is_declared(&self, token: TokenNumber) -> bool {
         self.of(token).next().is_some()
     }

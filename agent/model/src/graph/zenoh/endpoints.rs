@@ -1,4 +1,4 @@
-//! What a token of an endpoint is in the terms of DDS: its announcements and GUIDs.
+//! Conversion of an endpoint's token to the terms of DDS: its announcements and GUIDs.
 
 use ros2probe_wire::discovery::{EndpointAnnouncement, Role};
 use ros2probe_wire::names::{DdsTopic, DdsType};
@@ -40,8 +40,8 @@ pub(super) fn announcements(token: &EndpointToken) -> Vec<EndpointAnnouncement> 
     announcements.collect()
 }
 
-/// Returns the GUID that stands for an endpoint: its number in the session, or a part of its hash if
-/// that number is too large.
+/// Returns the GUID that represents an endpoint. It contains the endpoint's number in the session,
+/// or a part of its hash if that number is too large.
 fn endpoint_guid(token: &EndpointToken, role: Role) -> Guid {
     let [a, b, c, ..] = token.gid.0;
     let [.., x, y, z] = token.entity.to_be_bytes();
@@ -55,7 +55,7 @@ fn endpoint_guid(token: &EndpointToken, role: Role) -> Guid {
     )
 }
 
-/// Returns the GUID that stands for a writer whose token is unknown.
+/// Returns the GUID that represents a writer whose token is unknown.
 pub fn unknown_guid(gid: Gid) -> Guid {
     let mut bytes = [0; 16];
     let from = VendorId::ZENOH.0.into_iter().chain(gid.0);

@@ -5,13 +5,13 @@ use super::stream::Unseen;
 /// Figures of Zenoh.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ZenohFacts {
-    /// Connections of Zenoh at present, each counted once.
+    /// Current connections of Zenoh, each counted once.
     pub connections: u64,
-    /// Routers at present.
+    /// Current routers.
     pub routers: u64,
-    /// What was counted since the start.
+    /// Counters since the start.
     pub counters: Counters,
-    /// Connections of which nothing or no payload can be read, in the order of [`Unseen::ALL`].
+    /// Connections whose messages or payloads cannot be read, in the order of [`Unseen::ALL`].
     pub unseen: [u64; Unseen::ALL.len()],
 }
 
@@ -23,12 +23,12 @@ impl ZenohFacts {
     }
 }
 
-/// What was counted since the start.
+/// Counters since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
     /// Batches.
     pub batches: u64,
-    /// Times that bytes of a connection were missing.
+    /// Number of times that bytes of a connection were missing.
     pub gaps: u64,
     /// Messages without an attachment of ROS.
     pub foreign: u64,

@@ -1,8 +1,8 @@
-//! The ROS graph in liveliness tokens: sessions, nodes and endpoints.
+//! The ROS graph from liveliness tokens: sessions, nodes and endpoints.
 //!
-//! Several connections may declare a token: those of its session, and those of routers. It lives
-//! until the last of them undeclares it, until its own session undeclares it, or until the session
-//! ends. The end that closes a connection first undeclares its tokens with it.
+//! Several connections may declare a token: connections of its session, and of routers. A token
+//! exists until the last connection undeclares it, its own session undeclares it, or the session
+//! ends. If an end closes a connection first, it thereby undeclares its tokens.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -29,7 +29,7 @@ const SESSION: usize = 2048;
 /// Bytes that a token's parts take in its node, among the writers and among the servers, without
 /// names.
 const PARTS: usize = 640;
-/// Most routers that are remembered to pass on the tokens of sessions.
+/// Maximum number of routers that are remembered as forwarding tokens of sessions.
 pub(super) const MAX_PASSING_ROUTERS: usize = 256;
 /// An endpoint that discovery knows from saved state.
 #[derive(Clone, Copy, Debug)]
@@ -44,7 +44,7 @@ pub struct RestoredEndpoint<'a> {
     pub topic: &'a str,
 }
 
-/// Least time between two announcements of a session that discovery has forgotten.
+/// Minimum time between two announcements of a session that discovery has forgotten.
 const REPEAT: Duration = Duration::from_secs(1);
 
 /// A change of the graph, in the terms of DDS.
@@ -62,7 +62,7 @@ pub enum GraphChange {
     Nodes(ParticipantEntities),
 }
 
-/// What a token stands for.
+/// Entity that a token represents.
 #[derive(Debug)]
 enum Meaning {
     Node(u64),
@@ -83,7 +83,7 @@ struct TokenState {
 }
 
 impl HeapBytes for TokenState {
-    /// Returns nothing: what a token takes is estimated before it is entered.
+    /// Returns 0, because the memory of a token is estimated before its insertion.
     fn heap_bytes(&self) -> usize {
         0
     }
@@ -97,7 +97,7 @@ struct WriterState {
     session: Option<ZenohId>,
 }
 
-/// All tokens and what they stand for.
+/// All tokens and the entities that they represent.
 #[derive(Debug, Default)]
 pub struct Graph {
     tokens: ByOwner<ZenohTokens, (), Arc<str>, TokenState>,
@@ -110,7 +110,7 @@ pub struct Graph {
     writers: Bounded<ZenohWriters, HashMap<Gid, WriterState>>,
     /// Sessions from saved state with their domains, until they end.
     restored: Bounded<ZenohRestored, BTreeMap<ZenohId, DomainId>>,
-    /// Sessions behind other routers, by the router that passes on their tokens.
+    /// Sessions behind other routers, by the router that forwards their tokens.
     passages: ByOwner<ZenohPassages, ZenohId, ZenohId, ()>,
     servers: Bounded<ZenohServers, BTreeMap<Arc<str>, BTreeMap<ZenohId, Guid>>>,
     changed: BTreeSet<ZenohId>,
@@ -151,7 +151,7 @@ impl Graph {
             .chain(self.restored.keys().copied())
     }
 
-    /// Learns an endpoint that discovery knows from saved state.
+    /// Adds an endpoint that discovery knows from saved state.
     pub fn restore(&mut self, endpoint: RestoredEndpoint<'_>, session: Option<ZenohId>) {
         let guid = endpoint.guid;
         if let Some(session) = session {
@@ -187,7 +187,7 @@ impl Graph {
         std::mem::take(&mut self.changes)
     }
 
-    /// Announces a session again, which discovery has forgotten, at most once a second.
+    /// Announces again a session that discovery has forgotten, at most once a second.
     pub fn repeat(&mut self, session: ZenohId, now: ModelTime) {
         let Some(state) = self.sessions.get_mut(&session) else {
             return;
@@ -210,8 +210,8 @@ impl Graph {
         self.changed.insert(session);
     }
 
-    /// Records that a direction declares a token with a number. Returns whether it is of ROS, and
-    /// known.
+    /// Records that a direction declares a token with a number. Returns whether the token belongs
+    /// to ROS and is stored.
     pub fn declare(
         &mut self,
         text: &str,
@@ -232,7 +232,7 @@ impl Graph {
         };
         let session = node.session;
         let text: Arc<str> = text.into();
-        // Its names are parts of the text, and stand in the node, or in the key of a service.
+        // The names in the text are stored again, in the node or in the key of a service.
         let mut beside = PARTS + text.len();
         if !self.sessions.contains_key(&session) {
             beside += SESSION;
@@ -261,8 +261,8 @@ impl Graph {
         true
     }
 
-    /// Records that a direction, whose sender is this session if known, no longer declares the token
-    /// with this number or, without one, with this text.
+    /// Records that a direction no longer declares the token with this number or, if the number is
+    /// unknown, with this text. `by` is the session of the sender, if known.
     pub fn undeclare(
         &mut self,
         (direction, id): (DirectionNumber, u32),
@@ -277,14 +277,14 @@ impl Graph {
         }
     }
 
-    /// Records that a direction no longer declares anything: its sender has left.
+    /// Records that the sender of a direction has left, so that the direction declares nothing.
     pub fn leave(&mut self, direction: DirectionNumber) {
         for token in self.declared.remove_direction(direction) {
             self.remove_undeclared(token, None);
         }
     }
 
-    /// Forgets a direction, whose tokens may live on.
+    /// Removes a direction but not its tokens.
     pub fn disconnect(&mut self, direction: DirectionNumber) {
         self.declared.remove_direction(direction);
     }
@@ -301,7 +301,7 @@ impl Graph {
         }
     }
 
-    /// Removes a session with everything that it has.
+    /// Removes a session with all its tokens.
     pub fn end(&mut self, session: ZenohId) {
         let state = self.sessions.remove(&session);
         let was_restored = self.restored.remove(&session).is_some();
@@ -325,8 +325,8 @@ impl Graph {
         self.changes.push(GraphChange::ParticipantGone(guid));
     }
 
-    /// Records that a router passes on this token of a session behind another router. Returns
-    /// whether that is new.
+    /// Records that a router forwards this token of a session behind another router. Returns
+    /// whether this was unknown.
     pub fn pass_on(&mut self, token: &str, router: ZenohId) -> bool {
         let Some(session) = self.tokens.get((), token).map(|token| token.session) else {
             return false;
@@ -338,18 +338,18 @@ impl Graph {
         has_room && self.passages.insert(router, session, (), 0)
     }
 
-    /// Returns whether a router passes on tokens of sessions behind other routers.
+    /// Returns whether a router forwards tokens of sessions behind other routers.
     pub fn passes_on(&self, router: ZenohId) -> bool {
         self.passages.of(router).next().is_some()
     }
 
-    /// Returns the sessions of which a router passes on tokens.
+    /// Returns the sessions whose tokens a router forwards.
     pub fn passed_on_by(&self, router: ZenohId) -> BTreeSet<ZenohId> {
         let sessions = self.passages.of(router);
         sessions.map(|(session, ())| *session).collect()
     }
 
-    /// Removes a router that passes on tokens, and returns the sessions that no other one passes on.
+    /// Removes a router that forwards tokens. Returns the sessions that no other router forwards.
     pub fn pass_no_longer(&mut self, router: ZenohId) -> BTreeSet<ZenohId> {
         let mut sessions: BTreeSet<_> = self.passages.remove_owner(router).collect();
         for other in self.passages.owners() {
@@ -358,7 +358,7 @@ impl Graph {
         sessions
     }
 
-    /// Returns the routers that pass on tokens, with the sessions.
+    /// Returns the routers that forward tokens, with the sessions.
     pub fn passages(&self) -> BTreeMap<ZenohId, BTreeSet<ZenohId>> {
         let routers = self.passages.owners();
         routers
@@ -366,7 +366,7 @@ impl Graph {
             .collect()
     }
 
-    /// Restores saved routers with the restored sessions of which they pass on tokens.
+    /// Restores saved routers with the restored sessions whose tokens they forward.
     pub fn restore_passages(&mut self, passages: BTreeMap<ZenohId, BTreeSet<ZenohId>>) {
         for (router, sessions) in passages.into_iter().take(MAX_PASSING_ROUTERS) {
             for session in sessions {
@@ -387,7 +387,7 @@ impl Graph {
             .collect()
     }
 
-    /// Removes what no connection declares of a session of this domain.
+    /// Removes the tokens of a session of this domain that no connection declares.
     pub fn keep_declared(&mut self, session: ZenohId, domain: DomainId) {
         let Some(state) = self.sessions.get(&session) else {
             if self.restored.get(&session) == Some(&domain) {
@@ -416,7 +416,7 @@ impl Graph {
         tables
     }
 
-    /// Returns the number of routers that pass on tokens.
+    /// Returns the number of routers that forward tokens.
     fn routers(&self) -> usize {
         self.passages.owners().count()
     }
@@ -523,7 +523,7 @@ impl Graph {
         }
         self.changed.insert(token.session);
         if let Meaning::Node(node) = token.meaning {
-            // The endpoints of a node end with it, also without an undeclaration.
+            // The endpoints of a node end with it, even if they are not undeclared.
             let tokens = &self.tokens;
             let is_of_node = |text: &&Arc<str>| {
                 let other = tokens.get((), &***text);
@@ -593,7 +593,7 @@ fn served(token: &EndpointToken) -> Option<Arc<str>> {
         .then(|| service_key(token.node.domain, token.name.as_str()).into())
 }
 
-/// Returns the key of [`Graph::server`].
+/// Returns the key by which [`Graph::server`] finds a service.
 pub fn service_key(domain: DomainId, name: &str) -> String {
     format!("{}{name}", domain.0)
 }

@@ -55,7 +55,7 @@ impl Zenoh {
         resolve(expression, &self.aliases, number)
     }
 
-    /// Notes that a session wants to know the graph.
+    /// Records that a session requests the graph of a domain.
     fn interest(&mut self, stream: &StreamId, interest: &Interest<'_>) {
         let key = interest.key.filter(|_| interest.is_current);
         let key = key.and_then(|key| self.resolve(stream, key));
@@ -65,7 +65,7 @@ impl Zenoh {
         }
     }
 
-    /// Shows a sample of a topic.
+    /// Passes a sample of a topic to `show`.
     fn sample(
         &mut self,
         place: Place<'_>,
@@ -88,7 +88,7 @@ impl Zenoh {
         show(Shown::Sample(&sample));
     }
 
-    /// Shows the request of a service's client.
+    /// Passes the request of a service's client to `show`.
     fn request(&self, place: Place<'_>, request: &Request<'_>, show: &mut impl FnMut(Shown<'_>)) {
         let Some(attachment) = request.query.attachment.and_then(read_attachment) else {
             return;
@@ -105,7 +105,7 @@ impl Zenoh {
         }));
     }
 
-    /// Shows the reply of a service, or a sample of a topic's history.
+    /// Passes the reply of a service, or a sample of a topic's history, to `show`.
     fn response(
         &mut self,
         place: Place<'_>,
@@ -149,7 +149,7 @@ impl Zenoh {
         }));
     }
 
-    /// Returns the sample of a message, with the receiver that the connection shows.
+    /// Returns the sample of a message, with the receiver according to the connection.
     fn arrived<'a>(
         &self,
         place: Place<'_>,
@@ -173,7 +173,7 @@ impl Zenoh {
         }
     }
 
-    /// Learns from a publication who sends on a connection whose beginning was missed.
+    /// Derives from a publication the sender on a connection whose start was missed.
     fn note_source(&mut self, stream: &StreamId, gid: Gid, show: &mut impl FnMut(Shown<'_>)) {
         let Some(session) = self.graph.session(gid) else {
             return;

@@ -1,12 +1,13 @@
 //! Zenoh: sessions, liveliness tokens and messages of rmw_zenoh, as participants, endpoints and
 //! records.
 //!
-//! The rest of the model knows no Zenoh. A session is a participant, with a GUID prefix of the
-//! vendor [`VendorId::ZENOH`](ros2probe_wire::rtps::VendorId::ZENOH). A liveliness token is an
-//! endpoint, or two with a service. A message with an attachment is a sample of the writer whose
-//! token has the attachment's gid.
+//! This module converts Zenoh to the terms of DDS, so that the rest of the model needs no knowledge
+//! of it. A session becomes a participant, with a GUID prefix of the vendor
+//! [`VendorId::ZENOH`](ros2probe_wire::rtps::VendorId::ZENOH). A liveliness token becomes an
+//! endpoint, or two for a service. A message with an attachment becomes a sample of the writer
+//! whose token has the attachment's gid.
 //!
-//! Routers pass messages on. A message to a router counts for its writer, and is not a delivery.
+//! Routers forward messages. A message to a router counts for its writer, but not as a delivery.
 
 mod batch;
 mod connections;
@@ -51,26 +52,26 @@ use stream_state::{Aliases, DirectionNumber, StreamState};
 pub struct ZenohSample<'a> {
     /// Its writer.
     pub writer: Guid,
-    /// Its number, counted by the writer.
+    /// Its sequence number, assigned by the writer.
     pub number: SequenceNumber,
     /// Time of publication, by the writer's clock.
     pub source_timestamp: Option<Timestamp>,
-    /// The payload, of which the capture may have the beginning only.
+    /// The payload; the capture may contain only its beginning.
     pub payload: Bytes<'a>,
     /// The session that receives it, if known.
     pub receiver: Option<GuidPrefix>,
     /// Whether the receiver is a router.
     pub is_relayed: bool,
-    /// Cookie of the receiver's socket, if it is another socket of this host and `receiver` is known;
-    /// else 0.
+    /// Cookie of the receiver's socket, if it is another socket of this host and `receiver` is
+    /// known; else 0.
     pub receiving_socket: u64,
     /// Time of its first FRAGMENT.
     pub began: ModelTime,
-    /// With a request or reply: gid of the client, and the number of the request.
+    /// For a request or reply: gid of the client, and the number of the request.
     pub call: Option<(Gid, SequenceNumber)>,
 }
 
-/// What a report shows.
+/// A fact that a report shows.
 #[derive(Debug)]
 pub enum Shown<'a> {
     /// A message.
@@ -81,7 +82,7 @@ pub enum Shown<'a> {
     Disowned(u64, GuidPrefix),
     /// A session sent something.
     Alive(ZenohId),
-    /// A restored session, which only a router declares: the router sent something.
+    /// A router sent something, and this restored session is known only through a router.
     Relayed(ZenohId),
     /// Bytes for this destination were not captured.
     Missed(Destination),
@@ -96,28 +97,28 @@ pub struct Zenoh {
     /// Number of the newest direction.
     numbered: DirectionNumber,
     aliases: Aliases,
-    /// The direction that was last seen of each flow.
+    /// The stream in which each flow was last seen.
     flows: Bounded<ZenohDirections, HashMap<Flow, StreamId>>,
-    /// The graph in the tokens.
+    /// The graph from the tokens.
     pub graph: Graph,
     replies: Replies,
     remembered: Remembered,
-    /// Routers of which a connection that may lead to another router ended, with the time.
+    /// Routers that lost a connection that may have led to another router, with the time.
     cut: Bounded<ZenohCut, BTreeMap<ZenohId, ModelTime>>,
     /// Time of the first report.
     began: ModelTime,
     unseen: Bounded<ZenohUnseen, BTreeSet<(Unseen, Flow)>>,
     chain_bytes: Sum<ZenohChainBytes>,
-    /// When stale messages in FRAGMENTs were last searched for.
+    /// Time of the last search for stale messages in FRAGMENTs.
     gave_up: ModelTime,
     counters: Counters,
     /// Whether a session of this host has sent an INIT since the last [`Self::link`].
     pub has_begun: bool,
-    /// Increases with the senders that [`Self::memory`] contains.
+    /// Number that increases when the senders in [`Self::memory`] change.
     revision: u64,
 }
 
-/// The place of a message.
+/// Stream and times of a message.
 #[derive(Clone, Copy)]
 struct Place<'a> {
     stream: &'a StreamId,
@@ -128,7 +129,7 @@ struct Place<'a> {
 }
 
 impl Zenoh {
-    /// Processes a report of the time `time`. With `wants_bytes`, payloads are requested.
+    /// Processes a report at `time`. `wants_bytes` is whether payloads are requested.
     pub fn report(
         &mut self,
         report: &StreamReport<'_>,
@@ -195,7 +196,7 @@ impl Zenoh {
         self.counters.batches > 0 || !self.unseen.is_empty()
     }
 
-    /// Returns what to save of the connections.
+    /// Returns the state of the connections to save.
     #[must_use]
     pub fn memory(&self) -> ZenohMemory {
         let (senders, relayed) = self.remembered.parts();
@@ -220,13 +221,13 @@ impl Zenoh {
         ZenohMemory::new(&senders, &(&relayed - &connected), &self.graph.passages())
     }
 
-    /// Returns a number that increases with the connections of [`Self::memory`].
+    /// Returns a number that increases when the connections in [`Self::memory`] change.
     #[must_use]
     pub const fn revision(&self) -> u64 {
         self.revision
     }
 
-    /// Restores saved connections, and the endpoints of their sessions, which discovery has.
+    /// Restores saved connections, and the endpoints of their sessions, which discovery knows.
     pub fn restore<'a>(
         &mut self,
         memory: &ZenohMemory,

@@ -1,7 +1,7 @@
 //! Senders on connections that are older than the agent, by the process that holds the socket.
 //!
 //! A session has one connection to a router. A process with one such connection therefore has one
-//! session, and all of its connections are of this session.
+//! session, and all of its connections belong to this session.
 
 use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::GuidPrefix;
@@ -13,26 +13,26 @@ use super::stream::StreamId;
 /// The process that holds a socket.
 #[derive(Clone, Copy, Debug)]
 pub struct Holder {
-    /// Its id.
+    /// Process id.
     pub process_id: u32,
     /// The only session that is known to run in it.
     pub session: Option<GuidPrefix>,
 }
 
-/// A socket of which the owner has changed.
+/// A socket whose owner has changed.
 #[derive(Debug)]
 pub struct OwnerChange {
     /// `SO_COOKIE`.
     pub socket: u64,
-    /// The session that was taken for its owner.
+    /// The session that was considered its owner.
     pub before: Option<ZenohId>,
     /// The session that owns it.
     pub after: Option<ZenohId>,
 }
 
 impl Zenoh {
-    /// Learns who sends on connections that are older than the agent. `holder` returns the process
-    /// that holds a socket.
+    /// Determines the senders on connections that are older than the agent. `holder` returns the
+    /// process that holds a socket.
     pub fn link(&mut self, holder: impl Fn(u64) -> Option<Holder>) -> Vec<OwnerChange> {
         let mut changes = Vec::new();
         if self.directions.values().all(|each| each.sender.is_some()) {
@@ -59,7 +59,7 @@ impl Zenoh {
                 let session = sessions.get(&holder.session?).copied()?;
                 let is_certain = match to_routers.get(&holder.process_id) {
                     Some(count) => *count == 1,
-                    // The router is restarted.
+                    // The router is being restarted.
                     None => direction.linked == Some(session),
                 };
                 (is_certain && direction.sends_only_for(session)).then_some(session)

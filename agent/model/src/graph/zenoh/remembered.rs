@@ -1,7 +1,8 @@
 //! Connections as plain data that outlives the agent.
 //!
-//! A connection names its sessions once, when it opens. A restarted agent reads in the saved state
-//! which session sends on it. Saved data is validated like any other external input.
+//! A connection names its sessions once, when it opens. After a restart, the agent reads from the
+//! saved state which session sends on each connection. Saved data is validated like any other
+//! external input.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
@@ -15,11 +16,11 @@ use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{RememberedDirections, RememberedSessions};
 
-/// Longer than the interval of KEEP_ALIVE that rmw_zenoh configures, 30 s: a connection that sends
-/// nothing for so long is gone.
+/// Silence after which a connection is gone. It is longer than the interval of KEEP_ALIVE that
+/// rmw_zenoh configures, 30 s.
 const SILENCE: Duration = Duration::from_secs(90);
 
-/// What the agent saves of Zenoh.
+/// State of Zenoh that the agent saves.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ZenohMemory {
     /// Directions of connections, sorted by address.
@@ -28,7 +29,7 @@ pub struct ZenohMemory {
     /// Sessions without a connection of their own, which only routers declare.
     #[serde(default)]
     relayed: Vec<String>,
-    /// Routers that pass on the tokens of sessions behind other routers.
+    /// Routers that forward the tokens of sessions behind other routers.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     passages: Vec<RememberedPassage>,
 }
@@ -56,12 +57,12 @@ enum RememberedRole {
     Client,
 }
 
-/// Restored connections that have not been seen since.
+/// Restored connections that have not been seen since the restart.
 #[derive(Debug, Default)]
 pub(super) struct Remembered {
     senders: Bounded<RememberedDirections, BTreeMap<Flow, Side>>,
     relayed: Bounded<RememberedSessions, BTreeSet<ZenohId>>,
-    /// When those without a batch are forgotten.
+    /// Time at which entries without a batch are removed.
     end: ModelTime,
 }
 
@@ -97,7 +98,7 @@ impl ZenohMemory {
         }
     }
 
-    /// Returns the routers that pass on tokens. Invalid entries are skipped.
+    /// Returns the routers that forward tokens. Invalid entries are skipped.
     pub(super) fn passages(&self) -> BTreeMap<ZenohId, BTreeSet<ZenohId>> {
         let read = |passage: &RememberedPassage| {
             let sessions = passage.sessions.iter().take(RememberedDirections::CAP);
@@ -138,12 +139,12 @@ impl Remembered {
         (&self.senders, &self.relayed)
     }
 
-    /// Returns whether this session may have a connection that has not been seen since.
+    /// Returns whether this session may have a connection that has not been seen since the restart.
     pub(super) fn has(&self, session: ZenohId) -> bool {
         self.senders.values().any(|side| side.zid == session)
     }
 
-    /// Returns the sender of a connection that has not been seen since.
+    /// Returns the sender of a connection that has not been seen since the restart.
     pub(super) fn sender(&self, flow: Flow) -> Option<Side> {
         self.senders.get(&flow).copied()
     }
@@ -153,12 +154,12 @@ impl Remembered {
         self.senders.remove(&flow)
     }
 
-    /// Removes and returns the relayed sessions: a router is seen.
+    /// Removes and returns the relayed sessions, because a router was seen.
     pub(super) fn take_relayed(&mut self) -> BTreeSet<ZenohId> {
         self.relayed.take()
     }
 
-    /// Forgets entries that were not seen for too long.
+    /// Removes the entries that were not seen in time.
     pub(super) fn expire(&mut self, now: ModelTime) {
         if now > self.end && !(self.senders.is_empty() && self.relayed.is_empty()) {
             self.senders.clear();

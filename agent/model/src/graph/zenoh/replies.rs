@@ -1,5 +1,5 @@
-//! Numbers of replies. A reply has the number of its request, which other clients use too, so that
-//! its writer has no numbers of its own.
+//! Sequence numbers of replies. A reply carries only the number of its request, which other clients
+//! use too. Therefore this module numbers the replies of each writer.
 
 use std::collections::VecDeque;
 
@@ -54,7 +54,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn copies_have_one_number_and_the_oldest_of_many_replies_are_forgotten() {
+    fn copies_of_a_reply_share_a_number_and_the_oldest_replies_are_dropped() {
         let mut replies = Replies::default();
         let writer = |number: u8| Guid::from_bytes([number; 16]);
         let call = |number: u64| (Gid([7; 16]), SequenceNumber(number));

@@ -1,8 +1,8 @@
-//! Routers: which senders are routers although their INIT was missed, and which sessions only a
-//! router passes on.
+//! Detection of routers whose INIT was missed, and of sessions that are known only through a
+//! router.
 //!
-//! A router declares to a peer, and to another router, the tokens of sessions behind further
-//! routers only. Those sessions end with the last connection that the router has to another router.
+//! To a peer and to another router, a router declares only the tokens of sessions behind further
+//! routers. Those sessions end with the last connection of the router to another router.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -16,15 +16,15 @@ use super::stream::StreamId;
 use super::stream_state::StreamState;
 use crate::facts::model_time::ModelTime;
 
-/// Longer than the interval of KEEP_ALIVE that rmw_zenoh configures, 30 s: a connection that is older
-/// than the agent has been seen after this time.
+/// Time after which all connections older than the agent have been seen. It is longer than the
+/// interval of KEEP_ALIVE that rmw_zenoh configures, 30 s.
 const ALL_SEEN: Duration = Duration::from_secs(35);
 /// Time in which another connection of a router may replace one that ended.
 const REPLACED: Duration = Duration::from_secs(1);
 
 impl Zenoh {
-    /// Learns from the processes that hold the sockets which ends of connections are routers. One
-    /// router runs in a process, and no ROS session beside it.
+    /// Determines which ends of connections are routers, from the processes that hold the sockets.
+    /// A process with a router has no second router and no ROS session.
     pub(super) fn find_routers(
         &mut self,
         holder: impl Fn(u64) -> Option<Holder>,
@@ -92,8 +92,8 @@ impl Zenoh {
         changes
     }
 
-    /// Returns whether the receiver at the end of a direction is a router, as far as is known. A
-    /// message to it is not a delivery.
+    /// Returns whether the receiver of a direction is a router, as far as is known. A message to a
+    /// router is not a delivery.
     pub(super) fn is_for_router(&self, stream: &StreamId) -> bool {
         let own = self.directions.get(stream);
         let opposite = self.opposite(stream);
@@ -122,7 +122,7 @@ impl Zenoh {
             .or_else(|| self.remembered.sender(stream.flow.reversed()))
     }
 
-    /// Returns the router that passes on the tokens of other routers' sessions in this direction.
+    /// Returns the router that forwards the tokens of other routers' sessions in this direction.
     pub(super) fn passing_router(&self, stream: &StreamId) -> Option<ZenohId> {
         let sender = self.directions.get(stream)?.sender?;
         let receiver = self.receiver(stream)?;
@@ -133,7 +133,7 @@ impl Zenoh {
         }
     }
 
-    /// Records the end of a connection that may lead from a router to another one.
+    /// Records the end of a connection that may connect two routers.
     pub(super) fn note_cut(&mut self, stream: &StreamId, now: ModelTime) {
         for router in self.ends_of_link(stream) {
             if self.graph.passes_on(router) {
@@ -154,7 +154,7 @@ impl Zenoh {
         for router in due {
             let mut streams = self.directions.keys();
             if streams.any(|stream| self.is_link_of(router, stream)) {
-                // Which sessions are behind that one is not known.
+                // It is unknown which sessions are behind the remaining connection.
                 continue;
             }
             for session in self.graph.pass_no_longer(router) {
@@ -166,7 +166,7 @@ impl Zenoh {
         }
     }
 
-    /// Ends what a router has passed on before, and does not list in its whole answer to a new
+    /// Removes tokens that a router forwarded before but omits from its complete answer to a new
     /// session.
     pub(super) fn compare_answer(&mut self, stream: &StreamId, interest: u32) {
         let asked = self.opposite(stream).and_then(|opposite| opposite.asked);
@@ -185,7 +185,7 @@ impl Zenoh {
         }
     }
 
-    /// Returns whether a session is reached without this router.
+    /// Returns whether a session is reachable without this router.
     fn has_other_way(&self, session: ZenohId, router: ZenohId) -> bool {
         let mut directions = self.directions.iter();
         let has_own = directions.any(|(stream, direction)| {
@@ -212,7 +212,7 @@ impl Zenoh {
             && self.ends_of_link(stream).any(|end| end == router)
     }
 
-    /// Returns the known routers at the ends of a connection that may be one between routers.
+    /// Returns the known routers at the ends of a connection, if it may connect two routers.
     fn ends_of_link(&self, stream: &StreamId) -> impl Iterator<Item = ZenohId> + use<> {
         let sender = self.directions.get(stream).and_then(|each| each.sender);
         let sender = sender.or_else(|| self.remembered.sender(stream.flow));
@@ -241,7 +241,7 @@ impl Zenoh {
     }
 }
 
-/// Returns the domain whose tokens a key covers: that of rmw_zenoh's subscription to the graph.
+/// Returns the domain of a key with which rmw_zenoh subscribes to the graph.
 pub(super) fn domain_of_graph(key: &str) -> Option<DomainId> {
     let domain = key.strip_prefix("@ros2_lv/")?.strip_suffix("/**")?;
     domain.parse().ok().map(DomainId)

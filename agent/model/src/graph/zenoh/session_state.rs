@@ -19,7 +19,7 @@ pub(super) struct SessionState {
     pub(super) lease: Option<Duration>,
     pub(super) nodes: BTreeMap<u64, NodeState>,
     pub(super) tokens: BTreeSet<Arc<str>>,
-    /// When it was last announced again.
+    /// Time of its last repeated announcement.
     pub(super) repeated: ModelTime,
 }
 

@@ -1,4 +1,4 @@
-//! What a source reports of a Zenoh connection: batches of bytes, gaps and the end.
+//! Reports of a source about a Zenoh connection: batches of bytes, gaps, the start and the end.
 
 use ros2probe_wire::Timestamp;
 
@@ -14,7 +14,7 @@ pub struct Flow {
 }
 
 impl Flow {
-    /// Returns the other direction.
+    /// Returns the opposite direction.
     #[must_use]
     pub const fn reversed(self) -> Self {
         Self {
@@ -23,15 +23,15 @@ impl Flow {
         }
     }
 
-    /// Returns the connection: the same flow for both directions.
+    /// Returns the flow that identifies the connection, which is the same for both directions.
     #[must_use]
     pub fn connection(self) -> Self {
         self.min(self.reversed())
     }
 }
 
-/// One direction of a TCP connection, as seen at one place: a socket, an interface or a capture. On
-/// the loopback interface that is the socket of the sender.
+/// One direction of a TCP connection, as seen at a socket, on an interface or in a capture file. On
+/// the loopback interface, it is seen at the socket of the sender.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug, Default)]
 pub struct StreamId {
     /// The direction.
@@ -58,8 +58,8 @@ impl StreamId {
         is_own || destination.socket_address().ip().is_loopback()
     }
 
-    /// Returns the other direction at the same place. `outgoing` is a guess on an interface and in a
-    /// capture.
+    /// Returns the opposite direction at the same socket or interface. `outgoing` is a guess on an
+    /// interface and in a capture file.
     #[must_use]
     pub const fn reversed(self) -> Self {
         Self {
@@ -70,12 +70,13 @@ impl StreamId {
     }
 }
 
-/// Why nothing can be read of a connection.
+/// Why messages or payloads of a connection cannot be read.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum Unseen {
     /// The connection is encrypted.
     Tls,
-    /// The link is QUIC. Connections between the same two addresses are one, whose end is not seen.
+    /// The link is QUIC. Connections between the same two addresses count as one, and its end is
+    /// not seen.
     Quic,
     /// Another version of the wire format.
     Version,
@@ -98,7 +99,7 @@ impl Unseen {
         Self::SharedMemory,
     ];
 
-    /// Returns the reason in words, as they follow "connections".
+    /// Returns the reason as words that follow "connections".
     #[must_use]
     pub const fn in_words(self) -> &'static str {
         match self {
@@ -128,7 +129,7 @@ impl Unseen {
 /// A report about one direction of a connection.
 #[derive(Clone, Copy, Debug)]
 pub struct StreamReport<'a> {
-    /// Time of the segment that completed it.
+    /// Time of the TCP segment that completed it.
     pub time: Timestamp,
     /// The direction.
     pub stream: &'a StreamId,
@@ -146,12 +147,12 @@ pub enum StreamEvent<'a> {
         /// Its length.
         length: u16,
     },
-    /// Bytes are missing in what was captured. The next batch follows a boundary found anew.
+    /// Captured bytes are missing. The next batch begins at a boundary that was found again.
     Gap,
-    /// The connection begins: earlier state of the same addresses is another connection's.
+    /// The connection begins. Earlier state of the same addresses belongs to another connection.
     Begin,
     /// The sender closed the connection, or its process ended.
     End,
-    /// Nothing can be read of it.
+    /// Its messages or payloads cannot be read.
     Unseen(Unseen),
 }

@@ -1,5 +1,5 @@
-//! State of one direction of a connection: who sends, its aliases, its tokens, and the messages in
-//! FRAGMENTs.
+//! State of one direction of a connection: its sender and the messages in FRAGMENTs. The aliases of
+//! keys belong to a direction.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,16 +14,16 @@ use crate::facts::bounded::{Bounded, ByOwner, HeapBytes};
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{ZenohAliases, ZenohChains};
 
-/// Longest key that is kept. A token of ROS with the longest names has 1.4 KiB.
+/// Maximum length of a key in bytes. A token of ROS with the longest names has 1.4 KiB.
 pub(super) const MAX_KEY: usize = 2048;
-/// Most bytes of one message in FRAGMENTs.
+/// Maximum size of one message in FRAGMENTs, in bytes.
 const MAX_MESSAGE: usize = 32 << 20;
 /// Bytes kept of a message whose payload is not requested: everything before the payload.
 const HEAD: usize = 8192;
-/// Publications of one source after which the sender is taken for that source.
+/// Number of publications of one source after which it is considered the sender.
 const PRESUMED: u32 = 3;
 
-/// Number of a direction, never used again.
+/// Number of a direction, never reused.
 pub(super) type DirectionNumber = u64;
 /// Aliases by direction and number.
 pub(super) type Aliases = ByOwner<ZenohAliases, DirectionNumber, u16, Alias>;
@@ -32,7 +32,7 @@ pub(super) type Aliases = ByOwner<ZenohAliases, DirectionNumber, u16, Alias>;
 #[derive(Clone, Debug)]
 pub(super) struct Alias {
     pub(super) key: Arc<str>,
-    /// Whether it is of a topic or service of ROS.
+    /// Whether the key belongs to a topic or service of ROS.
     pub(super) is_topic: bool,
 }
 
@@ -42,9 +42,9 @@ pub(super) struct Chain {
     lane: Lane,
     /// Number of the next FRAGMENT.
     next: u32,
-    /// Time of the first.
+    /// Time of the first FRAGMENT.
     pub(super) began: ModelTime,
-    /// Time of the last.
+    /// Time of the last FRAGMENT.
     last: ModelTime,
     /// The beginning of the message, or all of it.
     pub(super) bytes: Vec<u8>,
@@ -64,21 +64,21 @@ pub(super) struct StreamState {
     /// Source of all publications so far, and their number, if the INIT was missed.
     presumed: Option<(ZenohId, u32)>,
     is_ambiguous: bool,
-    /// Whether the addresses are those of a router, which passes on publications of others.
+    /// Whether the ports suggest a router, which forwards publications of others.
     may_be_router: bool,
     /// Whether the sender is a router, if the INIT was missed and its id is unknown.
     pub(super) is_router: bool,
-    /// Whether a router holds the socket that receives.
+    /// Whether a router holds the receiving socket.
     pub(super) is_for_router: bool,
-    /// That router, if its id is known.
+    /// The receiving router, if its id is known.
     pub(super) receiver: Option<Side>,
-    /// The last INTEREST of the sender in the graph of a domain, with its number.
+    /// Number and domain of the sender's last INTEREST in the graph of a domain.
     pub(super) asked: Option<(u32, DomainId)>,
     pub(super) lease: Option<Duration>,
     pub(super) chains: Bounded<ZenohChains, Vec<Chain>>,
-    /// Whether the sender has sent CLOSE, or closed it.
+    /// Whether the sender has sent CLOSE, or closed the connection.
     pub(super) has_left: bool,
-    /// Whether the sender has closed it.
+    /// Whether the sender has closed the connection.
     pub(super) has_ended: bool,
     /// Time of the last batch.
     pub(super) last_seen: ModelTime,
@@ -135,7 +135,7 @@ impl Alias {
 }
 
 impl StreamState {
-    /// Creates the state of a direction of which nothing was seen; `sender` is from saved state.
+    /// Creates the state of a new direction; `sender` is from saved state.
     pub(super) fn new(number: DirectionNumber, stream: &StreamId, sender: Option<Side>) -> Self {
         let (from, to) = (stream.flow.source.port, stream.flow.destination.port);
         Self {
@@ -171,7 +171,7 @@ impl StreamState {
         self.presumed.map(|(source, _)| source)
     }
 
-    /// Returns whether no other session's publication was seen.
+    /// Returns whether no publication of another session was seen.
     pub(super) fn sends_only_for(&self, session: ZenohId) -> bool {
         !self.is_ambiguous && self.presumed.is_none_or(|(zid, _)| zid == session)
     }
@@ -182,7 +182,7 @@ impl StreamState {
         if stream.socket == 0 || !stream.outgoing {
             return None;
         }
-        // A router that passes on publications of one session looks like that session. It sends from
+        // A router that forwards publications of one session looks like that session. It sends from
         // its port to the sessions of its host, and to other hosts.
         let is_certain = self.sender.is_some()
             || self.linked.is_some()
@@ -190,7 +190,8 @@ impl StreamState {
         self.session().filter(|_| is_certain)
     }
 
-    /// Notes the source of a publication. A sender of several sources' is a router.
+    /// Records the source of a publication. A sender of publications from several sources is a
+    /// router.
     pub(super) fn note_source(&mut self, source: ZenohId) {
         match &mut self.presumed {
             Some((known, count)) if *known == source => *count = count.saturating_add(1),
@@ -199,7 +200,7 @@ impl StreamState {
         }
     }
 
-    /// Adds a FRAGMENT. Returns the message if it is complete; its bytes may be the beginning only.
+    /// Adds a FRAGMENT. Returns the message if it is complete; its bytes may be only the beginning.
     pub(super) fn fragment(
         &mut self,
         fragment: &Fragment<'_>,
@@ -256,7 +257,7 @@ impl StreamState {
         all - self.chains.len()
     }
 
-    /// Forgets the unfinished messages: bytes are missing.
+    /// Drops the unfinished messages, because bytes are missing.
     pub(super) fn interrupt(&mut self) {
         self.chains.clear();
     }
@@ -267,7 +268,7 @@ impl StreamState {
     }
 }
 
-/// Returns the alias or the own key of an expression.
+/// Returns the key of an expression, through its alias if it has one.
 pub(super) fn resolve(
     expression: WireExpr<'_>,
     aliases: &Aliases,
