@@ -126,7 +126,7 @@ fn samples(criterion: &mut Criterion) {
     group.finish();
 }
 
-/// Records of the host hook: what one writer sends to four receivers.
+/// Records of the host hook for samples that one writer sends to four receivers.
 fn deliveries(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("deliveries");
     group.throughput(Throughput::Elements(1));

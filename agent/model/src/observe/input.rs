@@ -30,7 +30,7 @@ pub enum Input<'a> {
     /// The wall clock was set forward by this many nanoseconds (backward if negative), without
     /// elapsed time.
     ClockSet(i64),
-    /// The source sees the traffic from this time on. It saw none, or not all, for a time before.
+    /// The source sees the traffic since this time. Before, it saw none of it or only a part.
     ViewBegan(Timestamp),
     /// A datagram that was captured in full.
     Datagram {
@@ -38,7 +38,7 @@ pub enum Input<'a> {
         envelope: &'a Envelope,
         /// The RTPS message.
         payload: &'a [u8],
-        /// Where the kernel filter stopped; it has reported the submessages before that.
+        /// The state in which the kernel filter stopped. It has reported all earlier submessages.
         handover: Option<&'a Handover>,
     },
     /// A datagram that the capture file truncated. Its payloads are not read.
@@ -51,7 +51,8 @@ pub enum Input<'a> {
         length: u32,
     },
     /// A submessage of a captured datagram, which is read for discovery and payloads. The caller
-    /// sorts observations of user data among others. [`Self::DatagramEnd`] follows the last one.
+    /// passes observations of user data separately, in their order. [`Self::DatagramEnd`] follows
+    /// the last one.
     Submessage {
         /// The datagram.
         captured: Captured<'a>,
@@ -73,7 +74,7 @@ pub enum Input<'a> {
     ProbesDetached,
     /// A report about one direction of a Zenoh connection.
     Zenoh(&'a StreamReport<'a>),
-    /// A submessage that a source saw, with the model's time by [`Observer::wall_clock`].
+    /// A submessage that a source saw, with model time from [`Observer::wall_clock`].
     ///
     /// [`Observer::wall_clock`]: crate::observe::observer::Observer::wall_clock
     Observation(&'a Observation),

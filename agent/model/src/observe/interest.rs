@@ -1,8 +1,8 @@
 //! Verdicts of the kernel filter: which writers and readers it meters, captures or ignores.
 //!
 //! The table keeps the wanted verdicts and those that the kernel has, so that only differences are
-//! sent. It has the cap of the kernel's map. When it is full, entries with [`Verdict::Ignore`] go
-//! first: without an entry, the kernel captures a writer within its budget for unknown writers.
+//! sent. It has the cap of the kernel's map. A full table drops entries with [`Verdict::Ignore`]
+//! first. Without an entry, the kernel captures a writer within its budget for unknown writers.
 
 use std::collections::BTreeSet;
 
@@ -98,14 +98,15 @@ impl Interest {
         changes
     }
 
-    /// Returns the number of entries, its cap, and the entries dropped because of it.
+    /// Returns the number of entries, the cap, and the number of entries dropped because of the
+    /// cap.
     #[must_use]
     pub fn size(&self) -> (usize, usize, u64) {
         (self.entries.len(), self.limit, self.evictions)
     }
 
-    /// Drops one uninteresting entry, if possible one that the kernel does not have. Returns
-    /// whether one was dropped.
+    /// Drops one entry with [`Verdict::Ignore`], if possible one that the kernel does not have.
+    /// Returns whether one was dropped.
     fn give_up_one(&mut self) -> bool {
         let mut ignored = self
             .entries
@@ -139,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn only_differences_travel() {
+    fn only_changed_verdicts_are_returned() {
         let mut interest = Interest::new(8);
         interest.set(guid(1), Verdict::Meter);
         interest.set(guid(2), Verdict::Ignore);
@@ -163,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_table_keeps_what_is_watched() {
+    fn a_full_table_drops_ignored_entries_for_metered_ones() {
         let mut interest = Interest::new(4);
         for number in 0..4 {
             interest.set(guid(number), Verdict::Ignore);

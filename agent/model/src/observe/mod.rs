@@ -1,4 +1,4 @@
-//! The entry: one input, one drain.
+//! The entry of the model: one `input`, one `drain`.
 
 pub mod input;
 pub mod interest;

@@ -59,15 +59,15 @@ use zenoh::ZenohNames;
 const TICK: Duration = Duration::from_millis(100);
 /// A larger step of the clock means that the clock was set; it is not processed tick by tick.
 const JUMP: Duration = Duration::from_secs(3600);
-/// Largest number of names matched against globs at once, which takes a few milliseconds.
+/// Maximum number of names matched against globs per round, which takes a few milliseconds.
 const MAX_MATCHES_PER_ROUND: usize = 20_000;
 
-/// What the model needs from shared memory.
+/// Which content of shared memory the model needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Wanted {
     /// No measured sample can use shared memory, and every name is known.
     Nothing,
-    /// A name is unknown that shared memory may contain.
+    /// Shared memory may contain a name that is unknown.
     Names,
     /// Samples of a measured writer may use shared memory.
     Samples,
@@ -87,20 +87,20 @@ pub struct Observer {
     zenoh_names: ZenohNames,
     pub(crate) counts: Counts,
     journal: Journal,
-    /// Time up to which all decisions are made.
+    /// Time of the latest decisions.
     clock: ModelTime,
-    /// Time from which on the source sees the traffic; silence before it is unknown.
+    /// Time at which the source began to see the traffic; silence before it is unknown.
     view_began: ModelTime,
 }
 
-/// What is to be measured and dispatched.
+/// Topics to measure, and samples to dispatch.
 #[derive(Debug)]
 pub(crate) struct Requested {
     pub(crate) watchlist: Arc<Watchlist>,
-    /// Topics to which the lists are still to be applied, the next one last.
+    /// Topics to which the lists have yet to be applied, the next one last.
     pending_topics: Vec<TopicId>,
     sample_requests: Arc<Vec<SampleRequest>>,
-    /// Time at which they last changed.
+    /// Time of the last change of `sample_requests`.
     requests_changed: ModelTime,
     pub(crate) interest: Interest,
 }
@@ -114,7 +114,7 @@ pub(crate) struct Measure {
     pub(crate) latched: Latched,
 }
 
-/// What follows from graph and samples.
+/// State derived from graph and samples.
 #[derive(Debug)]
 pub(crate) struct Derive {
     pub(crate) services: Services,
@@ -267,7 +267,7 @@ impl Observer {
         self.measure.payloads.is_full() || self.journal.events.are_many()
     }
 
-    /// Returns what the model needs from shared memory at present.
+    /// Returns which content of shared memory the model needs at present.
     #[must_use]
     pub fn wanted_of_shared_memory(&self) -> Wanted {
         let may_share = |guid: &Guid| may_share_memory(&self.graph.discovery, *guid);
@@ -287,8 +287,8 @@ impl Observer {
         }
     }
 
-    /// Returns whether a request covers topics whose writers may appear at any time. The first message
-    /// of such a writer is to be seen, too.
+    /// Returns whether a request covers topics whose writers may appear at any time. The first
+    /// message of such a writer must not be missed.
     fn awaits_writers(&self) -> bool {
         let mut requests = self.requested.sample_requests.iter();
         requests
@@ -370,7 +370,7 @@ impl Observer {
         report::measured(self, self.graph.wall_clock.model_time(now))
     }
 
-    /// Counts a parse failure, including those of callers that parse for the core.
+    /// Counts a parse failure. Callers that parse for the core report failures, too.
     fn decode_error(&mut self, stage: &'static str, reason: Reason) {
         *self
             .counts
@@ -419,7 +419,7 @@ impl Observer {
         if self.derive.tracer.is_wanted() {
             self.trace(observation);
         }
-        // Requests and replies are seldom measured: ordinary topics need no further lookup.
+        // Requests and replies are seldom measured, so ordinary topics skip this lookup.
         let measures_calls = self.derive.services.has_measured();
         if let Some(sample) = sample.filter(|_| measures_calls) {
             self.call_seen(sample);
@@ -488,7 +488,7 @@ impl Observer {
         });
     }
 
-    /// Reads a datagram: the announcements and payloads, and counts every submessage.
+    /// Reads the announcements and payloads of a datagram, and counts every submessage.
     fn walk(&mut self, captured: Captured<'_>, payload: &[u8], handover: Option<&Handover>) {
         let outcome = walk::datagram(payload, captured.envelope, handover, |found| {
             self.submessage(captured, &found, |_| true);

@@ -42,10 +42,10 @@ pub use delivery::{DeliveryFacts, Subscriber};
 /// All facts at the time `at`. Lists are sorted by identity.
 #[derive(Clone, Debug, Default)]
 pub struct Snapshot {
-    /// Time of the snapshot. All times but those of chains are model time, so that a step of the
-    /// clock leaves their distances as they are.
+    /// Time of the snapshot. All times but those of chains are model time, so a step of the clock
+    /// does not change the intervals between them.
     pub at: ModelTime,
-    /// Converts the times to wall time, that of the capture in a replay.
+    /// Converts the times to wall time. In a replay, this is the wall time of the capture.
     pub wall_clock: WallClock,
     /// Live participants.
     pub participants: Vec<ParticipantFacts>,
@@ -65,7 +65,7 @@ pub struct Snapshot {
     pub actions: Vec<ActionFacts>,
     /// Facts from inside processes; `None` while that source is off.
     pub inside: Option<Arc<InsideFacts>>,
-    /// Figures of Zenoh; `None` until something of it was seen.
+    /// Figures of Zenoh; `None` until Zenoh was observed.
     pub zenoh: Option<ZenohFacts>,
     /// Chains of messages.
     pub chains: ChainsFacts,
@@ -96,7 +96,7 @@ impl Snapshot {
         self.wall_time(self.at)
     }
 
-    /// Returns the wall time of one of its times.
+    /// Converts a time of the snapshot to wall time.
     #[must_use]
     pub const fn wall_time(&self, at: ModelTime) -> Timestamp {
         self.wall_clock.wall_time(at)
@@ -170,7 +170,7 @@ pub struct TopicFacts {
     pub dds_name: DdsName,
     /// Role of the topic in ROS.
     pub kind: TopicKind,
-    /// Hidden by ROS convention (a token begins with `_`).
+    /// Whether it is hidden by ROS convention (a token begins with `_`).
     pub hidden: bool,
     /// Announced message types in ROS form, sorted; more than one is a fault.
     pub message_types: Vec<TypeName>,
@@ -201,15 +201,15 @@ pub struct TopicFacts {
     pub transports: Vec<TransportCount>,
     /// Whether a subscription requests its samples.
     pub is_read: bool,
-    /// Where its messages, their rate and the time of the last one come from.
+    /// Source of its messages, their rate and the time of the last one.
     pub source: Source,
-    /// What observed processes show of it.
+    /// Figures of the topic from inside observed processes.
     pub inside: Option<Box<TopicInside>>,
-    /// Number of pairs for each transport whose both ends are observed processes.
+    /// Number of pairs with both ends in observed processes, for each transport.
     pub observed_pairs: Vec<TransportCount>,
 }
 
-/// Intervals after which a topic counts as sent regularly.
+/// Number of intervals after which a topic counts as sent regularly.
 const REGULAR: u64 = 10;
 
 /// Transport between a writer and a reader, as both announce it.
@@ -307,7 +307,7 @@ impl TopicFacts {
         is_alone && !self.is_connected_inside() && !is_flowing
     }
 
-    /// Returns the number of pairs with this transport whose both ends are observed processes.
+    /// Returns the number of pairs with this transport and with both ends in observed processes.
     #[must_use]
     pub fn observed_pairs(&self, transport: Transport) -> usize {
         let mut observed = self.observed_pairs.iter();
@@ -315,8 +315,9 @@ impl TopicFacts {
         own.map_or(0, |count| count.pairs)
     }
 
-    /// Returns the messages per second of the last window. `None` if the topic is not measured, or
-    /// if no message was seen and none can be: all pairs use transports that are not observed.
+    /// Returns the messages per second of the last window. Returns `None` if the topic is not
+    /// measured. Also returns `None` if no message was seen and all pairs use transports that are
+    /// not observed.
     #[must_use]
     pub fn rate_hz(&self) -> Option<f64> {
         let measured = self.measurement.as_deref()?;
@@ -333,8 +334,8 @@ impl TopicFacts {
         (rate_hz == 0.0 || has_sizes).then_some(measured.bandwidth)
     }
 
-    /// Returns whether a measured topic that was sent regularly has not been sent for long: for 10 s
-    /// and five times the longest interval so far. A topic whose messages are events is not silent.
+    /// Returns whether a regularly sent topic was silent for 10 s and for five times its longest
+    /// interval so far. A topic without regular messages is never silent.
     #[must_use]
     pub fn is_silent(&self, now: ModelTime) -> bool {
         let Some(measured) = self.measurement.as_deref() else {
@@ -350,8 +351,8 @@ impl TopicFacts {
         self.rate_hz() == Some(0.0) && is_regular && silence >= longest * 5.0
     }
 
-    /// Returns whether all pairs use transports that the network does not show, and not all of their
-    /// processes are observed.
+    /// Returns whether all pairs use transports that the network does not show, and not all of
+    /// their processes are observed.
     fn is_unseen(&self) -> bool {
         let is_hidden = |count: &TransportCount| {
             let is_inner = matches!(

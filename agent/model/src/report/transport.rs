@@ -1,7 +1,7 @@
 //! Transports between a writer and a reader, as far as both announce them: the network, or a
 //! transport within their host that the network does not show.
 //!
-//! The result is the transport that they would use; whether they match is decided elsewhere.
+//! The result is the transport that they would use if they match.
 
 use std::time::Duration;
 
@@ -12,15 +12,14 @@ use crate::facts::model_time::ModelTime;
 use crate::graph::discovery::{Discovery, Endpoint};
 use crate::report::snapshot::{EndpointFacts, Transport, TransportCount};
 
-/// Largest number of pairs examined per topic; the others are assumed to be alike.
+/// Maximum number of pairs examined per topic; the others are assumed to be alike.
 const MAX_PAIRS: usize = 1024;
-/// A participant without announced nodes for this long does not use ROS, and its endpoints have no
-/// node.
+/// Time in which a participant that uses ROS announces its nodes, and the node of an endpoint.
 const NODES_WITHIN: Duration = Duration::from_secs(30);
 const NODE_WITHIN: Duration = Duration::from_secs(10);
 
 /// Counts the pairs of these writers and readers by transport: all pairs, and those with both ends
-/// in observed processes. Passes each endpoint its transports.
+/// in observed processes. Sets the transports of each endpoint.
 pub(crate) fn transports(
     discovery: &Discovery,
     writers: &mut [EndpointFacts],
@@ -80,8 +79,8 @@ pub(crate) fn may_share_memory(discovery: &Discovery, writer: Guid) -> bool {
         })
 }
 
-/// Returns whether all samples of this writer pass through Fast DDS's shared memory, which is polled:
-/// some of these readers receive there, and none on the network.
+/// Returns whether all samples of this writer pass through Fast DDS's shared memory, which is
+/// polled. Some of these readers then receive there, and none on the network.
 pub(crate) fn is_polled(discovery: &Discovery, writer: Guid, readers: &[Guid]) -> bool {
     let mut is_shared = false;
     for reader in readers.iter().take(MAX_PAIRS) {
@@ -152,9 +151,9 @@ pub(crate) fn vendor(discovery: &Discovery, prefix: GuidPrefix) -> VendorId {
     participant.map_or(VendorId([first, second]), |known| known.proxy.vendor)
 }
 
-/// Returns whether both are one participant or in one process. Fast DDS stores vendor, host and
-/// process in the first eight bytes: the process id in the fifth and sixth, random bits in the next
-/// two.
+/// Returns whether both prefixes belong to one participant or process. Fast DDS stores vendor, host
+/// and process in the first eight bytes. The fifth and sixth contain the process id, the next two
+/// random bits.
 fn is_one_process(discovery: &Discovery, one: GuidPrefix, other: GuidPrefix) -> bool {
     one == other
         || vendor(discovery, one) == VendorId::EPROSIMA
@@ -162,8 +161,8 @@ fn is_one_process(discovery: &Discovery, one: GuidPrefix, other: GuidPrefix) -> 
             && one.0.first_chunk::<8>() == other.0.first_chunk::<8>()
 }
 
-/// Returns whether both are on one host. Fast DDS stores vendor and host in the first four bytes;
-/// only participants that announce shared memory are compared.
+/// Returns whether both prefixes belong to one host. Fast DDS stores vendor and host in the first
+/// four bytes; only participants that announce shared memory are compared.
 fn is_one_host(vendor: VendorId, one: GuidPrefix, other: GuidPrefix) -> bool {
     vendor != VendorId::EPROSIMA || one.0.first_chunk::<4>() == other.0.first_chunk::<4>()
 }
@@ -202,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn endpoints_that_are_not_known_are_no_pair() {
+    fn unknown_endpoints_have_no_transport() {
         let discovery = Discovery::new(Caps {
             participants: 1,
             endpoints: 1,

@@ -80,8 +80,8 @@ impl Observer {
         }
     }
 
-    /// Returns whether a sample is on `ros_discovery_info`, or on an unannounced topic and of the
-    /// same form. It is sent once, perhaps before its writer's announcement is processed.
+    /// Returns whether a sample is on `ros_discovery_info`, or has the same form on an unannounced
+    /// topic. Such a sample is sent once, perhaps before its writer's announcement is processed.
     fn may_be_entities(&self, found: &Found<'_>, sample: &Sample) -> bool {
         let writer = sample.head.writer;
         if sample.status_info != StatusInfo::ALIVE {
@@ -175,8 +175,7 @@ impl Observer {
             .participant(announcement, origin, evidence, journal);
     }
 
-    /// Records an endpoint that is announced. Returns whether its participant is admitted because
-    /// of it.
+    /// Records an endpoint that is announced. Returns whether its participant is thereby admitted.
     pub(super) fn learn_endpoint(
         &mut self,
         announcement: EndpointAnnouncement,

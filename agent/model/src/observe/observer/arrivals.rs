@@ -1,4 +1,4 @@
-//! What has arrived at the readers of a process, for comparison with its calls.
+//! Messages that arrived at the readers of a process, for comparison with its calls.
 
 use std::collections::BTreeSet;
 
@@ -32,8 +32,9 @@ impl Observer {
     }
 }
 
-/// Returns what has arrived at the readers of a topic at these participants. Returns `None` if
-/// messages arrive that are not counted: within the process, or by a way that is not observed.
+/// Returns the messages that arrived at the readers of a topic in these participants. Returns
+/// `None` if some of them are not counted, because they stay in the process or use an unobserved
+/// transport.
 fn arrivals(
     (graph, profiler): (&Graph, &Profiler),
     participants: &BTreeSet<GuidPrefix>,
@@ -85,8 +86,8 @@ fn arrivals(
     Some(found)
 }
 
-/// Returns whether both have the same type and compatible quality of service; `None` if one is
-/// unknown.
+/// Returns whether both endpoints have the same type and compatible quality of service; `None` if
+/// one is unknown.
 fn are_matched(discovery: &Discovery, writer: Guid, reader: Guid) -> Option<bool> {
     let endpoints = discovery.endpoints();
     let (of_writer, of_reader) = (endpoints.get(&writer)?, endpoints.get(&reader)?);
@@ -102,8 +103,8 @@ fn are_matched(discovery: &Discovery, writer: Guid, reader: Guid) -> Option<bool
     Some(is_one_type && verdict(offered, requested) == Verdict::Match)
 }
 
-/// Returns the messages of a writer that arrived at a participant, and the time since which all of
-/// them are counted.
+/// Returns when the count of a writer's messages at a participant began, and the count. The
+/// beginning is `None` if messages may have been sent before.
 fn arrived(
     measured: &Measured,
     transport: Transport,

@@ -15,7 +15,7 @@ use crate::measure::topic::Topic;
 use crate::measure::writer::Counted;
 
 impl Observer {
-    /// Adds the message that this sample completed to the chains, and notes where it arrived.
+    /// Adds the message that this sample completed to the chains, and records where it arrived.
     pub(super) fn chain_seen(&mut self, sample: &Sample, completed: Option<&Counted>) {
         let (writer, clock) = (sample.head.writer, self.graph.wall_clock);
         if !self.derive.chains.follows(writer) {

@@ -36,8 +36,8 @@ impl Observer {
         }
     }
 
-    /// Returns when the next decision is due that may become an event: at a whole second, or when
-    /// a lease ends.
+    /// Returns the time of the next decision that may become an event: a whole second, or the end
+    /// of a lease.
     #[must_use]
     pub fn next_decision(&self) -> Timestamp {
         let second = ModelTime::of_second(self.clock.whole_seconds() + 1);
@@ -45,8 +45,8 @@ impl Observer {
         self.next_expiry().map_or(second, |end| end.min(second))
     }
 
-    /// Returns when the lease of a participant ends, unless it is heard before; the first one's.
-    /// Leases are checked at multiples of an interval, also those that end at once.
+    /// Returns the earliest end of a participant's lease, unless further packets renew it. Leases
+    /// are checked at multiples of an interval, even if they end immediately.
     #[must_use]
     pub fn next_expiry(&self) -> Option<Timestamp> {
         let end = self.graph.discovery.next_expiry()?;
@@ -70,7 +70,7 @@ impl Observer {
         self.examine(self.clock);
     }
 
-    /// Determines what the worst subscriber of each measured topic lost in the last second.
+    /// Determines the loss of each measured topic's worst subscriber in the last second.
     fn end_second_of_losses(&mut self) {
         for id in self.graph.topics.ids() {
             let Some(topic) = self.graph.topics.get_mut(id) else {

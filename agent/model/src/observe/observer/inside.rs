@@ -1,4 +1,5 @@
-//! Figures from inside processes: their topics, and whether the network or they decide the counts.
+//! Figures from inside processes: their topics, and whether they or the network determine the
+//! counts.
 
 use super::Observer;
 use crate::derive::inside::source::Seen;
@@ -9,7 +10,7 @@ use crate::facts::topic_kind::TopicKind;
 use crate::measure::topic::{TopicId, Watched};
 
 impl Observer {
-    /// Takes a report about calls inside processes.
+    /// Processes a report about calls inside processes.
     pub(super) fn report_inside(&mut self, report: Report) {
         let clock = self.graph.wall_clock;
         let at = clock.model_time(report.at);

@@ -63,8 +63,8 @@ impl Observer {
         self.apply_more_lists();
     }
 
-    /// Applies the lists to further topics, as many as take a few milliseconds. The previous
-    /// decision holds for a topic until its turn.
+    /// Applies the lists to as many further topics as take a few milliseconds. Until then, the
+    /// previous decision about a topic is valid.
     pub(super) fn apply_more_lists(&mut self) {
         if self.has_applied_lists() {
             return;
@@ -198,7 +198,7 @@ impl Observer {
     }
 
     /// Returns the topic of a writer whose last message is kept; `None` for other writers. Messages
-    /// that expire, as those of `/rosout`, are kept only if a watch requests them.
+    /// that expire, such as those of `/rosout`, are kept only if a watch requests them.
     fn latched_topic(
         &self,
         topic: &Topic,
@@ -299,7 +299,7 @@ fn published(topic: &Topic, endpoint: &Endpoint) -> dispatch::Topic {
 
 pub(super) fn traits(guid: Guid, endpoint: &Endpoint) -> Traits {
     Traits {
-        // TCP repeats for Zenoh, unseen: a missing number will not arrive.
+        // TCP retransmits for Zenoh unseen, so a missing number will not arrive.
         reliable: !guid.prefix.is_zenoh() && endpoint.qos.reliability == Reliability::RELIABLE,
         keeps_history: endpoint.qos.durability != Durability::VOLATILE,
         has_header: begins_with_header(&endpoint.message_type),

@@ -292,7 +292,7 @@ fn unknown_writers(observer: &Observer, now: ModelTime) -> Vec<UnknownWriterFact
     facts
 }
 
-/// Combines what a participant announces about its process with the owner of its socket.
+/// Combines the announced facts about a participant's process with those of its socket's owner.
 fn process(proxy: Option<&ParticipantProxy>, holder: Option<&SocketFacts>) -> ProcessFacts {
     let announced = |text: fn(&ParticipantProxy) -> &Option<Arc<str>>| {
         proxy.and_then(|proxy| text(proxy).clone())

@@ -27,8 +27,8 @@ impl Observer {
         self.apply_lists_to_all();
     }
 
-    /// Returns the time up to which all samples have been dispatched or reported as missing at
-    /// `now`.
+    /// Returns the latest time before which all samples have been dispatched or reported as
+    /// missing.
     #[must_use]
     pub fn dispatched_until(&self, now: Timestamp) -> Timestamp {
         let writers = self.measure.payloads.wanted();
@@ -39,7 +39,7 @@ impl Observer {
         })
     }
 
-    /// Dispatches a sample in its turn, or remembers its number if the writer is unknown.
+    /// Dispatches a sample in the order of numbers, or stores its number if the writer is unknown.
     pub(super) fn counted(&mut self, writer: Guid, counted: &Counted) {
         if self.requested.sample_requests.is_empty() {
             return;
@@ -112,7 +112,7 @@ impl Observer {
         }
     }
 
-    /// Dispatches the samples of this writer whose turn has come.
+    /// Dispatches the samples of this writer that no longer wait for lower numbers.
     pub(super) fn turn(&mut self, writer: Guid, now: ModelTime) {
         let progress = self.measure.profiler.progress(writer, now, &self.graph);
         if let Some(progress) = progress {
@@ -156,9 +156,8 @@ impl Observer {
         }
     }
 
-    /// Returns the last messages of transient-local writers that this request covers, the oldest
-    /// first, for a reader of which it is new. Those that it received since the requests changed are
-    /// left out.
+    /// Returns the last messages of transient-local writers that a new request covers, the oldest
+    /// first. Messages that the request received since the requests changed are left out.
     pub fn latched(&mut self, request: &SampleRequest) -> Vec<Arc<dispatch::Sample>> {
         let covers = |sample: &Arc<dispatch::Sample>| {
             let topic = &sample.topic;
@@ -175,7 +174,7 @@ impl Observer {
         });
         let samples = samples.into_iter().map(|(at, mut sample)| {
             let time = self.graph.wall_clock.wall_time(at);
-            // The clock may have been set since the message came.
+            // The clock may have been set since the message arrived.
             if sample.time != time {
                 Arc::make_mut(&mut sample).time = time;
             }

@@ -28,14 +28,14 @@ pub struct Settings {
     pub payload_bytes: usize,
     /// Time for which a topic without endpoints stays in snapshots.
     pub topic_grace: Duration,
-    /// Longest time from a request for payloads to the first captured payload.
+    /// Maximum time from a request for payloads to the first captured payload.
     pub payload_delay: Duration,
     /// Time without a reply after which a call of a service is reported as hanging.
     pub service_timeout: Duration,
-    /// Whether the last message of each transient-local writer is kept, without a watch that
-    /// requests it.
+    /// Whether the last message of each transient-local writer is kept even if no watch requests
+    /// it.
     pub keeps_latched: bool,
-    /// Whether records contain the sender; those of a capture file do not.
+    /// Whether records contain the direction of datagrams; those of a capture file do not.
     pub directed: bool,
 }
 

@@ -17,7 +17,7 @@ use crate::graph::zenoh::{
     GraphChange, Holder, Shown, StreamId, StreamReport, ZenohSample, unknown_guid,
 };
 
-/// How the model names what Zenoh announces.
+/// Numbers of graph changes, and gids of writers, for Zenoh.
 #[derive(Debug)]
 pub(super) struct ZenohNames {
     /// Number of the last change of the graph.
@@ -37,12 +37,12 @@ impl Default for ZenohNames {
 
 impl Observer {
     pub(super) fn zenoh_report(&mut self, report: &StreamReport<'_>) {
-        // The state is apart while it calls back.
+        // The state is taken out, because its callback borrows the observer.
         let mut zenoh = std::mem::take(&mut self.zenoh);
         let at = self.graph.wall_clock.model_time(report.time);
         let mut alive = None;
         let wants_bytes = self.measure.payloads.wants_any_bytes() || self.measure.latched.is_used();
-        // A sample may precede its announcement in a batch, as that of an unknown writer.
+        // A sample may precede its writer's announcement in a batch. It then has an unknown writer.
         zenoh.report(report, at, wants_bytes, &mut |shown| match shown {
             Shown::Sample(sample) => self.zenoh_sample(report.stream, at, sample),
             Shown::Owner(socket, prefix) => self.graph.receivers.sends(socket, prefix),
@@ -71,14 +71,14 @@ impl Observer {
         self.change_zenoh_graph(at);
     }
 
-    /// Returns whether a connection of Zenoh has begun since [`Self::link_sessions`]. It may be short,
-    /// so the process that holds its socket should be looked up soon.
+    /// Returns whether a connection of Zenoh has begun since [`Self::link_sessions`]. It may be
+    /// short, so the process that holds its socket should be looked up soon.
     #[must_use]
     pub const fn awaits_holders(&self) -> bool {
         self.zenoh.has_begun
     }
 
-    /// Learns from the processes that hold the sockets which sessions of Zenoh send.
+    /// Determines which sessions of Zenoh send, from the processes that hold the sockets.
     pub(super) fn link_sessions(&mut self) {
         self.zenoh.has_begun = false;
         let receivers = &self.graph.receivers;
@@ -109,8 +109,8 @@ impl Observer {
         self.change_zenoh_graph(now);
     }
 
-    /// Names writers of Zenoh in changed verdicts as the wire does, by their gid. Readers have no
-    /// place there.
+    /// Replaces the GUIDs of Zenoh writers in changed verdicts by their gids, which messages
+    /// contain. Verdicts on readers of Zenoh are removed.
     pub(super) fn zenoh_interest(&mut self, interest: &mut Vec<(Guid, Option<Verdict>)>) {
         let (keys, discovery) = (&mut self.zenoh_names.keys, &self.graph.discovery);
         interest.retain_mut(|(guid, verdict)| {
@@ -140,7 +140,7 @@ impl Observer {
             return;
         }
         for change in changes {
-            // A counter, so that a token that comes back is not a delayed copy.
+            // The number increases, so that a token that returns is not taken for a delayed copy.
             self.zenoh_names.changes = self.zenoh_names.changes.next();
             let origin = |prefix: GuidPrefix| Origin {
                 at,
@@ -184,7 +184,7 @@ impl Observer {
         self.follow_up(at);
     }
 
-    /// Renames what an announced writer sent while its token was unknown.
+    /// Assigns the samples that a writer sent while its token was unknown to the announced writer.
     fn name_writer(&mut self, announcement: &EndpointAnnouncement) {
         if announcement.role == Role::Writer {
             let before = unknown_guid(Gid(announcement.gid));
@@ -213,7 +213,7 @@ impl Observer {
         }
         self.count(&Observation::Sample(observed));
         if stream.outgoing && stream.is_loopback() {
-            // Nothing is read at the receiver's socket: the sender's socket showed it.
+            // The receiver's socket is not read, because the sender's socket has shown the sample.
             let head = Head {
                 direction: Direction::Received,
                 socket: sample.receiving_socket,

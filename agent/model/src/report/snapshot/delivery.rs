@@ -76,7 +76,7 @@ impl fmt::Display for Subscriber {
 
 impl Ord for Subscriber {
     fn cmp(&self, other: &Self) -> Ordering {
-        // Decimal numbers of different lengths are compared digit by digit.
+        // Numbers are compared as decimal text, as they are displayed.
         match (self, other) {
             (Self::Unknown, Self::Unknown) => Ordering::Equal,
             (Self::Participant(one), Self::Participant(other)) => one.cmp(other),
