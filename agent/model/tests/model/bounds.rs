@@ -201,7 +201,7 @@ fn somewhere(dice: &mut Dice, time: u64) -> Envelope {
     envelope
 }
 
-/// One step, given the model, random numbers and the time.
+/// One step of a test, with the model, random numbers and the time.
 type Step<'a> = &'a mut dyn FnMut(&mut Observer, &mut Dice, u64);
 
 /// Runs the model with a step every `pause` nanoseconds. Returns the growth of the heap.
@@ -368,12 +368,12 @@ fn one_writer(observer: &mut Observer, dice: &mut Dice, now: u64) {
     }
 }
 
-/// Fills the tables of endpoints and nodes with groups of forty participants. Then it adds
-/// newcomers on a topic that is watched by exact name, and changes the watchlist.
+/// Fills the tables of endpoints and nodes with groups of forty participants. Among them are
+/// newcomers on a topic that is watched by exact name. The watchlist changes at intervals.
 fn newcomers_in_a_crowd(observer: &mut Observer, dice: &mut Dice, now: u64) {
     let step = (now - START) / 1_000_000;
     if step % 4_000 == 1 {
-        // With so many globs, the topics are not all matched at once.
+        // With so many globs, matching all topics takes several rounds.
         let globs = (0..20).map(|number| format!("/g{number}/**"));
         let names = globs.chain(["/exact".to_owned()]);
         let watches = names.map(|name| Watch::named(&name).unwrap()).collect();
@@ -418,7 +418,7 @@ fn newcomers_in_a_crowd(observer: &mut Observer, dice: &mut Dice, now: u64) {
 }
 
 #[test]
-fn no_table_grows_beyond_its_cap_whatever_is_forged() {
+fn forged_input_fills_no_table_beyond_its_cap() {
     let whole = drive(MESSAGES, 200_000, &mut any_datagram);
     assert_filled(&[
         "discovery.applicants",
@@ -467,7 +467,7 @@ fn no_table_grows_beyond_its_cap_whatever_is_forged() {
     println!("{ledger:#?}");
     let mut empty: Vec<_> = tables::ALL.iter().map(|table| table.name).collect();
     empty.retain(|table| ledger.get(table).is_none_or(|used| used.largest == 0));
-    // Tests of their own fill these: `deliveries`, `event`, `latched` and `zenoh::routers`.
+    // Other tests fill these tables: `deliveries`, `event`, `latched` and `zenoh::routers`.
     let rare = [
         "delivery.withheld",
         "events.losers",
@@ -476,7 +476,7 @@ fn no_table_grows_beyond_its_cap_whatever_is_forged() {
         "zenoh.cut",
         "zenoh_passages",
     ];
-    // These are filled from saved state only.
+    // Only saved state fills these tables.
     let restored = ["zenoh.relayed", "zenoh.remembered", "zenoh.restored"];
     empty.retain(|table| !rare.contains(table) && !restored.contains(table));
     assert!(empty.is_empty(), "nothing came into {empty:?}");
@@ -485,7 +485,7 @@ fn no_table_grows_beyond_its_cap_whatever_is_forged() {
 }
 
 #[test]
-fn one_forged_participant_with_fresh_addresses_keeps_the_last_ones_alone() {
+fn a_participant_with_ever_new_addresses_keeps_only_the_latest() {
     let prefix = GuidPrefix([9; 12]);
     let whole = drive(MESSAGES, 20_000, &mut |observer, dice, now| {
         let payload = forge::participant_at(prefix, 100, None, &dice.locators());

@@ -1,4 +1,4 @@
-//! Chains by stamps and by causality, in virtual time, with the traps that must give no hop.
+//! Chains by stamps and by causality, in virtual time, and traps that must not yield a hop.
 
 mod captured;
 mod causality;
@@ -36,7 +36,7 @@ fn pipeline_of(mut robot: Robot, count: u64) -> Robot {
 }
 
 #[test]
-fn a_pipeline_is_a_chain_with_the_time_of_each_hop() {
+fn a_pipeline_becomes_one_chain_with_the_time_of_each_hop() {
     let mut robot = pipeline(100);
     robot.play();
     let [chain] = &robot.chains()[..] else {
@@ -48,7 +48,7 @@ fn a_pipeline_is_a_chain_with_the_time_of_each_hop() {
     );
     assert_eq!(chain.path.method, Method::Stamps);
     assert_eq!(chain.path.topics[0].1.as_deref(), Some("/sensor"));
-    // Four messages are the evidence for each of both hops, one after the other.
+    // Each of the two hops in turn needs four messages as evidence.
     assert!((90..=96).contains(&chain.count), "{}", chain.count);
     let filter = chain.hop(0);
     near(filter.whole.p50, 0.012);
@@ -62,7 +62,7 @@ fn a_pipeline_is_a_chain_with_the_time_of_each_hop() {
 }
 
 #[test]
-fn quantiles_are_those_of_the_latest_messages() {
+fn quantiles_cover_only_the_latest_messages() {
     let mut robot = pipeline(300);
     robot.play();
     let chains = robot.chains();
@@ -72,7 +72,7 @@ fn quantiles_are_those_of_the_latest_messages() {
 }
 
 #[test]
-fn branches_and_dropped_messages_leave_whole_chains_only() {
+fn branches_and_dropped_messages_yield_only_whole_chains() {
     let mut robot = Robot::new();
     robot.node("/camera", &[], &["/image", "/camera_info"]);
     robot.node("/detector", &["/image"], &["/objects"]);
@@ -98,7 +98,7 @@ fn branches_and_dropped_messages_leave_whole_chains_only() {
 }
 
 #[test]
-fn a_fusion_node_continues_the_longest_way() {
+fn a_fusion_node_continues_only_the_longest_path() {
     let mut robot = Robot::new();
     robot.node("/lidar", &[], &["/scan"]);
     robot.node("/filter", &["/scan"], &["/clean"]);
@@ -138,7 +138,7 @@ fn a_multiplexer_continues_each_of_its_inputs() {
 }
 
 #[test]
-fn simulated_time_is_as_good_as_any_other_for_one_origin() {
+fn stamps_in_simulated_time_from_one_origin_yield_a_chain() {
     let mut robot = Robot::new();
     robot.node("/sensor", &[], &["/points"]);
     robot.node("/filter", &["/points"], &["/filtered"]);

@@ -114,6 +114,6 @@ fn thousands_of_participants_that_left_leave_no_state() {
     robot.held_after(14_000);
     let held: Vec<_> = (0..4).map(|_| robot.held_after(1_000)).collect();
     let (least, most) = (held.iter().min().unwrap(), held.iter().max().unwrap());
-    // The bound is less than 7 bytes for each of the 3000 that vanished since.
+    // The bound is less than 7 bytes for each of the 3000 participants that left in between.
     assert!(most - least < 20_000, "{held:?}");
 }

@@ -1,4 +1,4 @@
-//! Deliveries under forged records and virtual time: the samples that each receiver got, those it
+//! Deliveries under forged records and virtual time: the samples that each receiver received or
 //! lost, and the causes. The tests construct every class and check that the sums agree.
 
 mod causes;

@@ -138,7 +138,7 @@ fn reader(participant: u8, number: u8) -> Guid {
 }
 
 #[test]
-fn incompatible_pairs_are_named_with_every_policy_and_gone_with_the_cause() {
+fn an_incompatible_pair_is_found_with_every_policy_until_it_is_compatible() {
     let mut world = World::with(2);
     world.announce(writer(1, 1), "rt/points", STRING, &[BEST_EFFORT]);
     let demanding: Qos<'_> = &[RELIABLE, TRANSIENT_LOCAL, TEN_MILLISECONDS];
@@ -185,7 +185,7 @@ fn incompatible_pairs_are_named_with_every_policy_and_gone_with_the_cause() {
 }
 
 #[test]
-fn endpoints_of_two_domains_are_no_pair() {
+fn endpoints_of_two_domains_are_not_compared() {
     let mut world = World::with(1);
     world.announce(writer(1, 1), "rt/points", STRING, &[BEST_EFFORT]);
     world.domain_id = 5;
@@ -207,7 +207,7 @@ fn endpoints_of_two_domains_are_no_pair() {
 }
 
 #[test]
-fn endpoints_of_dds_and_zenoh_are_no_pair() {
+fn endpoints_of_dds_and_zenoh_are_not_compared() {
     let mut world = World::with(1);
     world.announce(reader(1, 1), "rt/chatter", STRING, &[TRANSIENT_LOCAL]);
     let [there, back] = zenoh::connection(1000);
@@ -241,7 +241,7 @@ fn endpoints_of_dds_and_zenoh_are_no_pair() {
 }
 
 #[test]
-fn partitions_keep_apart_on_purpose() {
+fn endpoints_in_different_partitions_are_not_incompatible() {
     let mut world = World::with(2);
     world.announce(writer(1, 1), "rt/points", STRING, &[BEST_EFFORT]);
     world.announce(reader(2, 1), "rt/points", STRING, &[RELIABLE, PARTITION_A]);
@@ -260,7 +260,7 @@ fn partitions_keep_apart_on_purpose() {
 }
 
 #[test]
-fn two_types_and_two_definitions_of_one_are_found() {
+fn two_types_and_two_definitions_of_one_type_are_found() {
     let mut world = World::with(3);
     let hash = |digit: &str| {
         let text = format!("typehash=RIHS01_{};", digit.repeat(64));
@@ -310,7 +310,7 @@ fn two_types_and_two_definitions_of_one_are_found() {
 }
 
 #[test]
-fn an_unmatched_endpoint_is_found_after_a_while_and_not_where_that_is_normal() {
+fn an_unmatched_endpoint_is_found_later_except_where_that_is_normal() {
     let mut world = World::with(2);
     world.announce(writer(1, 1), "rt/points", STRING, &[]);
     world.announce(reader(2, 1), "rt/cmd_vel", STRING, &[]);
@@ -362,7 +362,7 @@ fn no_endpoint_is_unmatched_while_a_participants_endpoints_are_unknown() {
 }
 
 #[test]
-fn two_nodes_of_one_name_are_found_in_one_domain_only() {
+fn two_nodes_with_one_name_are_found_only_in_the_same_domain() {
     let mut world = World::with(2);
     world.nodes(
         1,
@@ -393,7 +393,7 @@ fn two_nodes_of_one_name_are_found_in_one_domain_only() {
 }
 
 #[test]
-fn one_machine_with_a_node_in_two_domains_is_found_and_a_fleet_is_not() {
+fn a_node_in_two_domains_is_found_on_one_host_but_not_in_a_fleet() {
     let at = |last: u8| [SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, last), 7411)];
     let mut world = World::new();
     world.participant(1, &at(1));
@@ -415,7 +415,7 @@ fn one_machine_with_a_node_in_two_domains_is_found_and_a_fleet_is_not() {
 }
 
 #[test]
-fn nothing_is_found_anew_while_nothing_changes() {
+fn findings_are_not_recomputed_while_discovery_does_not_change() {
     let mut world = World::with(1);
     world.announce(writer(1, 1), "rt/points", STRING, &[]);
     world.wait(7000);
@@ -426,7 +426,7 @@ fn nothing_is_found_anew_while_nothing_changes() {
 }
 
 #[test]
-fn a_flood_is_counted_and_takes_no_time() {
+fn a_flood_of_incompatible_pairs_is_counted_and_bounded() {
     let mut world = World::with(200);
     for participant in 1..=100 {
         for number in 1..=40 {

@@ -208,7 +208,7 @@ fn endpoints(name: &str, facts: &Facts, replayed: &Replayed) {
     );
 }
 
-/// A disposed entity is removed at the datagram of its disposal.
+/// A disposed entity is removed when the datagram of its disposal arrives.
 fn disposals(name: &str, facts: &Facts, replayed: &Replayed) {
     let mut theirs: BTreeMap<String, f64> = BTreeMap::new();
     for event in &facts.events {
@@ -445,7 +445,7 @@ fn graph(name: &str, lines: &[GraphLine], facts: &Facts, replayed: &Replayed) {
     );
 }
 
-/// Compares a line with the graph at `at`; returns whether that is known.
+/// Compares a line with the graph at `at`. Returns whether the graph is known at that time.
 fn same_graph(name: &str, line: &GraphLine, at: u64, replayed: &Replayed) -> bool {
     let Some(view) = replayed.view_at(at) else {
         return false;

@@ -36,7 +36,7 @@ struct Run {
     period: u64,
     /// The first sequence number.
     first: u64,
-    /// Numbers of the messages before which the forgery is sent.
+    /// Index of the message before which the forgery is sent.
     forged_at: u64,
 }
 
@@ -90,12 +90,12 @@ impl Run {
         }
     }
 
-    /// Asserts that the counts with this forgery equal those without, plus `more` messages.
+    /// Asserts that the counts with this forgery equal those without it, plus `more` messages.
     fn stays_exact(&self, more: u64, forgery: &dyn Fn(&mut Host, CapturePoint)) {
         self.stays_exact_but(more, 0, forgery);
     }
 
-    /// Asserts the same, except that `unmeasured` latencies are missing.
+    /// Asserts the same as [`Self::stays_exact`], except that `unmeasured` latencies are missing.
     fn stays_exact_but(
         &self,
         more: u64,
@@ -130,7 +130,7 @@ fn stamped(record: Record, seconds: i64) -> Record {
 }
 
 #[test]
-fn one_datagram_with_a_number_far_ahead_hides_no_message_and_loses_none() {
+fn one_datagram_with_a_number_far_ahead_hides_and_loses_no_message() {
     for run in streams() {
         for ahead in [100, 5000, 100_000, 1 << 21, 1 << 40] {
             run.stays_exact(1, &|host, bob| host.data(bob, 500 + ahead));
@@ -153,7 +153,7 @@ fn a_number_far_ahead_with_its_own_heartbeat_is_not_confirmed() {
 }
 
 #[test]
-fn many_numbers_in_one_datagram_are_believed_no_more_than_one() {
+fn many_numbers_far_ahead_in_one_datagram_are_not_confirmed() {
     for run in streams() {
         run.stays_exact(20, &|host, bob| {
             (0..20).for_each(|number| host.data(bob, (1 << 40) + number));
@@ -162,7 +162,7 @@ fn many_numbers_in_one_datagram_are_believed_no_more_than_one() {
 }
 
 #[test]
-fn numbers_far_ahead_that_come_between_those_of_the_live_run_are_not_believed() {
+fn numbers_far_ahead_between_those_of_the_live_run_are_not_confirmed() {
     let run = Run::new(true, 10);
     let mut host = run.play(&|_, _| {});
     let bob = host.reader(BOB, 7411);
@@ -182,7 +182,7 @@ fn numbers_far_ahead_that_come_between_those_of_the_live_run_are_not_believed() 
 }
 
 #[test]
-fn one_heartbeat_far_ahead_loses_nothing() {
+fn one_heartbeat_far_ahead_causes_no_loss() {
     for period in [10, 1000] {
         for last in [600, 4000, 1 << 20, 1 << 40] {
             let run = Run::new(true, period);
@@ -193,7 +193,7 @@ fn one_heartbeat_far_ahead_loses_nothing() {
 }
 
 #[test]
-fn one_gap_far_ahead_excuses_nothing() {
+fn one_gap_far_ahead_excuses_no_sample() {
     for period in [10, 1000] {
         for number in [600, 4000, 1 << 20, 1 << 31] {
             let run = Run::new(true, period);
@@ -211,7 +211,7 @@ fn one_gap_far_ahead_excuses_nothing() {
 }
 
 #[test]
-fn one_acknack_far_ahead_acknowledges_nothing() {
+fn one_acknack_far_ahead_acknowledges_no_sample() {
     let run = Run::new(true, 10);
     let mut host = run.play(&|host, bob| host.acknack(bob, 400));
     let bob = host.reader(BOB, 7411);
@@ -229,7 +229,7 @@ fn one_acknack_far_ahead_acknowledges_nothing() {
 }
 
 #[test]
-fn an_old_number_with_a_newer_timestamp_begins_nothing_anew() {
+fn an_old_number_with_a_newer_timestamp_is_not_a_restart() {
     for run in streams() {
         for number in [1, 400, 499] {
             run.stays_exact(1, &|host, bob| {
@@ -240,7 +240,7 @@ fn an_old_number_with_a_newer_timestamp_begins_nothing_anew() {
 }
 
 #[test]
-fn a_fragment_with_a_number_far_ahead_or_long_gone_changes_nothing() {
+fn a_fragment_with_a_number_far_ahead_or_far_behind_changes_no_count() {
     for run in streams() {
         for number in [1, 400, 700, 100_000, 1 << 40] {
             run.stays_exact(0, &|host, bob| {
@@ -251,7 +251,7 @@ fn a_fragment_with_a_number_far_ahead_or_long_gone_changes_nothing() {
 }
 
 #[test]
-fn a_forgery_before_the_stream_hides_none_of_it() {
+fn a_forgery_before_the_stream_hides_no_message() {
     for run in streams() {
         let first = |number: u64, first: u64| {
             let run = Run {
@@ -259,7 +259,7 @@ fn a_forgery_before_the_stream_hides_none_of_it() {
                 forged_at: 0,
                 ..Run::new(run.reliable, run.period)
             };
-            // The messages before it establish the writer's run.
+            // The first messages establish the writer's run, and their latencies are not measured.
             run.stays_exact_but(1, 4, &|host, bob| {
                 host.put(stamped(host.record(bob, kind::DATA, number), 3000));
                 host.wait(10);
@@ -273,7 +273,7 @@ fn a_forgery_before_the_stream_hides_none_of_it() {
 }
 
 #[test]
-fn a_timestamp_hours_away_enters_no_sum_and_is_counted() {
+fn a_timestamp_hours_away_is_counted_but_enters_no_sum() {
     for seconds in [2 * HOUR, -2 * HOUR, -1_700_000_000] {
         let run = Run::new(false, 10);
         let host = run.play(&|host, bob| {
@@ -289,7 +289,7 @@ fn a_timestamp_hours_away_enters_no_sum_and_is_counted() {
 }
 
 #[test]
-fn a_timestamp_of_the_future_hides_no_restart_of_its_writer() {
+fn a_timestamp_in_the_future_hides_no_restart_of_its_writer() {
     for period in [10, 1000] {
         let run = Run::new(true, period);
         let mut host = run.play(&|host, bob| {
@@ -312,7 +312,7 @@ fn a_timestamp_of_the_future_hides_no_restart_of_its_writer() {
 }
 
 #[test]
-fn a_writer_without_a_set_clock_is_counted_as_such_in_every_message() {
+fn every_message_of_a_writer_with_an_unset_clock_is_implausible() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=50 {
@@ -331,7 +331,7 @@ fn a_writer_without_a_set_clock_is_counted_as_such_in_every_message() {
 }
 
 #[test]
-fn a_writer_that_really_jumps_loses_what_it_jumped_over() {
+fn a_confirmed_jump_loses_the_skipped_numbers_up_to_a_limit() {
     for (ahead, lost) in [(200, 200), (10_000, 10_000), (1 << 21, 0), (1 << 40, 0)] {
         let mut host = Host::new();
         let bob = host.reader(BOB, 7411);
@@ -364,7 +364,7 @@ fn a_writer_that_really_jumps_loses_what_it_jumped_over() {
 }
 
 #[test]
-fn a_jump_of_fragmented_messages_counts_each_once() {
+fn a_jump_of_fragmented_messages_counts_each_message_once() {
     for reliable in [true, false] {
         let mut host = Host::new();
         host.writer(reliable);
@@ -427,7 +427,7 @@ fn samples_that_a_gap_excused_stay_excused_after_a_confirmed_jump() {
 }
 
 #[test]
-fn a_restart_with_few_messages_is_counted_right() {
+fn a_restart_after_few_messages_is_counted_without_losses() {
     for (before, after) in [(1, 1), (3, 2), (3, 5), (100, 3), (100, 50), (2000, 4)] {
         let mut host = Host::new();
         let bob = host.reader(BOB, 7411);
@@ -447,7 +447,7 @@ fn a_restart_with_few_messages_is_counted_right() {
 }
 
 #[test]
-fn a_restart_fills_no_gaps_of_the_run_before() {
+fn a_restart_fills_no_gaps_of_the_previous_run() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let before = (1..=400).filter(|number| ![3, 150, 390].contains(number));
@@ -466,7 +466,7 @@ fn a_restart_fills_no_gaps_of_the_run_before() {
 }
 
 #[test]
-fn a_doubted_message_is_dispatched_once_and_delays_no_other() {
+fn an_unconfirmed_message_is_dispatched_once_and_delays_no_other() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     host.observer
@@ -499,7 +499,7 @@ proptest! {
 
     /// No single forged record changes the losses and messages of the real stream.
     #[test]
-    fn no_single_record_changes_what_is_counted_of_a_real_stream(
+    fn no_single_forged_record_changes_the_counts_of_a_real_stream(
         reliable: bool,
         is_slow: bool,
         kind in prop::sample::select(vec![kind::DATA, kind::HEARTBEAT, kind::GAP]),

@@ -3,9 +3,9 @@
 use ros2probe_message::{Dialect, Element, Library, Sources};
 use ros2probe_model::facts::header::begins_with_header;
 
-/// Uses the definitions built into the program; a unit test there finds each of them in this list.
+/// Uses the definitions built into the program. A unit test finds each of them in this list.
 #[test]
-fn types_that_begin_with_a_header_are_those_that_latency_is_measured_of() {
+fn the_list_of_types_with_a_header_agrees_with_the_message_definitions() {
     let listed = include_str!("../../../testing/data/message/type_hashes.txt");
     let names = listed.lines().filter_map(|line| line.split(' ').next());
     let messages = names.filter(|name| name.contains("/msg/"));

@@ -55,7 +55,7 @@ impl World {
         self.observer.input(Input::Watchlist(watchlist));
     }
 
-    /// Lets a second pass, at whose end the source reports these processes.
+    /// Lets a second pass, in the middle of which the source reports these processes.
     fn second(&mut self, processes: Vec<ProcessReport>) {
         self.now += SECOND / 2;
         self.observer.input(Input::Inside(Report {
@@ -199,7 +199,7 @@ fn timer(milliseconds: u64) -> Trigger {
     Trigger::Timer(Some(Duration::from_millis(milliseconds)))
 }
 
-/// Returns so many durations of this length.
+/// Returns `count` durations of this length.
 fn durations(count: u64, milliseconds: u64) -> Durations {
     let mut durations = Durations::default();
     for _ in 0..count {

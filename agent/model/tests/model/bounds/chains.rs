@@ -94,7 +94,7 @@ fn record(entity: EntityId, (number, at): (u64, u64), stamp: u64, place: u16) ->
     }
 }
 
-/// Sends a message on each topic, most of them with stamps of their own, and a publication.
+/// Sends a message on each topic, and three publications. `/fresh` has a stamp of its own.
 pub(super) fn messages(observer: &mut Observer, dice: &mut Dice, now: u64) {
     let step = (now - START) / 1_000_000;
     if step == 1 {
@@ -120,7 +120,7 @@ pub(super) fn messages(observer: &mut Observer, dice: &mut Dice, now: u64) {
 
 /// Reports a publication that may continue an earlier one.
 fn publish(observer: &mut Observer, dice: &mut Dice, now: u64) {
-    // Many begin with a topic whose chains are traced.
+    // Many publications continue a topic whose chains are traced.
     let input = match dice.pick(3) {
         0 => format!("/topic{}", dice.pick(100)),
         _ => "/in".to_owned(),

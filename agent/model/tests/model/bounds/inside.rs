@@ -72,7 +72,7 @@ pub(super) fn reports(observer: &mut Observer, dice: &mut Dice, now: u64) {
     }));
 }
 
-/// Returns the sizes after more reports of a subscription than its queue keeps states.
+/// Reports a subscription more often than its queue keeps totals.
 pub(super) fn of_a_queue() {
     let mut host = host::Host::new();
     let bob = host.reader(host::BOB, 7411);

@@ -1,4 +1,4 @@
-//! The chain of real nodes in a capture, against what the nodes logged.
+//! The chain of real nodes in a capture, compared with the log of the nodes.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -17,14 +17,14 @@ use ros2probe_wire::Expansion;
 
 use super::*;
 
-/// Largest difference between a median and that of the logs, in seconds.
+/// Maximum difference between a median and that of the logs, in seconds.
 const CLOSE: f64 = 0.000_2;
-/// Columns of the truth.
+/// Columns of `truth.csv`.
 const SENSOR: usize = 1;
 const FILTER: [usize; 2] = [2, 3];
 const CONTROLLER: [usize; 2] = [4, 5];
 
-/// What the model finds in the capture.
+/// Results of the model for the capture.
 struct Found {
     chains: Vec<ChainFacts>,
     restamping: Vec<String>,
@@ -153,7 +153,7 @@ const NAMES: [&str; 7] = [
 ];
 
 #[test]
-fn spans_of_real_nodes_have_the_times_of_the_capture_and_contain_what_the_nodes_logged() {
+fn spans_of_real_nodes_have_captured_times_and_contain_the_logged_times() {
     let Found { chains, spans, .. } = replay(1.0);
     let traces = by_stamp(&spans);
     let times = |stamp: u64| {
@@ -211,7 +211,7 @@ fn spans_of_real_nodes_have_the_times_of_the_capture_and_contain_what_the_nodes_
 }
 
 #[test]
-fn a_share_of_a_capture_is_the_same_every_time() {
+fn a_traced_share_selects_the_same_traces_in_each_replay() {
     let (all, tenth) = (replay(1.0).spans, replay(0.1).spans);
     assert_eq!(replay(0.1).spans, tenth);
     let ids = |spans: &[ChainSpan]| spans.iter().map(|span| span.trace_id).collect();

@@ -21,7 +21,7 @@ fn hop(node: &str, ends: (&str, &str), source: u64, taken: u64, done: u64) -> Ca
 }
 
 #[test]
-fn publications_are_joined_by_their_messages() {
+fn publications_within_callbacks_are_joined_by_their_messages() {
     let mut robot = Robot::new();
     robot.start();
     for index in 0..50 {
@@ -89,14 +89,14 @@ fn a_chain_from_a_message_without_a_source_timestamp_begins_at_its_take() {
 }
 
 #[test]
-fn a_publication_of_another_time_or_topic_begins_a_chain_of_its_own() {
+fn a_publication_of_another_time_or_topic_begins_its_own_chain() {
     let mut robot = Robot::new();
     robot.start();
     for index in 0..20 {
         let at = robot.after(index * 50 * MILLISECOND);
         let out = at + MILLISECOND;
         let filter = hop("/filter", ("/points", "/filtered"), at, at + 500, out);
-        // 20 ms after the publication it is another message.
+        // 20 ms after the publication, the source timestamp belongs to another message.
         let source = out + 20 * MILLISECOND;
         let drive = hop(
             "/drive",
@@ -118,10 +118,10 @@ fn a_publication_of_another_time_or_topic_begins_a_chain_of_its_own() {
     assert_eq!(robot.shown(), expected);
 }
 
-/// The chain had no source, and a process older than the agent no node, although discovery names
-/// both.
+/// Before the fix, the chain had no source node. A process older than the agent had no node,
+/// although discovery names both.
 #[test]
-fn nodes_are_named_that_only_discovery_knows() {
+fn nodes_of_a_process_older_than_the_agent_are_found_by_discovery() {
     let mut robot = Robot::new();
     robot.node("/sensor", &[], &["/points"]);
     robot.node("/filter", &["/points"], &["/filtered"]);
@@ -136,7 +136,7 @@ fn nodes_are_named_that_only_discovery_knows() {
         }
         robot.wait(3_000 * MILLISECOND);
     };
-    // Before their announcement no one is named.
+    // Before the announcement of the nodes, none is named.
     play(&mut robot, 0);
     let [chain] = &robot.chains()[..] else {
         panic!("{:?}", robot.chains())

@@ -18,7 +18,7 @@ fn expected(from: &str, to: &str, milliseconds: u64) -> ExpectedChain {
 }
 
 #[test]
-fn the_topics_between_the_ends_are_measured_and_a_slow_chain_is_a_finding_until_it_is_fast() {
+fn a_configured_chain_is_measured_and_is_a_finding_while_it_is_slow() {
     let mut robot = Robot::watching(&["/unrelated"]);
     robot.node("/sensor", &[], &["/points", "/other"]);
     robot.node("/filter", &["/points"], &["/filtered"]);

@@ -28,7 +28,7 @@ fn robot(every: u64, stamp: impl Fn(u64, u64) -> u64) -> Robot {
 }
 
 #[test]
-fn a_node_that_stamps_again_is_found_and_ends_the_chain() {
+fn a_restamping_node_is_a_finding_and_ends_the_chain() {
     let robot = robot(1, |_, out| out - 50 * MICROSECOND);
     let findings = robot.findings();
     let [Diagnosis::RestampingNode { topic, node, input }] = &findings[..] else {
@@ -42,17 +42,17 @@ fn a_node_that_stamps_again_is_found_and_ends_the_chain() {
 }
 
 #[test]
-fn a_node_that_keeps_the_stamp_is_no_finding() {
+fn a_node_that_keeps_the_stamp_is_not_a_finding() {
     assert_eq!(robot(1, |measured, _| measured).findings(), []);
 }
 
 #[test]
-fn a_source_of_its_own_rate_is_no_finding() {
+fn a_node_with_its_own_output_rate_is_not_a_finding() {
     assert_eq!(robot(2, |_, out| out - 50 * MICROSECOND).findings(), []);
 }
 
 #[test]
-fn a_node_whose_own_stamps_are_old_measures_on_its_own() {
+fn a_node_whose_stamps_precede_its_publications_is_not_a_finding() {
     let robot = robot(1, |_, out| out - 8 * MILLISECOND);
     assert_eq!(robot.findings(), []);
 }

@@ -21,7 +21,7 @@ fn by_trace(spans: &[ChainSpan]) -> BTreeMap<u128, Vec<&ChainSpan>> {
 }
 
 /// Returns the spans of one trace as a tree: indented by their parents, with their durations in
-/// microseconds, in the order of their begin.
+/// microseconds, sorted by their start.
 fn tree(trace: &[&ChainSpan]) -> Vec<String> {
     let mut lines = Vec::new();
     let ids: BTreeSet<SpanId> = trace.iter().map(|span| span.id).collect();
@@ -73,7 +73,7 @@ const WHOLE: [&str; 7] = [
 ];
 
 #[test]
-fn a_measurement_is_one_trace_with_the_times_of_each_hop() {
+fn a_measurement_becomes_one_trace_with_the_times_of_each_hop() {
     let mut robot = pipeline_of(Robot::tracing(&[("/**", 1.0)]), 100);
     robot.play();
     let spans = taken(&mut robot);
@@ -84,7 +84,7 @@ fn a_measurement_is_one_trace_with_the_times_of_each_hop() {
     for trace in &whole {
         assert_eq!(tree(trace), WHOLE);
     }
-    // Before the second hop was accepted, the chain had one.
+    // Before the second hop was accepted, the chain had only one hop.
     assert!(traces.len() <= whole.len() + 4, "{}", traces.len());
 
     // The spans begin and end at the points of the chain.
@@ -107,7 +107,7 @@ fn a_measurement_is_one_trace_with_the_times_of_each_hop() {
 }
 
 #[test]
-fn a_share_of_the_first_topic_selects_whole_traces_alike_every_time() {
+fn a_share_of_the_first_topic_selects_the_same_whole_traces_each_time() {
     let traces = |share: f64| {
         let shares = [("/points", share), ("/filtered", 0.0), ("/cmd", 1.0)];
         let mut robot = pipeline_of(Robot::tracing(&shares), 200);
@@ -125,7 +125,7 @@ fn a_share_of_the_first_topic_selects_whole_traces_alike_every_time() {
 }
 
 #[test]
-fn branches_share_their_trace_and_have_each_span_once() {
+fn branches_share_one_trace_in_which_each_span_occurs_once() {
     let shares = [("/image", 1.0), ("/objects", 0.0), ("/thumbnail", 0.0)];
     let others = [("/debug", 0.0), ("/plan", 0.0)];
     let mut robot = Robot::tracing(&[&shares[..], &others].concat());
@@ -192,15 +192,15 @@ fn traces_with(begin: u64, stamp: impl Fn(u64, u64) -> u64) -> BTreeSet<u128> {
 }
 
 #[test]
-fn stamps_that_come_again_do_not_join_the_traces_of_two_measurements() {
-    // The writer and the numbers are the same in both runs: the next number follows another stamp.
+fn repeated_stamps_do_not_join_the_traces_of_two_measurements() {
+    // Writer and numbers are the same in both runs, but each stamp has another number.
     for coarse in [50 * MILLISECOND, 1000] {
         let first = |index, _| (1 + index) * coarse;
         let other = |index, _| (2 + index) * coarse;
         let (one, two) = (traces_with(0, first), traces_with(0, other));
         assert!(one.is_disjoint(&two), "the stamp is not the whole identity");
     }
-    // A present stamp with nanoseconds is.
+    // A stamp of the present with nanoseconds identifies a measurement.
     let fine = |_, at| at - 777;
     let later = 3 * 50 * MILLISECOND;
     let (one, two) = (traces_with(0, fine), traces_with(later, fine));
@@ -211,7 +211,7 @@ fn stamps_that_come_again_do_not_join_the_traces_of_two_measurements() {
 }
 
 #[test]
-fn without_a_traced_watch_nothing_is_kept() {
+fn without_a_traced_watch_no_span_is_exported() {
     let mut robot = pipeline(100);
     robot.play();
     assert!(!robot.chains().is_empty());

@@ -1,4 +1,4 @@
-//! Equal stamps that prove nothing.
+//! Equal stamps that are not evidence of a hop.
 
 use super::*;
 
@@ -44,7 +44,7 @@ fn crowd(stamp: impl Fn(u64) -> u64, mut phase: impl FnMut(&mut Random, u64) -> 
 }
 
 #[test]
-fn fifty_nodes_with_five_inputs_and_exact_stamps_have_no_hop() {
+fn exact_stamps_of_fifty_unrelated_nodes_yield_no_hop() {
     let robot = crowd(
         |at| at,
         |random, number| number * MILLISECOND + random.below(50 * MICROSECOND),
@@ -53,7 +53,7 @@ fn fifty_nodes_with_five_inputs_and_exact_stamps_have_no_hop() {
 }
 
 #[test]
-fn stamps_that_timers_round_have_no_hop_whatever_the_phases() {
+fn rounded_stamps_of_timers_yield_no_hop_whatever_the_phases() {
     let rounded = |at: u64| at - at % (100 * MILLISECOND);
     let fixed = crowd(rounded, |_, number| (number + 1) * MILLISECOND);
     assert_eq!(hops(&fixed.chains()), [""; 0]);
@@ -62,7 +62,7 @@ fn stamps_that_timers_round_have_no_hop_whatever_the_phases() {
 }
 
 #[test]
-fn simulated_time_that_all_nodes_stamp_with_has_no_hop() {
+fn stamps_of_all_nodes_in_simulated_time_yield_no_hop() {
     // Simulated time in steps of 1/60 s, which are not round in nanoseconds.
     let step = 16_666_666;
     let simulated = |at: u64| 7_000_000_000 + (at / step) * step;
@@ -121,7 +121,7 @@ fn true_hops_are_found_among_fifty_nodes_with_five_inputs() {
 }
 
 #[test]
-fn two_inputs_with_one_stamp_that_do_not_derive_from_each_other_are_ambiguous() {
+fn two_independent_inputs_with_one_stamp_yield_no_hop() {
     let mut robot = Robot::new();
     robot.node("/camera", &[], &["/left", "/right"]);
     robot.node("/stereo", &["/left", "/right"], &["/depth"]);
@@ -137,7 +137,7 @@ fn two_inputs_with_one_stamp_that_do_not_derive_from_each_other_are_ambiguous() 
 }
 
 #[test]
-fn an_input_that_comes_too_late_is_not_the_cause() {
+fn an_input_after_the_output_is_not_its_cause() {
     let mut robot = Robot::new();
     robot.node("/camera", &[], &["/left", "/right"]);
     robot.node("/filter", &["/left", "/right"], &["/edges"]);
@@ -153,7 +153,7 @@ fn an_input_that_comes_too_late_is_not_the_cause() {
 }
 
 #[test]
-fn a_feedback_loop_is_no_endless_chain() {
+fn a_feedback_loop_yields_a_finite_chain() {
     let mut robot = Robot::new();
     robot.node("/sensor", &[], &["/state"]);
     robot.node("/controller", &["/state", "/response"], &["/cmd"]);
@@ -171,7 +171,7 @@ fn a_feedback_loop_is_no_endless_chain() {
 }
 
 #[test]
-fn an_unset_stamp_and_a_repeated_one_are_no_evidence() {
+fn unset_and_repeated_stamps_yield_no_hop() {
     let mut robot = Robot::new();
     robot.node("/sensor", &[], &["/points"]);
     robot.node("/filter", &["/points"], &["/filtered"]);
@@ -188,7 +188,7 @@ fn an_unset_stamp_and_a_repeated_one_are_no_evidence() {
 }
 
 #[test]
-fn a_stamp_that_too_many_messages_carry_is_no_evidence() {
+fn a_stamp_that_too_many_messages_carry_yields_no_hop() {
     for (count, expected) in [(20, vec!["/points -[/filter]-> /filtered"]), (80, vec![])] {
         let mut robot = Robot::new();
         let others: Vec<_> = (0..count).map(|number| format!("/other{number}")).collect();

@@ -7,7 +7,7 @@ use ros2probe_wire::Record;
 use ros2probe_wire::record::{flag, kind};
 
 #[test]
-fn every_cause_is_counted_for_itself_and_all_add_up() {
+fn each_cause_has_its_own_count_and_all_counts_add_up() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=100 {
@@ -46,7 +46,7 @@ fn every_cause_is_counted_for_itself_and_all_add_up() {
 }
 
 #[test]
-fn fragments_without_room_within_a_joined_run_lose_the_sample_and_its_repair_brings_it_back() {
+fn fragments_dropped_by_a_full_buffer_lose_the_sample_until_it_is_repaired() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let run = |host: &mut Host, number| {
@@ -101,7 +101,7 @@ fn fragments_without_room_within_a_joined_run_lose_the_sample_and_its_repair_bri
 }
 
 #[test]
-fn a_retransmission_without_room_is_lost_like_the_original() {
+fn a_retransmission_dropped_by_a_full_buffer_is_lost_in_the_buffer() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     host.data(bob, 1);
@@ -114,7 +114,7 @@ fn a_retransmission_without_room_is_lost_like_the_original() {
 }
 
 #[test]
-fn a_loss_whose_fragments_expire_later_has_its_final_cause() {
+fn a_pending_loss_gets_its_cause_when_its_fragments_expire() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=20 {
@@ -154,7 +154,7 @@ fn a_loss_whose_fragments_expire_later_has_its_final_cause() {
 }
 
 #[test]
-fn a_failed_reassembly_after_the_retransmission_is_no_loss() {
+fn a_failed_reassembly_after_the_retransmission_is_not_a_loss() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     host.data(bob, 1);
@@ -173,7 +173,7 @@ fn a_failed_reassembly_after_the_retransmission_is_no_loss() {
 }
 
 #[test]
-fn a_sample_that_left_this_host_and_never_arrived_is_lost_unless_its_socket_is_closed() {
+fn a_sample_that_left_this_host_is_lost_if_it_never_arrives_at_an_open_socket() {
     for is_closed in [false, true] {
         let mut host = Host::new();
         let bob = host.reader(BOB, 7411);
@@ -206,7 +206,7 @@ fn a_sample_that_left_this_host_and_never_arrived_is_lost_unless_its_socket_is_c
 }
 
 #[test]
-fn a_sample_to_a_live_receiver_that_never_arrived_is_lost_soon() {
+fn a_sample_that_never_arrives_at_a_live_receiver_is_lost_within_seconds() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=20 {

@@ -4,7 +4,7 @@ use ros2probe_model::facts::loss::LossCause;
 use ros2probe_testing::model::host::{BOB, CAROL, Host};
 
 #[test]
-fn a_heartbeat_announces_the_tail_to_its_reader_alone() {
+fn a_directed_heartbeat_announces_the_last_samples_only_to_its_reader() {
     let mut host = Host::new();
     let (bob, carol) = (host.reader(BOB, 7411), host.reader(CAROL, 7413));
     for number in 1..=10 {
@@ -25,7 +25,7 @@ fn a_heartbeat_announces_the_tail_to_its_reader_alone() {
 }
 
 #[test]
-fn an_acknowledgement_shows_what_a_reader_waits_for() {
+fn an_acknack_shows_the_acknowledged_and_missing_samples() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     host.acknack(bob, 1);
@@ -53,7 +53,7 @@ fn an_acknowledgement_shows_what_a_reader_waits_for() {
 }
 
 #[test]
-fn a_best_effort_reader_of_a_reliable_writer_is_sent_nothing_again() {
+fn a_best_effort_reader_of_a_reliable_writer_gets_no_retransmission() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     host.subscribe_with(BOB, 2, false);
@@ -75,7 +75,7 @@ fn a_best_effort_reader_of_a_reliable_writer_is_sent_nothing_again() {
 }
 
 #[test]
-fn heartbeats_alone_lose_nothing_until_the_reader_asks() {
+fn heartbeats_cause_no_loss_until_the_reader_requests_samples() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     // All samples use shared memory.
@@ -145,7 +145,7 @@ fn an_unseen_sample_that_its_reader_acknowledged_is_not_lost() {
 }
 
 #[test]
-fn samples_written_while_a_reader_was_away_are_not_lost_when_a_heartbeat_begins_later() {
+fn samples_written_while_a_reader_was_absent_are_not_lost() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     (1..=100).for_each(|number| host.data(bob, number));

@@ -63,7 +63,7 @@ proptest! {
         let bob = host.reader(BOB, 7411);
         let socket_full = |record: Record| Record { flags: record.flags | flag::SOCKET_FULL, ..record };
         host.put(arrival(&host, bob, 1, false, false));
-        // The kernel has the writer by then, so it captures every fragment from here on.
+        // By then, the kernel knows the writer and captures every further fragment.
         host.wait(300);
         let mut given_up = Vec::new();
         let mut repairs = Vec::new();
@@ -105,7 +105,7 @@ proptest! {
         for _ in 0..15 {
             host.wait(1000);
         }
-        // Unknown causes are pending, and no sample is open any longer.
+        // Unknown causes are pending, and no sample is awaited any longer.
         let facts = host.deliveries()[0].delivered;
         prop_assert_eq!(facts.messages - facts.history + facts.lost() + facts.irrelevant, sent);
         let unknown = fates.iter().filter(|(fate, ..)| matches!(fate, Fate::BeforeHost | Fate::Reassembly));

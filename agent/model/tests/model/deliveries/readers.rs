@@ -47,13 +47,13 @@ fn rest(host: &mut Host) {
 }
 
 #[test]
-fn eleven_processes_that_share_a_multicast_group_lose_nothing_that_they_never_subscribed_to() {
+fn processes_without_a_reader_in_a_multicast_group_have_no_losses() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411).multicast(100);
     host.owner(bob, BOB);
     let mut sockets = vec![bob];
     for other in 1..=11 {
-        // Half of them are known by a socket that sends, the others never sent.
+        // Half of the participants are known by a socket that sends; the others never sent.
         let prefix = GuidPrefix([1, 0x10, 100 + other, 4, 5, 6, 7, 8, 9, 10, 11, 12]);
         let socket = stranger(&mut host, prefix, 7500 + u16::from(other)).multicast(other.into());
         if other % 2 == 0 {
@@ -77,7 +77,7 @@ fn eleven_processes_that_share_a_multicast_group_lose_nothing_that_they_never_su
 }
 
 #[test]
-fn the_counts_of_a_socket_are_shown_once_its_participant_is_known_to_have_read() {
+fn counts_of_a_socket_appear_once_its_participant_is_known_as_a_reader() {
     for is_reader in [true, false] {
         let mut host = Host::new();
         let bob = host.reader(BOB, 7411);
@@ -118,7 +118,7 @@ fn samples_from_before_a_late_reader_are_neither_delivered_nor_lost() {
     let dave = stranger(&mut host, DAVE, 7415).multicast(103);
     host.owner(carol, CAROL);
     (1..=50).for_each(|number| send(&mut host, number, &[bob, carol, dave]));
-    // Both announce a reader; Dave's socket is found later.
+    // Carol and Dave announce a reader; Dave's socket is found later.
     host.subscribe(CAROL, 7);
     host.subscribe(DAVE, 7);
     host.wait(100);
@@ -136,17 +136,17 @@ fn samples_from_before_a_late_reader_are_neither_delivered_nor_lost() {
         )
     });
     let counts: Vec<_> = counts.collect();
-    // While Dave's socket is unknown, it may be another one of Carol's: four samples that it got
-    // are not missing there.
+    // While Dave's socket is unknown, it may be another socket of Carol. Therefore four samples
+    // that it received do not count as lost by Carol.
     assert_eq!(counts, [(BOB, 80, 20), (CAROL, 40, 6), (DAVE, 24, 6)]);
 }
 
 #[test]
-fn a_socket_of_an_unknown_participant_takes_no_sample_from_a_known_one_that_receives_it_later() {
+fn a_socket_of_an_unknown_participant_takes_no_sample_from_a_known_one() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411).multicast(101);
     host.owner(bob, BOB);
-    // As the loopback of the writer's own multicast.
+    // This order occurs with the loopback of the writer's own multicast.
     let carol = stranger(&mut host, CAROL, 7413).multicast(102);
     (1..=50).for_each(|number| {
         host.data(carol, number);
@@ -164,13 +164,13 @@ fn a_socket_of_an_unknown_participant_takes_no_sample_from_a_known_one_that_rece
 }
 
 #[test]
-fn a_reader_that_leaves_takes_its_process_from_the_subscribers_also_for_a_late_agent() {
+fn a_process_is_no_longer_a_subscriber_after_its_last_reader_left() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411).multicast(101);
     host.owner(bob, BOB);
     let carol = stranger(&mut host, CAROL, 7413).multicast(102);
     host.owner(carol, CAROL);
-    // The agent knows this announcement only, and not those before it.
+    // The agent knows only this announcement, and none before it.
     host.subscribe(CAROL, 9);
     (1..=50).for_each(|number| send(&mut host, number, &[bob, carol]));
     host.unsubscribe(CAROL, 10);
@@ -182,7 +182,7 @@ fn a_reader_that_leaves_takes_its_process_from_the_subscribers_also_for_a_late_a
 }
 
 #[test]
-fn a_process_whose_only_reader_is_incompatible_is_no_subscriber() {
+fn a_process_whose_only_reader_is_incompatible_is_not_a_subscriber() {
     let mut host = Host::new();
     host.writer(false);
     host.participant(BOB, "10.0.0.2:7411".parse().unwrap());
@@ -206,7 +206,7 @@ fn a_process_whose_only_reader_is_incompatible_is_no_subscriber() {
 }
 
 #[test]
-fn a_wire_without_any_reader_of_the_topic_delivers_nothing() {
+fn a_wire_source_has_no_delivery_without_a_reader_of_the_topic() {
     let mut host = Host::new();
     let group = stranger(&mut host, BOB, 7411).multicast(0).wire();
     (1..=20).for_each(|number| send(&mut host, number, &[group]));
@@ -224,7 +224,7 @@ fn a_wire_without_any_reader_of_the_topic_delivers_nothing() {
 }
 
 #[test]
-fn a_process_with_a_participant_in_each_of_two_domains_is_the_subscriber_in_one() {
+fn a_process_with_participants_in_two_domains_is_a_subscriber_in_one_domain() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411).multicast(101);
     let other = bob.multicast(102);
@@ -241,7 +241,7 @@ fn a_process_with_a_participant_in_each_of_two_domains_is_the_subscriber_in_one(
         &payload,
     ));
     host.owner(other, CAROL);
-    // The same process holds the sockets of both.
+    // The same process holds the sockets of both participants.
     for cookie in [101, 1000 + u64::from(CAROL.0[2])] {
         host.observer.input(Input::Socket(SocketFacts {
             cookie,

@@ -42,7 +42,7 @@ fn two_subscribers_of_one_multicast_have_separate_losses() {
 }
 
 #[test]
-fn a_late_joiner_and_its_history_lose_nothing() {
+fn a_late_joiner_with_requested_history_has_no_losses() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     (1..=500).for_each(|number| host.data(bob, number));
@@ -60,7 +60,7 @@ fn a_late_joiner_and_its_history_lose_nothing() {
 }
 
 #[test]
-fn a_reader_that_leaves_loses_nothing_and_returns_without_a_gap() {
+fn a_reader_that_leaves_and_returns_has_no_losses() {
     let mut host = Host::new();
     let (bob, carol) = (host.reader(BOB, 7411), host.reader(CAROL, 7413));
     for number in 1..=100 {
@@ -99,7 +99,7 @@ fn a_reader_that_leaves_loses_nothing_and_returns_without_a_gap() {
 }
 
 #[test]
-fn samples_that_arrive_without_a_reader_are_unmatched_and_take_no_room() {
+fn samples_that_arrive_without_a_reader_are_unmatched_and_add_no_delivery() {
     let mut host = Host::new();
     let (bob, carol) = (host.reader(BOB, 7411), host.bystander(CAROL, 7413));
     let (bob, carol) = (bob.multicast(101), carol.multicast(102));
@@ -125,7 +125,7 @@ fn samples_that_arrive_without_a_reader_are_unmatched_and_take_no_room() {
 }
 
 #[test]
-fn the_losses_of_a_killed_subscriber_end() {
+fn a_killed_subscriber_soon_has_no_further_losses() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=1000 {
@@ -141,7 +141,7 @@ fn the_losses_of_a_killed_subscriber_end() {
 }
 
 #[test]
-fn an_address_that_two_announce_in_turn_identifies_neither() {
+fn an_address_that_two_participants_announce_identifies_neither() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411).wire();
     host.reader(CAROL, 7411);
@@ -214,7 +214,7 @@ fn a_packet_to_the_senders_own_address_does_not_identify_its_socket() {
 }
 
 #[test]
-fn a_socket_is_shown_with_its_process_and_what_died_there_without_a_name() {
+fn a_socket_is_shown_with_its_process_and_its_unidentified_drops() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     host.data(bob, 1);
@@ -235,7 +235,7 @@ fn a_socket_is_shown_with_its_process_and_what_died_there_without_a_name() {
 }
 
 #[test]
-fn a_container_is_recognised_by_the_number_that_its_process_has_inside() {
+fn a_container_is_recognized_by_the_process_id_in_its_namespace() {
     let mut host = Host::new();
     let fast_dds = |process: u8| GuidPrefix([1, 0x0f, 1, 2, process, 0, 3, 3, 3, 3, 3, 3]);
     for (process, port) in [(7, 7411), (9, 7413)] {

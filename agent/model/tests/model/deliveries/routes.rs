@@ -11,7 +11,7 @@ use ros2probe_wire::Record;
 use ros2probe_wire::record::kind;
 
 #[test]
-fn a_multicast_original_and_its_unicast_repair_are_one_delivery() {
+fn multicast_samples_and_unicast_retransmissions_are_one_delivery() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let group = bob.multicast(101);
@@ -39,7 +39,7 @@ fn a_multicast_original_and_its_unicast_repair_are_one_delivery() {
 }
 
 #[test]
-fn ways_are_put_together_when_their_socket_is_known_late() {
+fn routes_are_merged_when_their_socket_is_identified_late() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let group = bob.multicast(101);
@@ -71,7 +71,7 @@ fn ways_are_put_together_when_their_socket_is_known_late() {
 }
 
 #[test]
-fn a_receiver_whose_socket_is_known_late_is_still_one() {
+fn a_receiver_whose_socket_is_identified_late_has_one_delivery() {
     for names in [&[false, true][..], &[true, true], &[false, false, true]] {
         let mut host = Host::new();
         // The participant does not announce the address of a connection.
@@ -113,7 +113,7 @@ fn a_receiver_whose_socket_is_known_late_is_still_one() {
 }
 
 #[test]
-fn samples_pending_when_routes_are_merged_stay_pending_once() {
+fn samples_pending_when_routes_are_merged_are_counted_once() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let group = bob.multicast(101);
@@ -151,7 +151,7 @@ fn samples_pending_when_routes_are_merged_stay_pending_once() {
 }
 
 #[test]
-fn a_wire_distinguishes_receivers_by_destination_and_invents_no_losses_for_repairs() {
+fn a_wire_source_separates_destinations_and_accepts_unicast_retransmissions() {
     let mut host = Host::new();
     let (bob, carol) = (
         host.reader(BOB, 7411).wire(),
@@ -201,7 +201,7 @@ fn a_wire_distinguishes_receivers_by_destination_and_invents_no_losses_for_repai
 }
 
 #[test]
-fn a_mirrored_wire_adds_what_sockets_do_not_see_and_nothing_else() {
+fn a_mirrored_wire_adds_only_samples_that_sockets_do_not_see() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let group = bob.multicast(101);
@@ -232,7 +232,7 @@ fn a_mirrored_wire_adds_what_sockets_do_not_see_and_nothing_else() {
 }
 
 #[test]
-fn copies_of_a_multicast_on_its_way_out_are_no_duplicates() {
+fn copies_of_an_outgoing_multicast_are_not_duplicates() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let group = bob.multicast(101);
@@ -260,7 +260,7 @@ fn copies_of_a_multicast_on_its_way_out_are_no_duplicates() {
 }
 
 #[test]
-fn a_full_table_refuses_counts_and_evicts_the_silent() {
+fn a_full_table_counts_refusals_and_evicts_silent_deliveries() {
     let mut host = Host::with(Settings {
         deliveries: 3,
         ..Settings::default()

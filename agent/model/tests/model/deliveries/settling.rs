@@ -1,4 +1,4 @@
-//! Every sample is at each time delivered, lost or pending, also when the writer falls silent.
+//! At any time, every sample is delivered, lost or pending, even if the writer falls silent.
 
 use ros2probe_model::facts::loss::LossCause;
 use ros2probe_testing::model::forge::{Message, SEDP_WRITERS};
@@ -22,13 +22,13 @@ fn states(host: &Host) -> (u64, u64, u64) {
 }
 
 #[test]
-fn half_received_messages_of_a_writer_that_stops_are_pending_and_lost_soon_after() {
+fn half_received_messages_of_a_stopped_writer_are_pending_and_then_lost() {
     let mut host = Host::new();
     let bob = best_effort(&mut host);
     host.data(bob, 1);
     host.wait(300);
     for number in 2..=50 {
-        // Every fifth loses its second half, as IP fragments do.
+        // Every fifth message loses its second half, as with lost IP fragments.
         let count = if number % 5 == 0 { 5 } else { 10 };
         host.put(host.fragments(bob, number, 1, count));
         host.wait(100);
@@ -66,7 +66,7 @@ fn the_last_messages_of_a_best_effort_writer_are_pending_until_they_are_lost() {
 }
 
 #[test]
-fn samples_to_a_closed_socket_are_not_pending_for_ever() {
+fn samples_to_a_removed_reader_do_not_stay_pending() {
     let mut host = Host::new();
     let bob = best_effort(&mut host);
     for number in 1..=100 {
@@ -105,7 +105,7 @@ fn the_losses_of_a_reliable_writer_that_leaves_are_settled_when_it_leaves() {
 }
 
 #[test]
-fn samples_that_a_writer_withdrew_are_lost_within_two_seconds() {
+fn samples_dropped_from_the_writers_history_are_lost_within_two_seconds() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in (1..=20).filter(|number| *number != 7) {
@@ -113,14 +113,14 @@ fn samples_that_a_writer_withdrew_are_lost_within_two_seconds() {
         host.wait(10);
     }
     assert_eq!(states(&host), (19, 0, 1));
-    // The writer keeps the last ten only.
+    // The writer keeps only the last ten samples.
     host.heartbeat(bob, 11, 20);
     host.wait(2000);
     assert_eq!(states(&host), (19, 1, 0));
 }
 
 #[test]
-fn a_gap_of_a_reliable_writer_is_pending_until_its_repair() {
+fn a_missing_sample_of_a_reliable_writer_is_pending_until_its_repair() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in (1..=20).filter(|number| *number != 7) {

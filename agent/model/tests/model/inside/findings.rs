@@ -68,7 +68,7 @@ impl Robot {
         self.world().snapshot().diagnoses.list.clone()
     }
 
-    /// Returns the numbers of diagnosis events that appeared and were resolved.
+    /// Returns the numbers of events about findings that appeared and that were resolved.
     fn events(&mut self) -> (usize, usize) {
         let events = self.world().observer.drain().events.events;
         let resolved = events.iter().filter_map(|event| match &event.kind {
@@ -116,7 +116,7 @@ fn a_healthy_robot_has_no_findings() {
 }
 
 #[test]
-fn a_slow_start_is_no_finding() {
+fn a_slow_start_is_not_a_finding() {
     let mut robot = Robot::with(vec![
         steady(0x40, timer(50), 1, 20, 400),
         steady(0x41, scan(), 1, 10, 400),
@@ -130,7 +130,7 @@ fn a_slow_start_is_no_finding() {
 }
 
 #[test]
-fn a_callback_longer_than_a_timer_of_its_thread_is_found_and_resolved() {
+fn a_callback_longer_than_a_timer_period_of_its_thread_is_a_finding() {
     let mut robot = Robot::with(vec![
         steady(0x40, timer(50), 1, 20, 2),
         steady(0x41, scan(), 1, 5, 120),
@@ -162,7 +162,7 @@ fn a_callback_longer_than_a_timer_of_its_thread_is_found_and_resolved() {
 }
 
 #[test]
-fn a_timer_longer_than_its_own_period_is_found() {
+fn a_timer_callback_longer_than_its_period_is_a_finding() {
     let mut robot = Robot::with(vec![steady(0x40, timer(50), 1, 14, 70)]);
     robot.run(30);
     let found = robot.found();
@@ -179,7 +179,7 @@ fn a_timer_longer_than_its_own_period_is_found() {
 }
 
 #[test]
-fn a_callback_that_changes_threads_delays_no_timer() {
+fn a_slow_callback_that_changes_threads_is_not_a_finding() {
     let mut robot = Robot::with(vec![
         steady(0x40, timer(50), 1, 20, 2),
         steady(0x41, scan(), 1, 5, 120),
@@ -192,7 +192,7 @@ fn a_callback_that_changes_threads_delays_no_timer() {
 }
 
 #[test]
-fn a_callback_that_waits_for_a_busy_executor_is_found() {
+fn a_callback_that_waits_for_a_busy_executor_is_a_finding() {
     let mut robot = Robot::with(vec![
         steady(0x40, scan(), 1, 10, 10),
         steady(0x41, Trigger::Subscription("/image".into()), 1, 3, 290),
@@ -207,12 +207,12 @@ fn a_callback_that_waits_for_a_busy_executor_is_found() {
 }
 
 #[test]
-fn a_message_that_travels_long_does_not_wait_for_the_executor() {
+fn a_long_transport_time_is_not_a_wait_for_the_executor() {
     let mut robot = Robot::with(vec![steady(0x40, scan(), 1, 10, 1)]);
     robot.callbacks[0].waits = 300;
     robot.run(30);
     assert!(robot.found().is_empty(), "{:?}", robot.found());
-    // A timer does not travel.
+    // The wait of a timer contains no transport time.
     let mut robot = Robot::with(vec![steady(0x40, timer(100), 1, 10, 1)]);
     robot.callbacks[0].waits = 300;
     robot.run(30);
@@ -220,7 +220,7 @@ fn a_message_that_travels_long_does_not_wait_for_the_executor() {
 }
 
 #[test]
-fn a_queue_that_overwrites_is_found_with_its_topic() {
+fn a_queue_that_overwrites_messages_is_a_finding_with_its_topic() {
     let mut robot = Robot::with(Vec::new());
     for _ in 0..30 {
         robot.buffer.0 += 100;
@@ -252,7 +252,7 @@ fn a_queue_that_overwrites_is_found_with_its_topic() {
 }
 
 #[test]
-fn a_process_beyond_its_budget_is_found() {
+fn a_process_that_exceeds_its_budget_is_a_finding() {
     let mut world = World::new();
     let report = ProcessReport {
         is_suspended: true,

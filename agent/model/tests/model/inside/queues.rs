@@ -1,4 +1,4 @@
-//! Subscriptions that take too slowly: what they lose in their queues, and what they do not.
+//! Subscriptions that take too slowly, and the messages that they lose in their queues.
 
 use std::collections::VecDeque;
 
@@ -79,7 +79,8 @@ impl Robot {
         robot
     }
 
-    /// Lets so many seconds pass, with a message in each `period` milliseconds; none if it is 0.
+    /// Lets `seconds` pass with a message every `period` milliseconds, or without messages if it is
+    /// 0.
     fn run(&mut self, seconds: u64, period: u64) {
         for millisecond in 1..=1000 * seconds {
             self.host.wait(1);
@@ -147,7 +148,7 @@ impl Robot {
         found.iter().find(is_ours).cloned()
     }
 
-    /// Counts calls from now on only, as an agent does that starts later.
+    /// Restarts the counts, as for an agent that starts later.
     fn attach(&mut self) {
         (self.taken, self.dropped) = (0, 0);
         self.latency = Durations::default();
@@ -156,7 +157,7 @@ impl Robot {
 }
 
 #[test]
-fn messages_that_a_slow_subscriber_never_takes_are_not_all_delivered() {
+fn messages_that_a_slow_subscriber_never_takes_are_lost_in_its_queue() {
     for prefix in [BOB, FAST] {
         // Cyclone DDS announces the depth if it is not 1; Fast DDS 2 never does.
         let depth = if prefix == BOB { 1 } else { 10 };
@@ -167,7 +168,7 @@ fn messages_that_a_slow_subscriber_never_takes_are_not_all_delivered() {
             panic!("no finding: {queue:?}");
         };
         assert!((700..=860).contains(&lost_permille), "{lost_permille}");
-        // Once the queue has been emptied, all losses are known, and the finding goes.
+        // Once the queue has been emptied, all losses are known, and the finding is resolved.
         robot.run(30, 0);
         let queue = robot.queue().unwrap();
         assert_eq!((queue.arrived, queue.taken), (1500, robot.taken));
@@ -189,7 +190,7 @@ fn messages_that_a_slow_subscriber_never_takes_are_not_all_delivered() {
 }
 
 #[test]
-fn a_subscriber_that_keeps_up_loses_nothing_whatever_its_rhythm() {
+fn a_subscriber_that_keeps_up_has_no_losses_at_any_rate() {
     // A message every 40 s, 1 kHz, and callbacks that take almost the whole period.
     for (period, callback, seconds) in [(40_000, 30, 200), (1, 0, 20), (20, 18, 60), (500, 1, 60)] {
         for prefix in [BOB, FAST] {
@@ -215,7 +216,7 @@ fn messages_that_wait_in_a_deep_queue_are_not_lost() {
     let queue = robot.queue().unwrap();
     assert_eq!((queue.arrived, queue.taken, queue.lost), (7000, 7000, 0));
     assert!(!robot.has_findings);
-    // Whether a message waits or is lost is open until the next take.
+    // Whether a message waits or is lost is unknown until the next take.
     let mut stuck = Robot::new(FAST, 5_000, 5);
     stuck.run(10, 10);
     stuck.busy_until = u64::MAX;
@@ -224,7 +225,7 @@ fn messages_that_wait_in_a_deep_queue_are_not_lost() {
 }
 
 #[test]
-fn a_late_agent_counts_no_loss_that_it_did_not_see() {
+fn a_late_agent_counts_no_losses_from_before_its_start() {
     for prefix in [BOB, FAST] {
         let mut robot = Robot::new(prefix, 1, 110);
         robot.is_attached = false;
@@ -233,7 +234,7 @@ fn a_late_agent_counts_no_loss_that_it_did_not_see() {
         robot.attach();
         robot.run(60, 20);
         robot.run(30, 0);
-        // The first two seconds only show where to begin.
+        // The first two seconds only determine the start of the comparison.
         let lost = robot.queue().unwrap().lost;
         let least = robot.dropped - 150;
         assert!(
@@ -253,8 +254,8 @@ fn a_late_agent_counts_no_loss_that_it_did_not_see() {
 }
 
 #[test]
-fn takes_that_cannot_be_compared_are_not_judged() {
-    // No call is observed: the process takes in another way.
+fn takes_that_cannot_be_compared_with_arrivals_yield_no_queue() {
+    // No call is observed, because the process takes messages by other calls.
     let mut robot = Robot::new(BOB, 1, 110);
     robot.is_observed = false;
     robot.run(20, 20);

@@ -27,7 +27,7 @@ fn check(quantiles: Quantiles, count: u64, expected: Duration) {
 }
 
 #[test]
-fn a_topic_of_one_message_in_40_s_does_not_stop_the_agent() {
+fn a_topic_with_one_message_per_40_s_has_exact_intervals() {
     let mut world = World::new();
     let mut intervals = Durations::default();
     for second in 0..200 {
@@ -60,7 +60,7 @@ fn a_topic_of_one_message_in_40_s_does_not_stop_the_agent() {
 }
 
 #[test]
-fn a_callback_longer_than_17_s_does_not_stop_the_agent() {
+fn a_callback_of_one_hour_has_its_exact_duration() {
     let mut world = World::new();
     let mut report = callback(0x40, timer(50), 71, 0, world.now);
     let mut calls = Durations::default();
@@ -74,7 +74,7 @@ fn a_callback_longer_than_17_s_does_not_stop_the_agent() {
     }
     let is_short = |it: Quantiles| it.maximum <= Duration::from_millis(2);
     assert!(is_short(only_callback(&world).duration));
-    // It runs for an hour: nothing is reported until it ends.
+    // The callback runs for an hour, and nothing is reported until it ends.
     for _ in 0..HOUR.as_secs() {
         world.second(Vec::new());
     }
@@ -91,7 +91,7 @@ fn a_callback_longer_than_17_s_does_not_stop_the_agent() {
     let ended = ends(&mut world, HOUR);
     check(ended.duration, 1, HOUR);
     assert_eq!(ended.busy, Some(1.0), "it took the whole window");
-    // A later call of 30 s is shown as what it is, not as the longest so far.
+    // A later call of 30 s has its own duration, not the longest so far.
     for _ in 0..30 {
         world.second(Vec::new());
     }
@@ -108,7 +108,7 @@ fn a_callback_longer_than_17_s_does_not_stop_the_agent() {
 }
 
 #[test]
-fn a_latched_message_of_yesterday_does_not_stop_the_agent() {
+fn a_latched_message_from_yesterday_yields_ordered_quantiles() {
     let mut world = World::new();
     let mut latency = Durations::default();
     for (taken, age) in [DAY, Duration::from_millis(3), DAY + HOUR]
@@ -140,7 +140,7 @@ fn a_latched_message_of_yesterday_does_not_stop_the_agent() {
 /// The kernel's figures are read while other threads change them: extremes and counts may belong to
 /// different moments.
 #[test]
-fn figures_that_contradict_each_other_do_not_stop_the_agent() {
+fn contradictory_figures_of_the_kernel_yield_ordered_quantiles() {
     use ros2probe_wire::inside::{BUCKETS, bucket};
     let mut world = World::new();
     let mut counts = [0; BUCKETS];

@@ -1,4 +1,4 @@
-//! One truth per topic: the network's counts, or those from inside.
+//! The source of a topic's counts: either the network or the observed processes.
 
 use super::*;
 use ros2probe_model::report::snapshot::{Source, Transport, WatchState};
@@ -31,7 +31,7 @@ fn report(world: &World, published: u64) -> Vec<ProcessReport> {
 }
 
 #[test]
-fn the_network_counts_what_it_sees_and_nothing_is_added() {
+fn counts_of_the_network_are_not_added_to_those_from_inside() {
     let (mut world, writer) = pair(70, 71);
     for second in 1..=10 {
         samples(&mut world, writer, 10 * second - 9..=10 * second);
@@ -59,7 +59,7 @@ fn without_a_datagram_the_counts_come_from_inside() {
 }
 
 #[test]
-fn both_ends_of_one_participant_are_observed() {
+fn a_pair_in_one_observed_process_counts_as_observed() {
     let mut world = World::new();
     let prefix = world.participant(1, 70);
     world.announce(Guid::new(prefix, EntityId([0, 1, 1, 3])), "rt/scan", STRING);
@@ -95,12 +95,12 @@ fn a_total_continues_when_the_last_remote_subscriber_leaves() {
         }
     }
     assert_eq!(world.topic("/scan").source, Source::Wire);
-    // The seconds of doubt are not counted twice.
+    // The seconds before the source changes are not counted twice.
     assert!((165..=200).contains(&last), "{last}");
 }
 
 #[test]
-fn expectations_hold_on_a_topic_that_only_processes_show() {
+fn expectations_are_evaluated_on_a_topic_that_only_processes_show() {
     let mut world = World::new();
     let watch = |expectations: &str| {
         let mut watch = Watch::named("/scan").unwrap();
@@ -144,7 +144,7 @@ fn a_topic_without_a_watch_is_listed_without_a_measurement() {
 }
 
 #[test]
-fn times_follow_a_clock_that_is_set() {
+fn times_follow_the_wall_clock_when_it_is_set() {
     let mut world = World::new();
     let reports = report(&world, 5);
     world.second(reports);

@@ -5,7 +5,7 @@ use ros2probe_model::facts::event::EventKind;
 use super::*;
 
 #[test]
-fn a_topic_that_no_datagram_shows_appears_with_its_rate_and_vanishes_with_its_process() {
+fn a_topic_without_datagrams_appears_with_its_rate_and_ends_with_its_process() {
     let mut world = World::new();
     for second in 1..=12 {
         let mut report = process(70);
@@ -42,7 +42,7 @@ fn a_topic_that_no_datagram_shows_appears_with_its_rate_and_vanishes_with_its_pr
 }
 
 #[test]
-fn a_total_never_decreases_when_processes_end_or_begin_anew() {
+fn a_total_never_decreases_when_processes_end_or_restart() {
     let mut world = World::new();
     let mut totals = Vec::new();
     let counts = [10, 30, 5, 25, 0, 40];
@@ -60,7 +60,7 @@ fn a_total_never_decreases_when_processes_end_or_begin_anew() {
 }
 
 #[test]
-fn handles_that_a_report_leaves_out_have_not_changed() {
+fn handles_omitted_from_a_report_keep_their_counts() {
     let mut world = World::new();
     for second in 1..=8 {
         let report = ProcessReport {
@@ -78,7 +78,7 @@ fn handles_that_a_report_leaves_out_have_not_changed() {
 }
 
 #[test]
-fn humble_shows_messages_within_a_process_by_the_callback_that_received_most() {
+fn on_humble_the_busiest_callback_counts_messages_within_a_process() {
     let mut world = World::new();
     for second in 1..=4 {
         let own = || Trigger::IntraProcess(Some("/image".into()));
@@ -103,7 +103,7 @@ fn humble_shows_messages_within_a_process_by_the_callback_that_received_most() {
 }
 
 #[test]
-fn a_subscription_shows_the_messages_of_a_publisher_elsewhere() {
+fn the_busiest_subscription_counts_messages_of_unobserved_publishers() {
     let mut world = World::new();
     for second in 1..=4 {
         let more = SubscriptionReport {
@@ -126,7 +126,7 @@ fn a_subscription_shows_the_messages_of_a_publisher_elsewhere() {
 }
 
 #[test]
-fn windowed_quantiles_forget_what_was_slow_before() {
+fn quantiles_of_the_window_exclude_earlier_slow_calls() {
     let mut world = World::new();
     let mut all = durations(100, 80);
     for second in 1..=20 {
@@ -154,7 +154,7 @@ fn windowed_quantiles_forget_what_was_slow_before() {
 }
 
 #[test]
-fn a_node_follows_from_the_graph_only_if_it_is_the_only_one() {
+fn the_graph_determines_the_node_of_a_handle_only_if_it_is_unambiguous() {
     let mut world = World::new();
     let prefix = world.participant(1, 70);
     let writer = Guid::new(prefix, EntityId([0, 1, 1, 3]));
@@ -179,7 +179,7 @@ fn a_node_follows_from_the_graph_only_if_it_is_the_only_one() {
     let owners: Vec<_> = publishers.iter().map(|each| &each.owner).collect();
     assert_eq!(owners[0].node, node("/lidar"));
     assert_eq!(owners[1].node, None, "two nodes may have published it");
-    // The participant decides about the domain, not the environment.
+    // The domain comes from the participant, not from the environment.
     assert!(owners.iter().all(|owner| owner.domain_id == DomainId(0)));
     let topics = world.snapshot().topics;
     assert_eq!(
@@ -189,7 +189,7 @@ fn a_node_follows_from_the_graph_only_if_it_is_the_only_one() {
 }
 
 #[test]
-fn a_process_with_one_node_needs_no_endpoint() {
+fn callbacks_and_transitions_belong_to_the_only_node_of_a_process() {
     let mut world = World::new();
     let report = ProcessReport {
         nodes: vec!["/lidar".into()],
@@ -211,7 +211,7 @@ fn a_process_with_one_node_needs_no_endpoint() {
     assert_eq!(facts.callbacks[0].owner.node, node("/lidar"));
     let state = &facts.states[0];
     assert_eq!((&state.node, &*state.state), (&node("/lidar"), "active"));
-    // Each transition is an event, also one back to the state before.
+    // Each transition is an event, even a return to the previous state.
     world.transit(Transition {
         process: 70,
         node: node("/lidar"),

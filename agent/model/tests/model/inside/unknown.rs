@@ -1,11 +1,11 @@
-//! Rates and sizes that are not visible are unknown, and events are no silence.
+//! Rates and sizes that cannot be observed are unknown, and topics with rare events are not silent.
 
 use ros2probe_testing::model::host::{BOB, Host};
 
 use super::*;
 
 #[test]
-fn a_topic_within_one_process_is_not_0_hz_and_silent_while_it_runs() {
+fn a_topic_within_one_process_has_an_unknown_rate_and_is_not_silent() {
     let mut world = World::new();
     let prefix = world.participant(1, 70);
     let writer = Guid::new(prefix, EntityId([0, 0, 0x11, 0x03]));
@@ -32,7 +32,7 @@ fn a_topic_within_one_process_is_not_0_hz_and_silent_while_it_runs() {
 }
 
 #[test]
-fn an_event_without_an_expectation_is_not_silent_and_a_stream_that_stops_is() {
+fn a_stopped_stream_is_silent_but_a_topic_with_rare_events_is_not() {
     let run = |messages: u64, every: u64, then: u64| {
         let mut host = Host::new();
         let bob = host.reader(BOB, 7411);

@@ -28,7 +28,7 @@ fn publication(
     }
 }
 
-/// A robot whose sensor's messages cause two messages of a filter, and one of them a command.
+/// A robot whose sensor's messages cause two messages of a filter, one of which causes a command.
 fn play(robot: &mut Robot) {
     robot.node("/sensor", &[], &["/points"]);
     robot.start();
@@ -52,7 +52,7 @@ fn play(robot: &mut Robot) {
 }
 
 #[test]
-fn callbacks_are_spans_between_publications() {
+fn callbacks_become_spans_between_publications() {
     let mut robot = Robot::tracing(&[("/points", 1.0)]);
     play(&mut robot);
     let spans = taken(&mut robot);
@@ -83,7 +83,7 @@ fn callbacks_are_spans_between_publications() {
 }
 
 #[test]
-fn the_share_of_the_first_input_decides() {
+fn the_share_of_the_first_input_selects_the_traces() {
     let mut robot = Robot::tracing(&[("/filtered", 1.0), ("/points", 0.5)]);
     play(&mut robot);
     let spans = taken(&mut robot);

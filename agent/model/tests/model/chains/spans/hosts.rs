@@ -1,4 +1,4 @@
-//! The spans of two agents on two hosts, of which neither sees the whole chain inside.
+//! The spans of two agents on two hosts, neither of which sees the whole chain.
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
@@ -113,8 +113,8 @@ impl Agent {
         self.observer.input(Input::Time(Timestamp(self.at)));
     }
 
-    /// Shows this agent what it sees of a message from one node to the next one. It is on the wire
-    /// after 100 µs, and at the other host 300 µs later.
+    /// Passes the records of a message between two nodes that this agent sees. The message leaves
+    /// after 100 µs and arrives 300 µs later.
     fn message(&mut self, node: usize, number: u64, at: u64, stamp: u64) {
         let is_read = node + 1 < NODES.len();
         let destination = address(if is_read { node + 1 } else { node }, self.hosts);
@@ -180,7 +180,7 @@ fn play(granularity: u64, hosts: Hosts) -> [Vec<ChainSpan>; 2] {
     agents.map(|mut agent| agent.observer.drain().chain_spans.spans.to_vec())
 }
 
-/// Asserts that each span comes from one agent, and that one of them exports its parent.
+/// Asserts that each span comes from one agent, and that one of the agents exports its parent.
 fn is_whole([one, two]: [&[ChainSpan]; 2]) {
     let ids = |spans: &[ChainSpan]| spans.iter().map(|span| span.id).collect::<BTreeSet<_>>();
     let (first, second) = (ids(one), ids(two));
@@ -193,9 +193,10 @@ fn is_whole([one, two]: [&[ChainSpan]; 2]) {
     }
 }
 
-/// Each agent had a span of its own for a node of the other host, so backends showed it twice.
+/// Before the fix, each agent had its own span for a node of the other host, and backends showed
+/// both.
 #[test]
-fn two_agents_report_one_trace_in_which_each_hop_is_once() {
+fn two_agents_report_one_trace_in_which_each_hop_occurs_once() {
     let [one, two] = play(1, BETWEEN);
     is_whole([&one, &two]);
     let (first, second) = (by_trace(&one), by_trace(&two));
@@ -230,7 +231,7 @@ fn two_agents_report_one_trace_in_which_each_hop_is_once() {
 }
 
 #[test]
-fn agents_that_see_the_first_message_agree_about_rounded_stamps_too() {
+fn agents_that_see_the_first_message_share_traces_with_rounded_stamps() {
     let [one, two] = play(50_000, BETWEEN);
     is_whole([&one, &two]);
     let (first, second) = (by_trace(&one), by_trace(&two));
@@ -238,9 +239,10 @@ fn agents_that_see_the_first_message_agree_about_rounded_stamps_too() {
     assert!(common.count() > 20, "{} {}", first.len(), second.len());
 }
 
-/// The agent of the sensor's host sees no message that continues the sensor's, and exported nothing.
+/// Before the fix, the sensor's host exported nothing, because its agent sees no continuation
+/// there.
 #[test]
-fn the_first_publication_is_exported_where_the_chain_goes_on_only_on_another_host() {
+fn the_first_publication_is_exported_if_the_chain_continues_on_another_host() {
     let [one, two] = play(1, BEYOND);
     is_whole([&one, &two]);
     let (first, second) = (by_trace(&one), by_trace(&two));
