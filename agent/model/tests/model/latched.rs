@@ -1,5 +1,5 @@
-//! Last messages of transient-local writers, in virtual time: which are kept, for how long, and what
-//! they may cost.
+//! Last messages of transient-local writers, in virtual time: which are kept, for how long, and
+//! what they may cost.
 
 use std::sync::Arc;
 
@@ -72,7 +72,7 @@ impl Robot {
         self.domain.put(message);
     }
 
-    /// A publisher of `/map`, as `map_server` has it.
+    /// A robot with a publisher of `/map` like that of `map_server`.
     fn map_server(participant: u8) -> (Self, Guid) {
         let mut robot = Self::new();
         let guid = writer(participant, 1);
@@ -100,7 +100,7 @@ impl Robot {
         }
     }
 
-    /// Lets the model read one record of a metered message, as of a writer that the kernel meters.
+    /// Passes one record of a metered message to the model.
     fn meter(&mut self, guid: Guid, number: u64) {
         let payload = payload(number, 100);
         let message = Message::from(guid.prefix).data(guid.entity, number, &payload);
@@ -126,7 +126,7 @@ impl Robot {
         own.next_back().and_then(|(_, verdict)| *verdict)
     }
 
-    /// Opens a subscription of everything. Returns what it receives first.
+    /// Opens a subscription to all topics. Returns the messages that it receives first.
     fn subscribe(&mut self, id: u64) -> Vec<(u64, usize)> {
         subscribe(&mut self.domain.observer, id)
     }
@@ -148,7 +148,7 @@ fn payload(number: u64, bytes: usize) -> Vec<u8> {
     payload
 }
 
-/// Returns a request for everything.
+/// Returns a request for the payloads of all topics.
 fn request(id: u64) -> SampleRequest {
     SampleRequest {
         id,
@@ -160,7 +160,7 @@ fn request(id: u64) -> SampleRequest {
 
 fn subscribe(observer: &mut Observer, id: u64) -> Vec<(u64, usize)> {
     let request = request(id);
-    // As the agent does before each change.
+    // The agent drains the output before each change, too.
     observer.drain();
     observer.input(Input::SampleRequests(Arc::new(vec![request.clone()])));
     let samples = observer.latched(&request);
@@ -174,7 +174,7 @@ fn subscribe(observer: &mut Observer, id: u64) -> Vec<(u64, usize)> {
 }
 
 #[test]
-fn the_last_message_of_an_unwatched_topic_reaches_a_subscription_that_begins_later() {
+fn a_later_subscription_receives_the_last_message_of_an_unwatched_topic() {
     let (mut robot, guid) = Robot::map_server(1);
     assert_eq!(robot.verdict(guid), Some(Verdict::Capture));
     assert_eq!(robot.facts(guid), Some(LatchedFacts::Unseen));
@@ -183,8 +183,8 @@ fn the_last_message_of_an_unwatched_topic_reaches_a_subscription_that_begins_lat
     assert_eq!(robot.facts(guid), Some(LatchedFacts::Kept(200_000)));
     robot.domain.wait(60_000);
     assert_eq!(robot.subscribe(7), [(2, 200_000)]);
-    // A later one comes as any other. The repetition of the last one for a late joiner is no other
-    // message.
+    // Later messages arrive as usual. The repetition of the last message for a late joiner is not
+    // another message.
     robot.domain.wait(1_000);
     robot.send(guid, 2, 200_000);
     robot.send(guid, 3, 300);
@@ -194,7 +194,7 @@ fn the_last_message_of_an_unwatched_topic_reaches_a_subscription_that_begins_lat
 }
 
 #[test]
-fn a_kept_message_follows_a_clock_that_is_set_and_a_received_one_has_its_time() {
+fn kept_and_received_messages_have_the_wall_time_after_a_clock_step() {
     for step in [3_600 * SECOND.cast_signed(), -3_600 * SECOND.cast_signed()] {
         let (mut robot, guid) = Robot::map_server(1);
         robot.send(guid, 1, 500);
@@ -214,7 +214,7 @@ fn a_kept_message_follows_a_clock_that_is_set_and_a_received_one_has_its_time() 
             panic!("{samples:?}")
         };
         assert_eq!(sample.time, Timestamp(robot.domain.now));
-        // A message that a client received is kept as well.
+        // A message that a client received is kept, too.
         let (later, observer) = (request(8), &mut robot.domain.observer);
         observer.input(Input::SampleRequests(Arc::new(vec![first, later.clone()])));
         let kept = observer.latched(&later);
@@ -223,7 +223,7 @@ fn a_kept_message_follows_a_clock_that_is_set_and_a_received_one_has_its_time() 
 }
 
 #[test]
-fn no_figure_changes() {
+fn keeping_the_last_messages_changes_no_figure() {
     let figures = |keeps_latched| {
         let mut robot = Robot::with(Settings {
             keeps_latched,
@@ -267,11 +267,11 @@ fn messages_from_before_the_agent_are_kept_once_they_are_repeated() {
 }
 
 #[test]
-fn a_writer_that_begins_anew_replaces_its_message_and_one_that_goes_takes_it_along() {
+fn a_restarted_writer_replaces_its_message_and_a_removed_writer_loses_it() {
     let (mut robot, guid) = Robot::map_server(1);
     robot.send(guid, 7, 700);
     robot.domain.wait(1_000);
-    // The same GUID, as of a vendor that derives it from the process.
+    // The GUID is the same, as from a vendor that derives it from the process.
     robot.send(guid, 1, 100);
     assert_eq!(robot.subscribe(7), [(1, 100)]);
     let gone = Message::from(guid.prefix).dispose_by_hash(SEDP_WRITERS, 90, guid);
@@ -290,7 +290,7 @@ fn a_writer_that_begins_anew_replaces_its_message_and_one_that_goes_takes_it_alo
 }
 
 #[test]
-fn volatile_writers_and_messages_that_expire_are_not_kept_and_nothing_is_when_it_is_off() {
+fn no_message_is_kept_if_it_is_volatile_or_expires_or_keeping_is_disabled() {
     let mut robot = Robot::new();
     let mut off = Robot::with(Settings {
         keeps_latched: false,
@@ -315,7 +315,7 @@ fn volatile_writers_and_messages_that_expire_are_not_kept_and_nothing_is_when_it
 }
 
 #[test]
-fn a_message_above_the_cap_is_named_and_kept_only_for_a_watch_that_asks() {
+fn a_message_above_the_cap_is_kept_only_for_a_watch_that_requests_it() {
     let (mut robot, guid) = Robot::map_server(1);
     let large = 3 * MESSAGE_BYTES + 1;
     robot.send(guid, 1, 100);
@@ -323,7 +323,7 @@ fn a_message_above_the_cap_is_named_and_kept_only_for_a_watch_that_asks() {
     robot.send(guid, 2, large);
     let size = u32::try_from(large).unwrap();
     assert_eq!(robot.facts(guid), Some(LatchedFacts::TooLarge(size)));
-    // No more of them is captured.
+    // Further messages are not captured.
     assert_eq!(robot.verdict(guid), Some(Verdict::Meter));
     assert!(robot.subscribe(7).is_empty());
 
@@ -355,7 +355,7 @@ fn a_message_above_the_cap_is_named_and_kept_only_for_a_watch_that_asks() {
 }
 
 #[test]
-fn a_writer_that_sends_much_is_only_metered_until_it_pauses() {
+fn a_writer_above_its_budget_is_only_metered_until_it_pauses() {
     let (mut robot, guid) = Robot::map_server(1);
     let mut number = 0;
     let mut captured = 0;
@@ -372,7 +372,7 @@ fn a_writer_that_sends_much_is_only_metered_until_it_pauses() {
         .domain
         .observer
         .input(Input::SampleRequests(Arc::default()));
-    // In a minute a whole message is allowed again.
+    // After a minute, a whole message is allowed again.
     robot.domain.wait(90_000);
     assert_eq!(robot.verdict(guid), Some(Verdict::Capture));
     robot.send(guid, number + 1, 500_000);
@@ -380,9 +380,9 @@ fn a_writer_that_sends_much_is_only_metered_until_it_pauses() {
 }
 
 #[test]
-fn a_message_that_is_repeated_often_stays_until_another_follows() {
+fn a_message_that_is_repeated_often_is_kept_until_another_one_follows() {
     let (mut robot, guid) = Robot::map_server(1);
-    // Forty subscribers start at once.
+    // Forty subscribers start at the same time.
     (0..40).for_each(|_| robot.send_written(guid, 1, 900_000, START));
     assert_eq!(robot.verdict(guid), Some(Verdict::Meter));
     assert_eq!(robot.facts(guid), Some(LatchedFacts::Kept(900_000)));
@@ -397,7 +397,7 @@ fn a_message_that_is_repeated_often_stays_until_another_follows() {
 }
 
 #[test]
-fn of_a_message_in_pieces_the_whole_is_kept_and_the_one_before_is_no_longer_the_last() {
+fn a_fragmented_message_displaces_the_previous_one_and_is_kept_when_complete() {
     let (mut robot, guid) = Robot::map_server(1);
     robot.send(guid, 1, 100);
     let payload = payload(2, 150_000);
@@ -416,7 +416,7 @@ fn of_a_message_in_pieces_the_whole_is_kept_and_the_one_before_is_no_longer_the_
 }
 
 #[test]
-fn when_the_bytes_are_full_the_participant_with_most_loses_its_oldest() {
+fn at_the_cap_in_bytes_the_largest_participant_loses_its_oldest_message() {
     let mut robot = Robot::new();
     let own = writer(1, 1);
     robot.announce(own, "rt/tf_static", TRANSIENT_LOCAL, 0);
@@ -452,7 +452,7 @@ fn writers_beyond_the_cap_are_not_followed() {
 }
 
 #[test]
-fn a_publisher_of_zenoh_is_kept_as_one_of_dds() {
+fn the_last_message_of_a_zenoh_publisher_is_kept() {
     const TALKER: [u8; 16] = [0x11; 16];
     const KEY: &str = "0/map/std_msgs::msg::dds_::String_/TypeHashNotSupported";
     let now = 1_800_000_000 * SECOND;
@@ -473,7 +473,7 @@ fn a_publisher_of_zenoh_is_kept_as_one_of_dds() {
     );
     send(&mut observer, &there, now, &open(60));
     send(&mut observer, &back, now, &open(60));
-    // Reliable is left out as the default; 1 is transient local.
+    // The token omits the default, reliable; 1 is transient local.
     let token = publisher(TALKER, 10, "/map").replace("/::,7:", "/:1:,7:");
     let declared = [declare_key(3, KEY), declare_token(1, &token)];
     send(&mut observer, &there, now, &frame(7, &declared));

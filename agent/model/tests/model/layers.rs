@@ -1,5 +1,5 @@
-//! The folders of the model are layers: a module imports its own layer and those below it, and no
-//! modules import each other in a cycle. The kernel's record ends in one module.
+//! The folders of the model are layers: a module imports its own layer and those below it. No
+//! modules import each other in a cycle. Only one module reads the kernel's record.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -31,7 +31,7 @@ fn names_record(source: &str) -> bool {
     })
 }
 
-/// Returns the modules that a source names by `crate::layer::module`, outside of comments and tests.
+/// Returns the modules that a source names by `crate::layer::module`, without comments and tests.
 fn imports(source: &str) -> BTreeSet<Module> {
     let mut found = BTreeSet::new();
     for part in code(source).flat_map(|line| line.split("crate::").skip(1)) {
@@ -48,7 +48,7 @@ fn imports(source: &str) -> BTreeSet<Module> {
     found
 }
 
-/// Returns what is wrong with the imports of some modules.
+/// Returns the forbidden imports and the cycles among these modules.
 fn mistakes(modules: &BTreeMap<Module, BTreeSet<Module>>) -> Vec<String> {
     let height = |layer: &str| LAYERS.iter().position(|each| *each == layer).unwrap();
     let mut found = Vec::new();
@@ -61,8 +61,7 @@ fn mistakes(modules: &BTreeMap<Module, BTreeSet<Module>>) -> Vec<String> {
             }
         }
     }
-    // Modules that import no other one, or that no other one imports, are removed until only those
-    // in cycles are left.
+    // Modules without imports or importers are removed until only modules in cycles are left.
     let mut left = modules.clone();
     loop {
         let names: BTreeSet<_> = left.keys().cloned().collect();
@@ -108,7 +107,7 @@ fn add(directory: &Path, module: &Module, into: &mut BTreeMap<Module, BTreeSet<M
 }
 
 #[test]
-fn each_layer_imports_only_those_below_it() {
+fn each_layer_imports_only_layers_below_it() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
     let mut modules = BTreeMap::new();
     let mut beside = BTreeSet::new();
@@ -138,7 +137,7 @@ fn each_layer_imports_only_those_below_it() {
 }
 
 #[test]
-fn one_module_reads_the_record_of_the_kernel() {
+fn only_one_module_reads_the_record_of_the_kernel() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
     let mut folders = vec![root.clone()];
     let mut found = Vec::new();
@@ -167,7 +166,7 @@ fn one_module_reads_the_record_of_the_kernel() {
 }
 
 #[test]
-fn an_import_upwards_and_a_cycle_are_mistakes() {
+fn an_import_upwards_and_a_cycle_are_reported() {
     let module = |path: &str| {
         let (layer, name) = path.split_once("::").unwrap();
         (layer.to_owned(), name.to_owned())

@@ -1,4 +1,5 @@
-//! The loss of a topic, as its worst subscriber means it: expectation, event, history, counters.
+//! The loss of a topic, which is that of its worst subscriber: expectation, event, history,
+//! counters.
 
 use std::sync::Arc;
 
@@ -23,7 +24,7 @@ fn host(max_loss_ratio: f64) -> Host {
     host
 }
 
-/// Sends 100 samples in ten seconds; each of the receivers loses every tenth but one.
+/// Sends 100 samples in ten seconds. Each receiver loses the multiples of its number.
 fn send(host: &mut Host, from: u64, receivers: &[(CapturePoint, u64)]) {
     for number in from..from + 100 {
         for (receiver, every) in receivers {
@@ -53,7 +54,7 @@ fn lost(host: &mut Host) -> Vec<u64> {
 }
 
 #[test]
-fn losses_at_one_of_two_subscribers_violate_the_expectation_and_are_an_event() {
+fn losses_at_one_of_two_subscribers_violate_the_expectation_and_raise_an_event() {
     let mut host = host(0.05);
     let (bob, carol) = (host.reader(BOB, 7411), host.reader(CAROL, 7413));
     send(&mut host, 1, &[(bob, 1000), (carol, 5)]);
@@ -72,7 +73,7 @@ fn losses_at_one_of_two_subscribers_violate_the_expectation_and_are_an_event() {
 }
 
 #[test]
-fn a_subscriber_within_the_limit_violates_nothing() {
+fn losses_of_each_subscriber_within_the_limit_violate_no_expectation() {
     let mut host = host(0.15);
     let (bob, carol) = (host.reader(BOB, 7411), host.reader(CAROL, 7413));
     // Together they lose more than either.
@@ -125,7 +126,7 @@ fn without_an_observed_delivery_samples_that_did_not_reach_this_host_are_lost() 
 }
 
 #[test]
-fn a_repaired_sample_is_no_loss_of_the_worst_subscriber() {
+fn a_retransmitted_sample_is_not_a_loss_of_the_worst_subscriber() {
     let mut host = host(0.0);
     let bob = host.reader(BOB, 7411);
     for number in 1..=200 {

@@ -1,6 +1,6 @@
 //! Compares the memory of deliveries, all other entries and recordings with the table of limits.
-//! The tests measure the resident memory of an otherwise idle process; nextest runs each test in
-//! one. `cargo test` requires the filter `memory::`.
+//! The tests measure the resident memory of an otherwise idle process. nextest runs each test in
+//! its own process; `cargo test` requires the filter `memory::`.
 
 mod inside;
 
@@ -34,7 +34,7 @@ fn resident() -> usize {
 }
 
 #[test]
-fn an_idle_delivery_takes_less_than_a_kibibyte_and_a_half() {
+fn an_idle_delivery_takes_less_than_1536_bytes() {
     const DELIVERIES: u64 = 500;
     const ROUNDS: u64 = 6;
     let mut worlds: Vec<_> = (0..ROUNDS).map(|_| Host::new()).collect();
@@ -106,7 +106,7 @@ fn announce_all(observer: &mut Observer, limits: &Limits, now: u64) -> Vec<Guid>
 }
 
 /// Sends 100 samples from each writer, ten per second, to separate sockets. Returns the time after
-/// them.
+/// the last sample.
 fn send_from_all(observer: &mut Observer, writers: &[Guid], mut now: u64) -> u64 {
     for number in 1..=100 {
         for (place, writer) in writers.iter().enumerate() {
@@ -266,7 +266,7 @@ fn a_recording_takes_at_most_the_documented_memory() {
 }
 
 #[test]
-fn all_limits_reached_together_fit_into_the_unit_s_memory() {
+fn all_limits_together_fit_into_the_memory_limit_of_the_unit() {
     let unit = include_str!("../../../../systemd/ros2probe.service");
     let megabytes = unit
         .lines()

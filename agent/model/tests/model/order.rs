@@ -1,5 +1,5 @@
 //! Samples in the order of a reliable subscriber: which ones wait for a retransmission, and for how
-//! long. Uses virtual time and forged records.
+//! long. The tests use virtual time and forged records.
 
 use std::sync::Arc;
 
@@ -31,7 +31,7 @@ fn sample_requests(host: &mut Host, ids: &[u64], depth: Depth) {
         .input(Input::SampleRequests(Arc::new(sample_requests.collect())));
 }
 
-/// Returns a host with a reader of Bob's that acknowledges.
+/// Returns a host on which Bob has a reader that acknowledges.
 fn listening() -> (Host, CapturePoint) {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
@@ -70,7 +70,7 @@ fn missed(host: &mut Host) -> Vec<(MissedReason, u64, u64)> {
 }
 
 #[test]
-fn a_stream_without_holes_never_waits() {
+fn a_stream_without_gaps_is_dispatched_without_delay() {
     let (mut host, bob) = listening();
     for number in 1..=100 {
         host.wait(10);
@@ -80,7 +80,7 @@ fn a_stream_without_holes_never_waits() {
 }
 
 #[test]
-fn samples_after_a_gap_are_dispatched_after_its_repair_and_at_the_time_of_the_repair() {
+fn samples_after_a_gap_are_dispatched_at_the_time_of_its_repair() {
     let (mut host, bob) = listening();
     for number in [1, 2, 4, 5] {
         host.wait(10);
@@ -96,7 +96,7 @@ fn samples_after_a_gap_are_dispatched_after_its_repair_and_at_the_time_of_the_re
 }
 
 #[test]
-fn a_hole_ends_when_its_writer_leaves_it_out_or_withdraws_it_and_when_readers_acknowledge_it() {
+fn a_wait_ends_with_a_gap_a_heartbeat_or_an_acknack() {
     let (mut host, bob) = listening();
     host.data(bob, 1);
     host.data(bob, 3);
@@ -118,7 +118,7 @@ fn a_hole_ends_when_its_writer_leaves_it_out_or_withdraws_it_and_when_readers_ac
 }
 
 #[test]
-fn an_unexplained_gap_delays_dispatch_for_a_while_and_its_late_repair_is_dispatched_late() {
+fn an_unexplained_gap_delays_dispatch_for_a_limited_time() {
     let (mut host, bob) = listening();
     for number in [1, 3, 4] {
         host.data(bob, number);
@@ -138,7 +138,7 @@ fn an_unexplained_gap_delays_dispatch_for_a_while_and_its_late_repair_is_dispatc
 }
 
 #[test]
-fn nothing_waits_of_a_best_effort_writer_or_for_best_effort_readers() {
+fn best_effort_writers_and_readers_cause_no_wait() {
     for reliable in [false, true] {
         let mut host = Host::new();
         host.writer(reliable);
@@ -168,7 +168,7 @@ fn a_reliable_reader_is_awaited_before_its_first_acknack_for_a_limited_time() {
     host.data(bob, 5);
     host.wait(4_100);
     assert_eq!(numbers(&mut host), [5]);
-    // Its ACKNACKs use a path that is not observed.
+    // The reader's ACKNACKs use a path that is not observed.
     host.data(bob, 7);
     assert_eq!(numbers(&mut host), [7]);
     host.acknack(bob, 8);
@@ -179,7 +179,7 @@ fn a_reliable_reader_is_awaited_before_its_first_acknack_for_a_limited_time() {
 }
 
 #[test]
-fn the_end_gives_what_waits() {
+fn the_end_of_the_input_or_of_the_writer_dispatches_waiting_samples() {
     let (mut host, bob) = listening();
     for number in [1, 3, 5] {
         host.data(bob, number);
@@ -216,7 +216,7 @@ fn samples_that_wait_are_dispatched_once_a_new_incarnation_is_confirmed() {
 }
 
 #[test]
-fn waiting_samples_are_bounded_in_number() {
+fn the_number_of_waiting_samples_is_bounded() {
     let (mut host, bob) = listening();
     host.data(bob, 1);
     (3..=10_000).for_each(|number| host.data(bob, number));
@@ -228,7 +228,7 @@ fn waiting_samples_are_bounded_in_number() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
     #[test]
-    fn samples_repaired_within_the_patience_are_dispatched_once_and_in_order(
+    fn samples_retransmitted_in_time_are_dispatched_once_and_in_order(
         fates in prop::collection::vec((0_u8..6, 1_u64..60), 1..200),
     ) {
         let (mut host, bob) = listening();
@@ -342,7 +342,7 @@ impl Unannounced {
 }
 
 #[test]
-fn a_sample_before_the_announcement_is_delivered_once_when_repeated() {
+fn a_sample_before_the_announcement_is_dispatched_once_when_repeated() {
     for depth in [Depth::Arrivals, Depth::Payloads] {
         let mut dora = Unannounced::new(depth);
         (1..=4).for_each(|number| dora.data(number));
@@ -366,7 +366,7 @@ fn a_sample_before_the_announcement_is_delivered_once_when_repeated() {
 }
 
 #[test]
-fn a_subscription_gets_what_preceded_the_announcement_since_it_began() {
+fn a_subscription_reports_unannounced_samples_only_since_its_start() {
     let mut dora = Unannounced::new(Depth::Arrivals);
     (1..=3).for_each(|number| dora.data(number));
     sample_requests(&mut dora.host, &[1, 2], Depth::Arrivals);
@@ -387,7 +387,7 @@ fn a_subscription_gets_what_preceded_the_announcement_since_it_began() {
 }
 
 #[test]
-fn a_sample_before_the_announcement_never_repeated_is_unannounced() {
+fn a_sample_that_precedes_the_announcement_is_unannounced_if_never_repeated() {
     for (reliable, acknowledged) in [(false, false), (true, false), (true, true)] {
         let mut dora = Unannounced::new(Depth::Payloads);
         for number in [1, 2, 4] {
@@ -462,10 +462,10 @@ impl Handover {
 }
 
 #[test]
-fn a_writer_keeps_its_order_and_its_times_while_breakpoints_attach() {
+fn samples_keep_their_order_and_times_while_breakpoints_attach() {
     let mut handover = Handover::new(Depth::Arrivals, 2);
     given(&mut handover.host);
-    // 3 was sent before the breakpoint was there, and is polled behind 4.
+    // Sample 3 was sent before the breakpoint was attached, and is polled after sample 4.
     handover.seen_in_its_process(4);
     handover.host.wait(1);
     handover.seen_in_its_process(5);
@@ -473,7 +473,8 @@ fn a_writer_keeps_its_order_and_its_times_while_breakpoints_attach() {
     handover.host.wait(1);
     handover.polled(3);
     handover.polled(4);
-    // Of the two views of 4, the first one counts. Times neither decrease nor jump to a later one.
+    // Of the two observations of sample 4, the first one counts. Times neither decrease nor jump to
+    // a later one.
     assert_eq!(given(&mut handover.host), [(3, 10), (4, 10), (5, 10)]);
     handover.host.wait(10);
     handover.seen_in_its_process(6);
@@ -482,7 +483,7 @@ fn a_writer_keeps_its_order_and_its_times_while_breakpoints_attach() {
 }
 
 #[test]
-fn samples_unseen_while_breakpoints_attach_are_named_once_and_delay_little() {
+fn samples_missed_while_breakpoints_attach_are_reported_once() {
     let mut handover = Handover::new(Depth::Arrivals, 2);
     given(&mut handover.host);
     for number in [5, 6, 7] {
@@ -503,7 +504,7 @@ fn samples_unseen_while_breakpoints_attach_are_named_once_and_delay_little() {
             }
         }
     }
-    // They waited for nothing that a reader waits for, and have their own times.
+    // No reader waits for the missing samples, so the others keep their own times.
     assert_eq!((numbers, times), (vec![5, 6, 7], vec![8, 12, 16]));
     assert_eq!(reported, [(MissedReason::NotCaptured, 3, 4)]);
     handover.host.wait(10_000);
@@ -512,7 +513,7 @@ fn samples_unseen_while_breakpoints_attach_are_named_once_and_delay_little() {
 }
 
 #[test]
-fn samples_that_polling_noticed_after_the_start_of_a_subscription_are_not_missing_from_it() {
+fn samples_sent_before_a_subscription_are_not_missing_from_it() {
     let mut handover = Handover::new(Depth::Arrivals, 1);
     // 2 to 7 were sent before the subscription, and polling missed them.
     handover.host.wait(600);
@@ -527,7 +528,7 @@ fn samples_that_polling_noticed_after_the_start_of_a_subscription_are_not_missin
         .collect();
     assert_eq!(dispatches.len() - reported.len(), 2, "{dispatches:?}");
     assert!(reported.is_empty(), "{reported:?}");
-    // Later ones are.
+    // Samples after the start of the subscription are missing from it.
     handover.host.wait(20_000);
     handover.polled(12);
     handover.host.wait(1_000);

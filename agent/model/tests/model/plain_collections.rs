@@ -4,9 +4,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
 
-/// Reasons, each behind `#`, and below it the files, or their fields, to which it applies.
+/// Reasons, each after a `#`, followed by the files or fields to which it applies.
 const EXCEPTIONS: &str = include_str!("plain_collections.txt");
-/// Sources that are read. Of the commands, those that read foreign bytes or this host themselves.
+/// Sources to check. Of the command line, only modules that read foreign bytes or this host.
 const PLACES: [&str; 10] = [
     "wire/src",
     "agent/model/src",
@@ -31,7 +31,7 @@ const GROWING: [&str; 9] = [
     "VecDeque<",
 ];
 
-/// Returns whether this type can grow, and no declaration bounds it.
+/// Returns whether this type can grow without the bound of a declaration.
 fn is_plain(of: &str) -> bool {
     let words = of.split(|character: char| !character.is_alphanumeric() && character != '<');
     // `Foo<Vec<u8>>` becomes `Foo<Vec<u8`.

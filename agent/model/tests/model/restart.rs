@@ -138,7 +138,7 @@ fn restarted(memory: &Memory, at: u64) -> Observer {
 }
 
 #[test]
-fn everything_shown_is_restored_and_the_filter_updated() {
+fn a_restart_restores_all_displayed_state_and_the_kernel_filter() {
     let mut before = agent(Settings::default());
     robot(&mut before);
     let text = serde_json::to_string(&before.memory()).unwrap();
@@ -167,7 +167,7 @@ fn everything_shown_is_restored_and_the_filter_updated() {
 }
 
 #[test]
-fn a_restored_participant_heard_within_its_lease_stays_and_another_expires() {
+fn a_restored_participant_stays_only_if_it_sends_within_its_lease() {
     let mut before = agent(Settings::default());
     robot(&mut before);
     let at = START + 60 * SECOND;
@@ -185,7 +185,8 @@ fn a_restored_participant_heard_within_its_lease_stays_and_another_expires() {
     assert!(snapshot.unknown_writers.is_empty());
 }
 
-/// The states of `/points` in the order of the daemon's start: restored state, watches, time.
+/// Returns the states of `/points` after a restart. As in the daemon, watches follow the saved
+/// state.
 fn states_after_restart(expectations: Expectations, messages: impl Fn(u64) -> bool) -> Vec<String> {
     let mut before = agent(Settings::default());
     robot(&mut before);
@@ -236,7 +237,7 @@ fn states_after_restart(expectations: Expectations, messages: impl Fn(u64) -> bo
 }
 
 #[test]
-fn a_restart_on_a_running_robot_reports_no_silence_of_the_time_before() {
+fn a_restart_on_a_running_robot_reports_no_earlier_silence() {
     let silence = Expectations {
         max_silence: Some(Duration::from_millis(6250)),
         ..Expectations::default()
@@ -244,7 +245,7 @@ fn a_restart_on_a_running_robot_reports_no_silence_of_the_time_before() {
     // A message each 4.9 s, the first one 3 s after the restart.
     let slow = states_after_restart(silence, |step| step % 49 == 30);
     assert_eq!(slow, Vec::<String>::new());
-    // A publisher that stopped is silent as soon as the agent can know.
+    // A publisher that stopped is silent as soon as the agent can know it.
     let stopped = states_after_restart(silence, |_| false);
     let silent: Vec<_> = stopped
         .iter()
@@ -258,8 +259,9 @@ fn a_restart_on_a_running_robot_reports_no_silence_of_the_time_before() {
     );
 }
 
-/// Returns after how many seconds a topic of Fast DDS without messages counts as silent. Its reader on
-/// the writer's host receives at locators of these kinds; another reader may be on another host.
+/// Returns the number of seconds after which a topic of Fast DDS without messages counts as silent.
+/// Its reader on the writer's host receives at locators of these kinds. `other_is_remote` adds a
+/// reader on another host.
 fn silent_after(reader_locators: &[u32], other_is_remote: bool) -> Option<u64> {
     let talker = GuidPrefix(*b"\x01\x0fHHpid10000");
     let listener = GuidPrefix(*b"\x01\x0fHHpid20000");
@@ -313,14 +315,14 @@ fn silent_after(reader_locators: &[u32], other_is_remote: bool) -> Option<u64> {
 }
 
 #[test]
-fn a_writer_that_polling_has_not_seen_yet_is_not_silent_at_once() {
+fn a_writer_that_polling_has_not_seen_yet_is_not_immediately_silent() {
     // 131 messages in a row, of which polling is assumed to see every tenth.
     let polled = silent_after(&[16, 1], false);
     assert!(
         polled.is_some_and(|after| (262..266).contains(&after)),
         "{polled:?}"
     );
-    // The agent sees what the network carries at once.
+    // The agent immediately sees messages on the network.
     for (locators, other_is_remote) in [(&[1][..], false), (&[16, 1], true)] {
         let seen = silent_after(locators, other_is_remote);
         assert!(seen.is_some_and(|after| after <= 5), "{seen:?}");
@@ -328,7 +330,7 @@ fn a_writer_that_polling_has_not_seen_yet_is_not_silent_at_once() {
 }
 
 #[test]
-fn a_restart_gives_the_robot_time_to_announce_its_subscribers() {
+fn subscribers_have_time_to_be_announced_after_a_restart() {
     let three = Expectations {
         subscribers: Some(3),
         ..Expectations::default()
@@ -344,7 +346,7 @@ fn a_restart_gives_the_robot_time_to_announce_its_subscribers() {
 }
 
 #[test]
-fn a_robot_whose_clock_begins_in_1970_is_seen_and_forgotten_like_any_other() {
+fn a_robot_whose_clock_begins_in_1970_appears_and_expires_as_usual() {
     // A Raspberry Pi has no battery-backed clock, and the agent starts before NTP.
     for start in [1, SECOND, 30 * SECOND] {
         let mut observer = agent(Settings::default());
@@ -369,7 +371,7 @@ fn a_robot_whose_clock_begins_in_1970_is_seen_and_forgotten_like_any_other() {
 }
 
 #[test]
-fn any_message_confirms_but_not_one_from_before_the_start() {
+fn only_messages_after_the_start_confirm_a_restored_participant() {
     let mut before = agent(Settings::default());
     robot(&mut before);
     let at = START + 60 * SECOND;
@@ -384,7 +386,7 @@ fn any_message_confirms_but_not_one_from_before_the_start() {
 }
 
 #[test]
-fn an_older_list_of_nodes_does_not_replace_the_one_that_was_known() {
+fn an_older_list_of_nodes_does_not_replace_the_restored_one() {
     let mut before = agent(Settings::default());
     robot(&mut before);
     let at = START + 60 * SECOND;
@@ -405,7 +407,7 @@ fn an_older_list_of_nodes_does_not_replace_the_one_that_was_known() {
 }
 
 #[test]
-fn caps_hold_for_what_comes_from_before_too() {
+fn restored_state_is_limited_by_the_caps() {
     let mut before = agent(Settings::default());
     robot(&mut before);
     let mut after = agent(Settings {
@@ -430,7 +432,7 @@ fn caps_hold_for_what_comes_from_before_too() {
 }
 
 #[test]
-fn the_memory_has_a_new_revision_only_after_a_change() {
+fn the_saved_state_has_a_new_revision_only_after_a_change() {
     let mut observer = agent(Settings::default());
     robot(&mut observer);
     let revision = observer.memory_revision();
@@ -448,7 +450,7 @@ fn the_memory_has_a_new_revision_only_after_a_change() {
 proptest! {
     /// Changes one character of the file so that it is still JSON of the right shape.
     #[test]
-    fn a_memory_with_a_wrong_character_is_taken_over_in_part_or_not(
+    fn saved_state_with_a_wrong_character_is_restored_in_part_or_refused(
         place in any::<prop::sample::Index>(),
         character in "[0-9a-z/\"\\\\ \u{202e}-]",
     ) {

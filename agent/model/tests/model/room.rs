@@ -1,5 +1,5 @@
-//! Tables filled by forgeries: a real newcomer of higher priority is admitted, existing entries
-//! stay, and no flood makes a packet expensive.
+//! Tables that forgeries fill: a real participant of higher priority is admitted, existing entries
+//! stay, and no flood makes the processing of packets slow.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::Arc;
@@ -131,7 +131,7 @@ fn entity(number: u32, kind: u8) -> EntityId {
 }
 
 #[test]
-fn a_newcomer_on_a_topic_watched_by_name_is_counted_among_1000_forged_participants() {
+fn a_publisher_of_a_topic_watched_by_name_is_admitted_to_a_full_table() {
     let mut world = World::new(&["/**", "/points"], &Limits::default());
     world.crowd(1000);
     world.spdp(ALICE);
@@ -146,11 +146,11 @@ fn a_newcomer_on_a_topic_watched_by_name_is_counted_among_1000_forged_participan
 }
 
 #[test]
-fn a_newcomer_of_which_a_flood_hid_the_announcement_is_counted_from_its_next_one_on() {
+fn a_participant_dropped_in_a_flood_is_admitted_at_its_next_announcement() {
     let mut world = World::new(&["/points"], &Limits::default());
     world.crowd(1000);
     world.spdp(ALICE);
-    // These are more than the table of refused participants holds.
+    // The forged participants are more than the table of refused participants holds.
     (5000..9000).for_each(|number| world.spdp(forged(number)));
     world.sedp(writer(ALICE), "rt/points");
     assert!(!world.knows(ALICE));
@@ -164,14 +164,14 @@ fn a_newcomer_of_which_a_flood_hid_the_announcement_is_counted_from_its_next_one
 }
 
 #[test]
-fn a_newcomer_with_a_socket_on_this_host_is_seen_among_1000_forged_participants() {
+fn a_participant_with_a_socket_on_this_host_is_admitted_to_a_full_table() {
     let mut world = World::new(&["/**"], &Limits::default());
     world.crowd(1000);
     world.spdp(ALICE);
     assert!(!world.knows(ALICE));
     world.leaves(ALICE, 77);
     assert!(world.knows(ALICE));
-    // Its packet may precede its announcement.
+    // The packet of a participant may precede its announcement.
     world.leaves(BOB, 78);
     world.spdp(BOB);
     assert!(world.knows(BOB));
@@ -181,7 +181,7 @@ fn a_newcomer_with_a_socket_on_this_host_is_seen_among_1000_forged_participants(
 }
 
 #[test]
-fn a_socket_of_this_host_that_sends_for_many_participants_speaks_for_eight_of_them() {
+fn a_socket_of_this_host_is_evidence_for_at_most_eight_participants() {
     let mut world = World::new(&["/points"], &Limits::default());
     world.crowd(1000);
     for number in 0..500 {
@@ -195,14 +195,14 @@ fn a_socket_of_this_host_that_sends_for_many_participants_speaks_for_eight_of_th
             .count()
     };
     assert_eq!(known(&world), 8);
-    // From then on the socket is evidence for no participant, but another socket still is.
+    // After that, the socket is not evidence for any participant, but another socket is.
     world.leaves(ALICE, 78);
     world.spdp(ALICE);
     assert!(world.knows(ALICE));
 }
 
 #[test]
-fn a_newcomer_that_sends_user_data_is_seen_among_1000_forged_participants() {
+fn a_participant_that_sends_user_data_is_admitted_to_a_full_table() {
     let mut world = World::new(&["/**"], &Limits::default());
     world.crowd(1000);
     world.spdp(ALICE);
@@ -211,14 +211,14 @@ fn a_newcomer_that_sends_user_data_is_seen_among_1000_forged_participants() {
     (1..=3).for_each(|number| world.sample(writer(ALICE), number));
     assert!(world.knows(ALICE));
     assert!(world.messages("/chatter") >= Some(2));
-    // It may send before its announcement.
+    // A participant may send before its announcement.
     world.sample(writer(BOB), 1);
     world.spdp(BOB);
     assert!(world.knows(BOB));
 }
 
 #[test]
-fn an_endpoint_on_a_topic_watched_by_name_finds_room_among_1200_forged_ones() {
+fn an_endpoint_of_a_topic_watched_by_name_is_admitted_to_a_full_table() {
     let limits = Limits {
         endpoints: 1200,
         ..Limits::default()
@@ -249,7 +249,7 @@ fn an_endpoint_on_a_topic_watched_by_name_finds_room_among_1200_forged_ones() {
 }
 
 #[test]
-fn an_endpoint_that_found_no_room_is_there_with_its_participant_s_next_announcement() {
+fn a_waiting_endpoint_is_admitted_at_its_participants_next_announcement() {
     let limits = Limits {
         endpoints: 10,
         ..Limits::default()
@@ -302,7 +302,7 @@ fn a_topic_watched_by_name_is_measured_at_the_cap_of_topics() {
     world.sedp(writer(ALICE), "rt/points");
     (1..=5).for_each(|number| world.sample(writer(ALICE), number));
     assert_eq!(world.messages("/points"), Some(5));
-    // The latest topic makes room, so topics from before a flood stay.
+    // The latest topic is displaced, so topics from before a flood stay.
     let measured = |world: &World| {
         let names = ["/crowd_0", "/crowd_1", "/crowd_2", "/crowd_3", "/crowd_4"];
         let topics = names.map(|name| world.topic(name).unwrap());
@@ -326,7 +326,7 @@ fn a_topic_watched_by_name_is_measured_at_the_cap_of_topics() {
 }
 
 #[test]
-fn a_topic_watched_by_name_stays_measured_when_its_publisher_is_gone_and_a_crowd_comes() {
+fn a_vanished_topic_watched_by_name_stays_measured_in_a_flood_of_topics() {
     let limits = Limits {
         topics: 4,
         ..Limits::default()
@@ -362,7 +362,7 @@ fn flood(world: &mut World, rounds: std::ops::Range<u32>, with_data: bool) {
 }
 
 #[test]
-fn a_flood_of_watched_names_displaces_neither_local_participants_nor_those_that_send() {
+fn a_flood_of_watched_names_displaces_neither_local_nor_sending_participants() {
     let mut world = World::new(&["/points"], &Limits::default());
     // Alice publishes a watched topic, Bob runs on this host, Carol sends, Dave is silent.
     let dave = GuidPrefix(*b"\x01\x10daves-host");
@@ -406,7 +406,7 @@ fn a_flood_of_watched_names_displaces_neither_local_participants_nor_those_that_
 }
 
 #[test]
-fn forgeries_that_fall_silent_make_room_for_silent_newcomers_as_before() {
+fn silent_forgeries_are_displaced_by_new_participants() {
     let mut world = World::new(&["/points"], &Limits::default());
     (0..1000).for_each(|number| world.spdp(forged(number)));
     world.spdp(ALICE);
@@ -434,7 +434,7 @@ fn forgeries_that_fall_silent_make_room_for_silent_newcomers_as_before() {
 }
 
 #[test]
-fn a_watch_that_is_added_lets_in_what_a_full_table_had_kept_out() {
+fn a_new_watch_admits_a_participant_that_a_full_table_had_refused() {
     let mut world = World::new(&["/other"], &Limits::default());
     world.crowd(1000);
     world.spdp(ALICE);
@@ -449,7 +449,7 @@ fn a_watch_that_is_added_lets_in_what_a_full_table_had_kept_out() {
 }
 
 #[test]
-fn nodes_of_a_participant_that_is_worth_more_find_room_among_forged_ones() {
+fn nodes_of_a_participant_with_a_higher_priority_displace_forged_ones() {
     let mut world = World::new(&["/points"], &Limits::default());
     let names: Vec<_> = (0..600).map(|number| format!("forged_{number}")).collect();
     for number in 0..8 {
@@ -466,7 +466,7 @@ fn nodes_of_a_participant_that_is_worth_more_find_room_among_forged_ones() {
 }
 
 #[test]
-fn a_flood_against_full_tables_takes_no_longer_than_one_against_empty_ones() {
+fn a_flood_into_full_tables_takes_no_longer_than_one_into_empty_ones() {
     const FLOOD: u32 = 20_000;
     let run = |crowd: u32| {
         let mut world = World::new(&["/points"], &Limits::default());

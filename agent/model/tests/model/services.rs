@@ -30,7 +30,8 @@ enum Middleware {
 #[derive(Clone, Copy)]
 struct Party {
     writer: Guid,
-    /// Fast DDS: the client's reader for replies. Cyclone DDS: the client id in front.
+    /// With Fast DDS, the client's reader for replies; with Cyclone DDS, the client id in the first
+    /// bytes.
     identity: [u8; 16],
 }
 
@@ -128,7 +129,7 @@ impl Robot {
         self.domain.put(message);
     }
 
-    /// Sends one DATA_FRAG of so many bytes of Cyclone DDS' reply number 1 to call 1.
+    /// Sends a DATA_FRAG of Cyclone DDS' reply 1 to call 1, with fragments of `bytes` bytes.
     fn part_of_a_reply(&mut self, from: Party, to: Party, body: &[u8], start: u32, bytes: u16) {
         let payload = [
             &[0, 1, 0, 0],
@@ -150,7 +151,7 @@ impl Robot {
         services.into_iter().find(|service| service.name == name)
     }
 
-    /// Returns requests, answered, unanswered and hanging requests of `/add`.
+    /// Returns the numbers of all, answered, unanswered and hanging requests of `/add`.
     fn counts(&self) -> (u64, u64, u64, usize) {
         let service = self.service(ADD).expect("a call of /add");
         let ServiceFacts {
@@ -168,7 +169,7 @@ impl Robot {
         actions.into_iter().find(|action| action.name == name)
     }
 
-    /// Returns the writers of the findings about hanging calls.
+    /// Returns the topic and the writer of each finding about a hanging call.
     fn hanging(&self) -> Vec<(TopicName, Guid)> {
         let found = &self.domain.snapshot().diagnoses.list;
         let hanging = found.iter().filter_map(|finding| match finding {
@@ -223,7 +224,7 @@ fn writers_of_requests_and_replies_are_captured() {
 }
 
 #[test]
-fn copies_retransmissions_and_second_servers_count_once() {
+fn copies_retransmissions_and_replies_of_a_second_server_count_once() {
     with_each(|mut robot| {
         let client = robot.client(1, ADD);
         let [one, other] = [2, 3].map(|number| robot.server(number, ADD));
@@ -247,7 +248,7 @@ fn copies_retransmissions_and_second_servers_count_once() {
 }
 
 #[test]
-fn clients_with_the_same_numbers_stay_apart() {
+fn calls_of_clients_with_the_same_numbers_are_counted_separately() {
     with_each(|mut robot| {
         let [one, other] = [1, 2].map(|number| robot.client(number, ADD));
         let server = robot.server(3, ADD);
@@ -296,7 +297,7 @@ fn a_call_without_a_reply_is_a_finding_until_it_is_answered() {
 }
 
 #[test]
-fn a_hanging_call_ends_with_its_client_and_after_ten_minutes() {
+fn a_hanging_call_ends_with_its_client_or_after_ten_minutes() {
     with_each(|mut robot| {
         let [one, other] = [1, 2].map(|number| robot.client(number, ADD));
         robot.request(one, 1);
@@ -329,7 +330,7 @@ fn a_goal_lasts_from_its_request_to_its_result() {
         }
         robot.request_with(gets, 1, &goal(1));
         robot.request_with(gets, 2, &goal(3));
-        // A result takes its time: it is no hanging call.
+        // A pending result is not a hanging call.
         robot.wait(19_970);
         assert_eq!(robot.hanging(), []);
         let expected = GoalCounts {
@@ -356,7 +357,7 @@ fn a_goal_lasts_from_its_request_to_its_result() {
 }
 
 #[test]
-fn messages_without_an_identity_cost_one_counter() {
+fn a_message_without_an_identity_increments_one_counter() {
     let mut robot = Robot::new(Middleware::Cyclone);
     let client = robot.client(1, ADD);
     let message = Message::from(client.writer.prefix);

@@ -1,5 +1,5 @@
-//! Discovery of a running stream in every order. Once the agent knows all of it, the figures of the
-//! same messages are equal. No figure is wrong on the way.
+//! Discovery of a running stream in every order. Once all of it is discovered, the same messages
+//! yield the same figures. No figure is wrong before.
 
 use std::net::SocketAddrV4;
 use std::sync::Arc;
@@ -20,7 +20,7 @@ const RATE: f64 = 50.0;
 const BETWEEN: u64 = 15;
 const AFTERWARDS: u64 = 1000;
 
-/// What the agent learns of the robot. Alice publishes, Bob subscribes, and Carol shares the host.
+/// A step of discovery. Alice publishes, Bob subscribes, and Carol shares the host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Step {
     Alice,
@@ -43,7 +43,7 @@ const STEPS: [Step; 6] = [
 struct Scene {
     host: Host,
     sent: u64,
-    /// Participants whose sockets are known, and whose readers acknowledge again and again.
+    /// Participants whose sockets are known, and whose readers acknowledge repeatedly.
     acknowledging: Vec<GuidPrefix>,
 }
 
@@ -101,8 +101,8 @@ impl Scene {
         }
     }
 
-    /// Sends messages by multicast, which reach both sockets of the port. The topic's rate never
-    /// exceeds the true one.
+    /// Sends messages by multicast, which reach both sockets of the port. The topic's rate must
+    /// never exceed the real one.
     fn send(&mut self, count: u64) {
         for _ in 0..count {
             self.host.wait(PERIOD);

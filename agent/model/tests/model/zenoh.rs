@@ -1,4 +1,4 @@
-//! Sessions of Zenoh: what appears, what ends, and what hostile senders cannot do.
+//! Sessions of Zenoh: how they appear and end, and what hostile senders cannot do.
 
 mod processes;
 mod routers;
@@ -92,7 +92,7 @@ fn participants(observer: &Observer, at: u64) -> usize {
 }
 
 #[test]
-fn a_message_on_two_connections_counts_once_and_reaches_the_peer_only() {
+fn a_message_on_two_connections_counts_once_and_reaches_only_the_peer() {
     let (mut observer, gid) = talking();
     subscribe(&mut observer, 1001, LISTENER);
     for number in 1..=10 {
@@ -106,13 +106,13 @@ fn a_message_on_two_connections_counts_once_and_reaches_the_peer_only() {
     let snapshot = observer.snapshot(Timestamp(START + SECOND));
     let received = chatter(&snapshot).unwrap().received.as_deref().unwrap();
     assert_eq!((received.messages, received.duplicates), (10, 0));
-    // The router is no subscriber.
+    // The router is not a subscriber.
     assert_eq!(received.unmatched, 0);
     assert_eq!(snapshot.participants.len(), 2);
 }
 
-/// Returns the losses of the topic and of its receivers, after the talker has sent ten messages a
-/// second. Those with a `missing` number did not arrive, and `gap` precedes the number after them.
+/// Returns the losses of the topic and of its receivers, after the talker has sent ten messages per
+/// second. Messages with a `missing` number did not arrive. `gap` precedes the message after them.
 fn lost(missing: Range<u64>, gap: Option<StreamEvent<'_>>) -> (u64, u64) {
     let (mut observer, gid) = talking();
     subscribe(&mut observer, 1001, LISTENER);
@@ -137,12 +137,12 @@ fn lost(missing: Range<u64>, gap: Option<StreamEvent<'_>>) -> (u64, u64) {
 }
 
 #[test]
-fn a_number_that_a_congested_publisher_left_out_is_lost() {
+fn a_number_that_a_congested_publisher_skipped_is_lost() {
     assert_eq!(lost(12..13, None), (1, 1));
 }
 
 #[test]
-fn messages_in_a_gap_of_the_capture_are_no_loss() {
+fn messages_in_a_gap_of_the_capture_are_not_lost() {
     assert_eq!(lost(12..15, Some(StreamEvent::Gap)), (0, 0));
 }
 
@@ -210,7 +210,7 @@ fn a_connection_whose_ends_were_both_silent_ends_once() {
 }
 
 #[test]
-fn a_restarted_agent_knows_who_sends_and_notices_the_end() {
+fn a_restarted_agent_knows_the_senders_and_detects_the_end() {
     let (mut before, gid) = talking();
     subscribe(&mut before, 1001, LISTENER);
     let token = publisher(LISTENER, 10, "/status");
@@ -254,14 +254,14 @@ fn a_restarted_agent_knows_who_sends_and_notices_the_end() {
     assert_eq!(deliveries.len(), 1, "{deliveries:?}");
     assert!(format!("{deliveries:?}").contains(&listener.to_string()));
 
-    // Its process is killed.
+    // The listener's process is killed.
     report(&mut after, &back, at, StreamEvent::End);
     report(&mut after, &there, at, StreamEvent::End);
     assert_eq!(participants(&after, at), 2);
 }
 
 #[test]
-fn restored_connections_that_are_gone_keep_no_session() {
+fn restored_connections_without_traffic_keep_no_session() {
     let (before, _) = talking();
     let memory = before.memory();
     let mut after = observer();
@@ -277,7 +277,7 @@ fn restored_connections_that_are_gone_keep_no_session() {
 }
 
 #[test]
-fn an_undeclared_token_takes_its_endpoint_and_the_last_one_its_session() {
+fn an_undeclared_token_removes_its_endpoint_and_the_last_one_its_session() {
     let (mut observer, _) = talking();
     let [there, _] = connection(1000);
     let at = START + SECOND;
@@ -287,7 +287,7 @@ fn an_undeclared_token_takes_its_endpoint_and_the_last_one_its_session() {
 }
 
 #[test]
-fn fragments_become_one_message_and_a_missing_one_breaks_it() {
+fn fragments_become_one_message_unless_one_is_missing() {
     let (mut observer, gid) = talking();
     let [there, _] = connection(1001);
     let payload = vec![7; 100_000];
@@ -311,7 +311,7 @@ fn fragments_become_one_message_and_a_missing_one_breaks_it() {
 }
 
 #[test]
-fn features_that_hide_messages_are_named() {
+fn features_that_hide_messages_are_reported() {
     let mut observer = observer();
     for (port, extension, reason) in [
         (1, 0x06, Unseen::Compression),
@@ -367,7 +367,7 @@ fn unseen(facts: &ZenohFacts, reason: Unseen) -> u64 {
     known.map_or(0, |(_, connections)| connections)
 }
 
-/// Every table stays within its cap.
+/// Asserts that every table stays within its cap.
 fn bounded(observer: &Observer) {
     let tables = observer.snapshot(Timestamp(START)).tables;
     assert!(tables.iter().all(|table| table.size <= table.limit));
@@ -384,7 +384,7 @@ fn table(observer: &Observer, name: &str) -> TableFacts {
 }
 
 #[test]
-fn connections_without_end_replace_the_longest_silent() {
+fn new_connections_replace_those_with_the_longest_silence() {
     let mut observer = observer();
     for number in 0..6000_u32 {
         let [mut there, _] = connection(1);
@@ -441,7 +441,7 @@ fn aliases_tokens_and_keys_beyond_their_caps_are_left_out() {
 }
 
 #[test]
-fn a_token_that_everybody_declares_is_one_session() {
+fn a_token_declared_on_many_connections_is_one_session() {
     let mut observer = observer();
     let token = publisher(TALKER, 10, "/chatter");
     for port in 0..100 {
@@ -511,7 +511,7 @@ fn long_tokens_of_forged_sessions_on_all_connections_take_a_few_megabytes() {
 }
 
 #[test]
-fn stale_fragments_make_room_for_a_large_message() {
+fn stale_fragments_are_dropped_for_a_large_message() {
     let (mut observer, gid) = talking();
     let part = vec![7; 60_000];
     for port in 100..140 {
@@ -554,7 +554,7 @@ fn stale_fragments_make_room_for_a_large_message() {
 }
 
 #[test]
-fn routers_that_pass_on_tokens_are_bounded() {
+fn the_number_of_routers_that_forward_tokens_is_bounded() {
     let mut observer = observer();
     for number in 0..400_u16 {
         let mut router = ROUTER;
@@ -573,14 +573,14 @@ fn routers_that_pass_on_tokens_are_bounded() {
 }
 
 #[test]
-fn endless_fragments_are_bounded() {
+fn messages_with_endless_fragments_are_bounded() {
     let (mut observer, gid) = talking();
     let requests = Vec::new();
     observer.input(Input::SampleRequests(std::sync::Arc::new(requests)));
     let part = vec![7; 60_000];
     for port in 0..8 {
         let [there, _] = connection(port);
-        // A request that never ends: it is kept whole until its bound.
+        // A request that never ends is kept whole up to its maximum size.
         let mut first = vec![0x1c, 1, 0, 0x03];
         first.extend_from_slice(&part[..50_000]);
         let message = push(3, gid, 1, &part);
@@ -604,7 +604,7 @@ fn endless_fragments_are_bounded() {
 }
 
 #[test]
-fn unseen_connections_are_bounded() {
+fn the_number_of_unseen_connections_is_bounded() {
     let mut observer = observer();
     for number in 0..2000_u32 {
         let [mut there, _] = connection(1);
@@ -624,7 +624,7 @@ fn unseen_connections_are_bounded() {
 
 proptest::proptest! {
     #[test]
-    fn any_batches_are_bounded(
+    fn arbitrary_batches_keep_all_tables_within_their_caps(
         batches in proptest::collection::vec(
             (0..4_u16, proptest::bool::ANY, proptest::collection::vec(proptest::num::u8::ANY, 0..120)),
             0..100,

@@ -14,7 +14,8 @@ use super::*;
 const PROCESSES: u32 = 1024;
 const HANDLES: u64 = 4;
 
-/// Returns a process with two callbacks and two publishers, of a topic each, after some seconds.
+/// Returns a process with two callbacks and two publishers, each with its own topic, after some
+/// seconds.
 fn process(id: u32, second: u64, now: u64) -> ProcessReport {
     let mut durations = Durations::default();
     for bit in 10..30 {
@@ -54,9 +55,10 @@ fn process(id: u32, second: u64, now: u64) -> ProcessReport {
     }
 }
 
-/// Compares the tables at their caps, with two snapshots and a page, with the unit's part for them.
+/// Compares the memory of the tables at their caps, with two snapshots and pages, to
+/// [`Limits::INSIDE`].
 #[test]
-fn figures_from_inside_processes_fit_into_their_part_of_the_unit_s_memory() {
+fn figures_from_inside_processes_fit_into_their_share_of_the_memory_limit() {
     let _alone = ALONE.lock().unwrap();
     let before = resident();
     let mut observer = Observer::new(Settings::default());

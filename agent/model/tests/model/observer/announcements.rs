@@ -8,7 +8,7 @@ use ros2probe_wire::{EntityId, GuidPrefix};
 use super::{ALICE, BOB, NODES, OTHER, STRING, WRITER, World, alice, bob};
 
 #[test]
-fn repeated_announcements_are_no_events_and_changed_ones_are() {
+fn repeated_announcements_raise_no_event_and_changed_ones_do() {
     let mut world = World::new(&["/**"]);
     for _ in 0..10 {
         world.spdp(ALICE, 10);
@@ -30,7 +30,7 @@ fn repeated_announcements_are_no_events_and_changed_ones_are() {
 }
 
 #[test]
-fn the_only_sample_of_ros_discovery_info_is_kept_if_it_is_first() {
+fn the_only_sample_of_ros_discovery_info_is_kept_if_it_arrives_first() {
     for gid_len in [16, 24] {
         let mut world = World::new(&[]);
         let nodes = [
@@ -69,7 +69,7 @@ fn ros_discovery_info_in_fragments_is_read() {
 }
 
 #[test]
-fn the_newest_node_list_wins_and_only_a_participants_own_counts() {
+fn only_the_newest_node_list_from_the_participant_itself_applies() {
     let mut world = World::new(&[]);
     world.spdp(ALICE, 10);
     world.spdp(BOB, 10);
@@ -94,7 +94,7 @@ fn the_newest_node_list_wins_and_only_a_participants_own_counts() {
 }
 
 #[test]
-fn a_discovery_servers_relays_speak_for_others() {
+fn announcements_relayed_by_a_discovery_server_apply_to_their_participant() {
     let server = GuidPrefix(*b"DS\x00_EPROSIMA");
     let mut world = World::new(&["/**"]);
     let relay = |writer, payload: &[u8]| Message::from(server).data(writer, 1, payload);
@@ -129,7 +129,7 @@ fn several_samples_of_several_writers_in_one_datagram_all_count() {
 }
 
 #[test]
-fn one_malformed_datagram_costs_one_counter() {
+fn a_malformed_datagram_increments_one_counter() {
     let mut world = World::new(&["/**"]);
     world.spdp(ALICE, 10);
     world.sedp(alice(WRITER), "rt/chatter");

@@ -9,7 +9,7 @@ use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 use super::{ALICE, BOB, Dice, START, WRITER, World, alice};
 
 #[test]
-fn a_clock_that_is_set_an_hour_forward_or_back_ends_no_lease_and_delays_none() {
+fn a_clock_step_of_an_hour_neither_ends_nor_delays_a_lease() {
     const HOUR: u64 = 3600 * SECOND;
     for (forward, step) in [(true, HOUR.cast_signed()), (false, -HOUR.cast_signed())] {
         let mut world = World::new(&["/chatter"]);
@@ -65,7 +65,7 @@ fn a_clock_that_is_set_an_hour_forward_or_back_ends_no_lease_and_delays_none() {
 }
 
 #[test]
-fn a_clock_that_jumps_is_followed() {
+fn jumps_of_the_source_clock_by_years_do_not_stop_the_model() {
     let mut world = World::new(&["/**"]);
     world.spdp(ALICE, 10);
     world.wait(1000 * 3600 * 24 * 365);
@@ -138,6 +138,6 @@ fn an_agent_that_sleeps_until_the_next_decision_reports_every_event_in_time() {
         assert_eq!((lazy.0, &lazy.1), (careful.0, &careful.1));
         assert!(lazy.2 <= careful.2, "{lazy:?} {careful:?}");
     }
-    // One for each second, and one for each lease.
+    // One round for each second, and one for each lease.
     assert!(rounds <= 15 + 2 + 1, "{rounds}");
 }

@@ -15,7 +15,7 @@ use ros2probe_wire::{DomainId, Timestamp};
 use super::{ALICE, BOB, READER, WRITER, World, alice, bob};
 
 #[test]
-fn joining_and_leaving_are_events_with_the_known_attributes() {
+fn joining_and_leaving_raise_events_with_the_known_attributes() {
     let mut world = World::new(&[]);
     world.spdp(ALICE, 10);
     world.sedp(alice(WRITER), "rt/chatter");
@@ -63,7 +63,7 @@ fn joining_and_leaving_are_events_with_the_known_attributes() {
 }
 
 #[test]
-fn losses_are_events_once_a_second_with_topic_and_node_even_of_a_gone_writer() {
+fn losses_raise_one_event_per_second_even_after_their_writer_left() {
     let mut world = World::new(&["/**"]);
     world.spdp(ALICE, 100);
     world.sedp(alice(WRITER), "rt/chatter");
@@ -114,7 +114,7 @@ fn losses_are_events_once_a_second_with_topic_and_node_even_of_a_gone_writer() {
 }
 
 #[test]
-fn a_changed_expectation_is_one_event_and_another_watch_changes_nothing() {
+fn a_changed_state_raises_one_event_and_another_watch_raises_none() {
     let expects = |pattern: &str, max_silence| Watch {
         expectations: Expectations {
             max_silence,
@@ -176,7 +176,7 @@ fn a_changed_expectation_is_one_event_and_another_watch_changes_nothing() {
 }
 
 #[test]
-fn time_in_which_the_source_was_blind_is_no_silence() {
+fn time_in_which_the_source_was_blind_is_not_silence() {
     let mut world = World::new(&[]);
     let watch = Watch {
         expectations: Expectations {
@@ -222,7 +222,7 @@ fn time_in_which_the_source_was_blind_is_no_silence() {
 }
 
 #[test]
-fn a_subscriber_that_returns_has_time_for_its_first_message() {
+fn a_returning_subscriber_has_time_for_its_first_message() {
     let mut world = World::new(&[]);
     let watch = Watch {
         expectations: Expectations {
@@ -257,7 +257,7 @@ fn a_subscriber_that_returns_has_time_for_its_first_message() {
 }
 
 #[test]
-fn expectations_are_judged_in_the_sources_time() {
+fn expectations_are_evaluated_in_the_time_of_the_source() {
     let mut world = World::new(&[]);
     let expectations = Expectations {
         min_rate_hz: Some(50.0),

@@ -12,7 +12,7 @@ use ros2probe_wire::record::Verdict;
 use super::{ALICE, BOB, NODES, OTHER, READER, WRITER, World, alice, bob, watchlist};
 
 #[test]
-fn interest_follows_discovery() {
+fn changes_of_discovery_and_of_watches_change_the_interest() {
     let mut world = World::new(&["/chatter"]);
     world.spdp(ALICE, 10);
     world.sedp(alice(WRITER), "rt/chatter");
@@ -49,7 +49,7 @@ fn interest_follows_discovery() {
 }
 
 #[test]
-fn the_cap_on_watched_topics_rejects_and_counts() {
+fn topics_above_the_cap_are_rejected_and_counted() {
     let mut world = World::with(
         &["/**"],
         Settings {
@@ -162,7 +162,7 @@ fn counts_of_a_topic_survive_its_writer_and_its_watch() {
 }
 
 #[test]
-fn a_topic_kept_out_by_a_crowd_is_measured_once_the_crowd_has_gone() {
+fn a_rejected_topic_is_measured_once_other_topics_have_vanished() {
     let settings = Settings {
         topics: 4,
         ..Settings::default()

@@ -9,7 +9,7 @@ use ros2probe_wire::{DomainId, EntityId, Timestamp};
 use super::{ALICE, BOB, OTHER, READER, WRITER, World, alice, bob};
 
 #[test]
-fn domains_are_not_mixed() {
+fn topics_of_two_domains_are_counted_separately() {
     let mut world = World::new(&["/**"]);
     world.spdp(ALICE, 10);
     world.sedp(alice(WRITER), "rt/chatter");
@@ -32,7 +32,7 @@ fn domains_are_not_mixed() {
 }
 
 #[test]
-fn a_domain_from_a_better_port_moves_everything_along() {
+fn a_domain_from_a_more_reliable_port_moves_endpoints_and_topics() {
     let mut world = World::new(&["/**"]);
     let payload = forge::participant(ALICE, 10, None);
     let unicast = Envelope {
@@ -67,7 +67,7 @@ fn a_domain_from_a_better_port_moves_everything_along() {
 }
 
 #[test]
-fn disposals_of_both_forms_are_seen_at_once() {
+fn disposals_by_key_and_by_hash_take_effect_immediately() {
     for by_key in [true, false] {
         let mut world = World::new(&["/**"]);
         world.spdp(ALICE, 10);
@@ -96,7 +96,7 @@ fn disposals_of_both_forms_are_seen_at_once() {
 }
 
 #[test]
-fn a_deleted_writer_does_not_stay_because_its_participant_is_announced_again() {
+fn a_disposed_writer_does_not_return_with_its_participants_announcements() {
     let mut world = World::new(&["/**"]);
     world.spdp(ALICE, 10);
     world.sedp(alice(WRITER), "rt/chatter");
@@ -149,7 +149,7 @@ fn a_killed_participant_is_removed_with_its_endpoints_when_its_lease_ends() {
 }
 
 #[test]
-fn the_kernel_can_vouch_for_a_participant() {
+fn a_sign_of_life_from_the_kernel_renews_the_lease() {
     let mut world = World::new(&[]);
     world.spdp(ALICE, 10);
     for _ in 0..5 {
@@ -163,7 +163,7 @@ fn the_kernel_can_vouch_for_a_participant() {
 }
 
 #[test]
-fn a_participant_comes_back_under_the_same_guid() {
+fn a_participant_that_returns_with_the_same_guid_continues_its_counts() {
     let mut world = World::new(&["/**"]);
     for round in 1..=3 {
         world.spdp(ALICE, 10);
@@ -182,7 +182,7 @@ fn a_participant_comes_back_under_the_same_guid() {
 }
 
 #[test]
-fn a_copy_overtaken_by_a_disposal_restores_nothing() {
+fn an_announcement_overtaken_by_a_disposal_restores_no_endpoint() {
     let mut world = World::new(&["/**"]);
     world.spdp(ALICE, 10);
     world.sedp(alice(WRITER), "rt/chatter");

@@ -89,7 +89,7 @@ fn repeated_forgeries_with_endless_leases_do_not_fill_the_table_permanently() {
 }
 
 #[test]
-fn a_storm_of_endpoints_of_one_participant_leaves_room_for_others() {
+fn a_storm_of_endpoints_of_one_participant_does_not_exclude_others() {
     let settings = Settings {
         endpoints: 10_000,
         ..Settings::default()

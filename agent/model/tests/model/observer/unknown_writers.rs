@@ -36,7 +36,7 @@ fn a_writer_whose_announcement_was_missed_is_shown_and_moves_to_its_topic() {
 }
 
 #[test]
-fn messages_sent_before_the_announcement_are_no_spike_of_the_rate() {
+fn messages_sent_before_the_announcement_cause_no_spike_of_the_rate() {
     let mut world = World::new(&["/chatter"]);
     world.spdp(ALICE, 100);
     world.sedp(alice(READER), "rt/chatter");
@@ -76,7 +76,7 @@ fn messages_sent_before_the_announcement_are_no_spike_of_the_rate() {
 }
 
 #[test]
-fn an_unknown_writer_is_reported_with_its_process_guid_and_participant() {
+fn an_unknown_writer_is_reported_with_its_vendor_and_process() {
     const FAST: GuidPrefix = GuidPrefix(*b"\x01\x0fsome-robot");
     let mut world = World::new(&[]);
     let holder = SocketFacts {
@@ -151,7 +151,7 @@ fn samples_beyond_the_budget_for_unknown_writers_are_not_lost() {
 }
 
 #[test]
-fn a_sample_in_transit_while_its_writer_leaves_makes_no_unknown_writer() {
+fn a_sample_that_arrives_after_its_writer_left_adds_no_unknown_writer() {
     let mut world = World::new(&["/**"]);
     world.spdp(ALICE, 10);
     world.sedp(alice(WRITER), "rt/chatter");

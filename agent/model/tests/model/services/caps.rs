@@ -4,7 +4,7 @@ use super::*;
 use ros2probe_model::facts::bounded::ledger;
 use ros2probe_model::facts::tables::ServiceWriters;
 
-/// Largest size of a table so far, and its cap.
+/// Returns the largest size of a table so far, and its cap.
 fn size(table: &str) -> (usize, usize) {
     let used = ledger()[table];
     (used.largest, used.cap)
@@ -57,7 +57,7 @@ fn writers_beyond_the_cap_are_not_captured() {
 }
 
 #[test]
-fn the_service_with_the_oldest_call_makes_room_for_a_new_one() {
+fn a_new_service_displaces_the_idle_one_with_the_oldest_call() {
     let mut robot = Robot::new(Middleware::Fast);
     let server = robot.server(9, "/s0");
     let clients = clients(&mut robot, 514);
@@ -67,7 +67,7 @@ fn the_service_with_the_oldest_call_makes_room_for_a_new_one() {
         robot.wait(1);
         robot.request(*client, 1);
     }
-    // The first one is idle; all others wait for a reply and stay.
+    // The first service is idle; all others wait for a reply and stay.
     assert_eq!(size("services.services"), (512, 512));
     assert_eq!((robot.service("/s0"), evictions(&robot)), (None, 2));
     assert!(robot.service("/s1").is_some() && robot.service("/s512").is_some());
@@ -75,7 +75,7 @@ fn the_service_with_the_oldest_call_makes_room_for_a_new_one() {
 }
 
 #[test]
-fn the_oldest_call_makes_room_for_a_new_one() {
+fn a_new_call_displaces_the_oldest_one() {
     let mut robot = Robot::new(Middleware::Cyclone);
     let client = robot.client(1, ADD);
     let server = robot.server(2, ADD);
@@ -93,7 +93,7 @@ fn the_oldest_call_makes_room_for_a_new_one() {
 }
 
 #[test]
-fn the_client_with_the_longest_silence_makes_room_for_a_new_one() {
+fn a_new_client_displaces_the_one_with_the_longest_silence() {
     let mut robot = Robot::new(Middleware::Cyclone);
     let client = robot.client(1, ADD);
     for number in 0..300_u16 {
@@ -108,7 +108,7 @@ fn the_client_with_the_longest_silence_makes_room_for_a_new_one() {
 }
 
 #[test]
-fn a_reply_in_too_many_parts_keeps_within_its_runs() {
+fn a_reply_in_too_many_parts_is_not_counted_as_complete() {
     let mut robot = Robot::new(Middleware::Cyclone);
     let client = robot.client(1, ADD);
     let server = robot.server(2, ADD);
@@ -117,12 +117,12 @@ fn a_reply_in_too_many_parts_keeps_within_its_runs() {
     (0..50).for_each(|part| fragment(2 * part + 1));
     (0..50).for_each(|part| fragment(2 * part + 2));
     assert_eq!(size("services.runs"), (16, 16));
-    // Runs were forgotten, so the reply is not known to be whole.
+    // Runs were dropped, so the reply is not known to be complete.
     assert_eq!(robot.counts(), (1, 0, 0, 0));
 }
 
 #[test]
-fn a_service_beyond_its_bytes_is_not_captured_for_a_while() {
+fn a_service_above_its_budget_of_bytes_is_temporarily_not_captured() {
     let mut robot = Robot::new(Middleware::Cyclone);
     let client = robot.client(1, ADD);
     robot.domain.observer.drain();

@@ -1,4 +1,4 @@
-//! The calls of real nodes in captures, against what the client logged.
+//! Calls of real nodes in captures, compared with the log of the client.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use ros2probe_wire::Expansion;
 use super::*;
 
 /// Label of the capture, and the client's times from request to response and from goal to result,
-/// in seconds. They are measured in Python, so they contain up to a few milliseconds of its own.
+/// in seconds. They were measured in Python, which adds up to a few milliseconds.
 const LOGGED: [(&str, [f64; 5], f64); 3] = [
     (
         "cyclonedds",
@@ -30,7 +30,7 @@ const LOGGED: [(&str, [f64; 5], f64); 3] = [
 ];
 
 #[test]
-fn calls_and_goals_of_real_nodes_are_paired() {
+fn calls_and_goals_of_real_nodes_have_the_logged_durations() {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
     for (label, calls, goal) in LOGGED {
         let mut observer = Observer::new(Settings {

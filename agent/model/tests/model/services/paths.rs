@@ -112,7 +112,7 @@ fn the_reply_counts_when_it_arrives_at_the_clients_socket() {
 }
 
 #[test]
-fn a_lost_reply_is_not_an_answer_and_its_repair_is() {
+fn a_lost_reply_is_not_an_answer_until_it_is_retransmitted() {
     with_each(|mut robot| {
         let client = robot.client(1, ADD);
         let server = robot.server(2, ADD);
@@ -121,7 +121,7 @@ fn a_lost_reply_is_not_an_answer_and_its_repair_is() {
         robot.replies(server, 1, client, 1);
         robot.wait(7_000);
         assert_eq!(robot.counts(), (1, 0, 1, 1));
-        // The repair leaves as a record, since the kernel captures a message once.
+        // The retransmission leaves as a record, since the kernel captures a message once.
         robot.copy(
             server,
             1,
@@ -179,7 +179,7 @@ fn a_client_on_another_host_is_answered_when_the_reply_leaves() {
 }
 
 #[test]
-fn messages_that_are_sampled_in_shared_memory_are_left_out() {
+fn messages_sampled_in_shared_memory_are_not_counted() {
     with_each(|mut robot| {
         let client = robot.client(1, ADD);
         robot.server(2, ADD);
@@ -194,7 +194,7 @@ fn messages_that_are_sampled_in_shared_memory_are_left_out() {
 }
 
 #[test]
-fn a_fragmented_reply_is_an_answer_when_all_of_it_has_arrived() {
+fn a_fragmented_reply_is_an_answer_when_all_fragments_have_arrived() {
     let mut robot = Robot::new(Middleware::Cyclone);
     let client = robot.client(1, ADD);
     let server = robot.server(2, ADD);

@@ -1,4 +1,4 @@
-//! Processes of sessions: by the sockets that send, also on connections older than the agent.
+//! Identification of a session's process by its sockets, even on connections older than the agent.
 
 use std::sync::Arc;
 
@@ -18,7 +18,7 @@ use super::{
     participants, talking,
 };
 
-/// Sees a direction at the socket of its sender.
+/// Returns the direction as seen at the socket of its sender.
 fn at_socket(stream: StreamId, socket: u64) -> StreamId {
     StreamId {
         socket,
@@ -100,7 +100,7 @@ fn a_session_whose_init_was_missed_runs_in_the_process_that_sends_its_messages()
     };
     let (mut observer, there) = sending(1002, true);
     assert_eq!(process(&observer), held(800));
-    // Another source: it is a router.
+    // A publication of another source shows that the sender is a router.
     let token = publisher(LISTENER, 10, "/chatter");
     let declared = frame(9, &[declare_token(2, &token)]);
     send(&mut observer, &connection(1001)[1], START, &declared);
@@ -113,7 +113,7 @@ fn a_session_whose_init_was_missed_runs_in_the_process_that_sends_its_messages()
 }
 
 #[test]
-fn a_process_stays_known_when_the_connection_that_showed_it_ends() {
+fn a_process_stays_known_when_the_connection_that_identified_it_ends() {
     let (mut observer, _) = talking();
     let [short, _] = connection(1002);
     let [short, long] = [at_socket(short, 8), at_socket(connection(1003)[0], 9)];
@@ -133,7 +133,7 @@ fn a_process_stays_known_when_the_connection_that_showed_it_ends() {
     assert_eq!(process(&observer).0, None);
 }
 
-/// A connection between the sockets of two processes of this host, as their senders' sockets see it.
+/// A connection between the sockets of two processes of this host, as seen by the sending sockets.
 fn between(ports: [u16; 2], sockets: [u64; 2]) -> [StreamId; 2] {
     let [mut there, _] = connection(ports[0]);
     there.flow.destination.port = ports[1];
@@ -142,9 +142,9 @@ fn between(ports: [u16; 2], sockets: [u64; 2]) -> [StreamId; 2] {
 }
 
 /// A robot that is older than the agent: the talker (process 800) publishes to the listener
-/// (process 900), which sends nothing but KEEP_ALIVEs. Both are connected to a router (process 700).
-/// Then another session joins. It receives the tokens from the router, and the listener connects to
-/// it.
+/// (process 900), which sends nothing but KEEP_ALIVEs. Both are connected to a router (process
+/// 700). Then another session joins. The new session receives the tokens from the router, and the
+/// listener connects to the new session.
 fn joined(routers: &[u16]) -> (Observer, [u8; 16]) {
     let mut observer = observer();
     let silent = [
@@ -184,7 +184,7 @@ fn joined(routers: &[u16]) -> (Observer, [u8; 16]) {
     (observer, Gid::of_token(&talker).0)
 }
 
-/// The talker publishes ten messages; returns those delivered to the listener's session.
+/// Publishes ten messages of the talker. Returns the number delivered to the listener's session.
 fn delivered(observer: &mut Observer, gid: [u8; 16]) -> u64 {
     let [there, _] = between([1001, 2000], [81, 90]);
     for number in 1..=10 {
@@ -223,7 +223,7 @@ fn the_only_session_of_a_process_sends_on_its_older_connections() {
 }
 
 #[test]
-fn connections_of_a_process_with_several_sessions_stay_unknown() {
+fn connections_of_a_process_with_several_sessions_have_unknown_senders() {
     for routers in [&[2002, 2003][..], &[]] {
         let (mut observer, gid) = joined(routers);
         assert_eq!(delivered(&mut observer, gid), 0, "{routers:?}");
@@ -232,7 +232,7 @@ fn connections_of_a_process_with_several_sessions_stay_unknown() {
 }
 
 #[test]
-fn a_session_that_publishes_for_another_is_not_the_only_one_of_its_process() {
+fn a_process_that_forwards_publications_has_no_single_session() {
     let (mut observer, gid) = joined(&[2002]);
     let [_, back] = between([1001, 2000], [81, 90]);
     let at = START + 3 * SECOND;

@@ -1,7 +1,7 @@
 //! Two hosts with a router each: deliveries and ends of sessions in every order of starts.
 //!
-//! The agent observes one host. The story of all messages is fixed; an agent that starts late sees
-//! the end of it only, and then what a joining session receives.
+//! The agent observes one host. The sequence of all messages is fixed. An agent that starts late
+//! sees only its end, and then the messages that a joining session receives.
 
 use ros2probe_model::graph::discovery::Memory;
 use ros2probe_model::graph::zenoh::{StreamEvent, StreamId};
@@ -27,10 +27,10 @@ const HERE: u8 = 2;
 const THERE: u8 = 1;
 const THIRD: u8 = 3;
 
-/// A step of the story at the host of the listener and the router [`ROUTER`].
+/// A step of the sequence at the host of the listener and the router [`ROUTER`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Step {
-    /// The local router connects to the one of the talker's host.
+    /// The local router connects to the router of the talker's host.
     Routers,
     /// The listener opens a session.
     Listener,
@@ -143,7 +143,7 @@ impl Host {
         self.send(&back, &open(60));
     }
 
-    /// Takes a step that the agent sees.
+    /// Takes a step in view of the agent.
     fn step(&mut self, step: Step, after: &[Step]) {
         let [to_router, from_router] = of_listener();
         let [_, from_other] = to_other_router();
@@ -172,13 +172,13 @@ impl Host {
         }
     }
 
-    /// A router passes on the tokens of the other host.
+    /// Forwards the tokens of the other host from a router.
     fn pass_on(&mut self, stream: &StreamId, id: u32) {
         self.declare(stream, id, &talker());
         self.declare(stream, 2 * id, &far_listener());
     }
 
-    /// A session joins this host, receives all tokens, and leaves: a `ros2` command.
+    /// Lets a session join this host, receive all tokens and leave, like a `ros2` command.
     fn command(&mut self) {
         let [there, back] = within([3000, 7447], [60, 72]);
         self.connect([there, back], (LATE, Role::Peer), (ROUTER, Role::Router));
@@ -211,7 +211,7 @@ impl Host {
         self.observer.input(Input::Time(Timestamp(self.now)));
     }
 
-    /// The talker publishes messages, of which both routers pass on copies.
+    /// Publishes messages of the talker, of which both routers forward copies.
     fn publish(&mut self, count: u64) {
         let gid = Gid::of_token(&talker()).0;
         for _ in 0..count {
@@ -244,7 +244,7 @@ impl Host {
         participants.any(|each| each.guid.prefix == prefix)
     }
 
-    /// Returns whether the sessions of the other host and of this one are listed.
+    /// Returns whether both sessions of the other host and that of this host are listed.
     fn listed(&self) -> [bool; 3] {
         [TALKER, FAR_LISTENER, LISTENER].map(|session| self.has(session))
     }
@@ -268,7 +268,7 @@ fn orders() -> Vec<(Vec<Step>, usize)> {
     with_agent.collect()
 }
 
-/// Starts everything in an order, and lets a command join.
+/// Takes all steps in an order, with a new agent at step `agent`, and lets a command join.
 fn started(order: &[Step], agent: usize) -> Host {
     let mut host = Host::observed(START);
     for (index, step) in order.iter().enumerate() {
@@ -288,7 +288,7 @@ fn started(order: &[Step], agent: usize) -> Host {
 }
 
 #[test]
-fn a_router_is_no_receiver_in_any_order_of_starts() {
+fn a_router_is_not_a_receiver_in_any_order_of_starts() {
     for (order, agent) in orders() {
         let mut host = started(&order, agent);
         host.publish(100);
@@ -306,8 +306,8 @@ fn a_router_is_no_receiver_in_any_order_of_starts() {
 }
 
 #[test]
-fn a_router_that_passes_on_one_session_only_is_not_that_session() {
-    // Nothing joins: the agent sees no INIT at all.
+fn a_router_that_forwards_only_one_session_is_not_mistaken_for_it() {
+    // No session joins, so the agent sees no INIT.
     let mut host = Host::observed(START);
     let [to_router, _] = of_listener();
     let [to_other, _] = to_other_router();
@@ -365,7 +365,7 @@ fn sessions_behind_a_host_without_power_end_with_the_lease() {
             }
             assert_eq!(host.listed(), [true; 3], "{order:?} {agent}");
         }
-        // The local router closes the connection, and the other end answers nothing.
+        // The local router closes the connection, and the other end does not answer.
         host.send(&to_other, &[0x03, 0x00]);
         report(&mut host.observer, &to_other, host.now, StreamEvent::End);
         let gone = [undeclare_token(1), undeclare_token(2)];
@@ -376,7 +376,7 @@ fn sessions_behind_a_host_without_power_end_with_the_lease() {
 }
 
 #[test]
-fn a_session_with_another_way_outlives_one_of_three_routers() {
+fn a_session_with_another_path_outlives_one_of_three_routers() {
     for agent in [0, 3] {
         let order = [Step::Routers, Step::Listener, Step::Talker];
         let mut host = started(&order, agent);
@@ -392,7 +392,7 @@ fn a_session_with_another_way_outlives_one_of_three_routers() {
         report(&mut host.observer, &to_other, host.now, StreamEvent::End);
         host.pass(3);
         assert_eq!(host.listed(), [true; 3], "{agent}");
-        // The last way ends.
+        // The last path ends.
         for stream in to_third_router() {
             report(&mut host.observer, &stream, host.now, StreamEvent::End);
         }
