@@ -60,7 +60,7 @@ struct Reader {
     requested: u64,
     acknacks: u64,
     last_seen: ModelTime,
-    /// The last ACKNACK that was seen leaving this host but not yet arriving.
+    /// The last ACKNACK that was observed as sent but not yet as received.
     leaving: Option<SequenceNumberSet>,
 }
 
@@ -91,8 +91,8 @@ impl Acknowledgements {
         self.trim();
     }
 
-    /// Returns the number below which all of these readers have acknowledged everything; `None` if
-    /// none of them has sent an ACKNACK.
+    /// Returns the number below which all readers that `is_meant` selects have acknowledged every
+    /// sample; `None` if none of them has sent an ACKNACK.
     pub fn floor(&self, is_meant: impl Fn(Guid) -> bool) -> Option<SequenceNumber> {
         let meant = self.readers.iter().filter(|reader| is_meant(reader.guid));
         meant.map(|reader| reader.base).min()
@@ -201,7 +201,7 @@ impl Reader {
         self.last_seen = self.last_seen.max(acknack.head.at);
         self.base = acknack.base();
         self.missing = content.iter().count() as u64;
-        // If both ends are on this host, the ACKNACK is seen leaving and then arriving.
+        // If both ends are on this host, the ACKNACK is observed as sent and then as received.
         let is_leaving = acknack.head.is_sent();
         if !is_leaving && self.leaving.take() == Some(content) {
             return;
@@ -273,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn an_hour_of_silence_is_reported_in_bounded_memory() {
+    fn an_hour_without_acknacks_is_reported_in_bounded_memory() {
         let mut all = Acknowledgements::default();
         put(&mut all, &acknack(1, 1, 0, 0));
         for number in 1..=360_000 {
@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn an_acknack_that_is_seen_leaving_and_arriving_is_one() {
+    fn an_acknack_observed_as_sent_and_as_received_counts_once() {
         let mut all = Acknowledgements::default();
         let leaving = Record {
             flags: flag::OUTGOING,

@@ -20,11 +20,12 @@ use ros2probe_wire::{Guid, SequenceNumber};
 const OVERHEAD: usize = 128;
 /// An unfinished sample is dropped after this long without a fragment.
 const FRAGMENT_TIMEOUT: Duration = Duration::from_secs(30);
-/// Smallest allocation for a sample.
+/// Minimum allocation for a sample, in bytes.
 const LEAST: usize = 4096;
-/// Buffers from this size on are used again: in new ones, the kernel would have to clear each page.
+/// Minimum size of a buffer that is reused: the kernel would have to clear each page of a new one.
 const LARGE: usize = 128 << 10;
-/// Most buffers that are kept for it, and after how long without a sample they are freed.
+/// Maximum number of buffers kept for reuse, and the time without a sample after which they are
+/// freed.
 const KEPT: usize = 4;
 const KEPT_FOR: Duration = Duration::from_secs(10);
 
@@ -34,7 +35,8 @@ pub struct Assembly {
     parts: Bounded<AssembledSamples, HashMap<(Guid, SequenceNumber), Part>>,
     /// The same samples in the order in which they began.
     ages: Bounded<AssembledSamples, BTreeMap<u64, (Guid, SequenceNumber)>>,
-    /// Payloads that were passed on, the oldest first. Their readers drop them at some time.
+    /// Payloads that were passed on, oldest first. A buffer is free once its readers have dropped
+    /// it.
     passed: VecDeque<(ModelTime, Bytes)>,
     begun: u64,
     bytes: usize,
@@ -159,7 +161,8 @@ impl Assembly {
         self.passed.iter().map(|(_, payload)| payload.len()).sum()
     }
 
-    /// Returns an empty buffer, of a payload of at least `size` bytes that has no reader any longer.
+    /// Returns an empty buffer. A large one may be that of an earlier payload that has no reader
+    /// any longer.
     fn buffer(&mut self, size: usize) -> Vec<u8> {
         let is_free = |(_, payload): &(ModelTime, Bytes)| {
             (size..=2 * size).contains(&payload.len()) && payload.is_unique()
@@ -246,7 +249,7 @@ impl Part {
         }
     }
 
-    /// Appends the new ones of fragments that begin at `start`, which is not after the next one.
+    /// Appends the new fragments among those that begin at `start`, which is at most `next`.
     fn append(&mut self, start: u32, bytes: &[u8]) {
         let skipped = usize::try_from(self.next - start).unwrap_or(usize::MAX);
         let Some(known) = skipped.checked_mul(self.fragment_size) else {
@@ -328,7 +331,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_order_and_repetition_makes_the_same_bytes(
+        fn fragments_in_any_order_and_repetition_yield_the_same_bytes(
             size in 1_usize..4000,
             fragment_size in 1_usize..700,
             cuts in prop::collection::vec((0_usize..400, 1_usize..9), 0..60),
@@ -357,7 +360,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_of_several_writers_come_mixed() {
+    fn interleaved_samples_of_several_writers_are_assembled_separately() {
         let (one, two) = (payload(2500), payload(2000));
         let mut assembly = Assembly::new(1 << 20);
         for start in [2_u32, 1, 3] {
@@ -410,7 +413,7 @@ mod tests {
     }
 
     #[test]
-    fn a_disposal_a_key_and_other_sizes_are_no_payload() {
+    fn disposals_keys_and_contradictory_sizes_yield_no_payload() {
         let mut assembly = Assembly::new(1 << 20);
         let whole = fragment(writer(1), 1, 1, 1, 100, 1000);
         let strange = [
@@ -455,7 +458,7 @@ mod tests {
     }
 
     #[test]
-    fn a_claimed_size_allocates_in_proportion_to_what_came() {
+    fn a_claimed_size_allocates_in_proportion_to_the_bytes_that_arrived() {
         let mut assembly = Assembly::new(1 << 20);
         let hostile = fragment(writer(1), 1, 1, 1, u32::MAX, 65_535);
         put(&mut assembly, &hostile, &[0; 100], 0);
@@ -465,7 +468,7 @@ mod tests {
     }
 
     #[test]
-    fn a_storm_stays_in_the_budget_and_gives_up_the_oldest() {
+    fn a_storm_of_samples_stays_within_the_budget_and_drops_the_oldest() {
         let mut assembly = Assembly::new(1 << 20);
         for number in 0..50_000 {
             let record = fragment(writer(1), number, 1, 1, 2_000_000, 1000);
@@ -485,7 +488,7 @@ mod tests {
     }
 
     #[test]
-    fn the_buffer_of_a_payload_without_readers_is_used_again() {
+    fn the_buffer_of_a_payload_without_readers_is_reused() {
         let mut assembly = Assembly::new(64 << 20);
         let size = 300_000;
         let mut next = |number: u64, size: u32| {
@@ -509,7 +512,7 @@ mod tests {
     }
 
     #[test]
-    fn more_samples_than_may_be_put_together_at_once_push_out_the_oldest() {
+    fn unfinished_samples_beyond_the_cap_displace_the_oldest() {
         let mut assembly = Assembly::new(1 << 30);
         for number in 0..AssembledSamples::CAP as u64 + 100 {
             let record = fragment(writer(1), number, 1, 1, 2_000, 1000);

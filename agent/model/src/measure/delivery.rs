@@ -1,4 +1,4 @@
-//! Samples of one writer that one receiver got, or that left for one destination.
+//! Samples of one writer that arrived at one receiver, or that left for one destination.
 //!
 //! A delivery begins with the first sample that the receiver sees. A gap counts as lost if it is
 //! below the highest number that the receiver knows from a sample or HEARTBEAT. A sample that left
@@ -35,16 +35,16 @@ use crate::measure::writer::{BEST_EFFORT_WINDOW, settle_window};
 use accounting::Accounting;
 pub use accounting::Totals;
 
-/// Number of samples missed while no reader listened that are excused one by one. Above it, the
-/// delivery restarts.
+/// Maximum number of samples, missed while there was no reader, that are excused one by one. If
+/// there are more, the delivery restarts.
 const EXCUSED: u64 = 512;
 /// Samples that left this host less than this ago may still arrive.
 const UNDER_WAY: Duration = Duration::from_secs(1);
-/// A receiver without any sign of life counts samples that left for it as lost after this silence.
-/// Socket diagnostics of the kernel report a closed socket earlier.
+/// Samples that left for a receiver count as lost if it shows no sign of life for this time. Socket
+/// diagnostics of the kernel report a closed socket earlier.
 const SILENCE: Duration = Duration::from_secs(18);
 const FIRST_MOMENTS: Duration = Duration::from_secs(5);
-/// A run of lost samples at least this long keeps its pending cause when two deliveries merge.
+/// A run of pending losses longer than this is settled when two deliveries merge.
 const LONG_RUN: u64 = 256;
 
 /// State outside the delivery that an observation changes.
@@ -56,7 +56,7 @@ pub struct DeliveryContext<'a> {
     pub writer: Guid,
     /// Whether the writer is reliable and retransmits samples.
     pub reliable: bool,
-    /// Whether its datagrams may need IP reassembly on this host.
+    /// Whether the writer's datagrams may need IP reassembly on this host.
     pub reassembled: bool,
     /// Memory budget for fragmented samples.
     pub budget: &'a mut Budget,
@@ -78,13 +78,15 @@ pub struct Delivery {
     loss_causes: LossCauses,
     first_seen: ModelTime,
     last_seen: ModelTime,
-    /// Time at which a matching reader appeared, if that is after the last sample.
+    /// Time at which a matching reader last appeared or capture missed bytes; earlier gaps are
+    /// excused.
     opened: ModelTime,
     /// Time at which the oldest sample that has not arrived left this host for the receiver.
     waiting: Option<ModelTime>,
-    /// Whether samples that left since then are already counted as lost.
+    /// Whether samples that left after `waiting` are already counted as lost.
     presumed_lost: bool,
-    /// Number of samples that left this host for the receiver a while ago and have not arrived.
+    /// Number of samples that left this host for the receiver at least [`UNDER_WAY`] ago and have
+    /// not arrived.
     under_way: u64,
     /// Losses of the last seconds.
     recent: RecentLoss,
@@ -97,7 +99,7 @@ pub struct Delivery {
 }
 
 impl Delivery {
-    /// Creates a delivery that has seen nothing yet.
+    /// Creates a delivery without observations.
     #[must_use]
     pub fn new(receiver: Receiver, main: Route, now: ModelTime) -> Self {
         Self {
@@ -203,7 +205,8 @@ impl Delivery {
         }
     }
 
-    /// Records that a reader appeared. Earlier samples were for other readers.
+    /// Records that a reader appeared, or that capture missed bytes. Gaps from before `at` are
+    /// excused.
     pub fn open(&mut self, at: ModelTime) {
         self.opened = self.opened.max(at);
     }
@@ -213,7 +216,8 @@ impl Delivery {
         self.best_effort = best_effort;
     }
 
-    /// Records that the last reader is gone: samples after its last one do not count as lost.
+    /// Records that the last reader is gone: samples after the last received one do not count as
+    /// lost.
     pub fn close(&mut self, budget: &mut Budget) {
         (self.waiting, self.presumed_lost, self.under_way) = (None, false, 0);
         self.reception.close(budget);
@@ -327,7 +331,7 @@ impl Delivery {
         self.reception.sequence_mut().acknowledged(base);
     }
 
-    /// Settles samples whose waiting time is over.
+    /// Settles the samples for which the settle window is over.
     pub fn advance(&mut self, context: &mut DeliveryContext<'_>) {
         let (now, window) = (context.now, settle_window(self.is_reliable(context)));
         let (reception, budget, mut accounting) = self.split(context);
@@ -349,7 +353,7 @@ impl Delivery {
         self.conclude(ModelTime::MAX, context);
     }
 
-    /// Merges `other`, which turned out to be the same receiver.
+    /// Merges `other`, which turned out to have the same receiver.
     pub fn absorb(&mut self, mut other: Self, context: &mut DeliveryContext<'_>) {
         let mut runs = self.loss_causes.due(ModelTime::MAX);
         runs.extend(other.loss_causes.due(ModelTime::MAX));

@@ -1,4 +1,4 @@
-//! Times at which one writer's samples left this host, for the send delay and, if one clock sees
+//! Times at which one writer's samples left this host, for the send delay and, if one clock covers
 //! both ends, the transit time.
 
 use std::collections::VecDeque;
@@ -57,7 +57,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn departures_for_several_places_are_separate_and_bounded() {
+    fn departures_for_several_destinations_are_separate_and_bounded() {
         let mut departures = Departures::default();
         let destination = |port| Destination {
             port,

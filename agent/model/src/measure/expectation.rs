@@ -5,14 +5,14 @@
 //! window of at least three expected messages (1 to 10 s), or over the window of the entry. One
 //! message of tolerance at the window's edges keeps a healthy periodic topic stable. Silence has
 //! its own time and no hysteresis. The end of a window counts for `min_rate_hz` only as far as its
-//! messages are known: those of a sampled topic are known with the next one that polling sees.
+//! messages are known. The messages of a sampled topic are known once polling sees the next one.
 //!
-//! Windows and silence begin when the agent can see the messages, at the earliest: after its own
-//! start, the first publisher or subscriber, and a time in which the source saw nothing. A topic
-//! that was silent before such a time stays silent until its next message.
+//! Windows and silences begin at the earliest when the agent can see the messages. That is after
+//! its own start, the first publisher or subscriber, and a time in which the source saw nothing. A
+//! topic that was silent before such a time stays silent until its next message.
 //!
-//! Numbers of publishers and subscribers are evaluated from `GRACE` after the topic has its first
-//! publisher on, because a robot needs time to start. A writer without a reader mostly sends
+//! The numbers of publishers and subscribers are evaluated once `GRACE` has passed since the first
+//! publisher appeared, because a robot needs time to start. A writer without a reader mostly sends
 //! nothing. A quiet topic without a subscriber therefore violates neither `min_rate_hz` nor
 //! `max_silence_s`, but it may violate `publishers` and `subscribers`.
 
@@ -25,9 +25,9 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::rate::{SECONDS, Slot};
 use crate::facts::watch::{Expectations, WatchState};
 
-/// Bad evaluations in a row until a topic is violated.
+/// Number of bad evaluations in a row after which a topic is violated.
 const BAD: u8 = 2;
-/// Good evaluations in a row until it recovers.
+/// Number of good evaluations in a row after which a violated topic recovers.
 const GOOD: u8 = 3;
 /// Seconds from a topic's first publisher until the numbers of its endpoints are evaluated.
 pub const GRACE: u64 = 10;
@@ -58,12 +58,12 @@ pub struct Evidence<'a> {
     pub subscriptions: usize,
     /// Time of the last message of any writer.
     pub last_message: Option<ModelTime>,
-    /// Returns how long the topic may seem silent while messages are sent, at this interval if none
-    /// is known.
+    /// Returns how long the topic may seem silent while messages are sent. The argument is their
+    /// interval if it is not known.
     pub seeming_silence: &'a dyn Fn(Duration) -> Duration,
-    /// Time since which the topic has a writer and is watched.
+    /// Time at which the topic became both published and watched.
     pub since: ModelTime,
-    /// Time since which messages are expected and would be seen; at least `since`.
+    /// Time at which messages became expected and visible; at least `since`.
     pub observed: ModelTime,
     /// Returns counts of the last whole seconds and the number of these seconds.
     pub recent: &'a dyn Fn(u64) -> (Slot, u64),
@@ -71,7 +71,7 @@ pub struct Evidence<'a> {
     pub loss: LossShare,
 }
 
-/// State of one topic under one entry.
+/// State of one topic under one watchlist entry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Judgement {
     /// Whether no evaluation has taken place.
@@ -90,8 +90,8 @@ impl Evidence<'_> {
         self.now.whole_seconds().saturating_sub(first)
     }
 
-    /// Returns how much of the last whole seconds is not known yet, in seconds. Messages are expected
-    /// at this rate.
+    /// Returns the part of the last whole seconds that is not known yet, in seconds. Messages are
+    /// expected at `rate`.
     fn unknown_seconds(&self, rate: f64) -> f64 {
         let interval = Duration::try_from_secs_f64(1.0 / rate).unwrap_or(Duration::MAX);
         let seeming = (self.seeming_silence)(interval);
@@ -242,7 +242,7 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool)
     broken
 }
 
-/// Removes the violations that follow from the lack of every subscriber.
+/// Removes the violations that follow from the absence of all subscribers.
 const fn without_consequences(broken: u8, quiet: bool, evidence: &Evidence<'_>) -> u8 {
     let is_expected = broken & SUBSCRIBERS != 0;
     if evidence.subscriptions == 0 && (quiet || is_expected) {
@@ -271,7 +271,7 @@ mod tests {
         now: u64,
         last_message: Option<ModelTime>,
         seeming_silence: Duration,
-        /// Time before an evaluation of which polling has seen nothing.
+        /// Time before an evaluation in which polling has seen nothing.
         unseen: Duration,
         subscriptions: usize,
         publishers: usize,
@@ -334,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn one_bad_second_is_no_violation_and_one_good_one_no_recovery() {
+    fn two_bad_seconds_in_a_row_violate_and_three_good_ones_recover() {
         let mut bench = Bench::new(Expectations {
             min_rate_hz: Some(10.0),
             ..Expectations::default()
@@ -347,7 +347,7 @@ mod tests {
     }
 
     #[test]
-    fn a_periodic_topic_at_its_limit_does_not_waver() {
+    fn jitter_at_the_rate_limit_does_not_make_a_topic_silent() {
         let mut bench = Bench::new(Expectations {
             min_rate_hz: Some(20.0),
             max_rate_hz: Some(20.0),
@@ -363,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn violations_are_named() {
+    fn violations_are_reported_by_their_keys() {
         let mut bench = Bench::new(Expectations {
             max_rate_hz: Some(5.0),
             max_loss_ratio: Some(0.01),
@@ -400,7 +400,7 @@ mod tests {
     }
 
     #[test]
-    fn silence_counts_from_the_time_at_which_the_agent_sees_again() {
+    fn silence_counts_from_when_the_agent_sees_messages_again() {
         let expectations = Expectations {
             max_silence: Some(Duration::from_secs(2)),
             ..Expectations::default()
@@ -408,19 +408,19 @@ mod tests {
         let mut bench = Bench::new(expectations);
         let (ok, silent) = (WatchState::Ok, WatchState::Silent);
         assert_eq!(bench.second(rate(5)), ok);
-        // Five seconds are not seen.
+        // Five seconds pass unobserved.
         bench.now += 5 * SECOND;
         bench.observed = ModelTime::from_nanoseconds(bench.now);
         let states = [(); 3].map(|()| bench.second(rate(0)));
         assert_eq!(states, [ok, ok, silent]);
-        // What was silent before stays silent.
+        // A topic that was silent before stays silent.
         bench.now += 5 * SECOND;
         bench.observed = ModelTime::from_nanoseconds(bench.now);
         assert_eq!([0, 1].map(|count| bench.second(rate(count))), [silent, ok]);
     }
 
     #[test]
-    fn a_topic_that_is_sampled_is_silent_when_unseen_messages_no_longer_explain_it() {
+    fn a_sampled_topic_is_silent_once_missed_messages_cannot_explain_it() {
         let mut bench = Bench::new(Expectations {
             max_silence: Some(Duration::from_secs(2)),
             ..Expectations::default()
@@ -433,7 +433,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_of_a_sampled_topic_counts_up_to_the_last_message_that_polling_saw() {
+    fn the_rate_of_a_sampled_topic_counts_up_to_the_last_message_seen() {
         let mut bench = Bench::new(Expectations {
             min_rate_hz: Some(40.0),
             ..Expectations::default()
@@ -447,11 +447,11 @@ mod tests {
         let states = [(); 2].map(|()| bench.second(rate(18)));
         let (ok, bad) = (WatchState::Ok, WatchState::Violated);
         assert_eq!(states, [ok, bad]);
-        // It recovers, and ends.
+        // The topic recovers, and then its messages end.
         (0..3).for_each(|_| assert_ne!(bench.second(rate(30)), WatchState::Silent));
         let states = [(); 3].map(|()| bench.second(rate(0)));
         assert_eq!(states, [ok, bad, bad]);
-        // Without sampling, all messages are known at once.
+        // Without sampling, all messages are known immediately.
         (0..3).for_each(|_| assert_ne!(bench.second(rate(50)), WatchState::Silent));
         bench.seeming_silence = Duration::ZERO;
         let states = [(); 2].map(|()| bench.second(rate(30)));
@@ -459,7 +459,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_counts_from_the_time_at_which_the_agent_sees_again() {
+    fn a_rate_counts_from_when_the_agent_sees_messages_again() {
         let mut bench = Bench::new(Expectations {
             min_rate_hz: Some(0.5),
             ..Expectations::default()
@@ -473,7 +473,7 @@ mod tests {
     }
 
     #[test]
-    fn without_subscriber_or_publisher_nothing_is_expected() {
+    fn a_topic_without_subscriber_or_publisher_violates_nothing() {
         let mut bench = Bench::new(Expectations {
             max_silence: Some(Duration::from_secs(1)),
             ..Expectations::default()
@@ -485,7 +485,7 @@ mod tests {
         assert!(bench.judgement.violations().is_empty());
     }
 
-    /// Returns a bench after its grace, with ten messages each second.
+    /// Returns a bench after its grace period, with ten messages each second.
     fn counted(publishers: Option<u32>, subscribers: Option<u32>) -> Bench {
         let mut bench = Bench::new(Expectations {
             min_rate_hz: Some(8.0),
@@ -503,7 +503,7 @@ mod tests {
     }
 
     #[test]
-    fn too_few_publishers_violate_after_two_seconds() {
+    fn too_few_publishers_cause_a_violation_after_two_seconds() {
         let mut bench = counted(Some(2), None);
         bench.publishers = 1;
         let states = [(); 2].map(|()| bench.second(rate(10)));
@@ -520,7 +520,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_subscriber_is_the_only_violation_of_a_writer_that_stops_for_it() {
+    fn a_missing_subscriber_is_the_only_violation_of_a_writer_that_stops_without_it() {
         let mut bench = counted(None, Some(1));
         bench.subscriptions = 0;
         let states = [(); 5].map(|()| bench.second(rate(0)));
@@ -535,7 +535,7 @@ mod tests {
     }
 
     #[test]
-    fn too_few_publishers_violate_without_a_subscriber_too() {
+    fn too_few_publishers_cause_a_violation_even_without_a_subscriber() {
         let mut bench = Bench::new(Expectations {
             min_rate_hz: Some(8.0),
             max_silence: Some(Duration::from_secs(1)),
@@ -555,7 +555,7 @@ mod tests {
     }
 
     #[test]
-    fn a_robot_has_time_to_start_its_subscribers() {
+    fn missing_subscribers_are_tolerated_during_the_grace_period() {
         let mut bench = Bench::new(Expectations {
             subscribers: Some(1),
             ..Expectations::default()

@@ -19,14 +19,14 @@ use crate::facts::names::DdsName;
 use crate::facts::rate::SECONDS as WINDOW;
 use crate::facts::tables::{HistoryRows, HistorySeconds, HistoryTotals};
 
-/// Largest number of names per measurable topic. Topics that stopped being measured keep their
-/// names up to this factor.
+/// Maximum number of names, as a multiple of the measured topics. Topics that are no longer
+/// measured keep their names within it.
 const NAMES: usize = 2;
 
 /// A ring of the last seconds.
 #[derive(Debug)]
 pub struct History {
-    /// Largest number of topic names.
+    /// Maximum number of topic names.
     most: usize,
     seconds: Bounded<Counted<HistorySeconds>, VecDeque<Arc<Second>>>,
     rows: Sum<HistoryRows>,
@@ -34,7 +34,7 @@ pub struct History {
     before: Bounded<Counted<HistoryTotals>, HashMap<u32, PreviousTotals>>,
     /// The id assigned last.
     last: u32,
-    /// Topics whose history was dropped because the ring was full.
+    /// Number of topics whose history was dropped or refused because the table of names was full.
     evictions: u64,
 }
 
@@ -95,15 +95,15 @@ struct PreviousTotals {
     messages: u64,
     bytes: u64,
     lost: u64,
-    /// Parts of them that belong to earlier seconds.
+    /// Parts of these counts that belong to earlier seconds.
     earlier: EarlierCounts,
     latency: Histogram,
     interarrival: Histogram,
 }
 
 impl History {
-    /// Creates a ring of the last whole seconds of `span`, for at most `topics` measured topics at
-    /// once.
+    /// Creates a ring of the last whole seconds of `span`, for at most `topics` topics that are
+    /// measured simultaneously.
     #[must_use]
     pub fn new(span: Duration, topics: usize) -> Self {
         let most = topics.saturating_mul(NAMES);
@@ -281,7 +281,7 @@ impl Past {
         let mut began = None;
         for second in self.seconds.get(first..=place).unwrap_or_default() {
             let Some(row) = second.row(id) else {
-                // The counters were reset after this row.
+                // The topic was not measured in this second, so the sums begin again.
                 (messages, bytes, began) = (0.0, 0.0, Some(second.at));
                 continue;
             };
@@ -454,7 +454,7 @@ mod tests {
     }
 
     #[test]
-    fn a_second_has_what_was_counted_in_it() {
+    fn a_second_contains_only_the_counts_of_that_second() {
         let (mut history, points) = (
             History::new(Duration::from_secs(600), 10),
             name("rt/points"),
@@ -478,7 +478,7 @@ mod tests {
             .collect();
         let counts: Vec<_> = rows.iter().map(|row| (row.messages, row.lost)).collect();
         assert_eq!(counts, [(10, 0), (10, 3), (0, 0)]);
-        // The percentiles cover this second only, without the millisecond before.
+        // The percentiles cover this second only, without the latency of 1 ms in the second before.
         let [median, high] = rows[1].latency().unwrap();
         assert!(median > 0.02 && high < 0.0402, "{median} {high}");
         assert_eq!((rows[2].latency(), rows[1].interarrival()), (None, None));
@@ -489,13 +489,13 @@ mod tests {
     }
 
     #[test]
-    fn messages_sent_before_a_late_announcement_flatten_no_chart() {
+    fn messages_from_before_a_late_announcement_do_not_appear_in_a_chart() {
         let (mut history, points) = (
             History::new(Duration::from_secs(600), 10),
             name("rt/points"),
         );
         take(&mut history, 100, &[(&points, counted(0, 0, &[]))]);
-        // A writer is announced that has sent 702 messages.
+        // A writer that has sent 702 messages is announced.
         let promoted = |messages: u64| Measurement {
             earlier: EarlierCounts {
                 messages: 702,
@@ -541,7 +541,7 @@ mod tests {
     }
 
     #[test]
-    fn old_seconds_go_and_many_rows_reach_back_less_far() {
+    fn old_seconds_are_dropped_and_many_rows_shorten_the_history() {
         let (mut history, points) = (History::new(Duration::from_secs(3), 10), name("rt/points"));
         for second in 1..=5 {
             take(&mut history, second, &[(&points, counted(second, 0, &[]))]);
@@ -569,7 +569,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_topics_that_went_make_room_for_those_that_come() {
+    fn a_full_table_drops_the_names_of_topics_that_are_no_longer_measured() {
         let mut history = History::new(Duration::from_secs(600), 2);
         let names: Vec<_> = (0..9).map(|number| name(&number.to_string())).collect();
         for (second, name) in (1..).zip(&names) {
@@ -581,7 +581,7 @@ mod tests {
         assert_eq!(table.size + table.evictions, 9);
         assert!(past.topic(DomainId(0), "8").is_some() && past.topic(DomainId(0), "0").is_none());
         assert!(history.before.len() <= 4);
-        // More topics at once than the table of names holds.
+        // One second has more topics than the table of names holds.
         let all: Vec<_> = names
             .iter()
             .map(|name| (name, counted(1, 0, &[])))
@@ -591,7 +591,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_is_set_back_begins_anew() {
+    fn a_clock_that_is_set_back_clears_the_history() {
         let (mut history, points) = (History::new(Duration::from_secs(600), 2), name("rt/points"));
         take(&mut history, 100, &[(&points, counted(1, 0, &[]))]);
         assert!(!history.is_due(Timestamp(100 * SECOND + 5)));
@@ -604,7 +604,7 @@ mod tests {
     }
 
     #[test]
-    fn short_numbers_keep_two_digits() {
+    fn bfloat16_keeps_two_significant_digits() {
         for value in [1e-6, 0.00123, 0.5, 9.99, 86_400.0] {
             let rounded = f64::from(Bfloat16::new(value).value().unwrap());
             assert!((rounded / value - 1.0).abs() < 0.004, "{value} {rounded}");

@@ -1,16 +1,16 @@
 //! Puts one writer's samples into the order in which a reliable subscriber receives them.
 //!
 //! A reader delivers a sample once all lower numbers have arrived or will not arrive (RTPS 2.5,
-//! 8.4.12). A counted sample therefore waits after a gap until one of these closes it: a
-//! retransmission, a GAP or HEARTBEAT of the writer, ACKNACKs of the readers, or its loss. The
-//! sample then gets the time of that moment. The waiting samples are bounded in number, bytes and
-//! time; beyond, they are dispatched, and a late retransmission follows out of order. Samples never
-//! wait without a gap, without a reliable reader, or if all readers are on other hosts, whose
-//! ACKNACKs are not seen.
+//! 8.4.12). A counted sample that follows a gap therefore waits until the gap closes. A
+//! retransmission closes it, a GAP or HEARTBEAT of the writer, ACKNACKs of the readers, or the
+//! decision that it is lost. The time of the sample is then the time at which the gap closed. The
+//! waiting samples are bounded in number, bytes and time. Beyond these bounds they are dispatched,
+//! and a late retransmission follows out of order. Samples never wait without a gap, without a
+//! reliable reader, or if all readers are on other hosts, whose ACKNACKs are not seen.
 //!
-//! Samples of every writer also wait while uprobes take over from polling: a message that both views
-//! may have seen last arrives after later ones. The readers do not wait for it, so these samples
-//! keep their own times.
+//! Samples of every writer also wait while uprobes take over from polling: the last message that
+//! both views may have seen can arrive after later ones. The readers do not wait for it, so these
+//! samples keep their own times.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -23,31 +23,30 @@ use crate::facts::dispatch::{QueuedDispatch, Sample};
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{self, OrderedSamples};
 
-/// Longest time that a gap is waited for. Fast DDS requests retransmissions after a HEARTBEAT,
-/// which follows within three seconds.
+/// Maximum time to wait for a gap. Fast DDS requests retransmissions after a HEARTBEAT, which
+/// follows within three seconds.
 const GAP_TIMEOUT: Duration = Duration::from_secs(4);
 /// Samples from before the announcement are retransmitted within this time, or not at all.
 const RETRANSMISSION_TIMEOUT: Duration = Duration::from_secs(10);
-/// Memory per sample in addition to its payload.
+/// Memory per sample in addition to its payload, in bytes.
 const OVERHEAD: usize = size_of::<QueuedSample>() + 64;
-/// Longest time from the announcement to the first ACKNACK.
+/// Maximum time from the announcement to the first ACKNACK.
 const FIRST_ACKNACK_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// How far the samples of a writer are decided.
+/// Which samples of a writer are decided.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct Progress {
     /// Increases when the writer restarts its sequence numbers under the same GUID.
     pub incarnation: u32,
-    /// All samples below arrived, or no reader waits for them.
+    /// All samples below this number arrived, or no reader waits for them.
     pub complete: SequenceNumber,
     /// No reader waits for any sample below this number.
     pub awaited: SequenceNumber,
     /// Whether the writer retransmits.
     pub reliable: bool,
-    /// Whether the writer has readers that acknowledge, or new ones that may.
+    /// Whether the writer has readers that send ACKNACKs, or new readers that may.
     pub acknowledged: bool,
-    /// Whether the first missing sample is one that this host did not see, and that readers may
-    /// have.
+    /// Whether the first missing sample was not observed but may have reached the readers.
     pub unseen: bool,
 }
 
@@ -71,9 +70,9 @@ pub struct InOrder {
     waiting: Bounded<OrderedSamples, BTreeMap<SequenceNumber, QueuedSample>>,
     bytes: usize,
     incarnation: Option<u32>,
-    /// The missing number, and since when it is waited for.
+    /// The missing number, and the time when the wait for it began.
     hole: (SequenceNumber, ModelTime),
-    /// Whether readers may have the missing number.
+    /// Whether readers may have the missing sample.
     is_hole_unseen: bool,
     /// Time of the last dispatched sample.
     last: ModelTime,
@@ -132,7 +131,7 @@ impl InOrder {
         queued
     }
 
-    /// Adds a sample that is dispatched in its turn.
+    /// Adds a sample that is dispatched in the order of the numbers.
     pub fn put(&mut self, queued: QueuedSample) {
         let number = queued.sample.sequence_number;
         self.earlier.remove(&number);
@@ -143,7 +142,7 @@ impl InOrder {
         self.waiting.insert(number, queued);
     }
 
-    /// Returns samples from before the announcement that will not be retransmitted.
+    /// Removes and returns the samples from before the announcement that will not be retransmitted.
     pub fn forgone(&mut self, progress: &Progress, now: ModelTime) -> Vec<SequenceNumber> {
         if self.earlier.is_empty() {
             return Vec::new();
@@ -156,8 +155,8 @@ impl InOrder {
         gone.into_iter().collect()
     }
 
-    /// Dispatches the samples whose turn has come at `now`; at most `room` bytes may continue to
-    /// wait. If the order was given up, returns the number below which no sample is waited for.
+    /// Dispatches the samples that need not wait at `now`; at most `room` bytes may continue to
+    /// wait. If a bound ended the wait, returns the number below which no sample is awaited.
     pub fn turn(
         &mut self,
         progress: &Progress,
@@ -193,7 +192,7 @@ impl InOrder {
         None
     }
 
-    /// Dispatches all waiting samples at the end of the input.
+    /// Dispatches all waiting samples.
     pub fn give_all(&mut self, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
         while let Some((_, queued)) = self.waiting.pop_first() {
             self.give(queued, now, give);
@@ -203,8 +202,8 @@ impl InOrder {
     fn give(&mut self, queued: QueuedSample, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
         self.bytes -= queued.cost();
         let came = queued.sample.time;
-        // Its reader may have received the lower number through unobserved shared memory, and then
-        // it did not wait.
+        // The reader may have received the lower number through unobserved shared memory. This
+        // sample then did not wait.
         let is_own = queued.sample.sampled || self.is_hole_unseen;
         let now = if is_own { came } else { now };
         // Players sort by time, so samples that waited for the same retransmission are one

@@ -1,9 +1,10 @@
-//! The last message of each transient-local writer, for clients that begin later: the agent does not
-//! subscribe, so it cannot request what was sent before.
+//! The last message of each transient-local writer, for clients that subscribe later. The agent has
+//! no DDS reader, so it cannot request earlier messages from the writer.
 //!
-//! It changes no figure. Payloads are captured within an allowance of each writer and of all
-//! together. A writer that exceeds it is paused: the kernel only meters it, which shows whether the
-//! kept message is still the last. Messages, their bytes and the writers have caps.
+//! Kept messages change no measurement. Payloads are captured within an allowance per writer and
+//! one for all writers. A writer that exceeds its allowance is paused: the kernel only meters it,
+//! which shows whether the kept message is still the last. Messages, their bytes and the writers
+//! have caps.
 
 mod allowance;
 
@@ -22,30 +23,30 @@ use crate::facts::wall_clock::WallClock;
 use crate::measure::assembly::Assembly;
 use allowance::Allowance;
 
-/// What became of the last message of a transient-local writer. Sizes are in bytes.
+/// State of the last message of a transient-local writer. Sizes are in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LatchedFacts {
-    /// No message was seen whole.
+    /// No complete message was seen.
     Unseen,
     /// It is kept.
     Kept(u32),
-    /// It is larger than what is kept.
+    /// It exceeds the maximum size of a kept message.
     TooLarge(u32),
-    /// The writer sent more than what is captured for this purpose.
+    /// The writer exceeded its allowance, so its messages are only metered.
     Paused,
-    /// It was dropped for others, or had no room beside them.
+    /// It was dropped or refused because the kept messages have reached their cap.
     NoRoom(u32),
 }
 
-/// Largest message that is kept by default, in bytes.
+/// Maximum size of a message that is kept by default, in bytes.
 pub const MESSAGE_BYTES: usize = 1 << 20;
-/// Bytes of unfinished messages.
+/// Maximum size of all unfinished messages, in bytes.
 const ASSEMBLY_BYTES: usize = 4 << 20;
-/// Bytes that may be captured of one writer at once, and in a second.
+/// Bytes of one writer that may be captured in a burst, and per second.
 const WRITER: Allowance = Allowance::new(8 << 20, 16 << 10);
-/// The same of all writers together.
+/// Bytes of all writers that may be captured in a burst, and per second.
 const ALL_WRITERS: Allowance = Allowance::new(64 << 20, 256 << 10);
-/// A paused writer is captured again once this much is allowed: a whole message.
+/// A paused writer is captured again once it is allowed this many bytes: a whole message.
 const RESUME_BYTES: u64 = MESSAGE_BYTES as u64;
 
 /// Writers whose last message is kept.
@@ -59,7 +60,7 @@ pub struct Latched {
     paused: usize,
 }
 
-/// A writer, as far as its messages need it.
+/// Properties of a writer that its kept message needs.
 #[derive(Clone, Debug)]
 pub struct LatchedTopic {
     /// Its topic.
@@ -83,9 +84,9 @@ struct LatchedWriter {
 /// The last message of a writer.
 #[derive(Debug)]
 enum Last {
-    /// None was seen whole.
+    /// No complete message was seen.
     Unseen,
-    /// The message, and the time at which it came.
+    /// The message, and the time of its arrival.
     Kept(Arc<Sample>, ModelTime),
     TooLarge(u32),
     /// The writer was paused when it arrived.
@@ -106,7 +107,7 @@ impl Default for Latched {
 }
 
 impl Latched {
-    /// Keeps the last message of this writer from now on, if there is room for the writer.
+    /// Begins to keep the last message of this writer, unless the table of writers is full.
     pub fn follow(&mut self, writer: Guid, about: LatchedTopic) {
         let new = || LatchedWriter {
             about: about.clone(),
@@ -119,7 +120,7 @@ impl Latched {
             return;
         };
         known.about = about;
-        // A message that a watch requested may be too large without it.
+        // A message that was kept for a watch may be too large without the watch.
         if let Last::Kept(sample, _) = &known.last
             && size(sample) > known.most()
         {
@@ -137,7 +138,7 @@ impl Latched {
         }
     }
 
-    /// Returns the verdict that the kernel needs for this writer; `None` if none of its messages is
+    /// Returns the verdict that the kernel needs for this writer; `None` if its messages are not
     /// kept.
     #[must_use]
     pub fn verdict(&self, writer: Guid) -> Option<Verdict> {
@@ -217,7 +218,7 @@ impl Latched {
         false
     }
 
-    /// Keeps a message that a client received, and that came at `at`.
+    /// Keeps a message that was dispatched to a client and arrived at `at`.
     pub fn dispatched(&mut self, sample: &Arc<Sample>, at: ModelTime) {
         let Some(known) = self.writers.get_mut(&sample.writer) else {
             return;
@@ -236,7 +237,7 @@ impl Latched {
         }
     }
 
-    /// Drops the message of a paused writer, if this one shows that it is no longer the last.
+    /// Drops the kept message of a paused writer if `sample` shows that it is no longer the last.
     pub fn seen(&mut self, sample: &observation::Sample) {
         if self.paused == 0 || !sample.is_message() {
             return;
@@ -278,7 +279,7 @@ impl Latched {
         resumed
     }
 
-    /// Returns the kept messages with the times at which they came, the oldest first.
+    /// Returns the kept messages with the times of their arrival, oldest first.
     #[must_use]
     pub fn samples(&self) -> Vec<(ModelTime, Arc<Sample>)> {
         let kept = self.writers.values().filter_map(|known| match &known.last {
@@ -290,7 +291,7 @@ impl Latched {
         kept
     }
 
-    /// Returns what became of the last message of this writer; `None` if none is kept.
+    /// Returns the state of the last message of this writer; `None` if its messages are not kept.
     #[must_use]
     pub fn facts(&self, writer: Guid) -> Option<LatchedFacts> {
         let known = self.writers.get(&writer)?;
@@ -309,7 +310,7 @@ impl Latched {
         self.bytes.used()
     }
 
-    /// Returns the rows of the metrics: writers, and bytes.
+    /// Returns the sizes and limits of the tables of writers and of bytes.
     #[must_use]
     pub fn tables(&self) -> [TableFacts; 2] {
         [self.writers.facts(), self.bytes.facts()]
@@ -323,7 +324,7 @@ impl Latched {
         }
     }
 
-    /// Keeps a message, if it finds room.
+    /// Keeps a message, if the cap on bytes allows.
     fn keep(&mut self, sample: Arc<Sample>, at: ModelTime) {
         let (writer, bytes) = (sample.writer, size(&sample));
         self.replace(writer, Last::Unseen);
@@ -340,9 +341,10 @@ impl Latched {
         self.replace(writer, Last::Kept(sample, at));
     }
 
-    /// Returns the writer whose message makes room, and its size: the oldest of the participant with
-    /// the most bytes, so that no participant can take the room of the others. Messages that a watch
-    /// requests stay, unless the newcomer is one, too.
+    /// Returns the writer whose message is dropped for a new one, and the size of that message. It
+    /// is the oldest message of the participant with the most bytes, so that no participant
+    /// displaces the others. Messages that a watch requests stay, unless a watch requests the new
+    /// one, too.
     fn largest(
         &self,
         is_watched: bool,
@@ -368,7 +370,7 @@ impl Latched {
         Some((*writer, size(sample)))
     }
 
-    /// Replaces what became of a writer's last message.
+    /// Replaces the state of a writer's last message.
     fn replace(&mut self, writer: Guid, last: Last) {
         let Some(known) = self.writers.get_mut(&writer) else {
             return;
@@ -383,7 +385,7 @@ impl Latched {
 }
 
 impl LatchedWriter {
-    /// Returns the size of the largest message to keep.
+    /// Returns the maximum size of a message to keep.
     const fn most(&self) -> usize {
         match self.about.is_watched {
             true => RetainedBytes::CAP,
@@ -391,7 +393,8 @@ impl LatchedWriter {
         }
     }
 
-    /// Returns whether a message is later than the last one, or the last one and not seen whole.
+    /// Returns whether a message is later than the last one, or is the last one and was not
+    /// captured completely.
     fn lacks(&self, about: (SequenceNumber, Option<Timestamp>)) -> bool {
         let is_last = self.newest.is_some_and(|(number, _)| number == about.0);
         is_last && matches!(self.last, Last::Unseen | Last::Paused) || self.is_newer(about)

@@ -1,8 +1,8 @@
 //! Known causes of losses on this host for one receiver, and losses whose cause may still be
 //! reported.
 //!
-//! The kernel reports a full socket buffer at once and a failed IP reassembly half a minute later.
-//! A loss that may be of the second kind stays pending until then.
+//! The kernel reports a full socket buffer immediately and a failed IP reassembly half a minute
+//! later. A loss that may be a failed reassembly stays pending until then.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -41,7 +41,7 @@ struct Run {
 }
 
 impl LossCauses {
-    /// Records the loss of some or all of this sample. Returns whether an older one was dropped.
+    /// Records the loss of some or all of this sample. Returns whether an older entry was dropped.
     pub fn note(&mut self, number: SequenceNumber, cause: LossCause, at: ModelTime) -> bool {
         if let Some(known_loss) = self.known.get_mut(&number) {
             known_loss.cause = known_loss.cause.max(cause);
@@ -50,7 +50,7 @@ impl LossCauses {
         self.known.insert(number, KnownLoss { cause, at }).is_some()
     }
 
-    /// Removes a sample that arrived after all or was excused.
+    /// Removes and returns the known loss of a sample that arrived after all or was excused.
     pub fn forget(&mut self, number: SequenceNumber) -> Option<KnownLoss> {
         if self.known.is_empty() {
             return None;
@@ -94,7 +94,7 @@ impl LossCauses {
     }
 
     /// Keeps the cause of these samples open until `until`. Returns a run that must be decided now
-    /// to make room.
+    /// because the table is full.
     pub fn wait(
         &mut self,
         first: SequenceNumber,
@@ -134,7 +134,7 @@ impl LossCauses {
         true
     }
 
-    /// Removes and returns the runs whose waiting time is over.
+    /// Removes and returns the runs that are due at `now`.
     pub fn due(&mut self, now: ModelTime) -> Vec<(SequenceNumber, SequenceNumber)> {
         let mut due = Vec::new();
         self.pending.retain(|first, run| {
@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cause_nearest_to_the_reader_is_borne() {
+    fn of_two_causes_the_one_nearest_to_the_reader_applies() {
         let mut loss_causes = LossCauses::default();
         loss_causes.note(SequenceNumber(5), LossCause::Reassembly, at(1));
         loss_causes.note(SequenceNumber(5), LossCause::SocketBuffer, at(2));
@@ -230,13 +230,13 @@ mod tests {
     }
 
     #[test]
-    fn resolving_every_other_sample_of_a_long_run_makes_no_more_runs_than_there_may_be() {
+    fn resolving_every_other_sample_of_a_long_run_keeps_the_number_of_runs_bounded() {
         let mut loss_causes = LossCauses::default();
         loss_causes.wait(SequenceNumber(1), SequenceNumber(100_000), at(1));
         let resolved = (1..50_000).filter(|number| loss_causes.resolve(SequenceNumber(2 * number)));
         assert_eq!(resolved.count(), OpenLosses::CAP - 1);
         assert!(loss_causes.pending.is_full());
-        // Removing the end of a run splits nothing, and a removed hole frees no entry.
+        // Removing the end of a run needs no further entry.
         assert!(loss_causes.resolve(SequenceNumber(1)));
         let left = loss_causes.due(at(1)).into_iter();
         let left: u64 = left.map(|(first, last)| last - first + 1).sum();

@@ -1,8 +1,9 @@
 //! Samples for subscriptions: one per writer and sequence number, as soon as the profiler counts
-//! it. Samples of a reliable writer are in the order of their numbers ([`crate::measure::in_order`]).
+//! it. Samples of a reliable writer are dispatched in the order of their numbers
+//! ([`crate::measure::in_order`]).
 //!
-//! The output queue is bounded; samples without room are counted and reported. Requests for samples
-//! never change a measurement.
+//! The output queue is bounded; samples that exceed it are counted and reported. Requests for
+//! samples never change a measurement.
 
 mod request_begin;
 
@@ -27,8 +28,8 @@ use crate::measure::in_order::{InOrder, Progress, QueuedSample, UnannouncedNumbe
 use crate::measure::writer::Counted;
 use request_begin::RequestBegin;
 
-/// Longest time until the kernel captures payloads after a request, and the model has processed
-/// what was captured before.
+/// Maximum time until the kernel captures payloads after a request and the model has processed
+/// earlier captures.
 pub const PAYLOAD_DELAY: Duration = Duration::from_millis(400);
 
 /// Requests for the samples of one writer.
@@ -41,7 +42,7 @@ struct WantedWriter {
     arrivals: Arc<[u64]>,
     /// Where each request begins.
     begins: Vec<RequestBegin>,
-    /// Time since which payloads are requested.
+    /// Time when the requests for payloads began.
     since: ModelTime,
     /// Number of the first sample that was dispatched with its payload.
     first_whole: Option<SequenceNumber>,
@@ -93,7 +94,7 @@ impl Payloads {
         }
     }
 
-    /// Returns the bytes held, their cap, and the number of samples without room.
+    /// Returns the bytes held, their cap, and the number of samples dropped because of it.
     #[must_use]
     pub const fn size(&self) -> (usize, usize, u64) {
         let (bytes, limit, evictions) = self.assembly.size();
@@ -127,7 +128,8 @@ impl Payloads {
             .any(|known| known.to.contains(&request))
     }
 
-    /// Dispatches the samples of this writer from `now` on; the next one has the number `next`.
+    /// Begins to dispatch the samples of this writer at `now`; the next sample has the number
+    /// `next`.
     pub fn want(
         &mut self,
         writer: Guid,
@@ -172,7 +174,7 @@ impl Payloads {
         self.announced(writer, now);
     }
 
-    /// Stops dispatching samples of this writer, after those that wait.
+    /// Dispatches the waiting samples of this writer, and then stops dispatching its samples.
     pub fn release(&mut self, writer: Guid, now: ModelTime) {
         self.unknown_writers.remove(&writer);
         self.give_all(writer, now);
@@ -262,8 +264,8 @@ impl Payloads {
         self.turn(writer, progress, counted.at)
     }
 
-    /// Returns whether a request receives this sample from before it, which is then not dispatched
-    /// when the writer repeats it. A recent sample may have been dispatched to it.
+    /// Returns whether a request receives this sample from before its start. The sample is then not
+    /// dispatched when the writer repeats it. A recent sample may already have been dispatched.
     pub fn give_before(
         &mut self,
         writer: Guid,
@@ -326,7 +328,7 @@ impl Payloads {
         }
     }
 
-    /// Gives an unknown writer the GUID by which it is announced.
+    /// Replaces the GUID of an unknown writer by the announced one.
     pub fn rename(&mut self, before: Guid, guid: Guid) {
         if let Some(samples) = self.unknown_writers.remove(&before) {
             self.unknown_writers.insert(guid, samples);
@@ -364,8 +366,8 @@ impl Payloads {
         interested.is_some_and(|interested| !interested.order.is_idle())
     }
 
-    /// Dispatches the samples of this writer whose turn has come. If the order was given up,
-    /// returns the number below which no sample is waited for.
+    /// Dispatches the samples of this writer that need not wait. If a bound ended the wait, returns
+    /// the number below which no sample is awaited.
     pub fn turn(
         &mut self,
         writer: Guid,
@@ -387,8 +389,8 @@ impl Payloads {
         skip
     }
 
-    /// Dispatches all waiting samples of a writer that has ended, and reports those that never
-    /// arrived again.
+    /// Dispatches all waiting samples of a writer that has ended, and reports the samples that were
+    /// not retransmitted.
     pub fn give_all(&mut self, writer: Guid, now: ModelTime) {
         let nothing_awaited = Progress::default();
         let Some(interested) = self.writers.get_mut(&writer) else {
@@ -549,7 +551,8 @@ impl WantedWriter {
         missed.into_iter().map(dispatches).collect()
     }
 
-    /// Returns the ids without those whose readers received this sample as the one from before.
+    /// Returns the ids without those of requests that received this sample as the one from before
+    /// their start.
     fn without_repeats(&self, to: &Arc<[u64]>, number: SequenceNumber) -> Arc<[u64]> {
         let is_repeat = |begin: &&RequestBegin| begin.before == Some(number);
         if !self.begins.iter().any(|begin| is_repeat(&begin)) {

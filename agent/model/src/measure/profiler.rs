@@ -1,7 +1,7 @@
 //! Measured writers: those of watched topics, and unknown writers, whose announcement was missed.
 //!
 //! The number of unknown writers is capped: a new one is refused until a known one is silent for a
-//! while. Writers from before a flood of forged GUIDs stay.
+//! while. Writers that were known before a flood of forged GUIDs stay.
 
 mod unknown_writers;
 
@@ -37,15 +37,15 @@ const UNKNOWN_AFTER: Duration = Duration::from_secs(3);
 /// An unknown writer is dropped after this silence, or earlier if it sent little.
 const UNKNOWN_WRITER_TIMEOUT: Duration = Duration::from_secs(30);
 const EVICTABLE_AFTER: Duration = Duration::from_secs(3);
-/// Number of messages from which on an unknown writer is not evicted.
+/// Minimum number of messages of an unknown writer that is never evicted.
 const ESTABLISHED_MESSAGES: u64 = 10;
-/// Longest time until the kernel knows a writer: a round of the capture thread on a busy machine.
+/// Maximum time until the kernel knows a writer: a round of the capture thread on a busy machine.
 /// Until then the kernel limits captures as for an unknown writer, and a point cloud exceeds that
 /// limit.
 const KERNEL_UPDATE_TIME: Duration = Duration::from_millis(200);
-/// Unknown writers may use one part in this many of the memory for fragmented samples.
+/// Unknown writers may use the memory for fragmented samples divided by this number.
 const UNKNOWN_WRITERS_SHARE: usize = 4;
-/// Deliveries that may be dropped for new ones: minimum silence, and largest number at once.
+/// Deliveries that are dropped for new ones: minimum silence, and maximum number per tick.
 const DELIVERY_TIMEOUT: Duration = Duration::from_secs(10);
 const GIVEN_UP: usize = 64;
 
@@ -64,12 +64,12 @@ pub struct Measured {
     pub last_seen: ModelTime,
     /// Whether an unknown writer has existed long enough to be metered.
     pub metered: bool,
-    /// Cookie of the socket by which an unknown writer sends; 0 if not known.
+    /// Cookie of the socket through which an unknown writer sends; 0 if not known.
     pub sent_from: u64,
     opened: ModelTime,
-    /// Whether a gap was waited for and no ACKNACK arrived.
+    /// Whether the wait for a gap ended without an ACKNACK.
     unacknowledged: bool,
-    /// Time from which the kernel captures all of its fragments.
+    /// Time at which the kernel begins to capture all fragments of the writer.
     sure_from: ModelTime,
 }
 
@@ -178,7 +178,8 @@ impl Profiler {
         }
     }
 
-    /// Returns the number of writers with a topic, and the row of the metrics for unknown writers.
+    /// Returns the number of writers with a topic, and the size and limit of the table of unknown
+    /// writers.
     #[must_use]
     pub fn size(&self) -> (usize, TableFacts) {
         let known = self.writers.len() - self.unknown_writers.len();
@@ -216,7 +217,8 @@ impl Profiler {
         };
         measured.last_seen = measured.last_seen.max(now);
         if measured.topic.is_none() && !measured.metered {
-            // The kernel filter's budget for unknown writers may omit samples, so a gap is no loss.
+            // The kernel filter may omit samples beyond its budget for unknown writers, so a gap is
+            // not a loss.
             measured.opened = now;
         }
         if measured.topic.is_none() && head.is_at_socket() && head.is_sent() {
@@ -326,7 +328,7 @@ impl Profiler {
         self.writers.insert(guid, measured);
     }
 
-    /// Gives an unknown writer the GUID by which it is announced.
+    /// Replaces the GUID of an unknown writer by the announced one.
     pub fn rename(&mut self, before: Guid, guid: Guid) {
         if self.unknown_writers.contains(&before)
             && !self.writers.contains_key(&guid)
@@ -383,7 +385,8 @@ impl Profiler {
         })
     }
 
-    /// Settles samples whose waiting time is over.
+    /// Settles the samples for which the settle window is over. Returns the changes of unknown
+    /// writers.
     pub fn advance(
         &mut self,
         now: ModelTime,
@@ -451,7 +454,7 @@ impl Profiler {
         }
     }
 
-    /// Drops the deliveries that have been silent longest, since a new one was refused.
+    /// Drops the deliveries that have been silent longest, because a new one was refused.
     fn give_up_silent(&mut self, now: ModelTime, journal: &mut Journal, graph: &Graph) {
         let mut silent: Vec<_> = self
             .writers
@@ -554,7 +557,7 @@ impl Measured {
         }
     }
 
-    /// Marks the writer as metered once the kernel knows it.
+    /// Allows samples to lack fragments until the kernel knows the writer.
     fn allow_incomplete(&mut self, now: ModelTime) {
         self.sure_from = now + KERNEL_UPDATE_TIME;
         self.writer.allow_incomplete(self.sure_from);

@@ -1,13 +1,13 @@
 //! Maps sockets and addresses to the participants that receive there.
 //!
-//! A socket belongs to the participant that sends by it, whose process owns it, or to which a
-//! directed message (INFO_DST) arrived at it. Processes of participants are learned from the
-//! sockets by which they send, since announced process ids may be those of a container. INFO_DST is
-//! the weakest evidence: RustDDS announces loopback addresses to other hosts, so their participants
-//! send messages for this host to themselves. An address belongs to the participant that announces
-//! it, unless several do. A multicast group belongs to no participant, because directed messages
-//! reach all members. Without evidence, or if two participants share a socket, the result is
-//! "unknown".
+//! A socket belongs to the participant that sends through it, whose process owns it, or to which a
+//! directed message (INFO_DST) arrived at it. The process of a participant is learned from the
+//! sockets through which it sends, because announced process ids may be those of a container.
+//! INFO_DST is the weakest evidence: RustDDS announces loopback addresses to other hosts, so their
+//! participants send messages for this host to themselves. An address belongs to the participant
+//! that announces it, unless several do. A multicast group belongs to no participant, because
+//! directed messages reach all members. Without evidence, or if two participants share a socket,
+//! the result is "unknown".
 
 mod addresses;
 mod matched;
@@ -33,7 +33,7 @@ use crate::graph::sockets::SocketFacts;
 use crate::graph::sockets::Sockets;
 use crate::measure::topic::Topics;
 
-/// Largest number of addresses kept per participant.
+/// Maximum number of addresses kept per participant.
 const MAX_ADDRESSES: usize = 16;
 
 /// All evidence about receivers.
@@ -42,10 +42,9 @@ pub struct Receivers {
     sockets: Sockets,
     users: Bounded<Counted<UsedSockets>, HashMap<u64, SocketUsers>>,
     processes: Bounded<Counted<SocketProcesses>, HashMap<u32, Candidates>>,
-    /// Participants for which a socket of this host sends; at most as old as the last
-    /// [`Self::tidy`].
+    /// Participants that send through a socket of this host. [`Self::tidy`] rebuilds the set.
     local: Bounded<Counted<LocalParticipants>, HashSet<GuidPrefix>>,
-    /// Participants whose messages left this host, by a socket that is not seen or in shared memory.
+    /// Participants whose messages left this host through an unobserved socket or shared memory.
     here: Bounded<Counted<ParticipantsHere>, HashSet<GuidPrefix>>,
     addresses: AnnouncedAddresses,
     closed: Bounded<ClosedSockets, HashSet<u64>>,
@@ -69,11 +68,11 @@ pub struct Graph {
 /// Participants that a socket may belong to.
 #[derive(Debug, Default)]
 struct SocketUsers {
-    /// Participants that send by it.
+    /// Participants that send through it.
     senders: Candidates,
     /// Participants for which a directed message arrived at it.
     addressed: Candidates,
-    /// More participants send by it than are remembered, which indicates forgery.
+    /// Whether more participants send through it than are remembered, which indicates forgery.
     is_crowded: bool,
 }
 
@@ -118,8 +117,8 @@ impl Receivers {
         &self.sockets
     }
 
-    /// Returns the owner of the socket by which each participant sends, if known. If it was closed,
-    /// another socket of the same process stands for it.
+    /// Returns, by participant, the facts of a socket through which it sends. If that socket was
+    /// closed, another socket of the same process replaces it.
     #[must_use]
     pub fn holders(&self) -> HashMap<GuidPrefix, &SocketFacts> {
         let mut holders: HashMap<GuidPrefix, &SocketFacts> = HashMap::new();
@@ -188,7 +187,7 @@ impl Receivers {
         self.generation += 1;
     }
 
-    /// Returns the session of Zenoh that runs in a process, unless several do.
+    /// Returns the only Zenoh session of a process, or `None` if there are several.
     #[must_use]
     pub fn session_in(&self, process_id: u32) -> Option<GuidPrefix> {
         let candidates = self.processes.get(&process_id)?;
@@ -205,8 +204,8 @@ impl Receivers {
         self.local.contains(prefix) || self.here.contains(prefix)
     }
 
-    /// Records that a message of this participant left this host, by a socket that is not seen or
-    /// in shared memory. Returns whether there was room.
+    /// Records that a message of this participant left this host through an unobserved socket or
+    /// shared memory. Returns false if the table is full.
     pub fn found_here(&mut self, prefix: GuidPrefix) -> bool {
         self.here.insert(prefix) || self.here.contains(&prefix)
     }
@@ -289,7 +288,7 @@ impl Receivers {
         self.generation += 1;
     }
 
-    /// Records that this participant may not own a socket, contrary to [`Self::sends`].
+    /// Withdraws a claim of [`Self::sends`]: the participant may not own the socket.
     pub fn sends_no_longer(&mut self, socket: u64, owner: GuidPrefix) {
         let users = self.users.get_mut(&socket).map(|users| &mut users.senders);
         let process = self.sockets.get(socket).and_then(|facts| facts.process_id);
@@ -307,13 +306,14 @@ impl Receivers {
         }
     }
 
-    /// Returns the rows of the metrics: sockets and addresses.
+    /// Returns the sizes and limits of the tables of sockets and addresses.
     #[must_use]
     pub fn tables(&self) -> [TableFacts; 2] {
         [self.sockets.table(), self.addresses.table()]
     }
 
-    /// Removes the evidence of participants that are gone and do not wait for an entry.
+    /// Removes the evidence of participants that neither exist nor wait for a free entry in
+    /// discovery.
     pub fn tidy(&mut self, discovery: &Discovery) {
         let is_there = |prefix: &GuidPrefix| discovery.knows(*prefix);
         self.addresses.retain(is_there);
@@ -336,7 +336,7 @@ impl Receivers {
         }
     }
 
-    /// Returns the participant that receives on this route.
+    /// Returns the participant that receives on this route, if there is only one candidate.
     #[must_use]
     pub fn owner(&self, route: &Route, discovery: &Discovery) -> Option<GuidPrefix> {
         match self.owners(route, discovery, None)[..] {
@@ -345,8 +345,8 @@ impl Receivers {
         }
     }
 
-    /// Returns the participants, one of which receives on this route. `domain_id` is that of the
-    /// samples' topic, if known.
+    /// Returns the candidates for the participant that receives on this route. `domain_id` is the
+    /// domain of the samples' topic, if known.
     #[must_use]
     pub fn owners(
         &self,
@@ -363,7 +363,7 @@ impl Receivers {
                 process.and_then(|process| self.processes.get(&process)),
                 users.map(|users| &users.addressed),
             ];
-            // Each list is only checked for participants that the previous ones leave open.
+            // Each list narrows the candidates that the previous lists left.
             let mut open: Vec<GuidPrefix> = Vec::new();
             for candidates in lists.into_iter().flatten() {
                 let alive = |owner: &&GuidPrefix| discovery.participants().contains_key(*owner);

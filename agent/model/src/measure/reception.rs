@@ -13,10 +13,10 @@ use crate::facts::observation::{Content, DataFrag, Gap, Heartbeat, Sample};
 use crate::measure::samples::{Budget, Facts, Progress, Samples};
 use crate::measure::sequence::{Arrival, REACH, RepairMode, RunMembership, Sequence, Settled};
 
-/// A fragment that completes its sample this long after the sample's last fragment was
-/// retransmitted.
+/// Minimum nanoseconds from the last fragment number to the completing fragment that indicate a
+/// retransmission.
 const REPAIR: i64 = 5_000_000;
-/// Numbers below the newest for whose fragments a sampled view still waits.
+/// Number of samples before the newest one for whose fragments a sampled view still waits.
 const UNDER_WAY: u64 = 8;
 
 /// State of one writer's samples at one point.
@@ -37,7 +37,7 @@ pub struct CompleteSample {
     pub is_message: bool,
     /// Whether it was retransmitted.
     pub recovered: bool,
-    /// Whether it is the newest so far; otherwise its delay includes a retransmission.
+    /// Whether it is the newest so far; otherwise its delay may include a retransmission.
     pub newest: bool,
     /// Whether its number is not confirmed as the writer's.
     pub unconfirmed: bool,
@@ -47,7 +47,8 @@ pub struct CompleteSample {
     pub stamp: Option<(i32, u32)>,
     /// Time of its first datagram.
     pub began: ModelTime,
-    /// Nanoseconds from its last fragment number to its last missing fragment.
+    /// Nanoseconds from the arrival of the last fragment number to that of the last missing
+    /// fragment.
     pub repaired_after: i64,
 }
 
@@ -71,7 +72,7 @@ pub enum Decision {
         first: SequenceNumber,
         /// Last sequence number.
         last: SequenceNumber,
-        /// Whether fragments of it arrived; it is then a single sample.
+        /// Whether some fragments arrived; the run is then a single sample.
         incomplete: bool,
     },
     /// The writer will not send the sample.
@@ -96,8 +97,8 @@ impl Reception {
         self.samples.is_partial(number)
     }
 
-    /// Adds a DATA_FRAG of a sampled view. Returns whether it completes its sample. Samples far
-    /// below it are no longer waited for, unless it is `unconfirmed`.
+    /// Adds a DATA_FRAG of a sampled view. Returns whether it completes its sample. The wait for
+    /// samples far below it ends, unless it is `unconfirmed`.
     pub fn assemble(
         &mut self,
         sample: &Sample,
@@ -118,13 +119,13 @@ impl Reception {
         self.samples.transfer(from, to);
     }
 
-    /// Allows fragmented samples that begin before this to be incomplete without a loss: the kernel
-    /// did not know the writer yet and limits captures of unknown writers.
+    /// Allows fragmented samples that begin before `until` to be incomplete without a loss: the
+    /// kernel did not know the writer yet and limits captures of unknown writers.
     pub const fn allow_incomplete(&mut self, until: ModelTime) {
         self.samples.allow_incomplete(until);
     }
 
-    /// Processes a DATA or DATA_FRAG of a writer that is `reliable` or not.
+    /// Processes a DATA or DATA_FRAG. `reliable` states whether the writer retransmits.
     pub fn sample(
         &mut self,
         sample: &Sample,
@@ -202,7 +203,7 @@ impl Reception {
         });
     }
 
-    /// Merges what `other` received; its unfinished samples are dropped.
+    /// Merges the samples that `other` received. The unfinished samples of `other` are dropped.
     pub fn absorb(
         &mut self,
         mut other: Self,
@@ -217,8 +218,8 @@ impl Reception {
         });
     }
 
-    /// Hands over to another view: returns the numbers of unfinished samples, which are not losses
-    /// here.
+    /// Hands over to another view. Returns the numbers of unfinished samples, which do not count as
+    /// lost here.
     pub fn abandon(&mut self) -> Vec<SequenceNumber> {
         let mut partial = Vec::new();
         for number in self.sequence.settled().until(self.sequence.next()) {
@@ -247,7 +248,8 @@ impl Reception {
         }
     }
 
-    /// Decides samples that have been open for `window`, and those that the writer withdrew `grace` ago.
+    /// Decides samples that have been open for `window`, and samples that the writer withdrew
+    /// `grace` ago.
     pub fn advance(
         &mut self,
         now: ModelTime,

@@ -1,5 +1,5 @@
-//! Evaluates expectations on seconds that were counted before, as [`Judgement`] evaluates them on
-//! the present. Thresholds that are learnt from a robot are checked on the same robot here.
+//! Evaluates expectations on seconds that were counted earlier, as [`Judgement`] evaluates them
+//! live. Thresholds that were learnt from a robot are checked on the counts of the same robot.
 
 use std::time::Duration;
 
@@ -15,21 +15,21 @@ use crate::measure::expectation::{Evidence, Judgement};
 pub use crate::facts::rate::SECONDS;
 pub use crate::measure::expectation::{GRACE, window};
 
-/// Time at which a rehearsal begins; any time that leaves room for a silence before it.
+/// Model time at which a rehearsal begins, in seconds: late enough for a silence before it.
 const BEGIN: u64 = 1_000_000;
 
-/// One second of a topic. Small, because a client keeps hours of many topics.
+/// Counts of one second of a topic. The type is small, because a client keeps hours of many topics.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Second {
     /// Messages received whole.
     pub messages: u32,
     /// Messages that the worst subscriber lost.
     pub lost: u32,
-    /// Messages that it expected: those that it received or lost.
+    /// Messages that this subscriber received or lost.
     pub expected: u32,
     /// Messages with a latency.
     pub delayed: u32,
-    /// Sum of their latencies in seconds.
+    /// Sum of these latencies, in seconds.
     pub delay: f32,
     /// Time since the last message at the end of the second, in seconds; `None` before the first
     /// message.
@@ -41,7 +41,7 @@ pub struct Second {
 }
 
 /// Returns the keys of the expectations that the topic violates at any time, after hysteresis. A
-/// time without a publisher violates nothing.
+/// second without a publisher violates nothing.
 #[must_use]
 pub fn violations(expectations: &Expectations, seconds: &[Second]) -> Vec<&'static str> {
     let mut judgement = Judgement::default();
@@ -86,8 +86,8 @@ pub fn violations(expectations: &Expectations, seconds: &[Second]) -> Vec<&'stat
     violated
 }
 
-/// Returns the sum of at most `length` seconds before `end` and not before `begin`, and their
-/// number.
+/// Returns the sum of the last `length` seconds before `end`, none of them before `begin`, and the
+/// number of these seconds.
 fn recent(seconds: &[Second], begin: usize, end: usize, length: u64) -> (Slot, u64) {
     let length = usize::try_from(length).unwrap_or(usize::MAX);
     let begin = begin.max(end.saturating_sub(length)).min(end);
@@ -122,7 +122,7 @@ fn instant(place: usize) -> ModelTime {
 }
 
 fn duration(seconds: f32) -> Duration {
-    // Far shorter than the time before `BEGIN`.
+    // The maximum is shorter than the time before `BEGIN`.
     Duration::try_from_secs_f32(seconds.clamp(0.0, 900_000.0)).unwrap_or_default()
 }
 
@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn a_steady_topic_violates_nothing_and_one_hiccup_neither() {
+    fn one_slow_second_violates_nothing_and_two_in_a_row_violate_the_rate() {
         let mut seconds = vec![steady(10); 60];
         seconds[0].messages = 1;
         seconds[30].messages = 3;
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn a_window_finds_half_a_rate_that_varies_in_single_seconds() {
+    fn a_window_tolerates_varying_seconds_and_detects_half_the_rate() {
         // 40 Hz on a busy robot, in pairs of slow seconds.
         let busy = |part: u32| -> Vec<Second> {
             let counts = [24, 26, 46, 44, 46, 46, 40, 48].into_iter().cycle();
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn silence_and_a_lost_subscriber_are_named() {
+    fn silence_and_a_missing_subscriber_are_reported_by_their_keys() {
         let mut silent = vec![steady(10); 60];
         for (place, second) in silent.iter_mut().enumerate().skip(40) {
             second.messages = 0;
@@ -193,7 +193,7 @@ mod tests {
             .iter_mut()
             .for_each(|second| second.subscriptions = 0);
         assert_eq!(violations(&expecting(), &alone), ["subscribers"]);
-        // Not published: there is nothing to expect from it.
+        // Nothing is expected of a topic without a publisher.
         let mut gone = silent;
         gone[40..]
             .iter_mut()

@@ -15,14 +15,14 @@ use crate::facts::route::{Destination, Route};
 use crate::facts::tables::{DepartureTimes, WriterRoutes};
 use crate::measure::receivers::{Matched, MatchedReaders};
 
-/// Interval of these times.
+/// Minimum interval of the departure times that are remembered.
 const DEPARTURE_INTERVAL: Duration = Duration::from_secs(1);
 
 /// All routes of one writer, sorted.
 #[derive(Debug, Default)]
 pub struct Routes {
     routes: Bounded<WriterRoutes, Vec<KnownRoute>>,
-    /// Index of the route used last.
+    /// Index of the last route that was used.
     last: usize,
     /// Routes dropped because of the cap.
     evictions: u64,
@@ -35,10 +35,11 @@ pub struct KnownRoute {
     pub route: Route,
     /// The participant that receives on it.
     pub owner: Option<GuidPrefix>,
-    /// The participant of directed messages on it, the only evidence of a receiver.
+    /// The participant at which messages on it are directed, if that is the only evidence of a
+    /// receiver.
     directed_to: Option<GuidPrefix>,
-    /// Whether that participant has a reader that matches the writer; for an outgoing multicast,
-    /// whether the topic has any reader.
+    /// Whether the owner has a reader that matches the writer; for an outgoing multicast, whether
+    /// the topic has any reader.
     pub matched: Matched,
     /// Whether one of several participants receives on it, and each has a matching reader.
     pub is_shared: bool,
@@ -139,8 +140,8 @@ impl Routes {
         index
     }
 
-    /// Gives the route that was observed at an unknown socket with the same destination this one.
-    /// Returns that route, if there is one.
+    /// Replaces the route that was observed at an unknown socket with the same destination by this
+    /// one. Returns the replaced route, if any.
     pub fn learn_socket(&mut self, route: Route, readers: MatchedReaders<'_>) -> Option<Route> {
         let unknown = Route { socket: 0, ..route };
         let index = self.find(&unknown)?;
@@ -243,7 +244,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn samples_that_had_left_by_a_time_are_remembered_for_a_while() {
+    fn the_last_sample_that_had_left_by_a_time_is_remembered_for_a_while() {
         let mut known = KnownRoute {
             route: Route {
                 direction: Direction::Sent,

@@ -3,8 +3,8 @@
 //!
 //! Shared memory is polled, so samples that are overwritten between two polls are not seen.
 //! Sequence numbers still show how many were written: messages are counted by the span of their
-//! numbers, and unseen numbers are no losses. While a writer is sampled, its samples on the network
-//! are counted here, too.
+//! numbers, and unseen numbers are not losses. While a writer is sampled, its samples on the
+//! network are counted here, too.
 
 use std::time::Duration;
 
@@ -18,21 +18,21 @@ use crate::measure::sequence::{MAX_WINDOW, Run, RunMembership, Sequence};
 const SAMPLED_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time that an unseen sample may take to arrive by another transport before it is skipped.
 const ARRIVAL_TIMEOUT: Duration = Duration::from_millis(200);
-/// Probability that a silence is claimed while messages are sent.
+/// Accepted probability that a silence is claimed while messages are sent.
 const FALSE_SILENCE: f64 = 1e-6;
-/// Messages that are presumed before the first one is seen, and the share of them that polling
-/// missed: it misses nine of ten large ones on a busy machine. The same is presumed of messages
-/// after a missed one: what hides a message, such as a large one sent with it, hides the next ones.
+/// Number of messages presumed before the first one is seen, and the share of them that polling
+/// missed. On a busy machine, polling misses nine of ten large messages. The same is presumed after
+/// a missed message: its cause, such as a large message sent with it, also hides the next ones.
 const PRESUMED: f64 = 2.0;
 const PRESUMED_MISSED: f64 = 0.9;
-/// Longest time in which polling sees no message of a topic on a busy machine. Real Fast DDS: 0.4 s
-/// on an idle machine, more than 2 s for point clouds beside a load of 10.
+/// Maximum time in which polling sees no message of a topic on a busy machine. Measured with Fast
+/// DDS: 0.4 s on an idle machine, more than 2 s for point clouds at a load of 10.
 const POLLING_HOLE: Duration = Duration::from_secs(10);
 /// Factor by which a row of missed messages may exceed the longest one so far.
 const LONGER: f64 = 3.0;
-/// Share of the newest interval in the mean one.
+/// Weight of the newest interval in the moving average.
 const NEWEST: f64 = 0.125;
-/// Numbers below the next one that are tracked individually.
+/// Number of sequence numbers below the next one that are tracked individually.
 const WINDOW: u64 = u128::BITS as u64;
 
 /// State of one writer's sampled view.
@@ -47,19 +47,19 @@ pub struct Sampled {
     uncertain: u64,
     /// Number of times that one or more unseen messages preceded a seen one.
     holes: u64,
-    /// Largest number of unseen messages in a row.
+    /// Maximum number of unseen messages in a row so far.
     longest_hole: u64,
-    /// Mean time between messages of late, in seconds.
+    /// Moving average of the time between messages, in seconds.
     interval: Option<f64>,
     /// Messages known from HEARTBEATs and ACKNACKs whose size is not known yet.
     unmeasured: u64,
-    /// Bit `i`: the number `i + 1` below the next one was seen or need not be.
+    /// Bit `i`: the number `i + 1` below `next` was seen or is not awaited.
     sighted: u128,
-    /// Bit `i`: of that number everything was seen, or its last fragment without some others.
+    /// Bit `i`: that sample was seen completely, or its last fragment was seen without some others.
     finished: u128,
-    /// The number to which these bits are relative.
+    /// The number to which the bits of `sighted` and `finished` are relative.
     next: SequenceNumber,
-    /// No sample below this number is waited for.
+    /// No sample below this number is awaited.
     settled: SequenceNumber,
     /// Time of the last [`Self::tick`] that settled, and the next number at that time.
     last_settled: (ModelTime, SequenceNumber),
@@ -79,11 +79,11 @@ pub struct SampledUpdate {
     /// Number of samples assumed to have the size of this one: `samples`, and earlier announced
     /// ones.
     pub alike: u64,
-    /// Time since the previous number arrived, if that was seen.
+    /// Nanoseconds since the previous number arrived, if that number was seen.
     pub interval: Option<i64>,
     /// Whether it is the newest sample and has arrived, so that its delay is meaningful.
     pub arrived: bool,
-    /// Whether nothing more of it is waited for, for the first time.
+    /// Whether this observation ends the wait for the sample.
     pub finished: bool,
     /// Whether its number is not confirmed as the writer's.
     pub unconfirmed: bool,
@@ -138,8 +138,8 @@ impl Sampled {
     }
 
     /// Returns whether an observation at `now` belongs to this view: while the writer is sampled,
-    /// and for the first one after that, since samples missing before it may have used shared
-    /// memory.
+    /// and for the first observation after that, because samples missing before it may have used
+    /// shared memory.
     pub fn takes(&mut self, now: ModelTime) -> bool {
         let takes = self.is_current(now) || !self.left;
         self.left |= !self.is_current(now);
@@ -195,13 +195,13 @@ impl Sampled {
         self.settle(self.next);
     }
 
-    /// Returns the time since which a sample is waited for; `None` if no sample is.
+    /// Returns the time when the wait for a sample began; `None` if no sample is awaited.
     #[must_use]
     pub fn unseen_since(&self) -> Option<ModelTime> {
         self.unseen().map(|_| self.last_settled.0)
     }
 
-    /// Returns the lowest number that is waited for; `None` if no sample is.
+    /// Returns the lowest awaited number; `None` if no sample is awaited.
     #[must_use]
     pub fn unseen(&self) -> Option<SequenceNumber> {
         let open = self.next.steps_since(self.settled);
@@ -235,9 +235,9 @@ impl Sampled {
         }
     }
 
-    /// Returns how long the writer may seem silent while it sends: the time of so many messages in
-    /// a row that polling would hardly miss them all. Until two messages are known, they are assumed
-    /// to come at intervals of `slowest`. Zero after [`Self::end`].
+    /// Returns how long the writer may seem silent while it sends: the time of as many messages in
+    /// a row as polling may plausibly miss. Until two messages are known, their interval is assumed
+    /// to be `slowest`. The result is zero after [`Self::end`].
     #[must_use]
     #[expect(
         clippy::cast_precision_loss,
@@ -276,7 +276,7 @@ impl Sampled {
         }
     }
 
-    /// Returns whether nothing more of this sample is waited for; `next` is the number after the
+    /// Returns whether this sample exists and is no longer awaited; `next` is the number after the
     /// newest.
     #[must_use]
     pub fn has(&self, number: SequenceNumber, next: SequenceNumber) -> bool {
@@ -455,8 +455,7 @@ impl Sampled {
         samples.saturating_sub(run.numbers.len() as u64)
     }
 
-    /// Marks a sample as seen. Returns whether nothing more of it is waited for, for the first
-    /// time.
+    /// Marks a sample as seen. Returns whether this ends the wait for the sample.
     fn sight(&mut self, number: SequenceNumber, seen: Completeness) -> bool {
         let bit = self.bit(number, self.next).unwrap_or(0);
         if self.sighted & bit != bit {
@@ -509,7 +508,7 @@ impl Sampled {
         samples
     }
 
-    /// Takes over numbers that were counted elsewhere.
+    /// Takes over the numbers that another view counted.
     fn follow(&mut self, next: SequenceNumber, now: ModelTime) {
         if self.next != next {
             self.settle_all();
@@ -517,7 +516,7 @@ impl Sampled {
         }
     }
 
-    /// Marks all numbers below `next` as seen or not needed.
+    /// Marks all numbers below `next` as seen or not awaited.
     const fn begin(&mut self, next: SequenceNumber, now: ModelTime) {
         (self.sighted, self.finished) = (u128::MAX, u128::MAX);
         (self.next, self.settled, self.last_settled) = (next, next, (now, next));

@@ -2,8 +2,8 @@
 //!
 //! Writers repeat fragments, so counting bytes is not enough; each sample has a bitmap. Payloads
 //! are not kept, and announced sizes are not trusted: the bitmap grows with the fragments that
-//! arrived, within a budget shared by all writers. [`crate::measure::sequence`] knows whether a finished
-//! sample was seen before; the caller checks there first.
+//! arrived, within a budget shared by all writers. The caller first checks in
+//! [`crate::measure::sequence`] whether a finished sample was seen before.
 
 use std::time::Duration;
 
@@ -13,7 +13,7 @@ use crate::facts::observation::{DataFrag, Sample};
 use crate::facts::tables::PartialSamples;
 use ros2probe_wire::{RtpsTime, SequenceNumber};
 
-/// Largest number of fragments per sample: 88 MB of Cyclone DDS, 4 GB of Fast DDS.
+/// Maximum number of fragments per sample: 88 MB with Cyclone DDS, 4 GB with Fast DDS.
 pub const MAX_FRAGMENTS: u32 = 65_536;
 
 /// Memory budget for the bitmaps of all writers, and its evictions.
@@ -23,11 +23,12 @@ pub struct Budget {
     pub bytes: usize,
     /// Number of unfinished samples.
     pub samples: usize,
-    /// Cap on the bytes.
+    /// Maximum of `bytes`.
     pub limit: usize,
     /// Number of samples dropped because of the cap.
     pub evictions: u64,
-    /// Number of fragments with contradictory numbers, or of samples with too many fragments.
+    /// Number of fragments that were rejected: contradictory numbers, or a sample with too many
+    /// fragments.
     pub rejected: u64,
 }
 
@@ -49,9 +50,9 @@ impl Budget {
 #[derive(Debug, Default)]
 pub struct Samples {
     partial: Bounded<PartialSamples, Vec<Partial>>,
-    /// Time from which samples have all fragments captured; earlier ones may lack some.
+    /// Samples that began before this time may lack fragments that were not captured.
     sure_from: ModelTime,
-    /// The last sample that began before that time.
+    /// The highest number of a sample that began before `sure_from`.
     last_uncertain: SequenceNumber,
 }
 
@@ -72,7 +73,7 @@ struct Partial {
 /// Facts about a complete sample.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct Facts {
-    /// INFO_TS; Cyclone DDS sends it only with the first fragment.
+    /// Timestamp of the INFO_TS, which Cyclone DDS sends only with the first fragment.
     pub source: RtpsTime,
     /// Stamp in the payload of the first fragment.
     pub stamp: Option<(i32, u32)>,
@@ -80,7 +81,8 @@ pub struct Facts {
     pub size: u32,
     /// Time of the first datagram of the first observation.
     pub began: ModelTime,
-    /// Nanoseconds from its last fragment number to its last missing fragment.
+    /// Nanoseconds from the arrival of the last fragment number to that of the last missing
+    /// fragment.
     pub repaired_after: i64,
 }
 
@@ -91,9 +93,9 @@ pub enum Progress {
     Partial,
     /// The fragment completed the sample.
     Complete(Facts),
-    /// All of it was seen before.
+    /// All fragments of this DATA_FRAG were seen before.
     Duplicate,
-    /// Its numbers are invalid, or the budget is exhausted.
+    /// The fragment numbers or sizes are invalid, or contradict earlier fragments.
     Rejected,
     /// The sample has more fragments than are tracked, so its completeness is unknown.
     TooMany,
@@ -166,7 +168,7 @@ impl Samples {
         self.place(number).is_some()
     }
 
-    /// Allows samples that begin before this to lack fragments that the kernel did not capture.
+    /// Allows samples that begin before `until` to lack fragments that the kernel did not capture.
     pub const fn allow_incomplete(&mut self, until: ModelTime) {
         self.sure_from = until;
     }
@@ -177,8 +179,8 @@ impl Samples {
         number <= self.last_uncertain && self.is_partial(number)
     }
 
-    /// Returns the oldest sample, from `first` on, that still receives fragments. It and later ones
-    /// are not decided yet.
+    /// Returns the lowest number, not below `first`, of a sample that still receives fragments.
+    /// That sample and later ones are not decided yet.
     #[must_use]
     pub fn growing(
         &self,
@@ -271,7 +273,8 @@ impl Samples {
         self.partial.len() - 1
     }
 
-    /// Drops the sample with the longest wait; the newcomer goes only if it is alone.
+    /// Drops the sample that has waited longest for a fragment. The newcomer is dropped only if it
+    /// is alone.
     fn evict(&mut self, newcomer: SequenceNumber, budget: &mut Budget) {
         let candidates = self.partial.iter().enumerate();
         let oldest = candidates.min_by_key(|(_, each)| (each.number == newcomer, each.latest));
@@ -320,7 +323,7 @@ mod tests {
     use crate::facts::observation::tests::{fragments, sample};
 
     #[test]
-    fn ranges_are_marked_as_their_numbers_one_by_one_are() {
+    fn marking_a_range_equals_marking_its_numbers_one_by_one() {
         for (start, end) in [
             (0, 1),
             (0, 64),
@@ -402,7 +405,7 @@ mod tests {
     }
 
     #[test]
-    fn a_claimed_size_allocates_nothing() {
+    fn a_claimed_sample_size_does_not_determine_the_allocation() {
         let (mut samples, mut budget) = (Samples::default(), budget());
         let hostile = fragment(1, 1, 1, u32::MAX);
         assert_eq!(
@@ -440,7 +443,7 @@ mod tests {
     }
 
     #[test]
-    fn a_storm_of_unfinished_samples_stays_in_the_budget() {
+    fn a_storm_of_unfinished_samples_stays_within_the_budget() {
         let (mut samples, mut budget) = (Samples::default(), budget());
         for number in 0..10_000 {
             let last = fragment(number, 65_000, 1, 65_000 * 1344);

@@ -1,11 +1,11 @@
 //! Sequence numbers of one writer: which samples arrived, and which never will.
 //!
-//! A gap is not a loss at once: it stays open for the settle window, so that reordering and
-//! retransmission can fill it. Numbers excused by a GAP, an ACKNACK or the start of observation are
-//! never lost. The firstSN of a HEARTBEAT excuses nothing: a missing sample that the writer no
-//! longer has is lost (RTPS 2.5, 8.4.10.4, `lost_changes_update`). Memory is two bitmaps that grow
-//! with the undecided numbers, up to [`MAX_WINDOW`]. The module sees no payloads and only the times
-//! that callers pass in.
+//! A gap does not count as a loss immediately: it stays open for the settle window, so that
+//! reordered or retransmitted samples can fill it. Numbers excused by a GAP, an ACKNACK or the
+//! start of observation are never lost. The firstSN of a HEARTBEAT excuses nothing: a missing
+//! sample that the writer no longer has is lost (RTPS 2.5, 8.4.10.4, `lost_changes_update`). Memory
+//! is two bitmaps that grow with the undecided numbers, up to [`MAX_WINDOW`]. The module reads
+//! neither payloads nor a clock; callers pass the times in.
 
 mod bitmap;
 mod runs;
@@ -24,20 +24,21 @@ use bitmap::Bitmap;
 pub use unconfirmed::Run;
 use unconfirmed::{CONFIRMATIONS, UnconfirmedRun};
 
-/// Initial number of undecided and recently decided numbers that are remembered.
+/// Initial size of the window: the undecided and recently decided numbers that are remembered.
 const MIN_WINDOW: u64 = 512;
-/// Largest such number: 8 KiB of bitmaps, or about 3000 messages per second over the reliable
-/// settle window.
+/// Maximum size of the window: 8 KiB of bitmaps, or about 3000 messages per second over the
+/// reliable settle window.
 pub const MAX_WINDOW: u64 = 32_768;
-/// A larger jump is a new incarnation or a forgery, not a million losses.
+/// Maximum jump within an incarnation. A larger one is a restart or a forgery, not a million
+/// losses.
 const MAX_JUMP: u64 = 1 << 20;
-/// HEARTBEAT and GAP may exceed the received numbers by at most this, even if two agree.
+/// Maximum distance by which a HEARTBEAT or GAP may exceed the received numbers, even if two agree.
 pub const FAR: u64 = 4096;
-/// A number further ahead is unconfirmed, as is a claim about it in a single HEARTBEAT or GAP.
+/// A number further ahead than this is unconfirmed, as is a single HEARTBEAT or GAP that claims it.
 pub const REACH: u64 = 64;
-/// A gap that fills within this time without a request was reordering. Retransmissions take longer
-/// even if their ACKNACK was not seen: readers wait 5 ms (Fast DDS) to 100 ms (Cyclone DDS) before
-/// they answer a HEARTBEAT.
+/// A gap that fills within this time without a request is attributed to reordering. Retransmissions
+/// take longer even if their ACKNACK was not seen: readers wait 5 ms (Fast DDS) to 100 ms (Cyclone
+/// DDS) before they answer a HEARTBEAT.
 const REORDERING: Duration = Duration::from_millis(5);
 /// A lower number with a source time later by this much begins a new incarnation of the writer.
 const INCARNATION: Duration = Duration::from_millis(100);
@@ -50,9 +51,9 @@ const STEPS: u32 = 16;
 /// State of one writer's sequence numbers.
 #[derive(Debug, Default)]
 pub struct Sequence {
-    /// The first number seen; earlier ones do not count. 0 before the first.
+    /// The first number seen, or 0 before that. Lower numbers do not count.
     first: SequenceNumber,
-    /// All numbers below are decided.
+    /// All numbers below it are decided.
     settled: SequenceNumber,
     /// One more than the highest number known to exist.
     next: SequenceNumber,
@@ -60,33 +61,33 @@ pub struct Sequence {
     available: SequenceNumber,
     /// An earlier value of `available`, and its time.
     withdrawn: Option<(ModelTime, SequenceNumber)>,
-    /// All readers that acknowledge have every number below, or will not get it.
+    /// All readers that send ACKNACKs have every number below it, or will not get it.
     acknowledged: SequenceNumber,
-    /// Every number below, as far as checked, has arrived or is not waited for.
+    /// Last result of [`Self::complete`]: every number below it has arrived or is not awaited.
     complete: SequenceNumber,
     /// Number of restarts.
     incarnation: u32,
     received: Bitmap,
     excused: Bitmap,
-    /// `next` at some times, oldest first.
+    /// Earlier values of `next` with their times, oldest first.
     checkpoints: Bounded<Checkpoints, VecDeque<(ModelTime, SequenceNumber)>>,
     gaps: Bounded<SequenceGaps, VecDeque<Gap>>,
     newest_source: Timestamp,
     /// The number with the newest source time.
     newest: SequenceNumber,
-    /// Consecutive samples after it with an older source time.
+    /// Number of consecutive samples after `newest` with an older source time.
     older: u8,
     stale: u32,
     /// Time of the last increase of `next`.
     last_advance: ModelTime,
-    /// Samples that continued this incarnation, counted up to a small number.
+    /// Number of samples that continued this incarnation, at most 255.
     followed: u8,
     unconfirmed: Option<Box<UnconfirmedRun>>,
     /// Number of runs, HEARTBEATs, GAPs and ACKNACKs that were unconfirmed.
     jumps: u64,
 }
 
-/// Whether a sample's number belongs to the writer's run.
+/// Relation of a sample's number to the writer's live run.
 #[derive(Debug)]
 pub enum RunMembership {
     /// The number belongs to the live run.
@@ -96,7 +97,7 @@ pub enum RunMembership {
         /// Whether no part of this sample was seen before.
         new: bool,
     },
-    /// The number confirms a run, which is live from here on, with its earlier samples.
+    /// The number confirms this run of earlier samples, which is now the live run.
     Confirmed(Run),
 }
 
@@ -116,7 +117,7 @@ pub enum Arrival {
     New {
         /// Whether it filled a gap by retransmission.
         recovered: bool,
-        /// Whether it is the newest so far; otherwise its delay includes a retransmission.
+        /// Whether it is the newest so far; otherwise its delay may include a retransmission.
         newest: bool,
     },
     /// Seen before, or too old to decide.
@@ -141,7 +142,8 @@ pub enum Settled {
     Lost(SequenceNumber),
     /// The writer excused the number.
     Irrelevant(SequenceNumber),
-    /// Lost numbers from the first to the last, beyond the capacity of the window.
+    /// Lost numbers from the first up to, but not including, the second: the window is too small
+    /// for them.
     LostRun(SequenceNumber, SequenceNumber),
 }
 
@@ -164,7 +166,7 @@ impl Sequence {
         self.last_advance
     }
 
-    /// Returns whether this sample was received whole before.
+    /// Returns whether this sample was received whole before, or is too old to be remembered.
     #[must_use]
     pub fn has(&self, number: SequenceNumber) -> bool {
         self.started() && (number < self.floor() || number < self.next && self.received.get(number))
@@ -209,7 +211,7 @@ impl Sequence {
         }
     }
 
-    /// Returns how often a number was unconfirmed.
+    /// Returns the number of runs, HEARTBEATs, GAPs and ACKNACKs that were unconfirmed.
     #[must_use]
     pub const fn jumps(&self) -> u64 {
         self.jumps
@@ -241,7 +243,7 @@ impl Sequence {
         }
     }
 
-    /// Begins to count at this number; does nothing after the beginning.
+    /// Begins to count at this number. Has no effect once counting has begun.
     pub fn begin(&mut self, number: SequenceNumber) {
         if !self.started() && number > SequenceNumber::ZERO && number < SequenceNumber::MAX {
             self.restart(number);
@@ -278,15 +280,15 @@ impl Sequence {
         gap.map(|gap| gap.noticed)
     }
 
-    /// Records that this number arrived elsewhere: here it is neither a loss nor a sample.
+    /// Records that this number arrived by another route: here it counts neither as lost nor as
+    /// received.
     pub fn know(&mut self, number: SequenceNumber) {
         if self.started() && number >= self.floor() && number < self.next {
             self.received.set(number);
         }
     }
 
-    /// Merges the numbers of the same writer that `other` received. The beginning of this one
-    /// applies.
+    /// Merges the numbers of the same writer that `other` received. `self` keeps its first number.
     pub fn absorb(&mut self, other: &Self, now: ModelTime, settled: &mut impl FnMut(Settled)) {
         if !self.started() || !other.started() {
             return;
@@ -311,7 +313,7 @@ impl Sequence {
         self.first
     }
 
-    /// Returns the number below which every sample has arrived or is not waited for: the writer
+    /// Returns the number below which every sample has arrived or is not awaited: the writer
     /// skipped or dropped it, readers acknowledged it, or it is settled.
     pub fn complete(&mut self) -> SequenceNumber {
         let decided = self.settled.max(self.available).max(self.floor());
@@ -329,7 +331,7 @@ impl Sequence {
         self.complete = self.complete.max(number.min(self.next));
     }
 
-    /// Returns the number below which the writer sends no sample again.
+    /// Returns the number below which the writer retransmits no sample.
     #[must_use]
     pub fn awaited(&self) -> SequenceNumber {
         self.available.max(self.acknowledged)
@@ -342,7 +344,7 @@ impl Sequence {
     }
 
     /// Decides numbers that have been open for `window`, and those that the writer withdrew `grace`
-    /// ago. Numbers from `hold` on stay open.
+    /// ago. The number `hold` and all higher ones stay open.
     pub fn advance(
         &mut self,
         now: ModelTime,
@@ -411,7 +413,8 @@ impl Sequence {
         };
     }
 
-    /// Raises `next` to `end`: `start..end` arrived, and the numbers before are a gap.
+    /// Raises `next` to `end`: `start..end` exists, and the numbers between `next` and `start` are
+    /// a gap.
     fn extend(
         &mut self,
         start: SequenceNumber,
@@ -430,7 +433,7 @@ impl Sequence {
         }
         let keep = end.saturating_sub(self.received.len());
         if keep > self.settled {
-            // The window cannot keep so many numbers open, so they are decided now.
+            // The window cannot hold so many open numbers, so the lowest are decided now.
             self.settle(keep.min(self.next), settled);
             if keep > self.settled {
                 settled(Settled::LostRun(self.settled, keep));

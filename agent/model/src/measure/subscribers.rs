@@ -5,9 +5,9 @@
 //! that lead to a participant feed one delivery. A route to an unknown receiver has its own
 //! delivery until the receiver is known.
 //!
-//! A multicast route to an unknown receiver may lead to any receiver (on a wire, to all). The rule
-//! there is not to invent losses. Unicast samples fill its gaps, and its samples are not missing at
-//! unicast deliveries. A sample that it already has opens no delivery when it arrives again by
+//! A multicast route to an unknown receiver may lead to any receiver (on a wire, to all). Its
+//! delivery must not invent losses. Unicast samples fill its gaps, and its samples are not missing
+//! at unicast deliveries. A sample that it already has opens no delivery when it arrives again by
 //! unicast.
 //!
 //! A sample directed (INFO_DST) at a participant concerns no other participant at the same socket.
@@ -39,9 +39,9 @@ use crate::measure::routes::Routes;
 use crate::measure::samples::Budget;
 use crate::measure::topic::{Topic, TopicId};
 
-/// Largest number of samples compared with a sibling at once.
+/// Maximum number of samples that one call compares with other deliveries.
 const LOOK_BACK: u64 = 4096;
-/// Largest UDP payload that fits one Ethernet frame over IPv4; larger datagrams need IP reassembly.
+/// Maximum UDP payload of one Ethernet frame over IPv4. Larger datagrams need IP reassembly.
 const ONE_FRAME: u16 = 1472;
 
 /// All receivers and destinations of one writer.
@@ -54,13 +54,13 @@ pub struct Subscribers {
     totals: Totals,
     departures: Departures,
     acknowledgements: Acknowledgements,
-    /// Whether its datagrams may need IP reassembly on this host.
+    /// Whether the writer's datagrams may need IP reassembly on this host.
     reassembled: bool,
     /// Whether some routes are observed at sockets.
     at_socket: bool,
     /// Whether any participant has a reader that matches the writer.
     has_readers: bool,
-    /// Losses in this second of a receiver that is gone; those of the worst.
+    /// Losses in this second of the worst receiver that is gone.
     departed: LossShare,
     /// Generation of the results in `routes`.
     generation: u64,
@@ -84,9 +84,9 @@ pub enum Novelty {
 pub struct DeliveryQuota {
     /// Number of deliveries.
     pub used: usize,
-    /// Cap.
+    /// Maximum number of deliveries.
     pub limit: usize,
-    /// Deliveries refused or dropped because of the cap.
+    /// Number of deliveries refused or dropped because of the cap.
     pub evictions: u64,
     /// Whether a delivery was refused.
     pub wanted: bool,
@@ -114,7 +114,7 @@ pub struct WriterContext<'a> {
 }
 
 impl Subscribers {
-    /// Creates an empty state for a writer that the kernel meters from `sure_from` on.
+    /// Creates an empty state for a writer that the kernel knows since `sure_from`.
     #[must_use]
     pub fn new(sure_from: ModelTime) -> Self {
         Self {
@@ -123,8 +123,8 @@ impl Subscribers {
         }
     }
 
-    /// Records that bytes for this destination were not captured: what is missing before `at` may
-    /// have arrived.
+    /// Records that bytes for this destination were not captured: samples missing before `at` may
+    /// have arrived. Returns whether a delivery is affected.
     pub fn missed(&mut self, destination: Destination, at: ModelTime) -> bool {
         let mut is_affected = false;
         for delivery in &mut self.deliveries {
@@ -216,8 +216,8 @@ impl Subscribers {
         }
     }
 
-    /// Returns the number below which all acknowledging readers have everything; `None` without
-    /// any.
+    /// Returns the number below which all acknowledging readers have every sample; `None` without
+    /// such readers.
     #[must_use]
     pub fn acknowledged_below(&self) -> Option<SequenceNumber> {
         self.acknowledgements.floor(|_| true)
@@ -305,7 +305,7 @@ impl Subscribers {
         false
     }
 
-    /// Returns the receiver on this route, and whether it reads the topic.
+    /// Returns the receiver on this route, and whether it has a matching reader.
     fn receiver(
         &mut self,
         index: usize,
@@ -318,7 +318,7 @@ impl Subscribers {
         let is_multicast = known.route.destination.is_multicast();
         if let Some(prefix) = directed.filter(|_| !is_multicast) {
             if known.route.socket != 0 && known.owner.is_some_and(|owner| owner != prefix) {
-                // The receiver ignores it.
+                // The owner ignores a message that is directed at another participant.
                 return None;
             }
             known.note_directed(prefix, readers);
@@ -427,8 +427,8 @@ impl Subscribers {
         }
     }
 
-    /// Fills the gaps of deliveries that may be the same receiver. Returns whether any of them
-    /// knows the sample.
+    /// Fills the gaps of deliveries that may have the same receiver. Returns whether any of these
+    /// deliveries knows the sample.
     fn repair(&mut self, sample: &Sample, context: &mut WriterContext<'_>) -> bool {
         let number = sample.sequence_number;
         let mut is_known = false;
@@ -457,7 +457,7 @@ impl Subscribers {
             })
     }
 
-    /// Shares the samples of deliveries that may be the same receiver.
+    /// Shares the samples of deliveries that may have the same receiver.
     fn share(&mut self, place: usize, next: SequenceNumber, whole: Option<SequenceNumber>) {
         let Some(delivery) = self.deliveries.get(place) else {
             return;

@@ -49,30 +49,30 @@ pub struct Topic {
     pub readers: Vec<Guid>,
     /// Writers and readers of its buffer topic.
     pub buffer_endpoints: Vec<Guid>,
-    /// Type of the endpoint that was announced last; kept when all endpoints are gone.
+    /// Type of the last announced endpoint. It is kept when all endpoints are gone.
     pub last_type: Option<TypeName>,
     /// Whether it is measured.
     pub watched: Watched,
-    /// Watchlist entries that cover it, with the state under each.
+    /// Indices of the watchlist entries that cover it, with the state of each.
     pub judgements: Vec<(usize, Judgement)>,
     /// Requests for its samples; `None` without any.
     pub requested: Option<RequestIds>,
     /// Counts of writers that are no longer measured.
     pub retired: Option<Box<Measurement>>,
-    /// Sums over the deliveries of these writers.
+    /// Sums over the deliveries of writers that are no longer measured.
     pub retired_totals: Option<Box<Totals>>,
-    /// What its worst subscriber lost.
+    /// Losses of its worst subscriber.
     pub loss: TopicLoss,
     /// Time at which a reader last appeared.
     pub reader_appeared: ModelTime,
-    /// Time at which its first reader appeared, since it last had none.
+    /// Time at which the number of its readers last rose from zero.
     pub subscribed: ModelTime,
-    /// Time since which it is both published and watched.
+    /// Time at which it became both published and watched.
     pub published: ModelTime,
     /// Time at which its last endpoint vanished.
     pub vanished: Option<ModelTime>,
-    /// Whether an observed process has a publisher or subscription of it, also without an
-    /// announced endpoint.
+    /// Whether an observed process has a publisher or subscription of it, even without an announced
+    /// endpoint.
     pub is_held: bool,
 }
 
@@ -85,20 +85,21 @@ pub struct Topics {
     index: BTreeMap<(DomainId, DdsName), TopicId>,
     /// Topics without endpoints, by the time at which the last one vanished.
     vanished: BTreeSet<(ModelTime, TopicId)>,
-    /// Topics among `vanished` that hold a measuring slot.
+    /// Topics among `vanished` that still count as measured.
     vanished_watched: BTreeSet<(ModelTime, TopicId)>,
     /// Measured topics that are not watched by exact name.
     yielding: BTreeSet<TopicId>,
     created: u64,
     watched: usize,
-    /// How often a watched or requested topic exceeded the cap.
+    /// Number of times that a watched or requested topic exceeded the cap.
     pub rejected: u64,
-    /// Vanished topics dropped before their grace period ended.
+    /// Number of vanished topics dropped before their grace period ended.
     pub evictions: u64,
 }
 
 impl Topic {
-    /// Returns a participant's readers of the topic, sorted within each kind of topic.
+    /// Returns a participant's readers of the topic and then those of its buffer topic, each
+    /// sorted.
     pub fn readers_of(&self, prefix: GuidPrefix) -> impl Iterator<Item = Guid> + '_ {
         let lists = [&self.readers, &self.buffer_endpoints].into_iter();
         let own = lists.flat_map(move |list| {
@@ -255,7 +256,7 @@ impl Topics {
         }
     }
 
-    /// Keeps a topic of an observed process, also without an endpoint. Returns it and whether it is
+    /// Keeps a topic of an observed process, even without an endpoint. Returns it and whether it is
     /// new; `None` if there are `cap` topics already.
     pub fn hold(
         &mut self,
@@ -307,9 +308,9 @@ impl Topics {
         }
     }
 
-    /// Applies the watchlist and the sample requests to one topic, within the cap. The last part of
-    /// the lists states whether a configured chain needs the topic. A topic that is watched by exact
-    /// name displaces the latest other one, which is returned.
+    /// Applies the watchlist and the sample requests to one topic, within the cap. `is_needed`
+    /// states whether a configured chain needs the topic. A topic that is watched by exact name
+    /// displaces the latest other one, which is returned.
     pub fn apply_lists(
         &mut self,
         id: TopicId,
@@ -439,7 +440,7 @@ impl Topics {
     }
 
     /// Frees the slot of the topic that vanished first. A topic watched by exact name keeps its
-    /// slot unless the newcomer is watched so, too. Returns whether a slot was freed.
+    /// slot unless the new topic is watched by exact name, too. Returns whether a slot was freed.
     fn give_up_vanished(&mut self, keep: TopicId, is_named: bool) -> bool {
         let places = || self.vanished_watched.iter().map(|(_, id)| *id);
         let unnamed = places().find(|id| *id != keep && self.yielding.contains(id));
@@ -452,8 +453,8 @@ impl Topics {
         true
     }
 
-    /// Frees the slot of the latest topic that is not watched by exact name, so that topics from
-    /// before a flood stay.
+    /// Frees the slot of the latest topic that is not watched by exact name, so that topics that
+    /// were known before a flood stay.
     fn displace(&mut self) -> Option<TopicId> {
         let id = self.yielding.pop_last()?;
         let topic = self.topics.get_mut(&id)?;

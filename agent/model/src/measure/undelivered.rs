@@ -1,10 +1,9 @@
-//! Arrivals that never reached the reader, because the socket's buffer was full.
+//! Datagrams that arrived but never reached the reader, because the socket's buffer was full.
 //!
 //! The host hook reports a datagram when it reaches a socket, and shortly afterwards the kernel may
-//! report that the socket's buffer was full. The second report arrives here first and is
-//! subtracted, once, from the arrival that it names: a retransmission of the same fragments is
-//! another arrival. An arrival may cover several datagrams; only drops between its first and last
-//! are subtracted.
+//! report that the socket's buffer was full. The second report is processed first and is subtracted
+//! once from the arrival that it names: a retransmission of the same fragments is another arrival.
+//! An arrival may cover several datagrams; only drops between its first and last are subtracted.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -15,12 +14,12 @@ use crate::facts::observation::{Content, DataFrag, Head, Sample};
 use crate::facts::tables::UndeliveredParts;
 use ros2probe_wire::SequenceNumber;
 
-/// Largest difference between the clock conversions of the two reports.
+/// Maximum difference between the clock conversions of the two reports.
 const SLACK: Duration = Duration::from_micros(100);
-/// Arrivals follow within this time, or their record was lost.
+/// An arrival follows its drop within this time, or the record of the arrival was lost.
 const LIFETIME: Duration = Duration::from_secs(60);
 
-/// Drops that wait for their arrival at one receiver.
+/// Drops at one receiver that wait for the report of their arrival.
 #[derive(Debug, Default)]
 pub struct Undelivered {
     waiting: Bounded<UndeliveredParts, VecDeque<UndeliveredPart>>,
@@ -30,7 +29,7 @@ pub struct Undelivered {
 struct UndeliveredPart {
     socket: u64,
     number: SequenceNumber,
-    /// Fragments from `start` to before `end`; 0 and 1 for an unfragmented sample.
+    /// Fragments `start..end`; `0..1` for an unfragmented sample.
     start: u32,
     end: u32,
     first: ModelTime,
@@ -69,7 +68,8 @@ impl Undelivered {
         evicted.is_some()
     }
 
-    /// Returns the delivered parts of an arrival, in order. Adds evicted entries to `evictions`.
+    /// Returns the delivered parts of an arrival, in order. Adds the number of evicted entries to
+    /// `evictions`.
     pub fn delivered(&mut self, sample: &Sample, evictions: &mut u64) -> Vec<Sample> {
         let mut parts = vec![range(sample)];
         let (begin, end) = span(&sample.head);
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn undelivered_samples_are_subtracted_once_from_their_run() {
+    fn dropped_fragments_are_subtracted_once_from_their_arrival() {
         let mut undelivered = Undelivered::default();
         note(&mut undelivered, &fragments(3, 1, 12 * MILLISECOND, 0));
         note(&mut undelivered, &fragments(4, 1, 13 * MILLISECOND, 0));
@@ -217,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn a_retransmission_is_not_taken_for_the_arrival_that_got_lost_on_its_way_here() {
+    fn a_retransmission_is_not_mistaken_for_an_arrival_whose_record_was_lost() {
         let mut undelivered = Undelivered::default();
         note(&mut undelivered, &fragments(3, 1, 12 * MILLISECOND, 0));
         let later = fragments(3, 1, 40 * MILLISECOND, 0);
@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_may_end_within_undelivered_samples() {
+    fn an_arrival_may_end_within_a_run_of_dropped_fragments() {
         let mut undelivered = Undelivered::default();
         for fragment in 4..8 {
             let time = u64::from(10 + fragment) * MILLISECOND;
@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn a_whole_sample_for_which_there_was_no_room_did_not_arrive() {
+    fn an_unfragmented_sample_dropped_at_a_full_buffer_does_not_arrive() {
         let mut undelivered = Undelivered::default();
         let data = Record {
             kind: kind::DATA,
@@ -278,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn arrivals_that_take_out_the_middle_of_what_had_no_room_stay_bounded() {
+    fn arrivals_that_split_a_run_of_dropped_fragments_stay_bounded() {
         let mut undelivered = Undelivered::default();
         let mut evictions = 0;
         let time = 20 * MILLISECOND;

@@ -1,8 +1,8 @@
 //! Measurement of one writer: samples, bytes, losses, intervals, latencies.
 //!
-//! Its input is observations of any source. A sample counts once, at the one that completes it. An
-//! idle writer needs less than 2 KiB; bitmaps, which grow with traffic, are bounded in
-//! [`crate::measure::sequence`] and [`crate::measure::samples`].
+//! Its input is observations from any source. A sample counts once, with the observation that
+//! completes it. An idle writer needs less than 2 KiB; bitmaps, which grow with traffic, are
+//! bounded in [`crate::measure::sequence`] and [`crate::measure::samples`].
 
 mod latency;
 mod sampled_view;
@@ -81,7 +81,8 @@ pub struct Counted {
     pub began: ModelTime,
     /// Whether it was sampled, so that others may have been missed.
     pub sampled: bool,
-    /// Whether its number is not confirmed as the writer's; it then has no place in an order.
+    /// Whether its number is not confirmed as the writer's; the message then has no order among
+    /// others.
     pub unconfirmed: bool,
 }
 
@@ -143,8 +144,8 @@ impl Writer {
         self.traits = traits;
     }
 
-    /// Begins the figures per second at `now`, when the kernel captures all samples of the writer.
-    /// What was counted before stays in the totals.
+    /// Begins the counts per second at `now`, when the kernel begins to capture all samples of the
+    /// writer. Earlier counts stay in the totals.
     pub fn begin_window(&mut self, now: ModelTime) {
         let tally = &mut self.tally;
         tally.earlier = EarlierCounts {
@@ -165,7 +166,7 @@ impl Writer {
         self.reception.allow_incomplete(until);
     }
 
-    /// Sets the GUID by which the writer is announced.
+    /// Sets the announced GUID of the writer.
     pub const fn rename(&mut self, guid: Guid) {
         self.guid = guid;
     }
@@ -207,7 +208,8 @@ impl Writer {
         }
     }
 
-    /// Returns whether this ACKNACK acknowledges samples that are not known to exist.
+    /// Returns whether this ACKNACK is refused because it acknowledges numbers far above the known
+    /// ones.
     pub const fn refuses(&mut self, acknack: &AckNack) -> bool {
         let sequence = self.reception.sequence_mut();
         sequence.refuses(acknack.base())
@@ -219,7 +221,7 @@ impl Writer {
         self.tally.messages
     }
 
-    /// Returns the samples that did not reach this host among all.
+    /// Returns the number of samples that did not reach this host, and of all expected samples.
     #[must_use]
     pub const fn share(&self) -> LossShare {
         LossShare {
@@ -234,8 +236,8 @@ impl Writer {
         self.last_message
     }
 
-    /// Returns how long the writer may seem silent while it sends, as polling misses messages. Its
-    /// intervals are at most `slowest`, unless they are known.
+    /// Returns how long the writer may seem silent while it sends, because polling misses messages.
+    /// `slowest` is the assumed interval of its messages if it is not known.
     #[must_use]
     pub fn seeming_silence(&self, slowest: Duration) -> Duration {
         let sampled = self.sampled.as_ref();
@@ -261,8 +263,8 @@ impl Writer {
     }
 
     /// Processes an observation of this writer and returns the message that it completed. `opened`
-    /// is the time at which this host last gained a view of its samples: those missing before it
-    /// went elsewhere.
+    /// is the time at which this host last began to see its samples; samples missing before that
+    /// are excused.
     pub fn observe(
         &mut self,
         observation: &Observation,
@@ -281,7 +283,7 @@ impl Writer {
             return self.catch_up(sample, context);
         }
         if is_sampled && self.is_exact(at) {
-            // The sample has been seen already, or will be.
+            // The uprobe has reported the sample already, or will report it.
             return None;
         }
         let takes = self
@@ -295,7 +297,7 @@ impl Writer {
             let counted = self.sampled_observation(observation, is_sampled, context);
             self.leave_unseen(context.journal);
             if let Some(sampled) = self.sampled.as_mut().filter(|_| is_exact) {
-                // From here on every message is seen.
+                // From now on, the uprobe sees every message.
                 sampled.end();
             }
             return counted;
@@ -340,13 +342,14 @@ impl Writer {
         self.reception.sequence_mut().acknowledged(base);
     }
 
-    /// Returns how far its samples are decided. `acknowledged` states whether readers acknowledge.
+    /// Returns which samples are decided. `acknowledged` states whether readers send ACKNACKs.
     pub fn progress(&mut self, acknowledged: bool, now: ModelTime) -> Progress {
         let waits = self.traits.reliable && acknowledged;
         let is_sampled = self.is_sampled(now);
         let reliable = self.traits.reliable && !is_sampled;
-        // While a sample is waited for in shared memory, its retransmission may pass there, too.
-        // After the sampled view ended, samples of any writer may arrive after later ones.
+        // While the view waits for a sample in shared memory, the retransmission may use shared
+        // memory, too. After the sampled view ended, samples of any writer may arrive after later
+        // ones.
         let unseen = self.sampled.as_ref().and_then(|sampled| sampled.unseen());
         let unseen = unseen.filter(|_| waits || !is_sampled);
         let unseen = unseen.unwrap_or(SequenceNumber(u64::MAX));
@@ -370,13 +373,14 @@ impl Writer {
         self.reception.sequence_mut().skip(number);
     }
 
-    /// Returns the time since which a sent but unseen sample is waited for.
+    /// Returns the time when the wait for a sent but unseen sample began, if there is such a
+    /// sample.
     #[must_use]
     pub fn unseen_since(&self) -> Option<ModelTime> {
         self.sampled.as_ref()?.unseen_since()
     }
 
-    /// Settles samples whose waiting time is over.
+    /// Settles the samples for which the settle window is over.
     pub fn advance(&mut self, context: &mut MeasurementContext<'_>) {
         if let Some(sampled) = &mut self.sampled {
             sampled.tick(context.now);
@@ -584,7 +588,8 @@ impl Settling<'_> {
     }
 }
 
-/// Returns how far the numbers of an observation may be ahead; polling shared memory misses more.
+/// Returns how far ahead the numbers of an observation may be. Polling shared memory misses more
+/// numbers.
 fn reach(head: &Head) -> u64 {
     if head.is_polled() { FAR } else { REACH }
 }

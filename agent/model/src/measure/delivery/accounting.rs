@@ -20,13 +20,13 @@ use crate::measure::reception::Decision;
 /// Sums over all deliveries of a writer.
 #[derive(Clone, Debug, Default)]
 pub struct Totals {
-    /// Samples at receivers.
+    /// Samples that arrived at receivers.
     pub received: Delivered,
     /// Samples that left this host.
     pub sent: Delivered,
     /// Time spent in each stage.
     pub breakdown: Option<Box<Breakdown>>,
-    /// Whether anything arrived, and whether anything left.
+    /// Whether samples arrived, and whether samples left.
     pub seen: [bool; 2],
 }
 
@@ -39,7 +39,7 @@ impl Totals {
         }
     }
 
-    /// Adds all of `other`.
+    /// Adds all counts of `other`.
     pub fn add(&mut self, other: &Self) {
         self.received.add(&other.received);
         self.sent.add(&other.sent);
@@ -64,7 +64,7 @@ pub(super) struct Accounting<'a> {
     pub(super) receiver: Receiver,
     pub(super) main: Route,
     pub(super) at: ModelTime,
-    /// Time until which a new loss stays pending.
+    /// End of the time for which a new loss stays pending.
     pub(super) until: Option<ModelTime>,
 }
 

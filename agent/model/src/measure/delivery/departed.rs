@@ -11,8 +11,8 @@ use crate::facts::model_time::ModelTime;
 
 impl Delivery {
     /// Records that samples up to `newest` have left for this receiver; `left_by` returns the
-    /// highest number that had left at a time. Samples that do not arrive are lost if the receiver
-    /// was `alive` afterwards.
+    /// highest number that had left by a given time. Samples that do not arrive are lost if the
+    /// receiver was `alive` afterwards.
     pub fn expect(
         &mut self,
         newest: SequenceNumber,
@@ -45,8 +45,8 @@ impl Delivery {
         }
     }
 
-    /// Excuses samples that were written before the receiver's reader appeared. `next` and the time
-    /// of its last rise are the values from before the current observation.
+    /// Excuses samples that were written before the receiver's reader appeared. `next` and
+    /// `advanced` describe the sequence before the current observation.
     pub(super) fn excuse_unheard(&mut self, (next, advanced): (SequenceNumber, ModelTime)) {
         let sequence = self.reception.sequence_mut();
         if next > SequenceNumber::ZERO && advanced < self.opened && sequence.next() > next {

@@ -1,4 +1,4 @@
-//! What a delivery expected and lost, in total and in the last seconds.
+//! Expected and lost samples of a delivery, in total and in the last seconds.
 
 use super::Delivered;
 use super::Delivery;
@@ -6,7 +6,7 @@ use crate::facts::loss_share::{LossShare, RecentLoss};
 use crate::facts::route::Direction;
 
 impl Delivery {
-    /// Returns the counts, with the samples that are neither delivered nor lost at present.
+    /// Returns the counts, including the samples that are neither delivered nor lost yet.
     #[must_use]
     pub fn facts(&self) -> Delivered {
         let awaited = match self.direction() {
@@ -25,12 +25,12 @@ impl Delivery {
         &self.recent
     }
 
-    /// Ends a second of the losses.
+    /// Ends one second of the recent losses.
     pub fn end_second(&mut self) {
         self.recent.end_second(self.share());
     }
 
-    /// Returns the losses since the last second ended.
+    /// Returns the losses since the end of the last second.
     #[must_use]
     pub fn last_share(&self) -> LossShare {
         self.recent.since(self.share())

@@ -1,4 +1,4 @@
-//! Counts that are kept back until the participant that receives is known.
+//! Counts that are withheld until the receiving participant is known.
 
 use super::Delivery;
 use super::Totals;
@@ -6,18 +6,18 @@ use crate::facts::journal::Journal;
 use crate::measure::samples::Budget;
 
 impl Delivery {
-    /// Keeps all counts back until [`Self::publish`] or [`Self::discard`].
+    /// Withholds all counts until [`Self::publish`] or [`Self::discard`].
     pub fn withhold(&mut self) {
         self.withheld.get_or_insert_default();
     }
 
-    /// Returns whether its counts are kept back.
+    /// Returns whether the counts are withheld.
     #[must_use]
     pub const fn is_withheld(&self) -> bool {
         self.withheld.is_some()
     }
 
-    /// Adds the counts that were kept back to those of the writer.
+    /// Adds the withheld counts to the totals of the writer.
     pub fn publish(&mut self, journal: &mut Journal, totals: &mut Totals) {
         let Some(losses) = self.withheld.take() else {
             return;
@@ -28,7 +28,7 @@ impl Delivery {
         }
     }
 
-    /// Ends a delivery that was kept back: its samples reached a process without a reader.
+    /// Ends a withheld delivery: its samples reached a process without a reader.
     pub fn discard(&mut self, budget: &mut Budget, totals: &mut Totals) {
         totals.received.unmatched += self.tally.messages;
         self.reception.discard(budget);

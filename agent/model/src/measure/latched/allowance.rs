@@ -1,18 +1,18 @@
-//! How many bytes may be captured for messages that no client requests yet.
+//! Token bucket for the bytes of messages that are captured before any client requests them.
 
 use ros2probe_wire::time::SECOND;
 
 use crate::facts::model_time::ModelTime;
-/// Counts for a datagram besides its payload, so that small ones are not free.
+/// Bytes charged per datagram in addition to its payload, so that small datagrams are not free.
 const OVERHEAD: usize = 64;
 
-/// Bytes that may be captured: at once as many as `most`, and in the long run `rate` a second.
+/// Bytes that may be captured: a burst of at most `most`, and `rate` per second on average.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Allowance {
     most: u64,
     rate: u64,
     left: u64,
-    /// Time for which the rate is included in `left`.
+    /// Time of the last refill of `left`.
     at: ModelTime,
 }
 
@@ -27,10 +27,10 @@ impl Allowance {
         }
     }
 
-    /// Returns what is left at `now`.
+    /// Returns the bytes that are left at `now`.
     pub(super) fn left(&mut self, now: ModelTime) -> u64 {
         let elapsed = now - self.at;
-        // A remainder below one byte waits for the next call.
+        // An amount below one byte waits for the next call.
         let elapsed = u64::try_from(elapsed.as_nanos()).unwrap_or(u64::MAX);
         let more = u128::from(elapsed) * u128::from(self.rate) / u128::from(SECOND);
         if more > 0 {
@@ -41,7 +41,7 @@ impl Allowance {
         self.left
     }
 
-    /// Takes a datagram with this payload. Returns whether the allowance covers it.
+    /// Charges a datagram with this many bytes of payload. Returns whether the allowance covers it.
     pub(super) fn spend(&mut self, payload: usize, now: ModelTime) -> bool {
         let cost = u64::try_from(payload.saturating_add(OVERHEAD)).unwrap_or(u64::MAX);
         let left = self.left(now).checked_sub(cost);
@@ -49,7 +49,7 @@ impl Allowance {
         left.is_some()
     }
 
-    /// Takes all that is left.
+    /// Takes all bytes that are left.
     pub(super) const fn exhaust(&mut self) {
         self.left = 0;
     }
@@ -60,13 +60,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_burst_is_covered_and_then_the_rate() {
+    fn an_allowance_covers_a_burst_and_then_its_rate() {
         let mut allowance = Allowance::new(1_000, 100);
         let seconds = |seconds: u64| ModelTime::from_nanoseconds((1_000 + seconds) * SECOND);
         assert!((0..5).all(|_| allowance.spend(136, seconds(0))));
         assert!(!allowance.spend(136, seconds(0)));
         assert_eq!(allowance.left(seconds(3)), 300);
-        // Time does not go back.
+        // An earlier time changes nothing.
         assert_eq!(allowance.left(seconds(1)), 300);
         assert_eq!(allowance.left(seconds(3)), 300);
         assert_eq!(allowance.left(seconds(900)), 1_000);

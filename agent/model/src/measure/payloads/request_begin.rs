@@ -1,4 +1,4 @@
-//! Where the samples of one writer begin for one request.
+//! Start of the samples of one writer for one request.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use ros2probe_wire::SequenceNumber;
 use crate::facts::dispatch::MissedReason;
 use crate::facts::model_time::ModelTime;
 
-/// Longest time until samples that polling missed are reported: they may arrive from another view.
+/// Maximum time until samples that polling missed are reported: they may arrive from another view.
 const UNSEEN_DELAY: Duration = Duration::from_millis(400);
 
 /// A request for the samples of one writer.
@@ -15,7 +15,7 @@ const UNSEEN_DELAY: Duration = Duration::from_millis(400);
 pub(super) struct RequestBegin {
     /// Id of the request.
     pub(super) id: u64,
-    /// The next number when the request began.
+    /// The next number of the writer when the request began.
     number: SequenceNumber,
     since: ModelTime,
     /// The lowest number that arrived for it.
@@ -51,9 +51,9 @@ impl RequestBegin {
     /// Returns the first number that the request can miss for this reason; `None` if it can miss no
     /// sample yet.
     ///
-    /// Polling shared memory notices numbers late, perhaps after the request for samples that were
-    /// sent before it. So numbers that polling missed count from the first sample on, or if none
-    /// arrives, once one should have.
+    /// Polling shared memory notices numbers late, perhaps those of samples that were sent before
+    /// the request. Numbers that polling missed therefore count from the first sample that arrives.
+    /// If none arrives in time, they count from the start of the request.
     pub(super) fn misses_from(
         &self,
         reason: MissedReason,

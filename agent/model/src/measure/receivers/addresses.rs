@@ -1,7 +1,7 @@
 //! Addresses that participants announce.
 //!
 //! Two bounds apply, because a forger may announce a new address each time: one per participant and
-//! one in total. The addresses announced last are kept.
+//! one in total. The most recently announced addresses are kept.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -17,9 +17,9 @@ use crate::facts::tables::Addresses;
 #[derive(Debug)]
 pub(super) struct AnnouncedAddresses {
     announcers: Bounded<Counted<Addresses>, HashMap<Destination, Announcer>>,
-    /// Addresses by the age of the announcement.
+    /// Addresses in the order of their announcements.
     ages: Bounded<Counted<Addresses>, BTreeMap<u64, Destination>>,
-    /// The same ages, by participant.
+    /// The same order, per participant.
     own: Bounded<Counted<Addresses>, BTreeSet<(GuidPrefix, u64)>>,
     age: u64,
     each: usize,
@@ -29,7 +29,7 @@ pub(super) struct AnnouncedAddresses {
 struct Announcer {
     prefix: GuidPrefix,
     previous: Option<GuidPrefix>,
-    /// Whether two participants announce the address in turn.
+    /// Whether two participants announce the address alternately.
     contested: bool,
     age: u64,
 }
@@ -96,13 +96,14 @@ impl AnnouncedAddresses {
             .retain(|_, destination| announcers.contains_key(destination));
     }
 
-    /// Returns the participant that alone announces this address; `None` if none or several do.
+    /// Returns the last participant that announced this address, unless two announce it
+    /// alternately.
     pub(super) fn owner(&self, destination: &Destination) -> Option<GuidPrefix> {
         let announcer = self.announcers.get(destination)?;
         (!announcer.contested).then_some(announcer.prefix)
     }
 
-    /// Returns the row of the metrics.
+    /// Returns the size, limit and evictions of the table.
     pub(super) fn table(&self) -> TableFacts {
         self.announcers.facts()
     }
@@ -139,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn a_participant_whose_address_is_another_each_time_pushes_out_its_own_alone() {
+    fn a_participant_with_ever_new_addresses_displaces_only_its_own() {
         let mut addresses = AnnouncedAddresses::new(100, 16);
         addresses.put(BOB, at(7411));
         (8000..9000).for_each(|port| assert!(addresses.put(ALICE, at(port))));
@@ -151,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn of_all_participants_together_the_oldest_address_goes_first() {
+    fn a_full_table_drops_the_oldest_address_of_all_participants() {
         let mut addresses = AnnouncedAddresses::new(4, 2);
         for number in 0..100 {
             let prefix = GuidPrefix([number; 12]);
@@ -166,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn an_address_that_two_participants_announce_in_turn_has_no_owner() {
+    fn an_address_that_two_participants_announce_alternately_has_no_owner() {
         let mut addresses = AnnouncedAddresses::new(4, 2);
         addresses.put(ALICE, at(1));
         assert!(addresses.put(BOB, at(1)));

@@ -1,7 +1,7 @@
-//! The readers for which a writer's samples are, as far as discovery knows them.
+//! The readers that match a writer, as far as discovery knows.
 //!
-//! A process that shares a multicast group or a port with a reader receives the samples, too. Only
-//! a reader that matches the writer makes it a subscriber.
+//! A process that shares a multicast group or a port with a reader receives the samples, too. It
+//! counts as a subscriber only if it has a reader that matches the writer.
 
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::{Guid, GuidPrefix};
@@ -12,9 +12,10 @@ use crate::facts::model_time::ModelTime;
 use crate::graph::discovery::Endpoint;
 use crate::measure::topic::Topic;
 
-/// Largest effort of one comparison; longer lists of partitions count as a match.
+/// Maximum effort of one comparison. Endpoints whose lists of partitions exceed it count as a
+/// match.
 const EFFORT: usize = 4096;
-/// Largest number of readers that are compared in the search for any match.
+/// Maximum number of readers that the search for any match compares.
 const COMPARED: usize = 64;
 
 /// The readers of one writer's topic.
@@ -28,9 +29,9 @@ pub struct MatchedReaders<'a> {
 /// Whether a receiver has a reader that matches the writer.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Matched {
-    /// The receiver has such a reader.
+    /// The receiver has a matching reader.
     Yes,
-    /// No such reader of the receiver is known.
+    /// No matching reader of the receiver is known.
     No,
     /// The receiver is not known.
     Unknown,
@@ -59,7 +60,8 @@ impl<'a> MatchedReaders<'a> {
         self.topic
     }
 
-    /// Returns this participant's readers that match the writer, sorted within each kind of topic.
+    /// Returns this participant's readers that match the writer, sorted within the topic and its
+    /// buffer topic.
     pub fn of(self, prefix: GuidPrefix) -> impl Iterator<Item = Guid> + 'a {
         let readers = self.topic.into_iter();
         readers

@@ -46,7 +46,7 @@ impl View {
 }
 
 #[test]
-fn unseen_messages_were_sent_and_are_no_loss() {
+fn unseen_messages_count_as_sent_and_not_as_lost() {
     let mut view = View::new();
     for number in [1, 2, 5, 6, 100] {
         view.see(number);
@@ -56,7 +56,7 @@ fn unseen_messages_were_sent_and_are_no_loss() {
 }
 
 #[test]
-fn a_sample_is_seen_once_in_however_many_fragments_and_copies() {
+fn a_sample_counts_once_despite_fragments_and_copies() {
     let mut view = View::new();
     let parts = [
         Completeness::Partial,
@@ -86,7 +86,7 @@ fn a_sample_is_seen_once_in_however_many_fragments_and_copies() {
 }
 
 #[test]
-fn a_sample_needs_its_later_fragments_although_its_number_is_known() {
+fn a_sample_with_a_known_number_still_waits_for_its_later_fragments() {
     let mut view = View::new();
     view.see(1);
     let has = |view: &View, number| view.sampled.has(number, view.sequence.next());
@@ -117,7 +117,7 @@ fn a_sample_needs_its_later_fragments_although_its_number_is_known() {
 }
 
 #[test]
-fn an_interval_is_that_between_neighbours_that_both_were_seen() {
+fn an_interval_is_measured_only_between_two_seen_neighbours() {
     let mut view = View::new();
     assert_eq!(view.see(1).interval, None);
     assert_eq!(view.see(2).interval, Some(10_000_000));
@@ -126,7 +126,7 @@ fn an_interval_is_that_between_neighbours_that_both_were_seen() {
 }
 
 #[test]
-fn a_heartbeat_shows_lost_last_samples_and_a_gap_those_never_written() {
+fn a_heartbeat_reveals_unseen_samples_and_a_gap_those_never_sent() {
     let mut view = View::new();
     let now = ModelTime::from_nanoseconds(view.now);
     assert_eq!(
@@ -170,7 +170,7 @@ fn a_heartbeat_shows_lost_last_samples_and_a_gap_those_never_written() {
 }
 
 #[test]
-fn a_writer_that_begins_anew_under_its_old_name_counts_from_there() {
+fn a_writer_that_restarts_under_its_guid_counts_from_its_new_numbers() {
     let mut view = View::new();
     view.see(1);
     view.see(1000);
@@ -181,7 +181,7 @@ fn a_writer_that_begins_anew_under_its_old_name_counts_from_there() {
 }
 
 #[test]
-fn a_sample_announced_by_a_heartbeat_and_seen_late_is_no_restart() {
+fn a_late_sample_that_a_heartbeat_announced_is_not_a_restart() {
     let mut view = View::new();
     view.see(1);
     let now = ModelTime::from_nanoseconds(view.now);
@@ -202,7 +202,7 @@ fn a_sample_announced_by_a_heartbeat_and_seen_late_is_no_restart() {
 }
 
 #[test]
-fn an_unseen_message_is_left_out_once_after_the_wait() {
+fn an_unseen_message_is_reported_once_after_the_arrival_timeout() {
     let mut view = View::new();
     let settle = |view: &mut View| {
         view.now += nanoseconds(ARRIVAL_TIMEOUT);
@@ -242,7 +242,7 @@ fn an_unseen_message_is_left_out_once_after_the_wait() {
 }
 
 #[test]
-fn a_message_counted_from_another_source_is_not_left_out() {
+fn a_message_counted_from_another_source_is_not_reported_as_unseen() {
     let mut view = View::new();
     view.see(1);
     view.see(3);
@@ -262,7 +262,7 @@ fn a_message_counted_from_another_source_is_not_left_out() {
 }
 
 #[test]
-fn a_jump_beyond_all_windows_is_bounded_work_and_no_loss() {
+fn a_jump_beyond_all_windows_causes_bounded_work_and_no_loss() {
     let mut view = View::new();
     for number in 1..=6 {
         view.see(number);
@@ -281,7 +281,7 @@ fn a_jump_beyond_all_windows_is_bounded_work_and_no_loss() {
 }
 
 #[test]
-fn a_forged_number_far_ahead_counts_as_one_message_and_ends_no_other() {
+fn a_forged_number_far_ahead_counts_as_one_message_and_affects_no_other() {
     let mut view = View::new();
     for number in 1..=5 {
         view.see(number);
@@ -316,7 +316,7 @@ fn a_writer_is_sampled_until_shared_memory_is_silent() {
 }
 
 #[test]
-fn the_stamp_of_a_first_fragment_is_that_of_the_sample() {
+fn the_stamp_of_the_first_fragment_applies_to_the_whole_sample() {
     let mut sampled = Sampled::new(ModelTime::from_nanoseconds(SECOND));
     assert_eq!(sampled.stamp(SequenceNumber(1), Some((5, 6))), Some((5, 6)));
     assert_eq!(sampled.stamp(SequenceNumber(1), None), Some((5, 6)));
@@ -329,7 +329,8 @@ fn runs(runs: &[(u64, u64)]) -> Vec<(SequenceNumber, SequenceNumber)> {
     runs.iter().map(numbered).collect()
 }
 
-/// Messages in a row that polling may have missed after these numbers were seen.
+/// Returns the number of messages in a row that polling may have missed after these numbers were
+/// seen.
 fn possibly_missed(seen: impl Iterator<Item = u64>) -> u64 {
     let mut view = View::new();
     seen.for_each(|number| {
@@ -340,16 +341,16 @@ fn possibly_missed(seen: impl Iterator<Item = u64>) -> u64 {
 }
 
 #[test]
-fn messages_that_hide_one_after_the_other_explain_a_longer_silence() {
+fn consecutive_missed_messages_explain_a_longer_silence() {
     assert_eq!(possibly_missed(std::iter::empty()), 131);
     assert!((80..100).contains(&possibly_missed(1..=100)));
-    // Every other one, which never misses two in a row, and half of them at random.
+    // Every other message is missed, never two in a row; then half of them at random.
     assert!((4..8).contains(&possibly_missed((1..=100).step_by(2))));
     let at_random = (1..=400_u64).filter(|number| (number * number).count_ones() % 2 == 0);
     assert!((15..30).contains(&possibly_missed(at_random)));
-    // As many are missed, all in one row.
+    // Half of the messages are missed, all in a row.
     assert!(possibly_missed((1..=50).chain(100..=101)) > 400);
-    // A busy machine does not poll for seconds.
+    // A busy machine may not poll for seconds.
     let mut view = View::new();
     view.see(1);
     let short = view.sampled.seeming_silence(Duration::from_millis(1));

@@ -1,4 +1,4 @@
-//! A bitmap by sequence number.
+//! Bitmap that is addressed by sequence number.
 
 use ros2probe_wire::SequenceNumber;
 
@@ -32,7 +32,7 @@ impl Bitmap {
         self.words.get(word).is_some_and(|word| word & mask != 0)
     }
 
-    /// Returns the word with this number's bit, which is the bit `number % 64`.
+    /// Returns the word that holds the bit of this number, at bit position `number % 64`.
     pub(super) fn word(&self, number: SequenceNumber) -> u64 {
         let (word, _) = self.place(number);
         self.words.get(word).copied().unwrap_or(u64::MAX)
@@ -53,7 +53,7 @@ impl Bitmap {
         self.each_word(start, end, |word, mask| *word &= !mask);
     }
 
-    /// Changes whole words, since each HEARTBEAT may excuse thousands of numbers.
+    /// Changes whole words, because one ACKNACK or GAP may excuse thousands of numbers.
     fn each_word(
         &mut self,
         start: SequenceNumber,

@@ -1,4 +1,4 @@
-//! The writer's run of numbers: the live one, or another that further datagrams confirm.
+//! Runs of a writer's numbers: the live run, and one that further datagrams have to confirm.
 
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
@@ -74,7 +74,7 @@ impl Sequence {
         let continues =
             || unconfirmed.is_some_and(|unconfirmed| unconfirmed.is_continued(number, self.next));
         // The first samples may have been forged as well, so a lower number far away is
-        // unconfirmed. A number closer below is history.
+        // unconfirmed. A lower number within `FAR` is history.
         let is_young = self.followed < CONFIRMATIONS;
         newer && (self.has(number) || continues()) || is_young && self.next - number > FAR
     }
@@ -112,7 +112,7 @@ impl Sequence {
             return run;
         };
         let jump = (*first >= self.next).then(|| *first - self.next);
-        // A run of only a few samples has no losses far from it.
+        // While the live run has only a few samples, a long jump is a restart rather than a loss.
         let most = match self.followed < CONFIRMATIONS {
             true => FAR,
             false => MAX_JUMP,

@@ -1,4 +1,5 @@
-//! HEARTBEAT, GAP and ACKNACK: existing numbers, and those that readers miss (RTPS 2.5, 8.3.8).
+//! HEARTBEAT, GAP and ACKNACK: which numbers exist, and which of them readers miss (RTPS 2.5,
+//! 8.3.8).
 
 use ros2probe_wire::SequenceNumber;
 
@@ -70,14 +71,15 @@ impl Sequence {
         (false, None)
     }
 
-    /// Returns whether an ACKNACK acknowledges numbers that are not known to exist.
+    /// Returns whether an ACKNACK is refused because it acknowledges numbers far above the known
+    /// ones.
     pub const fn refuses(&mut self, base: SequenceNumber) -> bool {
         let refuses = self.started() && base.steps_since(self.next) > FAR;
         self.jumps += refuses as u64;
         refuses
     }
 
-    /// Processes an ACKNACK: the readers have all numbers below `base`, even unseen ones, except
+    /// Processes an ACKNACK: the readers have all numbers below `base`, observed or not, except
     /// samples that the writer had withdrawn before.
     pub fn acknowledged(&mut self, base: SequenceNumber) {
         if self.started() {
@@ -86,7 +88,7 @@ impl Sequence {
         }
     }
 
-    /// Processes a GAP: `start..base` and some numbers after it will never arrive.
+    /// Processes a GAP: `start..base` and the numbers in `set` will never arrive.
     pub fn gap(
         &mut self,
         start: SequenceNumber,

@@ -5,7 +5,7 @@ use ros2probe_wire::Timestamp;
 use super::*;
 use ros2probe_wire::time::SECOND;
 
-/// A sequence with virtual time and the verdicts in lists.
+/// A sequence with virtual time, and lists of its decisions.
 #[derive(Default)]
 struct Bench {
     sequence: Sequence,
@@ -95,7 +95,7 @@ fn note(settled: Settled, lost: &mut Vec<u64>, irrelevant: &mut Vec<u64>) {
 }
 
 #[test]
-fn order_1_2_4_3_5_is_no_loss_and_no_recovery() {
+fn reordered_samples_are_neither_lost_nor_recovered() {
     let mut bench = Bench::default();
     bench.receive([1, 2, 4, 3, 5]).wait(5);
     assert_eq!(
@@ -109,7 +109,7 @@ fn order_1_2_4_3_5_is_no_loss_and_no_recovery() {
 }
 
 #[test]
-fn a_gap_is_lost_once_after_the_window() {
+fn a_gap_counts_as_lost_only_once_after_the_settle_window() {
     let mut bench = Bench::default();
     bench.receive([1, 2, 5]);
     assert!(bench.lost.is_empty());
@@ -120,7 +120,7 @@ fn a_gap_is_lost_once_after_the_window() {
 }
 
 #[test]
-fn a_retransmission_recovers() {
+fn a_retransmission_recovers_a_missing_sample() {
     let mut bench = Bench::default();
     bench.receive([1, 2, 4]);
     bench.now += SECOND / 5;
@@ -132,7 +132,7 @@ fn a_retransmission_recovers() {
 }
 
 #[test]
-fn a_fast_retransmission_on_request_is_no_reordering() {
+fn a_fast_retransmission_on_request_counts_as_recovered() {
     let mut bench = Bench::default();
     bench.receive([1, 2, 4]);
     bench
@@ -143,14 +143,14 @@ fn a_fast_retransmission_on_request_is_no_reordering() {
 }
 
 #[test]
-fn nothing_before_the_first_sight_is_lost() {
+fn numbers_before_the_first_observed_sample_are_not_lost() {
     let mut bench = Bench::default();
     bench.receive([385, 386]).wait(5);
     assert!(bench.lost.is_empty());
 }
 
 #[test]
-fn gap_excuses_and_heartbeat_does_not() {
+fn a_gap_submessage_excuses_numbers_and_a_heartbeat_does_not() {
     let mut bench = Bench::default();
     bench.receive([1, 4, 7, 9]);
     bench.sequence.gap(
@@ -168,7 +168,7 @@ fn gap_excuses_and_heartbeat_does_not() {
 }
 
 #[test]
-fn acknowledged_samples_are_no_loss_unless_the_writer_had_withdrawn_them() {
+fn acknowledged_samples_are_lost_only_if_the_writer_had_withdrawn_them() {
     let mut bench = Bench::default();
     bench.receive([1, 4]);
     bench.sequence.acknowledged(SequenceNumber(4));
@@ -183,14 +183,14 @@ fn acknowledged_samples_are_no_loss_unless_the_writer_had_withdrawn_them() {
 }
 
 #[test]
-fn samples_that_a_heartbeat_announces_and_withdraws_at_once_are_lost() {
+fn samples_that_one_heartbeat_announces_and_withdraws_are_lost() {
     let mut bench = Bench::default();
     bench.receive([1, 2]).heartbeat(6, 6).wait(3);
     assert_eq!(bench.lost, [3, 4, 5, 6]);
 }
 
 #[test]
-fn samples_that_the_writer_withdrew_are_decided_after_the_grace() {
+fn withdrawn_samples_are_decided_after_the_grace_period() {
     let mut bench = Bench::default();
     bench.receive([1, 4, 6]).heartbeat(4, 6);
     let mut lost = Vec::new();
@@ -204,7 +204,7 @@ fn samples_that_the_writer_withdrew_are_decided_after_the_grace() {
 }
 
 #[test]
-fn a_gap_ahead_of_the_data_does_not_hide_data() {
+fn a_gap_submessage_ahead_of_the_data_does_not_excuse_later_samples() {
     let mut bench = Bench::default();
     bench.receive([1]);
     bench.sequence.gap(
@@ -223,7 +223,7 @@ fn a_gap_ahead_of_the_data_does_not_hide_data() {
 }
 
 #[test]
-fn the_last_sample_of_a_burst_is_missed_by_its_heartbeat() {
+fn a_heartbeat_reveals_that_the_last_sample_of_a_burst_is_lost() {
     let mut bench = Bench::default();
     bench.receive([1, 2]);
     bench.sequence.heartbeat(
@@ -237,7 +237,7 @@ fn the_last_sample_of_a_burst_is_missed_by_its_heartbeat() {
 }
 
 #[test]
-fn forged_heartbeats_and_gaps_make_no_losses() {
+fn forged_heartbeats_and_gaps_cause_no_losses() {
     let mut bench = Bench::default();
     bench.receive([1, 2]);
     let now = ModelTime::from_nanoseconds(bench.now);
@@ -268,7 +268,7 @@ fn forged_heartbeats_and_gaps_make_no_losses() {
 }
 
 #[test]
-fn a_restart_under_the_same_guid_begins_anew() {
+fn a_restart_under_the_same_guid_begins_a_new_incarnation() {
     let mut bench = Bench::default();
     for number in 1..=100 {
         bench.now += SECOND / 100;
@@ -284,7 +284,7 @@ fn a_restart_under_the_same_guid_begins_anew() {
 }
 
 #[test]
-fn history_for_a_late_joiner_is_duplicate() {
+fn history_for_a_late_joiner_counts_as_duplicates() {
     let mut bench = Bench::default();
     for number in 1..=100 {
         bench.now += SECOND / 100;
@@ -297,7 +297,7 @@ fn history_for_a_late_joiner_is_duplicate() {
 }
 
 #[test]
-fn a_forged_jump_is_not_a_million_losses() {
+fn a_forged_jump_causes_no_losses() {
     let mut bench = Bench::default();
     bench.receive([1, 2, u64::MAX >> 1, 1 << 40]).wait(3);
     assert!(bench.lost.is_empty());
@@ -308,7 +308,7 @@ fn a_forged_jump_is_not_a_million_losses() {
 }
 
 #[test]
-fn a_fragment_of_a_number_that_cannot_be_loses_nothing() {
+fn a_fragment_with_an_invalid_sequence_number_causes_no_losses() {
     for number in [(u64::MAX >> 1) + 1, u64::MAX - 1, u64::MAX] {
         let mut bench = Bench::default();
         bench.receive([1, 2]);
@@ -324,7 +324,7 @@ fn a_fragment_of_a_number_that_cannot_be_loses_nothing() {
 }
 
 #[test]
-fn more_undecided_than_the_window_holds_is_decided_at_once() {
+fn a_jump_beyond_the_window_decides_the_skipped_numbers() {
     let mut bench = Bench::default();
     bench.receive((1..10).chain(200_000..200_010));
     bench.wait(3);
@@ -334,7 +334,7 @@ fn more_undecided_than_the_window_holds_is_decided_at_once() {
 }
 
 #[test]
-fn a_late_sample_after_settling_still_counts_once() {
+fn a_sample_that_arrives_after_settling_counts_once() {
     let mut bench = Bench::default();
     bench.receive([1, 3]).wait(3);
     bench.receive([2, 2]);
@@ -346,7 +346,7 @@ fn a_late_sample_after_settling_still_counts_once() {
 }
 
 #[test]
-fn ranges_of_a_bitmap_are_set_and_cleared_to_the_bit_also_around_its_end() {
+fn bitmap_ranges_are_set_and_cleared_exactly_across_the_end() {
     for (start, end) in [
         (0, 0),
         (5, 6),
@@ -383,7 +383,7 @@ fn ranges_of_a_bitmap_are_set_and_cleared_to_the_bit_also_around_its_end() {
 }
 
 #[test]
-fn checkpoints_do_not_pile_up_while_a_growing_sample_holds_the_others() {
+fn checkpoints_stay_bounded_while_an_unfinished_sample_holds_later_numbers_open() {
     let mut sequence = Sequence::default();
     let mut lost = 0;
     let mut count = |settled| lost += u64::from(matches!(settled, Settled::Lost(_)));

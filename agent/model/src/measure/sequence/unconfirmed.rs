@@ -1,7 +1,7 @@
 //! Numbers outside a writer's live run: a jump, a restart, or a forgery.
 //!
-//! One datagram proves nothing. Two things confirm a run. Several datagrams continue it while the
-//! live run stands still, or a HEARTBEAT in a later datagram agrees with it.
+//! A single datagram proves nothing. A run is confirmed if several datagrams continue it while the
+//! live run does not advance. A HEARTBEAT in a later datagram confirms it, too.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -18,13 +18,13 @@ pub(super) const CONFIRMATIONS: u8 = 5;
 /// Copies of one datagram arrive at several sockets within this time.
 const COPIES: Duration = Duration::from_millis(5);
 
-/// The run, and unconfirmed claims of HEARTBEATs and GAPs.
+/// A run that is not confirmed yet, and the claims of HEARTBEATs and GAPs.
 #[derive(Debug, Default)]
 pub(super) struct UnconfirmedRun {
     run: Run,
-    /// Number of datagrams that continued the run since the live run last did.
+    /// Number of datagrams that continued the run since the live run last advanced.
     evidence: u8,
-    /// Times of the first and last of them.
+    /// Times of the first and last of these datagrams.
     since: ModelTime,
     latest: ModelTime,
     /// The number after lastSN of a HEARTBEAT, and its time.
@@ -64,7 +64,7 @@ impl UnconfirmedRun {
         (opens, true)
     }
 
-    /// Marks a sample as whole. Returns whether that is new.
+    /// Marks a sample as whole. Returns whether it was recorded and not yet whole.
     pub(super) fn complete(&mut self, number: SequenceNumber) -> bool {
         let mut numbers = self.run.numbers.iter_mut();
         let Some((_, is_whole)) = numbers.find(|(known, _)| *known == number) else {
@@ -109,7 +109,8 @@ impl UnconfirmedRun {
             && (is_ahead || next < live)
     }
 
-    /// Returns whether an earlier HEARTBEAT had the same lastSN, or one lower by at most `reach`.
+    /// Returns whether a HEARTBEAT at least [`COPIES`] ago had the same lastSN, or one lower by at
+    /// most `reach`.
     pub(super) fn is_claimed(&mut self, next: SequenceNumber, reach: u64, now: ModelTime) -> bool {
         let (claimed, at) = self.claim;
         let is_same = claimed > SequenceNumber::ZERO
@@ -153,7 +154,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_oldest_numbers_of_a_long_run_are_forgotten() {
+    fn a_long_run_drops_its_oldest_numbers() {
         let mut unconfirmed = UnconfirmedRun::default();
         for number in 1..=100 {
             assert_eq!(
@@ -162,7 +163,7 @@ mod tests {
             );
         }
         assert!(unconfirmed.run.numbers.is_full());
-        // The evidence counts again.
+        // A number that was dropped is new again.
         assert_eq!(
             unconfirmed.note(SequenceNumber(1), ModelTime::from_nanoseconds(1)),
             (false, true)

@@ -23,7 +23,8 @@ use crate::measure::receivers::Matched;
 const ROUTE_TIMEOUT: Duration = Duration::from_secs(60);
 
 impl Subscribers {
-    /// Settles samples whose waiting time is over, and drops routes that have been silent for long.
+    /// Settles the samples for which the settle window is over, and drops routes after a long
+    /// silence.
     pub fn advance(&mut self, context: &mut WriterContext<'_>) {
         self.refresh(context);
         let now = context.now;
@@ -56,12 +57,12 @@ impl Subscribers {
         }
     }
 
-    /// Ends a second at the end of the input.
+    /// Ends the last second of the recent losses at the end of the input.
     pub fn end_second(&mut self) {
         self.deliveries.iter_mut().for_each(Delivery::end_second);
     }
 
-    /// Settles all samples, returns the quota, and returns the counts and the losses of the worst
+    /// Settles all samples and releases the quota. Returns the counts, and the losses of the worst
     /// receiver in this second.
     pub fn stop(mut self, context: &mut WriterContext<'_>) -> (Totals, LossShare) {
         self.settle(context);
@@ -76,13 +77,13 @@ impl Subscribers {
         (self.totals, worst.unwrap_or_default())
     }
 
-    /// Returns the time of the last observation of each delivery that can be dropped for a new one.
+    /// Returns the time of the last observation of each delivery.
     pub fn silent_since(&self) -> impl Iterator<Item = ModelTime> + '_ {
         self.deliveries.iter().map(|delivery| delivery.seen().1)
     }
 
-    /// Drops at most `count` deliveries whose last observation is not after this time; returns how
-    /// many.
+    /// Drops at most `count` deliveries whose last observation is not after `until`. Returns the
+    /// number of dropped deliveries.
     pub fn give_up(
         &mut self,
         until: ModelTime,
@@ -157,7 +158,8 @@ impl Subscribers {
         }
     }
 
-    /// Begins to observe a route at a socket that was observed on a wire so far.
+    /// Drops the routes of this destination that were observed on a wire, because it is now
+    /// observed at a socket.
     pub(super) fn uncover(&mut self, route: Route, context: &mut WriterContext<'_>) {
         self.at_socket = true;
         let destination = route.destination;
@@ -209,8 +211,8 @@ impl Subscribers {
             .retain(|guid| topic.is_some_and(|topic| is_reader(topic, guid)));
     }
 
-    /// Gives deliveries the participants to which their routes lead, and merges those of one
-    /// participant. Samples from before the announcement of its reader were not for it.
+    /// Assigns deliveries to the participants to which their routes lead, and merges deliveries of
+    /// one participant. Samples from before the announcement of its reader do not belong to it.
     fn identify(&mut self, context: &mut WriterContext<'_>) {
         let readers = context.readers();
         let mut index = 0;
@@ -282,8 +284,9 @@ impl Subscribers {
         true
     }
 
-    /// Continues the delivery at an unknown socket as that of this route, which has the same
-    /// destination. The receiving socket of a connection of Zenoh is known once its session is.
+    /// Continues the delivery at an unknown socket as the delivery of this route, which has the
+    /// same destination. The receiving socket of a Zenoh connection is known once its session is
+    /// known.
     pub(super) fn learn_socket(&mut self, route: Route, context: &mut WriterContext<'_>) {
         let Some(unknown) = self.routes.learn_socket(route, context.readers()) else {
             return;
@@ -314,7 +317,7 @@ impl Subscribers {
         self.count_open();
     }
 
-    /// Drops a delivery that turned out to be of a participant without a reader.
+    /// Drops a delivery that turned out to belong to a participant without a reader.
     fn discard(&mut self, place: usize, context: &mut WriterContext<'_>) {
         let mut delivery = self.deliveries.remove(place);
         delivery.discard(context.budget, &mut self.totals);

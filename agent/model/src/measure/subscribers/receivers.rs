@@ -1,4 +1,4 @@
-//! Views of the deliveries at receivers, without those that are withheld.
+//! Views of the deliveries, except withheld ones.
 
 use super::Subscribers;
 use crate::facts::loss_share::{LossShare, RecentLoss};
@@ -8,7 +8,7 @@ use crate::measure::delivery::Delivery;
 use crate::measure::routes::KnownRoute;
 
 impl Subscribers {
-    /// Returns each delivery, also of outgoing samples, with its routes.
+    /// Returns each delivery, incoming or outgoing, with its routes.
     pub fn deliveries(&self) -> impl Iterator<Item = (&Delivery, Vec<&KnownRoute>)> {
         let deliveries = self.with_routes();
         deliveries.filter(|(delivery, _)| !delivery.is_withheld())

@@ -73,8 +73,8 @@ impl Subscribers {
         }
     }
 
-    /// Processes an acknowledgement. A delivery belongs to a participant: samples that all of its
-    /// readers have did arrive, even if they were not seen.
+    /// Processes an acknowledgement. Samples that all readers of a participant acknowledge have
+    /// arrived, even if they were not observed.
     pub(super) fn acknowledged(&mut self, acknack: &AckNack) {
         let prefix = acknack.head.reader.prefix;
         let below = self.acknowledgements.floor(|guid| guid.prefix == prefix);

@@ -23,7 +23,7 @@ fn watchlist(patterns: &[&str]) -> Watchlist {
 }
 
 #[test]
-fn the_same_name_in_two_domains_is_two_topics() {
+fn the_same_name_in_two_domains_makes_two_topics() {
     let mut topics = Topics::default();
     let naming = naming("rt/chatter");
     let (one, _) = topics.join(
@@ -44,7 +44,7 @@ fn the_same_name_in_two_domains_is_two_topics() {
 }
 
 #[test]
-fn everything_means_what_topic_list_shows() {
+fn the_glob_for_all_topics_excludes_hidden_topics_and_services() {
     let all = watchlist(&["/**"]);
     assert_eq!(naming("rt/points").covered_by(DomainId(0), &all), [0]);
     assert!(
@@ -74,7 +74,7 @@ fn everything_means_what_topic_list_shows() {
 }
 
 #[test]
-fn cpu_buffers_belong_to_the_topic_beside_them() {
+fn cpu_buffer_topics_belong_to_their_base_topic() {
     let mut topics = Topics::default();
     let (main, _) = topics.join(
         DomainId(0),
@@ -96,7 +96,7 @@ fn cpu_buffers_belong_to_the_topic_beside_them() {
 }
 
 #[test]
-fn the_cap_rejects_and_counts_until_a_place_is_free() {
+fn a_topic_beyond_the_cap_is_rejected_until_a_slot_is_free() {
     let mut topics = Topics::default();
     let all = watchlist(&["/**"]);
     let mut ids = Vec::new();

@@ -98,7 +98,7 @@ impl Writer {
         None
     }
 
-    /// Counts the samples up to a seen one. Unseen ones are assumed to have its size.
+    /// Counts the samples up to a seen one. Unseen samples are assumed to have the same size.
     fn count_span(
         &mut self,
         sample: &Sample,
@@ -118,7 +118,7 @@ impl Writer {
         }
     }
 
-    /// Counts what was sent after `since`, each message in the second of its time.
+    /// Counts the messages that were sent after `since`, each in the second of its presumed time.
     fn spread(&mut self, sent: Sum, since: ModelTime, now: ModelTime) {
         let tally = &mut self.tally;
         tally.messages += sent.messages;
@@ -149,7 +149,7 @@ impl Writer {
         };
         let seen = match is_whole {
             true => Completeness::Complete,
-            // Polling shared memory may yield a sample after the uprobe did.
+            // Polling shared memory may yield a sample after the uprobe has reported it.
             false if sample.is_end() && !sample.head.is_exact() => Completeness::LastFragment,
             false => Completeness::Partial,
         };

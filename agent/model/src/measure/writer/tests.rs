@@ -165,7 +165,7 @@ fn an_incomplete_sample_is_lost_although_its_number_was_seen() {
 }
 
 #[test]
-fn a_sample_begun_before_its_writer_was_in_the_kernels_map_is_no_loss_if_fragments_are_missing() {
+fn missing_fragments_from_before_the_kernel_knew_the_writer_cause_no_loss() {
     let mut bench = Bench::new(Traits::default());
     bench
         .writer
@@ -183,14 +183,14 @@ fn a_sample_begun_before_its_writer_was_in_the_kernels_map_is_no_loss_if_fragmen
 }
 
 #[test]
-fn the_last_incomplete_sample_is_lost_too() {
+fn an_incomplete_last_sample_is_lost() {
     let mut bench = Bench::new(Traits::default());
     bench.fragments(1, 1..=10).fragments(2, 2..=10).wait(5000);
     assert_eq!(bench.facts().lost, 1);
 }
 
 #[test]
-fn a_slow_large_sample_is_not_settled_while_it_grows() {
+fn a_slow_fragmented_sample_is_not_settled_while_fragments_arrive() {
     let mut bench = Bench::new(Traits::default());
     bench.data(1);
     for start in 1..=10 {
@@ -201,7 +201,7 @@ fn a_slow_large_sample_is_not_settled_while_it_grows() {
 }
 
 #[test]
-fn a_sample_joined_in_the_middle_is_no_loss() {
+fn a_first_sample_without_its_first_fragments_is_not_lost() {
     let mut bench = Bench::new(Traits::default());
     bench.fragments(7, 4..=10).fragments(8, 1..=10).wait(5000);
     let facts = bench.facts();
@@ -209,7 +209,7 @@ fn a_sample_joined_in_the_middle_is_no_loss() {
 }
 
 #[test]
-fn the_very_first_sample_can_be_lost_with_its_first_fragment() {
+fn sample_number_1_without_its_first_fragment_is_lost() {
     let mut bench = Bench::new(Traits::default());
     bench.fragments(1, 2..=10).fragments(2, 1..=10).wait(5000);
     let facts = bench.facts();
@@ -231,7 +231,7 @@ fn a_sample_of_too_many_fragments_is_neither_counted_nor_lost() {
 }
 
 #[test]
-fn a_repaired_fragment_counts_as_recovered() {
+fn a_sample_with_a_retransmitted_fragment_counts_as_recovered() {
     let mut bench = Bench::new(RELIABLE);
     bench
         .fragments(1, 1..=4)
@@ -242,7 +242,7 @@ fn a_repaired_fragment_counts_as_recovered() {
 }
 
 #[test]
-fn reliable_gaps_stay_open_for_retransmissions() {
+fn gaps_of_a_reliable_writer_stay_open_for_retransmissions() {
     let mut bench = Bench::new(RELIABLE);
     bench.data(1).data(3).wait(8000).data(2).wait(12_000);
     let facts = bench.facts();
@@ -260,7 +260,7 @@ fn an_unannounced_writer_that_sends_heartbeats_is_reliable() {
 }
 
 #[test]
-fn disposals_take_a_number_but_are_no_messages() {
+fn disposals_have_sequence_numbers_but_do_not_count_as_messages() {
     let mut bench = Bench::new(Traits::default());
     bench.data(1);
     bench.put(Record {
@@ -273,7 +273,7 @@ fn disposals_take_a_number_but_are_no_messages() {
 }
 
 #[test]
-fn negative_delays_are_not_made_positive() {
+fn negative_delays_are_counted_but_not_observed_as_latencies() {
     let mut bench = Bench::new(Traits {
         has_header: true,
         ..Traits::default()
@@ -296,7 +296,7 @@ fn negative_delays_are_not_made_positive() {
 }
 
 #[test]
-fn history_for_a_late_joiner_is_no_latency() {
+fn history_for_a_late_joiner_does_not_count_as_latency() {
     let mut bench = Bench::new(Traits {
         keeps_history: true,
         ..RELIABLE
@@ -313,7 +313,7 @@ fn history_for_a_late_joiner_is_no_latency() {
 }
 
 #[test]
-fn intervals_are_exact() {
+fn intervals_between_messages_are_measured_exactly() {
     let mut bench = Bench::new(Traits::default());
     for number in 1..=201 {
         bench.data(number);
@@ -352,7 +352,7 @@ fn messages_at_200_hz_have_a_rate_of_200_hz() {
 }
 
 #[test]
-fn an_idle_writer_is_small() {
+fn an_idle_writer_needs_at_most_1400_bytes() {
     assert!(size_of::<Writer>() <= 1400, "{}", size_of::<Writer>());
 }
 
@@ -364,7 +364,7 @@ fn in_shared_memory(record: Record) -> Record {
 }
 
 #[test]
-fn in_shared_memory_messages_are_the_span_of_their_numbers_and_no_gap_is_a_loss() {
+fn in_shared_memory_unseen_numbers_count_as_messages_and_not_as_losses() {
     let mut bench = Bench::new(RELIABLE);
     for number in [1, 2, 5, 9] {
         bench.put(in_shared_memory(data(number))).wait(10);
@@ -380,7 +380,7 @@ fn in_shared_memory_messages_are_the_span_of_their_numbers_and_no_gap_is_a_loss(
 }
 
 #[test]
-fn a_message_that_only_a_heartbeat_announces_is_the_last_message() {
+fn a_message_that_only_a_heartbeat_announces_counts_as_the_last_message() {
     let mut bench = Bench::new(RELIABLE);
     bench.put(in_shared_memory(data(1))).wait(1000);
     bench.put(in_shared_memory(heartbeat(1, 2)));
@@ -398,7 +398,7 @@ fn a_message_that_only_a_heartbeat_announces_is_the_last_message() {
 }
 
 #[test]
-fn a_writer_of_which_polling_misses_many_messages_seems_silent_for_long() {
+fn a_writer_whose_messages_polling_misses_may_seem_silent_for_long() {
     let slowest = Duration::from_secs(2);
     let silence_of = |seen: &dyn Fn(u64) -> bool| {
         let mut bench = Bench::new(RELIABLE);
@@ -408,7 +408,8 @@ fn a_writer_of_which_polling_misses_many_messages_seems_silent_for_long() {
         }
         bench.writer.seeming_silence(slowest).as_secs_f64()
     };
-    // Intervals of a second. What hides a message may hide the next ones, unless it never did.
+    // The interval is one second. A missed message may be followed by others, unless misses were
+    // always single.
     let all = silence_of(&|_| true);
     let most = silence_of(&|number| number % 4 > 0);
     let half = silence_of(&|number| number % 2 == 0);
@@ -424,7 +425,7 @@ fn a_writer_of_which_polling_misses_many_messages_seems_silent_for_long() {
 }
 
 #[test]
-fn messages_sent_while_shared_memory_was_not_polled_are_no_spike_of_the_rate() {
+fn messages_sent_while_shared_memory_was_not_polled_cause_no_rate_spike() {
     let mut bench = Bench::new(RELIABLE);
     let mut number = 1;
     let send = |bench: &mut Bench, number: &mut u64, count: u64, is_polled: bool| {
@@ -437,7 +438,7 @@ fn messages_sent_while_shared_memory_was_not_polled_are_no_spike_of_the_rate() {
         }
     };
     send(&mut bench, &mut number, 10, true);
-    // 50 Hz: 14 s pass until the topic is wanted.
+    // 50 Hz: 14 s pass until the topic is requested.
     send(&mut bench, &mut number, 700, false);
     for second in 0..15 {
         send(&mut bench, &mut number, 50, true);
@@ -448,7 +449,7 @@ fn messages_sent_while_shared_memory_was_not_polled_are_no_spike_of_the_rate() {
             facts.rate_hz
         );
         assert!((facts.bandwidth - 5000.0).abs() < 50.0, "{second}");
-        // All but the last second of that time is earlier.
+        // All but the last second of that time counts as earlier.
         assert!((600..=690).contains(&facts.earlier.messages), "{facts:?}");
     }
     let facts = bench.facts();
@@ -457,7 +458,7 @@ fn messages_sent_while_shared_memory_was_not_polled_are_no_spike_of_the_rate() {
 }
 
 #[test]
-fn one_fragment_that_was_seen_is_a_message_of_its_sample_s_size() {
+fn one_seen_fragment_counts_as_a_message_with_the_size_of_its_sample() {
     let mut bench = Bench::new(RELIABLE);
     bench.put(in_shared_memory(fragment(1, 4)));
     bench.put(in_shared_memory(fragment(3, 1)));
@@ -480,8 +481,8 @@ fn a_message_on_the_network_and_in_shared_memory_counts_once() {
     }
     let facts = bench.facts();
     assert_eq!((facts.messages, facts.lost), (10, 0));
-    // Shared memory falls silent. Samples missing before the next one may have passed there; after
-    // it, gaps on the network are losses again.
+    // Shared memory falls silent. Samples missing before the next one may have used shared memory.
+    // After it, gaps on the network are losses again.
     bench.wait(20_000);
     bench.data(21).data(24).wait(20_000);
     let facts = bench.facts();
@@ -489,7 +490,7 @@ fn a_message_on_the_network_and_in_shared_memory_counts_once() {
 }
 
 #[test]
-fn a_sample_half_of_which_came_by_the_network_is_no_loss_of_shared_memory() {
+fn a_sample_that_arrived_half_by_network_is_not_lost_in_shared_memory() {
     let mut bench = Bench::new(RELIABLE);
     bench.fragments(1, 1..=5);
     bench.put(in_shared_memory(fragment(1, 9)));
@@ -506,7 +507,7 @@ fn in_its_process(record: Record) -> Record {
 }
 
 #[test]
-fn seen_in_its_process_a_writer_s_gap_is_a_loss_and_a_copy_is_nothing() {
+fn with_uprobes_gaps_count_as_losses_and_copies_do_not_count_again() {
     let mut bench = Bench::new(Traits::default());
     for number in [1, 2, 3, 5, 6] {
         bench.put(in_its_process(data(number)));
@@ -523,7 +524,7 @@ fn seen_in_its_process_a_writer_s_gap_is_a_loss_and_a_copy_is_nothing() {
 }
 
 #[test]
-fn messages_from_before_a_writer_was_seen_in_its_process_count_by_their_span() {
+fn messages_from_before_uprobes_began_count_by_the_span_of_their_numbers() {
     let mut bench = Bench::new(Traits::default());
     for number in [1, 4, 7] {
         bench.put(in_shared_memory(data(number))).wait(10);
@@ -545,7 +546,7 @@ fn messages_from_before_a_writer_was_seen_in_its_process_count_by_their_span() {
 }
 
 #[test]
-fn when_a_writer_is_no_longer_seen_in_its_process_shared_memory_counts_at_once() {
+fn when_uprobes_end_messages_in_shared_memory_count_immediately() {
     let mut bench = Bench::new(Traits::default());
     for number in [1, 2, 3] {
         bench.put(in_its_process(data(number))).wait(10);
@@ -575,8 +576,8 @@ fn thirds() -> Vec<Record> {
     (1..=4).flat_map(starts).collect()
 }
 
-/// Processes two views' records in every interleaved order. Each sample must be dispatched once or
-/// reported once as not captured.
+/// Processes the records of two views in every interleaved order. Each sample must be dispatched
+/// once or reported once as not captured.
 fn every_sample_is_counted_or_missed(
     before: &[Record],
     after: &[Record],
@@ -586,8 +587,8 @@ fn every_sample_is_counted_or_missed(
     let mut fewest = [1; 4];
     let shifts = if mixed { after.len() } else { 0 };
     for shift in 0..=shifts {
-        // The first record is from the first view; the next `shift` of the second view may overtake
-        // it.
+        // The first record is from the first view. The first `shift` records of the second view may
+        // overtake the others.
         for at in 1..=before.len() {
             let mut bench = Bench::new(RELIABLE);
             let (early, late) = before.split_at(at);
@@ -632,7 +633,7 @@ fn every_sample_is_counted_or_missed(
 }
 
 #[test]
-fn a_sample_in_transit_when_its_process_is_first_seen_is_counted() {
+fn a_sample_in_transit_when_uprobes_begin_is_counted() {
     let records = thirds();
     let looked: Vec<_> = records.iter().copied().map(in_shared_memory).collect();
     let exact: Vec<_> = records.into_iter().map(in_its_process).collect();
@@ -646,8 +647,7 @@ fn a_sample_in_transit_when_its_process_is_first_seen_is_counted() {
 }
 
 #[test]
-fn a_sample_in_transit_when_its_process_is_first_seen_counts_as_not_captured_if_a_part_is_missing()
-{
+fn a_sample_in_transit_when_uprobes_begin_is_not_captured_if_a_part_is_missing() {
     let records = thirds();
     let looked = [in_shared_memory(records[0])];
     let exact: Vec<_> = records[2..].iter().copied().map(in_its_process).collect();
@@ -656,7 +656,7 @@ fn a_sample_in_transit_when_its_process_is_first_seen_counts_as_not_captured_if_
 }
 
 #[test]
-fn a_sample_in_transit_when_its_process_is_last_seen_is_counted_by_polling() {
+fn a_sample_in_transit_when_uprobes_end_is_counted_by_polling() {
     let records = thirds();
     for ends in 1..records.len() {
         let exact: Vec<_> = records[..ends]
