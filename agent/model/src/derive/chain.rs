@@ -4,10 +4,10 @@
 //! A hop is one node: it reads a message on a topic and publishes another because of it. Two
 //! independent methods find hops. By stamps, a message whose header has the stamp of an input
 //! continues that input ([`stamps`]). By causality, a process publishes within the callback that
-//! processes the input ([`causality`]). Their chains are kept apart.
+//! processes the input ([`causality`]). The chains of the two methods are kept apart.
 //!
-//! Nothing here depends on payloads: records carry the stamps. A wrong chain is worse than a missing
-//! one, so a hop counts only after repeated and unambiguous evidence ([`evidence`]).
+//! Payloads are not needed, because records contain the stamps. A wrong chain is worse than a
+//! missing one, so a hop counts only after repeated and unambiguous evidence ([`evidence`]).
 
 pub mod causality;
 mod evidence;
@@ -85,7 +85,7 @@ impl Chains {
         self.revision
     }
 
-    /// Returns the problems of chains: nodes that stamp again, and chains above their limit.
+    /// Returns the problems of chains: nodes that replace stamps, and chains above their limit.
     #[must_use]
     pub fn findings(&self) -> &[Diagnosis] {
         &self.findings
@@ -103,7 +103,7 @@ impl Chains {
         self.graph.outputs.contains_key(&writer)
     }
 
-    /// Processes a counted message. `is_local` states whether its writer's clock is that of the
+    /// Processes a counted message. `is_local` states whether its writer uses the clock of the
     /// capture.
     pub fn counted(
         &mut self,
@@ -195,9 +195,9 @@ impl Chains {
         self.tracer.take()
     }
 
-    /// Evaluates messages that are old enough, and the findings. `share` returns the traced share
-    /// of a topic, `is_local` whether a participant runs on this host. Returns the topics whose measurement the configured chains newly need or no
-    /// longer need.
+    /// Evaluates the messages that are old enough, and updates the findings. `share` returns the
+    /// traced share of a topic, `is_local` whether a participant runs on this host. Returns the
+    /// topics whose measurement the configured chains newly need or no longer need.
     pub fn advance(
         &mut self,
         (discovery, topics, profiler): (&Discovery, &Topics, &Profiler),
@@ -241,8 +241,8 @@ impl Chains {
         self.paths.facts(&self.expected, now)
     }
 
-    /// Returns the rows of the metrics: chains with the messages of further ones, and messages that
-    /// wait for evaluation with the stamps evaluated early.
+    /// Returns the size, limit and evictions of two tables: chains, and messages that wait for
+    /// evaluation.
     #[must_use]
     pub fn tables(&self) -> [TableFacts; 2] {
         [self.paths.table(), self.messages.table()]

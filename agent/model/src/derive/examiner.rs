@@ -21,25 +21,25 @@ use crate::graph::discovery::Discovery;
 use crate::measure::topic::Topics;
 use endpoints::{EndpointExaminer, UnmatchedEndpoint};
 
-/// Time that an endpoint may be without a counterpart, since nodes start one after another.
+/// Time for which an endpoint may have no counterpart, because nodes start one after another.
 const MATCH_TIMEOUT: Duration = Duration::from_secs(5);
-/// Largest number of findings kept of each kind.
+/// Maximum number of findings kept of each kind.
 const PER_KIND: usize = 256;
-/// Largest number of series for incompatible pairs.
+/// Maximum number of series for incompatible pairs.
 const MAX_QOS_PAIRS: usize = 1024;
-/// Largest number of steps per examination, about ten nanoseconds each, and per topic.
+/// Maximum number of steps per examination, and per topic. A step takes about ten nanoseconds.
 const STEPS: usize = 500_000;
 const STEPS_PER_TOPIC: usize = 50_000;
 
 /// Examines the graph after each change.
 #[derive(Debug, Default)]
 pub struct Examiner {
-    /// Revisions of discovery, of the hanging calls, of the findings from inside processes and of the
-    /// chains at the last examination.
+    /// Revisions of discovery, hanging calls, findings from inside processes, and chains at the
+    /// last examination.
     revision: Option<(u64, u64, u64, u64)>,
     /// Time at which the first unmatched endpoint becomes a finding.
     due: Option<ModelTime>,
-    /// Time since which each endpoint is unmatched.
+    /// Time at which each unmatched endpoint was first found.
     alone: HashMap<Guid, ModelTime>,
     current: Arc<Diagnoses>,
     /// Time at which each finding appeared.
@@ -139,7 +139,7 @@ impl Examiner {
     }
 }
 
-/// Returns the time at which each finding in `after` appeared; known findings keep theirs.
+/// Returns the time at which each finding in `after` appeared; known findings keep their time.
 fn since(
     before: &[Diagnosis],
     times: &[ModelTime],
@@ -172,7 +172,7 @@ impl Findings {
         }
     }
 
-    /// Adds a finding if its kind has room.
+    /// Adds a finding, unless its kind has reached the cap.
     fn add(&mut self, diagnosis: Diagnosis) {
         let kinds = Diagnosis::KINDS.iter().zip(&mut self.counts);
         let mut own = kinds.filter(|(kind, _)| **kind == diagnosis.kind());
@@ -219,8 +219,8 @@ impl Findings {
     }
 }
 
-/// Returns the domains that are known only in part: a ROS participant there has no announced
-/// endpoint, although each has some.
+/// Returns the domains that are known only in part: some ROS participant has no announced endpoint
+/// there, although every ROS participant has endpoints.
 fn half_known(discovery: &Discovery) -> BTreeSet<DomainId> {
     let participants = discovery.participants().values();
     let silent = participants.filter(|participant| {

@@ -1,14 +1,15 @@
 //! Latency of services and actions: which reply answers which request, and after what time.
 //!
 //! A request and its reply share an identity: rmw_fastrtps puts it into their inline QoS,
-//! rmw_cyclonedds before their payload. So the writers of service topics are captured, within a
-//! budget. Every copy of a request or reply, also one that is only metered, is then recognised by
-//! writer and sequence number.
+//! rmw_cyclonedds before their payload. The writers of service topics are therefore captured,
+//! within a budget. Every copy of a request or reply, even one that is only metered, is then
+//! recognised by writer and sequence number.
 //!
-//! A call begins when its request is first seen, which is at the client's socket if that is on this
-//! host. It ends when the reply is whole and, for such a client, has arrived at the client's socket.
-//! Otherwise it ends when the reply is first seen. Messages that are only sampled in shared memory
-//! are left out, because missing ones would look unanswered.
+//! A call begins when its request is first seen, which is at the client's socket if the client is
+//! on this host. It ends when the reply is complete and, for a client on this host, has arrived at
+//! the client's socket. Otherwise it ends when the reply is first seen. Messages that are only
+//! sampled in shared memory are ignored, because requests with unseen replies would seem
+//! unanswered.
 
 pub mod action;
 pub mod facts;
@@ -37,9 +38,9 @@ use crate::facts::topic_kind::TopicKind;
 use action::Action;
 use service::{CallId, Position, Service, Sighting};
 
-/// Bytes per second of one writer above which it is not captured for a while.
+/// Maximum bytes per second of one writer. A writer that exceeds it is not captured for a while.
 const MAX_BYTES_PER_SECOND: usize = 4 << 20;
-/// Time for which such a writer is not captured.
+/// Time for which a writer above the maximum is not captured.
 const SUSPENDED: Duration = Duration::from_secs(10);
 
 /// Domain and ROS name of a service or action.
@@ -80,7 +81,7 @@ enum Half {
 #[derive(Debug)]
 struct ServiceName {
     key: Key,
-    /// The action that it belongs to, and its role there.
+    /// The action to which it belongs, and its role in the action.
     action: Option<(Key, ActionPart)>,
 }
 
@@ -91,7 +92,7 @@ struct Identities {
     order: Bounded<CallIdentities, VecDeque<(Guid, SequenceNumber)>>,
 }
 
-/// What the first captured copy of a request or reply shows.
+/// Data from the first captured copy of a request or reply.
 #[derive(Clone, Copy, Debug)]
 struct Identity {
     call: CallId,
@@ -283,7 +284,7 @@ impl Services {
     ) -> Vec<Guid> {
         let mut changed = false;
         self.services.retain(|(domain_id, name), service| {
-            // The result of a goal is late by design.
+            // `get_result` is answered only when the goal ends, however long that takes.
             let timeout = match name.ends_with("/_action/get_result") {
                 true => Duration::MAX,
                 false => timeout,
@@ -334,7 +335,7 @@ impl Services {
         hanging
     }
 
-    /// Returns the figures of all services with calls, sorted by domain and name.
+    /// Returns the statistics of all services with calls, sorted by domain and name.
     #[must_use]
     pub fn facts(&self) -> Vec<ServiceFacts> {
         let facts = |((domain_id, name), service): (&Key, &Service)| ServiceFacts {
@@ -352,7 +353,7 @@ impl Services {
         self.services.iter().map(facts).collect()
     }
 
-    /// Returns the figures of all actions with goals, sorted by domain and name.
+    /// Returns the statistics of all actions with goals, sorted by domain and name.
     #[must_use]
     pub fn action_facts(&self) -> Vec<ActionFacts> {
         let facts = |((domain_id, name), action): (&Key, &Action)| ActionFacts {
@@ -365,7 +366,8 @@ impl Services {
         self.actions.iter().map(facts).collect()
     }
 
-    /// Returns the row of the metrics: calls without a reply, and what was dropped because of a cap.
+    /// Returns the number of calls without a reply, its cap, and the number of entries that caps
+    /// dropped.
     #[must_use]
     pub fn table(&self) -> TableFacts {
         let mut facts = self.open.facts();
@@ -440,8 +442,8 @@ impl Services {
         }
     }
 
-    /// Returns whether one more service has room: if necessary, the one with the oldest request
-    /// and without open calls is dropped.
+    /// Returns whether one more service can be added. If necessary, the service without open calls
+    /// whose last request is oldest is dropped.
     fn has_place(&mut self, at: ModelTime) -> bool {
         if !self.services.is_full() {
             return true;
@@ -455,7 +457,7 @@ impl Services {
         oldest.is_some_and(|key| self.services.remove(&key).is_some())
     }
 
-    /// Drops the open calls of a service, since one of its writers is no longer captured.
+    /// Drops the open calls of a service, because one of its writers is no longer captured.
     fn suspend(&mut self, key: &Key, until: ModelTime, at: ModelTime) {
         self.open.refuse();
         if !self.services.contains_key(key) && !self.has_place(at) {
@@ -517,7 +519,7 @@ fn identity(
     } else {
         let related = found.inline_qos(vendor)?.related_sample_identity;
         let call = match (half, related) {
-            // The number of a request is that of its own sample.
+            // A request has the number of its own sample.
             (Half::Requests, Some(related)) if related.writer != Guid::default() => CallId {
                 client: related.writer.to_bytes(),
                 number,

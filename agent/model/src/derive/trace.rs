@@ -34,8 +34,8 @@ use share::Share;
 const BITMAP_BYTES: usize = 1 << 18;
 /// Acknowledgements after this time have no span.
 const ACKNACK_TIMEOUT: Duration = Duration::from_secs(10);
-/// An arriving message is not a copy of one sent from here if no observation shows that within this
-/// time.
+/// An arriving message is from another host if no observation shows within this time that it was
+/// sent from this host.
 const LOCAL_COPY_DELAY: Duration = Duration::from_millis(500);
 
 /// The stage that a span covers.
@@ -43,7 +43,7 @@ const LOCAL_COPY_DELAY: Duration = Duration::from_millis(500);
 pub enum SpanStage {
     /// The message leaves this host, or is on the wire if the direction is unknown: from the first
     /// to the last fragment. On a gateway with a wire source, forwarded messages leave, too. In
-    /// shared memory, the time at which the agent sees the message.
+    /// shared memory, the span is the time at which the agent sees the message.
     Send,
     /// The message arrives from another host: from the first to the last fragment.
     Receive,
@@ -51,7 +51,7 @@ pub enum SpanStage {
     Settle(Guid),
 }
 
-/// A span. Its times are a [`ModelTime`] until it is taken.
+/// A span. Its times are of type [`ModelTime`] until [`Tracer::take`] converts them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Span<T = Timestamp> {
     /// The stage.
@@ -71,7 +71,7 @@ pub struct Message {
     pub writer: Guid,
     /// Its sequence number.
     pub sequence_number: SequenceNumber,
-    /// Trace id, derived from both.
+    /// Trace id, derived from the writer and the sequence number.
     pub trace_id: u128,
     /// Its topic and type.
     pub description: Arc<WriterDescription>,
@@ -112,7 +112,7 @@ pub struct Spans {
 pub struct Tracer {
     wanted: bool,
     directed: bool,
-    /// Traced writers; `None` for a writer that is not traced.
+    /// Known writers; `None` for a writer that is not traced.
     writers: Bounded<TracedWriters, HashMap<Guid, Option<Box<WriterTrace>>>>,
     shared: Shared,
 }
@@ -135,8 +135,8 @@ struct WriterTrace {
     identity: Identity,
     share: Share,
     samples: Samples,
-    /// Whether it sends from this host. The kernel shows a multicast's local copies before its
-    /// departure, so the first message arrives before this is known.
+    /// Whether it sends from this host. The kernel reports the local copies of a multicast before
+    /// its departure, so the first message arrives before this is known.
     is_local: bool,
     under_way: Bounded<MessagesUnderWay, VecDeque<Message>>,
     /// Spans of arrivals, until it is certain that they were not sent from this host.
@@ -204,7 +204,7 @@ impl Tracer {
     }
 
     /// Processes an observation. `is_local` states whether the writer is known to run on this host,
-    /// so that no message of it arrives from another one. `about` returns the description and
+    /// so that none of its messages arrives from another host. `about` returns the description and
     /// traced share of a new writer, or `None` if they are not known yet.
     pub fn observe(
         &mut self,
@@ -265,7 +265,7 @@ impl Tracer {
         }
     }
 
-    /// Returns the row of the metrics: the open messages of all writers.
+    /// Returns the size, limit and evictions of the table of open messages.
     #[must_use]
     pub fn table(&self) -> TableFacts {
         self.shared.open.facts()
@@ -363,7 +363,7 @@ impl WriterTrace {
         self.whole(message, begin, at, shared);
     }
 
-    /// Processes a message that was seen whole.
+    /// Processes a message that was observed completely.
     fn whole(&mut self, message: Message, begin: ModelTime, at: ModelTime, shared: &mut Shared) {
         if self.waiting.len() + self.arrived.len() >= OpenMessages::CAP {
             self.waiting.refuse();
@@ -396,7 +396,7 @@ impl WriterTrace {
         });
     }
 
-    /// Completes the spans of arrivals that are old enough to be from another host.
+    /// Completes the spans of arrivals that are old enough to be attributed to another host.
     fn release(&mut self, now: ModelTime, shared: &mut Shared) {
         while let Some(first) = self.arrived.front()
             && now - first.end > LOCAL_COPY_DELAY
@@ -480,7 +480,7 @@ impl WriterTrace {
 }
 
 impl Place {
-    /// Returns the place; `None` for a message that a router of this host passes on.
+    /// Returns where a datagram was seen; `None` for a message that a router of this host forwards.
     fn of(head: &Head, is_local: bool) -> Option<Self> {
         let is_stream = matches!(head.path, Path::Stream { .. });
         let by_router = is_stream && head.is_at_socket() && !is_local;

@@ -1,7 +1,7 @@
 //! Chains by causality: publications within the callback that processes an input.
 //!
-//! A publication is joined with the hop before it by its message: the publication of the input is
-//! the one whose source timestamp is the first on that topic at or after it, within 10 ms.
+//! A publication continues the latest hop that published on the topic of its input at most 10 ms
+//! before the source timestamp of the input.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -22,13 +22,13 @@ use crate::facts::tables::CausalPublications;
 
 /// Time after which a publication that no other continues ends its chain.
 const QUIET: Duration = Duration::from_secs(2);
-/// Time for which a publication is remembered for those that continue it.
+/// Time for which a publication is remembered, so that others can continue it.
 const REMEMBERED: Duration = Duration::from_secs(5);
-/// Longest time from the start of a publication to the source timestamp of its message.
+/// Maximum time from the start of a publication to the source timestamp of its message.
 const WRITING: Duration = Duration::from_millis(10);
-/// Number of the latest publications among which the origin of another is searched.
+/// Number of the latest publications among which the hop before another one is searched.
 const SEARCHED: usize = 2048;
-/// Largest number of hops of a chain.
+/// Maximum number of hops of a chain.
 const MAX_HOPS: usize = 31;
 
 /// A publication within the callback that processes an input. Times are wall time.
@@ -78,17 +78,17 @@ struct Hop {
 /// Facts about the input of a publication that begins a chain.
 #[derive(Debug, Default)]
 pub struct Origin {
-    /// The node that publishes the input; `None` if it is not known, or one of several.
+    /// The node that publishes the input; `None` if it is unknown or one of several.
     pub node: Option<NodeName>,
     /// Share of the input's traces that is exported.
     pub share: Option<Share>,
 }
 
-/// What decides about the trace of a publication.
+/// What decides whether the trace of a publication is exported.
 enum Decision {
-    /// The share of its input's traces: it begins a chain.
+    /// The publication begins a chain: the share of its input's traces decides.
     Share(Share),
-    /// The publication that it continues.
+    /// The publication continues this one, whose trace is exported.
     Hop(Traced),
 }
 
@@ -112,7 +112,7 @@ impl Causality {
             output,
             published,
         } = publication;
-        // The clock of the input's writer may be another one.
+        // The writer of the input may use another clock.
         let is_known = input_source.0 != 0;
         let input_published = if is_known {
             (*input_source).min(*taken)

@@ -1,13 +1,13 @@
 //! Evidence that a node's output continues one of its inputs, by equal stamps.
 //!
 //! Equal stamps alone prove little: timers round them, simulated time gives the same stamp to all
-//! nodes, and inputs share stamps when one derives from the other. So a message is evidence for at
-//! most one input of its node:
+//! nodes, and inputs share stamps when one derives from the other. A message is therefore evidence
+//! for at most one input of its node:
 //!
 //! - The input must have reached the node before the output was published.
-//! - An input from which another candidate derives is not the cause; the other one is.
+//! - An input from which another candidate derives is not the cause; the other candidate is.
 //! - Several remaining candidates are ambiguous and count for none.
-//! - A stamp that several nodes originated is shared, and no evidence at all.
+//! - A stamp that originates at several nodes is shared, and is not evidence.
 //!
 //! A hop is accepted after [`ENOUGH`] matches, if the node's output mostly has the stamp of some
 //! input and the input is hardly ever late.
@@ -28,16 +28,16 @@ use crate::facts::names::{NodeName, TopicName};
 use crate::facts::tables::{EvidenceInputs, EvidenceOutputs, LatestStamps};
 use crate::measure::topic::TopicId;
 
-/// Matches from which on a hop may be accepted, for ordinary and for rounded stamps.
+/// Minimum number of matches of an accepted hop, for ordinary and for rounded stamps.
 const ENOUGH: u32 = 5;
 const ENOUGH_ROUNDED: u32 = 20;
-/// Number of outputs after which all counts are halved, so that the present prevails.
+/// Number of outputs after which all counts are halved, so that recent outputs prevail.
 const HALVED: u32 = 256;
 /// A stamp that is a multiple of this many nanoseconds is rounded.
 const ROUNDED: u32 = 100_000;
-/// Number of outputs from which on a node may be found to stamp again.
+/// Minimum number of outputs of a node that is reported as re-stamping.
 const RESTAMPED: u32 = 20;
-/// Age in nanoseconds below which a message is stamped at publication.
+/// A message whose age is below this many nanoseconds was stamped at publication.
 const FRESH: i64 = 1_000_000;
 
 /// Evidence about all outputs.
@@ -60,13 +60,13 @@ struct Counts {
     topic: TopicId,
     /// Messages with a stamp that was new on this topic.
     outputs: u32,
-    /// Those with the stamp of exactly one input.
+    /// Messages with the stamp of exactly one input.
     matched: u32,
-    /// Those with a rounded stamp.
+    /// Messages with a rounded stamp.
     rounded: u32,
-    /// Those whose stamp was not seen on any input before.
+    /// Messages whose stamp was not seen on any input before.
     own: u32,
-    /// Those whose age was compared with that of the inputs, and those with almost no age.
+    /// Messages whose age was compared with that of the inputs, and messages with almost no age.
     aged: u32,
     fresh: u32,
     inputs: Bounded<EvidenceInputs, BTreeMap<TopicId, InputCounts>>,
@@ -77,18 +77,18 @@ struct Counts {
 struct InputCounts {
     name: TopicName,
     matched: u32,
-    /// Messages with the stamp that reached the node only after its output.
+    /// Messages with the same stamp that reached the node only after its output.
     late: u32,
-    /// Outputs that are fresh, but would have ten times their age with the stamp of this input.
+    /// Fresh outputs that would be at least ten times as old with the stamp of this input.
     older: u32,
 }
 
 /// Messages with one stamp, in the order of their publication.
 struct SameStamp<'a> {
     list: Vec<&'a Published>,
-    /// The candidates of each message, as bits.
+    /// The possible causes of each message, as a bit set.
     candidates: Vec<u64>,
-    /// The one cause of each message.
+    /// The cause of each message, if it is unambiguous.
     cause: Vec<Option<usize>>,
 }
 
@@ -180,8 +180,8 @@ impl Evidence {
         traces(&messages.list, &causes, &exported)
     }
 
-    /// Returns the findings about nodes whose outputs have new stamps although they have the rate of
-    /// an input.
+    /// Returns the findings about nodes whose outputs have new stamps although their rate equals
+    /// that of an input.
     pub(super) fn restamping(&self, rates: &Rates<'_>) -> Vec<Diagnosis> {
         let restamped = self.outputs.iter().filter_map(|((topic, node), counts)| {
             let enough = counts.outputs >= RESTAMPED && counts.aged >= RESTAMPED;
@@ -208,7 +208,7 @@ impl Evidence {
         counts.is_some_and(|counts| counts.accepts(cause.output.topic))
     }
 
-    /// Returns for each message the one that it continues by an accepted hop.
+    /// Returns, for each message, the index of the message that it continues by an accepted hop.
     fn accepted(&self, messages: &SameStamp<'_>) -> Vec<Option<usize>> {
         let message = |index: usize| messages.list.get(index).copied();
         let accepted = |index: usize| {
@@ -284,7 +284,7 @@ impl<'a> SameStamp<'a> {
             cause: Vec::with_capacity(list.len()),
             list,
         };
-        // All messages from which each message derives, as bits.
+        // All messages from which each message derives, as a bit set.
         let mut origins: Vec<u64> = Vec::with_capacity(found.list.len());
         for message in &found.list {
             let is_candidate =
@@ -307,7 +307,7 @@ impl<'a> SameStamp<'a> {
     }
 
     /// Returns whether several nodes published the stamp without an input that had it. A node that
-    /// reads topics which are not measured may have it from there, unless the stamp is rounded.
+    /// reads unmeasured topics may have copied the stamp from them, unless the stamp is rounded.
     fn has_several_origins(&self, is_rounded: bool) -> bool {
         let mut origins: Vec<&Arc<NodeView>> = Vec::new();
         for (message, candidates) in self.list.iter().zip(&self.candidates) {
@@ -322,7 +322,8 @@ impl<'a> SameStamp<'a> {
         origins.len() > 1
     }
 
-    /// Returns the inputs with the stamp that reached the message's node after the message.
+    /// Returns the inputs with the same stamp that reached the node of the message after its
+    /// publication.
     fn late(&self, message: &Published) -> impl Iterator<Item = &&'a Published> {
         self.list
             .iter()
@@ -374,7 +375,7 @@ fn counts<'a>(
     })
 }
 
-/// Returns the paths of messages that no accepted hop continues. `exported`: the trace of each
+/// Returns the paths of messages that no accepted hop continues. `exported` has the trace of each
 /// message with a span.
 fn traces(
     messages: &[&Published],

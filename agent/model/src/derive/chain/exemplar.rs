@@ -1,7 +1,7 @@
 //! Exemplars of a histogram: for each bucket the newest duration whose trace is exported.
 //!
-//! The sampling decision is the only test: spans dropped later, which are counted, keep their
-//! exemplar.
+//! Only the sampling decision matters. An exemplar stays even if its spans are dropped later, which
+//! is counted.
 
 use std::num::NonZero;
 use std::sync::Arc;
@@ -18,14 +18,14 @@ const BUCKETS: usize = BOUNDS.len() + 1;
 pub struct Exemplar {
     /// The duration in seconds.
     pub seconds: f64,
-    /// Id of the trace; OpenTelemetry allows none of zeros.
+    /// Id of the trace; OpenTelemetry forbids an id of zeros.
     pub trace_id: NonZero<u128>,
-    /// Its end, by the wall clock.
+    /// End of the duration, by the wall clock.
     pub at: Timestamp,
 }
 
-/// One slot for each bucket of a histogram. Without exemplars it is a pointer; the slots have
-/// [`Exemplars::BYTES`]. Snapshots share them.
+/// One slot for each bucket of a histogram. Without exemplars, only a pointer is stored; the slots
+/// need [`Exemplars::BYTES`] bytes. Snapshots share the slots.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Exemplars {
     slots: Option<Arc<[Option<Exemplar>; BUCKETS]>>,
@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn there_are_never_more_than_buckets_and_each_lies_in_its_own() {
+    fn each_bucket_has_at_most_one_exemplar_which_lies_within_the_bucket() {
         let (mut exemplars, mut histogram) = (Exemplars::default(), Histogram::default());
         let bounds: Vec<_> = histogram.buckets().map(|(bound, _)| bound).collect();
         for step in 1..2_000_u32 {

@@ -1,4 +1,4 @@
-//! Configured chains: the topics between their ends, and their latency against its limit.
+//! Configured chains: the topics between their ends, and their latency compared with its limit.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -20,9 +20,9 @@ use crate::facts::topic_kind::TopicKind;
 use crate::graph::discovery::Discovery;
 use crate::measure::topic::{TopicId, Topics};
 
-/// Largest number of configured chains.
+/// Maximum number of configured chains.
 pub const MAX_CHAINS: usize = 64;
-/// Time over which a chain is compared with its limit, and the fewest messages for that.
+/// Time over which a chain is compared with its limit, and the minimum number of messages for it.
 const JUDGED: Duration = Duration::from_secs(10);
 const FEWEST: usize = 5;
 
@@ -35,7 +35,7 @@ pub struct ExpectedChain {
     pub from: TopicName,
     /// ROS name of its last topic.
     pub to: TopicName,
-    /// Longest time from the publication of the first message to that of the last.
+    /// Maximum time from the publication of the first message to that of the last.
     pub max_latency: Option<Duration>,
 }
 
@@ -63,7 +63,7 @@ pub struct ExpectedFacts {
     pub state: ChainState,
     /// Durations since the start.
     pub histogram: Histogram,
-    /// Exemplars of these.
+    /// Exemplars of `histogram`.
     pub exemplars: Exemplars,
     /// Quantiles of the latest 256 durations.
     pub latency: Option<Quantiles>,
@@ -83,7 +83,7 @@ pub(super) struct ExpectedChains {
 struct Progress {
     histogram: Histogram,
     exemplars: Exemplars,
-    /// Publication of the last message, and of the first.
+    /// Times of the publications on the last and on the first topic.
     recent: Bounded<ExpectedTimes, VecDeque<(Timestamp, Timestamp)>>,
 }
 
@@ -130,7 +130,8 @@ impl ExpectedChains {
         !self.topics.is_empty() && self.topics.contains(&(domain_id, dds_name.clone()))
     }
 
-    /// Finds the topics between the ends of the chains. Returns those that changed.
+    /// Finds the topics between the ends of the chains. Returns the topics that were added or
+    /// removed.
     pub(super) fn route(
         &mut self,
         discovery: &Discovery,
@@ -182,7 +183,7 @@ impl ExpectedChains {
         }
     }
 
-    /// Returns a finding for each chain that takes longer than it may, at wall time `now`.
+    /// Returns a finding for each chain that exceeds its maximum latency at wall time `now`.
     pub(super) fn slow(&self, now: Timestamp) -> impl Iterator<Item = Diagnosis> {
         self.progress
             .iter()
@@ -256,7 +257,8 @@ impl Progress {
     }
 }
 
-/// Returns the topics with a header on the ways through nodes from one end of a chain to the other.
+/// Returns the topics with a header on the paths through nodes from one end of a chain to the
+/// other.
 fn between(
     chains: &[ExpectedChain],
     discovery: &Discovery,
@@ -309,7 +311,7 @@ fn between(
     found
 }
 
-/// Returns the topics that are reached from these by going through nodes in one direction.
+/// Returns the topics that can be reached from `begin` through nodes in one direction.
 fn reached(
     begin: BTreeSet<TopicId>,
     nodes: &[Through],

@@ -1,4 +1,4 @@
-//! Which node reads and writes which measured topics with a header.
+//! The measured topics with a header that each node reads and writes.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -26,22 +26,22 @@ pub(super) struct NodeView {
     pub(super) name: Option<NodeName>,
     /// Measured topics with a header that it reads.
     pub(super) inputs: BTreeMap<TopicId, TopicName>,
-    /// Whether it reads nothing else, so that no input of it is hidden.
+    /// Whether it reads no other topics, so that all its inputs are known.
     pub(super) is_complete: bool,
 }
 
-/// A topic as one of its writers' nodes publishes it.
+/// A topic that a node publishes.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Output {
     pub(super) node: Arc<NodeView>,
     pub(super) topic: TopicId,
     pub(super) key: TopicKey,
     pub(super) message_type: TypeName,
-    /// Share of the chains from this topic on that is traced.
+    /// Traced share of the chains that begin with this topic.
     pub(super) share: Option<Share>,
-    /// Whether a node that publishes reads it.
+    /// Whether a node that has outputs reads it.
     pub(super) is_read: bool,
-    /// Whether such a node runs on another host, as far as this is known.
+    /// Whether such a node runs on another host, as far as known.
     pub(super) is_read_elsewhere: bool,
 }
 
@@ -160,8 +160,8 @@ pub(super) fn owners(discovery: &Discovery) -> HashMap<Guid, &NodeName> {
     owners
 }
 
-/// Returns the node that publishes a topic. Of several, `is_meant` selects one; `None` if it does
-/// not, or if a publisher's node is not known.
+/// Returns the node that publishes a topic. Of several nodes, `is_meant` selects one. Returns
+/// `None` if that leaves no node or several, or if the only node is unknown.
 pub(crate) fn publisher(
     discovery: &Discovery,
     topic: &Topic,

@@ -14,11 +14,11 @@ use crate::facts::bounded::{Bounded, Counted};
 use crate::facts::histogram::Histogram;
 use crate::facts::tables::{ChainPaths, ChainTraces};
 
-/// Largest number of topics in a chain.
+/// Maximum number of topics in a chain.
 pub const MAX_TOPICS: usize = 32;
-/// Number of messages from which on a chain is shown.
+/// Minimum number of messages of a chain that is shown.
 const ENOUGH: u64 = 5;
-/// Time without a message after which a chain gives way to a new one.
+/// Time without a message after which a new chain may replace a chain.
 const IDLE: Duration = Duration::from_secs(60);
 
 /// All chains with messages.
@@ -43,7 +43,7 @@ struct Progress {
 pub struct HopHistograms {
     /// From the publication of the input to that of the output.
     pub whole: Histogram,
-    /// Exemplars of these.
+    /// Exemplars of `whole`.
     pub exemplars: Exemplars,
     /// From the publication of the input to its arrival at the node.
     pub transit: Histogram,
@@ -66,17 +66,17 @@ pub struct ChainsFacts {
 pub struct ChainFacts {
     /// Its identity.
     pub path: Arc<Path>,
-    /// Messages that passed the whole path.
+    /// Number of messages that passed the whole path.
     pub count: u64,
-    /// The times of the latest 256 of them, one point for each topic.
+    /// The times of the latest 256 messages, one point for each topic.
     pub traces: Arc<Bounded<ChainTraces, VecDeque<Vec<Point>>>>,
     /// Durations from the first publication to the last.
     pub whole: Histogram,
-    /// Exemplars of these.
+    /// Exemplars of `whole`.
     pub exemplars: Exemplars,
     /// Durations of each hop.
     pub hops: Vec<HopHistograms>,
-    /// Publication of the latest last message.
+    /// Time of the latest publication on the last topic.
     pub last: Timestamp,
 }
 
@@ -87,9 +87,9 @@ pub struct Quantiles {
     pub count: usize,
     /// Median.
     pub p50: f64,
-    /// Duration below which 99 % lie.
+    /// 99th percentile.
     pub p99: f64,
-    /// Largest duration.
+    /// Maximum.
     pub max: f64,
 }
 
@@ -216,7 +216,8 @@ impl Progress {
 }
 
 impl ChainFacts {
-    /// Returns the quantiles from the publication on one topic to that on a later one, by position.
+    /// Returns the quantiles of the time between the publications on two topics, given by their
+    /// positions.
     #[must_use]
     pub fn between(&self, from: usize, to: usize) -> Quantiles {
         let duration = |points: &Vec<Point>| {

@@ -5,7 +5,7 @@ use crate::facts::rate::{SECONDS, Slot};
 use crate::measure::profiler::Profiler;
 use crate::measure::topic::{TopicId, Topics};
 
-/// Smallest number of messages from which rates are compared.
+/// Minimum number of messages for a comparison of rates.
 const FEWEST: u64 = 20;
 
 /// The numbers of messages of the last seconds.

@@ -1,15 +1,15 @@
 //! Chains of recorded messages, which name no nodes: a hop leads from topic to topic.
 //!
-//! A recording has the stamp of each message and its time, but neither who published it nor who
-//! read the topic. So the rules of [`super::evidence`] hold as far as they need no nodes, and
-//! stronger ones replace the others:
+//! A recording has the stamp and the time of each message, but neither its publisher nor its
+//! readers. The rules of [`super::evidence`] therefore apply as far as they need no nodes, and
+//! stronger rules replace the others:
 //!
 //! - A stamp that is a multiple of 100 µs is not evidence, because several nodes may give it
 //!   independently.
 //! - Topics whose messages of one stamp are less than 1 ms apart are published together. They count
 //!   as one topic.
-//! - Messages of one stamp may come on three topics in one order. Then the second may be the cause
-//!   of the third, or both derive from the first. The delays decide ([`relation`]).
+//! - Three topics may have their messages of one stamp in a fixed order. The second may then be the
+//!   cause of the third, or both may derive from the first. The delays decide ([`relation`]).
 
 mod hops;
 mod relation;
@@ -26,13 +26,13 @@ use super::path::{ChainFacts, Paths};
 use super::stamps::{LONGEST, QUIET, Stamp};
 use crate::facts::names::TopicName;
 
-/// Largest number of topics.
+/// Maximum number of topics.
 pub const MAX_TOPICS: usize = 1024;
-/// Largest number of messages whose stamps are kept, without those of a stamp on one topic only.
+/// Maximum number of kept messages. Messages whose stamp occurs on one topic only are not kept.
 pub const MAX_RECORDED: usize = 4_000_000;
-/// Largest number of stamps to which messages may still follow.
+/// Maximum number of stamps for which further messages may follow.
 pub const MAX_OPEN: usize = 65_536;
-/// Largest number of topics with one stamp; a stamp with more identifies nothing.
+/// Maximum number of topics with one stamp. A stamp on more topics identifies nothing.
 const MAX_OF_STAMP: usize = 64;
 /// A stamp that is a multiple of this many nanoseconds is rounded.
 const ROUNDED: u32 = 100_000;
@@ -40,20 +40,21 @@ const ROUNDED: u32 = 100_000;
 /// Collects the messages of a recording.
 #[derive(Debug)]
 pub struct RecordedChains {
-    /// Largest number of messages to keep.
+    /// Maximum number of messages to keep.
     room: usize,
     topics: Vec<Topic>,
     ids: HashMap<TopicName, u16>,
     open: HashMap<Stamp, Open>,
     /// Stamps in the order of their first message.
     order: VecDeque<Stamp>,
-    /// Time since the first message, without steps of the clock backwards.
+    /// Time since the first message, without backward steps of the clock.
     elapsed: Duration,
     last: Option<Timestamp>,
-    /// Messages of stamps with several topics, and the end of each stamp among them.
+    /// Messages of stamps with several topics, and the end of each stamp in this list.
     messages: Vec<Recorded>,
     ends: Vec<usize>,
-    /// Whether publication times differ from log times, and whether some message has none.
+    /// Whether publication times differ from log times, and whether some message has no publication
+    /// time.
     has_published: bool,
     lacks_published: bool,
     rounded: u64,
@@ -77,20 +78,20 @@ pub struct RecordedFacts {
     pub times: Times,
     /// Chains; their nodes are unknown.
     pub chains: Vec<ChainFacts>,
-    /// Topics that are published together with the one that stands for them.
+    /// Topics that are published together with another one, and the topic that represents them.
     pub together: Vec<(TopicName, TopicName)>,
     /// Topics with the stamps of several others, of which none is known to be the cause.
     pub unclear: Vec<(TopicName, Vec<TopicName>)>,
-    /// Messages with a rounded stamp, which were not used.
+    /// Number of messages with a rounded stamp, which were not used.
     pub rounded: u64,
-    /// Messages above the caps.
+    /// Number of messages that were refused because of a cap.
     pub refused: u64,
 }
 
 #[derive(Debug)]
 struct Topic {
     name: TopicName,
-    /// Stamps with a message of it, without rounded ones.
+    /// Number of stamps with a message of this topic, without rounded stamps.
     stamps: u64,
 }
 
@@ -102,7 +103,7 @@ struct Recorded {
     published: Timestamp,
 }
 
-/// Messages of a stamp to which others may follow.
+/// Messages of a stamp for which further messages may follow.
 #[derive(Debug)]
 struct Open {
     first: Duration,
@@ -138,7 +139,7 @@ impl RecordedChains {
     }
 
     /// Adds a message whose type begins with a header. `published` is `None` if the recording has
-    /// no such time.
+    /// no publication time.
     pub fn add(
         &mut self,
         topic: &TopicName,
@@ -190,8 +191,8 @@ impl RecordedChains {
         });
     }
 
-    /// Returns the chains. Of topics that are published together, one in `preferred` stands for the
-    /// others, or else the first.
+    /// Returns the chains. Topics that are published together are represented by one of them that
+    /// is in `preferred`, or else by the first.
     #[must_use]
     pub fn finish(mut self, preferred: &[&str]) -> RecordedFacts {
         self.close(Duration::MAX);
@@ -271,7 +272,7 @@ impl RecordedChains {
         topic.map_or_else(|| TopicName::from(""), |topic| topic.name.clone())
     }
 
-    /// Returns the messages of each stamp with their times, in the order of these.
+    /// Returns the messages of each stamp with their times, in the order of these times.
     fn stamps(&self, times: Times) -> impl Iterator<Item = Vec<(u16, Timestamp)>> {
         let mut start = 0;
         self.ends.iter().map(move |end| {
@@ -292,7 +293,7 @@ impl RecordedChains {
 }
 
 impl Times {
-    /// Returns its word: `publish` or `log`.
+    /// Returns the label: `publish` or `log`.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {

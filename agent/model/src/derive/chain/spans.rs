@@ -1,8 +1,8 @@
 //! Spans of chains: one trace for each measurement on its path through nodes.
 //!
-//! Spans contain only what was observed here, of nodes of this host. Those of nodes on other hosts
-//! are reported by the agents there, under the same trace: its id follows from the measurement. The number of finished
-//! spans is bounded, and dropped ones are counted.
+//! Spans contain only what was observed on this host, about nodes of this host. The agents of other
+//! hosts report the spans of their nodes under the same trace, whose id follows from the
+//! measurement. The number of finished spans is bounded, and dropped ones are counted.
 
 pub(super) mod causal;
 pub(super) mod stamped;
@@ -86,7 +86,7 @@ pub struct ChainMessage {
     pub size: u32,
     /// Seconds and nanoseconds of its header.
     pub stamp: (i32, u32),
-    /// Id of its own trace, if this agent sends that.
+    /// Id of the message's own trace, if this agent exports it.
     pub own_trace: Option<u128>,
 }
 
@@ -121,7 +121,7 @@ impl ChainStage {
 }
 
 impl SpanId {
-    /// Returns the id of a trace's span at this stage, which these values identify.
+    /// Returns the id of the span that these values identify, at this stage of a trace.
     fn of(stage: ChainStage, trace_id: u128, values: &[&[u8]]) -> Self {
         let mut identity = Identity::of(stage.label().as_bytes());
         identity.add(&trace_id.to_be_bytes());

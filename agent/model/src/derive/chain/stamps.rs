@@ -1,7 +1,8 @@
-//! Messages by the stamp of their header, until all that carry the same stamp were seen.
+//! Messages by the stamp of their header, until all messages with the same stamp were seen.
 //!
-//! The messages of one stamp are evaluated together, some seconds after the last one. So the order
-//! in which sources deliver them is irrelevant: shared memory is polled and arrives late.
+//! The messages of one stamp are evaluated together, some seconds after the last one. The order in
+//! which sources deliver them is therefore irrelevant: messages in shared memory are polled and
+//! arrive late.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -20,11 +21,13 @@ use crate::facts::tables::{
 
 /// Time without a message after which the messages of a stamp are evaluated.
 pub(super) const QUIET: Duration = Duration::from_secs(2);
-/// Time after which they are evaluated in any case; longer chains are not recognised.
+/// Time after which the messages of a stamp are evaluated in any case; longer chains are not
+/// recognised.
 pub(super) const LONGEST: Duration = Duration::from_secs(5);
 /// Time for which later messages of an evaluated stamp are ignored.
 const REMEMBERED: Duration = Duration::from_secs(10);
-/// Longest time from INFO_TS to the capture for which INFO_TS is the time of publication.
+/// Maximum nanoseconds from INFO_TS to the capture for which INFO_TS counts as the time of
+/// publication.
 const PLAUSIBLE_DELAY: i64 = 1_000_000_000;
 
 /// Seconds and nanoseconds of a header.
@@ -88,15 +91,14 @@ pub(super) struct Messages {
 type RecentOfWriter = Bounded<RecentMessages, VecDeque<(SequenceNumber, Key)>>;
 
 impl Published {
-    /// Returns the time at which it reached this participant, as far as that is observed.
+    /// Returns the time at which it reached this participant, if that was observed.
     pub(super) fn arrival(&self, prefix: GuidPrefix) -> Option<Timestamp> {
         let mut arrivals = self.arrivals.iter();
         let own = arrivals.find(|(participant, _)| *participant == prefix);
         own.map(|(_, at)| *at)
     }
 
-    /// Returns the time at which it reached the node that published `next`, as far as that is
-    /// observed.
+    /// Returns the time at which it reached the node that published `next`, if that was observed.
     pub(super) fn reached(&self, next: &Self) -> Option<Timestamp> {
         let own = self.arrival(next.output.node.prefix);
         let captured = (!self.sampled && self.at <= next.published).then_some(self.at);
@@ -138,7 +140,7 @@ impl Messages {
         evicted
     }
 
-    /// Removes the oldest stamp other than this one, and returns its messages.
+    /// Removes the oldest stamp other than `keep`, and returns its messages.
     fn evict(&mut self, keep: Key) -> Option<Group> {
         while let Some(key) = self.order.pop_front() {
             if key == keep {

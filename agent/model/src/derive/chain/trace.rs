@@ -36,7 +36,7 @@ pub struct Point {
     /// Time at which it reached the next node: the process took it from the middleware, or its
     /// datagram arrived. `None` if that was not observed, and on the last topic.
     pub arrived: Option<Timestamp>,
-    /// Begin of the callback in the next node; known by causality only.
+    /// Begin of the callback in the next node; known only by causality.
     pub started: Option<Timestamp>,
 }
 
@@ -78,7 +78,7 @@ impl Method {
 }
 
 impl Path {
-    /// Returns the positions of the first topic and of a later one, if the chain has both.
+    /// Returns the positions of topic `from` and of a later topic `to`, if the chain has both.
     #[must_use]
     pub fn section(&self, from: &str, to: &str) -> Option<(usize, usize)> {
         let begin = self.topics.iter().position(|(topic, _)| topic == from)?;
@@ -126,7 +126,8 @@ impl HopTimes {
 }
 
 /// Returns the paths of at least two messages that no other message continues, each from its first
-/// message to its last. `causes`: the cause of each message, which precedes it.
+/// message to its last. `causes` has the index of the cause of each message, which precedes the
+/// message.
 pub(super) fn paths(causes: &[Option<usize>]) -> impl Iterator<Item = Vec<usize>> {
     let ends = (0..causes.len()).filter(|end| !causes.contains(&Some(*end)));
     let paths = ends.map(|end| {

@@ -18,26 +18,27 @@ use crate::facts::topic_kind::TopicKind;
 use crate::graph::discovery::{Discovery, Endpoint};
 use crate::measure::topic::Topic;
 
-/// Largest number of incompatible pairs listed per topic.
+/// Maximum number of incompatible pairs listed per topic.
 const PAIRS_PER_TOPIC: usize = 32;
-/// Largest number of types and hashes listed in one finding.
+/// Maximum number of types and hashes listed in one finding.
 const MAX_NAMED: usize = 16;
 
-/// Examines topics, with the context that it needs.
+/// Examines topics, and holds the context of the examination.
 #[derive(Debug)]
 pub(super) struct EndpointExaminer<'a> {
     discovery: &'a Discovery,
     half_known: BTreeSet<DomainId>,
 }
 
-/// An endpoint without a counterpart; it becomes a finding if that lasts.
+/// An endpoint without a counterpart. It becomes a finding if it stays without one.
 #[derive(Debug)]
 pub(super) struct UnmatchedEndpoint {
     pub(super) guid: Guid,
     pub(super) diagnosis: Diagnosis,
 }
 
-/// Endpoints of one role that have the same verdict against any endpoint.
+/// Endpoints of one role with the same type, QoS and vendor: their verdict against any endpoint is
+/// the same.
 #[derive(Debug)]
 struct Group<'a> {
     message_type: &'a TypeName,
@@ -223,7 +224,7 @@ fn compare<'a>(
     }
 }
 
-/// Lists pairs of these two groups while the list has room; returns their number.
+/// Lists at most `room` pairs of these two groups. Returns the number of listed pairs.
 fn list(
     writers: &Group<'_>,
     readers: &Group<'_>,
@@ -249,8 +250,8 @@ fn list(
     count
 }
 
-/// Returns whether an endpoint without a counterpart is a problem on this topic. It is not on
-/// topics that every node has anyway: `/rosout`, `/parameter_events`, a lifecycle node's
+/// Returns whether an endpoint without a counterpart is a problem on this topic. It is not a
+/// problem on topics that every node has anyway: `/rosout`, `/parameter_events`, a lifecycle node's
 /// `transition_event`, hidden topics, and topics of services and actions.
 fn is_about_hearing(topic: &Topic) -> bool {
     let naming = &topic.naming;

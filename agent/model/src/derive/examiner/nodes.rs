@@ -52,9 +52,9 @@ pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
     }
 }
 
-/// Adds nodes that are in several domains: their endpoints are announced in several, or nodes of
-/// the same name run in several on one machine. Equal names on different machines are normal for a
-/// fleet that is separated by domains.
+/// Adds nodes in several domains: their endpoints are announced in several domains, or nodes of the
+/// same name run in several domains on one machine. Equal names on different machines are normal
+/// for a fleet that is separated by domains.
 fn several_domains(
     name: &NodeName,
     nodes: &[HostedNode<'_>],
@@ -108,8 +108,8 @@ impl HostedNode<'_> {
         domains
     }
 
-    /// Returns the machine's addresses. Host names do not suffice, since robots of one series share
-    /// them. `None` without an address.
+    /// Returns the machine's addresses. Host names do not suffice, because robots of one series may
+    /// share them. `None` without an address.
     fn machine(&self) -> Option<BTreeSet<IpAddr>> {
         let addresses = &self.participant.addresses;
         let all = addresses.default.iter().chain(&addresses.metatraffic);

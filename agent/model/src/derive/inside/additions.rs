@@ -1,11 +1,11 @@
-//! What a report adds to the topics: from the figures of each handle.
+//! Counts that a report adds to the topics, from the figures of each handle.
 
 use super::topics::{Live, TopicAdded};
 use super::tracked::{Added, Detail, Kind, Tracked};
 use crate::facts::calls::report::Trigger;
 
 impl Live {
-    /// Counts a handle that is alive.
+    /// Counts a live handle.
     pub(super) fn count(&mut self, tracked: &Tracked) {
         match (tracked.figures.kind, &tracked.figures.detail) {
             (Kind::Publisher, _) => self.publishers += 1,
@@ -26,8 +26,8 @@ impl Live {
 }
 
 impl TopicAdded {
-    /// Adds what came to one handle. `both` are the publications of the process, and the receptions
-    /// of the callback with the most.
+    /// Adds the new counts of one handle. `both` has the publications of the process, and the
+    /// receptions of the callback with the most receptions.
     pub(super) fn take(
         &mut self,
         tracked: &Tracked,

@@ -55,8 +55,8 @@ impl Attribution {
                 _ => {}
             }
         }
-        // Without the owner of a socket, an announced id must be unique on both sides. Fast DDS
-        // announces only the low 16 bits.
+        // If no socket shows the process, an announced process id must be unique among participants
+        // and processes. Fast DDS announces only the low 16 bits.
         for id in processes {
             if found.processes.contains_key(id) {
                 continue;
@@ -112,7 +112,7 @@ impl Attribution {
     }
 
     /// Sets the domain and node of a handle of this process. `reported` are the nodes that the
-    /// process created while it was observed, `domain_id` is that of its environment.
+    /// process created while it was observed, `domain_id` is the domain of its environment.
     pub(super) fn resolve(
         &self,
         process: u32,
@@ -171,7 +171,7 @@ impl Attribution {
     }
 }
 
-/// Returns the only different value, or `None` if there are several or none.
+/// Returns the common value, or `None` if the values differ or there are none.
 fn only<'a, T: PartialEq + 'a>(mut values: impl Iterator<Item = &'a T>) -> Option<&'a T> {
     let first = values.next()?;
     values.all(|other| other == first).then_some(first)

@@ -2,9 +2,9 @@
 //! period, callbacks that wait, messages overwritten in their queue.
 //!
 //! A rule is evaluated at each report, on the window of the last 5 to 10 s. A finding appears after
-//! [`BAD`] bad evaluations in a row and goes after [`GOOD`] good ones. Handles are not evaluated in
-//! their first [`GRACE`], because nodes load and connect when they start. A finding keeps its
-//! figure until that grows by half, so that it is not an event per second.
+//! [`BAD`] bad evaluations in a row and ends after [`GOOD`] good ones. Handles are not evaluated in
+//! their first [`GRACE`], because nodes load and connect when they start. A finding keeps its value
+//! until the value grows by half, so that it does not cause an event per second.
 
 use std::time::Duration;
 
@@ -14,19 +14,20 @@ use super::tracked::{Kind, Tracked};
 use crate::facts::calls::report::{Durations, Trigger};
 use crate::facts::model_time::ModelTime;
 
-/// Bad evaluations in a row until a finding appears.
+/// Number of bad evaluations in a row after which a finding appears.
 const BAD: u8 = 3;
-/// Good evaluations in a row until it goes.
+/// Number of good evaluations in a row after which a finding ends.
 const GOOD: u8 = 10;
 /// Time after the first report of a handle in which it is not evaluated.
 pub(super) const GRACE: Duration = Duration::from_secs(10);
-/// Least number of calls or messages of a window that are bad.
+/// Minimum number of bad calls or messages in a window.
 const LEAST: u64 = 3;
-/// Their least share, as a divisor: 1 %.
+/// Minimum share of bad calls or messages in a window, as a divisor: 1 %.
 const SHARE: u64 = 100;
-/// A shorter wait is not a finding.
+/// Minimum wait of a finding.
 const WAIT: Duration = Duration::from_millis(100);
-/// Time for which two callbacks must have run in one thread until one delays the other.
+/// Time for which two callbacks must have run in one thread before one counts as a delay of the
+/// other.
 const SAME_THREAD: Duration = Duration::from_secs(10);
 
 /// The state of one rule for one handle.
@@ -34,7 +35,7 @@ const SAME_THREAD: Duration = Duration::from_secs(10);
 pub(super) struct Alarm {
     bad: u8,
     good: u8,
-    /// The finding's figure and what it exceeds.
+    /// The finding's value, and the value with which it is compared.
     raised: Option<(u64, u64)>,
 }
 
@@ -45,7 +46,7 @@ pub(super) struct Alarms {
     pub(super) slow: Alarm,
     /// Wait of a callback.
     pub(super) wait: Alarm,
-    /// Messages overwritten, and put into the queue.
+    /// Permille of messages overwritten, and number of messages put into the queue.
     pub(super) overwritten: Alarm,
 }
 
@@ -58,7 +59,7 @@ pub(super) struct TimerThread {
     pub(super) period: Duration,
 }
 
-/// The longest callback of each thread and the calls of the window.
+/// The longest callback of a thread, and the share of the window that its callbacks took.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct ThreadLoad {
     pub(super) longest: Duration,
@@ -66,8 +67,8 @@ pub(super) struct ThreadLoad {
 }
 
 impl Alarm {
-    /// Evaluates the rule once; `found` is the figure if it is bad. Returns whether the finding
-    /// appeared, went or changed.
+    /// Evaluates the rule once; `found` is the value if it is bad. Returns whether the finding
+    /// appeared, ended or changed.
     pub(super) fn judge(&mut self, found: Option<(u64, u64)>) -> bool {
         match found {
             Some(value) => {
@@ -86,7 +87,7 @@ impl Alarm {
         }
     }
 
-    /// Returns the figure of the finding and what it exceeds.
+    /// Returns the finding's value, and the value with which it is compared.
     pub(super) const fn raised(&self) -> Option<(u64, u64)> {
         self.raised
     }
@@ -109,7 +110,7 @@ impl TimerThread {
     }
 }
 
-/// Evaluates all rules for a handle. Returns whether a finding appeared, went or changed.
+/// Evaluates all rules for a handle. Returns whether a finding appeared, ended or changed.
 pub(super) fn judge(
     tracked: &mut Tracked,
     timers: &[TimerThread],
@@ -164,8 +165,8 @@ fn wait(tracked: &Tracked, load: ThreadLoad) -> Option<(u64, u64)> {
     }
     let durations = tracked.window(DELAY)?;
     let p99 = exceeds(&durations, limit)?;
-    // The wait of a message from the middleware includes its way. It is the executor's only if the
-    // thread was busy for so long.
+    // The wait of a message from the middleware includes its transport. The executor is the cause
+    // only if the thread was busy for that long.
     let is_way = matches!(tracked.figures.trigger(), Some(Trigger::Subscription(_)));
     let is_busy = load.longest * 2 >= p99 || load.busy >= 0.8;
     (!is_way || is_busy).then_some((nanoseconds(p99), nanoseconds(limit)))
@@ -180,8 +181,8 @@ fn interval(tracked: &Tracked) -> Option<Duration> {
     (calls > 0).then(|| tracked.recent.span / calls)
 }
 
-/// Returns the 99th percentile if enough durations are certainly longer than the limit: those in
-/// the limit's own bucket do not count.
+/// Returns the 99th percentile if enough durations are certainly longer than the limit: durations
+/// in the bucket of the limit do not count.
 fn exceeds(durations: &Durations, limit: Duration) -> Option<Duration> {
     let long = durations.above(limit);
     let p99 = durations.quantile(0.99)?;

@@ -1,8 +1,9 @@
-//! Figures from inside processes: what no wire shows.
+//! Figures from calls inside processes, which the network does not show.
 //!
-//! A source of uprobes reports calls of `libtracetools.so` once a second ([`report::Report`]).
-//! [`Inside`] adds them up per topic and finds their nodes; [`facts`] are what a snapshot shows.
-//! The counts of a topic come from the network or from inside, never from both: [`source`].
+//! A source of uprobes reports calls of `libtracetools.so` once a second
+//! ([`crate::facts::calls::report::Report`]). [`Inside`] adds them up per topic and finds their
+//! nodes. Snapshots show them as [`crate::facts::calls::facts`]. The counts of a topic come from
+//! the network or from inside processes, never from both: [`source`].
 
 mod additions;
 mod attribution;

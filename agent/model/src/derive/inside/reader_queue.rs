@@ -1,17 +1,17 @@
 //! Messages that arrived at a process and that its subscription never took: the middleware dropped
-//! them from the subscription's queue, because the process takes too slowly.
+//! them from the subscription's queue, because the process takes messages too slowly.
 //!
-//! Arrivals are those of the deliveries, takes are those of the calls. All subscriptions of a
-//! process with the same topic are one queue, as a delivery belongs to a participant. A message
-//! that was not taken may still wait, so a loss needs proof:
+//! Deliveries count the arrivals, and calls count the takes. All subscriptions of a process to the
+//! same topic count as one queue, because a delivery belongs to a participant. A message that was
+//! not taken may still wait, so a loss needs one of these proofs:
 //!
 //! - More messages wait than the queues hold, if their depth is announced.
 //! - A message that was published later has been taken. Queues keep the order, and the latency of a
 //!   take shows when its message was published.
-//! - Takes followed the last arrival, and neither was seen for a while.
+//! - A take followed the last arrival, and neither takes nor arrivals were seen for a while.
 //!
-//! Arrivals are compared with the takes of the next report, so a message under way is never lost.
-//! Messages within the process cannot be compared, and are not evaluated.
+//! Arrivals are compared with the takes of the next report, so a message in transit never counts as
+//! lost. Messages within the process cannot be compared, and are not evaluated.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -24,71 +24,73 @@ use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::QueueTotals;
 
-/// Writers of one queue; a queue with more is not evaluated.
+/// Maximum number of writers of one queue. A queue with more writers is not evaluated.
 const WRITERS: usize = 256;
-/// Time without arrivals and takes after which nothing waits.
+/// Time without arrivals and takes after which no message waits.
 const QUIET: Duration = Duration::from_secs(10);
-/// Arrivals may be counted so long before the clock reaches their time.
+/// Maximum time by which arrivals are counted before the clock reaches their time.
 const AHEAD: Duration = Duration::from_millis(100);
 
-/// What has arrived at the subscriptions of a process.
+/// Messages that have arrived at the subscriptions of a process.
 #[derive(Clone, Debug, Default)]
 pub struct Arrivals {
     /// The readers of the topic in that process, sorted.
     pub readers: Vec<Guid>,
     /// The writers that these readers match, sorted.
     pub writers: Vec<ArrivalsOf>,
-    /// Messages that all readers together keep; `None` if that is not announced or unbounded.
+    /// Number of messages that all readers together keep; `None` if it is not announced or
+    /// unbounded.
     pub depth: Option<u64>,
-    /// Time of the last one, or later.
+    /// Time of the last arrival, or later.
     pub last: Option<ModelTime>,
     /// Whether timestamps of a writer are ahead of this host's clock.
     pub is_ahead: bool,
 }
 
-/// What has arrived from one writer.
+/// Messages that have arrived from one writer.
 #[derive(Clone, Copy, Debug)]
 pub struct ArrivalsOf {
     /// The writer.
     pub writer: Guid,
-    /// Time since which all arrivals are counted; `None` if earlier ones may be missing.
+    /// Time when the complete count of arrivals began; `None` if earlier arrivals may be missing.
     pub since: Option<ModelTime>,
-    /// Messages, once for each matched reader.
+    /// Number of messages, each counted once per matched reader.
     pub messages: u64,
 }
 
-/// What the subscriptions of a process have taken.
+/// Messages that the subscriptions of a process have taken.
 #[derive(Clone, Debug)]
 pub(super) struct Takes {
     /// The subscriptions, sorted.
     pub(super) handles: Vec<u64>,
-    /// Messages that they have taken.
+    /// Number of messages that they have taken.
     pub(super) taken: u64,
-    /// Time since which all takes are counted; `None` if earlier ones may be missing.
+    /// Time when the complete count of takes began; `None` if earlier takes may be missing.
     pub(super) since: Option<ModelTime>,
-    /// Time of publication of the last message that each of them has taken, or before.
+    /// Time at or before the publication of the last message that each subscription has taken.
     pub(super) published: Option<ModelTime>,
-    /// Time of the last take of each of them.
+    /// The earliest of the times at which each subscription last took a message.
     pub(super) last: ModelTime,
 }
 
-/// The subscriptions of one process with one topic.
+/// The subscriptions of one process to one topic.
 #[derive(Debug)]
 pub(super) struct ReaderQueue {
     handles: Vec<u64>,
     readers: Vec<Guid>,
     writers: Vec<ArrivalsOf>,
     depth: Option<u64>,
-    /// Takes, and those that do not count: of messages whose arrival is not counted.
+    /// Number of takes, and of those that do not count, because the arrival of their message is not
+    /// counted.
     taken: u64,
     excluded: u64,
-    /// Messages that arrived, now and at earlier reports.
+    /// Number of messages that have arrived, now and at earlier reports.
     arrived: u64,
     past: Bounded<QueueTotals, VecDeque<(ModelTime, u64)>>,
     lost: u64,
-    /// Whether the start of the arrivals is known: a report after that of the takes.
+    /// Whether the count of arrivals has begun, which is one report after that of takes.
     has_begun: bool,
-    /// Time of the last change, and the longest time between takes.
+    /// Times of the last change and of the last take, and the longest time between takes.
     changed: ModelTime,
     took: ModelTime,
     longest_gap: Duration,
@@ -99,9 +101,9 @@ pub(super) struct ReaderQueue {
 }
 
 impl ReaderQueue {
-    /// Begins to compare.
+    /// Begins the comparison.
     pub(super) fn new(arrivals: &Arrivals, takes: &Takes, now: ModelTime) -> Self {
-        // The whole life of the queue is known: all takes count, and all arrivals.
+        // If the whole life of the queue is known, all takes and all arrivals count.
         let is_whole = takes.since.is_some_and(|observed| {
             let mut begins = arrivals.writers.iter().map(|each| each.since);
             begins.all(|since| since.is_some_and(|since| since >= observed))
@@ -137,12 +139,12 @@ impl ReaderQueue {
             && self.taken <= takes.taken
     }
 
-    /// Compares arrivals with takes. Returns the messages that were lost in the meantime.
+    /// Compares arrivals with takes. Returns the number of messages lost since the last comparison.
     pub(super) fn compare(&mut self, arrivals: &Arrivals, takes: &Takes, now: ModelTime) -> u64 {
         let before = (self.arrived, self.taken);
         self.arrive(arrivals);
-        // All of these takes are older than the arrivals counted now, so more takes than arrivals
-        // are takes of messages whose arrival is not counted.
+        // All these takes are older than the arrivals counted now. Takes in excess of the arrivals
+        // are of messages whose arrival is not counted.
         let counted = self.taken.saturating_sub(self.excluded);
         self.excluded += counted.saturating_sub(self.arrived);
         if takes.taken > self.taken {
@@ -173,7 +175,7 @@ impl ReaderQueue {
         lost
     }
 
-    /// Evaluates the rule of the finding. Returns whether it appeared, went or changed.
+    /// Evaluates the rule of the finding. Returns whether the finding appeared, ended or changed.
     pub(super) fn judge(&mut self, now: ModelTime) -> bool {
         let [(_, arrived, lost), (middle, ..)] = self.marks;
         let (arrived, lost) = (self.arrived - arrived, self.lost - lost);
@@ -192,7 +194,7 @@ impl ReaderQueue {
         (self.arrived, taken, self.lost)
     }
 
-    /// Returns the messages that all subscriptions together keep, if that is announced.
+    /// Returns the number of messages that all subscriptions together keep, if it is announced.
     pub(super) const fn depth(&self) -> Option<u64> {
         self.depth
     }
@@ -210,7 +212,8 @@ impl ReaderQueue {
         }
     }
 
-    /// Adds what has arrived. Of a writer that is new, only what is certainly new counts.
+    /// Adds the new arrivals. Messages of a new writer count only if all of them arrived since the
+    /// comparison began.
     fn arrive(&mut self, arrivals: &Arrivals) {
         let has_begun = std::mem::replace(&mut self.has_begun, true);
         for each in &arrivals.writers {

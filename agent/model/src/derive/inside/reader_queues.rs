@@ -16,8 +16,8 @@ use crate::facts::naming::Naming;
 
 impl Inside {
     /// Compares what has arrived at the subscriptions of each process with what they took, after a
-    /// report. `arrivals` returns the arrivals of a topic at these participants; `None` if they
-    /// are not known.
+    /// report. `arrivals` returns the arrivals of a topic at the participants of a process; `None`
+    /// if they are not known.
     pub fn compare_queues(
         &mut self,
         now: ModelTime,
@@ -47,7 +47,7 @@ impl Inside {
                 self.topics.lose(&key, lost);
                 process.queues.insert(key, queue);
             }
-            // Those that can no longer be compared, with their findings.
+            // The remaining queues can no longer be compared, so their findings end.
             let ended = queues.values().any(|queue| queue.alarm.raised().is_some());
             self.revision += u64::from(ended);
         }
@@ -111,8 +111,8 @@ impl Process {
         }
     }
 
-    /// Returns what the subscriptions with each topic have taken. Without a take it is unknown
-    /// whether the calls of a subscription are observed.
+    /// Returns what the subscriptions to each topic have taken. A subscription without a take is
+    /// left out, because its calls may not be observed.
     fn takes(&self) -> BTreeMap<(DomainId, TopicName), Takes> {
         let mut all: BTreeMap<(DomainId, TopicName), Takes> = BTreeMap::new();
         if self.facts.is_suspended {
@@ -141,7 +141,8 @@ impl Process {
         all
     }
 
-    /// Returns the identity of a queue: its first subscription, and the node if it is that of all.
+    /// Returns the identity of a queue: its first subscription, and the node if all its
+    /// subscriptions belong to it.
     fn owner(&self, process: u32, domain_id: DomainId, queue: &ReaderQueue) -> Owner {
         let tracked = |handle: &u64| self.handles.get(&(Kind::Subscription, *handle));
         let all = || queue.handles().iter().filter_map(tracked);

@@ -1,13 +1,14 @@
 //! Decides whether a topic's counts come from the network or from inside processes.
 //!
-//! The network decides as long as it shows what processes publish. If a process has published for
-//! two seconds without a message on the network, the counts come from inside. Both are never added:
-//! at a change the total continues with the further messages of the new source.
+//! The counts come from the network as long as it shows the messages that processes publish. If a
+//! process has published for two seconds without a message on the network, the counts come from
+//! inside. The two counts are never added: at a change, the total continues with the further
+//! messages of the new source.
 
 use std::time::Duration;
 
 use crate::facts::model_time::ModelTime;
-/// Time by which publications may be ahead of the network's messages.
+/// Maximum time by which publications may be ahead of the network's messages.
 const AHEAD: Duration = Duration::from_secs(2);
 
 /// Where a topic's counts come from.
@@ -121,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn the_network_counts_as_long_as_it_sees_the_messages() {
+    fn the_network_is_the_source_as_long_as_it_shows_messages() {
         let mut choice = Choice::default();
         for second in 1..20 {
             choice.choose(Some(seen(10 * second, second)), seen(12 * second, second));
@@ -131,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn the_total_continues_when_the_network_falls_silent_and_speaks_again() {
+    fn the_total_continues_when_the_network_falls_silent_and_recovers() {
         let mut choice = Choice::default();
         choice.choose(Some(seen(100, 10)), seen(150, 10));
         choice.choose(Some(seen(100, 10)), seen(170, 12));

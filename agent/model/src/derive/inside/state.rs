@@ -28,10 +28,10 @@ use crate::graph::discovery::Discovery;
 use crate::measure::receivers::Receivers;
 use crate::measure::topic::TopicId;
 
-/// Without a report for this long, the source has stopped.
+/// Time without a report after which the source counts as stopped.
 const STALE: Duration = Duration::from_secs(10);
 
-/// Everything that reports have shown.
+/// Processes, handles and topics that reports have shown.
 #[derive(Debug, Default)]
 pub struct Inside {
     /// Time of the last report; `None` without one, or if the source has stopped.
@@ -47,7 +47,7 @@ pub struct Inside {
     states: Bounded<LifecycleStates, BTreeMap<(u32, Option<NodeName>), LifecycleState>>,
     /// Revisions of the graph that determined nodes and domains.
     graph: Option<(u64, u64)>,
-    /// Changes of the findings.
+    /// Number of changes of the findings.
     pub(super) revision: u64,
 }
 
@@ -55,7 +55,8 @@ pub struct Inside {
 #[derive(Debug)]
 pub(super) struct Process {
     pub(super) facts: ObservedProcess,
-    /// Time of the report before its first one: all of its calls since then are counted.
+    /// Time of the report before the first one with this process: all its calls since then are
+    /// counted.
     pub(super) born: Option<ModelTime>,
     /// Its participants.
     pub(super) participants: BTreeSet<GuidPrefix>,
@@ -73,7 +74,7 @@ pub(super) struct Process {
     witnesses: BTreeMap<(DomainId, TopicName), Witness>,
 }
 
-/// What a report added to a handle.
+/// Counts that a report added to a handle.
 #[derive(Debug)]
 struct HandleAdded {
     process: u32,
@@ -82,7 +83,8 @@ struct HandleAdded {
 }
 
 impl Inside {
-    /// Returns the row of the metrics: handles, and what was dropped or refused because of caps.
+    /// Returns the number of handles, its cap, and the number of entries dropped or refused because
+    /// of caps.
     #[must_use]
     pub fn table(&self) -> TableFacts {
         let mut facts = self.handles.facts();
@@ -90,7 +92,7 @@ impl Inside {
         facts
     }
 
-    /// Takes a report, with times of the wall clock. Returns the transitions of managed nodes in it.
+    /// Processes a report, whose times are wall times. Returns its transitions of managed nodes.
     pub fn report(
         &mut self,
         report: Report,
@@ -109,7 +111,7 @@ impl Inside {
         self.at = Some(at);
         self.has_callbacks = has_callbacks;
         if began.is_none() {
-            // Those that have ended in the meantime are not reported again.
+            // Processes that ended while there was no report are not reported again.
             let running: HashSet<_> = processes.iter().map(|process| process.id).collect();
             self.states.retain(|(id, _), _| running.contains(id));
         }
@@ -133,8 +135,7 @@ impl Inside {
         transitions
     }
 
-    /// Drops what has ended: topics after the grace period, and all handles if the source has
-    /// stopped.
+    /// Drops topics after their grace period, and all handles if the source has stopped.
     pub fn advance(&mut self, now: ModelTime, grace: Duration) {
         self.topics.expire(now, grace);
         if self.at.is_some_and(|at| now - at >= STALE) {
@@ -206,7 +207,7 @@ impl Inside {
         topic.map_or(Source::Wire, InsideTopic::source)
     }
 
-    /// Replaces what is known from inside in the sum of a topic's writers.
+    /// Replaces the values that are known from inside in the sum over a topic's writers.
     pub fn apply(&self, domain_id: DomainId, naming: &Naming, sum: &mut Measurement) {
         if let Some(topic) = self.find(domain_id, naming) {
             topic.apply(sum);
@@ -259,7 +260,7 @@ impl Inside {
         Some(facts)
     }
 
-    /// Takes the figures of one process, and collects what they add.
+    /// Processes the figures of one process, and collects the counts that they add.
     fn take(
         &mut self,
         report: ProcessReport,
@@ -395,7 +396,7 @@ impl Inside {
             let Some(process) = id.and_then(|id| self.processes.get_mut(&id)) else {
                 continue;
             };
-            // Humble does not report publications within a process: its callbacks show them.
+            // Humble does not report publications within a process, but its callbacks show them.
             let mut received: BTreeMap<(DomainId, TopicName), (u64, u64)> = BTreeMap::new();
             for HandleAdded { key, added, .. } in of_process {
                 let Some(tracked) = process.handles.get(key) else {
@@ -434,7 +435,7 @@ impl Inside {
         }
     }
 
-    /// Keeps the state of a managed node, and returns it.
+    /// Records a transition of a managed node, and returns the new state.
     fn transit(&mut self, transition: Transition, clock: WallClock) -> LifecycleState {
         let Transition {
             process,

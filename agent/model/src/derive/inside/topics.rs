@@ -1,6 +1,6 @@
 //! Sums per topic over all processes.
 //!
-//! Every report adds what is new, so a total never decreases when a process ends.
+//! Every report adds its new counts, so a total never decreases when a process ends.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -23,11 +23,11 @@ use crate::facts::rate::{SECONDS, Slot};
 use crate::facts::tables::{InsideTopicSums, TopicTotals};
 use crate::measure::topic::TopicId;
 
-/// All topics of observed processes, and those that had one within the grace period.
+/// All topics that have handles in observed processes, or had one within the grace period.
 #[derive(Debug, Default)]
 pub(super) struct InsideTopics {
     topics: Bounded<InsideTopicSums, BTreeMap<(DomainId, TopicName), InsideTopic>>,
-    /// Topics dropped or refused because of the cap.
+    /// Number of topics dropped or refused because of the cap.
     pub(super) evictions: u64,
 }
 
@@ -47,7 +47,7 @@ pub(super) struct InsideTopic {
     past: Bounded<TopicTotals, VecDeque<(ModelTime, u64)>>,
     live: Live,
     choice: Choice,
-    /// Its entry among the topics of the graph, if that is known.
+    /// Its id among the topics of the graph, if known.
     pub(super) id: Option<TopicId>,
     /// Time of the last report with a handle of this topic.
     seen: ModelTime,
@@ -64,11 +64,11 @@ pub(super) struct Live {
     pub(super) depth: u64,
 }
 
-/// What a report adds to a topic.
+/// Counts that a report adds to a topic.
 #[derive(Debug, Default)]
 pub(super) struct TopicAdded {
     pub(super) counts: TopicCounts,
-    /// The most messages that one subscription took.
+    /// Maximum number of messages that one subscription took.
     pub(super) taken_by_one: u64,
     pub(super) last: Option<ModelTime>,
     pub(super) latency: Option<Durations>,
@@ -125,7 +125,7 @@ impl InsideTopics {
         }
     }
 
-    /// Takes the handles that are alive, and the totals of this time.
+    /// Records the live handles, and the totals at `at`.
     pub(super) fn turn(&mut self, live: &BTreeMap<(DomainId, TopicName), Live>, at: ModelTime) {
         for (key, topic) in &mut self.topics {
             topic.messages += topic.witness.turn(false);
@@ -144,7 +144,8 @@ impl InsideTopics {
         }
     }
 
-    /// Adds messages lost in the queues of subscriptions, also 0.
+    /// Adds messages lost in the queues of subscriptions. A count of 0 marks the queues as
+    /// evaluated.
     pub(super) fn lose(&mut self, key: &(DomainId, TopicName), lost: u64) {
         if let Some(topic) = self.topics.get_mut(key) {
             *topic.lost_in_queues.get_or_insert_default() += lost;
@@ -165,7 +166,8 @@ impl InsideTopics {
             .retain(|_, topic| topic.is_live() || topic.seen + grace > now);
     }
 
-    /// Frees an entry if none is free: that of the topic whose last handle ended first.
+    /// Returns whether an entry is free. If necessary, drops the topic whose last handle ended
+    /// first.
     fn has_room(&mut self) -> bool {
         if !self.topics.is_full() {
             return true;
@@ -181,7 +183,8 @@ impl InsideTopics {
 }
 
 impl Live {
-    /// Returns the number of subscriptions. A callback's buffer or subscription may be unknown.
+    /// Returns the number of subscriptions. The buffer or subscription of a callback may be
+    /// unknown, so the larger count applies.
     const fn subscriptions(&self) -> usize {
         if self.subscriptions > self.receivers {
             self.subscriptions
@@ -258,7 +261,7 @@ impl InsideTopic {
         self.choice.choose(wire, inside);
     }
 
-    /// Replaces what the source decides in the topic's sum of its writers.
+    /// Replaces the values that the source determines in the sum over the topic's writers.
     pub(super) fn apply(&self, sum: &mut Measurement) {
         sum.messages = self.choice.messages(sum.messages, self.messages);
         if self.source() == Source::Inside {

@@ -58,7 +58,8 @@ pub(super) struct Figures {
     pub(super) detail: Detail,
     pub(super) counts: Counts,
     pub(super) last: ModelTime,
-    /// As [`ros2probe_wire::inside::distribution`] numbers them; `None` if the kind has none.
+    /// Durations by the index of [`ros2probe_wire::inside::distribution`]; `None` if the kind has
+    /// none.
     pub(super) durations: [Option<Arc<Durations>>; 2],
 }
 
@@ -77,12 +78,12 @@ pub(super) struct Tracked {
     /// Its node: as the source reports it, otherwise as the graph shows it.
     pub(super) node: Option<NodeName>,
     pub(super) domain_id: DomainId,
-    /// Time since which the thread of its calls is the same.
+    /// Time at which the thread of its calls last changed.
     pub(super) thread_since: ModelTime,
     /// Time of its first report.
     pub(super) since: ModelTime,
-    /// A subscription: time of publication of the last message that it took, or before. Only
-    /// increases.
+    /// For a subscription: a time at or before the publication of the last message that it took. It
+    /// only increases.
     pub(super) published: Option<ModelTime>,
     /// The earlier and the later start of a window.
     marks: [Mark; 2],
@@ -105,11 +106,12 @@ pub(super) struct Recent {
     pub(super) span: Duration,
     pub(super) counts: Counts,
     pub(super) quantiles: [Quantiles; 2],
-    /// Time of the window that its calls took; a call that began before counts from there on.
+    /// Time that its calls took within the window. A call that began earlier counts from the start
+    /// of the window.
     pub(super) busy: Duration,
 }
 
-/// What one report added to a handle.
+/// Counts and delays that one report added to a handle.
 #[derive(Debug, Default)]
 pub(super) struct Added {
     pub(super) counts: Counts,
@@ -117,7 +119,7 @@ pub(super) struct Added {
 }
 
 impl Counts {
-    /// Returns what was added since `earlier`; a smaller count began anew.
+    /// Returns the counts since `earlier`. A count that decreased has restarted from 0.
     fn since(self, earlier: Self) -> Self {
         let one = |now: u64, before: u64| now.checked_sub(before).unwrap_or(now);
         Self {
@@ -260,7 +262,7 @@ impl Tracked {
         }
     }
 
-    /// Replaces the figures by newer ones. Returns what they add.
+    /// Replaces the figures by newer ones. Returns the counts and delays that they add.
     pub(super) fn update(&mut self, mut figures: Figures, at: ModelTime) -> Added {
         if figures.counts.count >= self.figures.counts.count {
             figures.continue_from(&self.figures);
@@ -287,8 +289,8 @@ impl Tracked {
         added
     }
 
-    /// Takes note of the oldest message among those that a report added. Without the latency of
-    /// each of them, that is unknown.
+    /// Records the publication time of the oldest message that a report added. It is unknown
+    /// without the latency of each message.
     pub(super) fn took(&mut self, added: &Added) {
         let delay = added.delay.as_ref().filter(|delay| {
             self.figures.kind == Kind::Subscription && delay.count() == added.counts.count
@@ -308,8 +310,8 @@ impl Tracked {
         }
     }
 
-    /// Returns the durations of the window, as [`ros2probe_wire::inside::distribution`] numbers
-    /// them.
+    /// Returns the durations of the window with this index in
+    /// [`ros2probe_wire::inside::distribution`].
     pub(super) fn window(&self, which: usize) -> Option<Durations> {
         let now = self.figures.durations.get(which)?.as_deref()?;
         let [begin, _] = &self.marks;
@@ -327,7 +329,7 @@ impl Tracked {
         }
     }
 
-    /// Adds it to the list of its kind.
+    /// Adds the handle to the list of its kind.
     pub(super) fn facts(&self, process: u32, into: &mut InsideFacts) {
         let owner = self.owner(process);
         let Figures {
@@ -404,7 +406,7 @@ impl Tracked {
         }
     }
 
-    /// Returns what its counts add to its topic per second over the window.
+    /// Returns the count per second over the window.
     #[expect(
         clippy::cast_precision_loss,
         reason = "counts of ten seconds are far below 2^52"
@@ -431,7 +433,7 @@ impl Figures {
         }
     }
 
-    /// Returns the delays that were added since these.
+    /// Returns the delays that were added since `before`.
     pub(super) fn added_delay(&self, before: Option<&Durations>) -> Option<Durations> {
         let now = self.durations[DELAY].as_deref()?;
         Some(before.map_or_else(|| now.clone(), |before| now.since(before)))

@@ -1,15 +1,15 @@
 //! Publications of which only receptions are observed.
 //!
-//! A reception shows a publication that no observed publisher made: one of another host, or on
+//! A reception may show a publication whose publisher is not observed: one on another host, or on
 //! Humble one within a process. Most receptions belong to observed publications, and are read some
-//! milliseconds earlier or later. So the receptions of a report are compared with the publications
-//! up to the next one.
+//! milliseconds earlier or later. The receptions of a report are therefore compared with the
+//! publications up to the next report.
 
 /// The balance of publications and receptions of one subscription.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Witness {
-    /// Publications less receptions, without those of the last report. Never more than the
-    /// publications of the last two reports, since a subscription need not receive all.
+    /// Publications minus receptions, without those of the last report. It is at most the
+    /// publications of the last two reports, because a subscription need not receive all.
     lead: i64,
     /// Publications and receptions of the last report.
     last: (i64, i64),
@@ -19,15 +19,15 @@ pub(super) struct Witness {
 }
 
 impl Witness {
-    /// Takes what one report adds.
+    /// Adds the counts of one report.
     pub(super) fn take(&mut self, published: u64, received: u64) {
         let signed = |count: u64| i64::try_from(count).unwrap_or(i64::MAX);
         self.published = self.published.saturating_add(signed(published));
         self.received = self.received.saturating_add(signed(received));
     }
 
-    /// Ends a report. Returns the number of publications that only receptions show; if it is the
-    /// last report, also those that no other can confirm.
+    /// Ends a report. Returns the number of publications that only receptions show. After the last
+    /// report, this includes publications that no later report can confirm.
     pub(super) fn turn(&mut self, is_last: bool) -> u64 {
         let published = std::mem::take(&mut self.published);
         let received = std::mem::take(&mut self.received);
@@ -67,7 +67,7 @@ mod tests {
         let mut witness = Witness::default();
         let counted = [10, 10, 10, 0, 0].map(|received| add(&mut witness, 0, received));
         assert_eq!(counted, [0, 10, 10, 10, 0]);
-        // Publications that were not received do not hide later ones for long.
+        // Publications that were not received do not hide later receptions for long.
         let counted = [500, 500, 0, 0].map(|published| add(&mut witness, published, 0));
         assert_eq!(counted, [0; 4]);
         let counted = [7, 7, 0].map(|received| add(&mut witness, 0, received));

@@ -21,7 +21,7 @@ pub struct Action {
     pub counts: GoalCounts,
     /// Times from the request of a goal to its result.
     pub durations: Latencies,
-    /// Goals dropped because of the cap.
+    /// Number of goals dropped because of the cap.
     pub evictions: u64,
 }
 
@@ -34,14 +34,14 @@ pub struct GoalCounts {
     pub rejected: u64,
     /// The result was sent to a client, and the goal had succeeded.
     pub succeeded: u64,
-    /// The same for a goal that was cancelled.
+    /// The result was sent to a client, and the goal had been cancelled.
     pub canceled: u64,
-    /// The same for a goal that the server aborted.
+    /// The result was sent to a client, and the server had aborted the goal.
     pub aborted: u64,
 }
 
 impl Action {
-    /// Records the reply to a goal's request, which was sent at `sent`.
+    /// Records the reply to a goal request that was sent at `sent`.
     pub fn replied(&mut self, goal: [u8; 16], sent: ModelTime, accepted: bool) {
         if !accepted {
             self.counts.rejected += 1;

@@ -22,7 +22,7 @@ pub struct LatencyFacts {
     pub histogram: Histogram,
     /// Median of the latest 1024 durations, in seconds; `None` before the first.
     pub p50: Option<f64>,
-    /// Duration below which 99 % of them lie, in seconds.
+    /// 99th percentile of the same durations, in seconds.
     pub p99: Option<f64>,
 }
 

@@ -1,5 +1,5 @@
 //! The calls of one service: each request counts once, and the first reply that reaches the client
-//! ends it.
+//! ends the call.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -12,7 +12,7 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::observation::{Content, Sample};
 use crate::facts::tables::{ReplyRuns, ServiceClients};
 
-/// Request numbers below the highest one that are remembered per client, for late duplicates.
+/// Number of request numbers that are remembered per client, to recognise late duplicates.
 const WINDOW: u64 = 64;
 /// A number further ahead does not move a client's highest number, since it may be forged.
 const FAR: u64 = 1 << 20;
@@ -67,7 +67,8 @@ pub struct Service {
     pub unanswered: u64,
     /// Times from request to reply.
     pub latencies: Latencies,
-    /// Time until which requests are not followed, because one of its writers is not captured.
+    /// End of the time in which requests are not followed, because one of its writers is not
+    /// captured.
     pub suspended: Option<ModelTime>,
     /// Time of the last request.
     pub last_request: ModelTime,
@@ -106,7 +107,7 @@ struct Call {
 struct Received {
     /// Writer and number of the reply.
     of: Option<(Guid, SequenceNumber)>,
-    /// Sorted ranges of fragment numbers, the end exclusive.
+    /// Sorted half-open ranges of fragment numbers.
     runs: Bounded<ReplyRuns, Vec<(u32, u32)>>,
 }
 
@@ -224,8 +225,8 @@ impl Service {
         was_hanging
     }
 
-    /// Drops the oldest call of one client: a flood of requests must not cost a search for the
-    /// oldest of all. Returns whether there was one.
+    /// Drops the oldest call of one client, because the search for the oldest call of all is too
+    /// expensive in a flood of requests. Returns whether there was a call.
     pub fn forget_one(&mut self) -> bool {
         self.calls.pop_first().is_some()
     }
@@ -296,7 +297,7 @@ impl Client {
 }
 
 impl Received {
-    /// Adds a reply or some of its fragments. Returns whether all of it has arrived.
+    /// Adds a reply or some of its fragments. Returns whether the reply is complete.
     fn put(&mut self, writer: Guid, sample: &Sample) -> bool {
         let Content::DataFrag(fragments) = sample.content else {
             return true;
@@ -329,7 +330,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_number_is_new_once_also_behind_and_far_from_the_highest() {
+    fn a_request_number_is_new_only_once_in_any_order() {
         let mut client = Client::default();
         let new = |client: &mut Client, numbers: &[u64]| -> Vec<bool> {
             numbers.iter().map(|number| client.note(*number)).collect()

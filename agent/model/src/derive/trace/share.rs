@@ -1,6 +1,6 @@
 //! The share of traces that are exported, decided by their ids as OpenTelemetry's samplers do.
 
-/// The bits of a trace id that decide.
+/// The bits of a trace id that decide whether the trace is exported.
 const RANDOM: u64 = (1 << 56) - 1;
 
 /// A share above 0. A larger share contains all traces of a smaller one.
@@ -10,7 +10,7 @@ pub struct Share {
 }
 
 impl Share {
-    /// Returns this part of all traces, or `None` if it is 0 or not a number.
+    /// Returns the share with this ratio, or `None` if the ratio is at most 0 or not a number.
     #[must_use]
     pub fn of(ratio: f64) -> Option<Self> {
         if ratio.is_nan() || ratio <= 0.0 {

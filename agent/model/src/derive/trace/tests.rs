@@ -8,7 +8,7 @@ use ros2probe_wire::time::SECOND;
 
 const WRITER: Guid = Guid::new(GuidPrefix([7; 12]), EntityId([0, 0, 1, 3]));
 
-/// Returns the number of open messages, its cap, and those dropped because of it.
+/// Returns the number of open messages, its cap, and the number dropped because of it.
 fn size(tracer: &Tracer) -> (usize, usize, u64) {
     let facts = tracer.table();
     (facts.size as usize, facts.limit as usize, facts.evictions)
@@ -90,7 +90,7 @@ fn times(spans: &[Span]) -> Vec<(SpanStage, u64, u64)> {
 }
 
 #[test]
-fn a_message_is_sent_from_its_first_to_its_last_fragment_and_settled_by_each_reader() {
+fn a_send_span_covers_all_fragments_and_each_reader_has_a_settle_span() {
     let mut tracer = tracer();
     let spans = take(
         &mut tracer,
@@ -133,7 +133,7 @@ fn a_message_is_sent_from_its_first_to_its_last_fragment_and_settled_by_each_rea
 }
 
 #[test]
-fn where_it_only_arrives_it_is_received_in_the_same_trace() {
+fn a_message_that_only_arrives_has_a_receive_span_in_the_same_trace() {
     let arrives = [data(5, 10, flag::HOST), data(5, 11, flag::HOST)];
     let received = take_all(&mut tracer(), &arrives, 1.0);
     assert_eq!(times(&received), [(SpanStage::Receive, 10, 10)]);
@@ -157,7 +157,7 @@ fn where_it_only_arrives_it_is_received_in_the_same_trace() {
 }
 
 #[test]
-fn a_multicast_whose_local_copies_are_seen_first_is_sent() {
+fn a_multicast_whose_local_copies_are_seen_first_has_a_send_span() {
     let mut tracer = tracer();
     let records = [
         data(5, 10, flag::HOST),
@@ -174,7 +174,7 @@ fn a_multicast_whose_local_copies_are_seen_first_is_sent() {
 }
 
 #[test]
-fn messages_in_shared_memory_are_sent_here_and_received_from_no_other_host() {
+fn messages_in_shared_memory_have_send_spans_and_no_receive_spans() {
     let shared = |number, time| Record {
         interface: 0,
         ..data(number, time, flag::SHM)
@@ -196,7 +196,7 @@ fn messages_in_shared_memory_are_sent_here_and_received_from_no_other_host() {
 }
 
 #[test]
-fn a_writer_of_this_host_has_no_arrivals_and_a_router_sends_nothing_of_its_own() {
+fn a_local_writer_has_no_receive_spans_and_a_router_has_no_send_spans() {
     let taken = |records: &[Record], is_local: bool| {
         let mut tracer = tracer();
         for record in records {
@@ -209,7 +209,7 @@ fn a_writer_of_this_host_has_no_arrivals_and_a_router_sends_nothing_of_its_own()
     };
     let copies = [data(5, 10, flag::HOST), data(6, 20, flag::HOST)];
     assert_eq!(taken(&copies, true), []);
-    // A router passes a message of another host on, to a subscriber of this host.
+    // A router forwards a message of another host to a subscriber on this host.
     let relayed = flag::STREAM | flag::HOST;
     let passes = [
         data(5, 10, relayed | flag::RELAYED),
@@ -243,7 +243,7 @@ fn every_agent_samples_the_same_messages_at_the_configured_ratio() {
 }
 
 #[test]
-fn traces_that_never_complete_take_bounded_memory() {
+fn traces_that_never_complete_need_bounded_memory() {
     let mut tracer = tracer();
     for number in 1..=1_000 {
         take(&mut tracer, &[fragments(number, 1, 1, number, 0)], 1.0);

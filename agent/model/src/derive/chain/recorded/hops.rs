@@ -12,14 +12,14 @@ use super::relation::{Relation, relation};
 use crate::derive::chain::trace::{Method, Path, Point, Trace, paths};
 use crate::facts::names::TopicName;
 
-/// Number of matches from which on a hop may be accepted.
+/// Minimum number of matches of an accepted hop.
 const ENOUGH: u64 = 5;
-/// Messages of one stamp that are closer than this are published together.
+/// Messages of one stamp that are less than this many nanoseconds apart are published together.
 const TOGETHER: i64 = 1_000_000;
-/// Number of stamps from which delays are computed.
+/// Maximum number of stamps from which the delays of three topics are computed.
 const SAMPLES: usize = 4096;
 
-/// What a recording shows.
+/// Results of the search for hops in a recording.
 #[derive(Default)]
 pub(super) struct Found {
     pub(super) traces: Vec<Trace>,
@@ -27,10 +27,10 @@ pub(super) struct Found {
     pub(super) unclear: Vec<(TopicName, Vec<TopicName>)>,
 }
 
-/// The messages of each stamp with their times, in the order of these.
+/// The messages of each stamp with their times, in the order of these times.
 type Stamps = Vec<Vec<(u16, Timestamp)>>;
 
-/// How often two topics had one stamp, and how often the first came before the second.
+/// How often two topics had the same stamp, and how often the first topic came before the second.
 #[derive(Clone, Copy, Default)]
 struct Pair {
     both: u64,
@@ -43,7 +43,7 @@ type Pairs = HashMap<(u16, u16), Pair>;
 #[derive(Default)]
 struct Causes {
     matched: BTreeMap<u16, u64>,
-    /// Those of which several topics may be the cause, and these topics.
+    /// Number of messages of which several topics may be the cause, and these topics.
     unclear: u64,
     candidates: BTreeSet<u16>,
 }
@@ -115,7 +115,7 @@ pub(super) fn find(recorded: &RecordedChains, times: Times, preferred: &[&str]) 
 }
 
 impl Causes {
-    /// Returns whether messages with `stamps` stamps continue this input.
+    /// Returns whether the topic, which has `stamps` stamps, continues this input.
     fn accepts(&self, input: u16, stamps: u64) -> bool {
         let matched = self.matched.get(&input).copied().unwrap_or(0);
         let all: u64 = self.matched.values().sum();
@@ -123,8 +123,8 @@ impl Causes {
     }
 }
 
-/// Returns whether the output regularly comes after the input with its stamp, and hardly ever
-/// before it.
+/// Returns whether the output regularly follows the input with the same stamp, and hardly ever
+/// precedes it.
 fn follows(recorded: &RecordedChains, pairs: &Pairs, input: u16, output: u16) -> bool {
     pairs.get(&(input, output)).is_some_and(|pair| {
         let late = pair.both - pair.before;
@@ -197,10 +197,11 @@ fn relations(
     relations.collect()
 }
 
-/// Returns the topics that are published together with another one, each with the one that stands
-/// for all of them.
+/// Returns the topics that are published together with another one, each with the topic that
+/// represents all of them.
 fn together(recorded: &RecordedChains, stamps: &Stamps, preferred: &[&str]) -> BTreeMap<u16, u16> {
-    // How often both had a stamp, how often less than 1 ms apart, and how often the first led.
+    // How often both topics had a stamp, how often less than 1 ms apart, and how often each came
+    // first.
     let mut pairs: BTreeMap<(u16, u16), (u64, u64)> = BTreeMap::new();
     let mut led: BTreeMap<u16, u64> = BTreeMap::new();
     for stamp in stamps {
@@ -244,7 +245,7 @@ fn together(recorded: &RecordedChains, stamps: &Stamps, preferred: &[&str]) -> B
     leads
 }
 
-/// Replaces topics that are published together by the first message of them.
+/// Replaces the messages of topics that are published together by the first of these messages.
 fn join(stamp: &mut Vec<(u16, Timestamp)>, together: &BTreeMap<u16, u16>) {
     let mut seen = BTreeSet::new();
     stamp.retain_mut(|(topic, _)| {

@@ -2,12 +2,12 @@
 //!
 //! Let `second` and `third` be the delays of two topics after the first, for each stamp. If the
 //! third derives from the second, its delay contains that of the second: the slope of `third` over
-//! `second` is 1. If both derive from the first on their own, it is 0. The slope has a standard
-//! error; where it leaves both possible, the relation is unclear.
+//! `second` is 1. If both derive from the first independently, the slope is 0. The slope has a
+//! standard error. If that leaves both cases possible, the relation is unclear.
 
-/// Smallest number of stamps from which a relation is computed.
+/// Minimum number of stamps for the computation of a relation.
 const FEWEST: usize = 20;
-/// Share of delays at each end that is left out: stalls delay all nodes together.
+/// One in this many delays is left out at each end, because stalls delay all nodes together.
 const OUTER: usize = 20;
 
 /// The relation of three topics.
@@ -79,7 +79,7 @@ fn bounds(delays: &[(f64, f64)], value: fn(&(f64, f64)) -> f64) -> Option<(f64, 
 mod tests {
     use super::*;
 
-    /// Returns delays around 10 ms that spread by 2 ms, without order.
+    /// Returns pseudo-random delays from 10 to 12 ms, in seconds.
     fn delays(seed: u64) -> impl Iterator<Item = f64> {
         let mut state = seed;
         std::iter::repeat_with(move || {
@@ -100,14 +100,14 @@ mod tests {
     }
 
     #[test]
-    fn a_third_topic_with_its_own_delay_does_not() {
+    fn a_third_topic_with_an_independent_delay_does_not_derive_from_the_second() {
         let pairs = delays(1).zip(delays(2)).take(100);
         let beside: Vec<_> = pairs.map(|(one, other)| (one, other + 0.02)).collect();
         assert_eq!(relation(&beside), Relation::Beside);
     }
 
     #[test]
-    fn equal_delays_and_stalls_of_all_nodes_decide_nothing() {
+    fn constant_delays_are_unclear_and_stalls_of_all_nodes_are_ignored() {
         assert_eq!(relation(&[(0.01, 0.02); 100]), Relation::Unclear);
         assert_eq!(relation(&[]), Relation::Unclear);
         // Both topics are late in some rounds, and independent in the others.

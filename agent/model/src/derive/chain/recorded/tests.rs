@@ -3,7 +3,7 @@ use super::*;
 const START: u64 = 1_795_142_331_000_000_000;
 const MILLISECOND: u64 = 1_000_000;
 
-/// Delays that spread by `spread` nanoseconds, without order.
+/// A generator of pseudo-random delays.
 struct Delays(u64);
 
 impl Delays {
@@ -17,7 +17,7 @@ impl Delays {
 }
 
 /// Adds 100 stamps, each with the topics and delays that `each` returns. The recorder receives each
-/// message `transport` after its publication.
+/// message `transport` nanoseconds after its publication.
 fn recorded(
     transport: Option<u64>,
     mut each: impl FnMut(&mut Delays) -> Vec<(&'static str, u64)>,
@@ -57,7 +57,7 @@ fn paths(facts: &RecordedFacts) -> Vec<String> {
 }
 
 #[test]
-fn topics_whose_delays_add_up_are_a_chain() {
+fn topics_whose_delays_add_up_form_a_chain() {
     let chains = recorded(Some(500_000), |delays| {
         let first = delays.next(10 * MILLISECOND, 4 * MILLISECOND);
         let second = first + delays.next(5 * MILLISECOND, 2 * MILLISECOND);
@@ -71,7 +71,7 @@ fn topics_whose_delays_add_up_are_a_chain() {
 }
 
 #[test]
-fn branches_of_one_topic_are_no_chain_though_one_always_comes_first() {
+fn branches_of_one_topic_form_no_chain_even_if_one_always_comes_first() {
     let chains = recorded(None, |delays| {
         let clean = delays.next(10 * MILLISECOND, 4 * MILLISECOND);
         let map = delays.next(30 * MILLISECOND, 4 * MILLISECOND);
@@ -83,7 +83,7 @@ fn branches_of_one_topic_are_no_chain_though_one_always_comes_first() {
 }
 
 #[test]
-fn constant_delays_leave_the_cause_open() {
+fn constant_delays_leave_the_cause_unclear() {
     let chains = recorded(None, |_| {
         let (clean, map) = (10 * MILLISECOND, 30 * MILLISECOND);
         vec![("/scan", 0), ("/clean", clean), ("/map", map)]
@@ -95,7 +95,7 @@ fn constant_delays_leave_the_cause_open() {
 }
 
 #[test]
-fn topics_published_together_count_as_one_and_the_named_one_stands_for_them() {
+fn topics_published_together_count_as_one_and_the_preferred_one_represents_them() {
     let chains = || {
         recorded(None, |delays| {
             let info = delays.next(0, MILLISECOND / 2);
@@ -111,7 +111,7 @@ fn topics_published_together_count_as_one_and_the_named_one_stands_for_them() {
 }
 
 #[test]
-fn rounded_stamps_and_topics_in_any_order_prove_nothing() {
+fn rounded_stamps_and_topics_without_a_fixed_order_form_no_chain() {
     let mut chains = RecordedChains::default();
     for round in 0..100 {
         let stamp = START + round * 100 * MILLISECOND;
@@ -131,7 +131,7 @@ fn rounded_stamps_and_topics_in_any_order_prove_nothing() {
 }
 
 #[test]
-fn a_topic_that_is_stamped_again_is_in_no_chain() {
+fn a_topic_with_new_stamps_belongs_to_no_chain() {
     let mut chains = RecordedChains::default();
     for round in 0..100 {
         let stamp = START + round * 100_000_001 + 1;
@@ -143,7 +143,7 @@ fn a_topic_that_is_stamped_again_is_in_no_chain() {
 }
 
 #[test]
-fn steps_of_the_clock_spoil_at_most_the_messages_at_the_step() {
+fn clock_steps_affect_at_most_the_messages_at_the_step() {
     for step in [-3_600_000_000_000_i64, 3_600_000_000_000] {
         let mut chains = RecordedChains::default();
         for round in 0..100_u64 {
@@ -152,7 +152,7 @@ fn steps_of_the_clock_spoil_at_most_the_messages_at_the_step() {
                 true => at.checked_add_signed(step).unwrap(),
                 false => at,
             };
-            // The clock steps within the round of 50: between both messages.
+            // The clock steps in round 50, between the two messages.
             let stamp = after(round > 50, stamp);
             add(&mut chains, "/a", stamp, stamp + MILLISECOND, None);
             let second = after(round == 50, stamp + 9 * MILLISECOND);
@@ -166,7 +166,7 @@ fn steps_of_the_clock_spoil_at_most_the_messages_at_the_step() {
 }
 
 #[test]
-fn a_recording_that_is_played_again_and_again_counts_each_time() {
+fn a_recording_of_repeated_playback_counts_each_repetition() {
     let mut chains = RecordedChains::default();
     for play in 0..3_u64 {
         for round in 0..10_u64 {

@@ -1,8 +1,8 @@
 //! Spans of publications within callbacks.
 //!
 //! The source timestamp of the first input identifies the measurement, because every process that
-//! takes the message knows it. Publications are seen inside processes only, so all ids of spans
-//! belong to the host.
+//! takes the message knows it. Publications are observed only inside processes, so the host is a
+//! part of all span ids.
 
 use ros2probe_wire::Timestamp;
 
@@ -26,7 +26,7 @@ pub(in crate::derive::chain) struct Traced {
     publish: SpanId,
 }
 
-/// A publication, with the times of its input and of itself.
+/// A publication, with the times of its input and its output.
 pub(in crate::derive::chain) struct Step<'a> {
     pub(in crate::derive::chain) publication: &'a CausalPublication,
     /// The node that publishes the first input of the chain.

@@ -1,11 +1,13 @@
 //! Spans of the messages with one stamp.
 //!
 //! A span belongs to a node, and the agent of the node's host exports it: the path of the input to
-//! the node, its processing, and the publication. Other agents derive its id without a copy of it.
+//! the node, its processing, and the publication. Other agents derive the id of the span without
+//! having the span.
 //!
-//! The stamp alone identifies the measurement if it has nanoseconds and is of the present. Then all
-//! agents that see a part of the chain report one trace. Rounded, simulated and recorded stamps
-//! occur more than once: there, the first message of the chain is a part of the identity.
+//! The stamp alone identifies the measurement if it is not rounded and close to the present time.
+//! All agents that see a part of the chain then report one trace. Rounded, simulated and recorded
+//! stamps may occur more than once. With them, the first message of the chain is a part of the
+//! identity.
 
 use std::sync::Arc;
 
@@ -22,14 +24,14 @@ use crate::derive::trace::Message;
 use crate::facts::header::stamp_time;
 use crate::facts::identity::Identity;
 
-/// A stamp that is a multiple of this many nanoseconds may be that of another robot, too.
+/// A stamp that is a multiple of this many nanoseconds may also occur on another robot.
 const COARSE: u32 = 1000;
 
 /// The messages with one stamp, in the order of their publication.
 pub(in crate::derive::chain) struct Stamped<'a> {
     pub(in crate::derive::chain) stamp: Stamp,
     pub(in crate::derive::chain) messages: &'a [&'a Published],
-    /// For each message the one that it continues by an accepted hop, which is before it.
+    /// For each message, the index of the earlier message that it continues by an accepted hop.
     pub(in crate::derive::chain) causes: &'a [Option<usize>],
 }
 
@@ -65,7 +67,7 @@ impl Stamped<'_> {
     }
 
     /// Returns the trace of a message, or `None` if it is in no chain or not exported. If a node of
-    /// another host reads the message, the chain may go on there, unseen by this agent.
+    /// another host reads the message, the chain may continue there, unobserved by this agent.
     fn trace_id(&self, index: usize) -> Option<u128> {
         let is_in_chain = self.cause(index).is_some() || self.causes.contains(&Some(index));
         if !is_in_chain && !self.messages.get(index)?.output.is_read_elsewhere {
@@ -132,7 +134,7 @@ impl Stamped<'_> {
             let named = (ChainStage::Hop, hop.id(trace_id));
             return tracer.finish(with_output(span(named, times), output));
         };
-        // A node may publish several messages because of one.
+        // A node may publish several messages because of one input.
         let is_same = |other: &usize| {
             self.cause(*other) == self.cause(index)
                 && self.hop(*other).is_some_and(|other| {
@@ -219,7 +221,7 @@ fn with_output(span: ChainSpan, output: &Published) -> ChainSpan {
     }
 }
 
-/// Returns the trace of the messages with this stamp.
+/// Returns the trace id of the messages with this stamp.
 fn identity(stamp: Stamp, first: &Published) -> u128 {
     let (seconds, nanoseconds) = stamp;
     let mut identity = Identity::of(b"ros2 chain by stamps");
