@@ -9,7 +9,7 @@ use anyhow::{Context as _, Result};
 ///
 /// # Errors
 ///
-/// A file cannot be read or is damaged, or `each` fails.
+/// Fails if a file cannot be read or is damaged, or `each` fails.
 pub fn for_each_message(
     bag: &Path,
     mut each: impl FnMut(mcap::Message<'_>) -> Result<()>,

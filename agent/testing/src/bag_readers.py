@@ -1,6 +1,6 @@
 """Reads bags with the PyPI readers `mcap` and `rosbags`, and prints what they found as JSON.
 
-usage: read.py BAG_DIRECTORY...
+usage: bag_readers.py BAG_DIRECTORY...
 """
 
 import hashlib

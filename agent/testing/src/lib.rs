@@ -2,11 +2,11 @@
 //!
 //! - [`harness`] starts agents and DDS peers in network namespaces.
 //! - [`local_agent`] starts an agent on a capture without any privilege.
-//! - [`forged`] sends RTPS that no real participant would.
+//! - [`forged`] sends RTPS messages that no real participant sends.
 //! - [`viewer`] is a client of the Foxglove WebSocket protocol.
-//! - [`model`] writes the same for a model in virtual time.
+//! - [`model`] builds RTPS messages for a model in virtual time.
 //!
-//! If a tool is missing, these fail and name the package to install.
+//! If a tool is missing, the modules fail and name the package to install.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,
@@ -52,7 +52,7 @@ pub fn corpus() -> PathBuf {
     corpus
 }
 
-/// Returns a file of the repository, given its path from the top.
+/// Returns the path of a file of the repository, given its path from the root.
 #[must_use]
 pub fn repository(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -60,7 +60,7 @@ pub fn repository(path: &str) -> PathBuf {
         .join(path)
 }
 
-/// Returns these items in every order.
+/// Returns all permutations of these items.
 #[must_use]
 pub fn permutations<T: Copy>(items: &[T]) -> Vec<Vec<T>> {
     let Some((first, rest)) = items.split_first() else {

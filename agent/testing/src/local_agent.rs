@@ -1,4 +1,4 @@
-//! The real binary on a free port of this host, replaying a capture: no privilege, no namespaces.
+//! The real binary replays a capture on free ports of this host, without privileges or namespaces.
 use std::io::{BufRead as _, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use crate::repository;
 use serde_json::Value;
 
-/// Longest wait for anything.
+/// Maximum wait for a log line, a response, a metric or the end.
 pub const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Returns a small capture of the repository.
@@ -41,7 +41,7 @@ pub struct LocalAgent {
     pub api: SocketAddr,
 }
 
-/// An HTTP answer.
+/// An HTTP response.
 pub struct Answer {
     pub status: u16,
     pub headers: String,
@@ -212,7 +212,8 @@ pub fn ask(api: SocketAddr, method: &str, path: &str, body: &str) -> (u16, Value
     (status, body)
 }
 
-/// Sends a request with this head, without its last line, and this body; reads the answer.
+/// Sends a request with this head, followed by `Connection: close`, and this body. Returns the
+/// response.
 pub fn exchange(mut stream: impl Read + Write, head: &str, body: &str) -> Answer {
     let request = format!("{head}Connection: close\r\n\r\n{body}");
     stream.write_all(request.as_bytes()).unwrap();
@@ -233,7 +234,7 @@ pub fn metric(page: &str, series: &str) -> Option<f64> {
         .find_map(|line| line.strip_prefix(series)?.strip_prefix(' ')?.parse().ok())
 }
 
-/// Returns promtool's complaints about a page in classic format.
+/// Returns the output of promtool's check of a page in classic format.
 pub fn promtool(page: &str) -> String {
     let mut promtool = Command::new("promtool")
         .args(["check", "metrics"])

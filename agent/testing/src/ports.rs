@@ -1,14 +1,14 @@
-//! Ports for programs that take one by name, such as a receiver or a Prometheus.
+//! Free ports for programs that need a port number as an argument, such as Prometheus.
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr as UnixAddress, UnixListener};
 
-/// Below the range of Linux's ephemeral ports (`ip_local_port_range`), so that no other program gets
-/// such a port by chance between its choice and its use.
+/// Ports below Linux's ephemeral ports (`ip_local_port_range`), so that no other program gets one
+/// by chance between its choice and its use.
 const PORTS: std::ops::Range<u16> = 20_000..30_000;
 
-/// Returns a loopback address whose port is free, and remains with this process until it ends. An
-/// abstract socket of the port's name keeps it from other tests.
+/// Returns a loopback address whose port is free and stays reserved for this process until it ends.
+/// An abstract socket named after the port reserves it among tests.
 ///
 /// # Panics
 ///
@@ -23,7 +23,7 @@ pub fn free_address() -> SocketAddr {
     SocketAddr::from((Ipv4Addr::LOCALHOST, port))
 }
 
-/// Returns whether this process has the port from now on.
+/// Returns whether this process has reserved the port.
 fn is_reserved(port: u16) -> bool {
     let name = format!("ros2probe-tests-port-{port}");
     let listener =

@@ -31,7 +31,7 @@ pub struct FrameResult {
 pub struct SocketResult {
     /// Its first piece and all its bytes, if it is captured.
     pub captured: Option<(Piece, Vec<u8>)>,
-    /// Its records, including those held back for more fragments.
+    /// Its records, including records that wait for more fragments.
     pub records: Vec<Record>,
 }
 
@@ -43,7 +43,7 @@ pub enum Hook {
     Egress,
 }
 
-/// A loaded filter, and user space's processing of fragments.
+/// A loaded filter, and the processing of fragments in user space.
 pub struct Kernel {
     pub filter: Filter,
     hook: Hook,
@@ -188,7 +188,7 @@ impl Kernel {
         }
     }
 
-    /// Returns the time of the program for one IP packet, run `repeat` times.
+    /// Returns the total time of `repeat` runs of the program on one IP packet.
     pub fn time(&self, packet: &[u8], repeat: u32) -> Duration {
         let (_, mean) = self.run(packet, repeat);
         mean * repeat
@@ -208,8 +208,8 @@ impl Kernel {
         }
     }
 
-    /// Returns the program's own instructions after verification, without those of functions that
-    /// it calls (BPF_OBJ_GET_INFO_BY_FD).
+    /// Returns the program's own instructions after verification, without the functions that it
+    /// calls (BPF_OBJ_GET_INFO_BY_FD).
     pub fn verified_main(&self) -> Vec<[u8; 8]> {
         /// The head of `struct bpf_prog_info` (linux/bpf.h).
         #[repr(C)]
@@ -287,7 +287,7 @@ impl Kernel {
     }
 }
 
-/// Runs BPF_PROG_TEST_RUN; returns the program's result, and its mean time.
+/// Runs BPF_PROG_TEST_RUN. Returns the program's result, and its mean time.
 pub fn run(program: BorrowedFd<'_>, packet: &[u8], repeat: u32) -> (u32, Duration) {
     /// The head of `union bpf_attr` for BPF_PROG_TEST_RUN (linux/bpf.h).
     #[repr(C)]
@@ -352,7 +352,7 @@ fn stay_on_cpu() {
     go_to_cpu(usize::try_from(cpu).unwrap());
 }
 
-/// Moves this thread to a CPU: the filter joins fragments by CPU, as packets arrive by CPU.
+/// Moves this thread to a CPU. The filter joins fragments per CPU, because packets arrive per CPU.
 pub fn go_to_cpu(cpu: usize) {
     // SAFETY: a set of bits, for which all zero is valid.
     let mut set: libc::cpu_set_t = unsafe { std::mem::zeroed() };
@@ -430,7 +430,7 @@ pub fn fragments(payload: &[u8], size: usize, ipv6: bool, identification: u32) -
     fragments_of(payload, &[size], ipv6, identification)
 }
 
-/// Returns fragments as [`fragments`] does, of these sizes in turn.
+/// Returns packets as [`fragments`] does, with these sizes in rotation.
 pub fn fragments_of(
     payload: &[u8],
     sizes: &[usize],

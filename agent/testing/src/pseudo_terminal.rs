@@ -8,7 +8,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
-/// Longest wait for anything.
+/// Maximum wait for a text on the screen or for the end of the program.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A running program; dropping the value kills it.
@@ -93,7 +93,7 @@ impl Terminal {
         self.screen = Screen::new(width.into(), height.into());
     }
 
-    /// Stops the terminal's output, as on a line that hangs.
+    /// Stops the terminal's output, as on a connection that hangs.
     pub fn stop_output(&self) {
         // SAFETY: the descriptor is open; nothing else is passed.
         let stopped = unsafe { libc::tcflow(self.slave.as_raw_fd(), libc::TCOOFF) };

@@ -8,16 +8,16 @@ use std::time::{Duration, Instant};
 
 use crate::{ports::free_address, repository};
 
-/// Longest wait for anything.
+/// Maximum wait for output.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// A running receiver; dropping the value kills it, its output stays.
+/// A running receiver. Dropping the value kills it and keeps its output.
 pub struct Rotel {
     child: Child,
     output: PathBuf,
-    /// Where it takes gRPC.
+    /// Address for OTLP over gRPC.
     pub address: SocketAddr,
-    /// Where it takes HTTP.
+    /// Address for OTLP over HTTP.
     pub http: SocketAddr,
 }
 
@@ -41,7 +41,7 @@ pub struct Export {
 }
 
 impl Rotel {
-    /// Starts a receiver on a free port, or again on this one, printing into `directory`.
+    /// Starts a receiver at `address`, or on a free port, with its output in `directory`.
     pub fn start(command: &mut Command, directory: &Path, address: Option<SocketAddr>) -> Self {
         let (address, other) = (address.unwrap_or_else(free_address), free_address());
         let output = directory.join(format!("rotel-{}", other.port()));
@@ -120,7 +120,7 @@ impl Drop for Rotel {
     }
 }
 
-/// Returns all names in the output, with their number.
+/// Returns all names in the output, with their counts.
 fn names(text: &str) -> String {
     let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
     for line in text.lines().map(str::trim_start) {
@@ -134,7 +134,7 @@ fn names(text: &str) -> String {
     format!("{counts:#?}")
 }
 
-/// Returns the output, by request. The last one may be truncated.
+/// Returns the output by request. The last request may be truncated.
 pub fn exports(text: &str) -> Vec<Export> {
     let mut exports: Vec<Export> = Vec::new();
     let mut family = BTreeMap::new();

@@ -1,4 +1,4 @@
-//! A robot of any size as the model describes it, with every fact filled in.
+//! A robot of any size as the model describes it, with a value for every fact.
 
 pub mod inside;
 
@@ -204,7 +204,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
     }
 }
 
-/// Returns one finding of each kind.
+/// Returns the calls of one service.
 fn service() -> ServiceFacts {
     ServiceFacts {
         domain_id: DomainId(0),
@@ -244,6 +244,7 @@ fn latencies(values: &[f64]) -> LatencyFacts {
     latencies.facts()
 }
 
+/// Returns one finding of each kind.
 fn diagnoses() -> Diagnoses {
     let guid = |entity: [u8; 4]| Guid::new(GuidPrefix([1; 12]), EntityId(entity));
     let (writer, reader) = (guid([0, 0, 1, 3]), guid([0, 0, 2, 4]));

@@ -14,7 +14,7 @@ use tokio_tungstenite::tungstenite::{self, HandshakeError, Message, WebSocket};
 
 /// Names of the subprotocol.
 pub const SUBPROTOCOLS: [&str; 2] = ["foxglove.websocket.v1", "foxglove.sdk.v1"];
-/// Longest wait for a message that must come.
+/// Maximum wait for an expected message.
 pub const PATIENCE: Duration = Duration::from_secs(20);
 
 /// `serverInfo`.
@@ -104,10 +104,10 @@ pub struct Data {
     pub payload: Vec<u8>,
 }
 
-/// News from the server.
+/// A message or change from the server.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum News {
-    /// Channels came or went; see [`Viewer::channels`].
+    /// Channels were advertised or unadvertised; see [`Viewer::channels`].
     Channels,
     Data(Data),
     Time(u64),
@@ -134,7 +134,7 @@ pub struct Viewer {
     pub graph: Graph,
     /// Channels of the subscriptions.
     pub subscriptions: BTreeMap<u32, u32>,
-    /// Subscriptions that ended: their messages may be on the way.
+    /// Subscriptions that ended: their messages may be in transit.
     ended: BTreeSet<u32>,
     next: u32,
 }
@@ -146,7 +146,7 @@ impl Viewer {
         opened.map_err(|refused| anyhow::anyhow!("{refused:?}"))
     }
 
-    /// Returns the next message, or `None` if none comes in time.
+    /// Returns the next message, or `None` if no message arrives in time.
     pub fn next_within(&mut self, patience: Duration) -> Result<Option<News>> {
         let deadline = Instant::now() + patience;
         loop {
@@ -174,7 +174,7 @@ impl Viewer {
         }
     }
 
-    /// Returns the first message that `wanted` accepts; fails if the server closes before.
+    /// Returns the first result of `wanted`. Fails if the server closes the connection before.
     pub fn wait_for<T>(
         &mut self,
         what: &str,
@@ -262,12 +262,12 @@ impl Viewer {
         Ok(())
     }
 
-    /// Returns the stream, for bytes that are no frames.
+    /// Returns the stream, for bytes that are not WebSocket frames.
     pub fn stream(&mut self) -> &mut TcpStream {
         self.socket.get_mut()
     }
 
-    /// Waits until the server closes; returns code and reason.
+    /// Waits until the server closes the connection. Returns code and reason.
     pub fn wait_for_close(&mut self) -> Result<(u16, String)> {
         self.wait_for("close", |_, news| match news {
             News::Closed(code, reason) => Some((*code, reason.clone())),
@@ -401,7 +401,7 @@ impl Graph {
     }
 }
 
-/// Opens a WebSocket on a connected stream and reads the facts about the server, which come first.
+/// Opens a WebSocket on a connected stream and reads `serverInfo`, which is the first message.
 pub fn open(
     stream: TcpStream,
     path: &str,

@@ -1,4 +1,4 @@
-//! Writes messages of Zenoh as rmw_zenoh does (`reference/zenoh.md`), for tests.
+//! Builds messages of Zenoh as rmw_zenoh does, for tests.
 
 use ros2probe_model::facts::route::Destination;
 use ros2probe_model::graph::zenoh::{Flow, StreamEvent, StreamId, StreamReport};
@@ -14,12 +14,12 @@ pub enum Role {
     Peer = 1,
 }
 
-/// Returns bytes behind their length.
+/// Returns bytes preceded by their length.
 pub fn sized(bytes: &[u8]) -> Vec<u8> {
     [vle(bytes.len() as u64), bytes.to_vec()].concat()
 }
 
-/// INIT, or its acknowledgement with these extensions.
+/// Returns INIT, or its acknowledgement with these extensions.
 pub fn init(zid: [u8; 16], role: Role, ack: Option<&[u8]>) -> Vec<u8> {
     let mut bytes = vec![0x41, 0x09, 0xf0 | role as u8];
     bytes.extend(zid);
@@ -35,24 +35,24 @@ pub fn init(zid: [u8; 16], role: Role, ack: Option<&[u8]>) -> Vec<u8> {
     bytes
 }
 
-/// OPEN with a lease in seconds.
+/// Returns OPEN with a lease in seconds.
 pub fn open(lease: u8) -> Vec<u8> {
     [vec![0x62, lease], vle(7)].concat()
 }
 
-/// FRAME of the reliable lane with these messages.
+/// Returns a FRAME of the reliable lane with these messages.
 pub fn frame(number: u32, messages: &[Vec<u8>]) -> Vec<u8> {
     [vec![0x25], vle(number.into()), messages.concat()].concat()
 }
 
-/// FRAGMENT of the reliable lane.
+/// Returns a FRAGMENT of the reliable lane.
 pub fn fragment(number: u32, is_first: bool, has_more: bool, bytes: &[u8]) -> Vec<u8> {
     let header = 0x26 | if has_more { 0x40 } else { 0 } | if is_first { 0x80 } else { 0 };
     let first: &[u8] = if is_first { &[0x02] } else { &[] };
     [&[header], &vle(number.into())[..], first, bytes].concat()
 }
 
-/// D_KEYEXPR: an alias for a key.
+/// Returns D_KEYEXPR: an alias for a key.
 pub fn declare_key(id: u16, key: &str) -> Vec<u8> {
     [
         vec![0x1e, 0x20],
@@ -63,7 +63,7 @@ pub fn declare_key(id: u16, key: &str) -> Vec<u8> {
     .concat()
 }
 
-/// D_TOKEN with the whole key.
+/// Returns D_TOKEN with the whole key.
 pub fn declare_token(id: u32, key: &str) -> Vec<u8> {
     [
         vec![0x1e, 0x26],
@@ -74,12 +74,12 @@ pub fn declare_token(id: u32, key: &str) -> Vec<u8> {
     .concat()
 }
 
-/// U_TOKEN without a key.
+/// Returns U_TOKEN without a key.
 pub fn undeclare_token(id: u32) -> Vec<u8> {
     [vec![0x1e, 0x07], vle(id.into())].concat()
 }
 
-/// INTEREST in all present and future aliases and tokens of a key.
+/// Returns INTEREST in all present and future aliases and tokens of a key.
 pub fn interest(id: u32, key: &str) -> Vec<u8> {
     [
         vec![0x79],
@@ -90,18 +90,18 @@ pub fn interest(id: u32, key: &str) -> Vec<u8> {
     .concat()
 }
 
-/// D_FINAL: the end of the answer to an INTEREST.
+/// Returns D_FINAL: the end of the answer to an INTEREST.
 pub fn answer_end(interest: u32) -> Vec<u8> {
     [vec![0x3e], vle(interest.into()), vec![0x1a]].concat()
 }
 
-/// RESPONSE with a key, as the server of a service sends it.
+/// Returns a RESPONSE with a key, as the server of a service sends it.
 pub fn response(key: &str, gid: [u8; 16], number: u64, payload: &[u8]) -> Vec<u8> {
     let head = [vec![0x3b, 1, 0], sized(key.as_bytes()), vec![0x04]].concat();
     [head, put(gid, number, payload)].concat()
 }
 
-/// PUSH of a PUT to the sender's alias, with an attachment of rmw_zenoh.
+/// Returns the PUSH of a PUT to the sender's alias, with an attachment of rmw_zenoh.
 pub fn push(scope: u16, gid: [u8; 16], number: u64, payload: &[u8]) -> Vec<u8> {
     [vec![0x5d], vle(scope.into()), put(gid, number, payload)].concat()
 }
@@ -115,7 +115,7 @@ fn put(gid: [u8; 16], number: u64, payload: &[u8]) -> Vec<u8> {
     [vec![0x81], extension, sized(payload)].concat()
 }
 
-/// Token of a publisher.
+/// Returns the key of a publisher's token.
 pub fn publisher(zid: [u8; 16], entity: u32, topic: &str) -> String {
     let digits: String = zid.iter().rev().map(|byte| format!("{byte:02x}")).collect();
     let digits = digits.trim_start_matches('0');
@@ -126,7 +126,7 @@ pub fn publisher(zid: [u8; 16], entity: u32, topic: &str) -> String {
     )
 }
 
-/// Both directions of a connection on an interface, by the port of its initiator.
+/// Returns both directions of a connection on an interface, by the port of its initiator.
 pub fn connection(port: u16) -> [StreamId; 2] {
     let place = |port| Destination {
         address: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff, 127, 0, 0, 1],

@@ -1,5 +1,5 @@
-//! Permitted dependencies between the crates. A dependency upwards fails here with one line that
-//! names it.
+//! Permitted dependencies between the crates. A dependency on a higher crate fails a test with one
+//! line that names it.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,
@@ -19,14 +19,14 @@ use serde_json::Value;
 const ALLOWED: &[(&str, &[&str])] = &[
     ("wire", &[]),
     ("model", &["wire"]),
-    // It reads libraries with the one bounded cursor.
+    // This crate reads libraries with the bounded cursor of `wire`.
     ("attach", &["wire"]),
     ("capture", &["wire", "model", "attach"]),
-    // Both read payloads and times with the one bounded cursor.
+    // The next two crates read payloads and times with the bounded cursor of `wire`.
     ("message", &["wire"]),
     ("bag", &["wire"]),
     ("api", &[]),
-    // Its samples are the model's figures.
+    // The samples of this crate are the model's figures.
     ("metrics", &["wire", "model"]),
     ("page", &[]),
     (
@@ -36,8 +36,8 @@ const ALLOWED: &[(&str, &[&str])] = &[
         ],
     ),
     // The package is called ros2probe. It reaches a running agent only through the API. A replay
-    // composes an agent of its own from source and model; `rp doctor` examines this host with the
-    // code of the sources; `rp discover` listens with them, and speaks RTPS and Zenoh itself.
+    // composes an agent of its own from source and model. `rp doctor` examines this host with the
+    // code of the sources. `rp discover` listens with that code, and speaks RTPS and Zenoh itself.
     (
         "cli",
         &[
@@ -46,7 +46,8 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ),
 ];
 
-/// Libraries that must not be in the model's tree: it has no I/O, no clock, no configuration.
+/// Libraries that must not be in the model's dependency tree: the model has no I/O, no clock, no
+/// configuration.
 const NOT_IN_MODEL: &[&str] = &[
     "anyhow",
     "axum",
@@ -64,7 +65,7 @@ const NOT_IN_MODEL: &[&str] = &[
     "utoipa",
 ];
 
-/// Libraries that must not be in the tree of any of these crates.
+/// Libraries that must not be in the dependency tree of any crate below the daemon.
 const NO_RUNTIME: &[&str] = &["axum", "hyper", "tokio", "tonic"];
 
 /// The packages that the project's owner chose: the package, the crate that depends on it, and a
@@ -138,7 +139,7 @@ const CHOSEN: &[(&str, &str, &str, &[&str])] = &[
         "agent/daemon/src/logging.rs",
         &["tracing_subscriber::registry()", "fmt::layer()"],
     ),
-    // The maintained drop-in of serde_yaml, under its name.
+    // The maintained replacement of serde_yaml, imported under that name.
     (
         "yaml_serde",
         "ros2probe-daemon",
@@ -147,8 +148,8 @@ const CHOSEN: &[(&str, &str, &str, &[&str])] = &[
     ),
 ];
 
-/// What the chosen packages write in place of the product's own sources: text of metrics, and
-/// services and variables of OTLP.
+/// Texts that only the chosen packages may contain: the text format of metrics, and services and
+/// variables of OTLP.
 const WRITTEN_BY_PACKAGES: &[&str] = &[
     "# HELP ",
     "# TYPE ",
@@ -168,7 +169,7 @@ struct Workspace {
     names: BTreeMap<String, String>,
     /// Ids of normal dependencies by package id.
     dependencies: BTreeMap<String, Vec<String>>,
-    /// Names of normal dependencies that no feature leaves out, by package name.
+    /// Names of normal dependencies that are not optional, by package name.
     required: BTreeMap<String, BTreeSet<String>>,
 }
 
@@ -295,7 +296,7 @@ fn the_model_is_built_without_input_output_or_configuration() {
 }
 
 #[test]
-fn the_api_needs_serde_alone() {
+fn the_api_crate_depends_only_on_serde() {
     let workspace = Workspace::read();
     let required = &workspace.required["ros2probe-api"];
     assert_eq!(*required, BTreeSet::from(["serde".to_owned()]));
@@ -304,7 +305,7 @@ fn the_api_needs_serde_alone() {
 #[test]
 fn crates_below_the_daemon_need_no_runtime() {
     let workspace = Workspace::read();
-    // The metrics are left out: the thread of exports has a runtime.
+    // The crate `metrics` is left out, because its export thread has a runtime.
     for room in ["wire", "model", "capture", "message", "bag", "api", "page"] {
         let name = package(room);
         let tree = workspace.tree(&name);
@@ -331,14 +332,14 @@ fn each_chosen_package_is_used_for_its_purpose() {
             );
         }
     }
-    // The programs of the kernel are a workspace of their own.
+    // The kernel programs are a separate workspace.
     assert!(read("agent-ebpf/Cargo.toml").contains("\naya-ebpf = "));
     let programs = read("agent-ebpf/src/host.rs");
     assert!(programs.contains("use aya_ebpf::{"));
 }
 
 #[test]
-fn no_source_writes_what_a_chosen_package_writes() {
+fn no_source_contains_text_that_a_chosen_package_writes() {
     let mut waiting = vec![ros2probe_testing::repository("agent")];
     let mut sources = 0;
     while let Some(path) = waiting.pop() {

@@ -12,10 +12,10 @@ use std::path::{Path, PathBuf};
 
 use ros2probe_testing::repository;
 
-/// Bytes of a page that can be read in one sitting.
+/// Maximum number of bytes of a page, so that it can be read in one sitting.
 const MAX_PAGE: usize = 12 * 1024;
 
-/// Columns of a line outside of tables, code and links.
+/// Maximum number of columns of a line outside of tables, code and links.
 const MAX_COLUMNS: usize = 100;
 
 /// Pages that may be longer: SECURITY.md names the tests of each claim.
@@ -37,7 +37,7 @@ fn sources(folder: &Path, into: &mut Vec<String>) {
     }
 }
 
-/// Markdown files of these folders, by their path in the repository.
+/// Returns the Markdown files of these folders, by their path in the repository.
 fn markdown(folders: &[&str]) -> BTreeMap<String, String> {
     let mut found = BTreeMap::new();
     for folder in folders {
@@ -54,14 +54,14 @@ fn markdown(folders: &[&str]) -> BTreeMap<String, String> {
     found
 }
 
-/// The documents for users and contributors.
+/// Returns the documents for users and contributors.
 fn documents() -> BTreeMap<String, String> {
     let found = markdown(&[".", "docs", "deploy", "dashboards", "config"]);
     assert!(found.len() > 40, "{} documents", found.len());
     found
 }
 
-/// Lines outside of code blocks, numbered from 1.
+/// Returns the lines outside of code blocks, numbered from 1.
 fn prose(text: &str) -> impl Iterator<Item = (usize, &str)> {
     let mut is_code = false;
     let numbered = text.lines().enumerate();
@@ -72,7 +72,7 @@ fn prose(text: &str) -> impl Iterator<Item = (usize, &str)> {
     })
 }
 
-/// Targets of the links in a line, code excepted.
+/// Returns the targets of the links in a line, except links in code.
 fn links(line: &str) -> Vec<String> {
     let plain: String = line.split('`').step_by(2).collect::<Vec<_>>().join("");
     let targets = plain.split("](").skip(1);
@@ -160,7 +160,7 @@ fn the_summary_lists_every_page_of_the_book() {
 }
 
 #[test]
-fn pages_fit_a_sitting_and_lines_a_screen() {
+fn pages_and_lines_stay_below_their_maximum_length() {
     for (document, text) in documents() {
         let is_generated = GENERATED.contains(&document.as_str());
         let may_be_long = LONG.contains(&document.as_str()) || is_generated;

@@ -11,7 +11,7 @@ use std::path::Path;
 
 use ros2probe_testing::repository;
 
-/// Results with a string as their error, in the order of the source.
+/// Returns the `Result` types with a string as their error, in the order of the source.
 fn string_errors(source: &str) -> Vec<&str> {
     let starts = source.match_indices("Result<").map(|(start, _)| start);
     let types = starts.filter_map(|start| {
@@ -20,7 +20,7 @@ fn string_errors(source: &str) -> Vec<&str> {
         for (index, letter) in rest.char_indices() {
             match letter {
                 '<' | '(' | '[' => depth += 1,
-                // The arrow of a function's type.
+                // This is the arrow of a function's type.
                 '>' if rest.get(..index)?.ends_with('-') => {}
                 '>' | ')' | ']' => depth -= 1,
                 ',' if depth == 1 && error.is_none() => error = rest.get(index + 1..),

@@ -17,7 +17,7 @@ use std::sync::LazyLock;
 use regex::Regex;
 use ros2probe_testing::repository;
 
-/// Words that a sentence may have.
+/// Maximum number of words of a sentence.
 const MAX_WORDS: usize = 25;
 
 /// Patterns to avoid, each with its replacement.
@@ -67,7 +67,7 @@ const COMMENT_PATTERNS: [(&str, &str); 6] = [
 /// Documents and sources with sentences that stay as they are, and a part of each sentence.
 const EXCEPTIONS: [(&str, &str); 0] = [];
 
-/// Folders that hold other people's files, or none of the sources.
+/// Folders that hold files of other projects, or no sources.
 const FOREIGN: [&str; 9] = [
     ".git",
     "target",
@@ -100,13 +100,13 @@ const MARKS: [(&str, &str); 16] = [
     ("inst", "#"),
 ];
 
-/// Documents of this project's own prose, as folders of Markdown files.
+/// Folders with Markdown files that this project has written.
 const FOLDERS: [&str; 5] = [".", "docs", "deploy", "dashboards", "config"];
 
 /// Sentences, each with the line on which its paragraph begins.
 type Sentences = Vec<(usize, String)>;
 
-/// The sentences of a document: of its paragraphs, and of its tables.
+/// Returns the sentences of a document: of its paragraphs, and of its tables.
 fn sentences(text: &str) -> (Sentences, Sentences) {
     let (mut paragraphs, mut cells) = (Vec::new(), Vec::new());
     let (mut is_code, mut is_generated, mut is_open) = (false, false, false);
@@ -159,7 +159,7 @@ fn sentences(text: &str) -> (Sentences, Sentences) {
     (paragraphs, cells.into_iter().flat_map(split).collect())
 }
 
-/// A text without its code, targets of links and emphasis.
+/// Returns a text without its code, targets of links and emphasis.
 fn plain(text: &str) -> String {
     static CODE: LazyLock<Regex> = LazyLock::new(|| Regex::new("`[^`]*`").unwrap());
     static LINK: LazyLock<Regex> = LazyLock::new(|| Regex::new(r"\[([^\]]*)\]\([^)]*\)").unwrap());
@@ -211,7 +211,7 @@ fn sentences_are_short_and_have_a_subject() {
     assert!(read > 1000, "{read} sentences");
 }
 
-/// Comments of a source, each with the line on which it begins.
+/// Returns the comments of a source, each with the line on which it begins.
 fn comments(text: &str, mark: &str) -> Sentences {
     let mut found: Sentences = Vec::new();
     let mut is_open = false;
@@ -252,7 +252,7 @@ fn comments(text: &str, mark: &str) -> Sentences {
     found
 }
 
-/// Files below a folder with comments that are checked, by their path in the repository.
+/// Collects the files below a folder whose comments are checked, by their path in the repository.
 fn sources(folder: &Path, path: &str, into: &mut Vec<(String, &'static str)>) {
     for entry in fs::read_dir(folder).unwrap() {
         let entry = entry.unwrap();

@@ -1,5 +1,5 @@
-/* A process that calls libtracetools.so in the order of rclcpp (Iron), from commands on standard
- * input. Each command is answered by a line. -DPLACE=240 or 248: offset of rmw_handle. */
+/* A program that calls libtracetools.so in the order of rclcpp (Iron), by commands on standard
+ * input. It prints a line after each command. -DPLACE=240 or 248: offset of rmw_handle. */
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
@@ -65,7 +65,7 @@ static char node, object, machine, owner;
 static char callback[8], buffer[8], timer_callback, message;
 static uint64_t capacity = 4, filled, writes, reads;
 
-/* One message into the ring buffer, as rclcpp's RingBufferImplementation does it. */
+/* Puts one message into the ring buffer, as rclcpp's RingBufferImplementation does. */
 static void enqueue(void) {
 #ifndef HUMBLE
     bool full = filled == capacity;
@@ -115,12 +115,12 @@ int main(int argc, char **argv) {
         } else if (!strcmp(what, "publish")) {
             for (long i = 0; i < n; i++) { ros_trace_rcl_publish(&out, &message); pass(us); }
         } else if (!strcmp(what, "both")) {
-            /* To subscriptions of the same process and to others. */
+            /* Publishes to subscriptions of the same process and to others. */
             for (long i = 0; i < n; i++) { enqueue(); ros_trace_rcl_publish(&out, &message); }
         } else if (!strcmp(what, "enqueue")) {
             for (long i = 0; i < n; i++) enqueue();
         } else if (!strcmp(what, "receive")) {
-            /* Each message of the ring buffer in a callback of `us` microseconds. */
+            /* Takes each message of the ring buffer in a callback of `us` microseconds. */
             long i = 0;
             for (; i < n && dequeue(); i++) {
                 ros_trace_callback_start(callback + 1, true);
@@ -129,8 +129,8 @@ int main(int argc, char **argv) {
             }
             printf("%ld ", i);
         } else if (!strcmp(what, "take")) {
-            /* Messages stamped 5 ms ago; the callback publishes after `us` microseconds, and the
-               nanoseconds until then are printed. */
+            /* Takes messages stamped 5 ms ago. The callback publishes after `us` microseconds.
+               Prints the nanoseconds until then. */
             for (long i = 0; i < n; i++) {
                 ros_trace_rclcpp_executor_get_next_ready();
                 ros_trace_rclcpp_executor_execute(&in);
@@ -144,7 +144,7 @@ int main(int argc, char **argv) {
                 printf("%ld ", (long)(published - began));
             }
         } else if (!strcmp(what, "relay")) {
-            /* The message with the source timestamp `n`: the callback publishes after `us`
+            /* Takes a message with the source timestamp `n`. The callback publishes after `us`
                microseconds. Prints the source timestamp of its output, and the nanoseconds. */
             ros_trace_rclcpp_executor_get_next_ready();
             ros_trace_rclcpp_executor_execute(&in);
@@ -177,7 +177,7 @@ int main(int argc, char **argv) {
                 ros_trace_callback_end(&timer_callback);
             }
         } else if (!strcmp(what, "nowhere")) {
-            /* Handles that point to nothing, all of them different. */
+            /* Passes handles that are invalid pointers, all of them different. */
             for (long i = 0; i < n; i++) {
                 ros_trace_rcl_publish((void *)(uintptr_t)(0x1000 + 8 * i), 0);
                 ros_trace_rmw_take((void *)(uintptr_t)(0xdead0000beef0000 + 8 * i), 0, -1, true);
@@ -187,7 +187,7 @@ int main(int argc, char **argv) {
                 ros_trace_rclcpp_executor_execute((void *)(uintptr_t)i);
             }
         } else if (!strcmp(what, "fork")) {
-            /* Children that publish once and end. */
+            /* Forks children that publish once and exit. */
             for (long i = 0; i < n; i++) {
                 pid_t child = fork();
                 if (!child) { ros_trace_rcl_publish(&out, &message); _exit(0); }

@@ -1,5 +1,5 @@
 /* The functions of libtracetools.so with empty bodies, as ROS 2 builds without LTTng have them.
- * -DHUMBLE leaves out those of later distributions. */
+ * -DHUMBLE leaves out the functions of later distributions. */
 #define CALL(name) \
     __attribute__((noinline, visibility("default"))) void ros_trace_##name(void) { __asm__ volatile(""); }
 

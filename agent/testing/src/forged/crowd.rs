@@ -1,7 +1,8 @@
-//! A robot whose graph changes constantly, and the truth about it: its entities, and how others left.
+//! A robot whose graph changes constantly, and the truth about it: its entities, and how former
+//! ones ended.
 //!
-//! Participants send what DDS implementations send, at a bounded rate. The sender's knowledge is
-//! exact: a lease that it could not renew in time is one that expired.
+//! Participants send the same messages as DDS implementations, at a bounded rate. The sender's
+//! knowledge is exact: a lease that it could not renew in time has expired.
 
 mod member;
 
@@ -14,10 +15,10 @@ use super::storm::Dice;
 use super::{Carrier, PARTICIPANT, SPDP_WRITER};
 use member::{Member, announcer, entity, guid, role};
 
-/// Most datagrams per second.
+/// Maximum number of datagrams per second.
 const PACE: f64 = 2500.0;
-/// A participant that could not send for this part of its lease is given up: a later renewal might
-/// be too late.
+/// A participant that could not send for this part of its lease no longer renews it, because the
+/// renewal might be too late.
 const LATE: f64 = 0.8;
 /// Time within which an observer notices the end of a lease.
 const GREY: Duration = Duration::from_millis(2500);
@@ -33,7 +34,7 @@ const TYPE: &str = "sensor_msgs::msg::dds_::PointCloud2_";
 /// Size and rate of change of the crowd.
 #[derive(Clone, Copy, Debug)]
 pub struct Scale {
-    /// Most participants that an observer may consider alive at a time.
+    /// Maximum number of participants that an observer may consider alive at a time.
     pub participants: usize,
     /// Mean lifetime of a participant.
     pub life: Duration,
@@ -70,7 +71,7 @@ pub struct Crowd<C> {
     tally: Tally,
     /// Number of messages on each measured topic.
     messages: Vec<u32>,
-    /// Last messages of participants that left since [`Crowd::forget`].
+    /// Disposals of participants and endpoints since [`Crowd::forget`].
     farewells: Vec<Vec<u8>>,
     born: u32,
     due: Instant,
@@ -123,7 +124,7 @@ impl<C: Carrier> Crowd<C> {
         Ok(())
     }
 
-    /// Returns whether an observer may currently be right either way about some participant.
+    /// Returns whether a lease ends so soon that an observer may or may not have noticed its end.
     pub fn is_grey(&self) -> bool {
         let now = Instant::now();
         self.silent.iter().any(|member| member.ends() < now + GREY)
@@ -146,7 +147,7 @@ impl<C: Carrier> Crowd<C> {
         graph
     }
 
-    /// Returns the number of all events so far.
+    /// Returns the number of events so far, by entity and event.
     pub fn tally(&self) -> &Tally {
         &self.tally
     }
@@ -167,7 +168,7 @@ impl<C: Carrier> Crowd<C> {
         self.born
     }
 
-    /// Repeats every valid announcement, for an observer that missed some.
+    /// Repeats disposals and every valid announcement, for an observer that missed some.
     pub fn repeat(&mut self) -> Result<()> {
         for farewell in self.farewells.clone() {
             self.send(&farewell)?;
@@ -182,7 +183,7 @@ impl<C: Carrier> Crowd<C> {
         Ok(())
     }
 
-    /// Forgets past messages: the observer has seen them.
+    /// Forgets past disposals, which the observer has seen.
     pub fn forget(&mut self) {
         self.farewells.clear();
     }
@@ -251,7 +252,7 @@ impl<C: Carrier> Crowd<C> {
     fn renew(&mut self) -> Result<()> {
         for index in 0..self.members.len() {
             let member = &self.members[index];
-            // After a delay while others were renewed, this may be too late for some.
+            // The renewal of others takes time, after which it may be too late for this member.
             if member.seen.elapsed() > member.lease / 3 && !member.is_late() {
                 let message = member.announcement();
                 self.send(&message)?;
@@ -315,7 +316,7 @@ impl<C: Carrier> Crowd<C> {
         match self.dice.pick(10) {
             0..4 => self.dispose(),
             4..8 => self.silence().map(drop),
-            // The same node again in another process, before the first one's lease has ended.
+            // The same node starts in another process before the lease of the first one has ended.
             _ => match self.silence()? {
                 Some(node) if self.size() < self.scale.participants => self.birth(node),
                 _ => Ok(()),
@@ -443,7 +444,7 @@ impl<C: Carrier> Crowd<C> {
         100
     }
 
-    /// Returns a topic of another participant, or one time in twenty a new one.
+    /// Returns a topic of any participant, or a new topic one time in twenty.
     fn topic(&mut self) -> String {
         if self.dice.pick(20) == 0 {
             return format!("rt/once/topic_{}", self.dice.pick(1 << 40));

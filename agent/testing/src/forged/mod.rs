@@ -1,5 +1,5 @@
 //! Hand-made RTPS traffic: for links on which no DDS implementation can run, and for messages that
-//! none would send.
+//! no implementation sends.
 
 pub mod crowd;
 pub mod frames;
@@ -20,7 +20,7 @@ const SPDP_WRITER: [u8; 4] = [0, 1, 0, 0xc2];
 const PUBLICATIONS_WRITER: [u8; 4] = [0, 0, 3, 0xc2];
 const SUBSCRIPTIONS_WRITER: [u8; 4] = [0, 0, 4, 0xc2];
 const PARTICIPANT: [u8; 4] = [0, 0, 1, 0xc1];
-/// Writer of `ros_discovery_info`; user topics follow.
+/// Writer of `ros_discovery_info`. The entity ids of user topics follow it.
 const ENTITIES_WRITER: [u8; 4] = [0, 0, 1, 3];
 pub const SAMPLES_WRITER: [u8; 4] = [0, 0, 2, 3];
 pub const FINITE_LEASE_SECONDS: u32 = 12;
@@ -194,7 +194,7 @@ impl Carrier for Sender {
     }
 }
 
-/// Introduces the talker.
+/// Sends all announcements of the talker.
 pub fn introduce(talker: &Talker, carrier: &mut impl Carrier) -> Result<()> {
     for message in talker.introduction("talker") {
         carrier.carry(&message)?;

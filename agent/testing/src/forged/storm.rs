@@ -8,11 +8,11 @@ use anyhow::{Result, anyhow};
 
 use super::{Carrier, SAMPLES_WRITER, Talker, data, introduce};
 
-/// Different datagrams of a storm; each is sent under changing GUIDs.
+/// Number of different datagrams of a storm. Each is sent with changing GUIDs.
 const MOULDS: usize = 3000;
 const PREFIX: std::ops::Range<usize> = 8..20;
 
-/// Sends until [`Storm::end`].
+/// A thread that sends until [`Storm::end`].
 pub struct Storm {
     stop: Arc<AtomicBool>,
     sent: Arc<AtomicU64>,
@@ -45,7 +45,8 @@ impl Storm {
         }))
     }
 
-    /// Announces `participants` with `endpoints` each, every one on a separate topic, repeatedly.
+    /// Repeatedly announces `participants` participants with `endpoints` endpoints each, every
+    /// endpoint on a separate topic.
     pub fn of_a_crowd(
         carrier: impl Carrier + Send + 'static,
         participants: u32,
@@ -139,7 +140,7 @@ impl Storm {
             let mut bytes = Vec::new();
             while !stopped.load(Ordering::Relaxed) {
                 next(&mut bytes);
-                // A full queue on the path is no reason to stop.
+                // The storm continues if a queue on the path is full.
                 let _ = carrier.carry(&bytes);
                 counter.fetch_add(1, Ordering::Relaxed);
             }
@@ -147,7 +148,7 @@ impl Storm {
         Storm { stop, sent, thread }
     }
 
-    /// Stops; returns the number of datagrams sent.
+    /// Stops sending. Returns the number of datagrams sent.
     pub fn end(self) -> Result<u64> {
         self.stop.store(true, Ordering::Relaxed);
         self.thread.join().map_err(|_| anyhow!("the storm died"))?;
@@ -155,7 +156,7 @@ impl Storm {
     }
 }
 
-/// A datagram and the offset of its sender's GUID prefix.
+/// A datagram and the offsets of its sender's GUID prefix.
 struct Mould {
     bytes: Vec<u8>,
     places: Vec<usize>,
@@ -314,7 +315,8 @@ fn heartbeat(dice: &mut Dice, talker: &Talker) -> Vec<u8> {
     bytes
 }
 
-/// Returns submessages, parameters and strings whose length fields are wrong.
+/// Returns a datagram with random bytes, which falsify length fields of submessages, parameters and
+/// strings.
 fn lying_length(dice: &mut Dice, talker: &Talker) -> Vec<u8> {
     let mut bytes = match dice.pick(3) {
         0 => talker.participant(),

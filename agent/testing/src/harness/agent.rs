@@ -23,17 +23,19 @@ pub const METRICS: &str = "http://127.0.0.1:17400";
 /// Configuration for tests of packet sockets.
 pub const ON_THE_WIRE: &str = "capture: {source: wire}\n";
 
-/// Longest wait until the metrics show what was sent, on a busy machine.
+/// Maximum wait until the metrics show the sent messages, on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// Longest wait for the kernel to verify the programs there.
+/// Maximum wait for the kernel to verify the BPF programs on a busy machine.
 const START: Duration = Duration::from_secs(60);
-/// Longest wait for more of an answer.
+/// Maximum wait for further bytes of a response.
 const ANSWER: Duration = Duration::from_secs(20);
-/// Longer than the second after which a gap of a best-effort stream is settled.
+/// Time without a change of the counters: longer than the second after which a gap of a best-effort
+/// stream is settled.
 const STILL: Duration = Duration::from_millis(1800);
-/// Wait if the agent reports lost records or frames: some messages may never be counted.
+/// The same time if the agent reports lost records or frames, so that some messages may never be
+/// counted.
 const STILL_WITHOUT_SOME: Duration = Duration::from_secs(6);
-/// Largest age, in seconds, of the facts of an agent that received CPU time.
+/// Maximum age, in seconds, of the snapshot of an agent that received CPU time.
 const FRESH: f64 = 0.4;
 
 /// `rp run` on a host.
@@ -82,7 +84,7 @@ impl<'a> Agent<'a> {
             OsStr::new("run"),
             OsStr::new("--config"),
             configuration.as_os_str(),
-            // A test host has no service manager, and so no unix socket.
+            // A test host has no service manager, and therefore no Unix socket.
             OsStr::new("--api-loopback"),
             OsStr::new("all"),
         ];
@@ -154,7 +156,7 @@ impl<'a> Agent<'a> {
         }
     }
 
-    /// GETs a path from inside the host; fails unless the status is a success.
+    /// Requests a path with GET from inside the host. Fails unless the status is a success.
     pub fn request(&self, path: &str) -> Result<String> {
         get(self.host, &format!("{METRICS}{path}"))
     }
@@ -236,8 +238,8 @@ fn has_label(labels: &str, pair: &str) -> bool {
         .any(|(at, _)| at == 0 || labels.as_bytes().get(at - 1) == Some(&b','))
 }
 
-/// GETs a URL such as `http://127.0.0.1:17400/metrics` on a host's network. Fails unless the status
-/// is a success.
+/// Requests a URL such as `http://127.0.0.1:17400/metrics` with GET on a host's network. Fails
+/// unless the status is a success.
 pub fn get(host: &Namespace, url: &str) -> Result<String> {
     let (address, path) = url
         .strip_prefix("http://")
@@ -246,7 +248,7 @@ pub fn get(host: &Namespace, url: &str) -> Result<String> {
     let answer = (|| {
         let mut stream = netns::within(&host.network(), || TcpStream::connect(address))??;
         stream.set_read_timeout(Some(ANSWER))?;
-        // HTTP/1.0: the answer is not chunked and ends with the connection.
+        // With HTTP/1.0, the response is not chunked and ends with the connection.
         write!(stream, "GET {path} HTTP/1.0\r\nHost: {address}\r\n\r\n")?;
         let mut answer = Vec::new();
         stream.read_to_end(&mut answer)?;

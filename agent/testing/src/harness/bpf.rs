@@ -1,5 +1,5 @@
-//! The kernel's BPF programs, queried independently of the agent: those attached to a control
-//! group, those held by a process, those that still exist. Also attaches a foreign program.
+//! Queries the kernel's BPF programs independently of the agent: programs attached to a cgroup,
+//! programs held by a process, and programs that still exist. Also attaches a foreign program.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
@@ -35,17 +35,17 @@ pub enum Object {
     Link(u32),
 }
 
-/// Whether a foreign program tolerates others.
+/// Whether a foreign program allows other programs to be attached.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Manners {
-    /// Others may attach.
+    /// Other programs can be attached.
     BesideOthers,
-    /// Others cannot attach.
+    /// Other programs cannot be attached.
     Alone,
 }
 
-/// Attaches a foreign program that lets everything pass to a control group. It stays attached until
-/// the group is removed.
+/// Attaches to a cgroup a foreign program that accepts all packets. It stays attached until the
+/// cgroup is removed.
 pub fn attach_stranger(cgroup: &Path, direction: Direction, manners: Manners) -> Result<()> {
     // r0 = 1; exit
     let instructions: [u64; 2] = [0x0000_0001_0000_00b7, 0x95];
@@ -73,7 +73,7 @@ pub fn attach_stranger(cgroup: &Path, direction: Direction, manners: Manners) ->
     Ok(())
 }
 
-/// Returns the number of programs attached to a control group itself.
+/// Returns the number of programs attached directly to a cgroup.
 pub fn attached(cgroup: &Path, direction: Direction) -> Result<u32> {
     let directory = File::open(cgroup)?;
     let mut query = ProgramsToFind {

@@ -1,5 +1,5 @@
 //! tcpdump's recording of a host's link: the reference for the agent's reports, and for whether the
-//! agent sent anything itself.
+//! agent itself sent packets.
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -10,10 +10,10 @@ use anyhow::{Context as _, Result, bail};
 use super::network::{INTERFACE, Namespace};
 use super::process::Process;
 
-/// Time within which tcpdump reads the kernel's buffer, each second and later on a busy machine. It
-/// does not read it at its end.
+/// Time within which tcpdump reads the kernel's buffer: each second, or later on a busy machine. It
+/// does not read the buffer when it ends.
 pub const SETTLE: Duration = Duration::from_secs(3);
-/// 64 MiB: more than a second of point clouds.
+/// Size of tcpdump's buffer: 64 MiB, which is more than a second of point clouds.
 const BUFFER_KILOBYTES: &str = "65536";
 
 pub struct Capture {
@@ -51,8 +51,8 @@ impl Capture {
         Ok(capture)
     }
 
-    /// Ends the recording. The file lacks only the last [`SETTLE`]. Fails if tcpdump dropped frames
-    /// before.
+    /// Ends the recording. The file lacks only the last [`SETTLE`]. Fails if tcpdump dropped
+    /// frames.
     pub fn finish(mut self) -> Result<PathBuf> {
         self.process.signal("INT")?;
         let status = self

@@ -12,10 +12,10 @@ use anyhow::{Context as _, Result};
 
 use super::remove_leftovers;
 
-/// Longest wait for killed processes to leave.
+/// Maximum wait for killed processes to exit.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Held while this process is in one of its tests' cgroups.
+/// Locked while this process is in the cgroup of one of its tests.
 static MOVED: Mutex<()> = Mutex::new(());
 
 pub struct Cgroup {
@@ -29,7 +29,7 @@ impl Cgroup {
         Ok(Cgroup { path })
     }
 
-    /// Creates a cgroup below this one; it must be removed first.
+    /// Creates a cgroup below this one. The new cgroup must be removed before this one.
     pub fn create_below(&self, name: &str) -> Result<Cgroup> {
         let path = self.path.join(name);
         fs::create_dir(&path).with_context(|| format!("cannot create {}", path.display()))?;
@@ -48,7 +48,7 @@ impl Cgroup {
     }
 
     /// Runs `make` with this process in it and moves back: a socket belongs to the cgroup in which
-    /// it was created. Tests of one process take turns.
+    /// it was created. Tests of one process do so one after another.
     pub fn hold<T>(&self, make: impl FnOnce() -> T) -> Result<T> {
         let turn = MOVED.lock();
         let own = fs::read_to_string("/proc/self/cgroup").context("cannot read /proc")?;
@@ -65,7 +65,8 @@ impl Cgroup {
 impl Drop for Cgroup {
     fn drop(&mut self) {
         let deadline = Instant::now() + PATIENCE;
-        // Linux 5.14 and newer; on older kernels its processes have been ended one by one.
+        // This file exists in Linux 5.14 and newer. On older kernels, the processes have been ended
+        // one by one.
         let _ = fs::write(self.path.join("cgroup.kill"), "1");
         while let Err(error) = fs::remove_dir(&self.path) {
             if Instant::now() > deadline {
@@ -94,8 +95,8 @@ pub fn hierarchy() -> Result<PathBuf> {
     path.context("no cgroup2 is mounted: `mount -t cgroup2 none /sys/fs/cgroup/unified`")
 }
 
-/// Returns the number of programs attached for received and sent datagrams, without those attached
-/// further up.
+/// Returns the number of programs attached for received and sent datagrams, without programs
+/// attached to its ancestors.
 pub fn attached(cgroup: &Path) -> Result<[u32; 2]> {
     /// The part of `union bpf_attr` for BPF_PROG_QUERY (linux/bpf.h).
     #[repr(C)]
@@ -136,7 +137,7 @@ pub fn attached(cgroup: &Path) -> Result<[u32; 2]> {
     Ok(counts)
 }
 
-/// Removes the cgroups of processes that were killed before they could.
+/// Removes the cgroups of processes that were killed before they could remove them.
 pub fn sweep() {
     if let Ok(hierarchy) = hierarchy() {
         remove_leftovers(&hierarchy, |name| {

@@ -1,4 +1,4 @@
-//! Compares the code of a running process with its file, which shows breakpoints.
+//! Compares the code of a running process with its file, which reveals breakpoints.
 
 use std::fs::{self, File};
 use std::io::{BufRead as _, BufReader};
@@ -10,14 +10,15 @@ use ros2probe_attach::library;
 
 use super::process::Process;
 
-/// First byte of an instruction.
+/// First byte of an instruction, in memory and in the file.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Code {
     pub in_memory: u8,
     pub in_file: u8,
 }
 
-/// Reads the instruction at which Fast DDS passes messages, in a process that maps this file.
+/// Reads the first instruction of the Fast DDS function that copies messages into shared memory, in
+/// a process that maps this file.
 pub fn at_function(process: &Process, file: &Path) -> Result<Code> {
     let entry = library::find(&File::open(file)?)?;
     at(process, file, entry.offset)

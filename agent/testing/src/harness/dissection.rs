@@ -38,7 +38,7 @@ pub struct Dissection {
     pub frames: Vec<Frame>,
 }
 
-/// One frame. A datagram that arrived in IP fragments is in the frame of its last one.
+/// One frame. A datagram that arrived in IP fragments is in the frame of its last fragment.
 pub struct Frame {
     /// Seconds since the Unix epoch.
     pub time: f64,
@@ -74,7 +74,7 @@ pub enum Content {
     Heartbeat {
         last: u64,
     },
-    /// An ACKNACK: a reader requests some of these again.
+    /// An ACKNACK: a reader requests some of the numbers `first..end` again.
     Request {
         first: u64,
         end: u64,
@@ -85,15 +85,15 @@ pub enum Content {
 /// The received samples of one writer.
 #[derive(Debug, Default)]
 pub struct Samples {
-    /// Writer sequence number and time of each complete sample, in that order.
+    /// Time of each complete sample, by sequence number.
     pub whole: BTreeMap<u64, f64>,
     /// Lowest and highest number of any received sample or fragment.
     pub span: Option<(u64, u64)>,
-    /// Samples whose first DATA was dropped: a later one arrived first, or a HEARTBEAT announced
-    /// them and a request followed. Samples before the very first DATA do not count.
+    /// Number of samples whose first DATA was dropped: a later sample arrived first, or a reader
+    /// had requested the sample. Samples before the very first DATA do not count.
     pub retransmitted: u64,
-    /// Samples announced by a HEARTBEAT without a request: RustDDS announces samples before it
-    /// sends them.
+    /// Number of samples that a HEARTBEAT announced first, without a request: RustDDS announces
+    /// samples before it sends them.
     pub announced_early: u64,
     /// Number of DATA submessages beyond the first of each sample.
     pub repeated: u64,
@@ -182,7 +182,7 @@ impl Samples {
         })
     }
 
-    /// Returns the application's numbers, which count from 0; the writer's count from 1.
+    /// Returns the application's numbers, which count from 0; sequence numbers count from 1.
     pub fn application_numbers(&self) -> BTreeSet<u64> {
         self.whole.keys().map(|number| number - 1).collect()
     }
@@ -232,7 +232,7 @@ impl Frame {
         for kind in values(kinds) {
             submessages.extend(cells.submessage(kind)?);
         }
-        // Unused values were assigned to the wrong submessage.
+        // If values are left over, some values were assigned to the wrong submessage.
         ensure!(
             cells.writers.next().is_none()
                 && cells.numbers.next().is_none()

@@ -1,4 +1,4 @@
-//! A peer's log of what it really sent or received: one JSON object per line.
+//! A peer's log of the samples that it sent or received: one JSON object per line.
 
 use std::collections::BTreeSet;
 use std::path::Path;

@@ -34,11 +34,11 @@ impl Failing {
     pub const SYNCS: Self = Self(4);
     /// Opening, creating, renaming, removing and truncating.
     pub const NAMES: Self = Self(8);
-    /// All of them, and what a file is.
+    /// All of these, and lookups, attributes, statistics and flushes.
     pub const ALL: Self = Self(31);
 }
 
-/// A mounted file system. It is unmounted when this is dropped.
+/// A mounted file system. It is unmounted when the value is dropped.
 #[derive(Debug)]
 pub struct FailingDisk {
     place: PathBuf,
@@ -48,11 +48,11 @@ pub struct FailingDisk {
 }
 
 impl FailingDisk {
-    /// Mounts it at an existing directory.
+    /// Mounts a new file system at an existing directory.
     ///
     /// # Errors
     ///
-    /// `/dev/fuse` cannot be opened, or the mount fails.
+    /// Fails if `/dev/fuse` cannot be opened, or the mount fails.
     pub fn mount(place: &Path) -> Result<Self> {
         let device = File::options().read(true).write(true).open("/dev/fuse")?;
         let status = Command::new("mount")
@@ -72,7 +72,7 @@ impl FailingDisk {
             failures: Arc::clone(&failures),
         };
         let server = std::thread::Builder::new().spawn(move || {
-            // The kernel answers ENODEV once it is unmounted.
+            // The kernel returns ENODEV once the file system is unmounted.
             if let Err(error) = server.serve() {
                 eprintln!("the failing disk ends: {error:#}");
             }
@@ -90,7 +90,7 @@ impl FailingDisk {
         self.failing.store(operations.0, Ordering::SeqCst);
     }
 
-    /// Returns how many operations failed so far.
+    /// Returns the number of operations that have failed so far.
     #[must_use]
     pub fn failures(&self) -> u64 {
         self.failures.load(Ordering::SeqCst)
@@ -143,7 +143,7 @@ struct Server {
     failures: Arc<AtomicU64>,
 }
 
-/// An answer, or a number of errno.
+/// The body of a response, or an errno.
 type Answer = Result<Vec<u8>, i32>;
 
 impl Server {
@@ -180,7 +180,7 @@ impl Server {
         }
     }
 
-    /// Answers a request. `None` for those without an answer.
+    /// Handles a request. Returns `None` for requests that have no response.
     fn answer(&mut self, operation: u32, node: u64, body: &[u8]) -> Option<Answer> {
         let kind = match operation {
             15 | 28 => Failing::READS.0,
@@ -216,7 +216,7 @@ impl Server {
             35 => {
                 let mode = FILE | word(body, 4) & 0o7777;
                 let created = self.create(node, mode, name(&body[16..]));
-                // The answer of OPEN follows.
+                // The response to OPEN follows.
                 created.map(|mut answer| {
                     answer.extend([0; 16]);
                     answer

@@ -16,16 +16,16 @@ use super::run;
 const LEAST_OVERHEAD: usize = 60;
 const MOST_OVERHEAD: usize = 180;
 
-/// Kind of the DATA's writer (RTPS 2.5, 9.3.1.2), behind UDP, RTPS header and INFO_TS, or behind these
-/// and INFO_DST.
+/// Excludes built-in writers by the entity kind in the DATA (RTPS 2.5, 9.3.1.2). The DATA follows
+/// the UDP header, the RTPS header and INFO_TS, or these and INFO_DST.
 const NO_BUILT_IN_WRITER: &str = "@th,440,8 != 0xc2 @th,568,8 != 0xc2";
 
-/// Marks selected datagrams on their way from the socket to the interface.
+/// Mark of selected datagrams between the socket and the interface.
 const MARK: u32 = 0x7232;
 
 pub struct Loss<'a> {
     host: &'a Namespace,
-    /// The family of the table that selects.
+    /// Family of the nftables table that selects datagrams.
     chosen_in: &'static str,
 }
 
@@ -47,9 +47,9 @@ pub struct Counts {
 
 impl<'a> Loss<'a> {
     /// Drops `per_mille` of the datagrams from `host` to `receiver` that carry one unfragmented
-    /// sample of `stream`. Selects them by length, excluding discovery by port and by writer: Cyclone
-    /// DDS announces its participant on the port of samples, too. RustDDS multicasts samples, the
-    /// others send them to each reader.
+    /// sample of `stream`. Selects them by length, excluding discovery by port and by writer:
+    /// Cyclone DDS announces its participant on the port of samples, too. RustDDS multicasts
+    /// samples, the other stacks send them to each reader.
     pub fn of_samples(
         host: &'a Namespace,
         receiver: &Namespace,
@@ -98,9 +98,9 @@ impl<'a> Loss<'a> {
         })
     }
 
-    /// Drops every `nth` datagram that an nftables expression such as `udp length > 1000` matches,
-    /// tested before it is cut into IP fragments. The sender's socket sees a success; the kernel
-    /// itself does not send the fragments after a dropped one.
+    /// Drops every `nth` datagram that an nftables expression such as `udp length > 1000` matches.
+    /// The expression is tested before IP fragmentation. The sender's socket sees a success; the
+    /// kernel itself does not send the fragments that follow a dropped one.
     pub fn of_datagrams(
         host: &'a Namespace,
         matches: &str,

@@ -158,7 +158,7 @@ impl Namespace {
         run(&format!(
             "ip -n {name} route add 239.0.0.0/8 dev {interface}"
         ))?;
-        // Otherwise veth carries unfinished checksums, which no physical link does.
+        // Otherwise veth carries incomplete checksums, unlike a physical link.
         run(&format!(
             "ip netns exec {name} ethtool -K {interface} tx off"
         ))?;

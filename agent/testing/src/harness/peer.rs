@@ -1,4 +1,4 @@
-//! Real DDS participants and sessions of Zenoh: one command line for four stacks (see
+//! Real DDS participants and Zenoh sessions: one command line for four stacks (see
 //! `agent/cli/tests/peers/peer.hpp`).
 
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ use super::event_log::EventLog;
 use super::network::Namespace;
 use super::process::Process;
 
-/// Longest time of discovery on a busy machine.
+/// Maximum time of discovery on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -78,7 +78,7 @@ impl Stack {
         }
     }
 
-    /// Returns the script that its program runs, if it is an interpreter.
+    /// Returns the script that the program runs, if the program is an interpreter.
     fn script(self) -> Option<&'static str> {
         const SCRIPT: &str = concat!(
             env!("CARGO_MANIFEST_DIR"),
@@ -99,7 +99,7 @@ impl Stack {
 }
 
 impl Stream {
-    /// Small samples as from an IMU: 320 B at 200 Hz, best effort.
+    /// Returns a stream of small samples, as from an IMU: 320 B at 200 Hz, best effort.
     pub fn small(count: u64) -> Stream {
         Stream {
             topic: "/imu".to_owned(),
@@ -120,8 +120,9 @@ impl Stream {
         }
     }
 
-    /// A point cloud of `size` bytes at 20 Hz, best effort. The history holds a second: RustDDS
-    /// drops samples that it overwrites before a busy CPU has sent them.
+    /// Returns a stream of point clouds of `size` bytes at 20 Hz, best effort. The history holds
+    /// one second of samples: RustDDS drops samples that it overwrites before a busy CPU has sent
+    /// them.
     pub fn point_cloud(size: usize, count: u64) -> Stream {
         Stream {
             topic: "/points".to_owned(),
@@ -133,7 +134,7 @@ impl Stream {
     }
 }
 
-/// Starts a router of Zenoh, which connects to the routers of these hosts.
+/// Starts a Zenoh router, which connects to the routers of the hosts in `others`.
 pub fn router(host: &Namespace, others: &[&Namespace]) -> Result<Process> {
     let mut words = vec!["--role".to_owned(), "router".to_owned()];
     for other in others {
@@ -194,8 +195,8 @@ impl Peer {
         Peer::launch_behind(&host.inside(), stack, role, stream, nodes)
     }
 
-    /// Starts a peer as [`Peer::launch`] does, behind the caller's command prefix, such as a host's
-    /// with environment variables.
+    /// Starts a peer as [`Peer::launch`] does, behind the caller's command prefix, such as that of
+    /// a host with environment variables.
     pub fn launch_behind(
         enter: &[String],
         stack: Stack,
@@ -269,7 +270,7 @@ impl Peer {
         self.process.write_line("go")
     }
 
-    /// Waits until a publisher has sent everything.
+    /// Waits until a publisher has sent all its samples.
     pub fn wait_sent(&mut self, limit: Duration) -> Result<()> {
         self.process.wait_for("done", limit)
     }
@@ -283,7 +284,7 @@ impl Peer {
     }
 }
 
-/// The demo robot, built by cargo as an example beside the tests.
+/// Returns the path of the demo robot, which cargo builds as an example beside the tests.
 pub fn robot() -> Result<PathBuf> {
     Ok(profile_directory()?.join("examples/robot"))
 }

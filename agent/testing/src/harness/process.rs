@@ -1,5 +1,6 @@
-//! A program running on a host, ended when its value is dropped. It also dies with the thread that
-//! started it, so a killed test leaves nothing behind: start it on the thread that keeps the value.
+//! A program that runs on a host and is killed when its value is dropped. It also dies with the
+//! thread that started it, so a killed test leaves no program behind. Start it on the thread that
+//! keeps the value.
 
 use std::collections::BTreeSet;
 use std::ffi::OsStr;

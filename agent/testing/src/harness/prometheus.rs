@@ -1,4 +1,4 @@
-//! A real Prometheus on a host, and its answers.
+//! A real Prometheus on a host, and the results of its queries.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -13,7 +13,7 @@ use super::process::Process;
 
 pub const INSTALL: &str = "run `make prerequisites` or `apt-get install prometheus`";
 const SERVER: &str = "127.0.0.1:9090";
-/// Longest wait for the answer to a query.
+/// Maximum wait for the result of a query.
 const PATIENCE: Duration = Duration::from_secs(40);
 
 pub struct Prometheus<'a> {
@@ -32,7 +32,8 @@ pub enum Kind {
 }
 
 impl<'a> Prometheus<'a> {
-    /// Scrapes these targets (`address:port`) and evaluates these rule files each second.
+    /// Starts a server that scrapes these targets (`address:port`) and evaluates these rule files
+    /// each second.
     pub fn start(
         host: &'a Namespace,
         targets: &[String],
@@ -46,7 +47,7 @@ impl<'a> Prometheus<'a> {
         Prometheus::run(host, Kind::Server, &text)
     }
 
-    /// Runs with this configuration, on port 9090, and returns once it answers queries.
+    /// Starts Prometheus with this configuration on port 9090, and returns once it answers queries.
     pub fn run(host: &'a Namespace, kind: Kind, text: &str) -> Result<Prometheus<'a>> {
         let directory = tempfile::tempdir()?;
         let configuration = directory.path().join("prometheus.yml");
@@ -78,7 +79,7 @@ impl<'a> Prometheus<'a> {
         Ok(prometheus)
     }
 
-    /// Until then Prometheus answers each query with 503.
+    /// Waits until Prometheus is ready; before that, it answers each query with 503.
     fn wait_until_ready(&self) -> Result<()> {
         let deadline = Instant::now() + PATIENCE;
         while let Err(error) = get(self.host, &format!("http://{SERVER}/-/ready")) {
@@ -90,7 +91,7 @@ impl<'a> Prometheus<'a> {
         Ok(())
     }
 
-    /// Queries until an answer exists; returns the value of its first sample.
+    /// Queries until there is a result, and returns the value of its first sample.
     pub fn query(&self, expression: &str) -> Result<f64> {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -110,7 +111,7 @@ impl<'a> Prometheus<'a> {
         }
     }
 
-    /// Queries until the answer is `wanted`.
+    /// Queries until the result is `wanted`.
     pub fn wait_for(&self, expression: &str, wanted: f64) -> Result<()> {
         let deadline = Instant::now() + PATIENCE;
         loop {

@@ -12,17 +12,18 @@ impl Snmp {
         Ok(Snmp(text))
     }
 
-    /// Returns datagrams dropped at a full socket buffer.
+    /// Returns the number of datagrams dropped at a full socket buffer.
     pub fn receive_buffer_errors(&self) -> Result<u64> {
         self.value("Udp:", "RcvbufErrors")
     }
 
-    /// Returns datagrams that reached a socket but were not delivered, for any reason.
+    /// Returns the number of datagrams that reached a socket but were not delivered, for any
+    /// reason.
     pub fn receive_errors(&self) -> Result<u64> {
         self.value("Udp:", "InErrors")
     }
 
-    /// Returns datagrams sent.
+    /// Returns the number of datagrams sent.
     pub fn sent(&self) -> Result<u64> {
         self.value("Udp:", "OutDatagrams")
     }

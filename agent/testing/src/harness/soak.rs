@@ -13,13 +13,13 @@ use super::agent::{METRICS, Scrape, get};
 use super::network::Namespace;
 use super::usage::Usage;
 
-/// Set for the long run.
+/// Variable that is set for the long run.
 const SOAK: &str = "ROS2PROBE_SOAK";
-/// Length of the long run in seconds; an hour if unset.
+/// Variable with the length of the long run in seconds; an hour if unset.
 const SECONDS: &str = "ROS2PROBE_SOAK_SECONDS";
-/// Path of another build of `rp` than the tests'.
+/// Variable with the path of `rp`, if it is not the one that the tests build.
 const PROGRAM: &str = "ROS2PROBE_SOAK_PROGRAM";
-/// Directory of results; `target/soak` if unset.
+/// Variable with the directory of results; `target/soak` if unset.
 const RESULTS: &str = "ROS2PROBE_SOAK_RESULTS";
 
 /// Returns the length of the long run; `None` in `make test`.
@@ -87,7 +87,7 @@ impl Need {
     }
 }
 
-/// Returns what the kernel could not deliver to the agent.
+/// Returns the number of packets and records that the kernel could not deliver to the agent.
 pub fn dropped(page: &Scrape) -> f64 {
     page.sum("ros2probe_capture_dropped_packets_total", &[])
         + page.sum("ros2probe_records_dropped_total", &[])
@@ -117,7 +117,7 @@ pub struct Curve {
 }
 
 impl Curve {
-    /// Samples the usage until it is stopped, and logs it once per minute.
+    /// Samples the usage until `stop` is set, and logs it once per minute.
     pub fn draw(
         name: &'static str,
         (pid, host): (u32, &Namespace),
@@ -142,7 +142,8 @@ impl Curve {
         Ok(Curve { name, needs })
     }
 
-    /// Returns the medians of the minutes with a large graph, after the first ones.
+    /// Returns the median memory of each minute with a large graph, after the first `skipped`
+    /// seconds.
     fn minutes(&self, skipped: f64) -> Vec<(f64, f64)> {
         let largest = self.needs.iter().map(|need| need.participants);
         let large = largest.fold(0.0, f64::max) * 0.9;
@@ -181,7 +182,7 @@ impl Curve {
         })
     }
 
-    /// Fails if anything but memory is higher at the end than in the middle.
+    /// Fails if any usage other than memory is higher in the second half than in the first.
     pub fn is_level(&self) -> Result<()> {
         let middle = self.needs.len() / 2;
         let (early, late) = self.needs.split_at(middle);
@@ -348,7 +349,7 @@ fn picture(curves: &[Curve]) -> Result<String> {
     Ok(svg)
 }
 
-/// In the long run, appends the result of a fault to `faults.md`; prints it.
+/// Prints the result of a fault. In the long run, also appends it to `faults.md`.
 pub fn outcome(fault: &str, outcome: &str) -> Result<()> {
     eprintln!("{fault}: {outcome}");
     if long().is_none() {
@@ -361,13 +362,13 @@ pub fn outcome(fault: &str, outcome: &str) -> Result<()> {
         text.push_str("| fault | outcome |\n| --- | --- |\n");
     }
     writeln!(text, "| {fault} | {outcome} |")?;
-    // One write: tests run in parallel.
+    // The row is one write, because tests run in parallel.
     let mut file = fs::File::options().create(true).append(true).open(file)?;
     std::io::Write::write_all(&mut file, text.as_bytes())?;
     Ok(())
 }
 
-/// Returns the median; 0 of nothing.
+/// Returns the median, or 0 without values.
 pub fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or(0.0)

@@ -1,12 +1,12 @@
-//! A switch between two hosts. The sender's packet taps see what it drops, the receiver's do not:
-//! `Loss::of_samples` on it creates loss between two agents.
+//! A switch between two hosts. The sender's packet sockets see the datagrams that it drops, the
+//! receiver's do not. `Loss::of_samples` on the switch therefore creates loss between two agents.
 
 use anyhow::Result;
 
 use super::network::{INTERFACE, Link, Namespace};
 use super::run;
 
-/// The switch's port to the robot; the one to the monitor is called [`INTERFACE`].
+/// The switch's port to the robot; the port to the monitor is called [`INTERFACE`].
 const ROBOT_PORT: &str = "robot";
 
 pub struct Switched {

@@ -17,8 +17,8 @@ pub struct TracedProgram {
 }
 
 impl TracedProgram {
-    /// Compiles both. `place`: offset of `rmw_handle` in rcl's structures, 240 or 248. `defines`:
-    /// such as `-DHUMBLE`.
+    /// Compiles the library and the program. `place` is the offset of `rmw_handle` in rcl's
+    /// structures, 240 or 248. `defines` has compiler arguments such as `-DHUMBLE`.
     pub fn build(place: u32, defines: &[&str]) -> Result<Self> {
         let built = Self {
             directory: tempfile::tempdir()?,
@@ -42,8 +42,8 @@ impl TracedProgram {
         self.directory.path().join("libtracetools.so")
     }
 
-    /// Its arguments are the topic that it takes from, the topic that it publishes on, and its
-    /// node; by default `/in`, `/out` and `filter`.
+    /// Returns the path of the program. Its arguments are the topic from which it takes, the topic
+    /// on which it publishes, and its node; by default `/in`, `/out` and `filter`.
     pub fn program(&self) -> PathBuf {
         self.directory.path().join("process")
     }

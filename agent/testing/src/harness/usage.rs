@@ -16,16 +16,16 @@ pub struct Usage {
     pub memory: Memory,
 }
 
-/// Its memory in bytes.
+/// Memory of a process, in bytes.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Memory {
     /// Memory that the kernel cannot reclaim while the process exists: its own pages (anonymous,
-    /// changed, swapped) and the rings that it shares with the kernel. The rest is pages of files,
-    /// such as the program's.
+    /// changed, swapped) and the rings that it shares with the kernel. All other memory is pages of
+    /// files, such as those of the program.
     pub unreclaimable: u64,
-    /// The part of it in the rings.
+    /// The part of `unreclaimable` in the rings.
     pub rings: u64,
-    /// The part of it in pages of the program changed at start or run time.
+    /// The part of `unreclaimable` in pages of the program that changed at start or run time.
     pub program: u64,
     /// All pages in memory.
     pub rss: u64,
@@ -61,7 +61,7 @@ impl Memory {
         self.with(other, u64::max)
     }
 
-    /// Returns the sum of two processes.
+    /// Returns the sum of each figure of two processes.
     pub fn plus(self, other: Memory) -> Memory {
         self.with(other, u64::saturating_add)
     }
@@ -157,8 +157,8 @@ impl Mapping {
     }
 }
 
-/// Returns the idle time of all CPUs of the machine; the rest is work. The kernel's counters of
-/// work are sampled at its ticks, and miss work that a timer starts just after one.
+/// Returns the idle time of all CPUs of the machine; the remaining time is work. The kernel samples
+/// its counters of work at clock ticks, and misses work that a timer starts just after a tick.
 pub fn machine_idle() -> Result<Duration> {
     let statistics = fs::read_to_string("/proc/stat").context("cannot read /proc/stat")?;
     let times = statistics.lines().next().context("/proc/stat is empty")?;
@@ -198,7 +198,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pages_of_files_do_not_count_as_the_process_s_own_and_rings_do() {
+    fn pages_of_files_are_reclaimable_and_rings_are_not() {
         let maps = "00400000-00e00000 r-xp 00000000 fe:00 12 /usr/bin/rp
 Rss:               10000 kB
 Pss:                5000 kB

@@ -1,6 +1,6 @@
-//! The agent's library inside a test: it exposes each sample, while the agent's page has only sums.
-//! It works as the agent does, and observes sockets of the whole machine unless it is given a
-//! control group.
+//! The agent's library inside a test: it exposes each loss, while the agent's metrics have only
+//! sums. It works as the agent does, and observes sockets of the whole machine unless a control
+//! group is configured.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -24,7 +24,7 @@ use super::bpf;
 use super::network::Namespace;
 
 const SLICE: Duration = Duration::from_millis(100);
-/// Longer than the kernel waits for IP fragments: after that every cause is settled.
+/// Nanoseconds after which every cause is settled: longer than the kernel waits for IP fragments.
 const UNTIL_ALL_IS_SETTLED: u64 = 60_000_000_000;
 
 pub struct Witness {
@@ -32,9 +32,9 @@ pub struct Witness {
     thread: Option<JoinHandle<Result<Testimony>>>,
 }
 
-/// Its state at the end.
+/// State of the witness at the end.
 pub struct Testimony {
-    /// Snapshot after the peers left and everything open was settled.
+    /// Snapshot after the peers left and all open samples were settled.
     pub end: Snapshot,
     pub losses: Vec<Loss>,
     pub delivery_losses: Vec<DeliveryLoss>,
@@ -45,7 +45,7 @@ pub struct Testimony {
 }
 
 impl Testimony {
-    /// Fails if the kernel programs had to omit anything.
+    /// Fails if the kernel programs had to omit records.
     pub fn ensure_complete(&self) -> Result<()> {
         for (counter, value) in &self.counters {
             let blind = ["records_lost", "contended"].contains(&counter.label());
@@ -62,7 +62,7 @@ struct Shared {
 }
 
 impl Witness {
-    /// Returns once it observes all traffic.
+    /// Starts a witness, and returns once it observes all traffic.
     pub fn start(configuration: &str) -> Result<Witness> {
         Witness::start_in(None, configuration)
     }
@@ -104,7 +104,7 @@ impl Witness {
         latest.unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Waits until `question` returns an answer for the current state.
+    /// Waits until `question` returns `Some` for the current state.
     pub fn wait_for<T>(
         &self,
         what: &str,
@@ -124,7 +124,7 @@ impl Witness {
         }
     }
 
-    /// Reads what the kernel still holds and settles everything.
+    /// Reads the remaining records of the kernel, and settles all samples.
     pub fn finish(&mut self) -> Result<Testimony> {
         self.shared.stop.store(true, Ordering::Relaxed);
         let thread = self.thread.take().context("the witness has ended")?;

@@ -20,7 +20,7 @@ pub struct VirtualDomain {
     pub observer: Observer,
     /// Nanoseconds since the Unix epoch.
     pub now: u64,
-    /// Domain whose multicast port receives everything.
+    /// Domain whose multicast port receives all messages.
     pub domain_id: u16,
 }
 

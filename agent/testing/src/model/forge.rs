@@ -136,7 +136,8 @@ fn text(text: &str) -> Vec<u8> {
     [&len.to_le_bytes()[..], text.as_bytes(), &[0]].concat()
 }
 
-/// Returns an SPDP payload; with `None` the domain is left to the port.
+/// Returns an SPDP payload. With `None`, it has no domain id, so that the port determines the
+/// domain.
 pub fn participant(prefix: GuidPrefix, lease_seconds: u32, domain_id: Option<u32>) -> Vec<u8> {
     participant_at(prefix, lease_seconds, domain_id, &[])
 }
@@ -190,8 +191,7 @@ pub fn endpoint_with(guid: Guid, topic: &str, type_name: &str, others: &[(u16, &
     encapsulated(&list)
 }
 
-/// Returns a `ros_discovery_info` payload: nodes by name with one writer each; gids of 16 or 24
-/// bytes.
+/// Returns a `ros_discovery_info` payload of nodes with one writer each. Gids have 16 or 24 bytes.
 pub fn entities(prefix: GuidPrefix, gid_len: usize, nodes: &[(&str, &str, Guid)]) -> Vec<u8> {
     let nodes = nodes.iter().map(|(namespace, name, writer)| AnnouncedNode {
         namespace,
@@ -210,7 +210,7 @@ pub struct AnnouncedNode<'a> {
     pub writers: Vec<Guid>,
 }
 
-/// Returns a `ros_discovery_info` payload of these nodes; gids of 16 or 24 bytes.
+/// Returns a `ros_discovery_info` payload of these nodes. Gids have 16 or 24 bytes.
 pub fn entities_of(prefix: GuidPrefix, gid_len: usize, nodes: &[AnnouncedNode<'_>]) -> Vec<u8> {
     let gid = |guid: Guid| {
         let mut bytes = guid.to_bytes().to_vec();

@@ -28,7 +28,7 @@ pub const CAROL: GuidPrefix = GuidPrefix(*b"\x01\x10carol-host");
 pub const GROUP: &str = "239.255.0.1:7401";
 const STRING: &str = "std_msgs::msg::dds_::String_";
 
-/// Place at which a record is seen.
+/// A point at which records are captured.
 #[derive(Clone, Copy)]
 pub struct CapturePoint {
     pub socket: u64,
@@ -48,7 +48,7 @@ impl CapturePoint {
         }
     }
 
-    /// Returns the same place for a datagram sent to it.
+    /// Returns the point at which a datagram leaves this host for this address.
     pub fn leaving(self) -> Self {
         Self {
             socket: 9,
@@ -57,7 +57,7 @@ impl CapturePoint {
         }
     }
 
-    /// Returns the same place on a wire.
+    /// Returns the point on a wire for this address.
     pub fn wire(self) -> Self {
         Self {
             socket: 0,
@@ -162,7 +162,7 @@ impl Host {
         }
     }
 
-    /// Reports that the participant's process holds the socket, as its own packets show.
+    /// Reports that the participant's process owns the socket, as its own packets show.
     pub fn owner(&mut self, seen: CapturePoint, prefix: GuidPrefix) {
         let process_id = u32::from(prefix.0[2]);
         let sending = 1000 + u64::from(process_id);
@@ -242,7 +242,7 @@ impl Host {
         self.put(self.record(seen, kind::DATA, number));
     }
 
-    /// Reports that the socket had no room for the record.
+    /// Reports that the socket's buffer was full for this sample.
     pub fn socket_full(&mut self, seen: CapturePoint, number: u64) {
         let arrival = self.record(seen, kind::DATA, number);
         self.put(Record {
@@ -252,7 +252,7 @@ impl Host {
         self.put(arrival);
     }
 
-    /// Returns fragments of a sample with ten, joined over `elapsed` nanoseconds.
+    /// Returns a record of `count` fragments of a sample that has ten.
     pub fn fragments(&self, seen: CapturePoint, number: u64, start: u32, count: u32) -> Record {
         Record {
             fragment_start: start,
@@ -273,12 +273,12 @@ impl Host {
         });
     }
 
-    /// Acknowledges all samples below `base` by Bob's reader.
+    /// Sends an ACKNACK of Bob's reader for all samples below `base`.
     pub fn acknack(&mut self, bob: CapturePoint, base: u64) {
         self.request(bob, base, 0, 0);
     }
 
-    /// Acknowledges, and requests some of the next `bits` samples.
+    /// Sends an ACKNACK of Bob's reader that also requests some of the next `bits` samples.
     pub fn request(&mut self, bob: CapturePoint, base: u64, bits: u32, bitmap: u32) {
         self.put(Record {
             reader: guid_words(Guid::new(BOB, READER)),
@@ -317,7 +317,7 @@ impl Host {
         deliveries
     }
 
-    /// Returns the numbers lost by this cause, of all receivers.
+    /// Returns the sequence numbers that any receiver lost by this cause.
     pub fn losses(&self, cause: LossCause) -> Vec<u64> {
         let losses = self.observer.journal().delivery_losses();
         let mut lost: Vec<_> = losses

@@ -1,4 +1,4 @@
-//! RTPS for a model in virtual time: messages, captures of them, domains, and hosts that receive them.
+//! RTPS for a model in virtual time: messages, captures, domains, and hosts that receive messages.
 
 pub mod capture;
 pub mod domain;

@@ -1,4 +1,4 @@
-//! What the sample robot's processes show from inside.
+//! Calls inside the processes of the sample robot.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -93,7 +93,7 @@ pub fn inside() -> InsideFacts {
     }
 }
 
-/// Returns what these processes show of a topic.
+/// Returns the figures of these processes about a topic.
 pub fn topic() -> TopicInside {
     TopicInside {
         counts: TopicCounts {
@@ -141,7 +141,7 @@ pub fn source() -> InsideSourceFacts {
     }
 }
 
-/// Returns a finding of each kind that only processes show.
+/// Returns a finding of each kind that only calls inside processes show.
 pub fn findings(topic: &TopicKey) -> [Diagnosis; 5] {
     [
         Diagnosis::SlowCallback {

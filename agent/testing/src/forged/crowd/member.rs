@@ -53,7 +53,7 @@ impl Member {
         }
     }
 
-    /// Returns all its announcements, as for a newcomer.
+    /// Returns all its announcements, as a new participant sends them.
     pub(super) fn introduction(&self) -> Vec<Vec<u8>> {
         let mut messages = vec![self.announcement()];
         let mut numbers = self.numbers;
@@ -138,7 +138,7 @@ impl Member {
             inline.extend_from_slice(&key.finish());
         }
         let mut message = self.message(writer, number, &inline);
-        // Inline QoS; and a key instead of data, or no payload.
+        // Flags for inline QoS, and for a key instead of data or no payload.
         message[21] = if by_key { 0x0b } else { 0x03 };
         message
     }
@@ -168,7 +168,7 @@ pub(super) fn role(entity: [u8; 4]) -> &'static str {
     if entity[3] == 3 { "writer" } else { "reader" }
 }
 
-/// Returns a GUID in the agent's form.
+/// Returns a GUID in the agent's text form.
 pub(super) fn guid(prefix: &[u8; 12], entity: [u8; 4]) -> String {
     let hexadecimal =
         |bytes: &[u8]| -> String { bytes.iter().map(|byte| format!("{byte:02x}")).collect() };
