@@ -85,7 +85,7 @@ struct Provided {
     provider_ids: Vec<String>,
 }
 
-/// Nodes at each topic or service.
+/// Ids of the nodes at each topic or service.
 pub type Parties = BTreeMap<String, BTreeSet<String>>;
 
 /// The connection graph after all updates.

@@ -39,7 +39,7 @@ pub struct Examiner {
     revision: Option<(u64, u64, u64, u64)>,
     /// Time at which the first unmatched endpoint becomes a finding.
     due: Option<ModelTime>,
-    /// Time at which each unmatched endpoint was first found.
+    /// Time at which each unmatched endpoint was first found to be unmatched.
     alone: HashMap<Guid, ModelTime>,
     current: Arc<Diagnoses>,
     /// Time at which each finding appeared.
@@ -85,7 +85,7 @@ impl Examiner {
         self.revision = None;
     }
 
-    /// Examines the graph if anything has changed since the last time.
+    /// Examines the graph if it has changed since the last examination, or a deadline has passed.
     pub fn examine(
         &mut self,
         discovery: &Discovery,

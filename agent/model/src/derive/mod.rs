@@ -1,4 +1,4 @@
-//! What follows from measurements: chains, services, calls inside processes, findings.
+//! Facts derived from measurements: chains, services, calls inside processes, findings.
 
 pub mod chain;
 pub mod examiner;

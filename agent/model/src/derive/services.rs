@@ -1,4 +1,4 @@
-//! Latency of services and actions: which reply answers which request, and after what time.
+//! Latency of services and actions: which reply answers which request, and how long that takes.
 //!
 //! A request and its reply share an identity: rmw_fastrtps puts it into their inline QoS,
 //! rmw_cyclonedds before their payload. The writers of service topics are therefore captured,

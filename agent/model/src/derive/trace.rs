@@ -333,7 +333,7 @@ impl WriterTrace {
         }
         let known = |message: &Message| message.sequence_number == number;
         let index = match self.under_way.iter().position(known) {
-            // The wire shows its fragments.
+            // The wire shows the fragments of this message.
             Some(_) if sample.head.is_in_shared_memory() => return,
             Some(index) => index,
             None => match self.begin(self.message(sample, trace_id), shared) {

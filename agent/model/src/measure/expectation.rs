@@ -334,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn two_bad_seconds_in_a_row_violate_and_three_good_ones_recover() {
+    fn two_bad_seconds_in_a_row_cause_a_violation_and_three_good_ones_end_it() {
         let mut bench = Bench::new(Expectations {
             min_rate_hz: Some(10.0),
             ..Expectations::default()

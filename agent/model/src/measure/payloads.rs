@@ -40,7 +40,7 @@ struct WantedWriter {
     to: Arc<[u64]>,
     payloads: Arc<[u64]>,
     arrivals: Arc<[u64]>,
-    /// Where each request begins.
+    /// Start of each request.
     begins: Vec<RequestBegin>,
     /// Time when the requests for payloads began.
     since: ModelTime,

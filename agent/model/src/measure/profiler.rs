@@ -91,7 +91,7 @@ struct SharedBudgets {
     quota: DeliveryQuota,
 }
 
-/// The writer that an observation belongs to.
+/// The writer to which an observation belongs.
 #[derive(Clone, Copy)]
 struct WriterRef {
     writer: Guid,
@@ -162,7 +162,7 @@ impl Profiler {
         self.writers.iter()
     }
 
-    /// Returns how far the samples of this writer are decided; `None` if it is not measured.
+    /// Returns which samples of this writer are decided; `None` if it is not measured.
     pub fn progress(&mut self, guid: Guid, now: ModelTime, graph: &Graph) -> Option<Progress> {
         let measured = self.writers.get_mut(&guid)?;
         let acknowledged = measured.is_acknowledged()
@@ -296,7 +296,8 @@ impl Profiler {
         }
     }
 
-    /// Begins to measure a writer with a topic, keeping what was measured before its announcement.
+    /// Begins to measure a writer with a topic, and keeps its measurements from before the
+    /// announcement.
     pub fn measure(
         &mut self,
         guid: Guid,

@@ -1,7 +1,7 @@
 //! Maps sockets and addresses to the participants that receive there.
 //!
-//! A socket belongs to the participant that sends through it, whose process owns it, or to which a
-//! directed message (INFO_DST) arrived at it. The process of a participant is learned from the
+//! A socket belongs to the participant that sends through it, whose process owns it, or at which a
+//! message at the socket is directed (INFO_DST). The process of a participant is learned from the
 //! sockets through which it sends, because announced process ids may be those of a container.
 //! INFO_DST is the weakest evidence: RustDDS announces loopback addresses to other hosts, so their
 //! participants send messages for this host to themselves. An address belongs to the participant
@@ -65,7 +65,7 @@ pub struct Graph {
     pub wall_clock: WallClock,
 }
 
-/// Participants that a socket may belong to.
+/// Participants to which a socket may belong.
 #[derive(Debug, Default)]
 struct SocketUsers {
     /// Participants that send through it.
@@ -211,7 +211,7 @@ impl Receivers {
     }
 
     /// Learns the owner of a socket from an observation. Returns whether a socket of this host sent
-    /// it, unless that socket sends for too many participants.
+    /// the message, unless that socket sends for too many participants.
     pub fn learn(&mut self, observation: &Observation) -> bool {
         let Head {
             path: Path::Socket,

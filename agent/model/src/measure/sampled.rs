@@ -151,7 +151,7 @@ impl Sampled {
         (self.last, self.left) = (ModelTime::ZERO, true);
     }
 
-    /// Returns whether this sample was sent and is still waited for.
+    /// Returns whether this sample was sent and is still awaited.
     #[must_use]
     pub fn awaits(&self, number: SequenceNumber) -> bool {
         let bit = self.bit(number, self.next);

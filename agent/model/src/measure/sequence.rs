@@ -63,7 +63,8 @@ pub struct Sequence {
     withdrawn: Option<(ModelTime, SequenceNumber)>,
     /// All readers that send ACKNACKs have every number below it, or will not get it.
     acknowledged: SequenceNumber,
-    /// Last result of [`Self::complete`]: every number below it has arrived or is not awaited.
+    /// Every number below it has arrived or is not awaited; [`Self::complete`] and [`Self::skip`]
+    /// raise it.
     complete: SequenceNumber,
     /// Number of restarts.
     incarnation: u32,

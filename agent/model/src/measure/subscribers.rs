@@ -71,7 +71,7 @@ pub struct Subscribers {
 /// Result of an observation for the deliveries.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Novelty {
-    /// It may contain something new.
+    /// It may contain new data.
     New,
     /// The same receiver already had all of it, or all of it had left for the same destination.
     Duplicate,

@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn a_storm_stays_bounded() {
+    fn a_storm_of_drops_stays_bounded() {
         let mut undelivered = Undelivered::default();
         for number in 0..10_000 {
             let data = Record {

@@ -1,5 +1,5 @@
 //! A robot whose graph changes constantly, and the truth about it: its entities, and how former
-//! ones ended.
+//! entities ended.
 //!
 //! Participants send the same messages as DDS implementations, at a bounded rate. The sender's
 //! knowledge is exact: a lease that it could not renew in time has expired.
@@ -22,7 +22,7 @@ const PACE: f64 = 2500.0;
 const LATE: f64 = 0.8;
 /// Time within which an observer notices the end of a lease.
 const GREY: Duration = Duration::from_millis(2500);
-/// Permanent participants, and the number of measured topics of each.
+/// Numbers of permanent participants, and of measured topics of each.
 const STAYING: usize = 20;
 const MEASURED: usize = 10;
 const ENTITIES_WRITER: [u8; 4] = [0, 0, 1, 3];

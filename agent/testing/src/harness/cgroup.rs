@@ -40,15 +40,15 @@ impl Cgroup {
         &self.path
     }
 
-    /// Returns the command prefix that runs a program in it.
+    /// Returns the command prefix that runs a program in this cgroup.
     pub fn inside(&self) -> Vec<String> {
         let enter = r#"echo 0 >"$0/cgroup.procs" && exec "$@""#;
         let path = self.path.display().to_string();
         vec!["sh".to_owned(), "-c".to_owned(), enter.to_owned(), path]
     }
 
-    /// Runs `make` with this process in it and moves back: a socket belongs to the cgroup in which
-    /// it was created. Tests of one process do so one after another.
+    /// Runs `make` with this process in the cgroup, and moves the process back: a socket belongs to
+    /// the cgroup in which it was created. Tests of one process do so one after another.
     pub fn hold<T>(&self, make: impl FnOnce() -> T) -> Result<T> {
         let turn = MOVED.lock();
         let own = fs::read_to_string("/proc/self/cgroup").context("cannot read /proc")?;
@@ -84,7 +84,7 @@ fn enter(cgroup: &Path) -> Result<()> {
         .with_context(|| format!("cannot move to {}", cgroup.display()))
 }
 
-/// Returns the mount point of the v2 hierarchy.
+/// Returns the mount point of the cgroup v2 hierarchy.
 pub fn hierarchy() -> Result<PathBuf> {
     let mounts = fs::read_to_string("/proc/self/mounts").context("cannot read the mounts")?;
     let path = mounts.lines().find_map(|line| {

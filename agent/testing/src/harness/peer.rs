@@ -63,7 +63,7 @@ pub struct Peer {
 }
 
 impl Stack {
-    /// The stacks of DDS.
+    /// The DDS stacks.
     pub const ALL: [Stack; 3] = [Stack::Fast, Stack::Cyclone, Stack::Rust];
 
     fn program(self) -> Result<PathBuf> {

@@ -7,13 +7,13 @@ use anyhow::Result;
 use super::network::Namespace;
 use super::process::Process;
 
-/// A mount namespace with an empty `/dev/shm`. Exists as long as this value.
+/// A mount namespace with an empty `/dev/shm`. It exists as long as this value.
 pub struct SharedMemory {
     keeper: Process,
 }
 
 impl SharedMemory {
-    /// Creates one for the processes of `host`, with a size of `megabytes`.
+    /// Creates a `/dev/shm` of `megabytes` for the processes of `host`.
     pub fn of(host: &Namespace, megabytes: u32) -> Result<SharedMemory> {
         let mount = format!("mount -t tmpfs -o size={megabytes}m,mode=1777 shm /dev/shm");
         let script = format!("{mount} && echo ready && exec cat");
@@ -23,7 +23,7 @@ impl SharedMemory {
         Ok(SharedMemory { keeper })
     }
 
-    /// Returns the command prefix that runs a program of `host` with it.
+    /// Returns the command prefix that runs a program of `host` with this `/dev/shm`.
     pub fn inside(&self, host: &Namespace) -> Vec<String> {
         let mut words = host.on_network();
         let mounts = format!("--mount=/proc/{}/ns/mnt", self.keeper.pid());

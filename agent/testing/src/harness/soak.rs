@@ -60,7 +60,7 @@ pub struct Need {
     pub kernel_bytes: u64,
     pub page_bytes: usize,
     pub dropped: f64,
-    /// Age of the agent's facts, in seconds.
+    /// Age of the agent's snapshot, in seconds.
     pub age: f64,
 }
 

@@ -1,6 +1,6 @@
 //! The agent's library inside a test: it exposes each loss, while the agent's metrics have only
-//! sums. It works as the agent does, and observes sockets of the whole machine unless a control
-//! group is configured.
+//! sums. It works as the agent does, and observes sockets of the whole machine unless a cgroup is
+//! configured.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};

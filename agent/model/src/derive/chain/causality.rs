@@ -26,7 +26,7 @@ const QUIET: Duration = Duration::from_secs(2);
 const REMEMBERED: Duration = Duration::from_secs(5);
 /// Maximum time from the start of a publication to the source timestamp of its message.
 const WRITING: Duration = Duration::from_millis(10);
-/// Number of the latest publications among which the hop before another one is searched.
+/// Number of latest publications that are searched for the hop before a publication.
 const SEARCHED: usize = 2048;
 /// Maximum number of hops of a chain.
 const MAX_HOPS: usize = 31;
@@ -57,7 +57,7 @@ pub struct CausalPublication {
 /// Publications that others may continue.
 #[derive(Debug, Default)]
 pub(super) struct Causality {
-    /// In the order of their arrival.
+    /// Publications in the order of their arrival.
     publications: Bounded<CausalPublications, VecDeque<Hop>>,
 }
 
@@ -84,7 +84,7 @@ pub struct Origin {
     pub share: Option<Share>,
 }
 
-/// What decides whether the trace of a publication is exported.
+/// The decision whether the trace of a publication is exported.
 enum Decision {
     /// The publication begins a chain: the share of its input's traces decides.
     Share(Share),

@@ -6,7 +6,7 @@
 //!
 //! - The input must have reached the node before the output was published.
 //! - An input from which another candidate derives is not the cause; the other candidate is.
-//! - Several remaining candidates are ambiguous and count for none.
+//! - Several remaining candidates are ambiguous, and none of them counts.
 //! - A stamp that originates at several nodes is shared, and is not evidence.
 //!
 //! A hop is accepted after [`ENOUGH`] matches, if the node's output mostly has the stamp of some

@@ -59,7 +59,7 @@ struct Inputs {
 }
 
 impl NodeView {
-    /// Returns whether both are the same node.
+    /// Returns whether both views are of the same node.
     pub(super) fn is_same(&self, other: &Self) -> bool {
         match (&self.name, &other.name) {
             (Some(name), Some(other)) => name == other,

@@ -4,7 +4,7 @@
 //! readers. The rules of [`super::evidence`] therefore apply as far as they need no nodes, and
 //! stronger rules replace the others:
 //!
-//! - A stamp that is a multiple of 100 µs is not evidence, because several nodes may give it
+//! - A stamp that is a multiple of 100 µs is not evidence, because several nodes may use it
 //!   independently.
 //! - Topics whose messages of one stamp are less than 1 ms apart are published together. They count
 //!   as one topic.
@@ -76,7 +76,7 @@ pub enum Times {
 pub struct RecordedFacts {
     /// The times from which they are computed.
     pub times: Times,
-    /// Chains; their nodes are unknown.
+    /// Chains, whose nodes are unknown.
     pub chains: Vec<ChainFacts>,
     /// Topics that are published together with another one, and the topic that represents them.
     pub together: Vec<(TopicName, TopicName)>,

@@ -97,7 +97,7 @@ impl Path {
             })
     }
 
-    /// Returns whether all of `other` is a part of this chain.
+    /// Returns whether `other` is a part of this chain.
     #[must_use]
     pub fn contains(&self, other: &Self) -> bool {
         (self.domain_id, self.method) == (other.domain_id, other.method)

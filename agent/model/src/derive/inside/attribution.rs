@@ -171,7 +171,7 @@ impl Attribution {
     }
 }
 
-/// Returns the common value, or `None` if the values differ or there are none.
+/// Returns the value if all values are equal, or `None` if they differ or do not exist.
 fn only<'a, T: PartialEq + 'a>(mut values: impl Iterator<Item = &'a T>) -> Option<&'a T> {
     let first = values.next()?;
     values.all(|other| other == first).then_some(first)

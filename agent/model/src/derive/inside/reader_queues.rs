@@ -15,9 +15,9 @@ use crate::facts::names::TopicName;
 use crate::facts::naming::Naming;
 
 impl Inside {
-    /// Compares what has arrived at the subscriptions of each process with what they took, after a
-    /// report. `arrivals` returns the arrivals of a topic at the participants of a process; `None`
-    /// if they are not known.
+    /// Compares, after a report, the messages that arrived at the subscriptions of each process
+    /// with those that they took. `arrivals` returns the arrivals of a topic at the participants of
+    /// a process; `None` if they are not known.
     pub fn compare_queues(
         &mut self,
         now: ModelTime,

@@ -26,7 +26,7 @@ pub enum Source {
 pub struct Seen {
     /// Messages.
     pub messages: u64,
-    /// Time of the last one.
+    /// Time of the last message.
     pub last: Option<ModelTime>,
 }
 

@@ -22,7 +22,7 @@ const SEARCH_INTERVAL: Duration = Duration::from_millis(100);
 /// Changes of unknown writers.
 #[derive(Debug, Default)]
 pub struct UnknownWriters {
-    /// Writers to meter from now on.
+    /// Writers that are metered from now on.
     pub metered: Vec<Guid>,
     /// Writers that were dropped.
     pub forgotten: Vec<Guid>,
@@ -58,8 +58,8 @@ impl Profiler {
         self.observe(observation, journal, graph)
     }
 
-    /// Drops the unknown writer with the longest silence, unless it is established. Returns whether
-    /// one was dropped.
+    /// Drops the unknown writer with the longest silence that is not established. Returns whether
+    /// there was one.
     fn evict_unknown_writer(&mut self, now: ModelTime, graph: &Graph) -> bool {
         if now < self.search_after {
             return false;

@@ -1,4 +1,4 @@
-//! Hops between recorded topics, and the messages that went along them.
+//! Hops between recorded topics, and the paths of messages along them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
