@@ -12,9 +12,9 @@ pub struct ChainList<'a> {
     /// Unix time of the state that this answer describes.
     pub timestamp_seconds: f64,
     /// Chains, sorted by domain, method and topics. Without `from` and `to`, chains that are part
-    /// of another one are left out.
+    /// of another chain are left out.
     pub chains: Vec<Chain<'a>>,
-    /// Configured chains, in their order, once for each domain and method.
+    /// Configured chains, in the configuration's order, with one entry per domain and method.
     pub expected: Vec<ExpectedChain<'a>>,
 }
 
@@ -25,7 +25,7 @@ pub struct ChainList<'a> {
 pub struct Chain<'a> {
     /// Domain id.
     pub domain_id: u32,
-    /// How it was recognised: by `stamps` of headers, or by `causality` within processes.
+    /// How the chain was recognised: by `stamps` of headers, or by `causality` within processes.
     #[cfg_attr(feature = "openapi", schema(example = "stamps"))]
     pub method: Cow<'a, str>,
     /// ROS name of the first topic.
@@ -42,13 +42,13 @@ pub struct Chain<'a> {
     pub messages: u64,
     /// Time from the first publication to the last.
     pub latency: Quantiles,
-    /// Position of the hop with the largest median in `hops`.
+    /// Index in `hops` of the hop with the largest median.
     pub bottleneck: Option<u64>,
     /// Unix time of the latest message on the last topic.
     pub last_seen_seconds: f64,
 }
 
-/// A node of a chain. Its parts are null if they were not observed.
+/// A node of a chain. Durations that were not observed are null.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -78,9 +78,9 @@ pub struct Hop<'a> {
 pub struct Quantiles {
     /// Median.
     pub p50_seconds: f64,
-    /// Duration below which 99 % lie.
+    /// 99th percentile.
     pub p99_seconds: f64,
-    /// Largest duration.
+    /// Maximum.
     pub maximum_seconds: f64,
 }
 
@@ -89,15 +89,15 @@ pub struct Quantiles {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct ExpectedChain<'a> {
-    /// Domain id; null before the first message of a chain for every domain.
+    /// Domain id; null for a chain of every domain before its first message.
     pub domain_id: Option<u32>,
     /// ROS name of the first topic.
     pub from: Cow<'a, str>,
     /// ROS name of the last topic.
     pub to: Cow<'a, str>,
-    /// Longest time that it may take, in milliseconds; null without a limit.
+    /// Maximum latency of the chain, in milliseconds; null without a limit.
     pub max_latency_ms: Option<f64>,
-    /// How its messages were recognised; null before the first.
+    /// How the chain was recognised; null before its first message.
     pub method: Option<Cow<'a, str>>,
     /// `ok`, `slow`, or `idle` without a message in the last 10 s.
     #[cfg_attr(feature = "openapi", schema(example = "ok"))]

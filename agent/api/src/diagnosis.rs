@@ -44,16 +44,16 @@ pub enum Diagnosis<'a> {
     UnmatchedPublisher {
         /// GUID of the writer.
         writer: String,
-        /// The nearest mismatch: an endpoint with other QoS (`qos`), of another `type`, or in
-        /// another `partition`; `no_endpoint` if the topic has no reader.
+        /// The closest mismatch: a reader with other QoS (`qos`), of another `type`, or in another
+        /// `partition`; `no_endpoint` if the topic has no reader.
         reason: Cow<'static, str>,
     },
     /// A reader without a matching writer.
     UnmatchedSubscription {
         /// GUID of the reader.
         reader: String,
-        /// The nearest mismatch: `qos`, `type` or `partition`; `no_endpoint` if the topic
-        /// has no writer.
+        /// The closest mismatch: `qos`, `type` or `partition`; `no_endpoint` if the topic has no
+        /// writer.
         reason: Cow<'static, str>,
     },
     /// A client has called a service and received no reply within `service_timeout_s`.
@@ -70,33 +70,33 @@ pub enum Diagnosis<'a> {
     SlowCallback {
         /// Node of the callback; null when unknown.
         node: Option<Cow<'a, str>>,
-        /// Its process.
+        /// Id of the process.
         process_id: u32,
-        /// What triggers it.
+        /// Trigger of the callback.
         trigger: Trigger<'a>,
-        /// 99th percentile of its duration when the problem appeared.
+        /// 99th percentile of the callback's duration when the problem appeared.
         duration_seconds: f64,
-        /// The period.
+        /// Period of the timer.
         period_seconds: f64,
-        /// The period is that of its own timer.
+        /// Whether the period is that of the callback's own timer.
         own_period: bool,
     },
-    /// A callback waits for the executor, longer than its interval and than 100 ms.
+    /// A callback waits for the executor longer than its interval and longer than 100 ms.
     ExecutorWait {
         /// Node of the callback; null when unknown.
         node: Option<Cow<'a, str>>,
-        /// Its process.
+        /// Id of the process.
         process_id: u32,
-        /// What triggers it.
+        /// Trigger of the callback.
         trigger: Trigger<'a>,
-        /// 99th percentile of its wait when the problem appeared.
+        /// 99th percentile of the callback's wait when the problem appeared.
         wait_seconds: f64,
     },
     /// Messages within a process are overwritten before the subscription takes them.
     IntraProcessOverflow {
         /// Node of the subscription; null when unknown.
         node: Option<Cow<'a, str>>,
-        /// Its process.
+        /// Id of the process.
         process_id: u32,
         /// Share of messages overwritten when the problem appeared.
         overwritten_ratio: f64,
@@ -106,32 +106,32 @@ pub enum Diagnosis<'a> {
     ReaderQueueOverflow {
         /// Node of the subscription; null when unknown.
         node: Option<Cow<'a, str>>,
-        /// Its process.
+        /// Id of the process.
         process_id: u32,
         /// Share of messages lost when the problem appeared.
         lost_ratio: f64,
-        /// Messages that the queue keeps; null if that is not announced.
+        /// Maximum number of messages in the queue; null if the reader does not announce it.
         depth: Option<u64>,
     },
-    /// A process exceeds its budget of calls, and the agent no longer counts them.
+    /// A process exceeds its budget of calls, so the agent no longer counts its calls.
     ObservationSuspended {
-        /// The process.
+        /// Id of the process.
         process_id: u32,
-        /// Its name; null when unknown.
+        /// Name of the process; null when unknown.
         process: Option<Cow<'a, str>>,
     },
-    /// A node publishes at the rate of an input, but with new stamps: chains end at it.
+    /// A node publishes at the rate of an input but with new stamps, so chains end at the node.
     RestampingNode {
         /// Name of the node.
         node: Cow<'a, str>,
         /// The input, whose stamps are older.
         input: Cow<'a, str>,
     },
-    /// A configured chain that ends with the topic takes longer than it may.
+    /// A configured chain that ends with the topic exceeds its maximum latency.
     SlowChain {
         /// First topic of the chain.
         from: Cow<'a, str>,
-        /// Longest time that it may take, in milliseconds.
+        /// Maximum latency of the chain, in milliseconds.
         max_latency_ms: f64,
     },
 }

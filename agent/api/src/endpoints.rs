@@ -78,7 +78,7 @@ pub struct Qos<'a> {
 pub struct Process<'a> {
     /// Host name, if the participant announces it.
     pub host: Option<Cow<'a, str>>,
-    /// Process id: of the process that owns its socket, if known; otherwise as announced.
+    /// Id of the process that owns the participant's socket, or else the announced process id.
     pub process_id: Option<u32>,
     /// Process name.
     pub process: Option<Cow<'a, str>>,

@@ -23,12 +23,12 @@ pub struct Event<'a> {
     pub name: Cow<'static, str>,
     /// `INFO`, `WARN` or `ERROR`.
     pub severity: Cow<'static, str>,
-    /// Attributes of the event; their names are those of the metrics' labels.
+    /// Attributes of the event; they have the same names as the labels of metrics.
     #[cfg_attr(feature = "openapi", schema(value_type = Object))]
     pub attributes: Attributes<'a>,
 }
 
-/// Events are missing at this point: the `data` of a server-sent event named `lagged`.
+/// The `data` of a server-sent event named `lagged`: events are missing at this point.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Lagged {

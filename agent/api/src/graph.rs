@@ -30,7 +30,7 @@ pub struct Vertex {
     pub kind: Open<VertexKind>,
     /// Domain id.
     pub domain_id: u32,
-    /// ROS name; for a participant without a node, its GUID.
+    /// ROS name, or the GUID of a participant without a node.
     pub name: String,
 }
 

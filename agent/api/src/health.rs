@@ -15,7 +15,7 @@ pub struct Health {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub reason: Option<String>,
-    /// Which limits are reached, so that part of the robot is not observed; null if none is.
+    /// Limits that are reached, so that a part of the robot is not observed; null without any.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub degraded: Option<String>,
@@ -25,7 +25,7 @@ pub struct Health {
     pub version: Cow<'static, str>,
     /// Where the agent captures: `host`, `wire` or `replay`.
     pub source: Cow<'static, str>,
-    /// The replay has reached the end of its capture; no value changes after that.
+    /// The replay has reached the end of its capture, and no value changes any more.
     pub finished: bool,
     /// Age of the agent's state, in seconds; null before the first packet.
     pub age_seconds: Option<f64>,
@@ -41,17 +41,17 @@ pub struct Health {
     pub dropped_datagrams: u64,
     /// Datagrams that the kernel programs skipped because they interrupted each other too often.
     pub contended_datagrams: u64,
-    /// Writers whose announcement was missed; the names of their topics are unknown.
+    /// Number of writers whose announcement was missed. The names of their topics are unknown.
     pub unknown_writers: usize,
-    /// Command that requests the announcements of unknown writers; null without any.
+    /// Command that requests the announcements of unknown writers; null without unknown writers.
     pub unknown_writers_remedy: Option<String>,
     /// Topics that match a watch but are not measured because `limits.topics` is reached.
     pub topics_rejected: u64,
-    /// Why the agent captures at a source that shows less than another one would; null otherwise.
+    /// Why the agent uses a capture source that shows less than another one; null otherwise.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub source_reason: Option<String>,
-    /// Abilities of the agent, and whether it has each.
+    /// Abilities, and whether the agent has each of them.
     pub abilities: Vec<Ability>,
     /// Capture points: network interfaces, or `sockets`.
     pub interfaces: Vec<Interface>,
@@ -59,8 +59,8 @@ pub struct Health {
     pub tables: Vec<Table>,
     /// Use of the configured limits.
     pub limits: Vec<Limit>,
-    /// Capabilities that at least one thread still holds after startup. The thread that serves this
-    /// answer holds no capabilities.
+    /// Capabilities that at least one thread still has after startup. The thread that serves this
+    /// answer has no capabilities.
     pub capabilities: Vec<String>,
     /// Threads of the agent, as the kernel reports them.
     pub threads: Vec<Thread>,
@@ -75,7 +75,7 @@ pub struct Health {
     /// Ports at which the agent answers as the daemon of the `ros2` command line, by domain; empty
     /// if it does not.
     pub ros2_daemon: Vec<Ros2DaemonPort>,
-    /// Zenoh on this host; null until something of it was seen.
+    /// Zenoh connections and routers on this host; null until the agent has seen Zenoh.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub zenoh: Option<Zenoh>,
@@ -100,7 +100,7 @@ pub struct Foxglove {
     /// Rights of viewers without a token: `read`, `watch` or `all`; null if every viewer needs a
     /// token. Messages need `all`.
     pub access: Option<Cow<'static, str>>,
-    /// Connected viewers, the longest connected first.
+    /// Connected viewers, in the order in which they connected.
     pub clients: Vec<FoxgloveClient>,
 }
 
@@ -114,7 +114,7 @@ pub struct FoxgloveClient {
     pub address: Option<String>,
     /// Rights of the viewer: `read`, `watch` or `all`.
     pub access: Cow<'static, str>,
-    /// Channels that the viewer subscribes to.
+    /// Number of channels that the viewer subscribes to.
     pub subscriptions: usize,
     /// Messages sent to the viewer, statistics included.
     pub sent_messages: u64,
@@ -122,7 +122,7 @@ pub struct FoxgloveClient {
     pub dropped_messages: u64,
 }
 
-/// The port of the ros2 daemon of a domain.
+/// The port at which the agent acts as the ros2 daemon of a domain.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -142,31 +142,31 @@ pub struct Ros2DaemonPort {
     pub reason: Option<String>,
 }
 
-/// Connections of Zenoh.
+/// Zenoh connections and routers on this host.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Zenoh {
-    /// Connections at present, each counted once.
+    /// Number of current connections, each counted once.
     pub connections: u64,
-    /// Routers at present.
+    /// Number of current routers.
     pub routers: u64,
-    /// Times that bytes of a connection were not captured.
+    /// Number of times that bytes of a connection were not captured.
     pub gaps: u64,
-    /// Connections that cannot be read, by reason.
+    /// Connections that the agent cannot read, by reason.
     pub unseen: Vec<UnseenConnections>,
 }
 
-/// Connections of Zenoh that cannot be read.
+/// Zenoh connections that the agent cannot read for one reason.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct UnseenConnections {
-    /// `tls`, `quic`, `version`, `compression`, `low_latency`, or `shared_memory`: then only the
-    /// payloads are not seen.
+    /// `tls`, `quic`, `version`, `compression`, `low_latency` or `shared_memory`. With
+    /// `shared_memory`, only the payloads cannot be read.
     #[cfg_attr(feature = "openapi", schema(example = "tls"))]
     pub reason: Cow<'static, str>,
-    /// The reason in words, as they follow "connections".
+    /// The reason in words, to be appended to "connections".
     #[cfg_attr(feature = "openapi", schema(example = "encrypted with TLS"))]
     pub text: Cow<'static, str>,
     /// Number of connections.
@@ -178,14 +178,14 @@ pub struct UnseenConnections {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Ability {
-    /// Name of the ability, from `ros2probe_capture_ability`.
+    /// Name of the ability, as in the metric `ros2probe_capture_ability`.
     #[cfg_attr(feature = "openapi", schema(example = "socket_losses"))]
     pub ability: Cow<'static, str>,
     /// Whether the agent has the ability.
     pub able: bool,
     /// The agent gains the ability while a client needs it (`capture.shm.exact: auto`).
     pub on_demand: bool,
-    /// Why the agent lacks the ability; null if it is simply not requested.
+    /// Why the agent lacks the ability; null if the agent has it or it is not requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub reason: Option<String>,
@@ -196,10 +196,10 @@ pub struct Ability {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Thread {
-    /// Name of the thread; `rp` for the one that serves this answer.
+    /// Name of the thread; `rp` for the thread that serves this answer.
     #[cfg_attr(feature = "openapi", schema(example = "capture"))]
     pub thread: String,
-    /// Capabilities that the thread holds.
+    /// Capabilities of the thread.
     pub capabilities: Vec<String>,
     /// A seccomp filter limits the thread to the system calls that it needs.
     pub filtered: bool,
@@ -229,7 +229,7 @@ pub struct Table {
     pub table: Cow<'static, str>,
     /// Number of entries; for `reassembly`, bytes.
     pub entries: u64,
-    /// Largest number of entries, or bytes for `reassembly`.
+    /// Maximum number of entries; for `reassembly`, bytes.
     pub limit: u64,
     /// Entries evicted because the table was full.
     pub evictions: u64,
@@ -243,11 +243,11 @@ pub struct Limit {
     /// Key below `limits` in the configuration.
     #[cfg_attr(feature = "openapi", schema(example = "topics"))]
     pub limit: Cow<'static, str>,
-    /// Largest number of entries, connections or bytes.
+    /// Maximum number of entries, connections or bytes.
     pub cap: u64,
     /// Entries, connections or bytes in use.
     pub used: u64,
-    /// How often an entry was refused, or evicted to make room, because the limit was reached.
+    /// Number of times that an entry was refused or evicted because the limit was reached.
     pub reached: u64,
     /// The limit is reached now or was reached within the last minute.
     pub at_limit: bool,
@@ -278,7 +278,7 @@ pub struct PageToken {
 }
 
 impl Health {
-    /// Returns how many packets, records and datagrams were captured but not processed.
+    /// Returns the number of packets, records and datagrams that were dropped or skipped.
     #[must_use]
     pub const fn dropped(&self) -> u64 {
         self.dropped_packets

@@ -1,10 +1,10 @@
-//! `/inside`: what processes show from inside, and what other answers contain of it.
+//! `/inside`: observations from inside processes, and their parts in other answers.
 
 use std::borrow::Cow;
 
 use serde::{Deserialize, Serialize};
 
-/// Facts from inside processes.
+/// Observations from inside processes.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -13,7 +13,7 @@ pub struct Inside<'a> {
     pub timestamp_seconds: f64,
     /// Mode of the source: `off`, `topics`, `full` or `auto`.
     pub mode: Cow<'a, str>,
-    /// Why the source shows nothing although it is switched on; null if it works, or is `off`.
+    /// Why an enabled source observes nothing; null if the source works or is `off`.
     pub reason: Option<Cow<'a, str>>,
     /// Observed libraries.
     pub libraries: Vec<Library<'a>>,
@@ -23,11 +23,11 @@ pub struct Inside<'a> {
     pub processes: Vec<Process<'a>>,
     /// Publishers.
     pub publishers: Vec<Publisher<'a>>,
-    /// Subscriptions that take from the middleware.
+    /// Subscriptions that take messages from the middleware.
     pub subscriptions: Vec<Subscription<'a>>,
-    /// Queues of these subscriptions, as far as arrivals are known.
+    /// Queues that the middleware fills for the subscriptions, as far as arrivals are known.
     pub reader_queues: Vec<ReaderQueue<'a>>,
-    /// Buffers of subscriptions within a process, in Iron and later.
+    /// Buffers for intra-process messages, in Iron and later.
     pub buffers: Vec<Buffer<'a>>,
     /// Callbacks, in the modes `full` and `auto`.
     pub callbacks: Vec<Callback<'a>>,
@@ -40,11 +40,11 @@ pub struct Inside<'a> {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Library<'a> {
-    /// Its path, as its processes see it.
+    /// Path of the library, as the processes that use it see it.
     pub path: Cow<'a, str>,
-    /// Number of processes that use it.
+    /// Number of processes that use the library.
     pub processes: u64,
-    /// Why its calls are not observed; null if they are.
+    /// Why calls of the library are not observed; null if they are observed.
     pub refused: Option<Cow<'a, str>>,
 }
 
@@ -53,9 +53,9 @@ pub struct Library<'a> {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Counter<'a> {
-    /// Its name.
+    /// Name of the counter.
     pub name: Cow<'a, str>,
-    /// Its value since the agent's start.
+    /// Count since the agent started.
     pub count: u64,
 }
 
@@ -64,13 +64,13 @@ pub struct Counter<'a> {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Process<'a> {
-    /// Process id, as this host's root sees it.
+    /// Process id, in the host's PID namespace.
     pub process_id: u32,
     /// Name of the process.
     pub process: Option<Cow<'a, str>>,
     /// Domain id.
     pub domain_id: u32,
-    /// Its nodes, as far as they are known.
+    /// Known nodes of the process.
     pub nodes: Vec<Cow<'a, str>>,
     /// CPU time per second over the last window; 1 is one CPU.
     pub cpu_ratio: Option<f64>,
@@ -78,11 +78,12 @@ pub struct Process<'a> {
     pub calls_per_second: Option<f64>,
     /// Observed calls.
     pub calls: u64,
-    /// Calls that were not counted because of too many publishers, subscriptions and callbacks.
+    /// Calls that were not counted because the process has too many publishers, subscriptions and
+    /// callbacks.
     pub refused_calls: u64,
-    /// Its calls exceed the budget, and the agent no longer counts them.
+    /// The calls of the process exceed the budget, so the agent no longer counts them.
     pub suspended: bool,
-    /// Its library reports every step of messages within the process (Iron and later).
+    /// The library reports every step of intra-process messages (Iron and later).
     pub shows_intra_process: bool,
 }
 
@@ -93,7 +94,7 @@ pub struct Process<'a> {
 pub struct Owner<'a> {
     /// Process id.
     pub process_id: u32,
-    /// Address in the process; identifies the entity as long as the process runs.
+    /// Address of the entity in the process; it identifies the entity while the process runs.
     #[cfg_attr(feature = "openapi", schema(example = "0x5581c0de0010"))]
     pub handle: Cow<'a, str>,
     /// Domain id.
@@ -113,7 +114,7 @@ pub struct Durations {
     pub p50_seconds: f64,
     /// 99th percentile.
     pub p99_seconds: f64,
-    /// Largest value; an upper bound if several are as large and an earlier one was larger.
+    /// Maximum. It may be only an upper bound if a value before the window was larger.
     pub maximum_seconds: f64,
 }
 
@@ -135,13 +136,13 @@ pub struct Publisher<'a> {
     pub middleware: Option<Cow<'a, str>>,
     /// Messages published.
     pub published_messages: u64,
-    /// Messages among them passed directly to subscriptions in the same process.
+    /// Published messages that were passed directly to subscriptions in the same process.
     pub within_process_messages: u64,
     /// Publications per second over the last window.
     pub rate_hertz: Option<f64>,
     /// Unix time of the last publication.
     pub last_message_timestamp_seconds: f64,
-    /// Time between publications; null without any.
+    /// Time between publications; null without a value.
     pub interval: Option<Durations>,
 }
 
@@ -162,17 +163,17 @@ pub struct Subscription<'a> {
     pub middleware: Option<Cow<'a, str>>,
     /// Messages taken from the middleware.
     pub taken_messages: u64,
-    /// Attempts that returned no message.
+    /// Attempts to take that returned no message.
     pub failed_takes: u64,
     /// Messages taken per second over the last window.
     pub rate_hertz: Option<f64>,
     /// Unix time of the last message.
     pub last_message_timestamp_seconds: f64,
-    /// Time from the source timestamp to the take; null without any.
+    /// Time from the source timestamp to the take; null without a value.
     pub latency: Option<Durations>,
 }
 
-/// The queue of a process's subscriptions with one topic, which the middleware fills.
+/// The queue that the middleware fills for a process's subscriptions to one topic.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -185,19 +186,19 @@ pub struct ReaderQueue<'a> {
     pub owner: Owner<'a>,
     /// ROS name of the topic.
     pub topic: Cow<'a, str>,
-    /// GUID of the only writer whose messages arrive; null if there are several.
+    /// GUID of the only writer whose messages arrive; null if several writers send messages.
     pub writer: Option<String>,
-    /// Messages that the queue keeps; null if the reader does not announce it.
+    /// Maximum number of messages in the queue; null if the reader does not announce it.
     pub depth: Option<u64>,
-    /// Messages that arrived since the agent observes the calls.
+    /// Messages that arrived since the agent began to observe the calls.
     pub arrived_messages: u64,
-    /// Messages among them that were taken.
+    /// Arrived messages that were taken.
     pub taken_messages: u64,
-    /// Messages among them that were dropped from the queue before they were taken.
+    /// Arrived messages that were dropped from the queue before they were taken.
     pub lost_messages: u64,
 }
 
-/// The buffer of a subscription within a process.
+/// The buffer of a subscription for intra-process messages.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -214,32 +215,32 @@ pub struct Buffer<'a> {
     pub enqueued_messages: u64,
     /// Messages overwritten before they were taken.
     pub overwritten_messages: u64,
-    /// Messages taken.
+    /// Messages taken from the buffer.
     pub dequeued_messages: u64,
     /// Share of the messages of the last window that were overwritten.
     pub overwritten_ratio: Option<f64>,
-    /// Messages in the buffer after the last entry.
+    /// Number of messages in the buffer after the last message was added.
     pub depth: u32,
-    /// The largest of these.
+    /// Maximum number of messages in the buffer so far.
     pub maximum_depth: u32,
-    /// Capacity, if the process created the buffer while it was observed.
+    /// Capacity; null if the process created the buffer before it was observed.
     pub capacity: Option<u32>,
     /// Messages put into the buffer per second over the last window.
     pub rate_hertz: Option<f64>,
-    /// Unix time of the last entry.
+    /// Unix time at which the last message was added.
     pub last_message_timestamp_seconds: f64,
-    /// Time that messages spent in the buffer; null without any.
+    /// Time that messages spent in the buffer; null without a value.
     pub waiting: Option<Durations>,
 }
 
-/// What triggers a callback.
+/// The trigger of a callback.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Trigger<'a> {
     /// `subscription`, `intra_process`, `timer` or `service`.
     pub kind: Cow<'a, str>,
-    /// Topic or service; null when unknown, and for timers.
+    /// Name of the topic or service; null when unknown and for timers.
     pub name: Option<Cow<'a, str>>,
     /// Period of the timer, if known.
     pub period_seconds: Option<f64>,
@@ -256,23 +257,23 @@ pub struct Trigger<'a> {
 pub struct Callback<'a> {
     #[serde(flatten)]
     pub owner: Owner<'a>,
-    /// What triggers it.
+    /// Trigger of the callback.
     pub trigger: Trigger<'a>,
-    /// Id of the thread of its last call.
+    /// Id of the thread that ran the last call.
     pub thread_id: u32,
     /// Completed calls.
     pub calls: u64,
-    /// Periods in which a timer was not called.
+    /// Timer periods in which the callback was not called.
     pub skipped_periods: u64,
     /// Calls per second over the last window.
     pub rate_hertz: Option<f64>,
-    /// Share of the last window that its calls took.
+    /// Share of the last window in which the callback ran.
     pub busy_ratio: Option<f64>,
     /// Unix time at which the last call ended.
     pub last_call_timestamp_seconds: f64,
-    /// Duration of its calls; null without any.
+    /// Duration of the calls; null without a value.
     pub duration: Option<Durations>,
-    /// Time from being ready to the start; null without any.
+    /// Time from when the callback is ready to when it starts; null without a value.
     pub wait: Option<Durations>,
 }
 
@@ -290,36 +291,36 @@ pub struct LifecycleState<'a> {
     /// Label of the state.
     #[cfg_attr(feature = "openapi", schema(example = "active"))]
     pub state: Cow<'a, str>,
-    /// Label of the state before.
+    /// Label of the previous state.
     pub previous_state: Cow<'a, str>,
     /// Unix time of the transition.
     pub timestamp_seconds: f64,
 }
 
-/// What observed processes show of a topic. Counts cover all processes since the agent's start.
+/// Data about a topic from inside processes. Counts cover all processes since the agent started.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct TopicInside<'a> {
-    /// Messages published. In Humble, messages within a process count by their receptions.
+    /// Messages published. In Humble, intra-process messages are counted by their receptions.
     pub published_messages: u64,
-    /// Messages among them passed directly to subscriptions in the same process.
+    /// Published messages that were passed directly to subscriptions in the same process.
     pub within_process_messages: u64,
     /// Messages taken from the middleware, by all subscriptions.
     pub taken_messages: u64,
     /// Attempts to take that returned no message.
     pub failed_takes: u64,
-    /// Messages put into buffers within a process.
+    /// Messages put into intra-process buffers.
     pub enqueued_messages: u64,
-    /// Messages among them overwritten before they were taken.
+    /// Messages overwritten in the buffers before they were taken.
     pub overwritten_messages: u64,
-    /// Messages taken from these buffers.
+    /// Messages taken from intra-process buffers.
     pub dequeued_messages: u64,
-    /// Calls of callbacks for messages of the same process.
+    /// Callback calls for intra-process messages.
     pub intra_process_receptions: u64,
     /// Messages that arrived at observed processes and were dropped from the queue of a
-    /// subscription before they were taken; null if arrivals and takes of no process can be
-    /// compared.
+    /// subscription before they were taken. Null if arrivals and takes cannot be compared in any
+    /// process.
     pub lost_in_reader_queue_messages: Option<u64>,
     /// Messages per second over the last window.
     pub rate_hertz: f64,
@@ -335,7 +336,7 @@ pub struct TopicInside<'a> {
     /// Subscriptions; only in the answer about one topic.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub subscriptions: Vec<Subscription<'a>>,
-    /// Queues of these subscriptions; only in the answer about one topic.
+    /// Queues that the middleware fills for the subscriptions; only in the answer about one topic.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub reader_queues: Vec<ReaderQueue<'a>>,
     /// Buffers; only in the answer about one topic.
@@ -346,20 +347,20 @@ pub struct TopicInside<'a> {
     pub callbacks: Vec<Callback<'a>>,
 }
 
-/// What observed processes show of a node.
+/// Data about a node from inside its processes.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct NodeInside<'a> {
-    /// Share of the last window that calls of its callbacks took; above 1 with several threads.
+    /// Share of the last window in which the node's callbacks ran; above 1 with several threads.
     pub busy_ratio: Option<f64>,
-    /// Last known lifecycle state; null for an ordinary node, and before the first transition.
+    /// Last known lifecycle state; null for an ordinary node and before the first transition.
     pub lifecycle_state: Option<Cow<'a, str>>,
     /// Publishers.
     pub publishers: Vec<Publisher<'a>>,
     /// Subscriptions.
     pub subscriptions: Vec<Subscription<'a>>,
-    /// Queues of these subscriptions.
+    /// Queues that the middleware fills for the subscriptions.
     pub reader_queues: Vec<ReaderQueue<'a>>,
     /// Buffers.
     pub buffers: Vec<Buffer<'a>>,
@@ -368,7 +369,7 @@ pub struct NodeInside<'a> {
 }
 
 impl Trigger<'_> {
-    /// Describes the trigger in a few words: `/scan`, `timer 50 ms`, `service /reset`.
+    /// Describes the trigger in a few words, for example `/scan`, `timer 50 ms`, `service /reset`.
     #[must_use]
     pub fn words(&self) -> String {
         match (

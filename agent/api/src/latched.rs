@@ -1,14 +1,14 @@
-//! The last message of a transient-local writer, which the agent keeps for clients that begin later.
+//! The last message of a transient-local writer, which the agent keeps for later clients.
 
 use serde::{Deserialize, Serialize};
 
 use crate::Open;
 
-/// Largest message that is kept without a watch that requests it, in bytes.
+/// Maximum size of a message that is kept without a watch that requests it, in bytes.
 pub const MESSAGE_BYTES: u32 = 1 << 20;
-/// Bytes of all kept messages together.
+/// Maximum total size of all kept messages, in bytes.
 pub const ALL_BYTES: u32 = 16 << 20;
-/// Key of a watch that requests the last message.
+/// Remedy for a last message that is not kept.
 const REMEDY: &str = "set `retain: last` in a watch of it";
 
 /// The last message of a transient-local writer.
@@ -16,28 +16,28 @@ const REMEDY: &str = "set `retain: last` in a watch of it";
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Latched {
-    /// Whether it is kept, or why it is not.
+    /// Whether the message is kept, or why it is not.
     #[cfg_attr(feature = "openapi", schema(value_type = LatchedState))]
     pub state: Open<LatchedState>,
-    /// Its size in bytes; null if it was not seen.
+    /// Size of the message in bytes; null if it was not seen.
     pub bytes: Option<u32>,
 }
 
-/// What became of the last message of a transient-local writer.
+/// State of the last message of a transient-local writer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum LatchedState {
-    /// It is kept: recordings, viewers and commands that begin now receive it.
+    /// The message is kept: recordings, viewers and commands that start now receive it.
     Kept,
-    /// It was not seen: sent before the agent started, while nothing subscribed, or where the agent
-    /// does not look.
+    /// The message was not seen. It was sent before the agent started, without a subscriber, or on
+    /// a transport that the agent does not observe.
     Unseen,
-    /// It is larger than what is kept.
+    /// The message exceeds the size limit.
     TooLarge,
-    /// It was not captured, because its writer sends too much.
+    /// The message was not captured, because its writer sends too much.
     Paused,
-    /// It was dropped for other messages, or had no room beside them.
+    /// The message was dropped or refused because of the limit on the total size.
     NoRoom,
 }
 
@@ -48,8 +48,9 @@ impl Latched {
         self.state == LatchedState::Kept
     }
 
-    /// Returns why clients that begin now miss the last message of a transient-local writer on this
-    /// topic, with the remedy. `None` if they receive it. `latched` is null if none is kept.
+    /// Returns why clients that start now miss the last message of a transient-local writer on this
+    /// topic, with the remedy. Returns `None` if they receive it. `latched` is `None` if the agent
+    /// keeps no last messages.
     #[must_use]
     pub fn missing(latched: Option<&Self>, topic: &str) -> Option<String> {
         let size = latched.and_then(|latched| latched.bytes).map(size);
@@ -78,7 +79,7 @@ impl Latched {
     }
 }
 
-/// Returns a size with its unit.
+/// Formats a size with its unit.
 fn size(bytes: u32) -> String {
     let (amount, unit) = match bytes {
         0..1024 => return format!("{bytes} bytes"),
@@ -96,7 +97,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_missing_last_message_is_named_with_its_size_and_remedy() {
+    fn a_missing_last_message_is_reported_with_its_size_and_remedy() {
         let missing = |state: LatchedState, bytes| {
             let latched = Latched {
                 state: state.into(),

@@ -49,9 +49,9 @@ pub struct Open {
     pub interval_seconds: u32,
     /// Seconds that `/topics/{topic}/history` covers.
     pub history_seconds: u64,
-    /// Meaning of the bits of a topic's flags, from the lowest bit on.
+    /// Meaning of the bits of a topic's flags, starting with the lowest bit.
     pub flags: Vec<Cow<'static, str>>,
-    /// Meaning of the bits of passages, from the lowest bit on.
+    /// Meaning of the bits of passages, starting with the lowest bit.
     pub passages: Vec<Cow<'static, str>>,
     /// The replayed capture; null for a live agent.
     pub replay: Option<Replay>,
@@ -70,13 +70,13 @@ pub struct Replay {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveGraph))]
 pub struct Graph<'a> {
-    /// Version of the graph; each change increments it.
+    /// Version of the graph; it increases with each change.
     pub version: u64,
     /// Participants.
     pub participants: Vec<Participant<'a>>,
     /// Nodes, one for each name in a domain.
     pub nodes: Vec<Node<'a>>,
-    /// Topics, without those of services and discovery.
+    /// Topics, except topics of services and discovery.
     pub topics: Vec<Topic<'a>>,
     /// Writers.
     pub publishers: Vec<Endpoint<'a>>,
@@ -105,8 +105,8 @@ pub struct Participant<'a>(
 pub struct Node<'a>(pub u32, pub u32, pub Cow<'a, str>, pub Vec<u32>, pub u8);
 
 /// `[id, domain, name, DDS name, kind, types, 1 if hidden, 1 if vanished, 1 if measured, watched]`.
-/// `watched` names the origin of a watch of exactly this name: 1 for the configuration, 2 for the
-/// command line, 3 for a client, 0 without one. A glob that covers the topic adds 4.
+/// `watched` is the origin of a watch of exactly this name: 1 for the configuration, 2 for the
+/// command line, 3 for a client, 0 without a watch. A glob that covers the topic adds 4.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveTopic))]
 pub struct Topic<'a>(
@@ -144,16 +144,16 @@ pub struct Agent<'a> {
     pub ready: bool,
     /// Why the agent is not ready; null if it is.
     pub reason: Option<String>,
-    /// A replay has come to its end.
+    /// The replay has reached its end.
     pub finished: bool,
     /// Packets, records and datagrams dropped because a buffer was full. Above 0, counts are lower
     /// bounds.
     pub dropped: u64,
-    /// Writers whose announcement was missed.
+    /// Number of writers whose announcement was missed.
     pub unknown_writers: usize,
     /// Topics that match a watch but are not measured because `limits.topics` is reached.
     pub topics_rejected: u64,
-    /// Abilities of the agent, and whether it has each.
+    /// Abilities, and whether the agent has each of them.
     pub abilities: Vec<Ability<'a>>,
     /// Number of active watches.
     pub watches: usize,
@@ -184,8 +184,8 @@ pub struct Finding {
     /// Stable id: it stays the same while the finding concerns the same problem.
     pub id: String,
     /// Kind of the finding: a kind of `diagnoses` in `/topics`, or `loss`, `watch_violated`,
-    /// `watch_silent`, `agent_not_ready`, `agent_drops`, `unknown_writers`, `zenoh_unseen`,
-    /// `ability`.
+    /// `watch_silent`, `agent_not_ready`, `agent_drops`, `unknown_writers`, `topics_rejected`,
+    /// `zenoh_unseen`, `ability`.
     pub kind: Cow<'static, str>,
     /// Severity.
     pub severity: Severity,
@@ -239,7 +239,7 @@ pub struct Rates(pub u32, pub Vec<Option<f64>>);
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveEvents))]
 pub struct Events<'a> {
-    /// Events that were overwritten before they could be sent.
+    /// Number of events that were overwritten before they could be sent.
     pub missed: u64,
     /// The other events, in the form of `/events`.
     pub list: Vec<Event<'a>>,
@@ -262,9 +262,9 @@ pub struct Values {
 }
 
 /// `[topic, messages per second, payload bytes per second, messages, messages that the worst
-/// subscriber lost, those of the last second, median latency, 99th percentile of latency, flags,
-/// Unix time of the last message, messages that the worst subscriber expected]`. All elements but
-/// topic and flags are null for a topic that is not measured.
+/// subscriber lost, messages lost in the last second, median latency, 99th percentile of latency,
+/// flags, Unix time of the last message, messages that the worst subscriber expected]`. All
+/// elements but topic and flags are null for a topic that is not measured.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveRow))]
 pub struct Row(
@@ -286,7 +286,7 @@ pub struct Row(
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveTotals))]
 pub struct Totals(pub u64, pub u64, pub u64, pub u64);
 
-/// `[part of the file that was read, from 0 to 1, 1 at its end]`.
+/// `[share of the file that was read (0 to 1), 1 if the replay has finished]`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveProgress))]
 pub struct Progress(pub Option<f64>, pub u8);

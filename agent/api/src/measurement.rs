@@ -9,9 +9,9 @@ use serde::{Deserialize, Serialize};
 pub struct Measurement {
     /// Messages received whole, without duplicates.
     pub messages: u64,
-    /// Payload bytes of these messages.
+    /// Payload bytes of the counted messages.
     pub bytes: u64,
-    /// Messages that were sent and reached no receiver of this host whole. A subscriber may lose
+    /// Messages that were sent but reached no receiver on this host whole. A subscriber may lose
     /// more: see `subscriber_lost_messages`.
     pub lost_messages: u64,
     /// Messages that arrived late and closed a gap.
@@ -23,18 +23,18 @@ pub struct Measurement {
     /// Messages that the writer skipped (GAP), or that readers acknowledged although the agent did
     /// not see them. They do not count as lost.
     pub irrelevant_messages: u64,
-    /// Messages that the topic's worst subscriber expected: those that it received or lost. For a
-    /// writer, and for a topic without observed deliveries, those that were sent.
+    /// Messages that the topic's worst subscriber expected, which means that it received or lost
+    /// them. For a writer, and for a topic without observed deliveries, messages that were sent.
     pub subscriber_expected_messages: u64,
-    /// Messages among them that it lost, anywhere on the way to its socket.
+    /// Messages that the worst subscriber lost, anywhere on the path to its socket.
     pub subscriber_lost_messages: u64,
-    /// Messages that the worst subscriber lost divided by those that it expected; null before the
-    /// first.
+    /// Messages that the worst subscriber lost, divided by the messages that it expected; null
+    /// before the first expected message.
     pub loss_ratio: Option<f64>,
-    /// Messages per second over the last window; null if no message can be seen, as those within a
-    /// process.
+    /// Messages per second over the last window; null if messages cannot be observed, for example
+    /// within a process.
     pub rate_hertz: Option<f64>,
-    /// Payload bytes per second over the same window; null if the sizes are unknown, as those of
+    /// Payload bytes per second over the same window; null if the sizes are unknown, for example of
     /// messages that only calls inside processes show.
     pub bandwidth_bytes_per_second: Option<f64>,
     /// Unix time of the last message.
@@ -65,9 +65,9 @@ pub struct Measurement {
 pub struct Sampled {
     /// Messages of which at least a part was read.
     pub seen_messages: u64,
-    /// Messages that were written, by their sequence numbers.
+    /// Messages that were written, according to their sequence numbers.
     pub existing_messages: u64,
-    /// How often the buffer may have been overwritten unseen between two readings.
+    /// Number of times that the buffer may have been overwritten unseen between two readings.
     pub uncertain_looks: u64,
     /// Messages read divided by messages written; null before the first message.
     pub coverage_ratio: Option<f64>,
@@ -82,7 +82,7 @@ pub struct Distribution {
     pub count: u64,
     /// Mean.
     pub mean_seconds: f64,
-    /// Smallest value.
+    /// Minimum.
     pub minimum_seconds: f64,
     /// Median.
     pub p50_seconds: f64,
@@ -90,7 +90,7 @@ pub struct Distribution {
     pub p95_seconds: f64,
     /// 99th percentile.
     pub p99_seconds: f64,
-    /// Largest value.
+    /// Maximum.
     pub maximum_seconds: f64,
 }
 
@@ -99,26 +99,26 @@ pub struct Distribution {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Bucket {
-    /// Inclusive upper bound in seconds; null for the last bucket. The lower bound is that of the
-    /// bucket before.
+    /// Inclusive upper bound in seconds; null for the last bucket. The lower bound is the upper
+    /// bound of the previous bucket.
     pub upper_seconds: Option<f64>,
     /// Number of values in this bucket.
     pub count: u64,
 }
 
-/// Fate of messages on their way to a receiver or destination.
+/// Delivered, lost and pending messages of a receiver or destination.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Delivered {
-    /// Messages that arrived, or left, whole.
+    /// Messages that arrived whole, or left whole.
     pub messages: u64,
-    /// Payload bytes of these messages.
+    /// Payload bytes of the counted messages.
     pub bytes: u64,
     /// Messages that arrived by retransmission.
     pub recovered_messages: u64,
-    /// Messages that never arrived, by any known cause. Delivered, lost and pending messages add up
-    /// to those that the receiver expected.
+    /// Messages that never arrived, by any known cause. The sum of delivered, lost and pending
+    /// messages is the number that the receiver expected.
     pub lost_messages: u64,
     /// Lost messages that never reached this host.
     pub lost_before_host_messages: u64,

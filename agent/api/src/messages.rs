@@ -2,7 +2,7 @@
 //! `/topics/{topic}/definition`.
 //!
 //! Fields of a message have the generic type `V`: the agent writes JSON text, and a client
-//! deserializes the type that it needs. A line contains a [`Message`] of them.
+//! deserializes the type that it needs. A [`Line`] contains a [`Message`] of this type.
 
 use std::borrow::Cow;
 
@@ -19,7 +19,7 @@ pub enum Line<M> {
     Message(M),
     /// Messages that cannot be shown because their bytes were not captured.
     Missed(Missed),
-    /// A sign that the stream is alive, sent while no message arrives.
+    /// A keep-alive, sent while no message arrives.
     Beat(Beat),
     /// The last line of the stream.
     End(End),
@@ -36,7 +36,7 @@ pub struct Definition {
     pub known: bool,
     /// Why the definition is unknown; null if it is known.
     pub reason: Option<String>,
-    /// The definition followed by those of its nested types, in the format of ROS bags.
+    /// The definition, followed by the definitions of its nested types, in the format of ROS bags.
     pub definition: Option<String>,
 }
 
@@ -48,7 +48,7 @@ pub struct Message<V> {
     pub time: f64,
     /// Unix time at which the message was written, by the writer's clock.
     pub source_time: Option<f64>,
-    /// GUID of its writer.
+    /// GUID of the message's writer.
     pub writer: String,
     /// The writer's node.
     pub node: Option<String>,
@@ -56,14 +56,14 @@ pub struct Message<V> {
     pub sequence_number: u64,
     /// Bytes of the serialized message.
     pub bytes: u32,
-    /// Messages that arrived between the one shown before and this one.
+    /// Number of messages that arrived after the previously shown message and are not shown.
     pub skipped: u64,
     /// Fields in the order of the definition. 64-bit numbers beyond 2^53, NaN and infinities are
     /// strings. A long array or string becomes an object with its `$length` and its beginning,
     /// `$items` or `$text`.
     #[cfg_attr(feature = "openapi", schema(value_type = Option<Object>))]
     pub value: Option<V>,
-    /// Why the message cannot be decoded; null if it can.
+    /// Why the message cannot be decoded; null if it can be decoded.
     pub error: Option<String>,
 }
 
@@ -73,15 +73,15 @@ pub struct Message<V> {
 pub struct Missed {
     /// Number of messages.
     pub messages: u64,
-    /// Why they cannot be shown.
+    /// Why the messages cannot be shown.
     pub reason: Cow<'static, str>,
 }
 
-/// A sign that the stream is alive.
+/// A keep-alive.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = MessagesBeat))]
 pub struct Beat {
-    /// Unix time up to which all messages have been sent.
+    /// Unix time up to which the stream is complete.
     pub t: Option<f64>,
 }
 

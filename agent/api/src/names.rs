@@ -12,14 +12,14 @@ use serde::{Deserialize, Serialize};
 pub struct Names<'a> {
     /// Unix time of the state that this answer describes.
     pub timestamp_seconds: f64,
-    /// Every domain with a participant, even if the request selects one domain.
+    /// Domains with a participant, including domains that the request does not select.
     pub domains: BTreeSet<u32>,
     /// Number of participants.
     pub participants: usize,
-    /// Active writers whose announcement was missed; their domain is unknown.
+    /// Number of active writers whose announcement was missed. Their domain is unknown.
     pub unknown_writers: usize,
     /// Command that requests the announcements of unknown writers, or of participants without a
-    /// known topic; null if none of them is known.
+    /// known topic; null without any.
     pub remedy: Option<Cow<'a, str>>,
     /// Nodes, sorted by domain and name.
     pub nodes: Vec<NodeName<'a>>,
@@ -81,13 +81,13 @@ pub struct ServiceName<'a> {
     /// ROS types.
     #[cfg_attr(feature = "openapi", schema(example = json!(["example_interfaces/srv/AddTwoInts"])))]
     pub types: Vec<Cow<'a, str>>,
-    /// Readers of requests; they belong to servers.
+    /// Number of request readers, which belong to servers.
     pub request_readers: usize,
-    /// Writers of replies; they belong to servers.
+    /// Number of reply writers, which belong to servers.
     pub reply_writers: usize,
-    /// Writers of requests; they belong to clients.
+    /// Number of request writers, which belong to clients.
     pub request_writers: usize,
-    /// Readers of replies; they belong to clients.
+    /// Number of reply readers, which belong to clients.
     pub reply_readers: usize,
 }
 

@@ -19,7 +19,7 @@ pub struct NodeList<'a> {
     pub nodes: Vec<Node<'a>>,
 }
 
-/// A node name. Several nodes with one name in a domain are a fault; they share one entry.
+/// All nodes of a domain with the same name. More than one is a fault.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -48,18 +48,18 @@ pub struct Node<'a> {
     /// Problems of the node. Problems of its topics are in `/topics`.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<Diagnosis<'static>>))]
     pub diagnoses: Vec<Finding<'a>>,
-    /// What observed processes show of the node; null without `capture.inside`.
+    /// Data about the node from inside its processes; null without `capture.inside`.
     pub inside: Option<NodeInside<'a>>,
 }
 
-/// One of the nodes with this name.
+/// One of the nodes that share a name.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct NodeInstance<'a> {
     /// GUID of the node's participant.
     pub participant: String,
-    /// DDS implementation; null when unknown.
+    /// Middleware: the DDS implementation, or `Eclipse Zenoh`; null when unknown.
     pub vendor: Option<Cow<'a, str>>,
     /// Host and process of the node; null when unknown.
     #[serde(flatten)]

@@ -21,7 +21,7 @@ pub struct ParticipantList<'a> {
     pub unknown_writers: Vec<UnknownWriter<'a>>,
 }
 
-/// A participant of DDS, or a session of Zenoh.
+/// A DDS participant or a Zenoh session.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -52,13 +52,13 @@ pub struct Participant<'a> {
     pub default_addresses: Cow<'a, [SocketAddr]>,
     /// Lease duration in seconds; null is infinite.
     pub lease_seconds: Option<f64>,
-    /// Unix time of its first announcement.
+    /// Unix time of the participant's first announcement.
     pub first_seen_timestamp_seconds: f64,
     /// Unix time of the last packet that proves the participant alive.
     pub last_seen_timestamp_seconds: f64,
     /// The participant announces DDS security: its messages may be encrypted.
     pub secured: bool,
-    /// Restored from saved state; no announcement has confirmed it since the agent's start.
+    /// Restored from saved state; no announcement has confirmed it since the agent started.
     pub restored: bool,
 }
 
@@ -89,7 +89,8 @@ pub struct ProcessList {
     pub timestamp_seconds: f64,
     /// Processes, sorted by id.
     pub processes: Vec<ProcessUsage>,
-    /// Processes that the agent cannot read; see `ProtectProc=` in its systemd unit.
+    /// Number of processes whose usage the agent cannot read; see `ProtectProc=` in its systemd
+    /// unit.
     pub unreadable: usize,
 }
 
@@ -102,8 +103,8 @@ pub struct ProcessUsage {
     pub process_id: u32,
     /// Name of the process.
     pub process: String,
-    /// CPU time since the start, in seconds. The difference of two readings over their distance in
-    /// time is the CPU share.
+    /// CPU time since the process started, in seconds. The CPU share is the difference of two
+    /// readings, divided by the time between them.
     pub cpu_seconds: f64,
     /// Resident memory, in bytes.
     pub memory_bytes: u64,

@@ -1,6 +1,6 @@
 //! Percent encoding of names in paths and queries.
 
-/// Returns the name percent-encoded for a path or a query value. Slashes stay as they are.
+/// Returns the name percent-encoded for a path or a query value. Slashes are not encoded.
 #[must_use]
 pub fn encoded(name: &str) -> String {
     let mut path = String::with_capacity(name.len());
@@ -19,7 +19,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_keep_their_slashes_and_nothing_that_ends_a_path() {
+    fn a_name_keeps_its_slashes_and_reserved_bytes_are_encoded() {
         assert_eq!(encoded("/robot1/imu_data"), "/robot1/imu_data");
         assert_eq!(encoded("/a?b#c d%é"), "/a%3Fb%23c%20d%25%C3%A9");
     }

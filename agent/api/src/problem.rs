@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 pub enum Code {
     /// The request is not valid HTTP, or its path or query cannot be decoded.
     MalformedRequest,
-    /// The request has no token, or an unknown one.
+    /// The request has no token, or an unknown token.
     Unauthorized,
     /// The request's `Host` is not a name of this agent.
     ForeignHost,
@@ -25,7 +25,7 @@ pub enum Code {
     NoSuchTopic,
     /// The node does not exist.
     NoSuchNode,
-    /// The name exists several times; the request must say which one it means.
+    /// The name exists several times; the request must select one of them.
     Ambiguous,
     /// The path exists, but not with this method.
     MethodNotAllowed,
@@ -33,7 +33,7 @@ pub enum Code {
     WatchDiffers,
     /// The configuration or the command line lists the watch, so a client cannot change it.
     WatchGiven,
-    /// The largest number of watches is reached.
+    /// The maximum number of watches is reached.
     TooManyWatches,
     /// The agent runs without a configuration file.
     NothingToReload,
@@ -47,11 +47,11 @@ pub enum Code {
     InvalidConfiguration,
     /// The client sends requests too fast.
     TooManyRequests,
-    /// The largest number of event streams is open.
+    /// The maximum number of streams is open.
     TooManyStreams,
-    /// The largest number of clients is connected.
+    /// The maximum number of clients is connected.
     TooManyClients,
-    /// The largest number of subscriptions is open.
+    /// The maximum number of subscriptions is open.
     TooManySubscriptions,
     /// The recording does not exist.
     NoSuchRecording,
@@ -59,7 +59,7 @@ pub enum Code {
     NoSuchSnapshot,
     /// A recording of this name exists.
     RecordingExists,
-    /// The largest number of recordings is running.
+    /// The maximum number of recordings is running.
     TooManyRecordings,
     /// The configuration names no directory for recordings.
     NoPlaceForRecordings,

@@ -1,7 +1,7 @@
 //! Completeness of a recording: part of `/recordings`, and of each bag's metadata.
 //!
 //! `missing` counts messages of topics in the bag. Messages of unknown topics, and messages that
-//! never pass where the agent captures, have fields of their own.
+//! the agent cannot capture because they never pass its capture points, have fields of their own.
 
 use std::collections::BTreeMap;
 
@@ -12,29 +12,30 @@ use crate::latched::Latched;
 /// The reason in [`Report::unobserved`] for a topic without a subscriber; such a topic is complete.
 pub const NO_SUBSCRIBER: &str = "no_subscriber";
 
-/// Messages that a recording contains and lacks.
+/// Counts of messages in a recording and of missing messages.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = RecordingReport))]
 pub struct Report {
     /// Messages in the bag.
     pub messages: u64,
-    /// Bytes of these messages.
+    /// Bytes of the messages in the bag.
     pub bytes: u64,
     /// Messages that were sent but are not in the bag.
     pub missing: u64,
-    /// Messages of further topics that had no room in the recording; part of `missing`.
+    /// Messages of topics beyond the recording's limits on topics and their names; part of
+    /// `missing`.
     #[serde(default)]
     pub no_room: u64,
     /// Counts of each topic, by name.
     pub topics: BTreeMap<String, TopicReport>,
     /// The first missing messages, by writer and sequence number.
     pub missing_runs: Vec<MissingRun>,
-    /// Further runs of missing messages, which `missing_runs` does not list.
+    /// Number of runs of missing messages that `missing_runs` does not list.
     pub missing_runs_unnamed: u64,
     /// Topics that keep samples for late joiners (transient local) and whose samples from before
     /// the recording are not in the bag.
     pub sent_before: Vec<String>,
-    /// Of these topics, what became of a publisher's last message, which the agent may keep.
+    /// State of a publisher's last message, which the agent may keep, for topics in `sent_before`.
     #[serde(default)]
     pub latched: BTreeMap<String, Latched>,
     /// Topics that are not recorded because they have several types; a bag stores one type per
@@ -74,21 +75,21 @@ pub struct OtherDomain {
     pub domain_id: u32,
     /// Number of published topics.
     pub topics: u64,
-    /// Messages on these topics during the recording; null if none of them is measured.
+    /// Messages on the topics during the recording; null if no topic is measured.
     pub messages: Option<u64>,
 }
 
-/// Messages of a topic that a recording contains and lacks.
+/// Counts of a topic's messages in a recording and of missing messages.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TopicReport {
     /// Messages in the bag.
     pub messages: u64,
-    /// Bytes of these messages.
+    /// Bytes of the messages in the bag.
     pub bytes: u64,
     /// Messages that never arrived whole: fragments were lost.
     pub incomplete: u64,
-    /// Messages of which nothing arrived.
+    /// Messages of which no part arrived.
     #[serde(default)]
     pub lost: u64,
     /// Messages that arrived before their writer's announcement and were not sent again.

@@ -12,7 +12,7 @@ use crate::recording_report::Report;
 pub struct RecordingList {
     /// Directory of the recordings; null if none is configured or writable.
     pub directory: Option<String>,
-    /// Running recordings, and the last ones that ended.
+    /// Running recordings, and the most recently ended ones.
     pub recordings: Vec<Recording>,
     /// Limits of the disk space that recordings use.
     pub limits: RecordingLimits,
@@ -24,12 +24,12 @@ pub struct RecordingList {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct RecordingLimits {
-    /// Largest size of one recording, in bytes; null is unlimited.
+    /// Maximum size of one recording, in bytes; null is unlimited.
     pub max_bytes: Option<u64>,
-    /// Largest size of all bags in the directory, in bytes; null is unlimited.
+    /// Maximum size of all bags in the directory, in bytes; null is unlimited.
     pub max_total_bytes: Option<u64>,
-    /// Share of the file system that stays free, in percent. The larger of this and `reserve_bytes`
-    /// applies.
+    /// Share of the file system that stays free, in percent. The larger of this share and
+    /// `reserve_bytes` applies.
     pub reserve_percent: u8,
     /// Bytes of the file system that stay free.
     pub reserve_bytes: u64,
@@ -53,13 +53,13 @@ pub struct Recording {
     pub began_timestamp_seconds: f64,
     /// Total size of the bag's files, in bytes.
     pub file_bytes: u64,
-    /// Number of files, including the one being written.
+    /// Number of files, including the file that is being written.
     pub files: usize,
     /// Why the recording ended; null if it still runs or a client ended it.
     pub error: Option<String>,
     /// The filter that selects topics.
     pub topics: FilterOptions,
-    /// Messages that the recording contains and lacks.
+    /// Counts of messages in the recording and of missing messages.
     pub report: Report,
 }
 
@@ -90,7 +90,8 @@ pub struct RecordingRequest {
     /// Compression of complete files: `zstd` or `lz4`; empty disables it.
     #[cfg_attr(feature = "openapi", schema(value_type = String))]
     pub file_compression: String,
-    /// ROS distribution whose form of metadata.yaml is written; by default a form that all read.
+    /// ROS distribution whose format of metadata.yaml is written; by default a format that all
+    /// distributions read.
     #[cfg_attr(feature = "openapi", schema(value_type = String))]
     pub distro: String,
     /// Whether the recording starts paused.
@@ -135,7 +136,7 @@ pub struct FilterOptions {
     pub exclude_topic_types: Vec<String>,
     /// Services to exclude, by name.
     pub exclude_services: Vec<String>,
-    /// Whether to record hidden topics: those with a name token that begins with `_`.
+    /// Whether to record hidden topics, which have a name token that begins with `_`.
     pub include_hidden_topics: bool,
     /// Whether to declare topics without a publisher in the bag; they contain no message.
     pub include_unpublished_topics: bool,

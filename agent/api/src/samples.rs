@@ -28,8 +28,8 @@ pub enum Line {
     End(End),
 }
 
-/// Selected topics at the start of the stream. Messages of later topics follow without a new line
-/// of this kind.
+/// Topics that the request selects at the start of the stream. Later topics are not announced by a
+/// line of this kind.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Open {
@@ -46,7 +46,7 @@ pub struct OpenTopic {
     pub topic: String,
     /// Domain id.
     pub domain_id: u32,
-    /// ROS names of its types.
+    /// ROS names of the topic's types.
     pub types: Vec<String>,
 }
 
@@ -54,18 +54,18 @@ pub struct OpenTopic {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = SampleFacts))]
 pub struct Sample {
-    /// ROS name of its topic.
+    /// ROS name of the message's topic.
     #[cfg_attr(feature = "openapi", schema(example = "/points"))]
     pub topic: String,
     /// Domain id.
     pub domain_id: u32,
-    /// ROS name of its type.
+    /// ROS name of the message's type.
     #[serde(rename = "type")]
     #[cfg_attr(feature = "openapi", schema(example = "sensor_msgs/msg/PointCloud2"))]
     pub message_type: String,
     /// Capture time of the datagram that completed the message.
     pub time_ns: i64,
-    /// GUID of its writer.
+    /// GUID of the message's writer.
     #[cfg_attr(
         feature = "openapi",
         schema(example = "010f2b7d6a474f3300000000.00001103")
@@ -85,8 +85,8 @@ pub struct Sample {
     pub sampled: bool,
     /// Number of raw bytes that follow this line; null if the request does not include payloads.
     pub payload_bytes: Option<u32>,
-    /// Type hash and QoS of the writer, with the first of its messages; null if the request does
-    /// not include payloads.
+    /// Type hash and QoS of the writer, sent with its first message; null if the request does not
+    /// include payloads.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub offered: Option<Box<Offered>>,
@@ -113,7 +113,7 @@ pub struct OfferedQos {
     /// `UNKNOWN` if the implementation does not announce it.
     #[cfg_attr(feature = "openapi", schema(example = "KEEP_LAST (10)"))]
     pub history: String,
-    /// Longest time between two messages, in seconds.
+    /// Maximum time between two messages, in seconds.
     pub deadline_seconds: Option<f64>,
     /// Age at which a message expires, in seconds.
     pub lifespan_seconds: Option<f64>,
@@ -137,7 +137,7 @@ pub struct Clock {
 pub struct Missed {
     /// ROS name of the topic.
     pub topic: String,
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
     /// GUID of the writer.
     pub writer: String,
@@ -147,9 +147,9 @@ pub struct Missed {
     pub first_sequence_number: u64,
     /// Sequence number of the last missing message.
     pub last_sequence_number: u64,
-    /// `incomplete`: fragments never arrived. `lost`: nothing of the message arrived.
-    /// `unannounced`: it arrived before its writer's announcement and was not sent again.
-    /// `not_captured`: the agent could not capture its bytes. `queue_full`: this client read too
+    /// `incomplete`: fragments never arrived. `lost`: no part of the message arrived.
+    /// `unannounced`: the message arrived before its writer's announcement and was not sent again.
+    /// `not_captured`: the agent could not capture the message. `queue_full`: this client read too
     /// slowly.
     pub reason: MissedReason,
 }
@@ -161,7 +161,7 @@ pub struct Missed {
 pub enum MissedReason {
     /// Fragments never arrived.
     Incomplete,
-    /// Nothing of the messages arrived.
+    /// No part of the messages arrived.
     Lost,
     /// The messages arrived before their writer's announcement and were not sent again.
     Unannounced,

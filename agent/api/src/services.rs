@@ -41,10 +41,10 @@ pub struct Service<'a> {
     pub requests: Option<Measurement>,
     /// Counts and times of replies; null if their DDS topic is not watched.
     pub replies: Option<Measurement>,
-    /// Calls since the first one; null if none was seen.
+    /// Counts and times of calls; null if no call was seen.
     pub calls: Option<Calls>,
-    /// Paths between clients and servers on which the agent does not see calls: `shared_memory`,
-    /// `data_sharing`, `same_process`, `iceoryx`.
+    /// Transports between clients and servers on which the agent does not see calls:
+    /// `shared_memory`, `data_sharing`, `same_process`, `iceoryx`.
     pub unseen: Vec<Cow<'static, str>>,
     /// Problems of the service's topics.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<Diagnosis<'static>>))]
@@ -56,19 +56,19 @@ pub struct Service<'a> {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Calls {
-    /// Requests, each counted once regardless of copies and servers.
+    /// Requests. Each request is counted once, regardless of copies and servers.
     pub requests: u64,
-    /// Requests with a reply that reached the client, as far as the source shows that.
+    /// Requests whose reply reached the client, as far as the capture source shows it.
     pub answered: u64,
     /// Requests without a reply within `service_timeout_s`; some may have been answered later.
     pub unanswered: u64,
-    /// Requests that have had no reply for longer than that.
+    /// Requests that still wait for a reply after `service_timeout_s`.
     pub hanging: u64,
-    /// Requests that wait for a reply, including these.
+    /// Requests that wait for a reply, including hanging requests.
     pub open: u64,
-    /// Median of the latest 1024 times from a request to its reply; null before the first.
+    /// Median of the latest 1024 times from a request to its reply; null before the first reply.
     pub latency_p50_seconds: Option<f64>,
-    /// 99th percentile of these times.
+    /// 99th percentile of the same times.
     pub latency_p99_seconds: Option<f64>,
     /// Whether calls are not measured at present because the service's messages exceed 4 MiB/s.
     pub suspended: bool,
@@ -81,19 +81,20 @@ pub struct Calls {
 pub struct Goals {
     /// Goals that the server accepted.
     pub accepted: u64,
-    /// Goals that it rejected.
+    /// Goals that the server rejected.
     pub rejected: u64,
-    /// Goals with a result that a client received, and that had succeeded.
+    /// Succeeded goals whose result a client received.
     pub succeeded: u64,
-    /// The same for cancelled goals.
+    /// Canceled goals whose result a client received.
     pub canceled: u64,
-    /// The same for aborted goals.
+    /// Aborted goals whose result a client received.
     pub aborted: u64,
     /// Accepted goals whose result no client has received so far.
     pub open: u64,
-    /// Median of the latest 1024 times from a goal's request to its result; null before the first.
+    /// Median of the latest 1024 times from a goal's request to its result; null before the first
+    /// result.
     pub duration_p50_seconds: Option<f64>,
-    /// 99th percentile of these times.
+    /// 99th percentile of the same times.
     pub duration_p99_seconds: Option<f64>,
 }
 
@@ -125,16 +126,16 @@ pub struct Action<'a> {
     pub servers: Vec<Party<'a>>,
     /// Nodes that call the action. A node that only reads the feedback is not a client.
     pub clients: Vec<Party<'a>>,
-    /// Goals since the first one; null if none was seen.
+    /// Counts and times of goals; null if no goal was seen.
     pub goals: Option<Goals>,
     /// DDS names of the action's topics and services.
     pub parts: Vec<Cow<'a, str>>,
-    /// Problems of these topics.
+    /// Problems of the action's topics.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<Diagnosis<'static>>))]
     pub diagnoses: Vec<Finding<'a>>,
 }
 
-/// A node at one end of a service or action, or a participant if the node is unknown.
+/// A server or client of a service or action: a node, or a participant if the node is unknown.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -143,6 +144,6 @@ pub struct Party<'a> {
     pub node: Option<Cow<'a, str>>,
     /// GUID of the participant.
     pub participant: String,
-    /// GUIDs of the writers and readers that it uses there.
+    /// GUIDs of the writers and readers that it uses for the service or action.
     pub endpoints: Vec<String>,
 }

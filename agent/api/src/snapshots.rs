@@ -22,21 +22,21 @@ pub struct Snapshot {
     pub topics: Vec<String>,
     /// Domain id of the topics.
     pub domain_id: u32,
-    /// Seconds of messages before a trigger.
+    /// Time before a trigger that a bag covers, in seconds.
     pub seconds: u64,
-    /// Seconds of messages after a trigger.
+    /// Time after a trigger that a bag covers, in seconds.
     pub seconds_after: u64,
-    /// Largest amount of memory for the messages, in bytes.
+    /// Maximum memory for the messages, in bytes.
     pub max_bytes: usize,
-    /// Whether `trigger` has `expectation`.
+    /// Whether `trigger` contains `expectation`.
     pub on_violation: bool,
-    /// Names of the events that write a bag.
+    /// Names of the events that trigger a bag.
     pub trigger: Vec<String>,
-    /// Minimum seconds between two triggered bags.
+    /// Minimum time between two triggered bags, in seconds.
     pub min_interval_s: u64,
     /// Maximum number of triggered bags.
     pub max_count: usize,
-    /// Maximum bytes of all its bags.
+    /// Maximum total size of the snapshot's bags, in bytes.
     pub max_total_bytes: u64,
     /// Number of messages in memory.
     pub messages: u64,
@@ -48,7 +48,7 @@ pub struct Snapshot {
     pub written: u64,
     /// Number of bags that could not be written.
     pub failed: u64,
-    /// Number of events that met a trigger and began no bag.
+    /// Number of events that matched a trigger but did not start a bag.
     pub suppressed: u64,
     /// Number of old triggered bags removed for new ones.
     pub removed: u64,

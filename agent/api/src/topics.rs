@@ -60,17 +60,17 @@ pub struct Topic<'a> {
     pub sent: Option<Delivered>,
     /// Time that messages spent in each stage on this host.
     pub breakdown: Option<Breakdown>,
-    /// Number of publisher and subscriber pairs for each transport between them.
+    /// Publisher and subscriber pairs, counted per transport.
     pub passages: Vec<Passage>,
     /// Problems of the topic.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<Diagnosis<'static>>))]
     pub diagnoses: Vec<Finding<'a>>,
     /// Why the topic is silent or not measured; empty if messages are counted.
     pub reasons: Vec<Reason>,
-    /// Where the messages, their rate and the time of the last one come from: `wire` (datagrams and
-    /// shared memory) or `inside` (calls inside processes, which show no sizes).
+    /// Source of the message count, of the rate and of the time of the last message. `wire`:
+    /// datagrams and shared memory. `inside`: calls inside processes, which show no sizes.
     pub source: Cow<'static, str>,
-    /// What observed processes show of the topic; null without `capture.inside`.
+    /// Data about the topic from inside processes; null without `capture.inside`.
     pub inside: Option<TopicInside<'a>>,
 }
 
@@ -95,7 +95,7 @@ pub struct TopicDetails<'a> {
     pub acknowledgements: Vec<Acknowledgement<'a>>,
 }
 
-/// Pairs of publisher and subscriber with the same transport between them.
+/// Publisher and subscriber pairs that use the same transport.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -105,11 +105,12 @@ pub struct Passage {
     pub passage: Cow<'static, str>,
     /// Number of pairs.
     pub pairs: usize,
-    /// Number of these pairs with both ends in observed processes.
+    /// Number of pairs whose publisher and subscriber are both in observed processes.
     pub observed_pairs: usize,
-    /// Coverage of `shared_memory` at the moment. `exact`: every message, in the process that sends
-    /// it. `close`: sampled as often as `capture.shm.reading_cpu_percent` allows, because a client
-    /// reads its messages. `sampled`: sampled less often. `none`: not observed.
+    /// Current coverage of `shared_memory`. `exact`: the agent observes every message in the
+    /// sending process. `close`: it samples as often as `capture.shm.reading_cpu_percent` allows,
+    /// because a client reads the messages. `sampled`: it samples less often. `none`: it observes
+    /// no messages.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub view: Option<Cow<'static, str>>,
@@ -151,18 +152,18 @@ pub struct Delivery<'a> {
     pub subscriber: Cow<'a, str>,
     /// GUIDs of the topic's readers in that participant.
     pub readers: Vec<String>,
-    /// Nodes of these readers.
+    /// Nodes of the readers.
     pub nodes: Vec<Cow<'a, str>>,
     /// Id of the process that owns the socket.
     pub process_id: Option<u32>,
-    /// Name of that process.
+    /// Name of the process that owns the socket.
     pub process: Option<Cow<'a, str>>,
-    /// Control group of that process.
+    /// Control group of the process that owns the socket.
     pub cgroup: Option<Cow<'a, str>>,
-    /// Fate of the messages.
+    /// Counts of delivered, lost and pending messages.
     pub delivered: Delivered,
-    /// Delivered messages that the process never took from the queue of its subscription; null if
-    /// its calls are not observed, or other writers fill the same queue.
+    /// Delivered messages that the process never took from the queue of its subscription. Null if
+    /// its calls are not observed, or if other writers fill the same queue.
     pub lost_in_reader_queue_messages: Option<u64>,
 }
 
@@ -185,7 +186,7 @@ pub struct Acknowledgement<'a> {
     pub requested_messages: u64,
     /// Messages that the writer has sent and the reader has not acknowledged.
     pub lag_messages: u64,
-    /// Age in seconds of the oldest such message; null if it is no longer known.
+    /// Age in seconds of the oldest unacknowledged message; null if it is no longer known.
     pub lag_seconds: Option<f64>,
 }
 
@@ -201,8 +202,8 @@ pub struct Reason {
     pub detail: String,
 }
 
-/// Why a published topic is silent that has no subscriber, in words, for each surface on which a
-/// client waits for its messages.
+/// Why a published topic without a subscriber is silent, in words. Each surface on which a client
+/// waits for messages shows this text.
 pub const UNSUBSCRIBED: &str = "no subscriber exists, so nothing is sent";
 
 /// Why some or all messages of a topic are not observed.
@@ -238,8 +239,8 @@ pub enum ReasonCode {
     Quiet,
 }
 
-/// The last seconds of a topic. All columns have the same length. A null value means that the topic
-/// was not measured in that second, or that no value exists.
+/// Measurements of the last seconds of a topic. All columns have the same length. A null value
+/// means that the topic was not measured in that second, or that no value exists.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -259,16 +260,16 @@ pub struct History {
     pub messages: Vec<Option<u32>>,
     /// Messages confirmed as lost in each second.
     pub lost_messages: Vec<Option<u32>>,
-    /// Messages per second over the 10 s before.
+    /// Messages per second over the preceding 10 s.
     pub rate_hertz: Vec<Option<f64>>,
-    /// Payload bytes per second over the 10 s before.
+    /// Payload bytes per second over the preceding 10 s.
     pub bandwidth_bytes_per_second: Vec<Option<f64>>,
     /// Median time from the writer's timestamp to the capture.
     pub latency_p50_seconds: Vec<Option<f64>>,
-    /// 99th percentile of that time.
+    /// 99th percentile of the same time.
     pub latency_p99_seconds: Vec<Option<f64>>,
     /// Median time between messages of one writer.
     pub interarrival_p50_seconds: Vec<Option<f64>>,
-    /// 99th percentile of that time.
+    /// 99th percentile of the same time.
     pub interarrival_p99_seconds: Vec<Option<f64>>,
 }

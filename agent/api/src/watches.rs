@@ -47,15 +47,15 @@ pub struct Watch {
     pub retain: Retain,
     #[serde(flatten)]
     pub expectations: Expectations,
-    /// Whether the watch outlives the agent. False for a watch of a client while the state directory
-    /// is missing or cannot be written.
+    /// Whether the watch survives a restart of the agent. False for a watch of a client while the
+    /// state directory is missing or cannot be written.
     #[serde(default = "yes")]
     pub kept: bool,
     /// Topics that the watch covers; a watched name without a topic is listed too.
     pub topics: Vec<WatchedTopic>,
 }
 
-/// An agent without this field says nothing else.
+/// Default for older agents, which do not send the field.
 const fn yes() -> bool {
     true
 }
@@ -72,40 +72,40 @@ pub enum Retain {
     Last,
 }
 
-/// Expectations of each topic. A missing field expects nothing.
+/// Expectations of each topic. A missing field sets no expectation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = ExpectationsView))]
 pub struct Expectations {
-    /// Smallest rate, in messages per second.
+    /// Minimum rate, in messages per second.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub min_rate_hz: Option<f64>,
-    /// Largest rate, in messages per second.
+    /// Maximum rate, in messages per second.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub max_rate_hz: Option<f64>,
-    /// Window of both rates, in seconds. Without it, the agent chooses one from 1 to 10 s in which
-    /// three messages are due.
+    /// Window of both rates, in seconds. Without it, the agent chooses a window of 1 to 10 s in
+    /// which three messages are due.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub window_s: Option<u32>,
-    /// Largest share of lost messages, from 0 to 1.
+    /// Maximum share of lost messages, from 0 to 1.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub max_loss_ratio: Option<f64>,
-    /// Longest time from the writer's timestamp to the capture, in milliseconds.
+    /// Maximum time from the writer's timestamp to the capture, in milliseconds.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub max_latency_ms: Option<f64>,
-    /// Longest time without a message, in seconds.
+    /// Maximum time without a message, in seconds.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub max_silence_s: Option<f64>,
-    /// Smallest number of publishers.
+    /// Minimum number of publishers.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub publishers: Option<u32>,
-    /// Smallest number of subscribers.
+    /// Minimum number of subscribers.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub subscribers: Option<u32>,
@@ -131,9 +131,9 @@ pub enum Origin {
 pub enum WatchState {
     /// The watch takes effect with the next packets.
     Starting,
-    /// No such topic exists yet; it is measured as soon as it appears.
+    /// The topic does not exist yet. It is measured as soon as it appears.
     Waiting,
-    /// Its topics are measured.
+    /// The topics of the watch are measured.
     Measuring,
     /// The topic exists, but `limits.topics` is reached.
     Rejected,
@@ -153,9 +153,9 @@ pub struct WatchedTopic {
     pub state: Open<TopicState>,
     /// Expectations that the topic violates.
     pub violations: Vec<Cow<'static, str>>,
-    /// Messages counted since the topic is watched.
+    /// Messages counted since the agent began to watch the topic.
     pub messages: u64,
-    /// Messages per second over the last window; null if no message can be seen.
+    /// Messages per second over the last window; null if messages cannot be observed.
     pub rate_hertz: Option<f64>,
 }
 
@@ -164,7 +164,7 @@ pub struct WatchedTopic {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum TopicState {
-    /// All expectations hold.
+    /// All expectations are met.
     Ok,
     /// At least one expectation is violated.
     Violated,
@@ -192,29 +192,29 @@ pub struct WatchRequest {
     /// `last`: the agent keeps the last message of each transient-local writer for recordings that
     /// begin later.
     pub retain: Retain,
-    /// Smallest rate, in messages per second.
+    /// Minimum rate, in messages per second.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 1_000_000))]
     pub min_rate_hz: Option<f64>,
-    /// Largest rate, in messages per second.
+    /// Maximum rate, in messages per second.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 1_000_000))]
     pub max_rate_hz: Option<f64>,
-    /// Window of both rates, in seconds. Without it, the agent chooses one from 1 to 10 s in which
-    /// three messages are due.
+    /// Window of both rates, in seconds. Without it, the agent chooses a window of 1 to 10 s in
+    /// which three messages are due.
     #[cfg_attr(feature = "openapi", schema(minimum = 1, maximum = 10))]
     pub window_s: Option<u32>,
-    /// Largest share of lost messages, from 0 to 1.
+    /// Maximum share of lost messages, from 0 to 1.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 1))]
     pub max_loss_ratio: Option<f64>,
-    /// Longest time from the writer's timestamp to the capture, in milliseconds.
+    /// Maximum time from the writer's timestamp to the capture, in milliseconds.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 3_600_000))]
     pub max_latency_ms: Option<f64>,
-    /// Longest time without a message, in seconds.
+    /// Maximum time without a message, in seconds.
     #[cfg_attr(feature = "openapi", schema(minimum = 0.001, maximum = 604_800))]
     pub max_silence_s: Option<f64>,
-    /// Smallest number of publishers, from 10 s after the first one on.
+    /// Minimum number of publishers. The check begins 10 s after the first publisher appears.
     #[cfg_attr(feature = "openapi", schema(minimum = 1, maximum = 10_000))]
     pub publishers: Option<u32>,
-    /// Smallest number of subscribers, from 10 s after the first publisher on.
+    /// Minimum number of subscribers. The check begins 10 s after the first publisher appears.
     #[cfg_attr(feature = "openapi", schema(minimum = 1, maximum = 10_000))]
     pub subscribers: Option<u32>,
 }
