@@ -55,8 +55,8 @@ async fn list(
     Ok(Json(answer).into_response())
 }
 
-/// Groups the topics of actions by domain and name. These topics are hidden; an action is hidden if
-/// its own name is.
+/// Groups the topics of actions by domain and name. The topics are always hidden, but an action is
+/// hidden only if its own name is hidden.
 pub(super) fn actions(
     snapshot: &Snapshot,
     scope: Scope,
@@ -81,7 +81,7 @@ pub(super) fn parties<'a>(parts: &[&'a TopicFacts]) -> Parties<'a> {
     parties
 }
 
-/// Returns the goals of an action, if any was seen.
+/// Returns the goals of an action, if a goal was seen.
 fn goals(snapshot: &Snapshot, domain_id: DomainId, name: &str) -> Option<Goals> {
     let mut actions = snapshot.actions.iter();
     let facts = actions.find(|each| each.domain_id == domain_id && each.name == name)?;
@@ -97,7 +97,7 @@ fn goals(snapshot: &Snapshot, domain_id: DomainId, name: &str) -> Option<Goals> 
     })
 }
 
-/// Returns `None` for an action without endpoints.
+/// Returns the API representation of an action, or `None` if the action has no endpoints.
 fn view<'a>(
     domain_id: u32,
     name: String,

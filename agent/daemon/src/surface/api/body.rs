@@ -10,7 +10,7 @@ use serde::de::{DeserializeOwned, IgnoredAny};
 use super::problem::{Code, Problem};
 use super::security::too_large;
 
-/// A parsed body; the defaults if the body is empty.
+/// A parsed body, or the default value if the body is empty.
 pub(super) struct Body<T>(pub(super) T);
 
 impl<S: Send + Sync, T: DeserializeOwned + Default> FromRequest<S> for Body<T> {

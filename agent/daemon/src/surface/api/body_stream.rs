@@ -14,7 +14,7 @@ pub(super) trait Pieces: Send + 'static {
     fn next(&mut self) -> impl Future<Output = Option<Self::Piece>> + Send;
 }
 
-/// Turns `source` into the stream that a response body takes. It is dropped with the connection.
+/// Turns `source` into a stream for a response body. The source is dropped with the connection.
 pub(super) fn stream_of<S: Pieces>(
     source: S,
 ) -> impl Stream<Item = Result<S::Piece, Infallible>> + Send {

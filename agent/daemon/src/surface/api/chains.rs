@@ -20,7 +20,7 @@ use super::parameters::Parameters;
 use super::problem::{Code, Problem};
 use super::scope::domain;
 
-/// The chains of an answer.
+/// Query parameters that select the chains of an answer.
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
 #[into_params(parameter_in = Query)]
@@ -28,12 +28,13 @@ struct Ends {
     /// Domain id; by default every domain.
     #[param(minimum = 0, maximum = 232)]
     domain_id: Option<u32>,
-    /// ROS name of a topic; chains are cut before it, and others left out.
+    /// ROS name of the topic at which chains begin. Chains without the topic are left out.
     from: Option<String>,
-    /// ROS name of a topic; chains are cut after it, and others left out.
+    /// ROS name of the topic at which chains end. Chains without the topic are left out.
     to: Option<String>,
-    /// Whether calls inside processes are needed, which show how a callback uses its messages. With
-    /// `capture.inside: auto` they are observed until ten seconds after the last such request.
+    /// Whether the client needs calls inside processes, which show how a callback uses its
+    /// messages. With `capture.inside: auto`, calls are observed until ten seconds after the last
+    /// such request.
     calls: Option<bool>,
 }
 
@@ -77,8 +78,9 @@ async fn list(
     Ok(Json(answer).into_response())
 }
 
-/// Returns the chains as the API answers them, cut at these ROS names of topics. Chains that do not
-/// pass both are left out; of equal parts, the one with the most messages stays. `None`: not cut.
+/// Returns the API representation of chains, cut at the topics with the ROS names `from` and `to`.
+/// Chains without both topics are left out. Of equal parts, the part with the most messages stays.
+/// `None` means no cut.
 #[must_use]
 pub fn parts<'a>(
     facts: impl Iterator<Item = &'a ChainFacts>,
@@ -91,7 +93,7 @@ pub fn parts<'a>(
         let Some(chain) = part.and_then(|part| chain(facts, part)) else {
             continue;
         };
-        // Chains that differ beyond the ends have the same part.
+        // Chains that differ only outside of the ends have the same part.
         let is_same = |known: &&mut Chain<'_>| is_same(known, &chain);
         match chains.iter_mut().find(is_same) {
             Some(known) if known.messages >= chain.messages => {}

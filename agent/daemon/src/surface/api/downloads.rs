@@ -24,9 +24,9 @@ use super::problem::{Code, Problem, ProblemBody};
 use super::recordings::find;
 use ros2probe_api::recordings::{RecordingFile, RecordingFiles};
 
-/// Largest number of files listed per bag.
+/// Maximum number of files listed per bag.
 const MAX_FILES: usize = 10_000;
-/// Bytes read at once.
+/// Maximum size of one read, in bytes.
 const PIECE: usize = 64 << 10;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
@@ -59,7 +59,7 @@ async fn list(
 
 /// A file of a recording
 ///
-/// The answer has the file's length at the time of the request; later data of a growing file is not
+/// The answer has the file's length at the time of the request; data appended later is not
 /// included.
 #[utoipa::path(
     get,
@@ -101,7 +101,7 @@ async fn download(
         Some(
             match read.unwrap_or_else(|error| Err(io::Error::other(error))) {
                 Ok((piece, rest)) => (Ok(piece), Some(rest)),
-                // The connection breaks, so the client notices the missing bytes.
+                // The error breaks the connection, so the client notices the missing bytes.
                 Err(error) => (Err(error), None),
             },
         )
@@ -119,7 +119,7 @@ async fn download(
     Ok((headers, Body::from_stream(pieces)).into_response())
 }
 
-/// Reads the next bytes of a file. Returns them with the rest to read.
+/// Reads the next bytes of a file. Returns them with the file and the number of bytes left.
 fn piece(mut file: File, left: u64) -> io::Result<(Bytes, (File, u64))> {
     let mut piece = Vec::with_capacity(PIECE);
     let most = left.min(PIECE as u64);
@@ -135,7 +135,7 @@ fn files(directory: &FilePath) -> Vec<RecordingFile> {
     let entries = fs::read_dir(directory).into_iter().flatten();
     let files = entries.filter_map(|entry| {
         let entry = entry.ok()?;
-        // The metadata are those of the entry itself, so links are not followed.
+        // The metadata describe the entry itself, so links are not followed.
         let metadata = entry.metadata().ok().filter(fs::Metadata::is_file)?;
         let file = entry.file_name().into_string().ok()?;
         let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"._-".contains(&byte);

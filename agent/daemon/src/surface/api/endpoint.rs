@@ -10,7 +10,7 @@ use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot::{EndpointFacts, ProcessFacts};
 use ros2probe_wire::rtps::VendorId;
 
-/// Returns the answer's form of a writer or reader.
+/// Returns the API representation of a writer or reader.
 pub(super) fn endpoint<'a>(
     facts: &'a EndpointFacts,
     index: &Index<'a>,
@@ -62,7 +62,7 @@ pub(super) fn vendor(vendor: VendorId) -> Cow<'static, str> {
     }
 }
 
-/// Returns borrowed texts of the snapshot.
+/// Borrows each text.
 pub(super) fn texts<T: AsRef<str>>(texts: &[T]) -> Vec<Cow<'_, str>> {
     texts
         .iter()
@@ -70,7 +70,7 @@ pub(super) fn texts<T: AsRef<str>>(texts: &[T]) -> Vec<Cow<'_, str>> {
         .collect()
 }
 
-/// Returns each value as displayed text.
+/// Formats each value.
 pub(super) fn printed<T: ToString>(values: &[T]) -> Vec<String> {
     values.iter().map(ToString::to_string).collect()
 }

@@ -2,7 +2,7 @@
 //!
 //! Each stream has its own position in the event log and is read at its client's speed without
 //! delaying others. `lagged` reports events that were overwritten before a slow client read them.
-//! The number of streams is limited, and all end when the agent stops.
+//! The number of streams is limited, and all streams end when the agent stops.
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
@@ -38,19 +38,19 @@ use ros2probe_api::events::{self as answers, Lagged};
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_wire::DomainId;
 
-/// Slots for streams of all listeners: fewer than connections, so that other requests still get
-/// one.
+/// Slots for the event streams of all listeners. There are fewer slots than connections, so that
+/// other requests still get a connection.
 static STREAMS: LazyLock<Places> = LazyLock::new(|| Places::new(MAX_STREAMS));
 const MAX_STREAMS: usize = 16;
-/// Silence after which a stream sends a comment.
+/// Time without an event after which a stream sends a comment.
 const BEAT: Duration = Duration::from_secs(15);
 /// Time after which a disconnected client should reconnect.
 const RETRY: Duration = Duration::from_secs(2);
-/// Largest number of events formatted at once, besides the notice of overwritten ones.
+/// Maximum number of events formatted per batch, besides the notice of overwritten events.
 const BATCH: usize = StreamEvents::CAP - 1;
-/// Largest number of names or topics per filter.
+/// Maximum number of names or topics per filter.
 const MAX_FILTERS: usize = 32;
-/// Largest number of characters in a filter by name, and by topic.
+/// Maximum number of characters in a filter by name, and in a filter by topic.
 const MAX_NAMES: usize = 1_024;
 const MAX_TOPICS: usize = 4_096;
 /// Id of the position before the oldest event in the log.
@@ -134,7 +134,7 @@ async fn events(
     let last_event_id = last_event_id
         .transpose()
         .map_err(|_| no_id("Last-Event-ID"))?;
-    // A client that has not received an event yet sends an empty header.
+    // An empty id means that the client has not received an event yet.
     let last_event_id = last_event_id.filter(|id| !id.is_empty());
     let log = Arc::clone(&context.events);
     let (place, restarted) = match last_event_id.or(selection.after.as_deref()) {
@@ -189,7 +189,8 @@ impl Pieces for Stream {
                 () = self.log.wait(self.place) => {}
                 () = self.stop.cancelled() => return None,
                 () = sleep(BEAT) => {
-                    // The id also states how far a filter has read.
+                    // The id covers events that the filter left out, so that a reconnecting client
+                    // skips them.
                     let beat = Event::default().comment("").id(self.log.id(self.place));
                     return Some(beat);
                 }
@@ -208,7 +209,7 @@ impl Stream {
             self.lag(None, "restarted");
         }
     }
-    /// Moves the next events into `waiting`; returns whether there were any.
+    /// Moves the next selected events into `waiting`. Returns whether the log had new events.
     fn read(&mut self) -> bool {
         let batch = self.log.read(self.place, BATCH);
         if batch.lagged > 0 {
@@ -246,7 +247,7 @@ impl Stream {
     }
 }
 
-/// Returns the answer's form of an event.
+/// Returns the API representation of an event.
 pub(super) fn event<'a>(log: &EventLog, record: &'a Record) -> answers::Event<'a> {
     let attributes = record.attributes.iter();
     let attributes = attributes.map(|(name, value)| {
@@ -338,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn filters_that_can_never_match_are_refused() {
+    fn a_filter_that_can_never_match_is_refused() {
         for (name, topic) in [
             ("ros2.message.lost", ""),
             ("ros2.message.lost, ros2probe.*", "/points,/camera/**"),
@@ -376,7 +377,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_slow_client_gets_the_number_of_events_that_it_missed() {
+    async fn a_slow_client_receives_the_number_of_events_that_it_missed() {
         let (log, stop) = (Arc::new(EventLog::new()), CancellationToken::new());
         let mut stream = stream(&log, &stop);
         log.record(AgentEvent::Reloaded { watches: 0 });
@@ -390,7 +391,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_stream_reads_a_part_of_the_log_at_once() {
+    async fn a_stream_reads_a_long_log_in_batches() {
         let (log, stop) = (Arc::new(EventLog::new()), CancellationToken::new());
         log.overwrite(7);
         for watches in 0..150 {
@@ -407,7 +408,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_stream_ends_with_the_agent_after_what_has_happened() {
+    async fn a_stream_sends_pending_events_before_it_ends_with_the_agent() {
         let (log, stop) = (Arc::new(EventLog::new()), CancellationToken::new());
         log.record(AgentEvent::Reloaded { watches: 1 });
         stop.cancel();

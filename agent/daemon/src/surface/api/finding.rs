@@ -7,7 +7,7 @@ use super::inside::trigger;
 use ros2probe_api::diagnosis::{Diagnosis, Finding};
 use ros2probe_model::facts::diagnosis;
 
-/// Returns the answer's form of a problem.
+/// Returns the API representation of a problem.
 pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
     let known = match finding {
         diagnosis::Diagnosis::QosIncompatible {

@@ -94,7 +94,7 @@ impl Drawing {
         id
     }
 
-    /// Adds a node, or its participant if the node is unknown. Returns the id.
+    /// Adds a node, or its participant if the node is unknown. Returns the id of the vertex.
     fn party(&mut self, domain_id: u32, (node, participant): (Option<&str>, Guid)) -> String {
         match node {
             Some(node) => self.vertex(VertexKind::Node, domain_id, node),
@@ -128,7 +128,7 @@ impl Drawing {
         }
     }
 
-    /// Adds a service or action that has endpoints.
+    /// Adds a service or action with its edges, unless it has no endpoints.
     fn joint(&mut self, kind: VertexKind, domain_id: u32, name: &str, parties: &Parties<'_>) {
         if parties.is_empty() {
             return;

@@ -20,7 +20,7 @@ use crate::surface::ros2_daemon::{PortState, Ros2DaemonFigures, port};
 use ros2probe_api::health::{self, Health, Interface, Limit, Table, Thread};
 use ros2probe_metrics::otlp::Host;
 
-/// Read once, because the host's name rarely changes while the agent runs.
+/// Name of the host. It is read once, because it rarely changes while the agent runs.
 pub(super) static HOST: LazyLock<Option<String>> = LazyLock::new(|| Host::read().name);
 
 pub(super) fn routes() -> OpenApiRouter<Context> {

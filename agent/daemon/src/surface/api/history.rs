@@ -14,7 +14,7 @@ use ros2probe_api::topics::History;
 ///
 /// The answer covers as many seconds as `page.history_s`, the oldest first. A topic has a history
 /// while it is measured. A path such as `/topics/camera/history` means the topic `/camera/history`
-/// if that exists. With encoded slashes (`/topics/%2Fcamera%2Fimage/history`), the path is
+/// if that topic exists. With encoded slashes (`/topics/%2Fcamera%2Fimage/history`), the path is
 /// unambiguous.
 #[utoipa::path(
     get,
@@ -99,7 +99,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_have_as_many_digits_as_they_are_worth() {
+    fn numbers_are_rounded_to_their_significant_digits() {
         assert_eq!(short(0.001_234_567), 0.001_23);
         assert_eq!(short(12.345_678), 12.3);
         assert_eq!(short(1234.5), 1235.0);

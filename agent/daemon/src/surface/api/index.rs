@@ -60,8 +60,8 @@ impl<'a> Index<'a> {
         found.map_or(&[], Vec::as_slice)
     }
 
-    /// Returns the entries that cover a topic. Request and reply topics share the service's name
-    /// and are covered only if they are measured.
+    /// Returns the watchlist entries that cover a topic. Request and reply topics share the name of
+    /// their service, so entries apply only to measured topics.
     pub(super) fn watches(&self, topic: &'a TopicFacts) -> &[Standing<'a>] {
         if topic.measurement.is_none() {
             return &[];

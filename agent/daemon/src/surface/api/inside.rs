@@ -1,5 +1,4 @@
-//! `/inside`: what processes show from inside, and the same facts in answers about topics and
-//! nodes.
+//! `/inside`: observations from inside processes, also for answers about topics and nodes.
 
 use std::borrow::Cow;
 
@@ -28,7 +27,7 @@ use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot::{Snapshot, TopicFacts};
 use ros2probe_wire::DomainId;
 
-/// The facts that an answer contains.
+/// Query parameters that select the facts of an answer.
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
 #[into_params(parameter_in = Query)]
@@ -46,9 +45,10 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 
 /// Calls inside processes
 ///
-/// Publications, takes, messages within processes and callbacks, as uprobes on `libtracetools.so`
-/// show them. With `capture.inside: auto`, calls are observed from the first request until ten seconds
-/// after the last; the first answer takes up to five seconds. The lists are empty with `off`.
+/// Publications, takes, messages within processes and callbacks, observed with uprobes on
+/// `libtracetools.so`. With `capture.inside: auto`, the observation begins with the first request
+/// and ends ten seconds after the last one. The first answer takes up to five seconds. The lists
+/// are empty with `off`.
 #[utoipa::path(
     get,
     path = "/inside",
@@ -122,7 +122,7 @@ fn inside<'a>(
     answer
 }
 
-/// Keeps what belongs to this node or topic.
+/// Keeps only the entries of the node or topic `name`.
 fn select(inside: &mut Inside<'_>, name: &str) {
     let is_own = |owner: &Owner<'_>| owner.node.as_deref() == Some(name);
     let is_topic = |topic: Option<&str>| topic == Some(name);
@@ -156,7 +156,7 @@ fn select(inside: &mut Inside<'_>, name: &str) {
     });
 }
 
-/// Returns what processes show of a topic, without the lists.
+/// Returns the observations of a topic, without the lists.
 pub(super) fn topic(facts: &TopicFacts, clock: WallClock) -> Option<TopicInside<'_>> {
     let inside = facts.inside.as_deref()?;
     let counts = inside.counts;
@@ -178,8 +178,7 @@ pub(super) fn topic(facts: &TopicFacts, clock: WallClock) -> Option<TopicInside<
     })
 }
 
-/// Returns what processes show of a topic, with its publishers, subscriptions, buffers and
-/// callbacks.
+/// Returns the observations of a topic, with its publishers, subscriptions, buffers and callbacks.
 pub(super) fn topic_details<'a>(
     facts: &'a TopicFacts,
     snapshot: &'a Snapshot,
@@ -213,7 +212,7 @@ pub(super) fn topic_details<'a>(
     Some(shown)
 }
 
-/// Returns what processes show of a node; `None` if they show nothing.
+/// Returns the observations of a node, or `None` without any.
 pub(super) fn node<'a>(
     domain_id: DomainId,
     name: &str,
@@ -247,7 +246,7 @@ pub(super) fn node<'a>(
     (node != NodeInside::default()).then_some(node)
 }
 
-/// Returns the answer's form of a trigger.
+/// Returns the API representation of a trigger.
 pub(super) fn trigger(trigger: &report::Trigger) -> Trigger<'_> {
     Trigger {
         kind: Cow::Borrowed(trigger.label()),
@@ -431,7 +430,7 @@ mod tests {
     }
 
     #[test]
-    fn reports_become_answers() {
+    fn a_report_appears_in_the_answers_about_its_topic_and_node() {
         let snapshot = robot();
         let answer = inside(&snapshot, None, |_| true);
         let publisher = &answer.publishers[0];
@@ -470,7 +469,7 @@ mod tests {
     }
 
     #[test]
-    fn a_source_that_is_off_has_the_mode_off_and_its_reason() {
+    fn a_missing_source_has_the_mode_off_and_a_failed_one_its_reason() {
         let snapshot = Snapshot::default();
         assert_eq!(inside(&snapshot, None, |_| true).mode, "off");
         let source = InsideSourceFacts {

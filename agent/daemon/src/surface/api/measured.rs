@@ -7,7 +7,7 @@ use ros2probe_model::facts::histogram::Histogram;
 use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot;
 
-/// Returns the buckets of a histogram; empty if the histogram is.
+/// Returns the buckets of a histogram, or none if the histogram is empty.
 pub(super) fn buckets(values: &Histogram) -> Vec<Bucket> {
     let buckets = values.buckets().filter(|_| values.count() > 0);
     let bucket = |(upper, count): (f64, u64)| Bucket {
@@ -17,7 +17,7 @@ pub(super) fn buckets(values: &Histogram) -> Vec<Bucket> {
     buckets.map(bucket).collect()
 }
 
-/// Returns the answer's form of a measurement.
+/// Returns the API representation of a measurement.
 pub(super) fn measurement(facts: &snapshot::Measurement, clock: WallClock) -> Measurement {
     let last_message = facts.last_message;
     Measurement {
@@ -49,7 +49,7 @@ pub(super) fn measurement(facts: &snapshot::Measurement, clock: WallClock) -> Me
     }
 }
 
-/// Returns the answer's form of a topic's measurement.
+/// Returns the API representation of a topic's measurement.
 pub(super) fn topic_measurement(
     facts: &snapshot::TopicFacts,
     clock: WallClock,
@@ -61,7 +61,7 @@ pub(super) fn topic_measurement(
     })
 }
 
-/// Returns the answer's form of a delivery's counts.
+/// Returns the API representation of a delivery's counts.
 pub(super) fn delivered(facts: &snapshot::Delivered) -> Delivered {
     Delivered {
         messages: facts.messages,
@@ -78,7 +78,7 @@ pub(super) fn delivered(facts: &snapshot::Delivered) -> Delivered {
     }
 }
 
-/// Returns the answer's form of the stages' times.
+/// Returns the API representation of the times per stage.
 pub(super) fn breakdown(facts: &snapshot::Breakdown) -> Breakdown {
     Breakdown {
         send_delay: distribution(&facts.send_delay),
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn buckets_add_up_and_the_last_has_no_bound() {
+    fn buckets_add_up_and_the_last_bucket_has_no_bound() {
         let mut values = Histogram::default();
         assert!(buckets(&values).is_empty());
         values.observe(0.0015);
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn one_value_is_every_percentile() {
+    fn a_single_value_is_every_percentile() {
         let mut values = Histogram::default();
         values.observe(99.0);
         let shown = distribution(&values).unwrap();

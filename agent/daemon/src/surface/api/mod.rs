@@ -1,7 +1,8 @@
 //! The control API: REST over a loopback address and a unix socket, described by an OpenAPI
-//! document. It reads snapshots and changes the watches; the capture never waits for it.
+//! document. The API reads snapshots and changes the watches. The capture never waits for it.
 //!
-//! Each noun has a module with its routes; `security` holds the checks of every request.
+//! Each noun of the API has a module with its routes; `security` contains the checks of every
+//! request.
 
 mod actions;
 mod body;
@@ -76,11 +77,12 @@ use ros2probe_message::Library;
 use security::{Door, Needs};
 pub use server::{OpenError, Server};
 
-/// Longest time that a request waits for a snapshot that includes earlier requests.
+/// Maximum time that a request waits for a fresh snapshot, which shows the effects of earlier
+/// requests.
 const TIMEOUT: Duration = Duration::from_millis(600);
-/// Longest time that a request waits until calls inside processes are observed.
+/// Maximum time that a request waits until calls inside processes are observed.
 const CALLS_WITHIN: Duration = Duration::from_secs(5);
-/// How often it looks.
+/// Interval at which the request checks for the observation.
 const CALLS_POLLED: Duration = Duration::from_millis(250);
 
 /// State that the routes share.
@@ -100,7 +102,7 @@ pub struct Context {
     pub subscriptions: Arc<Subscriptions>,
     /// Bags that the agent writes.
     pub recordings: Arc<Recordings>,
-    /// The last seconds of some topics.
+    /// Snapshots: the last seconds of some topics.
     pub snapshots: Arc<Snapshots>,
     /// State that all streams of the web page share.
     pub live: Arc<Live>,
@@ -119,8 +121,8 @@ pub struct Context {
 }
 
 impl Context {
-    /// Notes that calls inside processes are needed, and waits at most five seconds until their
-    /// rates are known.
+    /// Requests the observation of calls inside processes, and waits at most five seconds until
+    /// their rates are known.
     async fn observe_calls(&self) {
         self.latest.want_calls();
         let is_known = async {
@@ -128,7 +130,8 @@ impl Context {
                 self.latest.refresh(TIMEOUT).await;
                 let state = self.latest.own_state();
                 let source = state.agent.inside.as_ref();
-                // What is always observed, or cannot be, needs no wait.
+                // Only the mode `auto` needs a wait. In other modes, calls are always observed or
+                // never.
                 if source.is_none_or(|source| source.mode != "auto" || source.shows_rates) {
                     return;
                 }
@@ -156,7 +159,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         Some(context) => views.layer(middleware::from_fn_with_state(context.clone(), take_turns)),
         None => views,
     };
-    // They wait outside of the turns of others.
+    // These requests wait before they take a permit for a large response.
     let calls = |views: OpenApiRouter<Context>| match context {
         Some(context) => views.layer(middleware::from_fn_with_state(
             context.clone(),
@@ -198,7 +201,7 @@ fn views() -> OpenApiRouter<Context> {
         .merge(names::routes())
 }
 
-/// Observes calls inside processes before the answer, if that is done on demand.
+/// Starts the on-demand observation of calls inside processes before the answer.
 async fn observe_calls(
     Extract(context): Extract<Context>,
     request: Request,
@@ -211,12 +214,12 @@ async fn observe_calls(
 /// Large answers that are being created and read.
 static VIEWS: LargeResponses = LargeResponses::new();
 
-/// Marks a streamed response, which is sent as it is produced and takes no permit of a large
+/// Marks a streamed response, which is sent as it is produced and keeps no permit for a large
 /// answer.
 #[derive(Clone, Copy, Debug)]
 struct Streamed;
 
-/// Limits the number of large answers; see [`super::large_responses`].
+/// Limits the number of large answers, as [`super::large_responses`] describes.
 async fn take_turns(Extract(context): Extract<Context>, request: Request, next: Next) -> Response {
     let Some(turn) = VIEWS.turn().await else {
         context.limits.reached(Limit::ApiClients, 1);
@@ -237,7 +240,7 @@ async fn take_turns(Extract(context): Extract<Context>, request: Request, next: 
     }
 }
 
-/// Returns the routes behind `door`.
+/// Returns the routes with the access checks of `door`.
 fn router(context: &Context, door: Arc<Door>) -> Router {
     let (router, _) = nouns(Some(context)).split_for_parts();
     let files = (door.is_for_browsers() && context.page.is_served()).then(|| {

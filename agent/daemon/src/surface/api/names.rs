@@ -1,5 +1,5 @@
-//! `/names`: names, types and numbers of endpoints, without details of each. The answer has about a
-//! tenth of the size of `/topics`.
+//! `/names`: names, types and numbers of endpoints, without the details of each endpoint. The
+//! answer is about a tenth as large as that of `/topics`.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -101,7 +101,7 @@ fn topic(facts: &TopicFacts) -> Option<TopicName<'_>> {
     })
 }
 
-/// Returns `None` for a service without endpoints.
+/// Returns the API representation of a service, or `None` if the service has no endpoints.
 fn service<'a>(domain_id: u32, name: &'a str, halves: &Halves<'a>) -> Option<ServiceName<'a>> {
     let ends = |topic: Option<&TopicFacts>| {
         topic.map_or((0, 0), |topic| {

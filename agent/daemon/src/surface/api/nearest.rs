@@ -1,11 +1,11 @@
 //! Suggestions for names that do not exist.
 
-/// Largest number of suggestions.
+/// Maximum number of suggestions.
 const SUGGESTIONS: usize = 3;
-/// Largest number of names compared.
+/// Maximum number of names compared.
 const COMPARED: usize = 2000;
 
-/// Returns " Did you mean ...?", or an empty string without a similar name.
+/// Returns "; did you mean ...?", or an empty string without a similar name.
 pub(super) fn hint<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> String {
     let near = nearest(wanted, names);
     if near.is_empty() {
@@ -18,7 +18,7 @@ pub(super) fn hint<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> St
 fn nearest<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
     let limit = (wanted.len() / 4).clamp(2, 6);
     let near = names.take(COMPARED).filter_map(|name| {
-        // The namespace is missing, or is one too many.
+        // The wanted name lacks a namespace, or has one too many.
         let is_end = name.ends_with(wanted) || wanted.ends_with(name);
         let steps = distance(wanted.as_bytes(), name.as_bytes(), limit);
         let steps = if is_end && name.len() > 1 {
@@ -67,7 +67,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn slips_of_the_finger_and_forgotten_namespaces_are_found() {
+    fn a_typing_error_or_a_missing_namespace_leads_to_a_suggestion() {
         let names = ["/points", "/robot1/lidar/points", "/point", "/tf", "/"];
         assert_eq!(nearest("/poinst", names.into_iter()), ["/point", "/points"]);
         assert_eq!(
@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn the_distance_is_levenshtein_s() {
+    fn the_distance_of_two_names_is_their_levenshtein_distance() {
         for (one, other, expected) in [
             ("kitten", "sitting", Some(3)),
             ("", "ab", Some(2)),

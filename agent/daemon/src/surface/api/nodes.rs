@@ -103,12 +103,12 @@ async fn show(
     Ok(Json(answers.node(nodes)).into_response())
 }
 
-/// The path parameter, for the document.
+/// The path parameter, declared for the OpenAPI document.
 #[derive(IntoParams)]
 #[into_params(parameter_in = Path)]
 #[expect(dead_code, reason = "read by the document's generator alone")]
 struct NodeParameter {
-    /// Fully qualified name without its leading slash; slashes within need not be encoded.
+    /// Fully qualified name without its leading slash; inner slashes need not be encoded.
     #[param(min_length = 1, example = "robot1/lidar")]
     node: String,
 }

@@ -20,7 +20,7 @@ use utoipa_axum::routes;
 use super::problem::{MEDIA_TYPE, ProblemBody};
 use super::{Context, nouns};
 
-/// Answers that any request may receive.
+/// Error responses that any request may receive.
 const COMMON: [(&str, &str); 6] = [
     ("400", "The request cannot be read."),
     ("401", "The listener requires a bearer token."),
@@ -107,7 +107,7 @@ fn operations(item: &mut PathItem) -> impl Iterator<Item = (&'static str, &mut O
 }
 
 /// Returns the id of an operation, which generated clients take as the name of a function:
-/// `get_recordings_by_name_files`. Handlers of different modules have the same names.
+/// `get_recordings_by_name_files`. The names of the handlers are not unique.
 fn operation_id(method: &str, path: &str) -> String {
     let mut id = method.to_owned();
     for segment in path.split('/') {
@@ -169,8 +169,9 @@ fn request_bodies(document: &utoipa::openapi::OpenApi) -> BTreeSet<String> {
     names
 }
 
-/// Sorts the properties of a schema. Clients tolerate missing fields of older agents; the document
-/// describes this agent, which sends all of them.
+/// Sorts the properties of a schema. In an answer, the properties are also required. Clients
+/// tolerate missing fields of older agents, but the document describes this agent, which sends all
+/// fields.
 fn complete_schema(schema: &mut RefOr<Schema>, is_answer: bool) {
     let items = match schema {
         RefOr::T(Schema::Object(object)) => {
@@ -192,7 +193,8 @@ fn complete_schema(schema: &mut RefOr<Schema>, is_answer: bool) {
     }
 }
 
-/// Makes properties with a default required, unless the default is null.
+/// Requires all properties except properties whose default is null. Does nothing if no property has
+/// a default.
 fn require_all(object: &mut Object) {
     let defaults = object.properties.values_mut().map(take_default);
     let defaults: Vec<_> = defaults.collect();

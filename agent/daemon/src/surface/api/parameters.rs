@@ -9,7 +9,7 @@ use serde::de::DeserializeOwned;
 use super::problem::{Code, Problem};
 
 /// `{*topic}` at the end of a path: a ROS name, whose leading slash the path may omit. A client
-/// that encodes the whole name sends it (`%2Fpoints`).
+/// that encodes the whole name includes the slash (`%2Fpoints`).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Name(pub(super) String);
 

@@ -31,8 +31,8 @@ pub(super) struct Parties<'a> {
 type Endpoints<'a> = BTreeMap<(Option<&'a str>, Guid), Vec<Guid>>;
 
 impl Side {
-    /// Returns the side of a writer or reader of this topic: a server reads requests and writes all
-    /// other topics. `None` if it cannot be determined.
+    /// Returns the side of a writer or reader of this topic. A server reads requests and writes all
+    /// other topics. Returns `None` if the side cannot be determined.
     pub(super) fn of(topic: &TopicFacts, is_writer: bool) -> Option<Self> {
         match (topic.kind, is_writer) {
             (TopicKind::ServiceRequest, false) | (TopicKind::ServiceReply, true) => {
@@ -87,7 +87,7 @@ impl<'a> Parties<'a> {
     }
 }
 
-/// Returns the service of a topic's type: `pkg/srv/Add` for `pkg/srv/Add_Request`.
+/// Returns the service type for a topic's type: `pkg/srv/Add` for `pkg/srv/Add_Request`.
 pub(super) fn service_type(message_type: &str) -> &str {
     let ends = ["_Request", "_Response"];
     let mut stems = ends.iter().filter_map(|end| message_type.strip_suffix(end));
@@ -102,8 +102,8 @@ pub(super) fn action(topic: &TopicFacts) -> Option<(RosName, ActionPart)> {
     }
 }
 
-/// Returns the action's type from the type of one of its topics, or `None` if that does not contain
-/// it.
+/// Returns the action type for the type of one of its topics, or `None` if the topic's type does
+/// not contain it.
 pub(super) fn action_type(message_type: &str) -> Option<&str> {
     const ENDS: [&str; 5] = [
         "_FeedbackMessage",
@@ -120,7 +120,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn types_lose_what_their_topic_adds() {
+    fn a_service_or_action_type_is_a_topic_type_without_its_suffix() {
         assert_eq!(service_type("a/srv/Add_Request"), "a/srv/Add");
         assert_eq!(service_type("a/srv/Add_Response"), "a/srv/Add");
         assert_eq!(service_type("Square"), "Square");

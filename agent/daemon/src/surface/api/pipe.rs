@@ -1,6 +1,6 @@
 //! The API within one process: requests use pipes in memory instead of sockets.
 //!
-//! Only the process itself can send requests, so only the rate limit remains of the checks.
+//! Only the process itself can send requests, so the limits of rate and size are the only checks.
 
 use std::io;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use super::security::{Door, Granted, Kind};
 use super::{Context, router};
 use crate::config::Access;
 
-/// The stream of opened pipes.
+/// The pipes that clients in the process open.
 #[derive(Debug)]
 struct Pipes(mpsc::UnboundedReceiver<DuplexStream>);
 

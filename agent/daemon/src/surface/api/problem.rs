@@ -1,4 +1,4 @@
-//! Refusals of requests: problem details (RFC 9457), each kind with a stable code of [`Code`].
+//! Refusals of requests: problem details (RFC 9457), each kind with a stable [`Code`].
 
 use std::borrow::Cow;
 
@@ -27,7 +27,7 @@ impl Problem {
         }
     }
 
-    /// Returns the kind.
+    /// Returns the code of the problem.
     #[must_use]
     pub const fn code(&self) -> Code {
         self.code

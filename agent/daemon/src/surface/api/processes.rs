@@ -1,7 +1,7 @@
 //! `/processes`: CPU time and memory of the processes of known participants, read at each request.
 //!
-//! Only processes are read that the kernel reports as owner of a participant's socket. A process id
-//! that a participant announces may belong to another host or namespace.
+//! Only processes that the kernel reports as owners of a participant's socket are read. A process
+//! id that a participant announces may belong to another host or namespace.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -18,7 +18,7 @@ use crate::surface::process::Usage;
 use ros2probe_api::participants::{ProcessList, ProcessUsage};
 use ros2probe_model::report::snapshot::Snapshot;
 
-/// Largest number of processes per answer.
+/// Maximum number of processes per answer.
 const MAX_PROCESSES: usize = 512;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
@@ -44,7 +44,8 @@ fn local(snapshot: &Snapshot) -> BTreeMap<u32, Option<Arc<str>>> {
     let mut ids = BTreeMap::new();
     for participant in &snapshot.participants {
         let process = &participant.process;
-        // A control group comes from the kernel only, so its presence shows the source of the id.
+        // Only the kernel provides a control group, so its presence shows that the id is the
+        // kernel's.
         if let (Some(id), Some(_)) = (process.id, &process.cgroup) {
             ids.insert(id, process.name.clone());
         }
@@ -107,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn only_processes_whose_sockets_are_here_are_read() {
+    fn only_processes_that_own_a_socket_on_this_host_are_read() {
         let own = std::process::id();
         let snapshot = Snapshot {
             participants: vec![
@@ -139,8 +140,8 @@ mod tests {
     }
 
     #[test]
-    fn processes_beyond_the_cap_are_not_read_for_one_answer() {
-        // No process has such an id.
+    fn processes_beyond_the_cap_are_not_read() {
+        // No process has an id this large.
         let first = 1 << 30;
         let participants = (first..).take(MAX_PROCESSES + 9);
         let snapshot = Snapshot {

@@ -1,6 +1,6 @@
 //! Reasons why a topic is silent or not measured, in words and as codes.
 //!
-//! Reasons follow from facts that other answers show, too; a missing number alone is no reason.
+//! Reasons follow from facts that other answers also show. A missing number alone is not a reason.
 
 use super::index::Index;
 use crate::agent_facts::SourceKind;
@@ -13,7 +13,7 @@ use ros2probe_model::report::snapshot::{
     EndpointFacts, Measurement, Snapshot, Source, TopicFacts, Transport,
 };
 
-/// Facts beyond the topic on which reasons depend.
+/// Facts, besides the topic, on which reasons depend.
 #[derive(Debug)]
 pub(super) struct Circumstances<'a> {
     pub(super) snapshot: &'a Snapshot,
@@ -22,7 +22,7 @@ pub(super) struct Circumstances<'a> {
     pub(super) source: SourceKind,
     /// Whether the agent samples shared memory.
     pub(super) looks_at_memory: bool,
-    /// Whether calls inside processes could be counted and are not.
+    /// Whether the agent could count calls inside processes but does not.
     pub(super) lacks_inside: bool,
     /// Why the agent is not ready.
     pub(super) unready: Option<Unready>,
@@ -158,7 +158,8 @@ impl<'a> Circumstances<'a> {
         (ReasonCode::NotWatched, detail)
     }
 
-    /// Returns the transport if no pair of publisher and subscriber uses the network.
+    /// Returns the reason, derived from the most common transport, if no pair of publisher and
+    /// subscriber uses the network.
     fn off_network(&self, topic: &TopicFacts) -> Option<(ReasonCode, String)> {
         let passages = topic.transports.iter();
         let most = passages.clone().max_by_key(|count| count.pairs)?;
@@ -198,8 +199,8 @@ impl<'a> Circumstances<'a> {
         })
     }
 
-    /// Returns whether no participant of the topic has a socket on this host, as far as sockets are
-    /// known.
+    /// Returns whether the agent captures at sockets and no participant of the topic has a known
+    /// socket on this host.
     fn is_elsewhere(&self, topic: &'a TopicFacts) -> bool {
         let mut all = topic.publishers.iter().chain(&topic.subscriptions);
         self.source == SourceKind::Host

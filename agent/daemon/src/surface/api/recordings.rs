@@ -23,12 +23,12 @@ use crate::recording::{Command, Recording, RecordingOptions, Refusal};
 use ros2probe_api::recordings::{self as answers, FilterOptions, RecordingList, RecordingRequest};
 use ros2probe_bag::{Form, Options, Storage};
 
-/// Longest time that an answer waits for a bag to be completed.
+/// Maximum time that an answer waits for a bag to be completed.
 const TIMEOUT: Duration = Duration::from_secs(10);
-/// Longest time that a new recording waits for the capture to apply its subscription, and for
+/// Maximum time that a new recording waits for the capture to apply its subscription, and for
 /// breakpoints in the processes that send the messages.
 const BEGINS_WITHIN: Duration = Duration::from_secs(6);
-/// Longest duration of one file, a year.
+/// Maximum duration of one file: a year, in seconds.
 const MAX_DURATION: u64 = 31_536_000;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
@@ -86,13 +86,14 @@ async fn begin(
     Body(request): Body<RecordingRequest>,
 ) -> Result<Response, Problem> {
     let wanted = wanted(request)?;
-    // The known topics are entered into the bag's list of topics.
+    // A fresh snapshot provides the known topics for the bag's list of topics.
     context.state().await;
     let recordings = Arc::clone(&context.recordings);
     let begun = tokio::task::spawn_blocking(move || recordings.begin(wanted)).await;
     let begun = begun.map_err(|_| Problem::new(Code::Ending, "the agent is shutting down"))?;
     let recording = begun.map_err(|refusal| problem(&refusal))?;
-    // From then on, the kernel's programs capture each message of the requested topics.
+    // Once the subscription is in force, the kernel's programs capture each message of the
+    // requested topics.
     tokio::select! {
         _ = recording.begin().in_force(BEGINS_WITHIN) => {}
         () = context.stop.cancelled() => {}

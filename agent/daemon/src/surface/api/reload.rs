@@ -19,7 +19,7 @@ pub struct Reloader(mpsc::Sender<Answer>);
 #[derive(Debug)]
 pub struct Reloads(mpsc::Receiver<Answer>);
 
-/// Receives the result of a reload.
+/// Returns the result of a reload to the client that requested it.
 pub type Answer = oneshot::Sender<Result<Reloaded, NotReloaded>>;
 
 /// Why the configuration is unchanged.
@@ -31,7 +31,7 @@ pub enum NotReloaded {
     Mistakes(Vec<String>),
 }
 
-/// Creates both ends.
+/// Creates both ends of the channel for reload requests.
 #[must_use]
 pub fn channel() -> (Reloader, Reloads) {
     let (ask, asked) = mpsc::channel(1);
@@ -39,7 +39,7 @@ pub fn channel() -> (Reloader, Reloads) {
 }
 
 impl Reloads {
-    /// Waits for a request; returns `None` once no further one can arrive.
+    /// Waits for a request; returns `None` once no further request can arrive.
     pub async fn next(&mut self) -> Option<Answer> {
         self.0.recv().await
     }

@@ -1,8 +1,9 @@
 //! `GET /samples`: messages of topics as they arrive, as long as the client is connected. The
 //! topics are measured while the stream is open.
 //!
-//! Each stream is a subscription with a bounded queue. A client that reads slowly misses messages
-//! and receives their number; a replay waits for it. It delays no other client.
+//! Each stream is a subscription with a bounded queue. A client of a live agent that reads slowly
+//! misses messages and receives their number. It does not delay other clients. A replay waits for
+//! its clients.
 
 use std::collections::HashSet;
 use std::time::Duration;
@@ -37,21 +38,22 @@ use ros2probe_api::samples::{LINES, Line, Open, OpenTopic, SAMPLES};
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::report::snapshot::Snapshot;
 
-/// Largest number of names and globs per request, and of characters in them and in a regular
-/// expression.
+/// Maximum number of names and globs per request, of characters in a list of them, and of
+/// characters in a regular expression.
 const MAX_PATTERNS: usize = 256;
 const MAX_LIST: usize = 16_384;
 const MAX_REGEX: usize = 4_096;
-/// Size of a piece of the answer, in bytes. Larger payloads are pieces of their own, without a copy.
+/// Size of a piece of the answer, in bytes. A larger payload is a piece of its own, without a copy.
 const BATCH_BYTES: usize = 16 * 1024;
-/// How long a live stream collects messages after the first: one piece for many small ones, instead
-/// of several system calls in agent and client for each. Their times are those of the capture.
+/// Time for which a live stream collects messages after the first one. One piece for many small
+/// messages saves system calls in agent and client. The times of the messages are still their
+/// capture times.
 const PAUSE: Duration = Duration::from_millis(20);
-/// Default queue sizes: for a few thousand arrivals, and for messages with payloads.
+/// Default queue sizes in bytes: for a few thousand arrivals, and for messages with payloads.
 const ARRIVALS_BYTES: usize = 1 << 20;
 const PAYLOADS_BYTES: usize = 16 << 20;
 const LEAST_BYTES: usize = 64 << 10;
-/// Longest time that the first line waits for the capture to apply the subscription, and for
+/// Maximum time that the first line waits for the capture to apply the subscription, and for
 /// breakpoints in the processes that send the samples.
 const TIMEOUT: Duration = Duration::from_secs(6);
 
@@ -63,7 +65,7 @@ struct Wanted {
     /// appear later are included.
     #[param(max_length = 16384, example = "/points,/robot1/**")]
     topic: Option<String>,
-    /// A regular expression; topics are included if it matches a part of their name.
+    /// Regular expression; topics are included if it matches a part of their name.
     #[param(max_length = 4096)]
     regex: Option<String>,
     /// Whether to include every topic that `ros2 topic list` shows.
@@ -71,7 +73,7 @@ struct Wanted {
     /// Topics to exclude, in the form of `topic`.
     #[param(max_length = 16384)]
     exclude: Option<String>,
-    /// A regular expression; topics are excluded if it matches a part of their name.
+    /// Regular expression; topics are excluded if it matches a part of their name.
     #[param(max_length = 4096)]
     exclude_regex: Option<String>,
     /// Whether globs, `regex` and `all` include hidden topics. An exact name always does.
@@ -83,7 +85,7 @@ struct Wanted {
     payload: bool,
     /// Size of the queue for this client in bytes, at least 64 KiB; `limits.payload_bytes` bounds
     /// the queues of all streams together. A full queue drops the oldest message of the topic with
-    /// the most bytes in it.
+    /// the most bytes in the queue.
     queue_bytes: Option<usize>,
 }
 
@@ -91,7 +93,7 @@ struct Wanted {
 struct Stream {
     subscription: Subscription,
     stop: CancellationToken,
-    /// Payload to send next, after its line.
+    /// Payload to send next, after the line of its message.
     payload: Option<Bytes>,
     first: Option<Line>,
     /// Whether to collect small messages for [`PAUSE`].
@@ -109,11 +111,11 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 ///
 /// Each line is a JSON object with one key. The first line is `open`, with the selected topics that
 /// are known. `sample` is a message; each message has one line, even if it was captured several
-/// times. `clock` follows at least ten times per second and states up to which time the stream is
-/// complete. `missed` reports messages that are missing from the stream, with the reason. `end` is
-/// the last line. With `payload=true`, a sample's line is followed by `payload_bytes` raw bytes:
-/// the serialized message with its encapsulation. The topics are measured while the stream is open,
-/// but are not listed as watches.
+/// times. `clock` follows at least ten times per second and contains the time up to which the
+/// stream is complete. `missed` reports messages that are missing from the stream, with the reason.
+/// `end` is the last line. With `payload=true`, a sample's line is followed by `payload_bytes` raw
+/// bytes: the serialized message with its encapsulation. The topics are measured while the stream
+/// is open, but are not listed as watches.
 #[utoipa::path(
     get,
     path = "/samples",
@@ -144,7 +146,7 @@ async fn samples(
     } else {
         (Depth::Arrivals, ARRIVALS_BYTES, LINES)
     };
-    // A smaller queue might overflow during a pause, and a replay waits for its client.
+    // A smaller queue might overflow during a pause, and a pause would slow down a replay.
     let collects = !is_replay && wanted.queue_bytes.is_none_or(|bytes| bytes >= queue_bytes);
     let queue_bytes = wanted.queue_bytes.unwrap_or(queue_bytes).max(LEAST_BYTES);
     let request = Request {
@@ -168,7 +170,7 @@ async fn samples(
     } else {
         tokio::select! {
             _ = subscription.in_force(TIMEOUT) => {}
-            // The stream then ends with this reason.
+            // The stream then ends with the reason `agent ends`.
             () = context.stop.cancelled() => {}
         }
         context.state().await
@@ -193,8 +195,8 @@ async fn samples(
 impl Pieces for Stream {
     type Piece = Bytes;
 
-    /// Returns the next piece of the answer: some lines, or the payload of the last one. `None` at
-    /// its end.
+    /// Returns the next piece of the answer: some lines, or the payload of the last line. Returns
+    /// `None` at the end of the answer.
     async fn next(&mut self) -> Option<Bytes> {
         if let Some(payload) = self.payload.take() {
             return Some(payload);
@@ -226,7 +228,7 @@ impl Pieces for Stream {
 }
 
 impl Stream {
-    /// Returns the line of an item; the first of each writer contains the writer's QoS.
+    /// Returns the line of an item. The first sample of each writer contains the writer's QoS.
     fn line(&mut self, item: &Item) -> Line {
         let mut line = line(item);
         if let (Line::Sample(facts), Item::Sample(sample)) = (&mut line, item)
@@ -297,7 +299,7 @@ fn patterns(names: Option<&str>, regex: Option<&str>) -> Result<Vec<Choice>, Pro
     })
 }
 
-/// Returns the selected topics that are known, at most as many as can be measured.
+/// Returns the selected topics that are known, at most `most` of them.
 fn topics(
     snapshot: &Snapshot,
     selection: &Selection,
@@ -323,7 +325,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn invalid_selections_are_refused() {
+    fn an_invalid_selection_is_refused() {
         let wanted = |topic: &str, regex: &str| Wanted {
             topic: (!topic.is_empty()).then(|| topic.to_owned()),
             regex: (!regex.is_empty()).then(|| regex.to_owned()),

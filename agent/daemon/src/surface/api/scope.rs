@@ -16,7 +16,7 @@ pub(super) struct Scope {
     /// Domain id; by default every domain.
     #[param(minimum = 0, maximum = 232)]
     domain_id: Option<u32>,
-    /// Whether to include names that `ros2` hides: those with a token that begins with `_`, and
+    /// Whether to include names that `ros2` hides: names with a token that begins with `_`, and
     /// topics of services and discovery.
     pub(super) hidden: Option<bool>,
 }
@@ -49,7 +49,7 @@ impl Scope {
 }
 
 impl Domain {
-    /// Selects this domain, or any.
+    /// Selects the domain `domain_id`, or every domain if it is `None`.
     pub(super) const fn of(domain_id: Option<u32>) -> Self {
         Self { domain_id }
     }
@@ -66,7 +66,7 @@ impl Domain {
     }
 }
 
-/// Returns the domain of a request; an invalid number has this problem code.
+/// Returns the domain of a request. An invalid number leads to a problem with this code.
 ///
 /// # Errors
 /// Fails if the number is not a domain id.
@@ -75,11 +75,11 @@ pub(super) fn domain(number: Option<u32>, code: Code) -> Result<Option<DomainId>
     domain_id.map_err(|error| Problem::new(code, error.to_string()))
 }
 
-/// Returns the only entity among `found`, which are paired with their domains.
+/// Returns the only entity in `found`, a list of entities with their domains.
 ///
 /// # Errors
-/// Returns the problem `missing` if there is no entity, or one that lists the domains if there are
-/// several.
+/// Returns the problem `missing` without an entity, or a problem that lists the domains of several
+/// entities.
 pub(super) fn only<T>(
     found: Vec<(DomainId, T)>,
     what: &str,

@@ -22,13 +22,13 @@ use super::problem::{Code, Problem};
 use crate::config::Access;
 use crate::surface::authority;
 
-/// Largest size of a request body in bytes, above any valid request.
+/// Maximum size of a request body in bytes, larger than any valid body.
 pub(super) const MAX_BODY: usize = 16 << 10;
-/// Sustained number of requests per second and size of a burst. Each door has such a limit for
+/// Sustained number of requests per second and size of a burst. Each listener has one limit for
 /// clients with a token or on the unix socket, one for other clients, and one for refused requests.
 const RATE: f64 = 500.0;
 const BURST: f64 = 1_000.0;
-/// Valid length of a token: shorter ones can be guessed, and a longer file is not a token.
+/// Valid length of a token. Shorter tokens can be guessed, and a longer file is not a token.
 const TOKEN_BYTES: std::ops::RangeInclusive<usize> = 16..=4096;
 
 const SEC_FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
@@ -60,7 +60,7 @@ pub enum TokenError {
     },
 }
 
-/// The access rules of one of the API's listeners.
+/// The access rules of one listener.
 #[derive(Debug)]
 pub(in crate::surface) struct Door {
     kind: Kind,
@@ -75,7 +75,7 @@ pub(in crate::surface) struct Door {
 #[derive(Clone, Debug)]
 pub(in crate::surface) struct Granted {
     access: Access,
-    /// Whether the client showed a token, or is on the unix socket.
+    /// Whether the client sent a valid token or uses the unix socket.
     is_holder: bool,
     /// The agent's unix socket, which grants all rights.
     socket: Option<Arc<Path>>,
@@ -99,7 +99,7 @@ pub(in crate::surface) enum Kind {
     Network(Token),
 }
 
-/// A token bucket: the remaining number of requests.
+/// A token bucket that limits the rate of requests.
 #[derive(Debug)]
 struct Bucket {
     left: f64,
@@ -155,7 +155,7 @@ impl Door {
         }
     }
 
-    /// Returns the door with the tokens of web pages.
+    /// Returns the access rules with the tokens of web pages.
     pub(in crate::surface) fn with(self, page: page::Shared) -> Self {
         Self { page, ..self }
     }
@@ -172,8 +172,8 @@ impl Door {
         Ok(granted)
     }
 
-    /// Checks a request for a file of the page. It needs no token, because a browser requests the
-    /// page before it can have one.
+    /// Checks a request for a file of the page. The request needs no token, because a browser
+    /// requests the page before it can have a token.
     fn let_in_for_files(&self, headers: &HeaderMap, now: Instant) -> Result<(), Problem> {
         let host = match self.kind {
             Kind::Loopback(_) => own_host(headers),
@@ -191,9 +191,9 @@ impl Door {
         self.pass(admitted, |()| false, now)
     }
 
-    /// Checks the handshake of a viewer and returns its rights. Viewers send a token in the URL. The
-    /// holder of a token may show any web page; without one, the page must be on this host, or among
-    /// `origins`.
+    /// Checks the handshake of a viewer and returns its rights. Viewers send a token in the URL. A
+    /// viewer with a token may be a web page of any origin. Without a token, the web page must be
+    /// on this host or among `origins`.
     pub(in crate::surface) fn let_in_viewer(
         &self,
         headers: &HeaderMap,
@@ -205,8 +205,8 @@ impl Door {
         self.pass(admitted, Granted::is_holder, now)
     }
 
-    /// Returns the token that a request needs, if any; `None` on the unix socket, whose file mode
-    /// decides. Fails if the request names another host than loopback.
+    /// Returns the token that a request needs, if any. Returns `None` for the unix socket, whose
+    /// file mode controls access. Fails if a request on loopback names another host.
     fn token(&self, headers: &HeaderMap) -> Result<Option<Option<&Token>>, Problem> {
         Ok(match &self.kind {
             Kind::Socket => None,
@@ -243,7 +243,8 @@ impl Door {
         Ok(self.granted.clone())
     }
 
-    /// Applies the rate limit. Each class of clients has its own, so that no other can exhaust it.
+    /// Applies the rate limit. Each class of clients has its own limit, which other classes cannot
+    /// exhaust.
     fn pass<T>(
         &self,
         admitted: Result<T, Problem>,
@@ -281,7 +282,7 @@ impl Door {
 }
 
 impl Kind {
-    /// Returns the rights of clients; `loopback` for those identified only by this host.
+    /// Returns the rights of clients. Loopback clients without a token have the rights `loopback`.
     pub(in crate::surface) const fn access(&self, loopback: Access) -> Access {
         match self {
             Self::Loopback(None) => loopback,
@@ -299,8 +300,8 @@ impl Granted {
         }
     }
 
-    /// Returns whether the client showed a token, or is on the unix socket. Some places are reserved
-    /// for such clients.
+    /// Returns whether the client sent a valid token or uses the unix socket. Some slots are
+    /// reserved for these clients.
     pub(in crate::surface) const fn is_holder(&self) -> bool {
         self.is_holder
     }
@@ -309,7 +310,7 @@ impl Granted {
         self.access
     }
 
-    /// Returns all rights, for the holder of a token of the page.
+    /// Returns all rights, for a client with a valid token.
     fn everything(&self) -> Self {
         Self {
             access: Access::All,
@@ -317,7 +318,7 @@ impl Granted {
         }
     }
 
-    /// Returns the same rights, for a client that showed a token.
+    /// Returns the same rights, for a client with a token or on the unix socket.
     fn held(&self) -> Self {
         Self {
             is_holder: true,
@@ -325,7 +326,8 @@ impl Granted {
         }
     }
 
-    /// Fails with a problem that names the way to `needed` if the listener does not grant it.
+    /// Fails if the listener does not grant `needed`. The problem describes how to get these
+    /// rights.
     pub(super) fn require(&self, needed: Access) -> Result<(), Problem> {
         if needed <= self.access {
             return Ok(());
@@ -394,7 +396,7 @@ fn turned_away(problem: Problem) -> Response {
     (close, problem).into_response()
 }
 
-/// Answers requests that exceed the listener's rights.
+/// Refuses requests that need more rights than the listener grants.
 pub(super) async fn within(
     State(needs): State<Needs>,
     Extension(granted): Extension<Granted>,
@@ -444,8 +446,8 @@ fn own_pages(headers: &HeaderMap) -> Result<(), Problem> {
     Ok(())
 }
 
-/// Checks that the web page of a viewer, if it is one, is on this host or among `origins`. A page
-/// elsewhere cannot have an origin of this host.
+/// Checks the origin of a viewer that is a web page: it must be on this host or among `origins`. A
+/// page from elsewhere cannot have an origin on this host.
 fn viewers_pages(headers: &HeaderMap, origins: &[String]) -> Result<(), Problem> {
     let mut pages = headers.get_all(ORIGIN).iter();
     let foreign = pages.find(|page| {

@@ -33,7 +33,7 @@ pub enum OpenError {
     /// The token cannot be loaded.
     #[error(transparent)]
     Token(#[from] TokenError),
-    /// Without a token, any host could change the watches.
+    /// Other hosts can reach the address, and no token is configured.
     #[error(
         "{address} is reachable from other hosts: serving the control API there needs \
          `api.token_file`"
@@ -97,8 +97,8 @@ struct SocketFile {
 }
 
 impl Server {
-    /// Creates a server without listeners. Clients in the network need the token in this file;
-    /// those on loopback have the rights `loopback` without it.
+    /// Creates a server without listeners. Clients in the network need the token in the file
+    /// `token`. Loopback clients without the token have the rights `loopback`.
     ///
     /// # Errors
     /// Fails if the file does not contain a valid token.
@@ -126,7 +126,8 @@ impl Server {
     /// Binds a unix socket, replacing the stale file of an agent that was killed.
     ///
     /// # Errors
-    /// Fails if another agent serves it, the path is not a socket, or the directory cannot be used.
+    /// Fails if another agent serves the socket, the path is not a socket, or the directory cannot
+    /// be used.
     pub fn bind_socket(&mut self, path: &Path) -> Result<(), OpenError> {
         let failed = |source| OpenError::Socket {
             path: path.to_path_buf(),
@@ -246,8 +247,8 @@ fn full(connections: usize) -> Refusal {
     )
 }
 
-/// Locks a file beside the socket. It is never removed, because agents could otherwise lock
-/// different files.
+/// Locks a file beside the socket. The lock file is never removed, because agents could otherwise
+/// lock different files.
 fn lock(path: &Path) -> Result<File, OpenError> {
     let mut name = path.as_os_str().to_owned();
     name.push(".lock");
@@ -267,9 +268,9 @@ fn lock(path: &Path) -> Result<File, OpenError> {
     }
 }
 
-/// Gives the socket to the group if the agent runs as root and the group exists. Under the service
-/// manager, the agent has that group already. Otherwise the socket stays with the agent's own
-/// group.
+/// Changes the group of the socket to [`GROUP`] if the agent runs as root and the group exists.
+/// Under the service manager, the agent already has that group. Otherwise the socket keeps the
+/// agent's own group.
 fn give_to_group(path: &Path) {
     let groups = fs::read_to_string("/etc/group").unwrap_or_default();
     let group = groups.lines().find_map(|line| {
@@ -319,10 +320,10 @@ mod tests {
     }
 
     #[test]
-    fn a_stale_socket_is_replaced_and_one_in_use_or_another_file_is_not() {
+    fn a_stale_socket_is_replaced_but_not_a_socket_in_use_or_another_file() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("api.sock");
-        // This file is left over, as from an agent that was killed.
+        // The file of the socket stays, as after an agent was killed.
         drop(UnixListener::bind(&path).unwrap());
         let mut server = Server::new(None, Access::Watch).unwrap();
         server.bind_socket(&path).unwrap();

@@ -107,7 +107,7 @@ pub(super) fn sorted<'a>(types: impl Iterator<Item = &'a str>) -> Vec<Cow<'a, st
     types.into_iter().map(Cow::Borrowed).collect()
 }
 
-/// Returns the calls of a service, if any was seen.
+/// Returns the calls of a service, if a call was seen.
 fn facts<'a>(snapshot: &'a Snapshot, domain_id: DomainId, name: &str) -> Option<&'a ServiceFacts> {
     let place = snapshot
         .services
@@ -149,7 +149,7 @@ fn calls(facts: &ServiceFacts) -> Calls {
     }
 }
 
-/// Returns `None` for a service without endpoints.
+/// Returns the API representation of a service, or `None` if the service has no endpoints.
 fn view<'a>(
     domain_id: u32,
     name: &'a str,

@@ -68,8 +68,8 @@ async fn list(State(context): State<Context>) -> Json<SnapshotList> {
 
 /// Write a snapshot to a bag
 ///
-/// The answer follows once the messages in memory are in a bag. They stay in memory, too. The bag is
-/// never removed for others.
+/// The answer follows once the messages in memory are in a bag. The messages also stay in memory.
+/// The bag is never removed to free space for other bags.
 #[utoipa::path(
     post,
     path = "/snapshots/{name}",

@@ -1,4 +1,4 @@
-//! `/topics`: topics with their measurements, and the reasons for missing ones.
+//! `/topics`: topics with their measurements, and the reasons for missing measurements.
 
 use std::borrow::Cow;
 use std::time::Instant;
@@ -141,12 +141,12 @@ pub(super) fn find<'a>(
     only(found, name, missing)
 }
 
-/// A part of a topic that has its own path.
+/// A part of the data about a topic that has its own path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Aspect {
     /// The history.
     History,
-    /// The definition of its type.
+    /// The definition of the topic's type.
     Definition,
     /// The decoded messages.
     Messages,
@@ -160,8 +160,8 @@ impl Aspect {
     ];
 }
 
-/// Returns the topic and the requested part of it. A topic's own name may end like a part; an
-/// existing topic of the whole name takes precedence, unless the name's slashes are encoded.
+/// Returns the topic and the requested part. The name of a topic may end like a part. A topic with
+/// the whole name takes precedence, unless the name's slashes are encoded.
 fn aspect<'a>(context: &Context, uri: &Uri, name: &'a str) -> Option<(&'a str, Aspect)> {
     let (topic, aspect) = Aspect::ALL
         .into_iter()
@@ -180,18 +180,18 @@ fn aspect<'a>(context: &Context, uri: &Uri, name: &'a str) -> Option<(&'a str, A
     (is_sure || !is_another()).then_some((topic, aspect))
 }
 
-/// The path parameter, for the document.
+/// The path parameter, declared for the OpenAPI document.
 #[derive(IntoParams)]
 #[into_params(parameter_in = Path)]
 #[expect(dead_code, reason = "read by the document's generator alone")]
 pub(super) struct TopicParameter {
-    /// ROS name without its leading slash; slashes within need not be encoded.
+    /// ROS name without its leading slash; inner slashes need not be encoded.
     #[param(min_length = 1, example = "camera/front/image_raw")]
     topic: String,
 }
 
-/// Returns whether the name is the topic's ROS name. Topics of services, and topics without a ROS
-/// name, are identified by their DDS names.
+/// Returns whether `name` identifies the topic, by its ROS name or by its DDS name after a slash.
+/// Topics of services, and topics without a ROS name, are identified only by their DDS names.
 fn is_called(topic: &TopicFacts, name: &str) -> bool {
     let is_ros_topic = topic.kind.is_ros_topic();
     is_ros_topic && topic.name == name || name.strip_prefix('/') == Some(topic.dds_name.as_str())

@@ -43,7 +43,7 @@ struct Domain {
 }
 
 impl Domain {
-    /// Fails if the domain id is invalid.
+    /// Returns the domain, or a problem if the domain id is invalid.
     fn checked(self) -> Result<Self, Problem> {
         scope::domain(self.domain_id, Code::MalformedRequest)?;
         Ok(self)
@@ -168,8 +168,8 @@ async fn replace(
 
 /// Remove a watch
 ///
-/// Only watches of clients can be removed; those of the configuration are removed with their entry
-/// there.
+/// Only watches of clients can be removed. Watches of the configuration are removed by changing the
+/// configuration.
 #[utoipa::path(
     delete,
     path = "/watch/{*topic}",
@@ -194,12 +194,12 @@ async fn remove(
     Ok(StatusCode::NO_CONTENT)
 }
 
-/// The path parameter, for the document.
+/// The path parameter, declared for the OpenAPI document.
 #[derive(IntoParams)]
 #[into_params(parameter_in = Path)]
 #[expect(dead_code, reason = "read by the document's generator alone")]
 struct TopicParameter {
-    /// ROS name or glob without its leading slash; slashes within need not be encoded.
+    /// ROS name or glob without its leading slash; inner slashes need not be encoded.
     #[param(
         max_length = 254,
         pattern = r"^(\*\*|\*|(\*?[A-Za-z_]|\*[0-9])(\*?[A-Za-z0-9_])*\*?)(/(\*\*|\*|(\*?[A-Za-z_]|\*[0-9])(\*?[A-Za-z0-9_])*\*?))*$",
@@ -259,7 +259,7 @@ fn answer(
     let done =
         done.map_err(|refused| problem(&refused, &watch.pattern, watch.domain_id.map(|id| id.0)))?;
     let in_force = context.watches.in_force();
-    // Another client has removed the watch already.
+    // Another client may have removed the watch already.
     let entry = in_force
         .find(&watch.pattern, watch.domain_id.map(|id| id.0))
         .cloned();
@@ -268,7 +268,7 @@ fn answer(
         origin: watches::Origin::Api,
     });
     let state = context.latest.state();
-    // A new watch is in no snapshot yet; an entry of that name belongs to an earlier watch.
+    // No snapshot contains the new watch yet. An entry with its name belongs to an earlier watch.
     let snapshot = state
         .snapshot
         .as_deref()
@@ -283,7 +283,7 @@ fn answer(
     })
 }
 
-/// Returns the path of a watch; names and globs contain no characters that a path excludes.
+/// Returns the path of a watch; names and globs contain only characters that a path allows.
 fn location(watch: &Watch) -> String {
     match watch.domain_id {
         None => format!("/watch{}", watch.pattern),

@@ -1,5 +1,5 @@
-//! Problems described in words: place, begin and remedy. The texts contain no rapidly changing
-//! numbers, so the list is sent only after real changes.
+//! Findings in words, each with its topic or node, its start and its remedy. The texts contain no
+//! rapidly changing numbers, so the list is sent only after real changes.
 
 use std::collections::HashMap;
 
@@ -16,7 +16,7 @@ use ros2probe_model::graph::zenoh::Unseen;
 use ros2probe_model::measure::history::Past;
 use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot, TopicFacts, WatchState};
 
-/// Largest number of findings per stream.
+/// Maximum number of findings in a list.
 const MOST: usize = 512;
 
 /// Input of the findings.
@@ -96,7 +96,7 @@ fn of_agent(all: &Circumstances<'_>) -> Vec<Finding> {
     list
 }
 
-/// Returns which connections of Zenoh cannot be read, one finding per reason.
+/// Returns one finding for each reason why Zenoh connections cannot be read.
 fn unseen_zenoh(snapshot: &Snapshot) -> Vec<Finding> {
     let unseen = snapshot.zenoh.iter().flat_map(|zenoh| zenoh.unseen());
     let findings = unseen.map(|(reason, connections)| {
@@ -120,8 +120,8 @@ fn unseen_zenoh(snapshot: &Snapshot) -> Vec<Finding> {
     findings.collect()
 }
 
-/// Returns what the agent cannot observe: one note per reason, and one for all that its source
-/// lacks.
+/// Returns one note for each missing ability with a known reason, and one note for all abilities
+/// that the source lacks.
 fn unseen(agent: &AgentFacts) -> Vec<Finding> {
     let mut list = Vec::new();
     let mut lacking = Vec::new();
@@ -149,7 +149,7 @@ fn unseen(agent: &AgentFacts) -> Vec<Finding> {
     list
 }
 
-/// Returns what an ability shows, in words.
+/// Describes what an ability observes.
 const fn object(ability: Ability) -> &'static str {
     match ability {
         Ability::Subscribers => "what each subscriber receives",
@@ -179,7 +179,7 @@ fn of_graph(all: &Circumstances<'_>) -> Vec<Finding> {
     let snapshot = all.snapshot;
     let ends = Ends::new(snapshot);
     let list = snapshot.diagnoses.list.iter();
-    // The times are omitted if the lists do not match.
+    // A finding has no time if the list of times is shorter.
     let times = snapshot
         .diagnosed
         .iter()
@@ -377,8 +377,8 @@ fn lacks(reason: &str, counterpart: &str) -> String {
     }
 }
 
-/// Returns the severity: an endpoint without any counterpart is common, one with only incompatible
-/// counterparts is not.
+/// Returns the severity. An endpoint without any counterpart is common, but an endpoint with only
+/// incompatible counterparts is not.
 fn alone(reason: &str) -> Severity {
     match reason {
         "qos" | "type" | "partition" => Severity::Warning,
@@ -419,7 +419,7 @@ fn of_watches(all: &Circumstances<'_>) -> Vec<Finding> {
     list
 }
 
-/// Returns topics that lost messages recently, with the cause.
+/// Returns a finding with the cause for each topic that lost messages recently.
 fn losses(all: &Circumstances<'_>) -> Vec<Finding> {
     let lost = lost_lately(all.past);
     let topics = all.snapshot.topics.iter();
@@ -475,8 +475,8 @@ fn died(topic: &TopicFacts) -> (&'static str, &'static str) {
     }
 }
 
-/// Returns when a loss began that has continued, with pauses shorter than [`LOSS`]; `None` without
-/// a recent loss.
+/// Returns when the current loss began. Pauses of up to [`LOSS`] seconds do not end a loss. Returns
+/// `None` without a recent loss.
 fn began(past: &Past, topic: u32) -> Option<f64> {
     let mut began = None;
     let mut pause = 0;
@@ -562,7 +562,7 @@ mod tests {
     use ros2probe_model::graph::zenoh::ZenohFacts;
 
     #[test]
-    fn the_worst_findings_are_sent_if_they_exceed_the_cap() {
+    fn findings_beyond_the_cap_are_dropped_and_the_most_severe_stay() {
         let list = (0..2 * MOST).map(|number| Diagnosis::DuplicateNode {
             domain_id: DomainId(0),
             node: format!("/node_{number}").into(),
@@ -592,7 +592,7 @@ mod tests {
     }
 
     #[test]
-    fn each_reason_for_unread_connections_of_zenoh_is_in_words() {
+    fn each_reason_for_unread_zenoh_connections_is_described() {
         let found = |unseen| {
             let snapshot = Snapshot {
                 zenoh: Some(ZenohFacts {
@@ -629,7 +629,7 @@ mod tests {
                  memory; rates and sizes are right",
             ]
         );
-        // A count inside the processes has no payloads either.
+        // Counting inside the processes does not provide payloads either.
         let remedies = two.iter().map(|each| each.remedy.is_some());
         assert_eq!(remedies.collect::<Vec<_>>(), [true, false]);
     }

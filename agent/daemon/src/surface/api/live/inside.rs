@@ -1,4 +1,4 @@
-//! Problems that only calls inside processes show, in words.
+//! Descriptions of problems that only calls inside processes show.
 
 use std::time::Duration;
 

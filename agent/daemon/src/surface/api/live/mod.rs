@@ -1,8 +1,8 @@
 //! `GET /live`: the data of the web page, first the whole state, then the changes of each second.
 //!
-//! A slow client delays no other. Each stream stores the last state that it has sent, and sends the
-//! changes since then when the client reads further. States in between are skipped. Without an open
-//! stream, no work is done.
+//! A slow client does not delay others. Each stream stores the last state that it has sent, and
+//! sends the changes since then when the client reads further. States in between are skipped.
+//! Without an open stream, no work is done.
 
 mod findings;
 mod inside;
@@ -36,17 +36,17 @@ use ros2probe_api::live::{End, Events, Line, Open, Replay};
 use ros2probe_model::report::snapshot::Transport;
 use shared_lines::SharedLines;
 
-/// Largest number of streams of all listeners: fewer than connections, so that other requests still
-/// get one.
+/// Maximum number of streams of all listeners. The maximum is lower than that of connections, so
+/// that other requests still get a connection.
 const MAX_TABS: usize = 16;
 /// Time between two batches; the agent publishes its state once per second.
 const INTERVAL: Duration = Duration::from_secs(1);
-/// The stream begins to wait for the next state this much earlier.
+/// The stream begins to wait for the next state this long before it is due.
 const EARLY: Duration = Duration::from_millis(100);
-/// Largest number of events in one batch.
+/// Maximum number of events in one batch.
 const EVENTS: usize = 64;
 
-/// State that all streams share; it exists only while a stream is open.
+/// State that all streams share. The shared lines exist only while a stream is open.
 #[derive(Debug)]
 pub struct Live {
     /// Time for which measurements are kept.
@@ -59,7 +59,7 @@ pub struct Live {
 struct Stream {
     context: Context,
     access: String,
-    /// The round of the last state that was sent; `None` before the first.
+    /// The round of the last state that was sent; `None` before the first state.
     seen: Option<u64>,
     sent: Instant,
     /// Number of the last event that was processed.
@@ -69,7 +69,7 @@ struct Stream {
 }
 
 impl Live {
-    /// Creates the state of an agent that keeps measurements for this time.
+    /// Creates the state of an agent that keeps measurements for the time `history`.
     #[must_use]
     pub fn new(history: Duration) -> Self {
         Self {
@@ -91,9 +91,9 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 /// The robot's state and its changes
 ///
 /// Each line is a JSON object with one member. The stream begins with `open`, `graph`, `agent`,
-/// `findings`, `history` and `values` with every row. Then each second has the lines that changed,
-/// and always `values` with the rows that changed. A client that reads slowly gets fewer batches,
-/// each complete. Numbers of topics, nodes and participants are valid within one stream.
+/// `findings`, `history` and `values` with every row. Then each second, the stream sends the lines
+/// that changed, and always `values` with the changed rows. A client that reads slowly gets fewer
+/// batches, each complete. Numbers of topics, nodes and participants are valid within one stream.
 #[utoipa::path(
     get,
     path = "/live",
@@ -154,7 +154,7 @@ impl Pieces for Stream {
 }
 
 impl Stream {
-    /// Waits for the next state to show; returns false if there is no further one.
+    /// Waits for the next state. Returns `false` if the agent stops.
     async fn moment(&self) -> bool {
         let latest = &self.context.latest;
         let next = async {

@@ -38,7 +38,7 @@ pub(super) struct SharedLines {
     progress: Option<Progress>,
 }
 
-/// Lines that are sent again after each change.
+/// A line that is sent again after each change.
 #[derive(Debug, Default)]
 struct Part {
     changed: u64,

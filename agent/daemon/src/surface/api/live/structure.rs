@@ -1,4 +1,4 @@
-//! The graph of the stream: it changes seldom, and rows of values refer to it.
+//! The graph of the stream. It changes rarely, and the rows of values refer to its numbers.
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap, HashSet};
@@ -183,7 +183,7 @@ pub(super) fn is_measured<'a>(topic: &'a TopicFacts, index: &Index<'a>) -> bool 
     topic.is_read || !index.watches(topic).is_empty()
 }
 
-/// Returns the origins of its watches, in the form of [`Topic`].
+/// Returns the origins of the topic's watches, encoded as in [`Topic`].
 fn watched<'a>(topic: &'a TopicFacts, index: &Index<'a>, in_force: &InForce) -> u8 {
     let (mut own, mut glob) = (0, 0);
     for (watch, _) in index.watches(topic) {
@@ -206,7 +206,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_are_never_used_again() {
+    fn a_forgotten_number_is_never_used_again() {
         let mut numbers = Numbers::default();
         assert_eq!((numbers.number("a", 1), numbers.number("b", 1)), (1, 2));
         assert_eq!(numbers.number("a", 2), 1);

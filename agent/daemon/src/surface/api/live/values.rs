@@ -17,7 +17,7 @@ const STEPS: usize = 60;
 /// Time for which a loss is flagged, in seconds.
 pub(super) const LOSS: usize = 60;
 
-/// Meaning of a topic's flags, from the lowest bit on.
+/// Meaning of a topic's flags, starting with the lowest bit.
 pub(super) const FLAGS: [&str; 12] = [
     "qos",
     "type",
@@ -63,7 +63,7 @@ pub(super) struct Figures<'a> {
 }
 
 impl Figures<'_> {
-    /// Returns the row of every topic that has one.
+    /// Returns the row of every topic that has a rate or a flag.
     pub(super) fn rows(&self, ids: &Ids) -> BTreeMap<u32, Row> {
         let last = self.past.seconds().last();
         let topics = self.snapshot.topics.iter().filter(|topic| is_shown(topic));

@@ -1,8 +1,8 @@
 //! `GET /topics/{topic}/messages`: decoded messages of a topic, a few per second.
 //!
-//! Messages are taken as they arrive and the newest one is shown; the topic is measured while the
-//! stream is open. Blocking threads read definitions and decode payloads, so neither the capture
-//! nor other answers wait.
+//! The stream takes messages as they arrive and shows the newest one. The topic is measured while
+//! the stream is open. Blocking threads read definitions and decode payloads, so neither the
+//! capture nor other answers wait.
 
 mod tree;
 
@@ -37,15 +37,16 @@ use ros2probe_wire::DomainId;
 use ros2probe_wire::discovery::TypeHash;
 use tree::{ELEMENTS, Tree};
 
-/// Slots for streams of all listeners; each makes the agent capture all payloads of its topic.
+/// Slots for streams of all listeners. Each stream makes the agent capture all payloads of its
+/// topic.
 static STREAMS: Semaphore = Semaphore::const_new(MAX_READERS);
 const MAX_READERS: usize = 8;
-/// Default and largest rate of shown messages, in hertz.
+/// Default and maximum rate of shown messages, in hertz.
 const MOST_HERTZ: f64 = 5.0;
 const LEAST_HERTZ: f64 = 0.1;
-/// Bytes of messages that may wait while one is shown.
+/// Maximum size of messages that wait while one is shown, in bytes.
 const QUEUE_BYTES: usize = 16 << 20;
-/// Longest silence of a stream.
+/// Maximum time without a line.
 const BEAT: Duration = Duration::from_secs(1);
 
 #[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
@@ -55,12 +56,12 @@ pub(super) struct Wanted {
     /// Domain id; required only if the name exists in several domains.
     #[param(minimum = 0, maximum = 232)]
     domain_id: Option<u32>,
-    /// Largest number of messages shown per second; by default 5.
+    /// Maximum number of messages shown per second; by default 5.
     #[param(minimum = 0.1, maximum = 5)]
     max_hertz: Option<f64>,
 }
 
-/// A decoded message, as JSON text.
+/// A decoded message as JSON text.
 #[derive(Debug, Serialize, ToSchema)]
 #[serde(transparent)]
 #[schema(value_type = Object)]
@@ -74,7 +75,7 @@ struct Stream {
     context: Context,
     subscription: Subscription,
     pause: Duration,
-    /// When the last message was shown, and when anything was sent.
+    /// When the last message was shown, and when the last line was sent.
     shown: Option<Instant>,
     written: Instant,
     newest: Option<Arc<Sample>>,
@@ -97,8 +98,8 @@ struct Known {
 
 /// The definition of a topic's type
 ///
-/// The definition that the agent finds: discovery announces a name and a hash, and the definition
-/// matches both. For the form of the path, see `/topics/{topic}/history`.
+/// Discovery announces the name and the hash of a type. The definition matches both. For the form
+/// of the path, see `/topics/{topic}/history`.
 #[utoipa::path(
     get,
     path = "/topics/{topic}/definition",
@@ -276,7 +277,7 @@ impl Stream {
         );
     }
 
-    /// Appends the newest message, or a sign that the stream is alive.
+    /// Appends the newest message, or a keep-alive.
     async fn show(&mut self, lines: &mut Vec<u8>) {
         if let Some(missed) = self.missed.take() {
             write_line(lines, &Line::Missed(missed));
@@ -412,7 +413,7 @@ mod tests {
     use ros2probe_model::facts::dispatch::{Dispatch, SampleOutcome, Topic};
 
     #[test]
-    fn messages_that_wait_beyond_the_bytes_go_and_are_counted() {
+    fn messages_beyond_the_size_of_the_queue_are_dropped_and_counted() {
         const MESSAGES: u64 = 40;
         let latest = Arc::new(SnapshotCell::new(SourceKind::Wire));
         let caps = Caps {

@@ -1,5 +1,5 @@
-//! Decoded messages as JSON for a browser: fields in the order of the definition, truncated arrays
-//! and strings. Numbers that JavaScript would round become strings.
+//! Decoded messages as JSON for a browser, with fields in the order of the definition and truncated
+//! arrays and strings. Numbers that JavaScript would round become strings.
 
 use std::cell::Cell;
 
@@ -8,13 +8,13 @@ use serde::{Serialize, Serializer};
 
 use ros2probe_message::{Array, Items, Message, Scalar, Value};
 
-/// Largest number of array elements shown.
+/// Maximum number of array elements shown.
 pub(super) const ELEMENTS: usize = 64;
-/// Largest number of characters shown of a string.
+/// Maximum number of characters shown of a string.
 const CHARACTERS: usize = 1024;
-/// Largest number of values shown of a message; 16 characters of a string count as one.
+/// Maximum number of values shown of a message; 16 characters of a string count as one.
 const VALUES: usize = 20_000;
-/// Largest integer up to which a double represents all integers.
+/// A double represents all integers up to this value exactly.
 const EXACT: u64 = 1 << 53;
 
 /// A message to serialize.
@@ -41,7 +41,7 @@ impl Serialize for Tree<'_> {
     }
 }
 
-/// Takes this many values from the remaining number; returns whether enough were left.
+/// Subtracts `values` from the remaining number. Returns whether enough values were left.
 fn draw(left: &Cell<usize>, values: usize) -> bool {
     let rest = left.get().checked_sub(values);
     left.set(rest.unwrap_or(0));
@@ -171,7 +171,7 @@ mod tests {
 
     use super::*;
 
-    /// Returns a message of this definition as JSON.
+    /// Returns a message with this definition and body as JSON.
     fn shown(definition: &str, body: &[u8]) -> String {
         let name = "a/msg/B".parse().unwrap();
         let message_type = MessageType::parse(&name, definition).unwrap();
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_a_browser_would_round_are_text() {
+    fn numbers_that_a_browser_would_round_become_strings() {
         let body = [
             &i64::MAX.to_le_bytes()[..],
             &7_i64.to_le_bytes(),
@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn long_arrays_and_texts_are_cut_and_show_their_length() {
+    fn long_arrays_and_strings_are_truncated_and_show_their_length() {
         let mut body = 1000_u32.to_le_bytes().to_vec();
         body.extend((0..1000_u32).map(|number| number as u8));
         body.extend(2001_u32.to_le_bytes());
@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn arrays_of_arrays_have_one_room_together() {
+    fn nested_arrays_share_one_limit_of_values() {
         // 64 messages of 64 messages of 64 numbers would be a quarter of a million values.
         let line = "=".repeat(80);
         let definition = format!("C[] c\n{line}\nMSG: a/C\nD[] d\n{line}\nMSG: a/D\nint32[] e");

@@ -1,8 +1,9 @@
-//! The web page at `/` beside the API: files built into the program, and tokens that grant a page
-//! more rights than its listener does.
+//! The web page at `/`: files built into the program, and tokens that grant a page more rights than
+//! its listener does.
 //!
-//! The files contain no data of the robot and need no token. Their policy restricts loading and
-//! requests to this listener. Pages of other origins cannot embed or load them.
+//! The files contain no data of the robot and need no token. Their content security policy
+//! restricts loading and requests to this listener. Pages of other origins cannot embed or load
+//! them.
 
 mod tokens;
 
@@ -48,7 +49,7 @@ const HEADERS: [(HeaderName, &str); 7] = [
         HeaderName::from_static("cross-origin-resource-policy"),
         "same-origin",
     ),
-    // Browsers revalidate, so an upgrade of the agent takes effect at once.
+    // Browsers revalidate, so an upgrade of the agent takes effect immediately.
     (CACHE_CONTROL, "no-cache"),
     (VARY, "accept-encoding"),
 ];
@@ -58,7 +59,7 @@ const TAG: usize = 16;
 /// State of the web page, shared by listeners and routes.
 #[derive(Debug, Default)]
 pub struct Page {
-    /// Addresses that serve it.
+    /// Addresses that serve the page.
     addresses: Vec<SocketAddr>,
     pub(super) tokens: Tokens,
 }
@@ -85,7 +86,7 @@ struct Forms {
 }
 
 impl Page {
-    /// Creates the state of a page served at these addresses.
+    /// Creates the state of a page that is served at `addresses`.
     #[must_use]
     pub fn new(addresses: Vec<SocketAddr>) -> Self {
         Self {
@@ -210,8 +211,8 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 
 /// Create a token for the page
 ///
-/// The token grants the rights of the unix socket: payloads, recordings, downloads. `rp page`
-/// requests one.
+/// The token grants the rights of the unix socket, such as payloads, recordings and downloads. `rp
+/// page` requests one.
 #[utoipa::path(
     post,
     path = "/page/token",
@@ -237,7 +238,7 @@ mod tests {
 
     use super::*;
 
-    /// Largest total size of the compressed files in bytes.
+    /// Maximum total size of the compressed files, in bytes.
     const BUDGET: usize = 126_000;
 
     fn headers(pairs: &[(&HeaderName, &str)]) -> HeaderMap {
@@ -247,7 +248,7 @@ mod tests {
             .collect()
     }
 
-    /// Collects the served files of a folder.
+    /// Collects the files of a folder that should be served.
     fn listed(folder: &std::path::Path, prefix: &str, into: &mut BTreeSet<String>) {
         for entry in fs::read_dir(folder).unwrap() {
             let entry = entry.unwrap();
@@ -308,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn the_page_is_small() {
+    fn the_compressed_page_stays_within_its_size_budget() {
         let sizes = FILES
             .iter()
             .map(|served| match served.forms().packed.len() {
@@ -357,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn the_address_is_one_that_the_listener_answers_to() {
+    fn the_page_address_is_that_of_a_loopback_listener_if_one_exists() {
         let page = |addresses: &[&str]| {
             let addresses = addresses.iter().map(|address| address.parse().unwrap());
             Page::new(addresses.collect()).address()

@@ -25,7 +25,7 @@ impl Tokens {
     pub(in super::super) fn mint(&self) -> io::Result<String> {
         let mut bytes = [0; BYTES];
         let flags = rustix::rand::GetRandomFlags::empty();
-        // Up to 256 bytes are returned at once (getrandom(2)).
+        // A call returns up to 256 bytes without interruption (getrandom(2)).
         let given = rustix::rand::getrandom(&mut bytes, flags)?;
         if given != BYTES {
             return Err(io::ErrorKind::UnexpectedEof.into());
@@ -40,8 +40,8 @@ impl Tokens {
         Ok(token)
     }
 
-    /// Returns whether the token is valid. The time is equal for all wrong tokens of the right
-    /// length.
+    /// Returns whether the token is valid. The check takes the same time for all wrong tokens of
+    /// the right length.
     pub(in super::super) fn know(&self, offered: &[u8]) -> bool {
         let tokens = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         tokens.iter().fold(false, |known, token| {
@@ -61,7 +61,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_latest_tokens_are_valid_and_no_two_are_alike() {
+    fn a_token_beyond_the_cap_replaces_the_oldest_token() {
         let tokens = Tokens::default();
         assert!(!tokens.know(b""));
         let given: Vec<_> = (0..=PageTokens::CAP)

@@ -18,19 +18,19 @@ fn headers(pairs: &[(&str, &str)]) -> HeaderMap {
     pairs.iter().map(pair).collect()
 }
 
-/// Returns the code of the refusal.
+/// Returns the code of the refusal, if the request is refused.
 fn refusal(door: &Door, pairs: &[(&str, &str)]) -> Option<Code> {
     let answer = door.let_in(&headers(pairs), Instant::now());
     answer.err().map(|problem| problem.code())
 }
 
-/// Returns a door that grants all rights.
+/// Returns access rules that grant all rights.
 fn door(kind: Kind) -> Door {
     Door::new(kind, Granted::new(Access::All, None))
 }
 
 #[test]
-fn loopback_answers_to_its_own_names_only() {
+fn a_loopback_listener_refuses_requests_for_foreign_hosts() {
     let door = door(Kind::Loopback(None));
     for host in ["localhost", "127.0.0.1:17401", "[::1]:9000"] {
         assert_eq!(refusal(&door, &[("host", host)]), None, "{host}");
@@ -45,7 +45,7 @@ fn loopback_answers_to_its_own_names_only() {
 }
 
 #[test]
-fn each_of_several_origins_must_be_the_agents() {
+fn a_request_with_a_foreign_origin_among_several_is_refused() {
     let door = door(Kind::Loopback(None));
     let own = ("origin", "http://localhost");
     for second in [
@@ -61,7 +61,7 @@ fn each_of_several_origins_must_be_the_agents() {
 }
 
 #[test]
-fn requests_without_the_token_take_nothing_from_those_with_it() {
+fn refused_requests_do_not_use_up_the_rate_of_admitted_clients() {
     let now = Instant::now();
     let right = headers(&[("authorization", "Bearer 0123456789abcdef")]);
     let foreign = headers(&[
@@ -88,7 +88,7 @@ fn requests_without_the_token_take_nothing_from_those_with_it() {
 }
 
 #[test]
-fn clients_of_loopback_take_nothing_from_those_with_a_token_of_the_page() {
+fn clients_without_a_token_do_not_use_up_the_rate_of_page_tokens() {
     let now = Instant::now();
     let page = page::Shared::default();
     let token = page.tokens.mint().unwrap();
@@ -107,7 +107,7 @@ fn clients_of_loopback_take_nothing_from_those_with_a_token_of_the_page() {
 }
 
 #[test]
-fn loopback_grants_what_is_configured_and_socket_and_token_everything() {
+fn loopback_grants_the_configured_rights_and_socket_and_token_grant_all() {
     for loopback in [Access::Read, Access::Watch, Access::All] {
         assert_eq!(Kind::Loopback(None).access(loopback), loopback);
         for kind in [
@@ -129,7 +129,7 @@ fn loopback_grants_what_is_configured_and_socket_and_token_everything() {
 }
 
 #[test]
-fn web_pages_from_elsewhere_are_not_answered() {
+fn requests_from_web_pages_of_other_origins_are_refused() {
     for door in [door(Kind::Loopback(None)), door(Kind::Network(token()))] {
         let host = ("host", "localhost:17401");
         let bearer = ("authorization", "Bearer 0123456789abcdef");
@@ -155,7 +155,7 @@ fn web_pages_from_elsewhere_are_not_answered() {
 }
 
 #[test]
-fn the_network_needs_the_token_and_the_socket_nothing() {
+fn a_configured_token_is_required_except_on_the_unix_socket() {
     for door in [
         door(Kind::Network(token())),
         door(Kind::Loopback(Some(token()))),
@@ -196,7 +196,7 @@ fn a_long_body_is_refused_before_it_is_read() {
 }
 
 #[test]
-fn a_flood_is_slowed_down_and_forgiven() {
+fn a_flood_exceeds_the_rate_limit_until_the_bucket_refills() {
     let start = Instant::now();
     let mut bucket = Bucket {
         left: BURST,
@@ -217,7 +217,7 @@ fn a_flood_is_slowed_down_and_forgiven() {
 }
 
 #[test]
-fn a_token_that_could_be_guessed_is_none() {
+fn a_token_that_could_be_guessed_is_rejected() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("token");
     let load = |text: &[u8]| {
