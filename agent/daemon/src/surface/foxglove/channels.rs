@@ -1,5 +1,6 @@
 //! Channels of the viewers: one for the messages of each topic and type, one for the statistics of
-//! each measured topic. They follow the snapshots once a second while a viewer is connected.
+//! each measured topic. They are updated from the snapshots once a second while a viewer is
+//! connected.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -18,7 +19,7 @@ use super::statistics;
 use crate::subscriptions::{Topic, TopicKey};
 use crate::tables::ViewerChannels;
 
-/// Largest total size of definitions in bytes; channels beyond it have no schema.
+/// Maximum total size of definitions, in bytes. Channels beyond it have no schema.
 const SCHEMA_BYTES: usize = 2 << 20;
 
 /// Channels by id.
@@ -35,7 +36,7 @@ pub(super) enum Content {
         dds_name: DdsName,
         message_type: TypeName,
     },
-    /// Figures of a topic.
+    /// Statistics of a topic.
     Statistics {
         domain_id: DomainId,
         dds_name: DdsName,
@@ -52,7 +53,7 @@ impl Content {
         }
     }
 
-    /// Returns the topic whose messages the channel shows. `None` for figures.
+    /// Returns the topic whose messages the channel shows, or `None` for statistics.
     pub(super) fn messages_of(&self) -> Option<TopicKey> {
         match self {
             Self::Messages {
@@ -65,7 +66,7 @@ impl Content {
     }
 }
 
-/// A channel. It never changes; another definition is another channel.
+/// A channel, which never changes. Another type of the same topic has another channel.
 #[derive(Debug)]
 pub(super) struct Channel {
     id: u32,
@@ -85,17 +86,17 @@ struct Schema {
 #[derive(Debug)]
 pub(super) struct Table {
     pub(super) channels: Arc<Channels>,
-    /// Present while a viewer shows it.
+    /// The graph, while a viewer shows it.
     pub(super) graph: Option<Arc<Graph>>,
 }
 
-/// Follows the snapshots.
+/// Updates the channels and the graph from the snapshots.
 #[derive(Debug)]
 pub(super) struct Registry {
     library: Arc<Library>,
     channels: Arc<Channels>,
     ids: Bounded<ViewerChannels, BTreeMap<Content, u32>>,
-    /// Number of channels so far; no id is used twice.
+    /// Number of channels so far, which is the last id. No id is used twice.
     count: u32,
     names: DomainNames,
     schemas: Schemas,
@@ -104,7 +105,7 @@ pub(super) struct Registry {
 /// Type and announced hash.
 type Definition = (TypeName, Option<String>);
 
-/// Definitions of the channels' types; `None` if none was found.
+/// Definitions of the channels' types; `None` if no definition was found.
 #[derive(Debug)]
 struct Schemas {
     known: BTreeMap<Definition, Option<Schema>>,
@@ -113,7 +114,7 @@ struct Schemas {
 }
 
 impl Channel {
-    /// Returns the id.
+    /// Returns the id of the channel.
     pub(super) const fn id(&self) -> u32 {
         self.id
     }
@@ -123,7 +124,7 @@ impl Channel {
         &self.topic
     }
 
-    /// Returns the form of an `advertise` message.
+    /// Returns the channel as an `advertise` message describes it.
     pub(super) fn advertised(&self) -> Advertised<'_> {
         let (encoding, schema_name) = match &self.content {
             Content::Messages { message_type, .. } => ("cdr", message_type.as_str()),
@@ -139,7 +140,7 @@ impl Channel {
         }
     }
 
-    /// Returns its size in an `advertise` message, approximately.
+    /// Returns the approximate size of the channel in an `advertise` message, in bytes.
     pub(super) fn size(&self) -> usize {
         let schema = self.schema.as_ref().map_or(0, |schema| schema.text.len());
         256 + self.topic.len() + schema
@@ -166,7 +167,7 @@ impl Registry {
         self.schemas.forget_unused();
     }
 
-    /// Follows a snapshot.
+    /// Updates the channels to a snapshot. Returns them, with the graph if `with_graph`.
     pub(super) async fn update(&mut self, snapshot: &Snapshot, with_graph: bool) -> Table {
         self.names.update(snapshot);
         let wanted = wanted(snapshot);
@@ -208,13 +209,13 @@ impl Registry {
             });
             found.collect::<Vec<_>>()
         });
-        // Without threads, these channels have no schema.
+        // If no thread can be started, the new channels have no schema.
         for (definition, schema) in found.await.unwrap_or_default() {
             self.schemas.keep(definition, schema);
         }
     }
 
-    /// Replaces the channels. Those that stay keep their ids.
+    /// Replaces the channels. Channels that stay keep their ids.
     fn change(&mut self, wanted: &Wanted<'_>) {
         let mut channels = Channels::default();
         let mut ids = Bounded::<_, BTreeMap<_, _>>::default();
@@ -267,7 +268,7 @@ impl Schemas {
         }
     }
 
-    /// Keeps a definition if it fits.
+    /// Keeps a definition if it does not exceed the limit.
     fn keep(&mut self, definition: Definition, schema: Option<Schema>) {
         let size = |schema: &Schema| schema.text.len();
         let schema = schema.filter(|schema| self.bytes + size(schema) <= self.limit);
@@ -286,7 +287,8 @@ impl Schemas {
     }
 }
 
-/// Returns the channels for a snapshot: first those of messages, then those of statistics.
+/// Returns the channels for a snapshot: first the channels of messages, then the channels of
+/// statistics.
 fn wanted(snapshot: &Snapshot) -> Wanted<'_> {
     let topics = snapshot.topics.iter();
     let topics =
@@ -313,7 +315,8 @@ fn wanted(snapshot: &Snapshot) -> Wanted<'_> {
     messages.chain(statistics).collect()
 }
 
-/// Returns type and hash of a channel's messages, as the first endpoint of that type announces it.
+/// Returns the type and the hash of a channel's messages, as the first endpoint of that type
+/// announces them.
 fn definition(content: &Content, topic: &TopicFacts) -> Option<Definition> {
     let Content::Messages { message_type, .. } = content else {
         return None;
@@ -329,7 +332,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn definitions_beyond_the_bytes_are_left_out_until_others_are_unused() {
+    fn definitions_beyond_the_size_limit_are_left_out_until_others_are_unused() {
         let mut schemas = Schemas::new(10);
         let definition = |name: &str| (TypeName::from(name), None);
         let schema = |size: usize| {

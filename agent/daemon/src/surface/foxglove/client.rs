@@ -1,8 +1,9 @@
 //! One viewer: its channels, its subscriptions and its messages.
 //!
-//! One task reads and writes, so a viewer that does not read is not read either, and nothing piles
-//! up for it. Its messages wait in the queue of one [`Subscription`], which drops the oldest of the
-//! topic with most bytes. A message is sent in fragments, so each viewer needs memory for two.
+//! One task reads and writes. It does not read from a viewer that does not read, so no data
+//! accumulates for that viewer. The messages of a viewer wait in the queue of one [`Subscription`].
+//! A full queue drops the oldest message of the topic with the most bytes. A message is sent in
+//! fragments, so each viewer needs memory for two fragments.
 
 mod sending;
 
@@ -33,30 +34,30 @@ use crate::subscriptions::{Depth, Item, Overflow, Selection, Subscription, Topic
 use crate::tables::{ViewerLosses, ViewerSubscriptions};
 use ros2probe_model::facts::bounded::Bounded;
 
-/// Largest message of a client, in bytes.
+/// Maximum size of a message from a client, in bytes.
 const MAX_MESSAGE: usize = 256 << 10;
 /// Capacity of a client's queue in bytes; `limits.payload_bytes` bounds all queues together.
 const QUEUE_BYTES: usize = 16 << 20;
 /// Size of a fragment of a message to a client, and of an `advertise` message, in bytes.
 const FRAGMENT: usize = 64 << 10;
-/// Messages that are sent before the client is read again.
+/// Maximum number of messages sent before the agent reads from the client again.
 const BATCH: usize = 64;
-/// Interval of statuses, and number of them between two pings.
+/// Interval of statuses, and number of intervals between two pings.
 const TICK: Duration = Duration::from_secs(1);
 const PING_TICKS: u32 = 20;
-/// Pings without an answer after which a client is gone.
+/// Number of unanswered pings after which a client counts as gone.
 const MAX_UNANSWERED: u32 = 3;
-/// Seconds without a further loss after which the status of losses is removed.
+/// Seconds without a loss after which the status of losses is removed.
 const QUIET_TICKS: u32 = 10;
-/// Topics that the status of losses names.
+/// Maximum number of topics that a status names.
 const NAMED: usize = 3;
 
-/// Silence of a topic after which a missing subscriber is named.
+/// Silence of a topic after which a status reports the missing subscriber.
 const SILENT: Duration = Duration::from_secs(5);
 /// Id of the status that names topics without a subscriber.
 const NO_SUBSCRIBER: &str = "no_subscriber";
 
-/// Longest time until a client reads why it is closed.
+/// Maximum time for a client to read why its connection is closed.
 const FAREWELL: Duration = Duration::from_secs(1);
 
 /// Losses that a status reports to the client.
@@ -88,7 +89,7 @@ pub(super) struct Client<S> {
     messages: Option<Subscription>,
     graph: Option<Arc<Graph>>,
     losses: [Losses; LOSSES.len()],
-    /// The status about topics without a subscriber; empty without one.
+    /// The last status about topics without a subscriber; empty without such topics.
     unsubscribed: String,
     unanswered: u32,
 }
@@ -98,14 +99,14 @@ struct Subscribed {
     channel: Arc<Channel>,
     previous: Previous,
     since: Instant,
-    /// Whether a message was sent for it.
+    /// Whether a message of the subscription was sent.
     is_heard: bool,
 }
 
-/// Lost messages of one reason, since its status was last removed.
+/// Messages lost for one reason, since the status of that reason was last removed.
 #[derive(Default)]
 struct Losses {
-    /// By the name that the client knows.
+    /// Number of lost messages of each topic, by the name that the client knows.
     topics: Bounded<ViewerLosses, BTreeMap<String, u64>>,
     messages: u64,
     is_changed: bool,
@@ -116,7 +117,7 @@ struct Losses {
 enum End {
     /// The client is gone.
     Gone,
-    /// The server closes it.
+    /// The server closes the connection.
     Closed(CloseCode, &'static str),
 }
 
@@ -174,7 +175,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         };
         if let Err(End::Closed(code, reason)) = end {
             tracing::debug!(%code, reason, "closed a viewer");
-            // Ends the interest in its topics first.
+            // Dropping the subscription ends the interest in its topics first.
             self.messages = None;
             let _ = timeout(FAREWELL, self.say_farewell(code, reason)).await;
         }
@@ -218,7 +219,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         }
     }
 
-    /// Sends the facts about the server.
+    /// Sends the description of the server.
     async fn introduce(&mut self) -> Result<(), End> {
         let shared = Arc::clone(&self.shared);
         let capabilities: &[_] = match shared.is_replay {
@@ -246,7 +247,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         let text = match incoming {
             Incoming::Text(text) => text,
             Incoming::Binary(_) => return self.unsupported("binary messages").await,
-            // A close is answered by the next read, which then ends.
+            // The next read answers a close frame, and then ends.
             Incoming::Ping(_) | Incoming::Pong(_) | Incoming::Close(_) | Incoming::Frame(_) => {
                 return Ok(());
             }
@@ -350,7 +351,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         Ok(())
     }
 
-    /// Requests the messages of all subscribed topics, and the retained ones of those in `fresh`.
+    /// Requests the messages of all subscribed topics, and the retained messages of the topics in
+    /// `fresh`.
     async fn select(&mut self, fresh: BTreeSet<TopicKey>) -> Result<(), End> {
         let topics: BTreeSet<_> = self.ids.keys().filter_map(Content::messages_of).collect();
         if topics.is_empty() {
@@ -366,7 +368,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
             .subscriptions
             .open(crate::subscriptions::Request {
                 topics: Selection::of_topics(topics),
-                // Each topic has its own.
+                // Each topic has its own domain.
                 domain_id: None,
                 depth: Depth::Payloads,
                 queue_bytes: QUEUE_BYTES,
@@ -388,7 +390,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         Ok(())
     }
 
-    /// Shows the new channels, graph and statistics.
+    /// Sends the changes of the channels and the graph, and the statistics.
     async fn show(&mut self) -> Result<(), End> {
         let table = self.tables.borrow_and_update().clone();
         let Some(table) = table else {
@@ -442,7 +444,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         Ok(())
     }
 
-    /// Sends the figures of the subscribed topics.
+    /// Sends the statistics of the subscribed topics.
     async fn show_statistics(&mut self) -> Result<(), End> {
         let is_statistics = |content: &Content| matches!(content, Content::Statistics { .. });
         if !self.ids.keys().any(is_statistics) {
@@ -468,7 +470,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         Ok(())
     }
 
-    /// Passes an item of the subscription on.
+    /// Sends an item of the subscription to the client, or counts its losses.
     async fn pass(&mut self, item: Option<Item>) -> Result<(), End> {
         match item {
             Some(Item::Sample(sample)) => self.pass_sample(&sample).await,
@@ -507,8 +509,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         }
     }
 
-    /// Counts a loss, unless no channel of the client has lost the messages: another type of the
-    /// topic has a channel of its own.
+    /// Counts a loss if a channel of the client has lost the messages. Another type of the topic
+    /// has a channel of its own.
     fn count(&mut self, missed: &Missed) {
         let id = self.ids.get(&Content::of(&missed.topic));
         let Some(subscribed) = id.and_then(|id| self.subscribed.get(id)) else {
@@ -524,7 +526,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         }
     }
 
-    /// Reports new losses, and removes the status of old ones.
+    /// Reports new losses, and removes the status of old losses.
     async fn report_losses(&mut self) -> Result<(), End> {
         for (place, (_, id, what)) in LOSSES.iter().enumerate() {
             let Some(losses) = self.losses.get_mut(place) else {
@@ -548,7 +550,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         Ok(())
     }
 
-    /// Reports topics that stay silent because no subscriber exists: the agent does not subscribe.
+    /// Reports topics that stay silent because they have no subscriber. The agent does not
+    /// subscribe.
     async fn report_unsubscribed(&mut self) -> Result<(), End> {
         let message = self.unsubscribed_now();
         if message == self.unsubscribed {
@@ -623,7 +626,7 @@ impl Losses {
         }
     }
 
-    /// Returns a sentence with the topics that lost most.
+    /// Returns a sentence with the topics that lost the most messages.
     fn text(&self, what: &str) -> String {
         let mut topics: Vec<_> = self.topics.iter().collect();
         topics.sort_by_key(|(_, messages)| std::cmp::Reverse(**messages));
@@ -636,7 +639,7 @@ impl Losses {
     }
 }
 
-/// Waits for the next item; forever without a subscription.
+/// Waits for the next item. Without a subscription, it never returns.
 async fn next(messages: &mut Option<Subscription>) -> Option<Item> {
     match messages {
         Some(messages) => messages.next().await,
@@ -656,7 +659,7 @@ mod tests {
     use crate::tables::tests::assert_driven;
 
     #[test]
-    fn losses_of_more_topics_than_are_counted_apart_are_in_the_sum() {
+    fn losses_of_topics_beyond_the_cap_are_included_in_the_sum() {
         let mut losses = Losses::default();
         for topic in 0..2 * ViewerLosses::CAP as u64 {
             losses.add(&format!("/t{topic}"), topic);

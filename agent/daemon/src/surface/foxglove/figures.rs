@@ -33,7 +33,7 @@ pub enum ViewerListener {
     Off,
     /// Listening, with the rights of clients without a token; `None` if every client needs one.
     At(SocketAddr, Option<Access>),
-    /// Could not listen, for this reason.
+    /// The agent could not listen, for this reason.
     Failed(SocketAddr, String),
 }
 
@@ -56,13 +56,13 @@ pub struct ViewerFacts {
     pub access: Access,
     /// Open subscriptions.
     pub subscriptions: usize,
-    /// Messages sent to it.
+    /// Messages sent to the client.
     pub sent_messages: u64,
-    /// Messages dropped because it read too slowly.
+    /// Messages dropped because the client read too slowly.
     pub dropped_messages: u64,
 }
 
-/// Totals since the start.
+/// Current numbers of clients and subscriptions, and totals since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ViewerTotals {
     /// Connected viewers.
@@ -71,7 +71,7 @@ pub struct ViewerTotals {
     pub subscriptions: usize,
     /// Messages sent to viewers.
     pub sent_messages: u64,
-    /// Bytes of these messages.
+    /// Payload bytes of the sent messages.
     pub sent_bytes: u64,
     /// Messages dropped because a viewer read too slowly.
     pub dropped_messages: u64,
@@ -94,7 +94,7 @@ impl Viewers {
         self.lock().listener.clone()
     }
 
-    /// Returns the connected viewers, the longest connected first.
+    /// Returns the connected viewers, in the order in which they connected.
     #[must_use]
     pub fn connected(&self) -> Vec<ViewerFacts> {
         let inner = self.lock();

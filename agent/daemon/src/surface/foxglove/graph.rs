@@ -8,7 +8,7 @@ use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot};
 use super::names::DomainNames;
 use super::protocol::{Message, Providers, Publishers, Subscribers};
 
-/// Names of topics or services, with the nodes at each.
+/// Nodes of each topic or service, by its name.
 type Parties = BTreeMap<String, BTreeSet<String>>;
 
 /// Publishers, subscribers and servers at one moment.
@@ -79,7 +79,7 @@ impl Graph {
     }
 }
 
-/// Adds the nodes of these endpoints; an endpoint without a known node counts by its GUID.
+/// Adds the nodes of `endpoints`. The GUID represents an endpoint without a known node.
 fn add(parties: &mut Parties, name: String, endpoints: &[EndpointFacts]) {
     if endpoints.is_empty() {
         return;
@@ -91,7 +91,7 @@ fn add(parties: &mut Parties, name: String, endpoints: &[EndpointFacts]) {
     parties.entry(name).or_default().extend(nodes);
 }
 
-/// Entries that differ from `before`; an entry that is gone has no nodes.
+/// Returns the entries that differ from `before`. A removed entry has no nodes.
 fn changed<'a>(
     now: &'a Parties,
     before: &'a Parties,
@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn an_update_has_what_changed_and_what_is_gone() {
+    fn an_update_contains_the_changed_and_the_removed_entries() {
         let before = Graph {
             published: parties(&[("/a", &["/one"]), ("/gone", &["/one"])]),
             subscribed: parties(&[("/a", &["/two"]), ("/b", &["/two"])]),

@@ -16,7 +16,7 @@ use super::protocol::SUBPROTOCOLS;
 /// Version of the WebSocket protocol.
 const VERSION: &str = "13";
 
-/// Query of the URL. Viewers can send nothing but a URL and subprotocols.
+/// Query of the URL. Viewers can choose only the URL and the subprotocols.
 #[derive(Default, Deserialize)]
 struct Parameters {
     token: Option<String>,
@@ -27,11 +27,11 @@ struct Parameters {
 pub(super) enum Unfit {
     /// The request does not open a WebSocket.
     NoWebSocket,
-    /// The client offers none of the subprotocols.
+    /// The client offers none of the supported subprotocols.
     Subprotocol,
 }
 
-/// Returns the token in the URL.
+/// Returns the token in the URL, if any, and the request.
 pub(super) async fn token(request: Request) -> (Option<String>, Request) {
     let (mut head, body) = request.into_parts();
     let parameters = Query::<Parameters>::from_request_parts(&mut head, &()).await;
@@ -69,7 +69,7 @@ pub(super) fn accept(request: &Request) -> Result<Response, Unfit> {
     Ok(response)
 }
 
-/// Returns the words of a header that lists them, in all its lines.
+/// Returns the comma-separated words in all lines of a header.
 fn words<'a>(headers: &'a HeaderMap, name: &HeaderName) -> impl Iterator<Item = &'a str> {
     let lines = headers.get_all(name).into_iter();
     let lines = lines.filter_map(|line| line.to_str().ok());
@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn a_handshake_is_accepted_as_the_specification_has_it() {
+    fn a_valid_handshake_is_accepted_with_the_key_of_the_specification() {
         let response = accept(&request(&[])).unwrap();
         assert_eq!(response.status(), StatusCode::SWITCHING_PROTOCOLS);
         let headers = response.headers();
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn other_requests_are_refused() {
+    fn a_request_that_is_not_a_valid_handshake_is_refused() {
         for (name, value) in [
             (CONNECTION, "keep-alive"),
             (UPGRADE, ""),

@@ -1,8 +1,8 @@
 //! The WebSocket server for viewers: Foxglove, Lichtblick and PlotJuggler show topics, messages,
-//! figures and the graph live, without a subscription on the robot.
+//! statistics and the graph live, without a subscription on the robot.
 //!
-//! It only reads. A viewer's subscription raises the interest in its topics, as a recording does,
-//! and ends with the connection.
+//! The server is read-only. A viewer's subscription raises the interest in its topics, as a
+//! recording does, and ends with the connection.
 
 mod channels;
 mod client;
@@ -51,9 +51,9 @@ use channels::{Registry, Table};
 use client::Client;
 pub use figures::{ViewerFacts, ViewerListener, ViewerTotals, Viewers};
 
-/// Interval of changes of the channels, of the graph and of statistics.
+/// Interval at which channels, graph and statistics are updated.
 const TICK: Duration = Duration::from_secs(1);
-/// Longest wait of a new viewer for a state that is current.
+/// Maximum time that a new viewer waits for a fresh snapshot.
 const TIMEOUT: Duration = Duration::from_millis(600);
 
 /// A bound listener that is not served yet.
@@ -71,7 +71,7 @@ struct Shared {
     subscriptions: Arc<Subscriptions>,
     viewers: Arc<Viewers>,
     tables: watch::Sender<Option<Arc<Table>>>,
-    /// Wakes the task that follows the snapshots.
+    /// Wakes the task that updates the tables from the snapshots.
     changed: Notify,
     /// Number of viewers that show the graph.
     graphs: AtomicUsize,
@@ -100,7 +100,7 @@ struct Place {
 
 impl Server {
     /// Binds the configured address. A busy port is a warning, because other servers for these
-    /// viewers use the same port, and the agent works without it.
+    /// viewers use the same port, and the agent works without the server.
     ///
     /// # Errors
     /// Fails if the token cannot be loaded.
@@ -212,7 +212,7 @@ impl Shared {
         }
     }
 
-    /// Records that a viewer shows the graph, or no longer does.
+    /// Records that a viewer shows the graph, or no longer shows it.
     fn change_graphs(&self, more: isize) {
         if more > 0 {
             self.graphs.fetch_add(1, Ordering::Relaxed);
@@ -223,7 +223,7 @@ impl Shared {
     }
 }
 
-/// Follows the snapshots while a viewer is connected.
+/// Updates the tables from the snapshots while a viewer is connected.
 async fn follow(shared: Arc<Shared>, library: Arc<Library>) {
     let mut registry = Registry::new(Arc::clone(&library));
     let mut ticks = interval(TICK);
@@ -245,7 +245,7 @@ async fn follow(shared: Arc<Shared>, library: Arc<Library>) {
     }
 }
 
-/// Opens a WebSocket, or answers why not.
+/// Opens a WebSocket, or refuses the request with a reason.
 async fn open(State(gate): State<Gate>, request: Request) -> Response {
     let place = request.extensions().get::<Place>().cloned();
     let (token, mut request) = handshake::token(request).await;
@@ -280,7 +280,7 @@ async fn open(State(gate): State<Gate>, request: Request) -> Response {
         };
         let address = place.as_ref().and_then(|place| place.address);
         if let Some(place) = place {
-            // A viewer may send nothing for as long as it reads.
+            // A viewer need not send data while it reads.
             place.state.answers(false);
         }
         let access = granted.access();

@@ -1,5 +1,5 @@
-//! Names of topics for viewers, which know no domains: a name that several domains have belongs to
-//! one of them, and the others' has the domain before it.
+//! Names of topics for viewers, which do not know domains. A name in several domains belongs to one
+//! of them. In the other domains, the name has the domain as a prefix.
 
 use std::collections::BTreeMap;
 
@@ -25,7 +25,7 @@ impl DomainNames {
         self.0 = owners;
     }
 
-    /// Returns the name for viewers.
+    /// Returns the name that viewers show.
     pub(super) fn shown(&self, domain_id: DomainId, name: &TopicName) -> String {
         match self.0.get(name) {
             Some(owner) if *owner != domain_id => format!("/domain_{domain_id}{name}"),

@@ -1,8 +1,8 @@
 //! Messages of the Foxglove WebSocket protocol, version 1: JSON objects with an `op`, and binary
 //! messages with an opcode.
 //!
-//! Two names of the subprotocol exist, and the messages of both are the same. The server offers a
-//! part of it: channels, statuses and the connection graph, but nothing that changes the robot.
+//! The subprotocol has two names with the same messages. The server supports a part of it:
+//! channels, statuses and the connection graph, but no operation that changes the robot.
 
 use std::borrow::Cow;
 
@@ -16,7 +16,7 @@ const MESSAGE_DATA: u8 = 1;
 const TIME: u8 = 2;
 /// Size of the part of a data message before the payload, in bytes.
 pub(super) const DATA_HEAD: usize = 13;
-/// Characters of an unknown `op` that a status repeats.
+/// Maximum number of characters of an unknown `op` that a status repeats.
 const SHOWN: usize = 32;
 
 /// A message of a client.
@@ -82,7 +82,7 @@ pub(super) enum Message<'a> {
     },
 }
 
-/// Facts about the server for people.
+/// Facts about the server for its users.
 #[derive(Debug, Serialize)]
 pub(super) struct Metadata {
     pub(super) ros2probe: &'static str,
@@ -205,7 +205,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn requests_are_those_of_the_specification() {
+    fn requests_are_parsed_as_the_specification_defines_them() {
         let subscribe =
             r#"{"op":"subscribe","subscriptions":[{"id":0,"channelId":3},{"id":1,"channelId":5}]}"#;
         let expected = [(0, 3), (1, 5)].map(|(id, channel)| Subscribe { id, channel });
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn other_texts_are_malformed() {
+    fn a_text_that_is_not_an_operation_is_malformed() {
         let deep = "[".repeat(10_000);
         for text in [
             "",
@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn binary_messages_are_those_of_the_specification() {
+    fn binary_messages_are_written_as_the_specification_defines_them() {
         let head = data_head(0x0403_0201, Timestamp(0x1716_1514_1312_1110));
         assert_eq!(
             head,
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_to_the_client_are_those_of_the_specification() {
+    fn json_messages_are_written_as_the_specification_defines_them() {
         let json = |message: &Message<'_>| serde_json::to_string(message).unwrap();
         let info = Message::ServerInfo {
             name: "rp",

@@ -1,5 +1,5 @@
-//! Figures of a topic as a channel: a flat JSON object of numbers each second, so that viewers plot
-//! each as a series.
+//! Statistics of a topic as a channel: a flat JSON object of numbers each second. Viewers can plot
+//! each number as a series.
 
 use std::sync::{Arc, LazyLock};
 
@@ -24,7 +24,7 @@ struct Times {
 struct Second<'a> {
     topic: &'a TopicFacts,
     measured: &'a Measurement,
-    /// Times of the messages of this second; `None` in the first.
+    /// Times of the messages of this second; `None` in the first second.
     times: Option<Times>,
 }
 

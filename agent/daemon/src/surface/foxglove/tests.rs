@@ -36,7 +36,7 @@ fn robot(names: &[&str]) -> Snapshot {
     sample_robot::snapshot(names.iter().copied())
 }
 
-/// Channels of a table: topic and id.
+/// Returns the ids of a table's channels, by topic.
 fn ids(table: &Table) -> BTreeMap<String, u32> {
     let channels = table.channels.values();
     let advertised = channels.map(|channel| channel.advertised());
@@ -69,7 +69,7 @@ async fn channels_keep_their_ids_and_no_id_is_used_twice() {
 }
 
 #[tokio::test]
-async fn names_of_several_domains_and_several_types_are_channels_of_their_own() {
+async fn each_domain_and_each_type_of_a_topic_has_a_channel_of_its_own() {
     let mut registry = Registry::new(library());
     let mut snapshot = robot(&["/a"]);
     let mut other = robot(&["/a"]).topics.remove(0);
@@ -87,7 +87,7 @@ async fn names_of_several_domains_and_several_types_are_channels_of_their_own() 
         ("/domain_5/a", "unknown/msg/Type", false),
     ];
     assert_eq!(shown, expected);
-    // The plain name stays with the domain that had it first.
+    // A channel keeps its name when the other domain no longer has the topic.
     snapshot.topics.remove(0);
     let before = ids(&table);
     let after = ids(&registry.update(&snapshot, false).await);
@@ -118,7 +118,7 @@ async fn topics_beyond_the_cap_have_no_channel() {
 }
 
 #[tokio::test]
-async fn a_viewer_with_all_subscriptions_that_it_may_have_is_closed_at_the_next() {
+async fn a_viewer_with_subscriptions_beyond_the_cap_is_closed() {
     let shared = shared(MEGABYTE);
     let names: Vec<_> = (0..ViewerSubscriptions::CAP)
         .map(|number| format!("/t{number}"))
@@ -151,7 +151,7 @@ async fn a_viewer_with_all_subscriptions_that_it_may_have_is_closed_at_the_next(
     assert_driven::<ViewerSubscriptions>();
 }
 
-/// Shared state of a live agent with one topic.
+/// Shared state of a live agent with two topics.
 fn shared(bytes: usize) -> Arc<Shared> {
     let latest = Arc::new(SnapshotCell::new(SourceKind::Wire));
     latest.publish(
@@ -178,7 +178,7 @@ fn shared(bytes: usize) -> Arc<Shared> {
     })
 }
 
-/// A viewer in memory, and its agent.
+/// A viewer on a stream in memory, and the shared state of its agent.
 struct Scene {
     shared: Arc<Shared>,
     socket: WebSocketStream<DuplexStream>,
@@ -207,7 +207,7 @@ impl Scene {
         }
     }
 
-    /// Subscribes to topics, and returns once the capture thread would know.
+    /// Subscribes to topics, and waits until the subscription is open.
     async fn subscribe(&mut self, topics: &[&str]) {
         assert_eq!(self.json().await["op"], "serverInfo");
         let advertised = self.json().await;
@@ -261,7 +261,7 @@ fn sample(topic: &str, number: u64, size: usize) -> Arc<Sample> {
 }
 
 #[tokio::test]
-async fn a_viewer_that_does_not_read_loses_the_oldest_and_receives_their_number() {
+async fn a_viewer_that_does_not_read_loses_the_oldest_messages_and_their_number_is_sent() {
     const MESSAGES: u64 = 40;
     let mut scene = Scene::new(64 * MEGABYTE).await;
     scene.subscribe(&["/points", "/chatter"]).await;
@@ -296,7 +296,7 @@ async fn a_viewer_that_does_not_read_loses_the_oldest_and_receives_their_number(
             _ => {}
         }
     }
-    // The small topic loses nothing beside the large one.
+    // The topic with small messages loses no message because of the other topic.
     assert_eq!(chatter, (1..=MESSAGES).collect::<Vec<_>>());
     assert_eq!(points.len() as u64 + dropped, MESSAGES);
     assert!((14..=17).contains(&points.len()), "{points:?}");
@@ -340,8 +340,8 @@ async fn interest_follows_the_subscriptions_and_ends_with_the_viewer() {
     }
 }
 
-/// A channel is one topic of one domain and one type. The subscription of a viewer captured the
-/// topics of that name in every domain, and the viewer showed their losses.
+/// A channel is one topic of one domain and one type. An earlier version captured the topics of
+/// that name in every domain, and reported their losses.
 #[tokio::test]
 async fn a_channel_has_the_messages_and_losses_of_its_domain_and_type_only() {
     let shared = shared(MEGABYTE);
@@ -405,7 +405,7 @@ async fn a_channel_has_the_messages_and_losses_of_its_domain_and_type_only() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_silent_topic_without_a_subscriber_is_named_until_it_has_one() {
+async fn a_silent_topic_without_a_subscriber_is_reported_until_it_has_one() {
     let shared = shared(MEGABYTE);
     let publish = |subscribed: bool| {
         let mut snapshot = robot(&["/points", "/chatter"]);
@@ -445,7 +445,7 @@ async fn a_silent_topic_without_a_subscriber_is_named_until_it_has_one() {
 }
 
 #[tokio::test]
-async fn the_last_message_of_a_latched_topic_comes_at_once_and_again_after_a_new_subscription() {
+async fn each_new_subscription_to_a_latched_topic_receives_its_last_message() {
     let mut scene = Scene::new(MEGABYTE).await;
     let subscriptions = Arc::clone(&scene.shared.subscriptions);
     let kept = sample("/points", 7, 20);
@@ -457,7 +457,7 @@ async fn the_last_message_of_a_latched_topic_comes_at_once_and_again_after_a_new
     };
     scene.subscribe(&["/chatter", "/points"]).await;
     for round in 0..2 {
-        // As the capture thread does.
+        // The test puts the requests in force, as the capture thread does.
         let requests = loop {
             match subscriptions.take_changed() {
                 Some(requests) if requests.len() == 1 => break requests,
@@ -472,7 +472,7 @@ async fn the_last_message_of_a_latched_topic_comes_at_once_and_again_after_a_new
             }
         };
         assert_eq!((data[5], data.len()), (7, 33), "{round}");
-        // Another topic is no reason to send it again.
+        // A message of another topic does not send the latched message again.
         scene.deliver("/chatter", 9, 10);
         let data = loop {
             if let Message::Binary(data) = scene.socket.next().await.unwrap().unwrap() {

@@ -1,4 +1,4 @@
-//! Sends to a viewer: messages in fragments, statuses, and the reason of the end.
+//! Data sent to a viewer: messages in fragments, statuses, and the reason for the end.
 
 use bytes::{Bytes, BytesMut};
 use futures_util::SinkExt as _;
@@ -12,7 +12,7 @@ use tokio_tungstenite::tungstenite::{Error, Message as Incoming};
 use super::super::protocol::{Level, Message, data_head};
 use super::{Client, End, FRAGMENT};
 
-/// Largest number of bytes that a client may send until it reads why it is closed.
+/// Maximum number of bytes that a client may send until it reads why its connection is closed.
 const FAREWELL_BYTES: u64 = 1 << 20;
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
@@ -52,7 +52,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         Ok(())
     }
 
-    /// Sends data as one or several frames, of which the first has this opcode.
+    /// Sends data as one or more frames. The first frame has the opcode `first`.
     async fn fragments(&mut self, mut rest: Bytes, first: Data) -> Result<(), End> {
         let mut data = first;
         loop {
@@ -76,8 +76,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         Ok(())
     }
 
-    /// Sends the reason of the end, and reads until the client closes. Closing with unread data
-    /// would reset the connection and might lose the reason.
+    /// Sends the reason for the end, and reads until the client closes the connection. Closing with
+    /// unread data would reset the connection and might lose the reason.
     pub(super) async fn say_farewell(
         &mut self,
         code: CloseCode,
