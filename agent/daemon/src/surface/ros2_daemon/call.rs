@@ -1,13 +1,13 @@
-//! Parser of XML-RPC requests: a method and its scalar arguments, which is all that `ros2` sends.
+//! Parser of XML-RPC requests with scalar arguments, the only requests that `ros2` sends.
 //!
-//! The bytes come from any process of this host. Attributes, comments, CDATA, document types and
-//! other values than texts, booleans and integers are refused. The caller bounds the length.
+//! The bytes come from any process of this host. Attributes, comments, CDATA, document types, and
+//! values other than texts, booleans, integers and nil are refused. The caller bounds the length.
 
 use quick_xml::Reader;
 use quick_xml::escape::resolve_predefined_entity;
 use quick_xml::events::Event;
 
-/// Most arguments of a call; no function has more than three.
+/// Maximum number of arguments of a call; no function has more than three.
 const MAX_ARGUMENTS: usize = 8;
 
 /// A request.
@@ -38,13 +38,13 @@ pub enum Malformed {
     /// The bytes are not UTF-8.
     #[error("the request is not UTF-8")]
     Encoding,
-    /// The bytes are not XML, or use more of it than XML-RPC needs.
+    /// The bytes are not XML, or use parts of XML that XML-RPC does not need.
     #[error("the request is not well-formed XML")]
     Xml,
-    /// The elements are not those of a call.
+    /// The elements are not the elements of a call.
     #[error("the request is not a methodCall")]
     Shape,
-    /// An argument has another type than text, boolean or integer.
+    /// An argument has a type other than text, boolean, integer and nil.
     #[error("an argument has an unsupported type")]
     Type,
     /// The value of an argument contradicts its type.
@@ -59,7 +59,7 @@ pub enum Malformed {
 ///
 /// # Errors
 ///
-/// Returns [`Malformed`] for anything but a call with scalar arguments.
+/// Returns [`Malformed`] unless the bytes are a call with scalar arguments.
 pub fn parse(bytes: &[u8]) -> Result<Call, Malformed> {
     let text = std::str::from_utf8(bytes).map_err(|_| Malformed::Encoding)?;
     let mut reader = Reader::from_str(text);
@@ -84,7 +84,7 @@ enum Name {
     Other,
 }
 
-/// The begin or end of an element, or the end of the request.
+/// The start or end of an element, or the end of the request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Tag {
     Open(Name),
@@ -97,7 +97,7 @@ struct Elements<'a> {
 }
 
 impl Name {
-    /// Returns the element of a tag's content, which holds attributes as well.
+    /// Returns the element of a tag. `content` also contains the attributes of the tag.
     fn of(content: &str) -> Self {
         match content.trim_end() {
             "methodCall" => Self::Call,
@@ -232,7 +232,7 @@ impl Elements<'_> {
     }
 }
 
-/// A declaration ends within these bytes.
+/// Maximum position of the end of the XML declaration, in bytes.
 const DECLARATION: u64 = 100;
 
 #[cfg(test)]
@@ -256,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn a_request_of_the_ros2_command_line_is_read() {
+    fn a_request_of_the_ros2_command_line_is_parsed() {
         let none = read(&call("system.listMethods", &[])).unwrap();
         assert_eq!(none.method, "system.listMethods");
         assert_eq!(none.arguments, []);
@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn more_than_a_call_with_scalars_is_refused() {
+    fn a_request_other_than_a_call_with_scalars_is_refused() {
         let value = |value: &str| read(&call("f", &[value]));
         assert_eq!(value("<array><data></data></array>"), Err(Malformed::Type));
         assert_eq!(value("<struct></struct>"), Err(Malformed::Type));
@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn a_request_has_at_most_so_many_arguments() {
+    fn a_request_with_arguments_beyond_the_cap_is_refused() {
         let most = vec!["<int>1</int>"; MAX_ARGUMENTS];
         assert_eq!(read(&call("f", &most)).unwrap().arguments.len(), 8);
         let more = vec!["<int>1</int>"; MAX_ARGUMENTS + 1];

@@ -1,4 +1,4 @@
-//! The distribution of a client, which decides how endpoints are written.
+//! The distribution of a client, which determines how endpoints are written.
 
 use std::cell::OnceCell;
 use std::path::Path;
@@ -11,21 +11,22 @@ use ros2probe_wire::rtps::VendorId;
 use super::function::Caller;
 use super::peer::{self, PeerProcess};
 
-/// RMW implementation of ROS 2 without a setting.
+/// Default RMW implementation of ROS 2.
 const DEFAULT_RMW: &str = "rmw_fastrtps_cpp";
 
-/// A client with the sources of its distribution. They are read only when an answer needs them.
+/// A client with the sources that show its distribution. The sources are read only when an answer
+/// needs them.
 #[derive(Debug)]
 pub(super) struct Client<'a> {
     /// The client's process, found at most once per connection.
     pub(super) process: &'a OnceCell<PeerProcess>,
     /// Port of the client and port of the listener.
     pub(super) ports: (u16, u16),
-    /// Distribution of the configuration.
+    /// Distribution that the configuration sets.
     pub(super) configured: Option<Dialect>,
     /// The User-Agent header.
     pub(super) user_agent: Option<&'a str>,
-    /// The robot. Only distributions after Humble announce type hashes.
+    /// State of the robot. Only distributions after Humble announce type hashes.
     pub(super) snapshot: &'a Snapshot,
     /// Domain of the port.
     pub(super) domain_id: DomainId,
@@ -40,8 +41,9 @@ impl Client<'_> {
 }
 
 impl Caller for Client<'_> {
-    /// Returns the distribution: of the process, which is certain; of the configuration; of the
-    /// Python release in the User-Agent; of the robot; else the default.
+    /// Returns the distribution from the first source that shows it. The sources are the process,
+    /// which is certain, the configuration, the Python release in the User-Agent, the robot, and
+    /// the default.
     fn dialect(&self) -> Dialect {
         let certain = self.process().dialect.or(self.configured);
         let guessed = || self.user_agent.and_then(of_user_agent);
@@ -52,8 +54,8 @@ impl Caller for Client<'_> {
             .unwrap_or_default()
     }
 
-    /// Returns the RMW implementation of the process, else the one that all participants of the domain
-    /// use, else the default.
+    /// Returns the RMW implementation of the process. If it is unknown, returns the implementation
+    /// that all participants of the domain use, or else the default.
     fn rmw_implementation(&self) -> String {
         let known = self.process().rmw_implementation.as_deref();
         let common = || common_rmw(self.snapshot, self.domain_id);
@@ -72,8 +74,8 @@ fn of_user_agent(value: &str) -> Option<Dialect> {
     }
 }
 
-/// Returns the distribution that the participants of a domain announce: type hashes came after
-/// Humble. `None` without a ROS participant.
+/// Returns the distribution that follows from the announcements in a domain: only distributions
+/// after Humble announce type hashes. Returns `None` without a ROS participant.
 fn announced(snapshot: &Snapshot, domain_id: DomainId) -> Option<Dialect> {
     let mut topics = snapshot
         .topics
@@ -87,7 +89,8 @@ fn announced(snapshot: &Snapshot, domain_id: DomainId) -> Option<Dialect> {
     is_ros.then_some(Dialect::Humble)
 }
 
-/// Returns the RMW implementation of all ROS participants of a domain. `None` if they differ.
+/// Returns the RMW implementation of all ROS participants of a domain. Returns `None` if they
+/// differ or it is unknown.
 fn common_rmw(snapshot: &Snapshot, domain_id: DomainId) -> Option<&'static str> {
     let participants = snapshot.participants.iter();
     let of_domain = participants.filter(|each| each.domain_id == domain_id);
@@ -113,7 +116,8 @@ mod tests {
 
     use super::*;
 
-    /// Returns the chosen distribution for a process, a setting, a User-Agent and the robot's hashes.
+    /// Returns the distribution that follows from a process, a setting, a User-Agent and the
+    /// robot's hashes.
     fn chosen(
         process: Option<Dialect>,
         configured: Option<Dialect>,
@@ -141,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn the_process_is_certain_then_comes_the_setting_then_python_then_the_robot() {
+    fn the_first_known_source_determines_the_distribution() {
         use Dialect::{Humble, Jazzy, Kilted, Rolling};
         let hash: &[TypeHash] = &[TypeHash([1; 32])];
         let python = |release| Some(release);
@@ -174,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn the_rmw_implementation_is_the_common_one_of_the_robot() {
+    fn the_rmw_implementation_is_that_of_all_ros_participants() {
         let mut snapshot = sample_robot::snapshot(["/points"]);
         let common = |snapshot: &Snapshot| common_rmw(snapshot, DomainId(0));
         assert_eq!(common(&snapshot), Some("rmw_fastrtps_cpp"));

@@ -19,14 +19,14 @@ use tokio_util::sync::CancellationToken;
 use crate::tables::Ros2DaemonClients;
 use ros2probe_model::facts::bounded::Bounded;
 
-/// Longest time from an answer to the end of the next request and its answer.
+/// Maximum time from an answer to the end of the next request and its answer.
 pub(super) const IDLE: Duration = Duration::from_secs(10);
 
 /// The stream of a connection.
 #[derive(Debug)]
 pub(super) struct Stream {
     inner: TcpStream,
-    /// Whether the connection was closed in order.
+    /// Whether the connection was shut down without a reset.
     is_shut: bool,
     resets: Arc<AtomicBool>,
 }
@@ -46,7 +46,7 @@ pub(super) struct ConnectionState {
 pub(super) struct Connections(Bounded<Ros2DaemonClients, Vec<Arc<ConnectionState>>>);
 
 impl Stream {
-    /// Takes over a stream.
+    /// Creates the stream of a connection.
     pub(super) fn new(inner: TcpStream, state: &ConnectionState) -> Self {
         Self {
             inner,
@@ -72,18 +72,18 @@ impl ConnectionState {
         self.is_working.store(true, Ordering::Relaxed);
     }
 
-    /// Records that its answer is ready.
+    /// Records that the answer is ready.
     pub(super) fn answered(&self) {
         self.is_working.store(false, Ordering::Relaxed);
         *self.since.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
     }
 
-    /// Lets the connection end with a reset, after the answer in progress.
+    /// Makes the connection end with a reset, after the answer in progress.
     pub(super) fn reset(&self) {
         self.resets.store(true, Ordering::Relaxed);
     }
 
-    /// Returns when the connection must end: on request, or after [`IDLE`] without an answer.
+    /// Waits until the connection must end: on request, or after [`IDLE`] without an answer.
     pub(super) async fn ended(&self) {
         loop {
             let deadline = self.since() + IDLE;
@@ -103,8 +103,8 @@ impl ConnectionState {
 }
 
 impl Connections {
-    /// Adds a connection. If all are in use, the one without a request for longest makes room;
-    /// returns `false` if all have one.
+    /// Adds a connection. If all slots are in use, the connection that has been idle longest is
+    /// closed. Returns `false` if every connection has a request in progress.
     pub(super) fn join(&mut self, state: &Arc<ConnectionState>) -> bool {
         if self.0.is_full() {
             let idle = self.0.iter().enumerate();
@@ -127,7 +127,7 @@ impl Connections {
 impl Drop for Stream {
     fn drop(&mut self) {
         if !self.is_shut {
-            // A failure leaves the kernel's default, an orderly close.
+            // If the call fails, the kernel's default applies, which is an orderly close.
             let _ = sockopt::set_socket_linger(&self.inner, Some(Duration::ZERO));
         }
     }
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn connections_beyond_the_cap_replace_the_longest_idle_one_and_no_busy_one() {
+    async fn a_connection_beyond_the_cap_replaces_the_longest_idle_but_never_a_busy_one() {
         let mut connections = Connections::default();
         let all: Vec<_> = std::iter::repeat_with(state)
             .take(Ros2DaemonClients::CAP)
@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn a_connection_without_an_answer_ends_after_a_time() {
+    async fn a_connection_ends_ten_seconds_after_its_last_answer() {
         let state = state();
         let start = Instant::now();
         tokio::time::advance(IDLE / 2).await;

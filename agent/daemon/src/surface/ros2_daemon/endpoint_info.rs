@@ -1,7 +1,7 @@
 //! rclpy's objects in answers: endpoints of topics, services and actions with their QoS.
 //!
-//! A client knows only the classes of its own distribution: Humble refuses a type hash and has GIDs
-//! of 24 bytes, Lyrical renamed the module of the classes.
+//! A client knows only the classes of its own distribution. Humble refuses a type hash and has GIDs
+//! of 24 bytes, and Lyrical renamed the module of the classes.
 
 use ros2probe_message::Dialect;
 use ros2probe_model::report::snapshot::EndpointFacts;
@@ -14,9 +14,10 @@ use super::value::Value;
 
 /// Bytes of a GID in Humble; a GUID has 16.
 const LONG_GID: usize = 24;
-/// The original's node name for an endpoint whose participant has not announced its nodes yet.
+/// Namespace and name that rmw returns for an endpoint whose participant has not announced its
+/// nodes yet.
 const UNKNOWN: (&str, &str) = ("_NODE_NAMESPACE_UNKNOWN_", "_NODE_NAME_UNKNOWN_");
-/// The original's node name for an endpoint of a participant without ROS.
+/// Namespace and name that rmw returns for an endpoint of a participant without ROS.
 const BARE: (&str, &str) = ("_CREATED_BY_BARE_DDS_APP_", "_CREATED_BY_BARE_DDS_APP_");
 
 /// rclpy's `EndpointTypeEnum`.
@@ -28,7 +29,7 @@ pub(super) enum EndpointType {
     Server,
 }
 
-/// Writes the classes of a distribution.
+/// Creates objects of the classes of a distribution.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Classes<'a> {
     pub(super) graph: Graph<'a>,
@@ -36,7 +37,7 @@ pub(super) struct Classes<'a> {
 }
 
 impl Classes<'_> {
-    /// Returns a writer or reader of a topic.
+    /// Returns the object for a writer or reader of a topic.
     pub(super) fn topic(self, endpoint: &EndpointFacts, kind: EndpointType) -> Value {
         let (namespace, name) = self.node(endpoint);
         let mut members = vec![
@@ -59,7 +60,7 @@ impl Classes<'_> {
         Value::Object(class, members)
     }
 
-    /// Returns a server or client of a service.
+    /// Returns the object for a server or client of a service.
     pub(super) fn service(self, ends: ServiceEnds<'_>, side: Side) -> Value {
         let (namespace, name) = self.node(ends.reader);
         // The endpoint of requests comes first.
@@ -95,7 +96,7 @@ impl Classes<'_> {
         Value::Object("rclpy.endpoint_info.ServiceEndpointInfo", members)
     }
 
-    /// Returns a server or client of an action.
+    /// Returns the object for a server or client of an action.
     pub(super) fn action(self, ends: ActionEnds<'_>, side: Side) -> Value {
         let kind = match side {
             Side::Server => EndpointType::Publisher,
@@ -111,7 +112,7 @@ impl Classes<'_> {
         Value::Object("rclpy.endpoint_info.ActionEndpointInfo", members)
     }
 
-    /// Returns namespace and name of the endpoint's node.
+    /// Returns the namespace and the name of the endpoint's node.
     fn node(self, endpoint: &EndpointFacts) -> (&str, &str) {
         match (&endpoint.node, self.graph.enclave(endpoint.guid.prefix)) {
             (Some(node), _) => parts(node),
@@ -143,7 +144,7 @@ impl Classes<'_> {
     }
 }
 
-/// Returns a type hash; version 0 is "unknown", which a client prints as `INVALID`.
+/// Returns the object for a type hash. Version 0 is "unknown", which a client prints as `INVALID`.
 fn type_hash(hash: Option<TypeHash>) -> Value {
     let (version, bytes) = hash.map_or((0, [0; 32]), |hash| (1, hash.0));
     let members = vec![
@@ -211,7 +212,7 @@ const fn liveliness(qos: &Qos) -> i64 {
     }
 }
 
-/// Returns nanoseconds; the largest number is infinite.
+/// Returns the object for a duration in nanoseconds. The maximum number is infinite.
 fn duration(duration: RtpsDuration) -> Value {
     let nanoseconds = match duration {
         RtpsDuration::Finite(finite) => i64::try_from(finite.as_nanos()).unwrap_or(i64::MAX),

@@ -9,11 +9,12 @@ use super::function::{ALL, FUNCTIONS, Function, UNKNOWN};
 /// Port of domain 0.
 pub const BASE_PORT: u16 = 11_511;
 
-/// Figures of the ros2 daemon.
+/// Port states and counters of the ros2 daemon.
 #[derive(Debug)]
 pub struct Ros2DaemonFigures {
     ports: Mutex<BTreeMap<u32, PortState>>,
-    /// By function, in the order of [`ALL`]; the last one counts all others.
+    /// Number of requests by function, in the order of [`ALL`]. The last number counts requests for
+    /// other functions.
     requests: [AtomicU64; FUNCTIONS + 1],
     refused: [AtomicU64; Refused::ALL.len()],
     clients: AtomicUsize,
@@ -41,9 +42,10 @@ pub enum Refused {
     Full,
     /// The Host header does not name this host.
     Host,
-    /// A web page sent it: it has an Origin header, or another media type than XML.
+    /// A web page may have sent the request: it has an Origin header, or a media type other than
+    /// XML.
     Origin,
-    /// The path is not that of the daemon, or the method is not POST.
+    /// The path is not the daemon's path, or the method is not POST.
     Path,
     /// The body is too large.
     Size,

@@ -1,5 +1,5 @@
-//! The functions of ros2cli's daemons of all distributions. A client calls only those that its own
-//! distribution has, so more of them do no harm.
+//! The functions of ros2cli's daemons of all distributions. A client calls only the functions of
+//! its own distribution, so additional functions do no harm.
 
 use std::fmt::Write as _;
 
@@ -11,19 +11,19 @@ use super::endpoint_info::{Classes, EndpointType};
 use super::graph::{ActionEnds, Endpoints, Graph, Names, NodeEnds, ServiceEnds, Side, parts};
 use super::value::{Fault, Value};
 
-/// Most endpoints in one answer; each takes 3 KB.
+/// Maximum number of endpoints in one answer; each endpoint takes 3 KB.
 pub(super) const MAX_ENDPOINTS: usize = 1024;
 /// Number of functions.
 pub(super) const FUNCTIONS: usize = 30;
 /// Label of requests for other functions.
 pub(super) const UNKNOWN: &str = "unknown";
 
-/// Facts about a client, found out only if an answer depends on them.
+/// Facts about a client, determined only if an answer depends on them.
 pub(super) trait Caller {
-    /// Distribution whose classes the client knows.
+    /// Returns the distribution whose classes the client knows.
     fn dialect(&self) -> Dialect;
 
-    /// RMW implementation of the client.
+    /// Returns the RMW implementation of the client.
     fn rmw_implementation(&self) -> String;
 }
 
@@ -41,17 +41,17 @@ pub(super) struct Query<'a> {
 
 /// A function.
 pub(super) struct Function {
-    /// Its name.
+    /// Name of the function.
     pub(super) name: &'static str,
-    /// Names of its parameters.
+    /// Names of the function's parameters.
     parameters: &'static [&'static str],
-    /// Name of a further parameter, a boolean that `ros2` never sends.
+    /// Name of an additional parameter, a boolean that `ros2` never sends.
     flag: Option<&'static str>,
     help: &'static str,
     answer: Answer,
 }
 
-/// Computes an answer from the arguments, of which there are as many as parameters.
+/// Computes an answer from the arguments, one for each parameter.
 type Answer = fn(&Query<'_>, &[&str]) -> Result<Value, Fault>;
 
 /// Creates a function without a flag.
@@ -81,7 +81,7 @@ impl Function {
         ALL.iter().find(|function| function.name == name)
     }
 
-    /// Returns the position in [`ALL`], for counters.
+    /// Returns the index of the function in [`ALL`], for counters.
     pub(super) fn index(name: &str) -> Option<usize> {
         ALL.iter().position(|function| function.name == name)
     }
@@ -143,7 +143,7 @@ impl Function {
 ///
 /// # Errors
 ///
-/// Returns the original's fault if the function, a node or an argument does not exist.
+/// Returns the fault of ros2cli's daemon if the function, a node or an argument does not exist.
 pub(super) fn answer(call: &Call, query: &Query<'_>) -> Result<Value, Fault> {
     let Some(function) = Function::find(&call.method) else {
         let text = format!("method \"{}\" is not supported", call.method);
@@ -394,7 +394,7 @@ pub(super) const ALL: [Function; FUNCTIONS] = [
         "Return the signature of a function.",
         |_, _| Ok(Value::text("signatures not supported")),
     ),
-    // The listener releases its port when it sees this call.
+    // The listener releases its port after this call.
     function(SHUTDOWN, &[], "Release the port.", |_, _| Ok(Value::Nil)),
 ];
 
@@ -465,7 +465,7 @@ impl<'a> Query<'a> {
     }
 }
 
-/// Returns the endpoints if one answer has room for them.
+/// Returns the endpoints, or a fault if they exceed [`MAX_ENDPOINTS`].
 fn bounded<T>(endpoints: Vec<T>) -> Result<Vec<T>, Fault> {
     let count = endpoints.len();
     if count <= MAX_ENDPOINTS {

@@ -1,7 +1,7 @@
 //! The graph of one domain as rclpy's functions return it, from a snapshot.
 //!
-//! Names and types are sorted, endpoints are sorted by GID. A service is counted and listed by the
-//! same endpoints as in rmw: a server reads requests and writes replies.
+//! Names and types are sorted, and endpoints are sorted by GUID. A service is counted and listed by
+//! the same endpoints as in rmw: a server reads requests and writes replies.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 
@@ -14,7 +14,7 @@ use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 const FEEDBACK: &str = "/_action/feedback";
 const FEEDBACK_TYPE: &str = "_FeedbackMessage";
 
-/// Names with their types, both sorted.
+/// Names with their types. Names and types are sorted.
 pub(super) type Names<'a> = BTreeMap<&'a str, BTreeSet<&'a str>>;
 
 /// The graph of a domain.
@@ -24,7 +24,7 @@ pub(super) struct Graph<'a> {
     domain_id: DomainId,
 }
 
-/// Endpoints of one node name; several nodes may have it.
+/// Endpoints of all nodes with one name.
 #[derive(Debug)]
 pub(super) struct NodeEnds<'a> {
     graph: Graph<'a>,
@@ -65,7 +65,7 @@ impl<'a> Graph<'a> {
         }
     }
 
-    /// Returns the nodes; several may have the same name.
+    /// Returns the nodes. Several nodes may have the same name.
     pub(super) fn nodes(self) -> impl Iterator<Item = &'a NodeFacts> {
         let nodes = self.snapshot.nodes.iter();
         nodes.filter(move |node| node.domain_id == self.domain_id)
@@ -96,7 +96,7 @@ impl<'a> Graph<'a> {
         Some(ends)
     }
 
-    /// Returns topics with endpoints. Service topics are not among them.
+    /// Returns the topics that have endpoints, without the topics of services.
     pub(super) fn topics(self) -> Names<'a> {
         let mut names = Names::new();
         for topic in self.ros_topics() {
@@ -119,12 +119,12 @@ impl<'a> Graph<'a> {
         names
     }
 
-    /// Returns actions, which are topics of feedback.
+    /// Returns the actions, derived from their feedback topics.
     pub(super) fn actions(self) -> Names<'a> {
         actions(self.topics())
     }
 
-    /// Returns writers or readers of a topic, sorted by GID.
+    /// Returns the writers or readers of a topic, sorted by GUID.
     pub(super) fn endpoints(self, name: &str, side: Endpoints) -> Vec<&'a EndpointFacts> {
         let topics = self.ros_topics().filter(|topic| *topic.name == *name);
         sorted(topics.flat_map(|topic| side.of(topic)))
@@ -147,7 +147,7 @@ impl<'a> Graph<'a> {
         readers.len()
     }
 
-    /// Returns the servers or clients of a service. Reader and writer belong together by their
+    /// Returns the servers or clients of a service. A reader and a writer are paired by their
     /// participant, their node and their order.
     pub(super) fn service(self, name: &str, side: Side) -> Vec<ServiceEnds<'a>> {
         let [readers, writers] = self.service_ends(name, side);
@@ -166,7 +166,7 @@ impl<'a> Graph<'a> {
         ends
     }
 
-    /// Returns the complete servers or clients of an action.
+    /// Returns the servers or clients of an action that have all of its endpoints.
     pub(super) fn action(self, name: &str, side: Side) -> Vec<ActionEnds<'a>> {
         let service = |part: &str| self.service(&format!("{name}/_action/{part}"), side);
         let (cancels, results) = (service("cancel_goal"), service("get_result"));
@@ -196,7 +196,7 @@ impl<'a> Graph<'a> {
         ends.collect()
     }
 
-    /// Returns readers and writers of a service's servers or clients, sorted by GID.
+    /// Returns the readers and writers of a service's servers or clients, sorted by GUID.
     fn service_ends(self, name: &str, side: Side) -> [Vec<&'a EndpointFacts>; 2] {
         let (read, written) = side.kinds();
         let of_kind = move |kind| {
@@ -264,7 +264,7 @@ impl<'a> NodeEnds<'a> {
     }
 }
 
-/// Endpoints of a topic.
+/// The writers or the readers of a topic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Endpoints {
     Writers,
@@ -290,7 +290,7 @@ impl Side {
     }
 }
 
-/// Returns namespace and name of a node's full name.
+/// Returns the namespace and the name in a node's full name.
 pub(super) fn parts(full: &str) -> (&str, &str) {
     match full.rsplit_once('/') {
         Some(("", name)) => ("/", name),
@@ -299,7 +299,7 @@ pub(super) fn parts(full: &str) -> (&str, &str) {
     }
 }
 
-/// Returns the service of the type of its requests or replies.
+/// Returns the service type for the type of its requests or replies.
 pub(super) fn service_type(message_type: &str) -> &str {
     let ends = ["_Request", "_Response"];
     let mut stems = ends.iter().filter_map(|end| message_type.strip_suffix(end));

@@ -1,9 +1,10 @@
 //! The daemon of the `ros2` command line: XML-RPC on loopback, answered from the snapshot.
 //!
-//! `ros2 topic list` and its like ask the daemon of their domain and start one if none answers, which
-//! is a DDS participant. While the agent answers, they start none and show what the agent has seen.
-//! Only graph functions exist: names, types and QoS, no messages. The one function that changes
-//! something, `system.shutdown`, releases the port for a minute.
+//! Commands such as `ros2 topic list` query the daemon of their domain. If no daemon answers, they
+//! start one, which is a DDS participant. While the agent answers, they do not start a daemon, and
+//! show the graph that the agent has observed. Only graph functions exist, for names, types and
+//! QoS, but not for messages. The only function with an effect, `system.shutdown`, releases the
+//! port for a minute.
 
 pub mod call;
 mod client;
@@ -45,19 +46,19 @@ const TICK: Duration = Duration::from_secs(1);
 /// Time for answers in progress when their port is released.
 const LAST_ANSWERS: Duration = Duration::from_millis(200);
 
-/// The thread that answers, waiting for its task.
+/// The thread that answers requests, while it waits for its task.
 pub(crate) struct Ros2Daemon {
     begin: oneshot::Sender<Task>,
     ended: oneshot::Receiver<Result<()>>,
 }
 
-/// What the thread needs.
+/// Input of the thread.
 pub(crate) struct Task {
-    /// The robot.
+    /// State of the robot.
     pub(crate) latest: Arc<SnapshotCell>,
     /// Watches, whose domains have ports.
     pub(crate) watches: Arc<Watches>,
-    /// Counters and states.
+    /// Counters and port states.
     pub(crate) figures: Arc<Ros2DaemonFigures>,
     /// Distribution of clients, if it is configured.
     pub(crate) distro: Option<Dialect>,
@@ -82,7 +83,7 @@ impl Ros2Daemon {
         let (report, ended) = oneshot::channel();
         let thread = std::thread::Builder::new().name("ros2-daemon".to_owned());
         privilege::spawn(Role::Ros2Daemon, thread, move || {
-            // An agent that fails to start answers nothing.
+            // If the agent fails to start, no task arrives.
             if let Ok(task) = begins.blocking_recv() {
                 let _ = report.send(task.run());
             }
@@ -90,9 +91,9 @@ impl Ros2Daemon {
         Ok(Self { begin, ended })
     }
 
-    /// Begins to answer. The returned channel reports the end.
+    /// Begins to answer requests. The returned channel reports the end of the thread.
     pub(crate) fn begin(self, task: Task) -> oneshot::Receiver<Result<()>> {
-        // If the thread has died, the next wait reports it.
+        // If the thread has died, the returned channel reports it.
         let _ = self.begin.send(task);
         self.ended
     }
@@ -100,7 +101,7 @@ impl Ros2Daemon {
 
 impl Task {
     fn run(self) -> Result<()> {
-        // Capabilities belong to threads: those of this one are verified, too.
+        // Capabilities belong to threads, so the capabilities of this thread are verified as well.
         let _: Unprivileged = Unprivileged::verify()?;
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
@@ -136,7 +137,7 @@ impl Task {
                             end.cancel();
                         });
                     }
-                    // The client may have gone.
+                    // The client may have disconnected.
                     let _ = release.done.send(());
                 }
                 Some(ended) = tasks.join_next() => {
@@ -158,7 +159,7 @@ impl Task {
         }
     }
 
-    /// Returns the domains with a port: those of participants and watches, and domain 0.
+    /// Returns the domains with a port: the domains of participants and watches, and domain 0.
     fn domains(&self) -> BTreeSet<u32> {
         let state = self.latest.state();
         let seen = state.known().participants.iter();

@@ -1,7 +1,8 @@
-//! The process at the other end of a loopback connection, as far as the agent's user can inspect it:
-//! its ROS distribution and RMW implementation.
+//! The process at the other end of a loopback connection: its ROS distribution and RMW
+//! implementation, if the agent's user can inspect it.
 //!
-//! The process controls these values. They only select how an answer to itself is written.
+//! The process controls both values. They only select the format of the answers that this process
+//! receives.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt as _;
@@ -9,24 +10,25 @@ use std::path::{Path, PathBuf};
 
 use ros2probe_message::Dialect;
 
-/// Bytes read of the table of connections and of a memory map, and of a process's variables.
+/// Maximum number of bytes read of the table of connections and of a memory map, and of a process's
+/// environment.
 const MAX_TABLE: u64 = 4 << 20;
 const MAX_VARIABLES: u64 = 128 << 10;
-/// Most processes and descriptors inspected for one connection.
+/// Maximum number of processes inspected for one connection, and of descriptors per process.
 const MAX_PROCESSES: usize = 4096;
 const MAX_DESCRIPTORS: usize = 4096;
 /// 127.0.0.1 as `/proc/net/tcp` writes it on little-endian machines.
 const LOOPBACK: &str = "0100007F";
-/// Column of the user and of the inode in `/proc/net/tcp`.
+/// Columns of the user and of the inode in `/proc/net/tcp`.
 const USER: usize = 7;
 const INODE: usize = 9;
 
 /// Facts about a client's process.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct PeerProcess {
-    /// Its distribution.
+    /// ROS distribution of the process.
     pub(super) dialect: Option<Dialect>,
-    /// Its RMW implementation, such as `rmw_cyclonedds_cpp`.
+    /// RMW implementation of the process, such as `rmw_cyclonedds_cpp`.
     pub(super) rmw_implementation: Option<String>,
 }
 
@@ -38,7 +40,7 @@ pub(super) fn find(proc: &Path, client: u16, server: u16) -> Option<PeerProcess>
     Some(read(&process))
 }
 
-/// Returns user and inode of the client's socket.
+/// Returns the user and the inode of the client's socket.
 fn socket(table: &str, client: u16, server: u16) -> Option<(u32, u64)> {
     let address = |port: u16| format!("{LOOPBACK}:{port:04X}");
     let ends = (address(client), address(server));
@@ -54,7 +56,7 @@ fn socket(table: &str, client: u16, server: u16) -> Option<(u32, u64)> {
     })
 }
 
-/// Returns the folder of the user's process that holds this socket.
+/// Returns the directory in `/proc` of the user's process that has this socket open.
 fn process(proc: &Path, user: u32, inode: u64) -> Option<PathBuf> {
     let wanted = format!("socket:[{inode}]");
     let processes = fs::read_dir(proc)
@@ -71,7 +73,7 @@ fn process(proc: &Path, user: u32, inode: u64) -> Option<PathBuf> {
     })
 }
 
-/// Returns the paths of processes, which have numbers, up to the cap.
+/// Returns the paths of processes, whose names are numbers, up to the cap.
 fn numbered(paths: impl Iterator<Item = PathBuf>) -> impl Iterator<Item = PathBuf> {
     let is_number = |path: &PathBuf| {
         let name = path.file_name().and_then(|name| name.to_str());
@@ -80,7 +82,7 @@ fn numbered(paths: impl Iterator<Item = PathBuf>) -> impl Iterator<Item = PathBu
     paths.filter(is_number).take(MAX_PROCESSES)
 }
 
-/// Reads the facts: variables first, then the mapped libraries.
+/// Reads the facts from the environment variables, and missing facts from the mapped libraries.
 fn read(process: &Path) -> PeerProcess {
     let variables = text(&process.join("environ"), MAX_VARIABLES).unwrap_or_default();
     let variable = |name: &str| {
@@ -142,14 +144,14 @@ mod tests {
         -1\n";
 
     #[test]
-    fn the_clients_end_of_a_connection_is_found_in_the_table() {
+    fn the_client_socket_of_a_connection_is_found_in_the_table() {
         assert_eq!(socket(TABLE, 0xa001, 11_511), Some((1000, 222)));
         assert_eq!(socket(TABLE, 0xa002, 11_511), None);
         assert_eq!(socket("", 0xa001, 11_511), None);
         assert_eq!(socket("a b\n0: c", 0xa001, 11_511), None);
     }
 
-    /// A folder as `/proc`, with one process that has the connection.
+    /// A directory in the form of `/proc`, with one process that has the connection.
     fn proc(variables: &str, map: &str) -> tempfile::TempDir {
         let directory = tempfile::tempdir().unwrap();
         let root = directory.path();
@@ -170,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn distribution_and_middleware_are_those_of_the_variables_else_of_the_libraries() {
+    fn environment_variables_or_else_libraries_show_distribution_and_middleware() {
         let found = |variables: &str, map: &str| {
             let proc = proc(variables, map);
             let found = find(proc.path(), 0xa001, 11_511).unwrap();

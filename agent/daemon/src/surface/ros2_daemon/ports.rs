@@ -1,8 +1,8 @@
 //! Listeners of the domains in use, at 127.0.0.1:11511 + domain.
 //!
-//! A port that another process has is never fought for: the agent tries again every second and takes
-//! over when the port is free. The `ros2` command line binds the port before it starts a daemon, so
-//! a daemon and the agent never have it both.
+//! The agent does not compete with another process for a port. It tries again every second, and
+//! takes over a port that has become free. The `ros2` command line binds the port before it starts
+//! a daemon, so a daemon and the agent never have the same port.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
@@ -31,7 +31,7 @@ const TAKEOVER: Duration = Duration::from_secs(3);
 #[derive(Debug)]
 pub(super) struct Ports {
     figures: Arc<Ros2DaemonFigures>,
-    /// A host has few domains, but any process can announce participants in each.
+    /// A host has few domains, but any process can announce participants in every domain.
     ports: Bounded<Ros2DaemonPorts, BTreeMap<u32, Port>>,
 }
 
@@ -41,9 +41,9 @@ enum Port {
     Open(TcpListener, CancellationToken),
     /// Not bound yet.
     Waiting,
-    /// Another process had it at the last attempt.
+    /// Another process had the port at the last attempt.
     Occupied,
-    /// It is free again since this time.
+    /// The port is free. The time is when the agent first noticed it.
     Free(Instant),
     Released(Instant),
 }
@@ -58,7 +58,7 @@ pub(super) struct Accepted {
 }
 
 impl Ports {
-    /// Creates the ports, without any.
+    /// Creates an empty set of ports.
     pub(super) fn new(figures: Arc<Ros2DaemonFigures>) -> Self {
         Self {
             figures,
@@ -66,8 +66,8 @@ impl Ports {
         }
     }
 
-    /// Binds the ports of domains in use that have none, and those that have become free. A port
-    /// stays bound when its domain is no longer in use.
+    /// Binds the ports of domains in use that are not bound, and ports that have become free. A
+    /// port stays bound when its domain is no longer in use.
     pub(super) fn update(&mut self, domains: &BTreeSet<u32>, now: Instant) {
         for domain_id in domains {
             if self.ports.contains_key(domain_id) {
@@ -119,7 +119,8 @@ impl Ports {
                 let Port::Open(listener, end) = port else {
                     continue;
                 };
-                // A client that has gone, or no free descriptor: the next event polls again.
+                // An error means that the client has gone, or that no descriptor is free. The next
+                // event polls again.
                 if let Poll::Ready(Ok((stream, address))) = listener.poll_accept(context) {
                     return Poll::Ready(Accepted {
                         domain_id: *domain_id,
@@ -134,8 +135,9 @@ impl Ports {
         .await
     }
 
-    /// Returns whether the port may be bound: at once if no other process had it, otherwise some time
-    /// after the port became free. `ros2 daemon stop` waits until no process listens.
+    /// Returns whether the port may be bound: immediately if no other process had it, otherwise
+    /// some time after it became free. The delay is necessary because `ros2 daemon stop` waits
+    /// until no process listens.
     fn is_takeover_due(&mut self, domain_id: u32, now: Instant) -> bool {
         let (Some(state), Some(number)) = (self.ports.get_mut(&domain_id), port(domain_id)) else {
             return false;
@@ -238,7 +240,7 @@ mod tests {
         drop(other);
         ports.update(&domains, start + TAKEOVER);
         ports.update(&domains, start + TAKEOVER * 2 - Duration::from_millis(1));
-        // Nothing listens, so that `ros2 daemon stop` ends.
+        // No process listens, so `ros2 daemon stop` ends.
         assert!(std::net::TcpStream::connect(address).is_err());
         ports.update(&domains, start + TAKEOVER * 2);
         assert_eq!(state(), PortState::Listening);
@@ -298,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn domains_have_the_ports_of_ros2() {
+    fn each_domain_has_the_port_of_its_ros2_daemon() {
         assert_eq!(
             (port(0), port(232), port(233)),
             (Some(11_511), Some(11_743), None)

@@ -1,4 +1,4 @@
-//! HTTP requests of the `ros2` command line, and the checks that keep web pages out.
+//! HTTP requests of the `ros2` command line, and the checks that refuse web pages.
 
 use std::cell::OnceCell;
 use std::convert::Infallible;
@@ -34,14 +34,15 @@ use crate::surface::large_responses::LargeResponses;
 
 /// Path of the daemon.
 const PATH: &str = "/ros2cli/";
-/// Largest body of a request in bytes.
+/// Maximum size of a request's body, in bytes.
 pub(super) const MAX_BODY: usize = 16 << 10;
-/// Largest size of a request's head in bytes, and largest number of its fields.
+/// Maximum size of a request's head in bytes, and maximum number of its fields.
 const MAX_HEAD: usize = 8 << 10;
 const MAX_FIELDS: usize = 32;
-/// Age up to which the state is current: a command sends several requests at once.
+/// Maximum age of a state that is used without a refresh. A command sends several requests in quick
+/// succession.
 const CURRENT: Duration = Duration::from_millis(200);
-/// Longest wait for a state that is current.
+/// Maximum time that a request waits for a fresh state.
 const TIMEOUT: Duration = Duration::from_millis(300);
 /// Bytes of the random part of the daemon's name.
 const NAME_BYTES: usize = 16;
@@ -60,7 +61,7 @@ pub(super) struct Requests {
     suffix: String,
 }
 
-/// A connection as its requests see it.
+/// Facts about the connection of a request.
 #[derive(Debug)]
 struct Origin {
     domain_id: u32,
@@ -134,7 +135,8 @@ impl Requests {
             self.figures.refuse(Refused::Size);
             return refusal(StatusCode::PAYLOAD_TOO_LARGE);
         };
-        // Until here, the connection makes room for others: its client may never finish.
+        // Until this call, the connection counts as idle and can be closed for others, because its
+        // client may never finish.
         origin.state.requested();
         let Some(turn) = ANSWERS.turn().await else {
             self.figures.refuse(Refused::Memory);
@@ -158,7 +160,8 @@ impl Requests {
         response
     }
 
-    /// Answers a call. The result is the connection's last one if the call released the port.
+    /// Answers a call. Returns the result, and whether the connection ends because the call
+    /// released the port.
     async fn answer(
         &self,
         call: &Call,
@@ -211,7 +214,7 @@ impl Requests {
         }
     }
 
-    /// Returns Python's exception for a body that is not a call.
+    /// Counts a body that is not a call, and returns Python's exception for it.
     fn malformed(&self, malformed: Malformed) -> Fault {
         self.figures.refuse(Refused::Malformed);
         let class = match malformed {
@@ -233,7 +236,8 @@ fn check(method: &Method, path: &str, headers: &HeaderMap) -> Result<(), (Refuse
     if path != PATH {
         return Err((Refused::Path, StatusCode::NOT_FOUND));
     }
-    // A web page cannot send this media type to another origin without a permission.
+    // A web page cannot send this media type to another origin without the permission of that
+    // origin.
     let media_type = headers
         .get(CONTENT_TYPE)
         .and_then(|value| value.to_str().ok());
@@ -244,7 +248,7 @@ fn check(method: &Method, path: &str, headers: &HeaderMap) -> Result<(), (Refuse
     Ok(())
 }
 
-/// Returns an answer that ends the connection.
+/// Returns an answer with this status that ends the connection.
 fn refusal(status: StatusCode) -> Response<Body> {
     let mut response = Response::new(Body::empty());
     *response.status_mut() = status;

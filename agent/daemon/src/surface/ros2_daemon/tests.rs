@@ -1,4 +1,4 @@
-//! Answers of the functions for a robot of every kind of endpoint, by distribution.
+//! Answers of the functions for a robot with every kind of endpoint, by distribution.
 
 mod robot;
 
@@ -33,7 +33,7 @@ impl Caller for Fixed {
     }
 }
 
-/// Calls a function with texts.
+/// Calls a function with text arguments.
 fn ask(
     snapshot: &Snapshot,
     dialect: Dialect,
@@ -62,7 +62,7 @@ fn asked(method: &str, arguments: &[&str]) -> Value {
     ask(&robot(), Dialect::Jazzy, method, arguments).unwrap()
 }
 
-/// Names with types, as an answer has them.
+/// Names with types, in the form of an answer.
 fn named(names: &[(&str, &str)]) -> Value {
     Value::array(
         names.iter().map(|(name, kind)| {
@@ -72,7 +72,7 @@ fn named(names: &[(&str, &str)]) -> Value {
 }
 
 #[test]
-fn humble_receives_the_bytes_of_its_own_daemon() {
+fn a_humble_client_receives_the_bytes_of_a_real_daemon() {
     let method = "get_publishers_info_by_topic";
     for name in ["/chatter", "chatter"] {
         let result = ask(&robot(), Dialect::Humble, method, &[name]);
@@ -81,7 +81,7 @@ fn humble_receives_the_bytes_of_its_own_daemon() {
 }
 
 #[test]
-fn later_distributions_have_a_hash_a_short_gid_and_their_own_classes() {
+fn later_distributions_receive_a_hash_a_short_gid_and_their_own_classes() {
     let mut robot = robot();
     robot.topics[0].publishers[0].type_hash = Some(TypeHash(std::array::from_fn(|at| at as u8)));
     robot.topics[0].publishers[0].qos = Arc::new(Qos {
@@ -243,7 +243,7 @@ fn a_server_or_client_of_zenoh_has_one_endpoint() {
 }
 
 #[test]
-fn names_counts_and_nodes_are_those_of_rclpy() {
+fn names_counts_and_nodes_are_returned_as_by_rclpy() {
     let text = |text: &str| Value::text(text);
     let string = "std_msgs/msg/String";
     assert_eq!(
@@ -349,7 +349,7 @@ fn names_counts_and_nodes_are_those_of_rclpy() {
 }
 
 #[test]
-fn servers_are_counted_by_their_replies_and_later_by_requests() {
+fn servers_are_counted_by_replies_until_kilted_and_then_by_requests() {
     let mut robot = robot();
     let replies =
         |topic: &&mut TopicFacts| *topic.name == *"/add" && topic.kind == TopicKind::ServiceReply;
@@ -371,7 +371,7 @@ fn servers_are_counted_by_their_replies_and_later_by_requests() {
 }
 
 #[test]
-fn faults_are_those_of_a_real_daemon() {
+fn an_invalid_call_leads_to_the_fault_of_a_real_daemon() {
     let nonexistent = "rclpy._rclpy_pybind11.NodeNameNonExistentError";
     let rcl = "rclpy._rclpy_pybind11.RCLError";
     let cases: [(&str, &[&str], &str, &str); 11] = [
@@ -485,7 +485,7 @@ fn the_functions_of_each_distribution_are_listed_in_order() {
 }
 
 #[test]
-fn an_extra_boolean_is_accepted_if_it_changes_nothing() {
+fn an_extra_boolean_is_accepted_only_if_it_is_false() {
     let robot = robot();
     let caller = Fixed(Dialect::Jazzy);
     let query = Query {
@@ -509,7 +509,7 @@ fn an_extra_boolean_is_accepted_if_it_changes_nothing() {
 }
 
 #[test]
-fn an_answer_has_at_most_so_many_endpoints() {
+fn an_answer_with_endpoints_beyond_the_cap_is_a_fault() {
     let mut robot = robot();
     let one = robot.topics[0].publishers[0].clone();
     let method = "get_publishers_info_by_topic";

@@ -1,12 +1,12 @@
-//! Values of XML-RPC, in the text of Python's `xmlrpc.client` with ros2cli's marshalling of rclpy
-//! objects: an object is an element named after its Python class.
+//! XML-RPC values in the format of Python's `xmlrpc.client`, with ros2cli's marshalling of rclpy
+//! objects. Each object is an element named after its Python class.
 
 use std::fmt::Write as _;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 
-/// Largest answer in bytes. A topic with 1000 publishers takes 3 MB in `topic info -v`.
+/// Maximum size of an answer, in bytes. A topic with 1000 publishers takes 3 MB in `topic info -v`.
 pub(super) const MAX_ANSWER: usize = 4 << 20;
 /// Characters in a line of base64, as Python breaks it.
 const BASE64_LINE: usize = 76;
@@ -28,9 +28,9 @@ pub(super) enum Value {
     Array(Vec<Value>),
     /// `struct`.
     Struct(Vec<(&'static str, Value)>),
-    /// A Python object that is one number, by its class.
+    /// A Python object that consists of one number: its class and the number.
     Number(&'static str, i64),
-    /// A Python object with named fields, by its class.
+    /// A Python object with named fields: its class and the fields.
     Object(&'static str, Vec<(&'static str, Value)>),
 }
 
@@ -47,17 +47,17 @@ pub(super) struct Fault {
 struct TooLarge;
 
 impl Value {
-    /// Returns a text.
+    /// Creates a text.
     pub(super) fn text(text: &str) -> Self {
         Self::Text(text.to_owned())
     }
 
-    /// Returns an array.
+    /// Creates an array.
     pub(super) fn array(values: impl IntoIterator<Item = Self>) -> Self {
         Self::Array(values.into_iter().collect())
     }
 
-    /// Returns a number of entries.
+    /// Creates an integer from a number of entries.
     pub(super) fn count(count: usize) -> Self {
         Self::Integer(i32::try_from(count).unwrap_or(i32::MAX))
     }
@@ -145,7 +145,7 @@ pub(super) fn answer(result: &Result<Value, Fault>) -> String {
         ),
     ];
     let mut body = "<?xml version='1.0'?>\n<methodResponse>\n<fault>\n".to_owned();
-    // The text of a fault is bounded by the request.
+    // The request bounds the text of a fault, so it never exceeds the limit.
     let _ = write_struct(&members, &mut body);
     body.push_str("</fault>\n</methodResponse>\n");
     body
@@ -174,8 +174,8 @@ fn push(out: &mut String, text: std::fmt::Arguments<'_>) {
     let _ = out.write_fmt(text);
 }
 
-/// Writes text with the escapes of XML. XML cannot express most control characters; a name with one
-/// is hostile, and the character is replaced.
+/// Writes text with the escapes of XML. XML cannot express most control characters. A name with
+/// such a character is hostile, and the character is replaced.
 fn escape(text: &str, out: &mut String) {
     for character in text.chars() {
         match character {
@@ -194,7 +194,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn scalars_are_written_as_python_writes_them() {
+    fn values_are_written_as_python_writes_them() {
         let body = answer(&Ok(Value::array([
             Value::Nil,
             Value::Boolean(true),
@@ -223,14 +223,14 @@ mod tests {
     }
 
     #[test]
-    fn long_bytes_are_broken_into_the_lines_of_python() {
+    fn long_base64_text_is_broken_into_lines_as_in_python() {
         let body = answer(&Ok(Value::Bytes(vec![0; 60])));
         let first = format!("<base64>\n{}\nAAAA\n</base64>", "A".repeat(76));
         assert!(body.contains(&first), "{body}");
     }
 
     #[test]
-    fn a_fault_is_that_of_the_original() {
+    fn a_fault_is_written_as_ros2cli_writes_it() {
         let fault = Fault::new("Exception", "method \"nope\" is not supported");
         assert_eq!(
             answer(&Err(fault)),

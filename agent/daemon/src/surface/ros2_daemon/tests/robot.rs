@@ -12,7 +12,7 @@ use ros2probe_wire::qos::{Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix};
 
-/// The participant of the answer that a real daemon gave.
+/// GUID prefix of the participant in the answer of a real daemon.
 const PREFIX: GuidPrefix = GuidPrefix([1, 15, 127, 1, 235, 111, 70, 136, 0, 0, 0, 0]);
 
 /// Endpoints of a topic: entity and node.
@@ -151,7 +151,7 @@ pub(super) fn robot() -> Snapshot {
     snapshot
 }
 
-/// Nodes with the endpoints that name them; the talker exists twice.
+/// Returns the nodes with their endpoints. Two nodes have the name `/talker`.
 fn nodes(participant: Guid, topics: &[TopicFacts]) -> Vec<NodeFacts> {
     let names = ["/client", "/robot1/server", "/talker", "/talker"];
     let nodes = names.map(|name| {
