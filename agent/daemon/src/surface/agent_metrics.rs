@@ -20,7 +20,7 @@ use ros2probe_metrics::metric_sink::{Label, MetricSink};
 use ros2probe_metrics::otlp::{Exports, Outcome, Reason};
 use ros2probe_model::facts::dispatch::MissedReason;
 
-/// Writes version, source and readiness of the agent.
+/// Writes the version, source, sandbox, abilities and readiness of the agent.
 pub(super) fn identity(sink: &mut MetricSink<'_>, state: &State, now: Instant) -> fmt::Result {
     sink.family(&metric::BUILD_INFO, |family| {
         let version = Label::Text(env!("CARGO_PKG_VERSION"));
@@ -115,7 +115,7 @@ fn shared_memory(sink: &mut MetricSink<'_>, facts: Option<&SharedMemoryFacts>) -
     })
 }
 
-/// Writes the sizes of the model's tables and its parse failures.
+/// Writes the metrics of the model: its input, decode errors, tables and limits, and the topics.
 pub(super) fn model(
     sink: &mut MetricSink<'_>,
     state: &State,
@@ -214,7 +214,7 @@ pub(super) fn kept(sink: &mut MetricSink<'_>, state: &State) -> fmt::Result {
     sink.single(&metric::RESTORED, restored.count())
 }
 
-/// Writes the metrics of the surface itself.
+/// Writes the age of the snapshot, the duration of the last scrape, and the last reload.
 pub(super) fn surface(
     sink: &mut MetricSink<'_>,
     state: &State,
@@ -247,7 +247,7 @@ pub(super) fn subscriptions(sink: &mut MetricSink<'_>, state: &State) -> fmt::Re
     sink.single(&metric::SAMPLES_RETAINED, facts.retained_bytes)
 }
 
-/// Writes the metrics of the ros2 daemon. Without it, its families have no samples.
+/// Writes the metrics of the ros2 daemon. Without the daemon, its families have no samples.
 pub(super) fn ros2_daemon(sink: &mut MetricSink<'_>, figures: &Ros2DaemonFigures) -> fmt::Result {
     let ports = figures.ports();
     let is_on = !ports.is_empty();
@@ -288,7 +288,7 @@ pub(super) fn viewers(sink: &mut MetricSink<'_>, viewers: &Viewers) -> fmt::Resu
     sink.single(&metric::FOXGLOVE_DROPPED, totals.dropped_messages)
 }
 
-/// Writes the number of events, and of events and log lines that were dropped.
+/// Writes the numbers of events, of dropped events and of lost log lines.
 pub(super) fn events(sink: &mut MetricSink<'_>, log: &EventLog, lost_lines: u64) -> fmt::Result {
     for (metric, counts) in [
         (&metric::EVENTS, log.recorded()),
@@ -356,7 +356,7 @@ pub(super) fn exports(sink: &mut MetricSink<'_>, exports: &Exports) -> fmt::Resu
     })
 }
 
-/// Writes the metrics of the process, without values that are unknown.
+/// Writes the metrics of the process. Unknown values are left out.
 pub(super) fn process(sink: &mut MetricSink<'_>) -> fmt::Result {
     let Process {
         cpu_seconds,

@@ -49,7 +49,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_localhost_and_loopback_addresses_are_own_names() {
+    fn only_localhost_and_loopback_addresses_are_names_of_this_host() {
         for host in [
             "localhost",
             "LOCALHOST:17401",
@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn two_host_headers_name_no_host() {
+    fn a_missing_or_repeated_host_header_is_refused() {
         let named = |hosts: &[&str]| {
             let mut headers = HeaderMap::new();
             for host in hosts {

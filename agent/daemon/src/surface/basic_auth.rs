@@ -1,8 +1,8 @@
 //! Basic authentication against bcrypt hashes.
 //!
-//! A hash takes a core for a tenth of a second by design. One hash is computed at a time, on a
-//! blocking thread. Correct passwords are remembered, since a scraper sends its password every few
-//! seconds.
+//! Computing a hash takes a core for a tenth of a second by design. One hash is computed at a time,
+//! on a blocking thread. Correct passwords are remembered, since a scraper sends its password every
+//! few seconds.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -17,7 +17,8 @@ use base64::engine::general_purpose::STANDARD;
 use subtle::ConstantTimeEq as _;
 use tokio::sync::Semaphore;
 
-/// A hash without a known password, so that an unknown name takes as long as a known one.
+/// A hash without a known password. It makes the check of an unknown name as slow as that of a
+/// known name.
 const NOBODY: &str = "$2y$10$QOauhQNbBCuQDKes6eFzPeMqBSjb7Mr5DUmpZ/VcEd00UAV/LDeSi";
 
 /// Checks the credentials of requests.
@@ -68,7 +69,7 @@ impl Gate {
     }
 }
 
-/// Answers requests without valid credentials.
+/// Refuses requests without valid credentials.
 pub(super) async fn guard(State(gate): State<Arc<Gate>>, request: Request, next: Next) -> Response {
     if gate.lets_in(request.headers()).await {
         return next.run(request).await;
@@ -103,7 +104,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn the_right_password_opens_and_is_remembered_and_no_other_does() {
+    async fn the_right_password_is_accepted_and_remembered_and_others_are_refused() {
         // This is the hash of "open sesame" at the lowest cost.
         let hash = bcrypt::hash("open sesame", 4).unwrap();
         let users = [("alice".to_owned(), hash)];

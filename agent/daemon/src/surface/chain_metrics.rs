@@ -46,7 +46,7 @@ pub(super) fn chains(
             let Some(domain_id) = facts.domain_id else {
                 continue;
             };
-            // A chain has one state; causality precedes stamps.
+            // A chain has one state. Causality takes precedence over stamps.
             let ends = (domain_id, &*facts.chain.from, &*facts.chain.to);
             if !seen.insert(ends) {
                 continue;
@@ -88,7 +88,7 @@ fn write<const LABELS: usize>(
     })
 }
 
-/// Returns one chain for each pair of ends, that with the most messages.
+/// Returns one chain for each pair of ends: the chain with the most messages.
 fn shown(chains: &[ChainFacts]) -> Vec<&ChainFacts> {
     let mut sorted: Vec<_> = chains.iter().collect();
     sorted.sort_by_key(|chain| (ends(chain), std::cmp::Reverse(chain.count)));
@@ -105,7 +105,7 @@ fn ends(chain: &ChainFacts) -> impl Ord + '_ {
     (path.domain_id, path.method, name(first), name(last))
 }
 
-/// Returns the figures of configured chains and of others.
+/// Returns the figures of configured chains and of all other chains.
 fn whole<'a>(snapshot: &'a Snapshot, chains: &[&'a ChainFacts]) -> Vec<Figures<'a, 4>> {
     let configured = snapshot.chains.expected.iter().filter_map(of_expected);
     let mut all: Vec<_> = configured.collect();

@@ -1,5 +1,5 @@
 //! The collection of all metrics, family by family in the catalogue's order. Scrapes and exports
-//! both use it, so they show the same values.
+//! use this collection, so they show the same values.
 
 use std::fmt;
 use std::pin::Pin;
@@ -27,8 +27,8 @@ use ros2probe_metrics::metric_sink::MetricSink;
 use ros2probe_metrics::metric_source::MetricSource;
 use ros2probe_metrics::otlp::{Exports, Signal};
 
-/// Input of a collection. Each part has its own writer; only the agent's setup and the collections
-/// hold all parts.
+/// Input of a collection. Each part has its own writer; only the agent's setup and the collection
+/// of metrics have all parts.
 #[derive(Clone, Debug)]
 pub struct MetricSources {
     /// State of the robot and the agent.
@@ -52,7 +52,8 @@ pub struct MetricSources {
 }
 
 impl MetricSources {
-    /// Creates the sources of an agent that was just configured; its start is the first event.
+    /// Creates the sources of an agent that was just configured, and records its start as the first
+    /// event.
     #[must_use]
     pub fn new(source: SourceKind, settings: Settings) -> Self {
         let events = EventLog::new();
@@ -70,7 +71,7 @@ impl MetricSources {
         }
     }
 
-    /// Returns whether traces are exported, so that exemplars lead somewhere.
+    /// Returns whether traces are exported. Exemplars refer to exported traces.
     fn has_traces(&self) -> bool {
         let mut signals = self.exports.signals();
         signals.any(|signal| signal == Signal::Traces)

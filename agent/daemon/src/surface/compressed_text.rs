@@ -163,7 +163,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn a_page_takes_a_tenth_of_its_length_and_comes_back_as_it_was() {
+    async fn a_page_is_kept_in_a_tenth_of_its_size_and_is_sent_unchanged() {
         for encoding in [Encoding::Identity, Encoding::Gzip] {
             let mut packer = TextCompressor::new(encoding);
             let mut page = String::new();

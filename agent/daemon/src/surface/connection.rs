@@ -1,6 +1,6 @@
-//! Limits of time and memory per connection. A client keeps its slot while it makes progress: a
-//! complete request within a time, an answer read at a minimum rate. An idle connection makes room
-//! for the next client.
+//! Limits of time and memory per connection. A client keeps its slot while it makes progress: it
+//! completes a request within a time limit, and reads an answer at a minimum rate. An idle
+//! connection is closed for the next client.
 
 use std::io;
 use std::pin::Pin;
@@ -16,19 +16,20 @@ use tokio_util::sync::CancellationToken;
 
 use crate::limit_facts::Slot;
 
-/// A connection is closed after this long without a request, and a stream after this long without a
+/// A connection is closed after this time without a request, and a stream after this time without a
 /// successful write.
 const IDLE: Duration = Duration::from_secs(75);
-/// Longest time from the first to the last byte of a request.
+/// Maximum time from the first to the last byte of a request.
 const REQUEST: Duration = Duration::from_secs(10);
 /// A client must read [`LEAST`] bytes of a complete answer within this time.
 const PROGRESS: Duration = Duration::from_secs(10);
 const LEAST: usize = 64 << 10;
-/// An agent that acts this long after a deadline had no CPU time.
+/// An agent that acts this late after a deadline had no CPU time.
 const LATE: Duration = Duration::from_secs(1);
-/// Bytes of unfinished requests that a listener holds, in addition to [`FREE`] per connection.
+/// Maximum number of bytes of unfinished requests per listener, in addition to [`FREE`] per
+/// connection.
 const UNFINISHED: usize = 256 << 10;
-/// Bytes of an unfinished request that every connection may use.
+/// Number of bytes of an unfinished request that every connection may use.
 const FREE: usize = 4 << 10;
 
 /// The connections of one listener.
@@ -55,18 +56,19 @@ struct Progress {
     read: usize,
     /// Bytes that are counted in [`Connections::unfinished`].
     counted: usize,
-    /// Whether nothing had arrived when the connection was read last. An agent without CPU time has
-    /// not read every connection yet, and those did not wait for their clients.
+    /// Whether the last read of the connection found no data. An agent without CPU time has not
+    /// read every connection yet. Unread connections do not wait for their clients.
     was_empty: bool,
-    /// Time since which the client reads too slowly, and the bytes read since then.
+    /// When the client began to read too slowly, and the number of bytes that it has read since
+    /// then.
     stalled: Option<(Instant, usize)>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
-    /// No request, or a part of its head, has arrived.
+    /// No request has arrived, or only a part of its head.
     Waiting,
-    /// A part of the body has arrived.
+    /// The head of a request has arrived, but not its whole body.
     Receiving,
     /// The request is being handled.
     Working,
@@ -100,8 +102,8 @@ impl Connections {
         }
     }
 
-    /// Closes the connection whose client has let it wait longest for a complete request. Returns
-    /// false if there is no such connection.
+    /// Closes the connection that has waited longest for a complete request from its client.
+    /// Returns `false` if no connection waits.
     pub(super) fn make_room(&self) -> bool {
         let connections = self.lock();
         let waiting = connections.iter().filter_map(|state| {
@@ -116,7 +118,7 @@ impl Connections {
         longest.map(|(_, state)| state.end.cancel()).is_some()
     }
 
-    /// Returns when a connection has been closed.
+    /// Waits until a connection has been closed.
     pub(super) async fn left(&self) {
         self.left.notified().await;
     }
@@ -174,7 +176,7 @@ impl ConnectionState {
         }
     }
 
-    /// Records that the answer begins; it has an end if `is_whole`.
+    /// Records that the answer begins. It is a stream unless `is_whole`.
     pub(super) fn answers(&self, is_whole: bool) {
         let phase = if is_whole {
             Phase::Answering
@@ -184,7 +186,7 @@ impl ConnectionState {
         self.lock().enter(phase);
     }
 
-    /// Records that the answer has been handed over.
+    /// Records that the HTTP server has finished with the answer.
     pub(super) fn answered(&self) {
         self.lock().enter(Phase::Waiting);
     }
@@ -195,7 +197,7 @@ impl ConnectionState {
         progress.phase == Phase::Waiting && progress.stalled.is_none()
     }
 
-    /// Returns when the connection must be closed.
+    /// Waits until the connection must be closed.
     pub(super) async fn ended(&self) {
         self.end.cancelled().await;
     }
@@ -250,7 +252,7 @@ impl<S> Connection<S> {
             .map(|()| Err(io::ErrorKind::TimedOut.into()))
     }
 
-    /// Counts bytes read of a request.
+    /// Counts bytes that were read of a request.
     fn has_read(&self, bytes: usize) -> io::Result<()> {
         let mut progress = self.state.lock();
         if !matches!(progress.phase, Phase::Waiting | Phase::Receiving) {
@@ -271,8 +273,8 @@ impl<S> Connection<S> {
         Ok(())
     }
 
-    /// Counts written bytes. An agent without CPU time may come after the deadline of a client that
-    /// has read in time, whose time then begins anew.
+    /// Counts written bytes. An agent without CPU time may miss the deadline of a client that has
+    /// read in time. The time limit of that client begins again.
     fn has_written(&self, bytes: usize) {
         let now = Instant::now();
         let mut progress = self.state.lock();
@@ -287,7 +289,7 @@ impl<S> Connection<S> {
             if *taken >= LEAST {
                 progress.stalled = None;
             } else if *since + PROGRESS + LATE <= now {
-                // Else the deadline would have closed the connection.
+                // An agent with CPU time would have closed the connection at the deadline.
                 progress.stalled = Some((now, 0));
             }
         }
@@ -371,7 +373,7 @@ mod tests {
     use crate::config::{Limit, Limits};
     use crate::limit_facts::LimitFigures;
 
-    /// Creates connections, and a function that adds one.
+    /// Creates a set of connections, and a function that adds one.
     fn connections() -> (
         Arc<Connections>,
         impl Fn() -> (Connection<DuplexStream>, DuplexStream),
@@ -400,7 +402,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn a_request_that_trickles_in_has_ten_seconds_and_a_pause_seventy_five() {
+    async fn a_slow_request_ends_after_ten_seconds_and_an_idle_connection_after_75() {
         let (_crowd, join) = connections();
         let (mut idle, _client) = join();
         let (lasted, why) = read(&mut idle).await;
@@ -423,7 +425,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn a_whole_answer_that_is_read_too_slowly_ends_and_a_stream_may_stall_for_longer() {
+    async fn a_slowly_read_answer_ends_its_connection_sooner_than_a_stalled_stream() {
         for (is_whole, seconds) in [(true, 10..=20), (false, 75..=75)] {
             let (_crowd, join) = connections();
             let (mut connection, mut client) = join();
@@ -452,7 +454,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn an_answer_that_is_read_at_twenty_kilobytes_a_second_is_sent_whole() {
+    async fn an_answer_that_is_read_fast_enough_is_sent_whole() {
         let (_crowd, join) = connections();
         let (mut connection, mut client) = join();
         connection.state().requested(true);
@@ -472,7 +474,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn an_agent_that_comes_late_to_a_client_that_has_read_goes_on() {
+    async fn a_client_that_read_in_time_stays_connected_if_the_agent_is_late() {
         let (_crowd, join) = connections();
         let (mut connection, mut client) = join();
         connection.state().requested(true);
@@ -488,7 +490,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn unfinished_requests_of_all_connections_share_a_budget_and_small_ones_need_none() {
+    async fn large_unfinished_requests_share_a_budget_and_small_ones_need_none() {
         let (connections, join) = connections();
         let mut large = Vec::new();
         let mut refused = 0;
@@ -512,7 +514,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn the_connection_that_waits_longest_makes_room_and_one_that_is_answered_does_not() {
+    async fn the_connection_that_has_waited_longest_for_its_client_is_closed_first() {
         let (connections, join) = connections();
         let (answered, _one) = join();
         answered.state().requested(true);
@@ -520,7 +522,7 @@ mod tests {
         tokio::time::advance(Duration::from_secs(1)).await;
         let (mut newest, _three) = join();
         let is_closed = |connection: &Connection<DuplexStream>| connection.state.end.is_cancelled();
-        // The agent has not had the time to read them.
+        // The agent has not read the connections yet.
         assert!(!connections.make_room());
         let read = [&mut oldest, &mut newest].map(|each| each.read_u8().now_or_never());
         assert!(read.iter().all(Option::is_none));

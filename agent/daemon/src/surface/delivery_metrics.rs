@@ -16,13 +16,13 @@ use ros2probe_model::report::snapshot::{
     AcknowledgementFacts, Breakdown, Delivered, DeliveryFacts, Direction, SocketFacts, TopicFacts,
 };
 
-/// Largest number of deliveries, and of acknowledging readers, with their own series.
+/// Maximum number of deliveries, and of acknowledging readers, with their own series.
 const MAX_SHOWN: usize = 1_000;
-/// Largest number of sockets with their own series.
+/// Maximum number of sockets with their own series.
 const MAX_SOCKETS: usize = 64;
-/// Cause of messages that arrived, and that a process never took.
+/// Loss cause of messages that arrived but were never taken by the process.
 const READER_QUEUE: &str = "reader_queue";
-/// Largest number of nodes in one label.
+/// Maximum number of nodes in one label.
 const MAX_NODES: usize = 4;
 
 /// Reads a counter.
@@ -41,7 +41,7 @@ pub(super) struct Deliveries<'a> {
     pub(super) hidden: usize,
 }
 
-/// A series; deliveries with equal labels are added.
+/// A series: the sum of all deliveries with equal labels.
 struct Delivery<'a> {
     row: &'a TopicRow<'a>,
     facts: &'a DeliveryFacts,
@@ -72,7 +72,8 @@ impl<'a> Deliveries<'a> {
         all
     }
 
-    /// Adds a delivery. The snapshot's lists are sorted by the labels, so equal ones are adjacent.
+    /// Adds a delivery. The snapshot's lists are sorted by the labels, so deliveries with equal
+    /// labels are adjacent.
     fn add(&mut self, row: &'a TopicRow<'a>, facts: &'a DeliveryFacts) {
         let shown = self.sent.len() + self.received.len();
         let list = match facts.direction {
@@ -248,7 +249,7 @@ impl<'a> Delivery<'a> {
     }
 }
 
-/// Writes the sums over a topic's deliveries, for topics with any.
+/// Writes the sums over the deliveries of each topic that has deliveries.
 pub(super) fn sums(
     sink: &mut MetricSink<'_>,
     rows: &[TopicRow<'_>],

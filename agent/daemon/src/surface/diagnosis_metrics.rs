@@ -11,12 +11,12 @@ use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::DomainId;
 
-/// Returns how much one finding adds to a family.
+/// Returns the number that one finding adds to a family.
 type Count = fn(&Diagnosis) -> usize;
 /// Counts by topic.
 type PerTopic<'a> = BTreeMap<(DomainId, Cow<'a, str>), usize>;
 
-/// Writes one family per kind of finding.
+/// Writes the number of findings per kind, and further families for some kinds.
 pub(super) fn diagnoses(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
     let found = &*snapshot.diagnoses;
     sink.family(&metric::DIAGNOSES, |family| {
@@ -70,7 +70,7 @@ pub(super) fn diagnoses(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::
     })
 }
 
-/// Writes the counts of each topic.
+/// Writes the counts per topic.
 fn per_topic(sink: &mut MetricSink<'_>, list: &[Diagnosis]) -> fmt::Result {
     let metrics: [(&'static Metric, Count); 4] = [
         (&metric::TOPIC_CONFLICTING_TYPES, |each| match each {

@@ -186,7 +186,8 @@ fn seen_inside() -> Snapshot {
     observer.snapshot(Timestamp(start + 10 * SECOND))
 }
 
-/// Returns the points of a request as lines `name{key="value",…} value`; of a histogram its count.
+/// Returns the points of a request as lines `name{key="value",…} value`; the value of a histogram
+/// is its count.
 fn lines(request: &ExportMetricsServiceRequest) -> Vec<String> {
     let scopes = request
         .resource_metrics
@@ -233,7 +234,7 @@ fn lines(request: &ExportMetricsServiceRequest) -> Vec<String> {
 }
 
 #[tokio::test]
-async fn figures_from_inside_processes_have_the_names_and_values_of_the_page() {
+async fn metrics_of_calls_inside_processes_are_exported_as_on_the_page() {
     let (receiver, address) = Receiver::listening([]).await;
     let sources = MetricSources::new(
         SourceKind::Host,
@@ -273,7 +274,7 @@ async fn figures_from_inside_processes_have_the_names_and_values_of_the_page() {
     ] {
         assert!(known(&expected), "{expected}\n{exported:#?}");
     }
-    // Every such metric of the page is exported under its name.
+    // Every metric of the page about calls inside processes is exported under its name.
     let of_inside = CATALOGUE.iter().filter(|metric| {
         let name = metric.name;
         ["inside", "callback", "intra_process", "lifecycle", "timer"]
@@ -312,7 +313,8 @@ async fn a_transient_failure_is_retried_and_a_refusal_is_not() {
         Answer::Rejects(7),
     ];
     let (receiver, address) = Receiver::listening(script).await;
-    // The pause before a retry is at most a second, so the next export must not overtake it.
+    // The pause before a retry is at most a second. The export interval is longer, so that the next
+    // export does not overtake the retry.
     let (exports, exporter) = exporting(address, 3, "compression: gzip");
     let exports = exports.as_ref();
     until("a part is rejected", || {
@@ -331,7 +333,7 @@ async fn a_transient_failure_is_retried_and_a_refusal_is_not() {
 }
 
 #[tokio::test]
-async fn newer_points_take_the_place_of_those_a_slow_receiver_does_not_take() {
+async fn newer_points_supersede_points_that_a_slow_receiver_does_not_accept() {
     let (receiver, address) = Receiver::listening([Answer::Sleeps, Answer::Sleeps]).await;
     let (exports, exporter) = exporting(address, 1, "timeout_s: 30");
     let exports = exports.as_ref();
@@ -343,8 +345,9 @@ async fn newer_points_take_the_place_of_those_a_slow_receiver_does_not_take() {
 }
 
 #[tokio::test]
-async fn a_receiver_that_comes_later_gets_the_latest_and_one_that_never_comes_delays_no_end() {
-    // An address of its own: another test could get its port before it listens there.
+async fn a_late_receiver_gets_recent_points_and_a_missing_one_does_not_delay_the_end() {
+    // The test uses an address of its own. On another address, a different test could take the port
+    // first.
     let listener = TcpListener::bind("127.17.40.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     drop(listener);

@@ -153,14 +153,14 @@ struct Local(bool);
 impl Local {
     fn of(connection: &Connection<TcpStream>) -> Self {
         let address = connection.stream().local_addr();
-        // A broken connection needs no answer.
+        // A connection without an address is broken, and needs no answer.
         Self(address.is_ok_and(|address| address.ip().to_canonical().is_loopback()))
     }
 }
 
-/// Rejects requests over loopback that are not for this host's own names: a web page could make a
-/// browser on this host resolve its name to loopback. Names of other addresses are unknown to the
-/// agent.
+/// Rejects requests over loopback that are not for this host's own names. A web page could make a
+/// browser on this host resolve its name to loopback. The agent does not know the names of other
+/// addresses.
 async fn own_names(Extension(local): Extension<Local>, request: Request, next: Next) -> Response {
     let headers = request.headers();
     // A client without the header is not a browser.
@@ -198,8 +198,8 @@ fn router(sources: MetricSources) -> Router {
 /// Pages that are being created and read.
 static PAGES: LargeResponses = LargeResponses::new();
 
-/// Longest time that a scrape waits for a fresh snapshot; the capture thread usually responds at
-/// once.
+/// Maximum time that a scrape waits for a fresh snapshot. The capture thread usually responds
+/// immediately.
 const REFRESH_TIMEOUT: Duration = Duration::from_millis(600);
 
 async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response {
@@ -282,7 +282,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_page_is_compressed_where_the_client_accepts_that() {
+    fn a_page_is_compressed_if_the_client_accepts_gzip() {
         for (accepted, expected) in [
             ("gzip", Encoding::Gzip),
             ("deflate, GZIP;q=0.5, br", Encoding::Gzip),

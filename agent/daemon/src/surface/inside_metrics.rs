@@ -16,7 +16,7 @@ use ros2probe_model::facts::histogram::Histogram;
 use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::DomainId;
 
-/// Largest number of callbacks with series of their own.
+/// Maximum number of callbacks with series of their own.
 const MAX_CALLBACKS: usize = 1024;
 
 /// Reads a counter of a topic.
@@ -28,7 +28,7 @@ type Gauge = fn(&CallbackSum) -> Option<f64>;
 /// Domain, node, trigger and name of callbacks that share their series.
 type CallbackKey<'a> = (DomainId, &'a str, &'static str, String);
 
-/// Callbacks with series of their own, and the number of the others.
+/// Callbacks with series of their own, and the number of other callbacks.
 #[derive(Debug, Default)]
 pub(super) struct Callbacks<'a> {
     sums: BTreeMap<CallbackKey<'a>, CallbackSum>,
@@ -63,7 +63,7 @@ impl<'a> Callbacks<'a> {
     }
 }
 
-/// Writes the metrics of topics inside processes.
+/// Writes the metrics of topics from inside processes.
 pub(super) fn topics(
     sink: &mut MetricSink<'_>,
     snapshot: &Snapshot,
@@ -113,7 +113,7 @@ pub(super) fn topics(
     })
 }
 
-/// Returns what processes show of a topic, if anything.
+/// Returns the observations of a topic from inside processes, if any.
 fn inside<'a>(row: &TopicRow<'a>) -> Option<&'a TopicInside> {
     row.facts.and_then(|facts| facts.inside.as_deref())
 }
@@ -193,7 +193,7 @@ fn nodes(sink: &mut MetricSink<'_>, known: Option<&InsideFacts>) -> fmt::Result 
     })
 }
 
-/// Writes the state of the source.
+/// Writes the state of the source of calls.
 pub(super) fn source(
     sink: &mut MetricSink<'_>,
     source: Option<&InsideSourceFacts>,

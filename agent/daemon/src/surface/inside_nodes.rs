@@ -1,4 +1,4 @@
-//! Sums of a node over its callbacks, and its lifecycle state.
+//! Activity of a node, summed over its callbacks, and its lifecycle state.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use ros2probe_wire::DomainId;
 /// Activity of one node.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct NodeActivity<'a> {
-    /// Share of the last window that calls of its callbacks took; `None` without a callback.
+    /// Share of the last window in which the node's callbacks ran; `None` without a callback.
     pub(super) busy: Option<f64>,
     /// Last lifecycle state, if known.
     pub(super) state: Option<&'a str>,

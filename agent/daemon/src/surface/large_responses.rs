@@ -1,6 +1,6 @@
-//! Large answers, such as a page of metrics or all topics: megabytes on a large robot. Few are
-//! created at a time, and they are kept compressed within a budget until they are read. A new
-//! answer revokes the memory of the one that has been read for longest.
+//! Large answers, such as a page of metrics or all topics: megabytes on a large robot. Few of them
+//! are created at a time, and they are kept compressed within a budget until they are read. A new
+//! answer beyond the budget revokes the memory of the oldest answers.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -12,13 +12,13 @@ use tokio_util::sync::CancellationToken;
 
 use super::compressed_text::{CompressedText, Encoding, TextCompressor};
 
-/// Number of large answers of one surface that are created at once.
+/// Maximum number of large answers of one surface that are created simultaneously.
 const AT_ONCE: usize = 2;
 /// Budget in bytes for compressed answers of one surface that are being read.
 const KEPT: usize = 4 << 20;
-/// Size in bytes from which an answer is large.
+/// Minimum size of a large answer, in bytes.
 const LARGE: usize = 256 << 10;
-/// Longest time that a request waits for a permit.
+/// Maximum time that a request waits for a permit.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Large answers of one surface.
@@ -29,11 +29,11 @@ pub(super) struct LargeResponses {
     kept: Mutex<Vec<Pending>>,
 }
 
-/// Answers that are being read, by age.
+/// An answer that is being read.
 #[derive(Debug)]
 struct Pending {
     bytes: usize,
-    /// Revokes the answer; its reader gets no more.
+    /// Revokes the answer: its reader receives no further data.
     given_up: CancellationToken,
 }
 
@@ -44,7 +44,7 @@ pub(super) struct RenderPermit {
     _making: SemaphorePermit<'static>,
 }
 
-/// Memory of one answer until it is read.
+/// Reserved memory of one answer, until the answer is read.
 #[derive(Debug)]
 pub(super) struct Reservation {
     of: &'static LargeResponses,
@@ -52,7 +52,7 @@ pub(super) struct Reservation {
 }
 
 impl LargeResponses {
-    /// Creates an empty state.
+    /// Creates the state without any answers.
     pub(super) const fn new() -> Self {
         Self {
             making: Semaphore::const_new(AT_ONCE),
@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_third_answer_waits_until_one_of_two_is_made() {
+    async fn a_third_answer_gets_no_permit_until_one_of_two_is_created() {
         static ANSWERS: LargeResponses = LargeResponses {
             making: Semaphore::const_new(AT_ONCE),
             longest: Duration::ZERO,

@@ -1,6 +1,6 @@
-//! A listener with a limited number of connections. If all slots are in use, the connection with
-//! the longest wait for its client makes room. If none waits, a further client receives 503 at
-//! once.
+//! A listener with a limited number of connections. If all slots are in use, the connection that
+//! has waited longest for its client is closed. If no connection waits, a further client receives
+//! 503 immediately.
 
 use std::io;
 use std::sync::Arc;
@@ -15,13 +15,13 @@ use super::connection::{Connection, Connections};
 use crate::config::Limit;
 use crate::limit_facts::{LimitFigures, Slot, Slots};
 
-/// Longest time for a refused client to read the answer, and largest number of such clients at
-/// once.
+/// Maximum time for a refused client to read the answer, and maximum number of such clients at a
+/// time.
 const REFUSAL_TIMEOUT: Duration = Duration::from_secs(1);
 const FAREWELLS: usize = 64;
-/// Bytes of a request that are read so that its sender receives the answer.
+/// Maximum number of bytes read of a refused request, so that its sender receives the answer.
 const REQUEST: u64 = 64 << 10;
-/// Longest time that a connection that makes room may take to close.
+/// Maximum time that an evicted connection may take to close.
 const EVICTION_TIMEOUT: Duration = Duration::from_millis(100);
 
 /// A listener with a limited number of connections.
@@ -60,14 +60,14 @@ impl<L> LimitedListener<L> {
         }
     }
 
-    /// Returns a slot, if necessary that of an idle connection.
+    /// Returns a free slot, or else the slot of an evicted connection.
     async fn slot(&self) -> Option<Slot> {
         if let Some(slot) = self.slots.take() {
             return Some(slot);
         }
         self.limits.reached(self.limit, 1);
         if !self.connections.make_room() {
-            // Those that were accepted a moment ago have not been read.
+            // Connections that were just accepted have not been read yet.
             tokio::task::yield_now().await;
             if !self.connections.make_room() {
                 return None;
@@ -84,7 +84,8 @@ impl<L> LimitedListener<L> {
         timeout(EVICTION_TIMEOUT, freed).await.ok()
     }
 
-    /// Answers a connection without a slot in the background. Few such answers are kept at a time.
+    /// Refuses a connection without a slot, in the background. The number of such answers in
+    /// progress is limited.
     fn reject(&mut self, stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static) {
         while self.leaving.try_join_next().is_some() {}
         if let Some(refusal) = self.refusal.clone()
@@ -98,7 +99,7 @@ impl<L> LimitedListener<L> {
 }
 
 impl<L: Listener> LimitedListener<L> {
-    /// Returns the next connection that has a slot.
+    /// Returns the next connection that gets a slot.
     pub(super) async fn accept(&mut self) -> Connection<L::Io> {
         loop {
             let (stream, _) = self.listener.accept().await;

@@ -1,4 +1,4 @@
-//! TCP listeners that bound the kernel's memory per connection: unread data of a slow client counts
+//! TCP listeners with bounded kernel memory per connection. Unread data of a slow client counts
 //! against the agent's `MemoryMax`, by default up to 4 MB per connection.
 
 use std::io;
@@ -26,14 +26,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_kernel_holds_little_for_a_client_that_does_not_read() {
+    fn the_send_buffer_does_not_grow_for_a_client_that_does_not_read() {
         let listener = listen(([127, 0, 0, 1], 0).into()).unwrap();
         let client = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
         listener.set_nonblocking(false).unwrap();
         let (server, _) = listener.accept().unwrap();
         let room = sockopt::socket_send_buffer_size(&server).unwrap();
         assert_eq!(room, 2 * SEND_BUFFER);
-        // The buffer would grow while data is sent.
+        // A buffer without a fixed size would grow while data is sent.
         server
             .set_write_timeout(Some(Duration::from_millis(100)))
             .unwrap();

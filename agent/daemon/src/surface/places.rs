@@ -1,13 +1,13 @@
-//! Places for streams, of which some are reserved for clients with a token.
+//! Slots for streams, of which some are reserved for clients with a token.
 //!
-//! A client without a token can hold a place for as long as it likes. It cannot hold those that are
-//! reserved, so the owner of the robot still finds one.
+//! A client without a token can use a slot for an unlimited time. It cannot use a reserved slot, so
+//! the owner of the robot can still open a stream.
 
 use std::sync::Arc;
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-/// A fixed number of places.
+/// A fixed number of slots.
 #[derive(Debug)]
 pub(super) struct Places {
     all: usize,
@@ -16,7 +16,7 @@ pub(super) struct Places {
 }
 
 impl Places {
-    /// Creates `all` places, a quarter of them reserved for clients with a token.
+    /// Creates `all` slots, a quarter of them reserved for clients with a token.
     pub(super) fn new(all: usize) -> Self {
         let reserved = all / 4;
         Self {
@@ -26,12 +26,13 @@ impl Places {
         }
     }
 
-    /// Returns whether no place is taken.
+    /// Returns whether all slots are free.
     pub(super) fn is_unused(&self) -> bool {
         self.open.available_permits() + self.reserved.available_permits() == self.all
     }
 
-    /// Returns a place until it is dropped; `None` if all are taken.
+    /// Returns a slot, which is free again after it is dropped. Returns `None` if no slot is free
+    /// for the client.
     pub(super) fn take(&self, is_holder: bool) -> Option<OwnedSemaphorePermit> {
         let open = Arc::clone(&self.open).try_acquire_owned();
         let reserved = || Arc::clone(&self.reserved).try_acquire_owned();
@@ -47,20 +48,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn clients_without_a_token_leave_a_quarter_of_the_places() {
+    fn clients_without_a_token_cannot_take_the_reserved_quarter_of_the_slots() {
         let places = Places::new(16);
         let strangers: Vec<_> = std::iter::from_fn(|| places.take(false)).collect();
         assert_eq!(strangers.len(), 12);
         let owners: Vec<_> = std::iter::from_fn(|| places.take(true)).collect();
         assert_eq!(owners.len(), 4);
         drop(strangers);
-        // Owners have the others, too.
+        // Clients with a token can also take the slots that are not reserved.
         let others: Vec<_> = std::iter::from_fn(|| places.take(true)).collect();
         assert_eq!(others.len(), 12);
     }
 
     #[test]
-    fn a_place_is_free_after_its_stream() {
+    fn a_slot_is_free_again_after_its_permit_is_dropped() {
         let places = Places::new(4);
         let held: Vec<_> = std::iter::from_fn(|| places.take(true)).collect();
         assert_eq!((held.len(), places.take(true).is_some()), (4, false));

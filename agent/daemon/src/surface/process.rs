@@ -1,9 +1,9 @@
 //! Resource usage of this process and others, from `/proc`. Unreadable values are absent, because
-//! hardened services may hide some.
+//! the sandbox of a service may hide some values.
 
 use std::fs;
 
-/// A reading of this process.
+/// Resource usage of this process.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Process {
     pub(super) cpu_seconds: Option<f64>,
@@ -27,7 +27,7 @@ pub(super) struct Usage {
 }
 
 impl Usage {
-    /// Returns `None` if the process has ended or is hidden.
+    /// Returns the usage of a process, or `None` if the process has ended or is hidden.
     pub(super) fn read(id: u32) -> Option<Self> {
         let stat = fs::read_to_string(format!("/proc/{id}/stat")).ok()?;
         let fields = Fields::of(&stat);
@@ -58,8 +58,8 @@ struct Fields<'a>(Vec<&'a str>);
 
 impl<'a> Fields<'a> {
     fn of(stat: &'a str) -> Self {
-        // The command name may contain spaces and brackets, so the fields begin after its last
-        // bracket.
+        // The command name may contain spaces and parentheses, so the fields begin after the last
+        // closing parenthesis.
         Self(match stat.rsplit_once(") ") {
             Some((_, rest)) => rest.split(' ').collect(),
             None => Vec::new(),
@@ -101,9 +101,9 @@ impl Process {
     }
 }
 
-/// Returns the memory that the kernel cannot reclaim while the process runs: its own pages
-/// (anonymous, changed, swapped), and the rings shared with the kernel, which are mapped as files.
-/// `None` if the kernel hides it.
+/// Returns the memory that the kernel cannot reclaim while the process runs, in bytes. It consists
+/// of the process's own pages (anonymous, changed, swapped), and of the rings shared with the
+/// kernel, which are mapped as files. Returns `None` if the kernel hides it.
 fn unreclaimable_bytes() -> Option<f64> {
     let maps = fs::read_to_string("/proc/self/smaps").ok()?;
     let mut bytes = 0.0;
@@ -173,7 +173,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_process_can_read_about_itself() {
+    fn a_process_can_read_its_own_resource_usage() {
         let process = Process::read();
         assert!(process.resident_bytes.unwrap() > 100_000.0);
         assert!(process.virtual_bytes >= process.resident_bytes);

@@ -20,14 +20,14 @@ use ros2probe_model::report::snapshot::{
 };
 use ros2probe_wire::DomainId;
 
-/// Largest number of unknown writers with their own series.
+/// Maximum number of unknown writers with their own series.
 const MAX_UNKNOWN_WRITERS: usize = 32;
-/// Largest number of types or policies in one label.
+/// Maximum number of types or policies in one label.
 const MAX_JOINED: usize = 4;
 
 /// Reads a counter.
 type Count = fn(&Measurement) -> u64;
-/// Reads a counter of a sampled view.
+/// Reads a counter of a sampled topic.
 type SampledCount = fn(&SampledFacts) -> u64;
 /// Reads a histogram.
 type Values = fn(&Measurement) -> &Histogram;
@@ -50,8 +50,8 @@ pub(super) struct TopicRows<'a> {
 }
 
 impl<'a> TopicRows<'a> {
-    /// Selects the topics to show: measured ones first. Service and other internal topics are shown
-    /// if they are measured.
+    /// Selects the topics to show, with measured topics first. Service and other internal topics
+    /// are shown only if they are measured.
     pub(super) fn new(snapshot: &'a Snapshot, settings: &Settings) -> Self {
         let max_topics = settings.limits.topics;
         let mut rows: BTreeMap<(DomainId, Cow<'a, str>), TopicRow<'a>> = BTreeMap::new();
@@ -222,7 +222,7 @@ fn unknown_writers(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resul
     })
 }
 
-/// Returns the labels host, process, process id and control group; unknown ones are empty.
+/// Returns the labels host, process, process id and control group. Unknown labels are empty.
 fn place(process: &ProcessFacts) -> [Label<'_>; 4] {
     [
         Label::Text(process.host.as_deref().unwrap_or_default()),
@@ -252,7 +252,7 @@ fn nodes(family: &mut Family<'_>, snapshot: &Snapshot) -> fmt::Result {
         .collect();
     let mut seen = BTreeSet::new();
     for node in &snapshot.nodes {
-        // Two nodes with one name in a participant are a fault, but only one series.
+        // Two nodes of a participant with the same name are a fault, but have only one series.
         if !seen.insert((node.participant, node.name.as_str())) {
             continue;
         }
@@ -466,8 +466,8 @@ fn measured(
     Ok(())
 }
 
-/// Writes a value per second of each measured topic where it is known; 0 of a watched name without a
-/// topic.
+/// Writes the value per second of each measured topic if it is known. The value of a watched topic
+/// without a measurement is 0.
 fn per_second(
     family: &mut Family<'_>,
     rows: &[TopicRow<'_>],
@@ -511,7 +511,7 @@ fn topic_info(family: &mut Family<'_>, row: &TopicRow<'_>) -> fmt::Result {
     ])
 }
 
-/// Joins different values, sorted, up to a cap.
+/// Joins the different values, sorted, up to [`MAX_JOINED`].
 fn joined<'a>(values: impl Iterator<Item = &'a str>) -> String {
     let different: BTreeSet<&str> = values.collect();
     let mut text = String::new();
@@ -595,8 +595,8 @@ pub(super) fn watches(
     })
 }
 
-/// Returns the configured entry of `watch` in the model: usually at the same index, unless the list
-/// has just changed. `None` if it was removed.
+/// Returns the configured entry of `watch`, which usually has the same index, unless the list has
+/// just changed. Returns `None` if the entry was removed.
 fn configured<'c>(
     place: usize,
     watch: &WatchFacts,
@@ -609,12 +609,13 @@ fn configured<'c>(
     there.or_else(|| configured.iter().map(|watch| &**watch).find(same))
 }
 
-/// Returns the vendor of a writer, as far as it is known.
+/// Returns the vendor of a writer, or an empty label if it is unknown.
 fn unknown_vendor(writer: &UnknownWriterFacts) -> Label<'static> {
     writer.vendor.map_or(Label::Text(""), Label::Vendor)
 }
 
-/// Returns `/points`, or `/points@5` for a single domain; ROS names contain no `@`.
+/// Returns the label of a watch: `/points`, or `/points@5` for a single domain. ROS names contain
+/// no `@`.
 fn watch_name(facts: &WatchFacts) -> Cow<'_, str> {
     let watch = &facts.watch;
     match watch.domain_id {

@@ -24,7 +24,7 @@ use tokio_util::sync::CancellationToken;
 use super::connection::{Connection, ConnectionState};
 use super::limited_listener::LimitedListener;
 
-/// Largest size of a request's head in bytes, and largest number of its fields.
+/// Maximum size of a request's head in bytes, and maximum number of its fields.
 pub(super) const MAX_HEAD: usize = 48 << 10;
 const MAX_FIELDS: usize = 64;
 

@@ -1,8 +1,8 @@
-//! TLS on the metrics listener, by rustls. Its provider is ring, which is partly C and assembly: the
-//! one in pure Rust, rustls-rustcrypto, is an alpha, and graviola needs AES instructions, which a
-//! Raspberry Pi 4 lacks.
+//! TLS on the metrics listener, with rustls. Its crypto provider is ring, which is partly C and
+//! assembly. The provider in pure Rust, rustls-rustcrypto, is an alpha release. The provider
+//! graviola needs AES instructions, which a Raspberry Pi 4 lacks.
 //!
-//! The handshake takes place while the connection is read, so a slow client only delays itself. The
+//! The handshake runs during reads of the connection, so a slow client only delays itself. The
 //! limits of the underlying connection apply as well.
 
 use std::io;
@@ -25,7 +25,7 @@ use super::connection::Connection;
 use super::serving::Wrap;
 use super::web_config::TlsFiles;
 
-/// Largest size of a file with certificates or a key.
+/// Maximum size of a file with certificates or a key, in bytes.
 const MAX_BYTES: u64 = 1 << 20;
 
 /// Why TLS cannot be set up.
@@ -47,7 +47,7 @@ pub enum TlsError {
         /// Error of the parser.
         source: pem::Error,
     },
-    /// Certificate and key do not match.
+    /// Certificates and key cannot be used, for example because they do not match.
     #[error("certificate and key (`tls_server_config`) cannot be used")]
     Unfit(#[from] rustls::Error),
     /// The client authorities are invalid.
@@ -59,7 +59,7 @@ pub enum TlsError {
 #[derive(Clone)]
 pub(super) struct Acceptor(TlsAcceptor);
 
-/// A connection, from its first byte on.
+/// A connection with TLS, including its handshake.
 pub(super) enum Stream<S> {
     /// The handshake is in progress.
     Handshake(Box<Accept<S>>),
@@ -136,7 +136,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin + Send + 'static> Wrap<S> for Acceptor {
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Stream<S> {
-    /// Returns the stream after the handshake, which each call advances.
+    /// Advances the handshake, and returns the stream once the handshake is complete.
     fn poll_open(&mut self, context: &mut Context<'_>) -> Poll<io::Result<Pin<&mut TlsStream<S>>>> {
         if let Self::Handshake(accept) = self {
             let agreed = ready!(Pin::new(&mut **accept).poll(context));

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-/// Largest size of the file.
+/// Maximum size of the file, in bytes.
 const MAX_BYTES: u64 = 1 << 20;
 /// Accepted bcrypt costs. Each step doubles the time of a check; 16 takes seconds on a robot.
 const COSTS: std::ops::RangeInclusive<u8> = 4..=16;
@@ -61,7 +61,7 @@ pub enum WebConfigError {
 /// Why a setting of the file is invalid.
 #[derive(Debug, thiserror::Error)]
 pub enum InvalidSetting {
-    /// Not YAML, or an unknown or missing key.
+    /// The file is not YAML, or has an unknown or missing key.
     #[error(transparent)]
     Yaml(#[from] serde_yaml::Error),
     /// A user's password hash cannot be used.
@@ -95,7 +95,7 @@ pub enum InvalidSetting {
 /// Why a password hash cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum InvalidHash {
-    /// Not of the form `$2y$10$` and 53 characters.
+    /// The hash does not consist of a prefix such as `$2y$10$` and 53 characters.
     #[error("is not a bcrypt hash, as printed by `htpasswd -nBC 10 NAME`")]
     NotBcrypt,
     /// The cost is outside of the accepted range.
@@ -124,7 +124,7 @@ struct TlsShape {
 }
 
 impl WebConfig {
-    /// Reads and validates the file; paths in it are relative to it.
+    /// Reads and validates the file. Paths in the file are relative to its directory.
     ///
     /// # Errors
     /// Fails if the file cannot be read, or has unknown or invalid settings.
@@ -190,7 +190,8 @@ impl TlsShape {
     }
 }
 
-/// Checks `$2y$10$` and 53 characters. The cost is bounded, because every client can cause it.
+/// Checks that a hash consists of a prefix such as `$2y$10$` and 53 characters. The cost is
+/// bounded, because every client can cause a check.
 fn check_hash(hash: &str) -> Result<(), InvalidHash> {
     let mut parts = hash.split('$');
     let (none, version, cost) = (parts.next(), parts.next(), parts.next());
@@ -220,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn the_form_of_exporter_toolkit_is_read() {
+    fn a_file_in_the_format_of_exporter_toolkit_is_accepted() {
         let text = format!(
             "tls_server_config:\n  cert_file: server.crt\n  key_file: /keys/server.key\n  \
              min_version: TLS13\nbasic_auth_users:\n  alice: {ALICE}\n"

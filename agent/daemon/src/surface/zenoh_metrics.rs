@@ -8,10 +8,10 @@ use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_metrics::catalogue::{self as metric, Metric};
 use ros2probe_metrics::metric_sink::{Label, MetricSink};
 
-/// Reads a figure.
+/// Reads a value of Zenoh.
 type Figure = fn(&ZenohFacts) -> u64;
 
-/// Writes the figures of Zenoh.
+/// Writes the metrics of Zenoh.
 pub(super) fn zenoh(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
     const FIGURES: [(&Metric, Figure); 6] = [
         (&metric::ZENOH_CONNECTIONS, |zenoh| zenoh.connections),
