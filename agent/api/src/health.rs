@@ -15,7 +15,8 @@ pub struct Health {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub reason: Option<String>,
-    /// Limits that are reached, so that a part of the robot is not observed; null without any.
+    /// Limits that are reached, so that a part of the robot is not observed; null if no limit is
+    /// reached.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub degraded: Option<String>,
@@ -93,7 +94,7 @@ pub struct Foxglove {
     /// Address that viewers open on the agent's host.
     #[cfg_attr(feature = "openapi", schema(example = "ws://localhost:8765/"))]
     pub address: String,
-    /// Why the agent does not listen there; null if it does.
+    /// Why the agent does not listen at the address; null if it does.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub reason: Option<String>,

@@ -15,7 +15,7 @@ pub enum Code {
     ForeignHost,
     /// A web page of another origin sent the request.
     ForeignOrigin,
-    /// This listener does not grant the request; the unix socket does.
+    /// This listener does not grant the request, but the unix socket grants it.
     NeedsSocket,
     /// The path does not exist.
     NotFound,

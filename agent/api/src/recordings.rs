@@ -12,7 +12,7 @@ use crate::recording_report::Report;
 pub struct RecordingList {
     /// Directory of the recordings; null if none is configured or writable.
     pub directory: Option<String>,
-    /// Running recordings, and the most recently ended ones.
+    /// Running recordings, and the most recently ended recordings.
     pub recordings: Vec<Recording>,
     /// Limits of the disk space that recordings use.
     pub limits: RecordingLimits,

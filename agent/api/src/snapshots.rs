@@ -50,7 +50,7 @@ pub struct Snapshot {
     pub failed: u64,
     /// Number of events that matched a trigger but did not start a bag.
     pub suppressed: u64,
-    /// Number of old triggered bags removed for new ones.
+    /// Number of old triggered bags that were removed for new bags.
     pub removed: u64,
 }
 

@@ -227,7 +227,7 @@ pub enum ReasonCode {
     WatchRejected,
     /// All endpoints are on other hosts, and the agent captures at this host's sockets only.
     OutsideView,
-    /// Messages use Fast DDS's shared memory, and the agent has read none of them there.
+    /// Messages use Fast DDS's shared memory, and the agent has not read any of them.
     SharedMemory,
     /// Subscribers read the publisher's history in shared memory, which cannot be observed.
     DataSharing,

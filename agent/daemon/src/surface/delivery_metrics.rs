@@ -173,7 +173,7 @@ impl<'a> Deliveries<'a> {
         })
     }
 
-    /// Writes each receiver once, whatever the number of its writers.
+    /// Writes each receiver once, regardless of the number of its writers.
     fn subscribers(&self, family: &mut Family<'_>) -> fmt::Result {
         let mut subscribers: Vec<&Delivery<'_>> = self.received.iter().collect();
         // Among one receiver's deliveries, the latest has the most complete facts.

@@ -168,7 +168,7 @@ mod tests {
         }
         let held: usize = ANSWERS.lock().iter().map(|kept| kept.bytes).sum();
         assert!(held <= KEPT, "{held}");
-        // The last answers are complete, the first ones end early.
+        // The last answers are complete, and the first answers end early.
         let mut whole = 0;
         for body in bodies {
             match to_bytes(body, usize::MAX).await {

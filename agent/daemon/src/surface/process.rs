@@ -148,7 +148,7 @@ fn max_fds() -> Option<f64> {
 }
 
 fn ticks_per_second() -> f64 {
-    // USER_HZ is 100 on every supported architecture, whatever the kernel's own HZ.
+    // USER_HZ is 100 on every supported architecture, regardless of the kernel's own HZ.
     100.0
 }
 

@@ -43,7 +43,7 @@ pub(super) struct TopicRow<'a> {
     pub(super) per_subscriber: bool,
 }
 
-/// The topics to show, sorted, and the number of omitted ones.
+/// The topics to show, sorted, and the number of omitted topics.
 pub(super) struct TopicRows<'a> {
     pub(super) shown: Vec<TopicRow<'a>>,
     pub(super) hidden: usize,

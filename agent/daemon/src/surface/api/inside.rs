@@ -212,7 +212,7 @@ pub(super) fn topic_details<'a>(
     Some(shown)
 }
 
-/// Returns the observations of a node, or `None` without any.
+/// Returns the observations of a node, or `None` without observations.
 pub(super) fn node<'a>(
     domain_id: DomainId,
     name: &str,

@@ -51,8 +51,8 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 
 /// Reload the configuration file
 ///
-/// This has the effect of `systemctl reload`. If the file has errors, the configuration stays
-/// unchanged and the answer lists all errors. Watches of clients stay.
+/// The request has the effect of `systemctl reload`. If the file has errors, the configuration
+/// stays unchanged and the answer lists all errors. Watches of clients stay.
 #[utoipa::path(
     post,
     path = "/-/reload",

@@ -565,7 +565,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         self.status(Level::Info, NO_SUBSCRIBER, &message).await
     }
 
-    /// Returns a sentence about the silent topics that have no subscriber; empty without any.
+    /// Returns a sentence about the silent topics that have no subscriber; empty without such
+    /// topics.
     fn unsubscribed_now(&self) -> String {
         let silent = self.subscribed.values().filter_map(|subscribed| {
             let is_silent = !subscribed.is_heard && subscribed.since.elapsed() >= SILENT;
