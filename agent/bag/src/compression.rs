@@ -1,7 +1,7 @@
 //! Compression of chunks and of whole files, in pure Rust.
 //!
-//! Supports one zstd level, the fastest: `ruzstd` implements no other. Zstd frames carry their
-//! content size; rosbag2 refuses to decompress a file without it.
+//! Zstd has one level, the fastest: `ruzstd` implements no other. Zstd frames carry their content
+//! size; rosbag2 refuses to decompress a file without it.
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
@@ -30,7 +30,7 @@ pub struct Progress {
 }
 
 impl Progress {
-    /// Returns the bytes of the file that were read so far.
+    /// Returns the number of bytes of the file that were read so far.
     #[must_use]
     pub fn read(&self) -> u64 {
         self.read.load(Ordering::Relaxed)
@@ -67,8 +67,7 @@ impl Compression {
             .find(|compression| compression.name() == name)
     }
 
-    /// Returns `bytes` compressed; `None` without compression, or if that does not make them
-    /// smaller.
+    /// Returns `bytes` compressed; `None` without compression, or if the result is not smaller.
     #[must_use]
     pub fn compressed(self, bytes: &[u8]) -> Option<Vec<u8>> {
         let compressed = match self {
@@ -141,7 +140,7 @@ impl Compression {
     }
 }
 
-/// Stores an error and ends the stream, because `ruzstd` accepts no errors.
+/// Stores an error and ends the stream, because `ruzstd` panics on an error.
 struct ProgressReader<'a, R> {
     inner: R,
     progress: &'a Progress,
@@ -186,12 +185,12 @@ impl<R: Read> Read for ProgressReader<'_, R> {
     }
 }
 
-/// Adds the content size to a zstd frame that lacks it (RFC 8878, 3.1.1.1). Stores an error,
-/// because `ruzstd` accepts none.
+/// Adds the content size to a zstd frame that lacks it (RFC 8878, 3.1.1.1). It stores an error,
+/// because `ruzstd` panics on an error.
 struct SizedFrame<W> {
     inner: W,
     size: u64,
-    /// Magic number, descriptor and window: the bytes before the size.
+    /// Bytes before the size: magic number, descriptor and window.
     head: Vec<u8>,
     failed: Option<io::Error>,
 }
@@ -259,7 +258,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn compressed_data_is_restored_and_a_zstd_frame_has_its_size() {
+    fn compressed_data_is_restored_and_a_zstd_frame_states_its_size() {
         let bytes = b"ros2probe ".repeat(40_000);
         for compression in [Compression::Lz4, Compression::Zstd] {
             let compressed = compression.compressed(&bytes).unwrap();
@@ -277,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_disk_is_an_error_and_no_panic() {
+    fn a_full_disk_returns_an_error_instead_of_a_panic() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("source");
         std::fs::write(&path, b"0123456789".repeat(100_000)).unwrap();
@@ -291,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn a_compression_that_is_given_up_fails() {
+    fn a_cancelled_compression_fails() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("source");
         std::fs::write(&path, b"0123456789".repeat(100_000)).unwrap();

@@ -1,8 +1,9 @@
-//! One MCAP file during writing: chunks, indexes, summary.
+//! Writes one MCAP file: chunks, indexes, summary.
 //!
-//! Records have the order of rosbag2's files. A file grows by whole pieces only: an incomplete
-//! write is cut off again. Before a piece is written, space is reserved for it and for the summary:
-//! a full disk is noticed while the file can still be completed. Knows only the channels of topics.
+//! Records have the same order as in rosbag2's files. A file grows by whole pieces only: an
+//! incomplete write is truncated. Before a piece is written, space is reserved for it and for the
+//! summary. A full disk is thus detected while the file can still be completed. Of topics, this
+//! module knows only the channels.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -24,7 +25,7 @@ use super::read::Scan;
 pub(super) const LIBRARY: &str = concat!("ros2probe ", env!("CARGO_PKG_VERSION"));
 /// Name of the metadata records.
 pub(super) const METADATA_NAME: &str = "rosbag2";
-/// Without chunks, records are written to the system in pieces of this size.
+/// Size of the pieces in which records without chunks are written, in bytes.
 const PIECE_BYTES: u64 = 256 << 10;
 /// Space for metadata.yaml, its record, and the additions of the final report.
 const SPARE_BYTES: u64 = 64 << 10;
@@ -35,16 +36,16 @@ pub(super) struct FileWriter {
     path: PathBuf,
     file: File,
     storage: Storage,
-    /// Bytes in the file; every record in them is complete.
+    /// Length of the file in bytes; every record in it is complete.
     position: u64,
-    /// Checksum of those bytes, if the options include it.
+    /// Checksum of the file so far, if the options include it.
     data_crc: Option<Crc>,
     pending: Pending,
     schemas: BTreeMap<u16, Schema>,
     /// Channels with messages.
     channels: BTreeMap<u16, Channel>,
     chunk_indexes: Vec<u8>,
-    /// Offset and length of metadata records.
+    /// Offset and length of each metadata record.
     metadata: Vec<(u64, u64)>,
     statistics: Statistics,
     /// Whether the file system can reserve space.
@@ -53,19 +54,19 @@ pub(super) struct FileWriter {
     is_torn: bool,
 }
 
-/// Records that are not in the file yet: the current chunk's, or plain ones.
+/// Records that are not in the file yet: those of the current chunk, or records without chunks.
 #[derive(Debug, Default)]
 struct Pending {
     records: Vec<u8>,
     start: u64,
     end: u64,
     messages: u64,
-    /// Per channel: log time and offset in the chunk.
+    /// Log time and offset in the chunk of each message, per channel.
     index: BTreeMap<u16, Vec<(u64, u64)>>,
 }
 
 impl FileWriter {
-    /// Creates the file, which must not exist, and writes its start.
+    /// Creates the file, which must not exist, and writes its first records.
     pub(super) fn create(path: &Path, storage: Storage, metadata: &Metadata) -> io::Result<Self> {
         let file = super::new_file(path)?;
         let mut writer = Self {
@@ -91,7 +92,7 @@ impl FileWriter {
         Ok(writer)
     }
 
-    /// Starts `path` with the complete part of `source`, to continue and finish it.
+    /// Creates `path` with the complete records of `source`, so that writing can continue.
     pub(super) fn resume(path: &Path, source: &mut File, scan: &Scan) -> io::Result<Self> {
         source.rewind()?;
         let mut file = super::new_file(path)?;
@@ -149,14 +150,14 @@ impl FileWriter {
         Ok(writer)
     }
 
-    /// Accepts one message. On an error it was not accepted; earlier messages are in the file or
-    /// still wait.
+    /// Accepts one message. If it fails, the message was not accepted; earlier messages are in the
+    /// file or still pending.
     pub(super) fn write(
         &mut self,
         message: &Message<'_>,
         channel: impl FnOnce() -> (Schema, Channel),
     ) -> io::Result<()> {
-        // Written directly, without another copy in memory.
+        // A large message is written directly, without another copy in memory.
         let is_large = self.storage.compression == Compression::None
             && message.data.len() as u64 >= self.piece_bytes();
         if self.pending.records.len() as u64 >= self.piece_bytes()
@@ -193,7 +194,7 @@ impl FileWriter {
         }
         let written = self.write_pending(message.data);
         if written.is_err() {
-            // Its channel record waits for the next attempt.
+            // The channel's record stays pending for the next attempt.
             let mut records = std::mem::take(&mut self.pending.records);
             records.truncate(usize::try_from(offset).unwrap_or(usize::MAX));
             self.pending = Pending {
@@ -204,7 +205,7 @@ impl FileWriter {
         written
     }
 
-    /// Writes everything accepted to the system: it survives the end of this process.
+    /// Writes all accepted messages to the system, where they survive the end of this process.
     pub(super) fn flush(&mut self) -> io::Result<()> {
         if self.pending.records.is_empty() {
             return Ok(());
@@ -212,12 +213,12 @@ impl FileWriter {
         self.write_pending(&[])
     }
 
-    /// Waits until everything flushed is on disk: it survives a loss of power.
+    /// Waits until all flushed data is on disk, where it survives a loss of power.
     pub(super) fn sync(&self) -> io::Result<()> {
         self.file.sync_data()
     }
 
-    /// Appends a metadata record after everything accepted.
+    /// Appends a metadata record after all accepted messages.
     pub(super) fn write_metadata(&mut self, metadata: &Metadata) -> io::Result<()> {
         self.flush()?;
         let mut record = Vec::new();
@@ -229,7 +230,7 @@ impl FileWriter {
         Ok(())
     }
 
-    /// Discards what is not in the file, and returns the number of messages and bytes per channel.
+    /// Discards the pending messages, and returns their number and bytes per channel.
     pub(super) fn discard(&mut self) -> BTreeMap<u16, (u64, u64)> {
         let pending = std::mem::take(&mut self.pending);
         let length = |offset: u64| {
@@ -244,7 +245,8 @@ impl FileWriter {
         counts.collect()
     }
 
-    /// Writes summary and footer. `channels` are all known ones, including those without messages.
+    /// Writes the summary and the footer. `channels` are all known channels, including those
+    /// without messages.
     pub(super) fn finish(
         &mut self,
         channels: impl Iterator<Item = (Schema, Channel)>,
@@ -267,12 +269,12 @@ impl FileWriter {
         self.file.set_len(self.position)
     }
 
-    /// Returns the bytes in the file.
+    /// Returns the length of the file in bytes.
     pub(super) fn position(&self) -> u64 {
         self.position
     }
 
-    /// Returns the bytes in the file, and the waiting ones if their size is known.
+    /// Returns the length of the file, plus the pending bytes if their size in the file is known.
     pub(super) fn expected_bytes(&self) -> u64 {
         match self.storage.compression {
             Compression::None => self.position + self.pending.records.len() as u64,
@@ -280,7 +282,7 @@ impl FileWriter {
         }
     }
 
-    /// Returns the bytes of its index in memory.
+    /// Returns the size of the chunk index in memory, in bytes.
     pub(super) fn index_bytes(&self) -> u64 {
         self.chunk_indexes.len() as u64
     }
@@ -295,8 +297,8 @@ impl FileWriter {
         &self.statistics.channel_message_counts
     }
 
-    /// Returns the earliest and latest log time, including waiting messages; `None` without a
-    /// message.
+    /// Returns the earliest and latest log time, including pending messages; `None` without
+    /// messages.
     pub(super) fn times(&self) -> Option<(u64, u64)> {
         let written = self.statistics.message_count > 0;
         let written = written.then_some((self.statistics.start, self.statistics.end));
@@ -320,10 +322,9 @@ impl FileWriter {
         }
     }
 
-    /// Writes the waiting records. `tail`: the data of the last message, if it is not among the
-    /// records.
+    /// Writes the pending records. `tail` is the data of the last message if the records lack it.
     fn write_pending(&mut self, tail: &[u8]) -> io::Result<()> {
-        // Taken out during the write; restored if it fails.
+        // The records are taken out for the write, and restored if it fails.
         let mut pending = std::mem::take(&mut self.pending);
         let written = if self.storage.chunked {
             self.write_chunk(&pending, tail)
@@ -351,7 +352,7 @@ impl FileWriter {
                 .or_default();
             *count += index.len() as u64;
         }
-        // Keeps the memory, except for that of an unusually large message.
+        // The buffer is reused, except for the memory of an unusually large message.
         pending.records.clear();
         let usual = usize::try_from(self.piece_bytes()).unwrap_or(usize::MAX);
         pending.records.shrink_to(usual.saturating_mul(2));
@@ -416,7 +417,7 @@ impl FileWriter {
         }
         for piece in pieces {
             if let Err(error) = self.file.write_all(piece) {
-                // A storage that fails may not truncate either: the next write does.
+                // A failing disk may also refuse the truncation. The next write then repeats it.
                 self.is_torn = true;
                 let _ = self.cut();
                 return Err(error);
@@ -437,7 +438,7 @@ impl FileWriter {
         Ok(())
     }
 
-    /// Reserves space for this many bytes, and for the end of the file.
+    /// Reserves space for `length` more bytes and for the end of the file.
     fn reserve(&mut self, length: u64) -> io::Result<()> {
         if !self.reserves {
             return Ok(());

@@ -38,7 +38,8 @@ impl FileCompression {
         fs::metadata(&self.path).map_or(0, |metadata| metadata.len())
     }
 
-    /// Compresses the file beside itself, then removes it. Slow; needs space for both.
+    /// Compresses the file into a new one beside it, then removes the original. It is slow and
+    /// needs space for both files.
     pub fn run(&self) -> Result<Compressed, Error> {
         self.run_watched(&Progress::default())
     }

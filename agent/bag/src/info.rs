@@ -1,7 +1,7 @@
 //! Content of a bag: the facts that `ros2 bag info` prints.
 //!
-//! Reads only metadata.yaml if it exists, as the original does, so that bags of other storages are
-//! supported as well; only [`Bag::details`] reads the files. Writes nothing.
+//! Of a directory, only metadata.yaml is read, as rosbag2 does, so bags of other storages are
+//! supported as well. Only [`Bag::details`] reads its files. Nothing is written.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -21,7 +21,7 @@ pub struct Bag {
     path: PathBuf,
     /// Content of metadata.yaml, or the equivalent for a single file.
     pub metadata: Metadata,
-    /// Size of all files in the directory.
+    /// Size of all files in the directory, in bytes.
     pub bytes: u64,
     expansion: Expansion,
 }
@@ -78,7 +78,7 @@ impl Bag {
     /// Opens a directory with metadata.yaml, or one file.
     ///
     /// # Errors
-    /// Fails if nothing there can be read, or if it is not a bag.
+    /// Fails if the path cannot be read or is not a bag.
     pub fn open(path: &Path, expansion: Expansion) -> Result<Self, InfoError> {
         let wrong = |source| ReadError::Io {
             path: path.to_owned(),
@@ -175,7 +175,7 @@ impl Bag {
     }
 }
 
-/// Returns the text of metadata.yaml; for one that is too large, enough of it to detect that.
+/// Returns the text of metadata.yaml. A file that is too large is cut one byte beyond the limit.
 pub(super) fn read_text(path: &Path) -> std::io::Result<String> {
     let mut text = String::new();
     let file = open_file(path)?;
@@ -184,7 +184,7 @@ pub(super) fn read_text(path: &Path) -> std::io::Result<String> {
     Ok(text)
 }
 
-/// Returns metadata.yaml's equivalent for a single file.
+/// Returns the equivalent of metadata.yaml for a single file.
 pub(super) fn of_contents(contents: &Contents, path: &str) -> Metadata {
     let mut stored = None;
     let mut ros_distro = String::new();
@@ -258,7 +258,7 @@ impl Details {
 }
 
 /// Records a service event, which begins with `service_msgs/msg/ServiceEventInfo`: kind, time,
-/// client, number.
+/// client, sequence number.
 fn note_call(calls: &mut Calls, message: &Message<'_>) {
     let Some((header, body)) = message.data.split_first_chunk::<4>() else {
         return;

@@ -3,7 +3,7 @@
 //! A bag is a directory with metadata.yaml and files that `ros2 bag play`, Foxglove and the PyPI
 //! readers open.
 //!
-//! - [`Writer`] writes a bag; [`Options`] choose form, compression and the size of files.
+//! - [`Writer`] writes a bag; [`Options`] selects form, compression and the size of files.
 //! - [`info::Bag`] opens a bag and describes its content; [`read`] visits the records of a file.
 //! - [`messages::read`] visits the messages of a bag, also in the sqlite3 storage.
 //! - [`reindex::reindex`] completes the files of a bag whose writer was killed.
@@ -72,7 +72,7 @@ pub use writer::{Schema, Summary, TopicDescription, TopicId, TopicSummary, Write
 /// Why a bag cannot be written. After an error a file is valid up to its last flushed chunk.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The directory exists; existing ones are never written to.
+    /// The directory already exists. A writer never writes into an existing one.
     #[error("Output folder '{}' already exists.", .0.display())]
     Exists(PathBuf),
     /// The name is not UTF-8, but names of files and metadata.yaml derive from it.
@@ -114,10 +114,10 @@ pub enum Error {
         /// Cause of the failure.
         source: io::Error,
     },
-    /// MCAP counts channels with 16 bits.
+    /// MCAP identifies channels and schemas by 16 bits.
     #[error("a bag holds at most 65535 topics and types")]
     TooManyTopics,
-    /// A topic has one type in a bag.
+    /// A topic was described with two types, but a bag stores one.
     #[error("{topic} has the types {first} and {second}: a bag holds one of them")]
     TypeConflict {
         /// Name of the topic.
@@ -142,8 +142,8 @@ fn new_file(path: &Path) -> io::Result<File> {
     options.write(true).create_new(true).mode(0o640).open(path)
 }
 
-/// Opens a regular file for reading. The open never blocks, as it would on a pipe without a writer;
-/// the check is made on the open file, so the path cannot be swapped in between.
+/// Opens a regular file for reading. The open does not block on a pipe without a writer. The check
+/// uses the open file, so the path cannot be swapped in between.
 fn open_file(path: &Path) -> io::Result<File> {
     let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
     let flags = flags.bits().cast_signed();

@@ -1,8 +1,8 @@
-//! MCAP records, encoding and decoding (MCAP specification, "Records").
+//! Encoding and decoding of MCAP records (MCAP specification, "Records").
 //!
-//! Exists because chunks must be compressed without C, cut when a recording is flushed, and read
-//! from files that were never finished. Knows neither files nor ROS. Decoding is bounded: a length
-//! counts only if its bytes exist.
+//! This module exists because chunks must be compressed without C, ended when a recording is
+//! flushed, and read from unfinished files. It knows neither files nor ROS. Decoding is bounded: a
+//! length is accepted only if its bytes exist.
 
 mod fields;
 
@@ -10,9 +10,9 @@ use std::collections::BTreeMap;
 
 use fields::{Cursor, length, numbers, text, texts};
 
-/// Starts and ends a file.
+/// Bytes at the start and at the end of a file.
 pub const MAGIC: [u8; 8] = *b"\x89MCAP0\r\n";
-/// Opcode and length.
+/// Length of a record's header: its opcode and its length.
 pub const RECORD_HEADER: usize = 9;
 
 /// Kind of a record.
@@ -56,7 +56,8 @@ pub struct Schema {
     pub id: u16,
     /// Name of the type: `pkg/msg/Type`.
     pub name: String,
-    /// `ros2msg`; empty if the definition is unknown (rosbag2 also writes `unknown`).
+    /// Encoding of the definition: `ros2msg`; empty if the definition is unknown (rosbag2 also
+    /// writes `unknown`).
     pub encoding: String,
     /// Text of the definition.
     pub data: Vec<u8>,
@@ -73,7 +74,7 @@ pub struct Channel {
     pub topic: String,
     /// Encoding of its messages: `cdr`.
     pub message_encoding: String,
-    /// Sorted, so that a channel always has the same bytes.
+    /// Metadata, sorted so that a channel always has the same bytes.
     pub metadata: BTreeMap<String, String>,
 }
 
@@ -103,7 +104,7 @@ pub struct Chunk<'a> {
     pub uncompressed_size: u64,
     /// Checksum of the records before compression; 0 for none.
     pub uncompressed_crc: u32,
-    /// Empty, `lz4` or `zstd`.
+    /// Compression: empty, `lz4` or `zstd`.
     pub compression: &'a str,
     /// The records, compressed.
     pub records: &'a [u8],
@@ -175,7 +176,7 @@ pub struct Footer {
     pub summary_crc: u32,
 }
 
-/// Writes the first record.
+/// Appends the header, which is the first record of a file.
 pub fn header(out: &mut Vec<u8>, profile: &str, library: &str) {
     record(out, Opcode::HEADER, |out| {
         text(out, profile);
@@ -271,8 +272,8 @@ impl<'a> Message<'a> {
 }
 
 impl<'a> Chunk<'a> {
-    /// Appends the record up to [`Self::records`], with `more` bytes of records after them; the
-    /// caller appends both.
+    /// Appends the record up to [`Self::records`]. The caller appends the records and `more` bytes
+    /// of further records.
     pub fn write_head(&self, out: &mut Vec<u8>, more: usize) {
         out.push(Opcode::CHUNK.0);
         let records = self.records.len() + more;
@@ -431,7 +432,7 @@ pub fn read_header(content: &[u8]) -> Option<String> {
 }
 
 /// Parses a truncated chunk: its compression and the available records. `None` if it ends before
-/// them.
+/// the records.
 #[must_use]
 pub fn cut_chunk(content: &[u8]) -> Option<(&str, &[u8])> {
     let mut cursor = Cursor(content);
@@ -503,7 +504,7 @@ mod tests {
     }
 
     #[test]
-    fn a_channel_is_read_as_it_was_written_and_not_when_it_is_cut() {
+    fn a_written_channel_is_read_back_and_a_truncated_one_is_rejected() {
         let channel = Channel {
             id: 7,
             schema_id: 3,
@@ -553,7 +554,7 @@ mod tests {
     }
 
     #[test]
-    fn a_length_beyond_the_bytes_is_not_believed() {
+    fn a_length_beyond_the_available_bytes_is_rejected() {
         let mut bytes = vec![Opcode::SCHEMA.0];
         bytes.extend_from_slice(&u64::MAX.to_le_bytes());
         assert_eq!(next_record(&bytes), None);

@@ -1,7 +1,7 @@
-//! All messages of a bag, in both storages of rosbag2.
+//! Reads all messages of a bag, in either storage of rosbag2.
 //!
-//! A bag that is damaged or was never completed is read as far as possible: [`Read::faults`] names
-//! what is missing. Nothing is written.
+//! A bag that is damaged or was never completed is read as far as possible: [`Read::faults`] lists
+//! the missing parts. Nothing is written.
 
 use std::error::Error as _;
 use std::ffi::OsStr;
@@ -32,7 +32,8 @@ pub struct Message<'a> {
     pub log_time: u64,
     /// Time of sending; `None` if the storage has none.
     pub publish_time: Option<u64>,
-    /// Begin of the payload with its encapsulation header: at least 64 bytes, if it has as many.
+    /// Start of the payload with its encapsulation header: at least 64 bytes, or all of a shorter
+    /// payload.
     pub begin: &'a [u8],
 }
 
@@ -57,7 +58,7 @@ pub enum Fault {
         /// Number of chunks or pages.
         parts: u64,
     },
-    /// A file cannot be read, or not to its end.
+    /// A file cannot be read, or only in part.
     Unreadable {
         /// Path of the file.
         path: PathBuf,
@@ -71,7 +72,7 @@ pub enum Fault {
 /// Why a bag cannot be read at all.
 #[derive(Debug, thiserror::Error)]
 pub enum MessagesError {
-    /// The path is neither a directory nor a file that can be read.
+    /// The directory or file cannot be read.
     #[error("cannot read {}", path.display())]
     Io {
         /// The path.
@@ -90,7 +91,7 @@ pub enum MessagesError {
     /// A directory without files of a bag.
     #[error("{} holds no file of a bag", .0.display())]
     Empty(PathBuf),
-    /// The file is of neither storage.
+    /// The file belongs to neither storage.
     #[error("{} is neither an MCAP file nor a sqlite3 bag", .0.display())]
     Unknown(PathBuf),
     /// Each message is compressed on its own.
@@ -104,8 +105,8 @@ pub fn is_bag(path: &Path) -> bool {
     path.is_dir() || begin_of(path).is_ok_and(|begin| storage(path, &begin).is_some())
 }
 
-/// Reads the messages of a bag, file by file, each in the order of the file. `each` also receives
-/// the number of messages in the bag, if metadata.yaml has it.
+/// Reads the messages of a bag, file by file, in the order in which a file stores them. `each` also
+/// receives the number of messages in the bag, if metadata.yaml has it.
 ///
 /// # Errors
 /// Fails if nothing can be read.
@@ -132,7 +133,7 @@ pub fn read(
             Ok(faults) => result.faults.extend(faults),
             Err(error) => failed = Some((file, error)),
         }
-        // An error of the whole bag, unless other messages were read.
+        // If messages of other files were read, the error concerns one file and not the whole bag.
         if is_any_read && let Some((path, error)) = failed.take() {
             result.faults.push(Fault::Unreadable { path, error });
         }
@@ -198,7 +199,7 @@ fn begin_of(path: &Path) -> io::Result<Vec<u8>> {
     Ok(begin)
 }
 
-/// Returns the files of a bag in their order, and its number of messages.
+/// Returns the files of a bag in order, and its number of messages.
 fn files_of(directory: &Path) -> Result<(Vec<PathBuf>, Option<u64>), MessagesError> {
     let wrong = |source| MessagesError::Io {
         path: directory.to_owned(),
@@ -213,7 +214,7 @@ fn files_of(directory: &Path) -> Result<(Vec<PathBuf>, Option<u64>), MessagesErr
             if metadata.compression_mode.eq_ignore_ascii_case("message") {
                 return Err(MessagesError::CompressedMessages(directory.to_owned()));
             }
-            // Old versions prefix the directory; files of a bag lie in it.
+            // Old versions prefix the name of the directory; all files of a bag are in it.
             let names = metadata.relative_file_paths.iter();
             let names = names.filter_map(|path| Path::new(path).file_name());
             let files: Vec<_> = names.map(|name| directory.join(name)).collect();
@@ -238,7 +239,7 @@ fn files_of(directory: &Path) -> Result<(Vec<PathBuf>, Option<u64>), MessagesErr
             files.push(path);
         }
     }
-    // By number: `bag_10` follows `bag_9`.
+    // Files are sorted by number: `bag_10` follows `bag_9`.
     files.sort_by_key(|path| (path.as_os_str().len(), path.clone()));
     match files.is_empty() {
         true => Err(MessagesError::Empty(directory.to_owned())),

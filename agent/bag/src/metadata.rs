@@ -1,7 +1,7 @@
 //! metadata.yaml: a bag directory's description of its files.
 //!
-//! Written byte for byte as rosbag2 does (yaml-cpp's layout, no newline at the end), read in every
-//! version. Knows nothing of MCAP; the files' metadata records hold the same text.
+//! The text is byte for byte that of rosbag2 (yaml-cpp's layout, no newline at the end). Every
+//! version can be read. This module does not know MCAP, whose metadata records hold the same text.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -11,11 +11,11 @@ use serde::Deserialize;
 
 /// Name of the file in every bag directory.
 pub const FILE_NAME: &str = "metadata.yaml";
-/// Largest file accepted: more than a bag with thousands of files and topics needs.
+/// Maximum size of the file, in bytes: more than a bag with thousands of files and topics needs.
 pub const MAX_BYTES: u64 = 64 << 20;
-/// Deepest nesting accepted; a real file has 8 levels.
+/// Maximum depth of nesting; a real file has 8 levels.
 const MAX_DEPTH: usize = 32;
-/// Most keys, values, lists and maps: some 40 per topic and 15 per file.
+/// Maximum number of YAML events: a topic has some 40, a file 15.
 const MAX_EVENTS: usize = 1_000_000;
 /// `starting_time` of a bag without messages.
 pub const NO_START: u64 = i64::MAX.cast_unsigned();
@@ -43,13 +43,13 @@ pub enum MetadataError {
 /// Content of metadata.yaml.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Metadata {
-    /// Version: 5 is Humble's, 9 that of Jazzy and later.
+    /// Version: 5 in Humble, 9 in Jazzy and later.
     pub version: u32,
     /// Storage: `mcap` or `sqlite3`.
     pub storage_identifier: String,
     /// Time from the first to the last message, in nanoseconds.
     pub duration: u64,
-    /// Time of the first message; [`NO_START`] without any.
+    /// Time of the first message; [`NO_START`] without messages.
     pub starting_time: u64,
     /// Number of messages of all topics.
     pub message_count: u64,
@@ -78,7 +78,8 @@ pub struct Topic {
     pub type_name: String,
     /// Serialization: `cdr`.
     pub serialization_format: String,
-    /// The text of `super::qos::profiles`; not read back from version 9, which has another form.
+    /// QoS of the publishers, as `super::qos::profiles` formats it; empty if read from version 9,
+    /// where it is a YAML list.
     pub offered_qos_profiles: String,
     /// Type hash: `RIHS01_...` or empty.
     pub type_description_hash: String,
@@ -225,7 +226,7 @@ impl Metadata {
     }
 }
 
-/// Checks the bounds of a text event by event, before it is parsed as a whole: the parser's time
+/// Checks the bounds of a text event by event, before it is parsed as a whole. The parser's time
 /// grows with the square of the depth, and its memory with the number of events.
 fn check(text: &str) -> Result<(), MetadataError> {
     if text.len() as u64 > MAX_BYTES {
@@ -438,7 +439,7 @@ mod tests {
     }
 
     #[test]
-    fn version_9_is_laid_out_as_the_serializer_of_jazzy_does() {
+    fn version_9_has_the_layout_of_the_serializer_of_jazzy() {
         let text = "rosbag2_bagfile_information:
   version: 9
   storage_identifier: mcap
@@ -479,7 +480,7 @@ mod tests {
     }
 
     #[test]
-    fn version_5_has_qos_as_a_string_and_comes_back_whole() {
+    fn version_5_stores_qos_as_a_string_and_is_read_back_unchanged() {
         let mut written = metadata(5);
         written
             .custom_data
@@ -495,7 +496,7 @@ mod tests {
     }
 
     #[test]
-    fn a_text_that_is_too_deep_or_too_large_is_refused_before_it_is_read() {
+    fn a_text_that_is_too_deep_or_too_large_is_refused_before_it_is_parsed() {
         let deep = [
             "[".repeat(100_000),
             "{a: ".repeat(100_000),
@@ -516,7 +517,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bag_without_topics_is_still_yaml() {
+    fn metadata_without_topics_is_valid_yaml() {
         let mut written = metadata(5);
         written.topics.clear();
         assert_eq!(Metadata::read(&written.file_text()).unwrap(), written);
@@ -528,7 +529,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_name_comes_back_as_it_went_in(name in any::<String>(), value in ".*") {
+        fn any_name_is_read_back_as_it_was_written(name in any::<String>(), value in ".*") {
             let mut written = metadata(5);
             written.topics[0].name = name.clone();
             written.topics[0].type_name = value.clone();

@@ -25,7 +25,8 @@ pub(super) fn write_metadata(
     let path = directory.join(metadata::FILE_NAME);
     let part = with_suffix(&path, "part");
     let write = || {
-        // Left behind by a killed process; recreated, so that nothing is written through a link.
+        // A killed process leaves this file behind. It is recreated, so that nothing is written
+        // through a link.
         match fs::remove_file(&part) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
             _ => {}

@@ -1,4 +1,4 @@
-//! Options of writing a bag: form, chunks, compression, limits of a file.
+//! Options for writing a bag: form, chunks, compression, limits of a file.
 //!
 //! The presets and the keys of a storage configuration file are those of rosbag2's MCAP plugin.
 //! Options without an effect here are rejected rather than ignored.
@@ -16,15 +16,15 @@ use super::qos::Spelling;
 pub struct Options {
     /// Form of metadata.yaml and of QoS.
     pub form: Form,
-    /// As in `ROS_DISTRO`; may be empty.
+    /// Distribution of ROS, as in `ROS_DISTRO`; may be empty.
     pub ros_distro: String,
     /// Layout of the MCAP files.
     pub storage: Storage,
     /// Compression of whole files after they are complete.
     pub file_compression: Compression,
-    /// Splits a file before the message that would exceed this many bytes.
+    /// Splits a file before the next message once it has this many bytes.
     pub max_file_bytes: Option<u64>,
-    /// Splits a file before the message that is later than its first by more than this.
+    /// Splits a file before a message that is later than the file's first one by more than this.
     pub max_file_duration: Option<Duration>,
     /// Splits a file when its index, which is kept in memory, takes this many bytes.
     pub max_index_bytes: Option<u64>,
@@ -39,14 +39,14 @@ pub enum Form {
     /// later versions are placed where Humble does not read them.
     #[default]
     Compatible,
-    /// Exactly as Humble writes.
+    /// Exactly what Humble writes.
     Humble,
-    /// Version 9 and QoS as names: Jazzy and later.
+    /// Version 9 and QoS as names: readable by Jazzy and later.
     Named,
 }
 
 impl Form {
-    /// Returns the form that this distribution writes.
+    /// Returns the form that a distribution writes.
     #[must_use]
     pub fn of(distro: &str) -> Self {
         match distro {
@@ -77,17 +77,17 @@ impl Form {
 /// Layout of an MCAP file.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Storage {
-    /// Collect messages in chunks, which are indexed and may be compressed.
+    /// Whether messages are collected in chunks, which are indexed and may be compressed.
     pub chunked: bool,
     /// Size at which a chunk ends, before compression.
     pub chunk_bytes: u64,
     /// Compression of chunks, if it makes them smaller.
     pub compression: Compression,
-    /// Write a checksum of each chunk's records before compression.
+    /// Whether each chunk has a checksum of its records before compression.
     pub chunk_crc: bool,
-    /// Write a checksum of the summary.
+    /// Whether the summary has a checksum.
     pub summary_crc: bool,
-    /// Write a checksum of everything before the summary.
+    /// Whether a checksum of everything before the summary is written.
     pub data_crc: bool,
 }
 
@@ -132,7 +132,7 @@ pub enum OptionsError {
     /// Mode `file` without a format.
     #[error("Invalid choice: Cannot specify compression mode without a compression format.")]
     ModeWithoutFormat,
-    /// The limit is smaller than any file.
+    /// The limit is below 1024 bytes, the minimum of the MCAP plugin.
     #[error(
         "Invalid bag splitting size given. Please provide a value greater than 1024. Specified value \
         of {0}"
@@ -217,7 +217,7 @@ impl Storage {
     }
 }
 
-/// Largest chunk accepted: a chunk is held in memory until it is full.
+/// Maximum size of a chunk, in bytes: a chunk is held in memory until it is full.
 const MAX_CHUNK_BYTES: u64 = 64 << 20;
 
 /// Keys of a storage configuration file. Attachments are never written, so their keys have no
@@ -295,7 +295,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn presets_and_keys_are_those_of_the_plugin() {
+    fn presets_and_keys_match_those_of_the_mcap_plugin() {
         let small = Storage::preset("zstd_small").unwrap();
         assert_eq!((small.chunk_bytes, small.chunk_crc), (4 << 20, true));
         let keys = "noChunkCRC: true\nchunkSize: 1000\ncompression: Lz4\ncompressionLevel: Slow\n";
@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_are_not_compressed_one_by_one() {
+    fn compression_of_single_messages_is_rejected() {
         assert_eq!(file_compression("file", "zstd"), Ok(Compression::Zstd));
         assert_eq!(file_compression("none", "zstd"), Ok(Compression::None));
         assert_eq!(

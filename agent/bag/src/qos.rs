@@ -1,9 +1,10 @@
 //! `offered_qos_profiles`: the QoS of a topic's publishers as rosbag2 writes it.
 //!
 //! Two spellings exist. Humble writes and reads the numbers of `rmw_qos_profile_t`; Jazzy and later
-//! write names and read both, depending on whether `history` is a number. A topic without
-//! publishers is `[]` in Jazzy and an empty text here, which every distribution accepts (Humble's
-//! own `~` ends Jazzy's reader). This module does not interpret profiles as a player would.
+//! write names and read both, depending on whether `history` is a number. For a topic without
+//! publishers, Jazzy writes `[]`. With numbers the text is empty, which every distribution accepts
+//! (Jazzy's reader fails on Humble's own `~`). This module does not interpret profiles as a player
+//! would.
 
 use std::fmt::Write as _;
 
@@ -13,9 +14,9 @@ use ros2probe_wire::qos::{Durability, HistoryKind, Liveliness, Qos, Reliability}
 /// Spelling of policies.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Spelling {
-    /// As Humble reads them; every distribution reads them.
+    /// Numbers, which every distribution reads; Humble reads nothing else.
     Numbers,
-    /// As Jazzy and later write them; Humble cannot read them.
+    /// Names, which Jazzy and later write; Humble cannot read them.
     Names,
 }
 
@@ -126,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_are_those_of_a_real_humble_bag() {
+    fn numeric_profiles_match_those_of_a_real_humble_bag() {
         // cyclonedds/bag-record-2ns, /robot1/imu/data, with a lifespan.
         let text = "- history: 1\n  depth: 5\n  reliability: 2\n  durability: 2\n  deadline:\n    sec: \
             9223372036\n    nsec: 854775807\n  lifespan:\n    sec: 10\n    nsec: 1\n  liveliness: 1\n  \
@@ -151,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn profiles_of_no_publisher_are_an_empty_text_or_list() {
+    fn without_publishers_the_profiles_are_an_empty_text_or_list() {
         assert_eq!(profiles(&[], Spelling::Numbers), "");
         assert_eq!(profiles(&[], Spelling::Names), "[]");
     }

@@ -17,12 +17,12 @@ use super::mcap::{
 };
 use super::{Compression, open_file};
 
-/// Longest record; a length beyond this is damage.
+/// Maximum length of a record, in bytes; a larger length is damage.
 const MAX_RECORD: u64 = 1 << 30;
-/// Limit of expansion over a file, beyond [`Expansion::FREE`]. Recordings stay far below: a few
-/// megabytes of the same byte are rare.
+/// Maximum factor by which a file may expand beyond [`Expansion::FREE`]. Recordings stay far below:
+/// a few megabytes of the same byte are rare.
 const FACTOR: u64 = 1024;
-/// Limit of expansion of one chunk or record, which is in memory at once.
+/// Maximum factor by which one chunk or record may expand, since all of it is in memory.
 const FACTOR_IN_MEMORY: u64 = 16;
 
 /// Content of a file.
@@ -53,11 +53,11 @@ pub struct Scan {
     pub is_ended: bool,
     /// End of the data section's last complete record.
     pub end: u64,
-    /// Its chunks, as in an index.
+    /// Chunks of the data section, as in an index.
     pub chunks: Vec<ChunkIndex>,
-    /// Offset and length of metadata records.
+    /// Offset and length of each metadata record.
     pub metadata_places: Vec<(u64, u64)>,
-    /// The last chunk's indexes that are missing because the file ends before them.
+    /// All message indexes of the last chunk, if the file ends before one of them.
     pub last_chunk_index: BTreeMap<u16, Vec<(u64, u64)>>,
     /// Complete records at the beginning of a truncated chunk.
     pub cut: Vec<u8>,
@@ -96,7 +96,7 @@ impl Contents {
         read_summary(&mut file).map_err(wrong)
     }
 
-    /// Reads the summary, or else all records.
+    /// Reads the summary, or all records of a file without a summary.
     pub fn of_file(path: &Path, expansion: Expansion) -> Result<Self, ReadError> {
         if compression(path) == Compression::None
             && let Some(contents) = Self::of_summary(path)?
@@ -236,7 +236,7 @@ pub fn scan(path: &Path, expansion: Expansion, each: &mut Visitor<'_>) -> Result
     scan_records(&mut records, each).map_err(wrong)
 }
 
-/// As [`scan`], but also visits the messages at the beginning of a truncated chunk.
+/// Does the same as [`scan`], but also visits the messages at the beginning of a truncated chunk.
 pub(super) fn scan_with_cut(
     path: &Path,
     expansion: Expansion,
@@ -316,7 +316,7 @@ fn scan_records(records: &mut Records<'_>, each: &mut Visitor<'_>) -> io::Result
             Opcode::HEADER => {
                 scan.contents.profile = mcap::read_header(&content).unwrap_or_default();
             }
-            // Not in a data section: no record follows.
+            // These records do not belong to a data section: no record follows.
             Opcode(0) | Opcode::FOOTER => return Ok(scan),
             _ => scan.contents.take(opcode, &content),
         }
@@ -329,7 +329,7 @@ struct IndexedChunk {
     chunk: ChunkIndex,
     offsets: BTreeMap<u16, u64>,
     length: u64,
-    /// The expected content of its indexes.
+    /// Expected content of its message indexes.
     index: BTreeMap<u16, Vec<(u64, u64)>>,
 }
 
@@ -356,7 +356,7 @@ impl IndexedChunk {
     }
 }
 
-/// Completes the last chunk. `at_end`: the file ends here, and missing indexes can still be
+/// Completes the last chunk. If the file ends here (`at_end`), missing indexes can still be
 /// written.
 fn finish_chunk(indexed: Option<IndexedChunk>, scan: &mut Scan, at_end: bool) {
     let Some(mut indexed) = indexed else {
@@ -373,8 +373,8 @@ fn finish_chunk(indexed: Option<IndexedChunk>, scan: &mut Scan, at_end: bool) {
     scan.chunks.push(indexed.chunk);
 }
 
-/// Reads a chunk. Subtracts its expanded size from `left`; a chunk beyond that, or beyond
-/// `in_memory`, ends the reading.
+/// Reads a chunk and subtracts its expanded size from `left`. Fails if the chunk expands beyond
+/// `left` or beyond `in_memory`.
 fn read_chunk(
     chunk: &Chunk<'_>,
     in_memory: u64,
@@ -481,7 +481,7 @@ struct Records<'a> {
     /// Bytes to which compressed chunks may still expand.
     expands: u64,
     expansion: Expansion,
-    /// Largest record of a file that is compressed as a whole, in bytes.
+    /// Maximum size of a record of a file that is compressed as a whole, in bytes.
     in_memory: u64,
 }
 
@@ -520,8 +520,8 @@ impl Records<'_> {
         })
     }
 
-    /// Reads at most this many bytes, allocating as they arrive. A truncated compressed stream just
-    /// ends.
+    /// Reads at most `length` bytes, allocating as they arrive. A truncated compressed stream is
+    /// not an error.
     fn read(&mut self, length: u64, into: &mut Vec<u8>) -> io::Result<u64> {
         let before = into.len();
         let limit = length.min(self.left).min(self.in_memory);

@@ -1,9 +1,9 @@
 //! Completes a bag: adds the summary to unfinished files, and regenerates metadata.yaml from the
 //! files.
 //!
-//! A file is rewritten beside itself and replaced once the copy is on disk; its incomplete rest is
-//! kept in a separate file. Complete files are not touched; files that are not MCAP are left alone
-//! and reported.
+//! A file is rewritten beside itself and replaced once the copy is on disk. The bytes after its
+//! last complete record are kept in a separate file. Complete files are not rewritten, except that
+//! they are compressed if another file is. Files that are not MCAP stay unchanged and are reported.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -43,20 +43,20 @@ pub struct FileReport {
 /// State of a file before it was completed.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Found {
-    /// It has its summary and was not touched.
+    /// It had a summary and was not rewritten.
     Complete,
     /// It had no summary and was completed.
     Unfinished {
-        /// Messages among them that were in a truncated chunk.
+        /// Number of messages recovered from a truncated chunk.
         salvaged: u64,
-        /// Bytes that formed no complete record.
+        /// Number of bytes after the last complete record; 0 if they are all zeros.
         cut: u64,
-        /// File with those bytes, unless they were all zeros.
+        /// Name of the file that keeps the bytes after the last complete record, if there are any.
         kept: Option<String>,
-        /// Chunks that cannot be decompressed or parsed; they were kept.
+        /// Number of chunks that cannot be decompressed or parsed; they stay in the file.
         unreadable_chunks: u64,
     },
-    /// Not an MCAP file: left alone, and not in metadata.yaml.
+    /// It is not an MCAP file: it is unchanged, and not in metadata.yaml.
     NotMcap,
 }
 
@@ -72,7 +72,7 @@ pub enum ReindexError {
     /// A file cannot be read.
     #[error(transparent)]
     Read(#[from] ReadError),
-    /// A file cannot be written; its original is unchanged.
+    /// A file cannot be written; the original file is unchanged.
     #[error(transparent)]
     Write(#[from] Error),
 }
@@ -138,7 +138,7 @@ fn files(directory: &Path) -> Result<Vec<String>, ReindexError> {
             names.push(name.to_owned());
         }
     }
-    // A process killed between compressing a file and removing the original left both.
+    // A process that was killed between compressing a file and removing the original leaves both.
     let all = names.clone();
     names.retain(|name| {
         let is_compressed = |suffix| all.contains(&format!("{name}.{suffix}"));
@@ -231,7 +231,7 @@ fn definition(known: &Contents, message: &Message<'_>) -> Option<(mcap::Schema, 
     Some((schema.clone(), channel.clone()))
 }
 
-/// Returns the bytes after the last complete record that once were a record.
+/// Returns the number of bytes after the last complete record; 0 if they are all zeros.
 fn cut_bytes(source: &mut File, scan: &Scan) -> io::Result<u64> {
     let length = source.metadata()?.len();
     if scan.is_ended || is_zero(source, scan.end)? {
@@ -240,7 +240,7 @@ fn cut_bytes(source: &mut File, scan: &Scan) -> io::Result<u64> {
     Ok(length - scan.end)
 }
 
-/// Copies the incomplete rest of a file beside it, for manual recovery.
+/// Copies the bytes after the last complete record into a file beside it, for manual recovery.
 fn keep_aside(path: &Path, source: &mut File, scan: &Scan) -> io::Result<Option<String>> {
     if cut_bytes(source, scan)? == 0 {
         return Ok(None);

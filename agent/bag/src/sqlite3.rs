@@ -1,8 +1,9 @@
 //! Reads the messages of a bag in rosbag2's sqlite3 storage: a table of topics, and one of messages.
 //!
-//! The file format is that of <https://www.sqlite.org/fileformat.html>: trees of pages, of which
-//! only tables are read. Indexes, the write-ahead log and the free list are not. Page numbers and
-//! lengths are not trusted: no page is read twice, and payloads are read up to [`PREFIX`] bytes.
+//! The file format is that of <https://www.sqlite.org/fileformat.html>: trees of pages. Only the
+//! trees of tables are read, not the indexes, the write-ahead log and the free list. Page numbers
+//! and lengths are not trusted: the number of pages read is bounded, and payloads are read up to
+//! [`PREFIX`] bytes.
 
 mod page;
 mod row;
@@ -16,9 +17,10 @@ use super::open_file;
 use page::Pages;
 use row::Value;
 
-/// Bytes of a row that are read; the rest is the end of a large message, or QoS.
+/// Maximum number of bytes of a row that are read; beyond them is the end of a large message, or
+/// QoS.
 const PREFIX: usize = 1024;
-/// Longest name of a topic or type that is kept, in bytes.
+/// Maximum length of the name of a topic or type, in bytes.
 const NAME: usize = 256;
 
 /// Reads all messages. Returns the number of damaged pages and rows.
@@ -50,7 +52,7 @@ pub(super) fn read(path: &Path, each: &mut dyn FnMut(&Message<'_>)) -> io::Resul
     ];
     pages.visit(topics.root, PREFIX, &mut |id, row| {
         let [of_id, name, type_name] = places.map(|place| row.value(place));
-        // A primary key is the number of the row, and NULL in the row.
+        // An integer primary key is the row's number; its column then holds NULL.
         let id = of_id.and_then(Value::integer).unwrap_or(id);
         let texts = name
             .and_then(Value::text)

@@ -1,9 +1,9 @@
 //! Writes a bag: its directory, its files one after the other, its metadata.yaml.
 //!
-//! Starts no thread and reads no clock: the caller decides when to flush, and the messages' times
-//! decide when to split. metadata.yaml exists from the beginning and is updated at each flush and
-//! split, so that `ros2 bag info` opens a bag whose writer was killed. Compressing whole files is
-//! slow, so the caller receives it as a task for another thread.
+//! The writer starts no thread and reads no clock. The caller decides when to flush; sizes and the
+//! messages' times decide when to split. metadata.yaml exists from the beginning and is updated at
+//! each flush and split, so that `ros2 bag info` opens a bag whose writer was killed. Compressing
+//! whole files is slow, so the caller receives it as a task for another thread.
 
 mod contents;
 
@@ -75,7 +75,7 @@ pub struct Writer {
 pub struct Summary {
     /// Path of the directory.
     pub directory: PathBuf,
-    /// Its files, in order, without metadata.yaml.
+    /// Paths of its files, in order, without metadata.yaml.
     pub files: Vec<PathBuf>,
     /// Size of the files in bytes.
     pub bytes: u64,
@@ -83,7 +83,7 @@ pub struct Summary {
     pub messages: u64,
     /// Earliest and latest log time.
     pub times: Option<(Timestamp, Timestamp)>,
-    /// Topics, in the order of their description.
+    /// Topics, in the order in which they were described.
     pub topics: Vec<TopicSummary>,
 }
 
@@ -131,9 +131,9 @@ impl Writer {
         };
         let begun = writer.open_file();
         if let Err(error) = begun.and_then(|()| writer.write_metadata_file()) {
-            // Removes the empty bag, since the next attempt would leave another one. One file by
-            // one: listing the directory would take a descriptor, which may be the missing
-            // resource.
+            // The empty bag is removed, since the next attempt would leave another one. Its files
+            // are removed by name: listing the directory needs a descriptor, which may be the
+            // missing resource.
             let file = directory.join(writer.file_name(0));
             drop(writer);
             let _ = fs::remove_file(file);
@@ -151,9 +151,9 @@ impl Writer {
     }
 
     /// Describes a topic before its first message, or again when its publishers change. The last
-    /// description before the first message stays in all files and in metadata.yaml: readers find a
-    /// topic's messages by comparing both (PyPI `rosbags` omits differing ones). Later publishers
-    /// are listed in the custom data.
+    /// description before the first message stays in all files and in metadata.yaml: readers
+    /// compare both descriptions (PyPI `rosbags` omits topics that differ). Later publishers are
+    /// listed in the custom data.
     pub fn topic(&mut self, mut description: TopicDescription) -> Result<TopicId, Error> {
         let known = self.by_name.get(&description.name).copied();
         if let Some(known) = known
@@ -208,8 +208,8 @@ impl Writer {
     }
 
     /// Accepts one message: its bytes with the encapsulation header, its times of reception and
-    /// sending, and its publisher's sequence number. On an error it was not accepted; earlier
-    /// messages are in a file or still wait, and the next call tries again.
+    /// sending, and its publisher's sequence number. If it fails, the message was not accepted.
+    /// Earlier messages are in a file or still pending, and the next call retries them.
     pub fn write(
         &mut self,
         topic: TopicId,
@@ -228,7 +228,7 @@ impl Writer {
             self.topics.get_mut(usize::from(topic.0)),
             self.current.as_mut(),
         ) else {
-            // Not a topic of this bag.
+            // The topic does not belong to this bag.
             return Ok(());
         };
         let message = Message {
@@ -245,8 +245,8 @@ impl Writer {
         written.map_err(|error| Error::writing(current.path(), error))
     }
 
-    /// Writes everything accepted so far to the system and updates metadata.yaml: all of it
-    /// survives the end of this process.
+    /// Writes all accepted messages to the system and updates metadata.yaml. They then survive the
+    /// end of this process.
     pub fn flush(&mut self) -> Result<(), Error> {
         if let Some(current) = &mut self.current {
             current
@@ -256,7 +256,7 @@ impl Writer {
         write_metadata(&self.directory, &self.metadata(), Durability::Process)
     }
 
-    /// Flushes, and waits until everything is on disk: all of it survives a loss of power.
+    /// Flushes, and waits until everything is on disk, where it survives a loss of power.
     pub fn sync(&mut self) -> Result<(), Error> {
         if let Some(current) = &mut self.current {
             let synced = current.flush().and_then(|()| current.sync());
@@ -281,16 +281,16 @@ impl Writer {
         self.write_metadata_file()
     }
 
-    /// Writes the waiting messages, or discards them if the storage fails: then [`Self::unwritten`]
-    /// counts them as lost.
+    /// Writes the pending messages. If the storage fails, they are discarded, and
+    /// [`Self::unwritten`] counts them.
     pub fn settle(&mut self) {
         if matches!(self.current.as_mut().map(FileWriter::flush), Some(Err(_))) {
             self.give_up_waiting();
         }
     }
 
-    /// Iterates over topics with messages that were accepted but discarded, with their number and
-    /// bytes.
+    /// Iterates over topics with messages that were accepted but discarded. Yields the topic's name
+    /// and the number and bytes of these messages.
     pub fn unwritten(&self) -> impl Iterator<Item = (&str, u64, u64)> {
         self.topics.iter().filter_map(|topic| {
             let (messages, bytes) = self.unwritten.get(&topic.channel_id)?;
@@ -298,9 +298,9 @@ impl Writer {
         })
     }
 
-    /// Completes the bag. `custom_data` is added to metadata.yaml and to the last file: for losses
-    /// and omissions. If the storage fails, waiting messages are discarded and counted in the
-    /// summary, and the file is completed in the reserved space.
+    /// Completes the bag. `custom_data`, such as losses and omissions, is added to metadata.yaml
+    /// and to the last file. If the storage fails, pending messages are discarded and counted in
+    /// the summary, and the file is completed in the reserved space.
     pub fn close(self, custom_data: BTreeMap<String, String>) -> Result<Summary, Error> {
         match self.close_with(custom_data, |work| work.run().map(Some)) {
             (summary, None) => Ok(summary),
@@ -309,8 +309,9 @@ impl Writer {
     }
 
     /// Does the same as [`Self::close`], compressing files with `compress`. If `compress` returns
-    /// `None`, the file stays uncompressed, which [`super::reindex`] accepts. Returns the error of
-    /// the storage beside what is in the bag; the summary alone counts what a full disk refused.
+    /// `None`, the file stays uncompressed, which [`super::reindex`] accepts. Returns the summary
+    /// and an error of the storage. A full disk is not an error here: the summary counts the
+    /// messages that did not fit.
     pub fn close_with(
         mut self,
         custom_data: BTreeMap<String, String>,
@@ -339,13 +340,14 @@ impl Writer {
             Err(error) if refused.is_none() && self.unwritten.is_empty() => refused = Some(error),
             _ => {}
         }
-        // The summary counts what a full disk refused.
+        // A full disk is not an error here: the summary counts the messages that did not fit.
         let error = refused
             .filter(|error| !matches!(error, Error::DiskFull { .. } | Error::FileTooLarge { .. }));
         (self.summary(), error)
     }
 
-    /// Returns the complete files to compress, each once. [`Self::close`] compresses the others.
+    /// Returns the complete files to compress, each once. [`Self::close`] compresses the files that
+    /// were not returned.
     pub fn take_file_compressions(&mut self) -> Vec<FileCompression> {
         std::mem::take(&mut self.uncompressed)
     }
@@ -359,14 +361,14 @@ impl Writer {
         self.write_metadata_file()
     }
 
-    /// Returns the bytes in the bag's files so far.
+    /// Returns the size of the bag's files so far, in bytes.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         let current = self.current.as_ref().map_or(0, FileWriter::position);
         current + self.done.iter().map(|file| file.bytes).sum::<u64>()
     }
 
-    /// Returns the same as [`Self::bytes`], plus the bytes that wait to be written.
+    /// Returns the same as [`Self::bytes`], plus the bytes that are not written yet.
     #[must_use]
     pub fn expected_bytes(&self) -> u64 {
         let current = self.current.as_ref().map_or(0, FileWriter::expected_bytes);
@@ -406,14 +408,15 @@ impl Writer {
                 Ok(())
             }
             Err(error) => {
-                // The file could not be started and is on no list: remove it.
+                // The file could not be started and is on no list, so it is removed.
                 let _ = fs::remove_file(&path);
                 Err(Error::creating(&path, error))
             }
         }
     }
 
-    /// Completes the current file. Keeps it if that fails: waiting messages may still find space.
+    /// Completes the current file. If that fails, the file stays the current one: its pending
+    /// messages may fit later.
     fn finish_file(&mut self) -> Result<(), Error> {
         if let Some(current) = &mut self.current {
             current
@@ -438,7 +441,7 @@ impl Writer {
         Ok(())
     }
 
-    /// Adds the file as it is to the complete ones.
+    /// Adds the current file, as it is, to the complete files.
     fn abandon_file(&mut self) {
         let Some(current) = self.current.take() else {
             return;
@@ -539,7 +542,7 @@ impl Writer {
         data
     }
 
-    /// Returns the metadata record for the files themselves.
+    /// Returns the metadata record that each file contains.
     fn metadata_record(&self) -> MetadataRecord {
         let mut entries = BTreeMap::new();
         if self.options.form != Form::Named {

@@ -1,4 +1,5 @@
-//! How long a scrape of a large robot takes: the capture thread never waits for it, but a core does.
+//! Duration of a scrape of a large robot. The capture thread never waits for it, but it occupies a
+//! core.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use ros2probe_daemon::agent_facts::SourceKind;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 pub(super) fn length(out: &mut Vec<u8>, length: usize) {
-    // Never reached: names, definitions and lists are bounded far below 4 GiB.
+    // The fallback is never reached: names, definitions and lists are bounded far below 4 GiB.
     let length = u32::try_from(length).unwrap_or(u32::MAX);
     out.extend_from_slice(&length.to_le_bytes());
 }
@@ -30,7 +30,7 @@ pub(super) fn numbers(out: &mut Vec<u8>, map: &BTreeMap<u16, u64>) {
     }
 }
 
-/// The remaining bytes.
+/// A cursor over the remaining bytes of a record.
 pub(super) struct Cursor<'a>(pub(super) &'a [u8]);
 
 impl<'a> Cursor<'a> {

@@ -9,17 +9,17 @@ use super::row::{Row, varint};
 
 /// Length of the header of the file, at the start of page 1.
 const HEADER: usize = 100;
-/// Kinds of pages of a table.
+/// Kinds of a table's pages: interior and leaf.
 const INTERIOR: u8 = 5;
 const LEAF: u8 = 13;
-/// Largest depth of a tree; a file of 2^32 pages has less than 20.
+/// Maximum depth of a tree; a file of 2^32 pages has less than 20.
 const MAX_DEPTH: usize = 32;
 
 /// An open file.
 pub(super) struct Pages {
     file: File,
     page_size: usize,
-    /// Bytes of each page that hold content.
+    /// Number of bytes of each page that hold content.
     usable: usize,
     damaged: u64,
 }
@@ -62,7 +62,8 @@ impl Pages {
         limit: usize,
         each: &mut Visitor<'_>,
     ) -> io::Result<()> {
-        // Pages below each page of the way to the present one, the next last.
+        // One list per level on the path to the current page: the pages still to visit, the next
+        // one last.
         let mut levels: Vec<Vec<u32>> = vec![vec![root]];
         let mut interior = HashSet::new();
         let mut leaves = 0_u64;
@@ -118,7 +119,7 @@ impl Pages {
         let (length, rest) = varint(page.get(cell..self.usable)?)?;
         let (id, rest) = varint(rest)?;
         let length = usize::try_from(length).ok()?;
-        // The rule of the format for the part that is in this page.
+        // This is the rule of the file format for the part of a row that is in its first page.
         let most = self.usable.checked_sub(35)?;
         let local = if length <= most {
             length

@@ -1,6 +1,6 @@
 //! A row: a header with the type of each column, and their values.
 
-/// The start of a row.
+/// A row, of which only the start may have been read.
 pub(super) struct Row<'a> {
     bytes: &'a [u8],
 }
@@ -12,7 +12,7 @@ pub(super) enum Value<'a> {
     Integer(i64),
     Real,
     Text(&'a str),
-    /// Bytes, as far as the row was read.
+    /// Bytes, up to the part of the row that was read.
     Blob(&'a [u8]),
 }
 
@@ -65,7 +65,7 @@ impl<'a> Value<'a> {
     }
 }
 
-/// Returns the number at the begin, of up to 9 bytes, and the rest.
+/// Parses a varint of up to 9 bytes. Returns its value and the remaining bytes.
 pub(super) fn varint(bytes: &[u8]) -> Option<(i64, &[u8])> {
     let mut value = 0_u64;
     for (index, byte) in bytes.iter().enumerate().take(9) {
@@ -94,7 +94,7 @@ fn size(kind: i64) -> Option<usize> {
     }
 }
 
-/// Returns a big-endian integer with a sign.
+/// Parses a signed big-endian integer.
 fn integer(bytes: &[u8]) -> i64 {
     let negative = bytes.first().is_some_and(|first| first & 0x80 != 0);
     let begin = if negative { -1 } else { 0 };
@@ -108,7 +108,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_have_up_to_nine_bytes() {
+    fn a_varint_has_up_to_nine_bytes() {
         assert_eq!(varint(&[0x7f, 1]), Some((127, &[1][..])));
         assert_eq!(varint(&[0x81, 0x00]), Some((128, &[][..])));
         assert_eq!(varint(&[0xff; 9]), Some((-1, &[][..])));
@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn values_follow_their_types() {
+    fn values_are_decoded_by_the_types_in_the_header() {
         // NULL, -2 in one byte, the constant 1, `ab`, and three bytes of which one is missing.
         let bytes = [6, 0, 1, 9, 17, 18, 0xfe, b'a', b'b', 7, 8];
         let row = Row::new(&bytes);

@@ -18,9 +18,9 @@ pub(super) struct Topic {
     pub(super) schema_id: u16,
     /// Number of messages in complete files.
     pub(super) messages: u64,
-    /// Whether it has messages: then the description is fixed.
+    /// Whether the topic has messages; its description is then fixed.
     pub(super) is_written: bool,
-    /// All publishers, if they changed after that.
+    /// All publishers, if they changed after the first message.
     pub(super) later: Option<Vec<Qos>>,
 }
 
@@ -39,7 +39,8 @@ impl Topic {
         let description = &self.description;
         let (encoding, data) = match &description.schema {
             Some(schema) => (schema.encoding.as_str(), schema.text.as_bytes()),
-            // As Humble writes. rosbag2 accepts `unknown` as well, PyPI `rosbags` does not.
+            // Humble writes an empty encoding. rosbag2 accepts `unknown` as well, but PyPI
+            // `rosbags` does not.
             None => ("", &[][..]),
         };
         let schema = SchemaRecord {

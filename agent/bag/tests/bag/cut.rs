@@ -13,7 +13,7 @@ use ros2probe_wire::{Expansion, Timestamp};
 
 use super::{BEGIN, messages, metadata, text, topic};
 
-/// A bag with many small chunks, or none.
+/// Writes a bag with many small chunks, or without chunks, and returns its file.
 fn written(directory: &Path, storage: Storage, form: Form) -> PathBuf {
     let path = directory.join("whole");
     let options = Options {
@@ -45,7 +45,7 @@ fn written(directory: &Path, storage: Storage, form: Form) -> PathBuf {
     summary.files[0].clone()
 }
 
-/// Returns the end of each message in a file without compression.
+/// Returns the offset of each message's end in a file without compression.
 fn ends(file: &Path) -> Vec<u64> {
     let bytes = fs::read(file).unwrap();
     let mut ends = Vec::new();
@@ -61,7 +61,7 @@ fn ends(file: &Path) -> Vec<u64> {
 }
 
 #[test]
-fn a_file_cut_anywhere_keeps_every_whole_message() {
+fn a_file_truncated_anywhere_keeps_every_complete_message() {
     for (storage, form) in [
         (
             Storage {
@@ -92,7 +92,7 @@ fn a_file_cut_anywhere_keeps_every_whole_message() {
                 .collect();
             let found: Vec<u32> = messages(&file).iter().map(|message| message.1).collect();
             assert_eq!(found, expected, "{length}: {report:?}");
-            // Including the index.
+            // The index is complete as well.
             let again = fs::read(&file).unwrap();
             let summary = mcap::Summary::read(&again).unwrap().unwrap();
             assert_eq!(
@@ -135,7 +135,7 @@ fn a_file_cut_anywhere_keeps_every_whole_message() {
 }
 
 #[test]
-fn a_compressed_chunk_that_was_cut_gives_what_can_be_decompressed() {
+fn a_truncated_compressed_chunk_keeps_the_messages_that_can_be_decompressed() {
     for compression in [Compression::Zstd, Compression::Lz4] {
         let directory = tempfile::tempdir().unwrap();
         let storage = Storage {
@@ -151,7 +151,7 @@ fn a_compressed_chunk_that_was_cut_gives_what_can_be_decompressed() {
         let bag = directory.path().join("cut");
         fs::create_dir(&bag).unwrap();
         let file = bag.join("cut_0.mcap");
-        // Within the third chunk: the first two are complete.
+        // The cut is within the third chunk; the first two are complete.
         let third = &scan.chunks[2];
         fs::write(&file, &bytes[..(third.offset + third.length - 20) as usize]).unwrap();
         reindex(&bag, Expansion::Limited).unwrap();
@@ -170,7 +170,7 @@ fn a_compressed_chunk_that_was_cut_gives_what_can_be_decompressed() {
 }
 
 #[test]
-fn a_file_after_a_loss_of_power_is_cut_at_its_zeros() {
+fn after_a_loss_of_power_a_file_is_truncated_at_its_zeros() {
     let directory = tempfile::tempdir().unwrap();
     let storage = Storage {
         chunk_bytes: 900,
@@ -200,7 +200,7 @@ fn a_file_after_a_loss_of_power_is_cut_at_its_zeros() {
 }
 
 #[test]
-fn metadata_is_made_anew_from_all_files_in_their_order() {
+fn missing_metadata_is_regenerated_from_all_files_in_order() {
     let directory = tempfile::tempdir().unwrap();
     for form in [Form::Compatible, Form::Humble, Form::Named] {
         let path = directory.path().join(format!("{form:?}"));
@@ -230,7 +230,7 @@ fn metadata_is_made_anew_from_all_files_in_their_order() {
 }
 
 #[test]
-fn a_file_that_is_not_mcap_is_left_alone_and_reported() {
+fn a_file_that_is_not_mcap_stays_unchanged_and_is_reported() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("bag");
     super::bag(&path, Options::default(), 5);
@@ -257,7 +257,7 @@ fn a_file_that_is_not_mcap_is_left_alone_and_reported() {
 }
 
 #[test]
-fn compression_of_files_that_was_interrupted_is_completed() {
+fn interrupted_compression_of_files_is_completed() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("bag");
     let options = Options {
@@ -288,7 +288,7 @@ fn compression_of_files_that_was_interrupted_is_completed() {
     assert_eq!(metadata(&path).compression_mode, "FILE");
 }
 
-/// Returns a file of chunks that each expand to zeros, `bytes` in all.
+/// Returns a file of `chunks` chunks, each of which expands to `chunk_bytes` zeros.
 fn expanding(chunk_bytes: usize, chunks: usize, compression: Compression) -> Vec<u8> {
     let inside = compression.compressed(&vec![0; chunk_bytes]).unwrap();
     let mut file = records::MAGIC.to_vec();
@@ -312,7 +312,7 @@ fn expanding(chunk_bytes: usize, chunks: usize, compression: Compression) -> Vec
 }
 
 #[test]
-fn a_small_file_that_expands_to_gigabytes_is_refused_before_it_does() {
+fn a_small_file_is_refused_before_it_expands_to_gigabytes() {
     let directory = tempfile::tempdir().unwrap();
     let refused = |name: &str, factor: u32, file: &[u8]| {
         let path = directory.path().join(name);
@@ -348,7 +348,7 @@ fn a_small_file_that_expands_to_gigabytes_is_refused_before_it_does() {
     });
     let whole = Compression::Zstd.compressed(&whole).unwrap();
     let path = refused("whole_0.mcap.zstd", 16, &whole);
-    // A person can trust it.
+    // The user can lift the limit.
     let scan = read::scan(&path, Expansion::Unlimited, &mut |_, _| {}).unwrap();
     assert_eq!(scan.metadata_places.len(), 1);
     // Content that expands like recordings of a still image is readable.

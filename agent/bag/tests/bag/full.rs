@@ -52,7 +52,7 @@ fn small_disk() {
     };
     assert!(matches!(error, Error::DiskFull { .. }), "{error:?}");
     assert!(taken > 30, "{taken}");
-    // The final report fits as well.
+    // The final report also fits.
     let report = BTreeMap::from([("ros2probe.report".to_owned(), "x".repeat(20_000))]);
     let summary = writer.close(report).unwrap();
     let found = messages(&summary.files[0]);
@@ -68,7 +68,7 @@ fn small_disk() {
     // No space stays reserved.
     let again = path.with_file_name("again");
     fs::write(&again, vec![0; 100_000]).unwrap();
-    // A bag that cannot be started leaves nothing behind, however often it is tried.
+    // A bag that cannot be started leaves nothing behind.
     let rest = fs::write(path.with_file_name("rest"), vec![0; 6 << 20]);
     assert!(rest.is_err());
     let third = path.with_file_name("third");
@@ -78,7 +78,7 @@ fn small_disk() {
 }
 
 #[test]
-fn a_place_that_cannot_be_written_to_is_named() {
+fn an_unwritable_path_is_named_in_the_error() {
     let error = Writer::create(Path::new("/proc/bag"), Options::default()).unwrap_err();
     assert!(matches!(error, Error::Create { .. }), "{error:?}");
     assert_eq!(error.to_string(), "cannot create /proc/bag");

@@ -20,7 +20,7 @@ fn real() -> PathBuf {
 }
 
 #[test]
-fn metadata_of_real_bags_comes_back_byte_for_byte() {
+fn metadata_of_real_bags_is_formatted_byte_for_byte() {
     for bag in fs::read_dir(real()).unwrap() {
         let file = bag.unwrap().path().join("metadata.yaml");
         let Ok(text) = fs::read_to_string(&file) else {
@@ -48,7 +48,7 @@ fn qos(depth: i32, reliability: Reliability, durability: Durability) -> Qos {
     }
 }
 
-/// Returns records in order, as text, without fields that must differ.
+/// Returns the records of a file in order, as text, without fields that must differ.
 fn listing(bytes: &[u8]) -> Vec<String> {
     let mut listing = Vec::new();
     let mut rest = &bytes[records::MAGIC.len()..bytes.len() - records::MAGIC.len()];
@@ -75,7 +75,7 @@ fn listing(bytes: &[u8]) -> Vec<String> {
                     listing.push(format!("  {} {content:?}", opcode.0));
                 }
             }
-            // One per channel, in any order.
+            // A chunk has one index per channel, in any order.
             Opcode::MESSAGE_INDEX => {
                 let at = listing
                     .iter()
@@ -116,7 +116,7 @@ fn listing(bytes: &[u8]) -> Vec<String> {
 }
 
 #[test]
-fn records_are_those_that_humble_writes() {
+fn written_records_equal_those_of_humble() {
     let original = real().join("bag_zstd_fast/bag_zstd_fast_0.mcap");
     let contents = Contents::of_summary(&original).unwrap().unwrap();
     let directory = tempfile::tempdir().unwrap();
@@ -162,7 +162,7 @@ fn records_are_those_that_humble_writes() {
     for (ours, theirs) in ours.iter().zip(&theirs) {
         assert_eq!(ours, theirs);
     }
-    // And metadata.yaml, except for the order of topics.
+    // metadata.yaml is equal as well, except for the order of topics.
     let theirs = fs::read_to_string(real().join("bag_zstd_fast/metadata.yaml")).unwrap();
     let mut theirs = Metadata::read(&theirs).unwrap();
     let ours = fs::read_to_string(path.join("metadata.yaml")).unwrap();

@@ -53,7 +53,8 @@ fn topic(name: &str, type_name: &str) -> TopicDescription {
     }
 }
 
-/// Writes `count` messages of two topics, ten per second; every third is of the larger topic.
+/// Writes `count` messages of two topics, ten per second; every third message is on the larger
+/// topic.
 fn bag(directory: &Path, options: Options, count: u64) -> Summary {
     let mut writer = Writer::create(directory, options).unwrap();
     let chatter = writer
@@ -95,7 +96,8 @@ fn metadata(directory: &Path) -> Metadata {
     Metadata::read(&text).unwrap()
 }
 
-/// Returns topic, sequence, log time, publish time and bytes, as the `mcap` crate reads them.
+/// Returns topic, sequence number, log time, publish time and bytes of each message, as the `mcap`
+/// crate reads them.
 fn messages(path: &Path) -> Vec<(String, u32, u64, u64, Vec<u8>)> {
     let bytes = fs::read(path).unwrap();
     let messages = mcap::MessageStream::new(&bytes).unwrap();

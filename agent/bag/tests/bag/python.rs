@@ -74,7 +74,7 @@ fn forms() -> [(&'static str, Options); 8] {
 }
 
 #[test]
-fn mcap_and_rosbags_of_python_read_every_form_and_compression() {
+fn the_python_readers_read_every_form_and_compression() {
     let directory = tempfile::tempdir().unwrap();
     let bags = forms().map(|(name, options)| {
         let path = directory.path().join(name);
@@ -141,7 +141,7 @@ fn mcap_and_rosbags_of_python_read_every_form_and_compression() {
 }
 
 #[test]
-fn rosbags_opens_a_bag_whose_types_are_not_known() {
+fn rosbags_opens_a_bag_with_an_unknown_type() {
     let directory = tempfile::tempdir().unwrap();
     let bags = [Form::Humble, Form::Compatible, Form::Named].map(|form| {
         let path = directory.path().join(format!("{form:?}"));

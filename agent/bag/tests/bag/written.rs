@@ -4,7 +4,7 @@ use super::*;
 use ros2probe_wire::Expansion;
 
 #[test]
-fn messages_larger_than_a_chunk_are_in_the_bag_as_they_came_between_small_ones() {
+fn messages_larger_than_a_chunk_are_stored_in_order_between_small_ones() {
     let directory = tempfile::tempdir().unwrap();
     let crc = |storage| Storage {
         chunk_crc: true,
@@ -41,7 +41,7 @@ fn messages_larger_than_a_chunk_are_in_the_bag_as_they_came_between_small_ones()
         .unwrap();
         let sent: Vec<_> = (0..sizes.len()).map(|index| (index, data(index))).collect();
         assert!(found == sent, "{name}");
-        // The other reader is built without zstd here; it checks the checksums.
+        // The `mcap` crate checks the checksums; it is built without zstd here.
         if name != "packed" {
             let theirs = messages(&summary.files[0]).into_iter();
             assert!(
@@ -58,7 +58,7 @@ fn messages_larger_than_a_chunk_are_in_the_bag_as_they_came_between_small_ones()
 }
 
 #[test]
-fn a_file_is_split_when_its_index_takes_what_it_may() {
+fn a_file_is_split_when_its_index_reaches_the_limit() {
     let directory = tempfile::tempdir().unwrap();
     let options = Options {
         max_index_bytes: Some(1000),
@@ -79,7 +79,7 @@ fn a_file_is_split_when_its_index_takes_what_it_may() {
 }
 
 #[test]
-fn another_reader_finds_every_message_in_its_place() {
+fn another_reader_finds_every_message_and_its_index() {
     let directory = tempfile::tempdir().unwrap();
     for (name, storage) in [
         (
@@ -181,7 +181,7 @@ fn metadata_describes_the_content_of_the_bag() {
             .offered_qos_profiles
             .starts_with("- history: 1\n  depth: 10\n")
     );
-    // The same in the file, for readers of single files.
+    // The file contains the same metadata, for readers of single files.
     let bytes = fs::read(path.join("run_0.mcap")).unwrap();
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
     assert_eq!(summary.metadata_indexes.len(), 2);
@@ -194,7 +194,7 @@ fn metadata_describes_the_content_of_the_bag() {
 }
 
 #[test]
-fn files_are_split_by_size_and_by_time_and_nothing_is_lost_between() {
+fn files_are_split_by_size_and_time_without_losing_messages() {
     let directory = tempfile::tempdir().unwrap();
     let by_time = directory.path().join("time");
     let options = Options {
@@ -258,7 +258,7 @@ fn flushed_messages_survive_the_end_of_the_writer() {
             writer.flush().unwrap();
         }
     }
-    // As after `kill -9`: neither closed nor dropped.
+    // The writer is neither closed nor dropped, as after `kill -9`.
     std::mem::forget(writer);
     assert_eq!(metadata(&path).message_count, 3);
     let bytes = fs::read(path.join("killed_0.mcap")).unwrap();
@@ -284,7 +284,7 @@ fn an_existing_directory_is_not_written_into() {
 }
 
 #[test]
-fn publishers_that_come_later_are_named_apart_from_the_topic() {
+fn later_publishers_are_listed_apart_from_the_topic() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("later");
     let mut writer = Writer::create(&path, Options::default()).unwrap();
@@ -365,7 +365,7 @@ fn the_form_follows_the_distribution() {
 }
 
 #[test]
-fn whole_files_are_compressed_by_the_thread_that_takes_the_work() {
+fn complete_files_are_compressed_by_the_thread_that_takes_the_task() {
     let directory = tempfile::tempdir().unwrap();
     for compression in [Compression::Zstd, Compression::Lz4] {
         let path = directory.path().join(compression.name());
@@ -406,7 +406,7 @@ fn whole_files_are_compressed_by_the_thread_that_takes_the_work() {
             found.relative_file_paths[0],
             format!("{suffix}_0.mcap.{suffix}")
         );
-        // The last file, and not the second, which was taken for another thread.
+        // Closing compresses the last file, but not the second one, which another thread took.
         let summary = writer.close(BTreeMap::new()).unwrap();
         let names: Vec<_> = summary.files.iter().map(|file| file.exists()).collect();
         assert_eq!(names, [true; 3]);
