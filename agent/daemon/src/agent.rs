@@ -51,7 +51,7 @@ pub struct Options {
     pub replay: Option<PathBuf>,
     /// Speed of the replay. `None` means as captured, or as fast as possible for a report.
     pub speed: Option<Speed>,
-    /// How far a gzipped capture may expand.
+    /// Limit for the expansion of a gzipped capture.
     pub expansion: Expansion,
     /// Whether to print the metrics on stdout at the end of the capture and exit.
     pub report: bool,
@@ -121,7 +121,7 @@ impl Components<'_> {
         } = self;
         let caps = Caps {
             subscriptions: config.limits.subscriptions,
-            // The other half is for samples in assembly.
+            // The other half of `payload_bytes` is for the reassembly of samples.
             bytes: config.limits.payload_bytes / 2,
         };
         let subscriptions =
@@ -295,7 +295,7 @@ pub fn run(options: Options) -> Result<()> {
     Ok(())
 }
 
-/// The configuration with the overrides of the command line.
+/// Returns the configuration with the overrides of the command line.
 fn overridden(configured: &Config, options: &Options) -> Config {
     let mut config = configured.clone();
     if let Some(listen) = options.metrics {
@@ -318,7 +318,8 @@ fn overridden(configured: &Config, options: &Options) -> Config {
     config
 }
 
-/// The thread of the ros2 daemon, if it is configured. A report ends before a client could ask.
+/// Starts the thread of the ros2 daemon, if it is configured. A report ends before a client could
+/// connect.
 fn ros2_daemon(config: &Config, is_report: bool) -> Result<Option<Ros2Daemon>> {
     if !config.ros2_daemon.is_on || is_report {
         return Ok(None);
@@ -327,13 +328,13 @@ fn ros2_daemon(config: &Config, is_report: bool) -> Result<Option<Ros2Daemon>> {
     Ok(Some(daemon))
 }
 
-/// Settings of exports, from the configuration and the environment.
+/// Returns the settings of exports, from the configuration and the environment.
 fn export(config: &Config) -> Result<Option<otlp::Settings>, otlp::SettingsError> {
     let variable = |name: &str| std::env::var(name).ok();
     otlp::Settings::resolve(&config.otlp, &variable, file::read_text, &Host::read())
 }
 
-/// Watches of the configuration and of the command line.
+/// Creates the watches of the configuration and of the command line.
 fn watches(config: &Config, given: Vec<Watch>, sources: &MetricSources) -> Result<Arc<Watches>> {
     let watches = Watches::new(
         Arc::clone(&sources.limits),
@@ -346,7 +347,8 @@ fn watches(config: &Config, given: Vec<Watch>, sources: &MetricSources) -> Resul
     Ok(Arc::new(watches.context("the watchlist is unusable")?))
 }
 
-/// Time span of figures. Zero if no API listener exists, since only its clients read them.
+/// Returns the time span of figures. It is zero without an API listener, since only API clients
+/// read figures.
 fn history(config: &Config, control: &api::Server) -> Duration {
     match control.is_empty() {
         true => Duration::ZERO,
@@ -354,7 +356,7 @@ fn history(config: &Config, control: &api::Server) -> Duration {
     }
 }
 
-/// Addresses at which the page is served.
+/// Returns the addresses at which the page is served.
 fn page_addresses(config: &Config, control: &api::Server) -> Vec<SocketAddr> {
     match config.api.page {
         PageChoice::On => control.addresses().collect(),
@@ -409,7 +411,7 @@ struct KeptState {
 }
 
 impl KeptState {
-    /// Reads the state of a live agent and restores its watches.
+    /// Reads the state that the previous live agent saved, and restores its watches.
     fn open(source: &Source, config: &Config, watches: &Watches) -> Self {
         let directory = match source {
             Source::Live(_) => memory::open(&config.state_directory),

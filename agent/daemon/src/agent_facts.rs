@@ -1,5 +1,5 @@
 //! Facts about the agent itself at one moment. The capture thread fills them in, and the surfaces
-//! read them. They are plain numbers, collected from their counters.
+//! read them. The facts are plain values, collected from counters.
 
 use std::time::Instant;
 
@@ -14,8 +14,8 @@ use ros2probe_model::facts::dispatch::MissedReason;
 pub struct AgentFacts {
     /// Kind of the packet source.
     pub source: SourceKind,
-    /// Reason why the source with more visibility is not used. `None` if it is used, or if the
-    /// configuration selects this one.
+    /// Reason why the source with more visibility is not used. `None` if that source is used, or if
+    /// the configuration selects `source`.
     pub source_reason: Option<String>,
     /// Abilities of the source, each at most once.
     pub abilities: Vec<Ability>,
@@ -23,11 +23,11 @@ pub struct AgentFacts {
     pub on_demand: Vec<Ability>,
     /// Reasons for missing abilities, as text. Not every missing ability has one.
     pub blind: Vec<(Ability, String)>,
-    /// Observed object that no longer exists, as text; traffic there is invisible.
+    /// Observed object that no longer exists, as text; its traffic is not observed.
     pub gone: Option<String>,
     /// Part of the source that makes no progress, as text.
     pub stalled: Option<String>,
-    /// What is not observed yet after the start, as text.
+    /// Part of the source that is not observed yet after the start, as text.
     pub pending: Option<String>,
     /// Number of times the host hook was attached again to a recreated control group.
     pub attached_anew: u64,
@@ -62,7 +62,7 @@ pub struct AgentFacts {
     pub reassembly_bytes: u64,
     /// Bytes held for reassembly of captured datagrams that arrive from the sockets in pieces.
     pub pieces_bytes: u64,
-    /// Incomplete datagrams evicted from reassembly to make room.
+    /// Incomplete datagrams evicted because the reassembly buffer was full.
     pub reassembly_evicted: u64,
     /// Updates of topics of interest that did not fit into the kernel filter's maps.
     pub refused_updates: u64,
@@ -178,7 +178,7 @@ pub struct InterfaceFacts {
 }
 
 impl AgentFacts {
-    /// Initial facts of a source.
+    /// Returns the initial facts of a source.
     #[must_use]
     pub fn new(source: SourceKind, at: Instant) -> Self {
         Self {
@@ -219,7 +219,7 @@ impl AgentFacts {
 }
 
 impl SourceKind {
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -229,7 +229,8 @@ impl SourceKind {
         }
     }
 
-    /// Abilities of every source of this kind. The kernel and the configuration may add more.
+    /// Returns the abilities of every source of this kind. The kernel and the configuration may add
+    /// more.
     #[must_use]
     pub const fn abilities(self) -> &'static [Ability] {
         match self {
@@ -255,7 +256,7 @@ impl Ability {
         Self::Inside,
     ];
 
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -284,9 +285,9 @@ pub struct SubscriptionFacts {
     pub given: u64,
     /// Samples not delivered since the start, per reader, in the order of [`MissedReason::ALL`].
     pub missed: [u64; MissedReason::ALL.len()],
-    /// Those of them evicted because all queues together were full.
+    /// Samples of `missed` that were evicted because all queues together were full.
     pub crowded_out: u64,
-    /// Bytes that wait in queues.
+    /// Bytes of the samples in queues.
     pub queued_bytes: usize,
     /// Bytes of retained messages.
     pub retained_bytes: usize,

@@ -17,7 +17,7 @@ const DEFAULT: &str = "/run/ros2probe";
 const VARIABLE: &str = "RUNTIME_DIRECTORY";
 const SOCKET: &str = "api.sock";
 
-/// Applies the command line to the configuration. With a report, there is no listener, since it
+/// Applies the command line to the configuration. By default, a report has no listener, since it
 /// ends before a client could connect.
 pub(crate) fn choose(
     settings: &mut ApiSettings,
@@ -68,7 +68,7 @@ pub(crate) fn open_socket(server: &mut Server, settings: &ApiSettings) -> Result
     Ok(())
 }
 
-/// Path of the agent's socket. `None` without a directory for it.
+/// Returns the path of the agent's socket; `None` without a directory for it.
 fn socket() -> Option<PathBuf> {
     let named = std::env::var_os(VARIABLE).filter(|paths| !paths.is_empty());
     if let Some(paths) = named {

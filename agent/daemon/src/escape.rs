@@ -10,7 +10,7 @@ pub fn visible(text: &str) -> Cow<'_, str> {
     escaped(text, commands)
 }
 
-/// As [`visible`], but keeps line ends and tabs.
+/// Does the same as [`visible`], but keeps line ends and tabs.
 #[must_use]
 pub fn visible_lines(text: &str) -> Cow<'_, str> {
     escaped(text, |each| commands(each) && !matches!(each, '\n' | '\t'))

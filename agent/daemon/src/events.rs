@@ -1,12 +1,12 @@
-//! Log of events: the last ones, numbered, for any number of readers.
+//! Log of the latest events, which are numbered, for any number of readers.
 //!
 //! Writers never wait for readers: they append under a lock that readers hold only to copy
 //! references. Each reader keeps its own position; overwritten events are counted and reported to
 //! it.
 //!
-//! Bursts are limited: of one name, at most `MOST` events per second are kept, and the others are
-//! counted. Seconds of robot events are those of the source's clock, so a capture gives the same
-//! events at any speed.
+//! Bursts are limited: at most `MOST` events of one name are kept per second, and further ones are
+//! only counted. The seconds of robot events are those of the source's clock, so a capture yields
+//! the same events at any speed.
 //!
 //! A number belongs to one run of the agent. An event id also names the run, so that a position
 //! from before a restart is not mistaken for a new one.
@@ -38,10 +38,10 @@ pub use self_monitor::{DropMonitor, SourceMonitor};
 pub use table::EVENTS;
 pub use trigger::Trigger;
 
-/// Most events of one name per second.
+/// Maximum number of events of one name per second.
 const MOST: u32 = 200;
 
-/// The last events.
+/// Log of the latest events.
 #[derive(Debug)]
 pub struct EventLog {
     run: Run,
@@ -64,7 +64,7 @@ pub enum Reader {
     Otlp,
 }
 
-/// Position in the events of some run.
+/// Position in the events of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Position {
     /// After the event of this number in this run.
@@ -121,8 +121,8 @@ impl EventLog {
         }
     }
 
-    /// Records the model's events until `clock`, the source's time. An empty call records the end
-    /// of a burst.
+    /// Records the model's events up to `clock`, the source's time. A call without events records
+    /// the end of a burst.
     pub fn add(&self, taken: Taken, clock: Timestamp) {
         let mut log = self.log();
         let before = log.last;
@@ -133,7 +133,7 @@ impl EventLog {
         for (class, count) in taken.overflow {
             log.hold_back(group(class), count);
         }
-        // Events are settled up to a second after they happen.
+        // The model reports an event up to a second after it happened.
         log.turn_robot(clock.whole_seconds().saturating_sub(1));
         let is_recorded = log.last > before;
         drop(log);
@@ -155,7 +155,7 @@ impl EventLog {
         self.record_at(event, Instant::now());
     }
 
-    /// Events after the number `after`, oldest first, at most `most`.
+    /// Returns at most `most` events after the number `after`, oldest first.
     #[must_use]
     pub fn read(&self, after: u64, most: usize) -> Batch {
         let log = self.log();
@@ -177,7 +177,7 @@ impl EventLog {
         }
     }
 
-    /// Number of the latest event; 0 before the first.
+    /// Returns the number of the latest event; 0 before the first one.
     #[must_use]
     pub fn last(&self) -> u64 {
         self.log().last
@@ -186,7 +186,7 @@ impl EventLog {
     /// Waits for an event after the number `after`.
     pub async fn wait(&self, after: u64) {
         loop {
-            // Registered before the check, so that no event is missed.
+            // The waiter is registered before the check, so that no event is missed.
             let recorded = self.recorded.notified();
             if self.last() > after {
                 return;
@@ -195,19 +195,19 @@ impl EventLog {
         }
     }
 
-    /// Id of the event with this number.
+    /// Returns the id of the event with this number.
     #[must_use]
     pub fn id(&self, number: u64) -> String {
         format!("{}-{number}", self.run)
     }
 
-    /// Identifier of this run of the agent.
+    /// Returns the identifier of this run of the agent.
     #[must_use]
     pub fn run(&self) -> String {
         self.run.to_string()
     }
 
-    /// Position of an id relative to this run. `None` if it is not an id.
+    /// Returns the position of an id relative to this run; `None` if the text is not an id.
     #[must_use]
     pub fn position(&self, id: &str) -> Option<Position> {
         let (run, number) = id.split_once('-')?;
@@ -228,7 +228,7 @@ impl EventLog {
         }
     }
 
-    /// Number of recorded events by name, including zeros.
+    /// Returns the number of recorded events by name, including zeros.
     #[must_use]
     pub fn recorded(&self) -> Vec<(&'static str, u64)> {
         let log = self.log();
@@ -239,7 +239,7 @@ impl EventLog {
             .collect()
     }
 
-    /// Number of events not delivered to all readers, by reason.
+    /// Returns the number of events not delivered to all readers, by reason.
     #[must_use]
     pub fn dropped(&self) -> Vec<(&'static str, u64)> {
         let mut dropped = vec![("storm", self.log().suppressed)];
@@ -264,7 +264,7 @@ impl EventLog {
         self.recorded.notify_waiters();
     }
 
-    /// Simulates `count` events, after which all kept events are overwritten.
+    /// Simulates `count` further events, which overwrite all kept ones.
     #[cfg(test)]
     pub(super) fn overwrite(&self, count: u64) {
         let mut log = self.log();
@@ -280,7 +280,7 @@ impl EventLog {
     }
 }
 
-/// The exporter of log records.
+/// The exporter of log records reads the log through this trait.
 impl EventSource for EventLog {
     fn wait_after(&self, after: u64) -> Pin<Box<dyn Future<Output = ()> + '_>> {
         Box::pin(self.wait(after))
@@ -296,9 +296,9 @@ impl EventSource for EventLog {
 }
 
 impl Log {
-    /// Advances the source's clock to this second and reports suppressed events of the last one. An
-    /// event of the second before counts in this one. A larger step back means that the clock was
-    /// set.
+    /// Advances the source's clock to `second` and records the suppressed events of the previous
+    /// second. An event of the previous second counts in the current one. A larger step back means
+    /// that the clock was set.
     fn turn_robot(&mut self, second: u64) {
         let current = self.robot.second;
         if second == current || second.checked_add(1) == Some(current) {
@@ -350,7 +350,7 @@ impl Log {
 }
 
 impl Storm {
-    /// Begins a second. Returns the suppressed events of the one before, by name.
+    /// Begins a second. Returns the suppressed events of the previous second, by name.
     fn turn(&mut self, second: u64) -> BTreeMap<&'static str, u64> {
         self.second = second;
         self.recorded.clear();
@@ -385,7 +385,7 @@ impl Entry {
 impl Reader {
     const ALL: [Self; 2] = [Self::Stream, Self::Otlp];
 
-    /// Label value.
+    /// Returns the label value.
     const fn reason(self) -> &'static str {
         match self {
             Self::Stream => "stream_lagged",
@@ -400,7 +400,7 @@ impl fmt::Display for Run {
     }
 }
 
-/// Common prefix of a class's event names.
+/// Returns the common prefix of a class's event names.
 const fn group(class: Class) -> &'static str {
     match class {
         Class::Participant => "ros2.participant.*",

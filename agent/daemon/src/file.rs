@@ -12,16 +12,16 @@ use std::path::Path;
 ///
 /// # Errors
 ///
-/// The file cannot be opened, or is not a regular file.
+/// Fails if the file cannot be opened or is not a regular file.
 pub fn open(path: &Path) -> io::Result<File> {
     open_with(path, 0)
 }
 
-/// As [`open`], but does not follow a symbolic link in the last component.
+/// Does the same as [`open`], but does not follow a symbolic link in the last component.
 ///
 /// # Errors
 ///
-/// The file cannot be opened, is a symbolic link, or is not a regular file.
+/// Fails if the file cannot be opened, is a symbolic link, or is not a regular file.
 pub fn open_no_link(path: &Path) -> io::Result<File> {
     open_with(path, libc::O_NOFOLLOW)
 }
@@ -30,7 +30,7 @@ pub fn open_no_link(path: &Path) -> io::Result<File> {
 ///
 /// # Errors
 ///
-/// The file cannot be read, or is not a regular file.
+/// Fails if the file cannot be read or is not a regular file.
 pub fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?
@@ -43,7 +43,7 @@ pub fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
 ///
 /// # Errors
 ///
-/// The file cannot be read, is not a regular file, is longer, or is not UTF-8.
+/// Fails if the file cannot be read, is not a regular file, is longer, or is not UTF-8.
 pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     let bytes = read(path, limit)?;
     if bytes.len() as u64 > limit {
@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn a_text_as_long_as_may_be_is_read_and_a_longer_one_refused() {
+    fn a_text_of_the_maximum_length_is_read_and_a_longer_one_is_refused() {
         let directory = tempfile::tempdir().unwrap();
         let file = directory.path().join("text");
         std::fs::write(&file, "0123456789").unwrap();

@@ -1,9 +1,9 @@
-//! The last messages of transient-local writers, as answers and reports name them.
+//! The last messages of transient-local writers, as the API and reports describe them.
 
 use ros2probe_api::latched::{Latched, LatchedState};
 use ros2probe_model::report::snapshot::LatchedFacts;
 
-/// Returns what became of the last message of a transient-local writer.
+/// Returns the state of the last message of a transient-local writer.
 pub(crate) fn latched(facts: LatchedFacts) -> Latched {
     let (state, bytes) = match facts {
         LatchedFacts::Unseen => (LatchedState::Unseen, None),

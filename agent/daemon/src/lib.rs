@@ -3,7 +3,7 @@
 //! - [`agent::run`] is the lifecycle of an agent. [`agent::Components`] composes one, live or
 //!   replayed.
 //! - [`config`] reads the configuration, [`watches`] merges the watched topics.
-//! - [`run`] is the loop of the working thread, the only one that touches the model.
+//! - [`run`] is the loop of the working thread, the only thread that accesses the model.
 //! - [`snapshot_cell`] holds the latest snapshot, [`events`] the log of events, [`limit_facts`] the
 //!   caps.
 //! - [`surface`] serves snapshots: Prometheus, the API and the page. OTLP exports them.

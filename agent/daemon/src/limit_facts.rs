@@ -1,7 +1,7 @@
-//! Usage of the configured caps, and the entries refused or evicted because of each.
+//! Usage of the configured caps, and the number of entries refused or evicted per cap.
 //!
-//! The model counts most of this in its tables. Resources of surfaces and recordings (connection
-//! slots, bags, watches) are counted here.
+//! The model counts most of these entries in its tables. Resources of surfaces and recordings
+//! (connection slots, bags, watches) are counted here.
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
@@ -19,9 +19,9 @@ const REACHED_FOR: Duration = Duration::from_secs(60);
 pub struct LimitFacts {
     /// Identity of the cap.
     pub limit: Limit,
-    /// Largest number of entries, connections or bytes.
+    /// Maximum number of entries, connections or bytes.
     pub cap: u64,
-    /// Current number.
+    /// Current number of entries, connections or bytes.
     pub used: u64,
     /// Number refused or evicted since the start.
     pub reached: u64,
@@ -47,14 +47,14 @@ struct Rise {
     at: Option<Instant>,
 }
 
-/// Slots, of which a limited number can be taken at once.
+/// A limited number of slots.
 #[derive(Debug)]
 pub struct Slots {
     cap: usize,
     taken: AtomicUsize,
 }
 
-/// One slot, which dropping releases.
+/// One slot, which is released when it is dropped.
 #[derive(Debug)]
 pub struct Slot {
     of: Arc<Slots>,
@@ -73,13 +73,14 @@ impl LimitFigures {
         }
     }
 
-    /// The caps.
+    /// Returns the caps.
     #[must_use]
     pub const fn caps(&self) -> &Limits {
         &self.caps
     }
 
-    /// Slots for `limit`. Each listener has its own, so that a full one does not block the others.
+    /// Creates slots for `limit`. Each listener has its own slots, so that a full listener does not
+    /// block the others.
     #[must_use]
     pub fn slots(&self, limit: Limit) -> Arc<Slots> {
         let slots = Arc::new(Slots {
@@ -117,7 +118,7 @@ impl LimitFigures {
         }
     }
 
-    /// State of all caps, with the model's counters from `state`.
+    /// Returns the state of all caps, with the model's counters from `state`.
     #[must_use]
     pub fn facts(&self, state: &State) -> [LimitFacts; LIMITS] {
         let rises = *self.rises.lock().unwrap_or_else(PoisonError::into_inner);
@@ -136,7 +137,7 @@ impl LimitFigures {
         })
     }
 
-    /// Limits that hide part of the robot, as text. `None` if no limit does.
+    /// Returns the reached limits that hide part of the robot, as text; `None` if no limit does.
     #[must_use]
     pub fn degraded(&self, state: &State) -> Option<String> {
         let all = self.facts(state).into_iter();
@@ -196,14 +197,14 @@ impl LimitFigures {
         let all = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
         let slots = all.iter().filter(|(of, _)| *of == limit);
         let taken = slots.filter_map(|(_, slots)| Some(slots.upgrade()?.taken() as u64));
-        // The largest usage: that listener refuses the next connection.
+        // The listener with the highest usage is the first to refuse a connection.
         let taken = taken.max().unwrap_or(0);
         (taken.max(read(&self.used)), read(&self.reached))
     }
 }
 
 impl Slots {
-    /// Takes a slot. `None` if all are in use.
+    /// Takes a slot; returns `None` if all are in use.
     pub fn take(self: &Arc<Self>) -> Option<Slot> {
         let more = |taken| (taken < self.cap).then_some(taken + 1);
         let taken = self
@@ -214,7 +215,7 @@ impl Slots {
         })
     }
 
-    /// Number of slots.
+    /// Returns the number of slots.
     #[must_use]
     pub const fn cap(&self) -> usize {
         self.cap
@@ -238,7 +239,7 @@ mod tests {
     use ros2probe_model::report::snapshot::{Snapshot, TableFacts};
 
     #[test]
-    fn places_are_as_many_as_the_cap_and_come_back() {
+    fn slots_are_limited_by_the_cap_and_can_be_reused() {
         let figures = LimitFigures::new(Limits {
             recordings: 2,
             ..Limits::default()
@@ -254,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn a_limit_is_reached_while_there_is_no_room_and_for_a_minute_after_a_refusal() {
+    fn a_limit_counts_as_reached_while_full_and_for_a_minute_after_a_refusal() {
         let figures = LimitFigures::new(Limits {
             participants: 10,
             ..Limits::default()
@@ -288,13 +289,13 @@ mod tests {
         let lately = "at a limit: participants (9 of 10, 5 refused or evicted)";
         assert_eq!(at(62, 9, 5).as_deref(), Some(lately));
         assert_eq!(at(63, 9, 5), None);
-        // Resources of clients hide nothing of the robot.
+        // Limits of clients do not hide any part of the robot.
         figures.set_used(Limit::Watches, 1_000);
         assert_eq!(at(64, 9, 5), None);
     }
 
     #[test]
-    fn of_several_listeners_the_fullest_one_is_shown_and_one_that_is_gone_is_not() {
+    fn usage_is_that_of_the_fullest_listener_and_ignores_closed_ones() {
         let figures = LimitFigures::new(Limits::default());
         let (one, other) = (
             figures.slots(Limit::ApiClients),

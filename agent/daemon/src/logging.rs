@@ -14,7 +14,7 @@ use tracing_subscriber::layer::SubscriberExt as _;
 use tracing_subscriber::util::SubscriberInitExt as _;
 use tracing_subscriber::{Layer as _, Registry, fmt, reload};
 
-/// Log whose level can change at run time. It stays started after it is dropped.
+/// Log whose level can change at run time. Logging continues after this handle is dropped.
 #[derive(Debug)]
 pub struct Log {
     level: reload::Handle<EnvFilter, Registry>,
@@ -25,8 +25,8 @@ pub struct Log {
 }
 
 impl Log {
-    /// Starts logging at `level`, or as `RUST_LOG` sets. Lines of the level `exported` are queued for
-    /// export. A process has one log: the first one that is started.
+    /// Starts logging at `level`, or as `RUST_LOG` sets. Lines of the level `exported` and of more
+    /// severe ones are queued for export. A process has one log: the first one that is started.
     #[must_use]
     pub fn start(level: Level, exported: Option<LevelFilter>) -> Self {
         let fixed = EnvFilter::try_from_default_env().ok();
@@ -57,12 +57,12 @@ impl Log {
         }
     }
 
-    /// Lines that wait for export, if they are exported.
+    /// Returns the queue of lines to export, if lines are exported.
     pub(crate) fn exported_lines(&self) -> Option<Arc<LogQueue>> {
         self.exported.clone()
     }
 
-    /// Counter of lines that standard error did not accept.
+    /// Returns the counter of lines that standard error did not accept.
     pub(crate) fn lost_lines(&self) -> Arc<AtomicU64> {
         Arc::clone(&self.lost)
     }

@@ -17,7 +17,7 @@ const VARIABLE: &str = "STATE_DIRECTORY";
 /// Subdirectory of recordings.
 const RECORDINGS: &str = "recordings";
 
-/// Opens the state directory. `None` if no state is saved.
+/// Opens the state directory; returns `None` if no state is saved.
 pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
     let named = std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
     let opened = match (choice, named) {
@@ -40,7 +40,7 @@ pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
     }
 }
 
-/// Directory of bags, created with the first one. `None` if there is no place for it.
+/// Returns the directory of bags, which is created with the first one; `None` if bags are refused.
 pub(crate) fn recordings(choice: &StateChoice, state: Option<&StateDirectory>) -> Option<PathBuf> {
     match choice {
         StateChoice::Off => None,
@@ -49,7 +49,7 @@ pub(crate) fn recordings(choice: &StateChoice, state: Option<&StateDirectory>) -
     }
 }
 
-/// Discovery state of the last agent, and whether this agent may overwrite it.
+/// Returns the discovery state of the previous agent, and whether this agent may overwrite it.
 pub(crate) fn load(directory: &StateDirectory) -> (Option<Memory>, bool) {
     let path = directory.path().display();
     let known = match directory.load() {
@@ -92,8 +92,8 @@ fn left_alone(newer: &Newer) {
     );
 }
 
-/// Restores watches that clients of the last agent had added. Returns whether this agent may
-/// overwrite them.
+/// Restores watches that clients of the previous agent had added. Returns whether this agent may
+/// overwrite the saved watches.
 pub(crate) fn restore_watches(directory: &StateDirectory, watches: &Watches) -> bool {
     let Some(kept) = load_watches(directory) else {
         return false;
@@ -109,7 +109,7 @@ pub(crate) fn restore_watches(directory: &StateDirectory, watches: &Watches) -> 
     true
 }
 
-/// Reads saved watches. `None` if a newer version wrote them.
+/// Reads saved watches; returns `None` if a newer version wrote them.
 fn load_watches(directory: &StateDirectory) -> Option<Vec<Watch>> {
     let path = directory.path().display();
     Some(match watches::load(directory) {

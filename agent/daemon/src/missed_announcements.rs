@@ -1,19 +1,20 @@
 //! Writers whose announcement the agent missed: the sentence about them, and the command that
-//! requests their announcements. All surfaces take both from here.
+//! requests their announcements. All surfaces use this sentence and this command.
 
 use ros2probe_api::participants::UnknownWriter;
 use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::rtps::VendorId;
 
-/// Requests the announcements of all DDS participants. Without `--all` it only lists them.
+/// Command that requests the announcements of all DDS participants. Without `--all`, it only lists
+/// the participants.
 pub const DISCOVER: &str = "sudo rp discover --all";
-/// Requests what a router of Zenoh knows.
+/// Command that requests the discovery state of a Zenoh router.
 pub const DISCOVER_ROUTER: &str = "rp discover --router";
-/// Requests both.
+/// Both commands in one.
 const DISCOVER_BOTH: &str = "sudo rp discover --all && rp discover --router";
 
-/// Returns the command that requests the announcements of these participants or writers, each
-/// `true` for one of Zenoh. Returns `None` without any.
+/// Returns the command that requests the announcements of participants or writers, each `true` for
+/// one of Zenoh; `None` without any.
 pub fn command(of_zenoh: impl IntoIterator<Item = bool>) -> Option<&'static str> {
     let (mut has_zenoh, mut has_dds) = (false, false);
     for is_zenoh in of_zenoh {
@@ -46,7 +47,7 @@ pub fn remedy_for(writers: &[UnknownWriter<'_>]) -> Option<&'static str> {
     command(writers.iter().map(|writer| is_zenoh(&writer.vendor)))
 }
 
-/// Returns whether the API names this middleware for Zenoh.
+/// Returns whether `vendor` is the name of Zenoh in the API.
 #[must_use]
 pub fn is_zenoh(vendor: &str) -> bool {
     VendorId::ZENOH.to_string() == vendor
@@ -74,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_remedy_is_a_command_that_sends_requests_to_the_middleware_in_question() {
+    fn the_remedy_requests_announcements_from_the_middleware_of_the_writers() {
         let writer = |vendor: &'static str| UnknownWriter {
             vendor: vendor.into(),
             ..UnknownWriter::default()

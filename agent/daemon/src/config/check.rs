@@ -78,7 +78,7 @@ fn check_map(
     for (key, value) in entries {
         let path = key_path(path, &key.name);
         let own = properties.and_then(|all| all.get(&key.name));
-        // A map with keys chosen by the operator.
+        // The operator chooses the keys of this map.
         let any = schema
             .get("additionalProperties")
             .filter(|any| any.is_object());
@@ -179,7 +179,7 @@ fn any_of(schema: &Value) -> Option<&Vec<Value>> {
     schema.get("anyOf").and_then(Value::as_array)
 }
 
-/// Alternatives of a schema; an optional value with alternatives nests them.
+/// Returns the alternatives of a schema; an optional value with alternatives nests them.
 fn choices<'a>(schema: &'a Value, root: &'a Value) -> Vec<&'a Value> {
     let schema = resolve(schema, root);
     match any_of(schema) {
@@ -191,7 +191,7 @@ fn choices<'a>(schema: &'a Value, root: &'a Value) -> Vec<&'a Value> {
     }
 }
 
-/// JSON types that a schema allows.
+/// Returns the JSON types that a schema allows.
 fn kinds(schema: &Value) -> Vec<&str> {
     match schema.get("type") {
         Some(Value::String(kind)) => vec![kind.as_str()],
@@ -215,8 +215,8 @@ fn allows(schema: &Value, node: &Node) -> bool {
     }
 }
 
-/// Names of the allowed kinds, with the words of an enumeration. Empty sections are always allowed
-/// and not listed.
+/// Returns the names of the allowed kinds, with the words of an enumeration. Empty sections are
+/// always allowed and not listed.
 fn expected(schema: &Value) -> Vec<String> {
     let listed: Vec<_> = words(schema).collect();
     let words = |kind: &&str| match *kind {
@@ -232,7 +232,7 @@ fn expected(schema: &Value) -> Vec<String> {
     kinds(schema).iter().filter_map(words).collect()
 }
 
-/// Values of an enumeration.
+/// Returns the values of an enumeration.
 fn words(schema: &Value) -> impl Iterator<Item = &str> {
     let listed = schema
         .get("enum")
@@ -249,7 +249,8 @@ fn words(schema: &Value) -> impl Iterator<Item = &str> {
         .filter_map(Value::as_str)
 }
 
-/// Edit distance of two words; words with the same letters in another order have distance one.
+/// Returns the edit distance of two words; words with the same letters in another order have
+/// distance one.
 fn distance(one: &str, other: &str) -> usize {
     if one != other && sorted(one) == sorted(other) {
         return 1;

@@ -1,7 +1,7 @@
 //! YAML text as a tree with the position of every key and value.
 //!
-//! Deliberately bounded: one document, no aliases (hence no alias bombs), limited depth and size.
-//! This module does not interpret keys.
+//! Parsing is deliberately bounded: one document, no aliases (hence no alias bombs), limited depth
+//! and size. This module does not interpret keys.
 
 use std::collections::BTreeMap;
 
@@ -9,9 +9,9 @@ use saphyr_parser::{Event, Marker, Parser, ScalarStyle};
 
 use super::mistake::{Mistakes, Position};
 
-/// Deepest nesting; no sensible configuration exceeds it.
+/// Maximum depth of nesting; no sensible configuration exceeds it.
 const MAX_DEPTH: usize = 16;
-/// Most values; enough for a watchlist of thousands.
+/// Maximum number of values; enough for a watchlist of thousands.
 const MAX_VALUES: usize = 50_000;
 
 /// A value and the position of its first character.
@@ -148,7 +148,7 @@ impl Node {
         self.scalar() == Some(Scalar::Null)
     }
 
-    /// Position of each value by its key path. Reports duplicate keys.
+    /// Returns the position of each value by its key path, and reports duplicate keys.
     pub(super) fn index(&self, mistakes: &mut Mistakes) -> BTreeMap<String, Position> {
         let mut places = BTreeMap::new();
         self.index_into("", &mut places, mistakes);
@@ -183,7 +183,7 @@ impl Node {
         }
     }
 
-    /// Version of the file as a whole number, with its position. `None` without one.
+    /// Returns the version of the file with its position; `None` unless it is a whole number.
     pub(super) fn version(&self) -> Option<(i128, Position)> {
         let Content::Map(entries) = &self.content else {
             return None;
@@ -195,7 +195,7 @@ impl Node {
         }
     }
 
-    /// Meaning of a scalar. `None` for lists and maps.
+    /// Returns the meaning of a scalar; `None` for lists and maps.
     pub(super) fn scalar(&self) -> Option<Scalar> {
         let Content::Scalar { text, plain } = &self.content else {
             return None;
@@ -220,7 +220,7 @@ impl Node {
         })
     }
 
-    /// The value as messages show it.
+    /// Returns the value as error messages show it.
     pub(super) fn describe(&self) -> String {
         let shown = |text: &str| -> String {
             let mut shown: String = text.chars().take(40).collect();
@@ -249,8 +249,8 @@ impl Open {
                 content: Content::List(items),
             },
             Self::Map(position, entries, _) => {
-                // The parser reports a block mapping at its first colon; it begins at its first
-                // key.
+                // The parser reports a block mapping at its first colon, but the mapping begins at
+                // its first key.
                 let first = entries.first().map_or(position, |(key, _)| key.position);
                 Node {
                     position: position.min(first),
@@ -261,7 +261,7 @@ impl Open {
     }
 }
 
-/// Path of a key: `path.key`.
+/// Returns the path of a key: `path.key`.
 pub(super) fn key_path(path: &str, key: &str) -> String {
     if path.is_empty() {
         key.to_owned()
@@ -270,7 +270,7 @@ pub(super) fn key_path(path: &str, key: &str) -> String {
     }
 }
 
-/// Path of a list item: `path[index]`.
+/// Returns the path of a list item: `path[index]`.
 pub(super) fn item_path(path: &str, index: usize) -> String {
     format!("{path}[{index}]")
 }

@@ -29,9 +29,9 @@ use super::{
 use crate::events::Trigger;
 use ros2probe_metrics::otlp::otlp_endpoint;
 
-/// Most configured snapshots; each needs memory and a thread.
+/// Maximum number of configured snapshots; each needs memory and a thread.
 const MAX_SNAPSHOTS: usize = 8;
-/// Shortest default interval between triggered bags of a snapshot, in seconds.
+/// Minimum of the default interval between triggered bags of a snapshot, in seconds.
 const SNAPSHOT_INTERVAL_S: u64 = 10;
 
 /// Parses and checks a configuration.
@@ -62,12 +62,12 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Config, Mistakes> {
     read(source, &document)
 }
 
-/// Readers of each version of the file, the oldest first.
+/// The reader of each version of the file, the oldest first.
 const READERS: &[(u32, Read)] = &[(1, read_1)];
 type Read = fn(&str, &Node) -> Result<Config, Mistakes>;
 
-/// Reader for the version of the file, which defaults to the first. A newer version is the only
-/// mistake reported, since the meaning of its other keys is unknown.
+/// Returns the reader for the version of the file, which defaults to the first version. In a newer
+/// file only the version is reported, since the meaning of its other keys is unknown.
 fn reader(document: &Node, mistakes: &mut Mistakes) -> Option<Read> {
     let newest = READERS.last().map_or(0, |(version, _)| *version);
     let Some((version, position)) = document.version() else {
@@ -107,7 +107,7 @@ fn read_1(source: &str, document: &Node) -> Result<Config, Mistakes> {
             let config = reader.config(shape);
             reader.mistakes.none_or(config)
         }
-        // The two YAML readers disagree: rare, and still reported with a position.
+        // The two YAML readers rarely disagree. The error is then still reported with a position.
         Err(error) => {
             let place = error.location().map(|at| Position {
                 line: at.line(),
@@ -265,7 +265,7 @@ impl Reader {
         Watch {
             pattern: entry.topic,
             domain_id: entry.domain.map(DomainId),
-            // Values out of their ranges are reported already, by the schema or above.
+            // Values outside their ranges were reported before, by the schema or above.
             expectations: Expectations::try_from(values).unwrap_or_default(),
             per_subscriber: entry.per_subscriber,
             trace: entry.trace.unwrap_or_default(),
@@ -556,7 +556,7 @@ fn ros2_daemon(shape: Ros2DaemonShape) -> Ros2DaemonSettings {
 
 fn metrics(shape: MetricsShape) -> MetricsSettings {
     MetricsSettings {
-        // Text other than an address is `off`; the check of texts has refused the rest.
+        // Text other than an address is `off`; the check of texts has refused all other text.
         listen: shape.listen.parse().ok(),
         histograms: shape.histograms,
         per_writer: shape.per_writer,

@@ -33,7 +33,7 @@ pub struct Mistake {
 impl fmt::Display for Mistake {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}: ", self.position)?;
-        // Both quote the file.
+        // Key and message quote the file.
         if !self.key.is_empty() {
             write!(f, "{}: ", visible(&self.key))?;
         }
@@ -46,7 +46,7 @@ impl fmt::Display for Mistake {
 pub struct Mistakes(Vec<Mistake>);
 
 impl Mistakes {
-    /// Most mistakes printed.
+    /// Maximum number of mistakes printed.
     const SHOWN: usize = 50;
 
     /// Adds a mistake.
@@ -78,12 +78,12 @@ impl Mistakes {
         self.0.is_empty()
     }
 
-    /// All mistakes.
+    /// Iterates over all mistakes.
     pub fn iter(&self) -> impl Iterator<Item = &Mistake> {
         self.0.iter()
     }
 
-    /// One line per mistake in the format of compilers: `file:line:column: key: message`.
+    /// Formats one line per mistake, as compilers do: `file:line:column: key: message`.
     #[must_use]
     pub fn report(&self, file: &str) -> String {
         let mut lines: Vec<String> = self

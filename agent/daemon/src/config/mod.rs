@@ -36,7 +36,7 @@ pub use ros2probe_model::facts::watch::{
 pub use ros2probe_model::measure::rehearsal;
 use tracing_subscriber::filter::LevelFilter;
 
-/// Largest file accepted, in bytes.
+/// Maximum size of the file, in bytes.
 const MAX_BYTES: u64 = 1 << 20;
 
 /// The checked configuration.
@@ -72,7 +72,7 @@ pub struct Config {
     pub retain: RetainChoice,
     /// Directory of the saved discovery state.
     pub state_directory: StateChoice,
-    /// Least severe level that is logged.
+    /// Minimum severity that is logged.
     pub log: Level,
 }
 
@@ -90,7 +90,7 @@ pub enum Access {
 }
 
 impl Access {
-    /// Its name in the configuration and on the command line.
+    /// Returns its name in the configuration and on the command line.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -114,7 +114,7 @@ pub enum PageChoice {
     /// Serve the page beside the API.
     #[default]
     On,
-    /// Do not serve it.
+    /// Do not serve the page.
     Off,
 }
 
@@ -122,11 +122,11 @@ pub enum PageChoice {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum RetainChoice {
-    /// Of each transient-local writer, messages of up to 1 MiB; of watches with `retain: last` also
-    /// larger ones. 16 MiB together.
+    /// Messages of up to 1 MiB of each transient-local writer, and larger ones of watches with
+    /// `retain: last`; 16 MiB in total.
     #[default]
     Latched,
-    /// Only of watches with `retain: last`.
+    /// Only messages of watches with `retain: last`.
     Off,
 }
 
@@ -182,7 +182,7 @@ pub struct FoxgloveSettings {
 /// The daemon of the `ros2` command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Ros2DaemonSettings {
-    /// Whether the agent answers in its place.
+    /// Whether the agent answers in place of that daemon.
     pub is_on: bool,
     /// Distribution of the clients whose process cannot be inspected; `None` = guessed.
     pub distro: Option<Dialect>,
@@ -219,7 +219,7 @@ pub struct RecordingLimits {
     pub max_bytes: Option<u64>,
     /// Bytes of all bags in the directory; `None` = no limit.
     pub max_total_bytes: Option<u64>,
-    /// Percent of the file system that stays free; the larger of this and `reserve_bytes` applies.
+    /// Percentage of the file system that stays free; the larger of it and `reserve_bytes` applies.
     pub reserve_percent: u8,
     /// Bytes of the file system that stay free.
     pub reserve_bytes: u64,
@@ -244,10 +244,10 @@ impl RecordingSettings {
     }
 }
 
-/// The last seconds of some topics.
+/// A snapshot: the last seconds of some topics.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SnapshotSettings {
-    /// Prefix of its bags' names.
+    /// Prefix of the names of its bags.
     pub name: String,
     /// Names and globs of topics.
     pub topics: Vec<String>,
@@ -265,7 +265,7 @@ pub struct SnapshotSettings {
     pub min_interval: Duration,
     /// Maximum number of triggered bags.
     pub max_count: usize,
-    /// Maximum bytes of all its bags.
+    /// Maximum size of all its bags, in bytes.
     pub max_total_bytes: u64,
 }
 
@@ -317,7 +317,7 @@ impl Config {
     /// Reads and checks a file.
     ///
     /// # Errors
-    /// Fails if the file cannot be read or has mistakes, and returns all of them.
+    /// Fails if the file cannot be read. If the file has mistakes, the error contains all of them.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
         let bytes = crate::file::read(path, MAX_BYTES).map_err(|source| ConfigError::Read {
             path: path.into(),
@@ -450,7 +450,7 @@ impl Level {
         }
     }
 
-    /// Returns the filter of lines of this level or a more severe one.
+    /// Returns the filter that passes lines of this level and of more severe ones.
     #[must_use]
     pub const fn filter(self) -> LevelFilter {
         match self {
@@ -476,7 +476,7 @@ mod defaults {
     pub(super) const LISTEN: &str = "127.0.0.1:17400";
     pub(super) const API: &str = "127.0.0.1:17401";
     pub(super) const FOXGLOVE: &str = "127.0.0.1:8765";
-    /// The web application, and the desktop applications, whose pages are files.
+    /// Origins of the web application and of desktop applications, whose pages are files.
     pub(super) const ORIGINS: [&str; 2] = ["https://app.foxglove.dev", "file://"];
     pub(super) const HISTORY_S: u32 = 600;
     pub(super) const SNAPSHOT_COUNT: usize = 20;

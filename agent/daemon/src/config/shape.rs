@@ -67,7 +67,7 @@ pub(super) struct ConfigShape {
     /// /var/lib/ros2probe if it exists and is writable.
     #[serde(default = "defaults::state_directory")]
     pub(super) state_directory: String,
-    /// Least severe log level on standard error. Applied on reload.
+    /// Minimum severity of log lines on standard error. Applied on reload.
     #[serde(default)]
     pub(super) log: Level,
 }
@@ -124,10 +124,10 @@ pub(super) struct WatchEntryShape {
     /// Maximum time without a message, in seconds.
     #[schemars(range(min = 0.001, max = 604_800.0))]
     pub(super) max_silence_s: Option<f64>,
-    /// Minimum number of publishers, from 10 s after the first one on.
+    /// Minimum number of publishers, checked from 10 s after the first one.
     #[schemars(range(min = 1, max = 10_000))]
     pub(super) publishers: Option<u32>,
-    /// Minimum number of subscribers, from 10 s after the first publisher on.
+    /// Minimum number of subscribers, checked from 10 s after the first publisher.
     #[schemars(range(min = 1, max = 10_000))]
     pub(super) subscribers: Option<u32>,
 }
@@ -166,7 +166,7 @@ pub(super) enum RetainShape {
 #[schemars(inline)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct CaptureShape {
-    /// At the sockets of this host, or on its interfaces.
+    /// Where packets are captured: at the sockets of this host, or on its interfaces.
     pub(super) source: SourceChoice,
     /// Only the sockets of this cgroup (v2) and those below it, by absolute path; default: every
     /// socket of the host. Not with `source: wire`.
@@ -206,28 +206,30 @@ pub(super) struct CaptureShape {
 #[serde(deny_unknown_fields, default)]
 pub(super) struct ZenohShape {
     /// Ports of Zenoh, TCP and QUIC, at most 8: of routers, and of sessions that listen on a fixed
-    /// port. A connection is recognized on any TCP port; on these, unreadable ones are reported, too.
+    /// port. Connections are recognized on any TCP port. On these ports, unreadable connections are
+    /// reported, too.
     #[schemars(length(max = 8), inner(range(min = 1, max = 65_535)))]
     pub(super) ports: Vec<u16>,
 }
 
-/// Settings of shared memory, which is only ever read.
+/// Settings of shared memory, which the agent only reads.
 #[derive(Debug, Deserialize, JsonSchema)]
 #[schemars(inline)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct ShmShape {
     /// `auto`: read it if it exists; `off`: never.
     pub(super) mode: ShmMode,
-    /// `auto`: while messages of a topic in shared memory are recorded, echoed or measured by a command,
-    /// read every message. A kernel breakpoint in all processes that use Fast DDS shows it. If that is
-    /// impossible, shared memory is sampled. `uprobe`: the same, always; `off`: never.
+    /// `auto`: read every message while a command records, echoes or measures a topic in shared
+    /// memory. Kernel breakpoints in all processes that use Fast DDS report the messages. If
+    /// breakpoints are impossible, shared memory is sampled. `uprobe`: the same, always; `off`:
+    /// never.
     pub(super) exact: ExactChoice,
     /// Share of one CPU for polling, in percent; briefly exceeded while participants discover each
-    /// other. With less, fewer messages are read, but all are counted.
+    /// other. With a lower share, fewer messages are read, but all are counted.
     #[schemars(range(min = 0.1, max = 100))]
     pub(super) cpu_percent: f64,
-    /// The same while messages of a topic in shared memory are recorded, echoed, retained or
-    /// measured by a command, which needs frequent polls.
+    /// Share of one CPU for polling, in percent, while messages of a topic in shared memory are
+    /// recorded, echoed, retained or measured, which needs frequent polls.
     #[schemars(range(min = 0.1, max = 100))]
     pub(super) reading_cpu_percent: f64,
 }
@@ -271,8 +273,8 @@ pub(super) struct ApiShape {
     /// Additional unix socket, for members of its group: a path, `off`, or `auto`: api.sock in
     /// `$RUNTIME_DIRECTORY` as set by the service manager, else in /run/ros2probe if that exists.
     pub(super) socket: String,
-    /// Rights without a token of clients of a loopback `listen`, which may be any user of this
-    /// host. `read`: graph, figures and events; `watch`: also add watches; `all`: also message
+    /// Rights of clients without a token at a loopback `listen`; any user of this host can be such
+    /// a client. `read`: graph, figures and events; `watch`: also add watches; `all`: also message
     /// payloads, recordings, snapshots and reloads. The unix socket and a token always grant all.
     pub(super) loopback: Access,
     /// File with the bearer token that clients of `listen` must send, for example from the service
@@ -292,7 +294,7 @@ pub(super) struct FoxgloveShape {
     /// `api.token_file`.
     pub(super) listen: String,
     /// Origins of web pages that may connect without a token, as in `https://app.foxglove.dev`;
-    /// `file://` for desktop applications. Pages of this host always may.
+    /// `file://` for desktop applications. Pages of this host may always connect.
     pub(super) origins: Option<Vec<String>>,
 }
 
@@ -431,10 +433,10 @@ pub(super) struct RecordingsShape {
     /// Maximum size of all bags in the directory in bytes; recordings then end. Default: no limit.
     #[schemars(range(min = 65_536))]
     pub(super) max_total_bytes: Option<u64>,
-    /// Share of the file system that stays free, in percent: recordings end before.
+    /// Share of the file system that recordings leave free, in percent.
     #[schemars(range(min = 0, max = 99))]
     pub(super) reserve_percent: u8,
-    /// The same in bytes; the larger one applies.
+    /// Bytes of the file system that recordings leave free; the larger of both reserves applies.
     #[schemars(range(min = 0, max = 1_099_511_627_776_u64))]
     pub(super) reserve_bytes: u64,
     /// Topics whose last seconds are kept in memory, and written on an incident.
@@ -446,7 +448,7 @@ pub(super) struct RecordingsShape {
 #[schemars(inline)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SnapshotShape {
-    /// Prefix of its bags' names.
+    /// Prefix of the names of the snapshot's bags.
     #[schemars(regex(pattern = r"^[A-Za-z0-9_-]{1,64}$"))]
     pub(super) name: String,
     /// ROS names or globs.
@@ -459,7 +461,7 @@ pub(super) struct SnapshotShape {
     #[schemars(range(min = 1, max = 600))]
     #[serde(default = "defaults::snapshot_seconds")]
     pub(super) seconds: u64,
-    /// Seconds after a trigger; they are written as they come, and need no memory.
+    /// Seconds after a trigger; their messages are written as they arrive, and need no memory.
     #[schemars(range(min = 0, max = 600))]
     #[serde(default)]
     pub(super) seconds_after: u64,
@@ -478,7 +480,8 @@ pub(super) struct SnapshotShape {
     #[schemars(range(min = 1, max = 1000))]
     #[serde(default = "defaults::snapshot_count")]
     pub(super) max_count: usize,
-    /// Maximum bytes of all its bags: the oldest triggered bag is removed first.
+    /// Maximum size of all bags of the snapshot, in bytes; the oldest triggered bag is removed
+    /// first.
     #[schemars(range(min = 65_536))]
     #[serde(default = "defaults::snapshot_total_bytes")]
     pub(super) max_total_bytes: u64,
@@ -506,8 +509,8 @@ impl Default for RecordingsShape {
 #[serde(deny_unknown_fields, default)]
 pub(super) struct OtlpShape {
     /// URL of the receiver, e.g. `http://collector:4317`, or `off`. By default
-    /// `OTEL_EXPORTER_OTLP_ENDPOINT` applies (and those of single signals); without it nothing is
-    /// exported.
+    /// `OTEL_EXPORTER_OTLP_ENDPOINT` and the variables of single signals apply; without them
+    /// nothing is exported.
     pub(super) endpoint: Option<String>,
     /// Interval between exports of metrics, in seconds; default 15.
     #[schemars(range(min = 1, max = 3_600))]
@@ -530,8 +533,8 @@ pub(super) struct OtlpShape {
     pub(super) events: Option<bool>,
     /// Whether spans are exported, for watches with `trace`.
     pub(super) traces: Option<bool>,
-    /// Exports lines of the agent's own log of this level or a more severe one, e.g. `warn`. By
-    /// default none is exported.
+    /// Minimum severity of lines of the agent's own log that are exported, e.g. `warn`. By default
+    /// no line is exported.
     pub(super) log: Option<Level>,
     /// Name of this robot: the attribute `robot.name` of all exports.
     pub(super) robot: Option<String>,

@@ -37,7 +37,7 @@ pub enum AgentEvent {
         /// Kind of the packet source.
         source: SourceKind,
     },
-    /// Packets or records were lost before the model.
+    /// Packets or records were lost before they reached the model.
     Dropped {
         /// `packets`, `records`, `datagrams` or `contended`.
         what: &'static str,
@@ -109,7 +109,7 @@ pub enum AgentEvent {
         /// Reason of the failure.
         reason: Option<String>,
     },
-    /// Too many events of one kind were suppressed.
+    /// Events were suppressed because too many of one kind occurred in a second.
     Suppressed {
         /// Name of the events, or their common prefix and `*`.
         event: &'static str,
@@ -119,7 +119,7 @@ pub enum AgentEvent {
 }
 
 impl Occurrence {
-    /// Definition of the event.
+    /// Returns the definition of the event.
     pub(super) const fn definition(&self) -> &'static Definition {
         use churn::Event::{Appeared, Cascaded, Changed, Disposed, Expired};
         match self {
@@ -172,7 +172,8 @@ impl Occurrence {
             Self::Robot(EventKind::Participant { change, .. }) => *change == churn::Event::Disposed,
             Self::Robot(EventKind::Lifecycle(state)) => *state.state != *ERROR_PROCESSING,
             Self::Robot(EventKind::Expectation { to, .. }) => *to == WatchState::Ok,
-            // Common while nodes start, and with tools that publish without a subscriber.
+            // These findings are common while nodes start, and with tools that publish without a
+            // subscriber.
             Self::Robot(EventKind::Diagnosis { finding, .. }) => matches!(
                 finding,
                 Diagnosis::UnmatchedPublisher { .. }
@@ -192,7 +193,7 @@ impl Occurrence {
         }
     }
 
-    /// Attributes by name, in any order; the value of an unknown one is `None`.
+    /// Returns the attributes by name, in any order; the value of an unknown attribute is `None`.
     fn values(&self, at: Timestamp) -> Values {
         match self {
             Self::Robot(kind) => robot(kind, at),
@@ -200,7 +201,7 @@ impl Occurrence {
         }
     }
 
-    /// Known attributes in the table's order.
+    /// Returns the known attributes in the table's order.
     pub(super) fn attributes(&self, at: Timestamp) -> Vec<(&'static str, Value)> {
         let mut values = self.values(at);
         let names = self.definition().attributes.iter();
@@ -310,7 +311,7 @@ fn domain(domain_id: DomainId) -> (&'static str, Option<Value>) {
     ("domain_id", number(domain_id.0))
 }
 
-/// Cause of an entity's departure, if it departed.
+/// Returns the attribute `cause`, which has a value if the entity left.
 fn cause(change: &churn::Event) -> (&'static str, Option<Value>) {
     use churn::Event::{Cascaded, Disposed, Expired};
     let went = matches!(change, Disposed | Expired | Cascaded);
@@ -395,7 +396,7 @@ fn finding(finding: &Diagnosis) -> Values {
             ("reader", written(reader)),
             ("reason", Some(text(reason.label()))),
         ],
-        // Described above.
+        // The start of this function handles this case.
         Diagnosis::HangingCall { .. } => Vec::new(),
         Diagnosis::NodeInSeveralDomains {
             node,
@@ -529,7 +530,7 @@ fn naming(topic: &str) -> Option<Naming> {
     DdsTopic::parse(topic).ok().map(|topic| Naming::of(&topic))
 }
 
-/// Topic name as in the metrics.
+/// Returns the topic name as in the metrics.
 fn series<'a>(naming: Option<&'a Naming>, topic: &'a str) -> Cow<'a, str> {
     naming.map_or(Cow::Borrowed(topic), |naming| {
         series_name(naming.kind, &naming.name, &naming.dds_name)
@@ -567,7 +568,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_goodbye_is_no_warning_and_an_expired_lease_is_one() {
+    fn a_disposed_participant_is_no_warning_and_an_expired_lease_is_one() {
         let lost = |change| {
             Occurrence::Robot(EventKind::Participant {
                 change,

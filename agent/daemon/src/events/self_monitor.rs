@@ -7,10 +7,10 @@ use super::AgentEvent;
 use crate::agent_facts::AgentFacts;
 use crate::snapshot_cell::Unready;
 
-/// Least time between two reports of losses.
+/// Minimum time between two reports of losses.
 const PAUSE: Duration = Duration::from_secs(1);
 
-/// Detects losses before the model.
+/// Detects losses of packets and records before they reach the model.
 #[derive(Debug, Default)]
 pub struct DropMonitor {
     reported: Losses,
@@ -19,17 +19,17 @@ pub struct DropMonitor {
 
 type Losses = [(&'static str, u64); 4];
 
-/// Detects whether the agent observes.
+/// Detects when the agent stops observing, and when it observes again.
 #[derive(Debug, Default)]
 pub struct SourceMonitor {
     blind_since: Option<Instant>,
-    /// Time of the last successful check. Before it, the agent is starting, not blind.
+    /// Time of the last successful check. Before the first one, the agent is starting, not blind.
     saw: Option<Instant>,
     attached_anew: u64,
 }
 
 impl DropMonitor {
-    /// Events about losses since the last report.
+    /// Returns events about losses since the last report.
     pub fn check(&mut self, facts: &AgentFacts, now: Instant) -> Vec<AgentEvent> {
         let early = |at: Instant| now.saturating_duration_since(at) < PAUSE;
         if self.at.is_some_and(early) {
@@ -64,9 +64,9 @@ fn losses(facts: &AgentFacts) -> Losses {
 }
 
 impl SourceMonitor {
-    /// Events about changes of visibility at `now`. `ready` has the reason of a failure, and
-    /// `attached_anew` the number of times the hook was attached. If a control group was recreated
-    /// between two checks, both events are returned, with the time between the checks.
+    /// Returns events about changes of visibility at `now`. `ready` has the reason of a failure,
+    /// and `attached_anew` the number of times the hook was attached again. If a control group was
+    /// recreated between two checks, both events are returned, with the time between the checks.
     pub fn check(
         &mut self,
         ready: &Result<(), Unready>,
@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn blindness_is_reported_once_and_not_during_the_start() {
+    fn a_loss_of_visibility_is_reported_once_and_not_during_the_start() {
         let start = Instant::now();
         let mut sight = SourceMonitor::default();
         let blind = Err(Unready::Unseen("stuck".to_owned()));
@@ -159,7 +159,7 @@ mod tests {
         assert_eq!(events, [AgentEvent::Blind { reason }, seeing(2.0)]);
         assert_eq!(sight.check(&Ok(()), 1, second(4)), []);
 
-        // The check while it was gone has reported it.
+        // A check while the cgroup was missing has reported the removal.
         let gone = "the cgroup /robot was removed".to_owned();
         let gone = Err(Unready::Unseen(gone));
         assert_eq!(sight.check(&gone, 1, second(6)).len(), 1);

@@ -307,7 +307,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_unique_dotted_and_in_a_namespace_of_ours() {
+    fn event_names_are_unique_and_dotted_in_a_namespace_of_the_project() {
         let names: BTreeSet<&str> = EVENTS.iter().map(|event| event.name).collect();
         assert_eq!(names.len(), EVENTS.len());
         for event in EVENTS {

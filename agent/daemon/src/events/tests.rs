@@ -25,7 +25,7 @@ fn taken(events: Vec<Event>) -> Taken {
     Taken { events, overflow }
 }
 
-/// Time at the start of a second of the clock.
+/// Returns the time at the start of a second of the clock.
 const fn second(number: u64) -> Timestamp {
     Timestamp(number * SECOND)
 }
@@ -36,7 +36,7 @@ fn names(batch: &Batch) -> Vec<&'static str> {
 }
 
 #[test]
-fn numbers_grow_by_one_and_a_reader_goes_on_where_it_was() {
+fn numbers_grow_by_one_and_a_reader_continues_after_its_position() {
     let log = EventLog::new();
     assert_eq!((log.last(), log.read(0, 10).records.len()), (0, 0));
     log.add(taken((1..=3).map(node).collect()), second(0));
@@ -66,7 +66,7 @@ fn numbers_grow_by_one_and_a_reader_goes_on_where_it_was() {
 }
 
 #[test]
-fn a_transition_of_a_managed_node_warns_of_errors_only() {
+fn a_lifecycle_transition_is_a_warning_only_on_an_error() {
     let log = EventLog::new();
     let transition = |name: Option<&str>, from: &str, to: &str| Event {
         kind: EventKind::Lifecycle(LifecycleState {
@@ -104,7 +104,7 @@ fn a_transition_of_a_managed_node_warns_of_errors_only() {
 }
 
 #[test]
-fn a_storm_is_limited_each_second_and_summed_up_in_one_event() {
+fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
     let log = EventLog::new();
     let storm = u64::from(MOST) + 50;
     log.add(taken((0..storm).map(node).collect()), second(0));
@@ -161,7 +161,7 @@ fn a_storm_is_limited_each_second_and_summed_up_in_one_event() {
 }
 
 #[test]
-fn a_storm_of_the_agent_is_cut_by_the_seconds_of_its_life() {
+fn a_burst_of_agent_events_is_limited_by_the_clock_of_the_agent() {
     let log = EventLog::new();
     let at = |seconds| log.begun + Duration::from_secs(seconds);
     for _ in 0..MOST + 3 {
@@ -175,7 +175,7 @@ fn a_storm_of_the_agent_is_cut_by_the_seconds_of_its_life() {
 }
 
 #[test]
-fn a_replay_at_full_speed_prints_the_same_as_one_at_the_capture_s_pace() {
+fn a_replay_at_full_speed_records_the_same_events_as_at_the_capture_s_speed() {
     let events: Vec<_> = (0..430).map(|number| node(number * SECOND / 100)).collect();
     let (at_once, paced) = (EventLog::new(), EventLog::new());
     at_once.add(taken(events.clone()), second(5));
@@ -197,10 +197,10 @@ fn a_replay_at_full_speed_prints_the_same_as_one_at_the_capture_s_pace() {
 }
 
 #[test]
-fn an_overwritten_sample_is_reported_to_the_reader_that_missed_it() {
+fn overwritten_events_are_reported_to_the_reader_that_missed_them() {
     let log = EventLog::new();
     for number in 0..25 {
-        // Every other second, since a late event counts in the current second.
+        // The events are two seconds apart, since a late event counts in the current second.
         let at = second(2 * number);
         log.add(taken((0..200).map(|each| node(at.0 + each)).collect()), at);
     }
@@ -218,7 +218,7 @@ fn an_overwritten_sample_is_reported_to_the_reader_that_missed_it() {
 }
 
 #[test]
-fn an_id_means_something_to_its_own_run_alone() {
+fn an_event_id_of_another_run_is_an_unknown_position() {
     let log = EventLog::new();
     log.add(taken(vec![node(1), node(2)]), second(0));
     assert_eq!(log.position(&log.id(1)), Some(Position::After(1)));

@@ -54,7 +54,7 @@ impl Trigger {
         })
     }
 
-    /// Names of all triggers: short names, kinds of findings, events.
+    /// Returns the names of all triggers: short names, kinds of findings, events.
     pub fn names() -> impl Iterator<Item = &'static str> {
         let problems = PROBLEMS.iter().map(|(name, _)| *name);
         let is_short = |kind: &&str| !PROBLEMS.iter().any(|(name, _)| name == kind);
@@ -64,7 +64,7 @@ impl Trigger {
         problems.chain(findings).chain(events)
     }
 
-    /// The name, as in the configuration.
+    /// Returns the name, as in the configuration.
     #[must_use]
     pub const fn name(&self) -> &'static str {
         self.name

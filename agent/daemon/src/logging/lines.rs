@@ -1,5 +1,6 @@
-//! Writes log lines to standard error without blocking. If it accepts no more, lines are dropped
-//! and counted. A hanging journal, a stopped terminal or a full disk must not stop the capture.
+//! Writes log lines to standard error without blocking. If standard error accepts no more, lines
+//! are dropped and counted. A hanging journal, a stopped terminal or a full disk must not stop the
+//! capture.
 //!
 //! The descriptor may be shared with other processes, so it stays in blocking mode. It is polled
 //! before each write of at most the size that a pipe accepts atomically.
@@ -13,7 +14,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 /// Bytes that a ready pipe accepts without blocking (`PIPE_BUF`).
 const PIECE: usize = 4096;
-/// Longest wait for a reader that kept up so far.
+/// Maximum time to wait for a reader that has kept up so far.
 const TIMEOUT: Timespec = Timespec {
     tv_sec: 0,
     tv_nsec: 100_000_000,
@@ -57,7 +58,7 @@ impl<W: Write + AsFd> Lines<W> {
         Ok(())
     }
 
-    /// Completes a cut line and reports dropped lines before the next one.
+    /// Ends a truncated line, and reports dropped lines before the next one.
     fn catch_up(&mut self) -> io::Result<()> {
         if self.unreported == 0 {
             return Ok(());
@@ -121,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pipe_without_a_reader_delays_no_thread_and_its_lost_lines_are_reported() {
+    fn a_full_pipe_does_not_block_and_its_lost_lines_are_reported() {
         let (mut reader, writer) = io::pipe().unwrap();
         let (mut lines, lost) = lines(writer);
         let line = [&[b'x'; 999][..], b"\n"].concat();
@@ -152,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_that_was_cut_is_ended_before_the_next_one() {
+    fn a_truncated_line_is_ended_before_the_next_one() {
         let (mut reader, writer) = io::pipe().unwrap();
         let (mut lines, lost) = lines(writer);
         lines.write_all(&[b'x'; 1 << 20]).unwrap();
@@ -168,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pipe_that_was_closed_and_a_disk_that_is_full_cost_a_counter() {
+    fn lines_to_a_closed_pipe_or_a_full_disk_are_counted_as_lost() {
         let (reader, writer) = io::pipe().unwrap();
         drop(reader);
         let (mut lines, lost) = lines(writer);

@@ -1,9 +1,9 @@
 //! System calls of each thread role, and the filter that refuses all others.
 //!
-//! A refused call fails with `EPERM`, as without a privilege. Calls that C libraries try before an
-//! older allowed one fail with `ENOSYS`, which makes them use that one. Some calls are restricted
-//! by their arguments: memory never becomes executable, only the broker creates processes, and
-//! threads that read the network or other processes open no file for writing.
+//! A refused call fails with `EPERM`, as without a privilege. Newer calls fail with `ENOSYS`, so
+//! that C libraries use an older, allowed one instead. Some calls are restricted by their
+//! arguments: memory never becomes executable, only the broker creates processes, and threads that
+//! read the network or other processes open no file for writing.
 
 use std::collections::BTreeMap;
 
@@ -15,7 +15,7 @@ use seccompiler::{
 
 use super::Role;
 
-/// A filter is not in force.
+/// Why a filter is not in force.
 #[derive(Debug, thiserror::Error)]
 pub enum FilterError {
     /// The filter cannot be built.
@@ -32,7 +32,7 @@ pub(super) fn load(role: Role) -> Result<(), FilterError> {
     apply_filter(&program).map_err(|error| FilterError::Refused(error.to_string()))
 }
 
-/// Program of a role's filter.
+/// Builds the program of a role's filter.
 fn program(role: Role) -> Result<BpfProgram, BackendError> {
     let filter = SeccompFilter::new(
         Allowed::to(role)?.0,
@@ -45,9 +45,9 @@ fn program(role: Role) -> Result<BpfProgram, BackendError> {
     Ok(program)
 }
 
-/// Calls with an older alternative that C libraries use.
+/// Newer calls, for which C libraries use an older alternative.
 const ABSENT: [c_long; 3] = [libc::SYS_clone3, libc::SYS_epoll_pwait2, FCHMODAT2];
-/// The libc crate does not define it for every architecture.
+/// `fchmodat2`, which the libc crate does not define for every architecture.
 const FCHMODAT2: c_long = 452;
 #[cfg(target_arch = "aarch64")]
 const RENAMEAT: c_long = 38;
@@ -55,8 +55,8 @@ const RENAMEAT: c_long = 38;
 const RENAMEAT: c_long = libc::SYS_renameat;
 
 /// Returns the first part of a filter's program, which refuses [`ABSENT`] calls with `ENOSYS`. The
-/// rest has a single result for refused calls. These calls have the same number on all
-/// architectures.
+/// other part has a single result for refused calls. Each call of [`ABSENT`] has the same number on
+/// all architectures.
 fn absent() -> BpfProgram {
     let step = |code: u32, jt, jf, k| sock_filter {
         code: u16::try_from(code).unwrap_or_default(),
@@ -124,7 +124,7 @@ const EVERYWHERE: &[c_long] = &[
     libc::SYS_poll,
 ];
 
-/// Reading file metadata and directories; opening is allowed separately.
+/// Calls that read file metadata and directories; opening files is allowed separately.
 const LOOK: &[c_long] = &[
     libc::SYS_faccessat,
     libc::SYS_faccessat2,
@@ -145,7 +145,7 @@ const LOOK: &[c_long] = &[
     libc::SYS_stat,
 ];
 
-/// Changing files, for state and recordings.
+/// Calls that change files, for state and recordings.
 const CHANGE: &[c_long] = &[
     libc::SYS_copy_file_range,
     libc::SYS_fallocate,
@@ -196,16 +196,16 @@ const SERVE: &[c_long] = &[
     libc::SYS_epoll_wait,
 ];
 
-/// Connecting. Each of these can connect: a message with an address does so with TCP Fast Open.
+/// Calls that can connect. A message with an address does so with TCP Fast Open.
 const CONNECT: &[c_long] = &[libc::SYS_connect, libc::SYS_sendmsg, libc::SYS_sendto];
 
-/// DNS queries: several questions at once, and musl binds before it sends.
+/// Calls for DNS queries: one call sends several questions, and musl binds before it sends.
 const RESOLVE: &[c_long] = &[libc::SYS_bind, libc::SYS_recvmmsg, libc::SYS_sendmmsg];
 
-/// Listening for connections.
+/// Calls that listen for connections.
 const LISTEN: &[c_long] = &[libc::SYS_bind, libc::SYS_listen];
 
-/// inotify.
+/// Calls of inotify.
 const NOTICE: &[c_long] = &[
     libc::SYS_inotify_add_watch,
     libc::SYS_inotify_init1,
@@ -293,7 +293,8 @@ impl Allowed {
         self.socket(libc::AF_UNIX, libc::SOCK_SEQPACKET)
     }
 
-    /// Allows the broker's answers, each in a fork, and what they do.
+    /// Allows the calls of the broker, which answers each request in a fork and attaches programs
+    /// there.
     fn answer_agents(&mut self) -> Result<(), BackendError> {
         self.always(LOOK).open_for_reading()?;
         let spaces = [
@@ -347,7 +348,7 @@ impl Allowed {
         for call in [libc::SYS_mmap, libc::SYS_mprotect] {
             self.when(call, &[without(2, libc::PROT_EXEC)?])?;
         }
-        // A signal to itself, which abort() sends.
+        // abort() sends a signal to its own process.
         self.when(libc::SYS_tgkill, &[equal(0, process)?])?;
         let named_or_read = [
             libc::PR_SET_NAME,
@@ -361,7 +362,7 @@ impl Allowed {
         self.when(libc::SYS_prctl, &[equal(0, libc::PR_CAP_AMBIENT)?, is_set])?;
         // Any thread may handle a signal, and notifies the runtime through an open socket.
         self.when(libc::SYS_sendto, &[condition(4, SeccompCmpOp::Eq, 0)?])?;
-        // Limits are only read.
+        // Resource limits are only read.
         self.when(libc::SYS_prlimit64, &[condition(2, SeccompCmpOp::Eq, 0)?])
     }
 
@@ -376,7 +377,7 @@ impl Allowed {
 
     fn serve(&mut self) -> Result<(), BackendError> {
         self.always(LOOK).always(CHANGE).always(SERVE);
-        // Threads only, without new processes or namespaces.
+        // Only threads may be created, without new processes or namespaces.
         let kinds =
             libc::CLONE_THREAD | libc::CLONE_NEWUSER | libc::CLONE_NEWNS | libc::CLONE_NEWNET;
         let thread = SeccompCmpOp::MaskedEq(wide(kinds));
@@ -385,7 +386,7 @@ impl Allowed {
         self.connections()
     }
 
-    /// Allows what a runtime does with its signals and connections.
+    /// Allows the calls that a runtime uses for its signals and connections.
     fn connections(&mut self) -> Result<(), BackendError> {
         self.when(libc::SYS_socketpair, &[equal(0, libc::AF_UNIX)?])?;
         for request in request::ORDINARY {
@@ -421,13 +422,13 @@ impl Allowed {
     }
 }
 
-/// Condition that a 32-bit argument has this value.
+/// Returns the condition that a 32-bit argument has this value.
 fn equal(argument: u8, value: i32) -> Result<SeccompCondition, BackendError> {
     let value = u64::from(value.cast_unsigned());
     SeccompCondition::new(argument, SeccompCmpArgLen::Dword, SeccompCmpOp::Eq, value)
 }
 
-/// Condition that an argument has none of these bits.
+/// Returns the condition that an argument has none of these bits.
 fn without(argument: u8, bits: i32) -> Result<SeccompCondition, BackendError> {
     condition(argument, SeccompCmpOp::MaskedEq(wide(bits)), 0)
 }

@@ -11,16 +11,16 @@ use rustix::thread::{
 
 use crate::config::{CaptureSettings, SourceChoice};
 
-/// For attaching programs to a cgroup (`CAP_NET_ADMIN`), for loading them, and for tracepoints and
-/// iterators. The last one also skips Spectre barriers in the verifier, without which 5.15 to 6.8
-/// refuse the filter.
+/// Capabilities for attaching programs to a cgroup (`CAP_NET_ADMIN`), for loading them (`CAP_BPF`),
+/// and for tracepoints and iterators (`CAP_PERFMON`). `CAP_PERFMON` also skips Spectre barriers in
+/// the verifier, with which Linux 5.15 to 6.8 refuses the filter.
 const HOST: [CapabilitySet; 3] = [
     CapabilitySet::NET_ADMIN,
     CapabilitySet::BPF,
     CapabilitySet::PERFMON,
 ];
 
-/// Packet sockets (`CAP_NET_RAW`); the rest as for the host's sockets.
+/// Capabilities for packet sockets (`CAP_NET_RAW`); the others are as for the host's sockets.
 const WIRE: [CapabilitySet; 3] = [
     CapabilitySet::NET_RAW,
     CapabilitySet::BPF,
@@ -67,8 +67,8 @@ pub enum CapabilitiesRemain {
     Unknown(#[source] Errno),
 }
 
-/// Checks for the capabilities that `settings` need. If the agent selects the source, those of one
-/// possible source suffice.
+/// Checks for the capabilities that `settings` require. If the agent selects the source, the
+/// capabilities of one possible source suffice.
 ///
 /// # Errors
 ///
@@ -81,10 +81,10 @@ pub fn check(settings: &CaptureSettings) -> Result<(), Missing> {
     missing(sets.effective, settings).map_or(Ok(()), Err)
 }
 
-/// Capabilities that a process with these effective ones lacks. `None` if it lacks none.
+/// Returns the capabilities that a process with the `effective` ones lacks; `None` if it has all.
 #[must_use]
 pub fn missing(effective: CapabilitySet, settings: &CaptureSettings) -> Option<Missing> {
-    // The older, wider capability includes its successors.
+    // `CAP_SYS_ADMIN`, which is older and wider, includes its successors.
     let inherited = match effective.contains(CapabilitySet::SYS_ADMIN) {
         true => CapabilitySet::BPF | CapabilitySet::PERFMON,
         false => CapabilitySet::empty(),
@@ -102,7 +102,7 @@ pub fn missing(effective: CapabilitySet, settings: &CaptureSettings) -> Option<M
     (!sources.iter().any(able)).then_some(Missing { sources, grant })
 }
 
-/// Sources that `settings` allow, each with the capabilities it needs.
+/// Returns the sources that `settings` allow, each with the capabilities that it needs.
 fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<CapabilitySet>)> {
     let named = !settings.include_interfaces.is_empty() || !settings.exclude_interfaces.is_empty();
     let mirrors = !settings.mirror_interfaces.is_empty();
@@ -146,7 +146,7 @@ pub(super) fn keep(kept: CapabilitySet) -> Result<(), DropError> {
     Ok(())
 }
 
-/// Names of the capabilities in a set, sorted.
+/// Returns the names of the capabilities in a set, sorted.
 #[must_use]
 pub fn capability_names(set: CapabilitySet) -> Vec<String> {
     let named = set.iter_names().map(|(name, _)| format!("CAP_{name}"));
@@ -155,7 +155,7 @@ pub fn capability_names(set: CapabilitySet) -> Vec<String> {
     names
 }
 
-/// Capabilities in the calling thread's ambient set.
+/// Returns the capabilities in the calling thread's ambient set.
 fn ambient() -> Result<CapabilitySet, Errno> {
     let mut ambient = CapabilitySet::empty();
     for (_, capability) in CapabilitySet::all().iter_names() {
@@ -169,7 +169,7 @@ impl Unprivileged {
     ///
     /// # Errors
     ///
-    /// A capability is left, or a set cannot be read.
+    /// Fails if a privilege is left or cannot be read.
     pub fn verify() -> Result<Self, CapabilitiesRemain> {
         let sets = capabilities(None).map_err(CapabilitiesRemain::Unreadable)?;
         let ambient = ambient().map_err(CapabilitiesRemain::Unreadable)?;
@@ -193,7 +193,7 @@ impl Unprivileged {
 }
 
 impl Missing {
-    /// Text about the capabilities that each source lacks.
+    /// Returns a text about the capabilities that each source lacks.
     #[must_use]
     pub fn needs(&self) -> String {
         let needs: Vec<String> = self
@@ -208,7 +208,7 @@ impl Missing {
         needs.join(", or ")
     }
 
-    /// Command that grants them to this program.
+    /// Returns the command that grants the capabilities to this program.
     #[must_use]
     pub fn command(&self) -> String {
         let grant = self.grant.iter().copied().flat_map(capability_names);
@@ -276,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn the_daemon_set_grants_what_either_source_needs_and_nothing_else() {
+    fn the_daemon_set_grants_exactly_the_capabilities_of_both_sources() {
         let manifest = include_str!("../../../../deploy/kubernetes/ros2probe.yaml");
         let mut lines = manifest.lines().map(str::trim);
         let added = lines.find_map(|line| line.strip_prefix("add: [")?.strip_suffix(']'));
@@ -288,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn settings_that_need_further_capabilities_require_them() {
+    fn settings_for_more_interfaces_or_namespaces_require_more_capabilities() {
         let named = CaptureSettings {
             include_interfaces: vec!["eth0".to_owned()],
             ..settings(SourceChoice::Auto)
@@ -309,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn the_message_names_what_each_source_lacks_and_the_command_that_grants_it() {
+    fn the_error_names_the_missing_capabilities_and_the_command_that_grants_them() {
         let has = set(&[CapabilitySet::BPF, CapabilitySet::PERFMON]);
         let missing = missing(has, &settings(SourceChoice::Auto)).unwrap();
         let message = missing.to_string();

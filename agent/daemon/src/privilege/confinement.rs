@@ -35,38 +35,39 @@ pub enum Role {
     /// The main thread and its children: signals, reloads, state, snapshots. No capability, and no
     /// outgoing connection except to the service manager.
     Service,
-    /// HTTP, and recordings started by clients. As [`Role::Service`], without any outgoing
+    /// HTTP, and recordings started by clients. Like [`Role::Service`], but without any outgoing
     /// connection. An accepted connection cannot be redirected.
     Serve,
-    /// OTLP. As [`Role::Service`], with connections to the collector.
+    /// OTLP. Like [`Role::Service`], but with connections to the collector.
     Export,
-    /// The ros2 daemon. No capability. Binds TCP ports, whose domains are known only later, and reads
-    /// `/proc`; creates no outgoing connection, no thread, and opens no file for writing.
+    /// The ros2 daemon. No capability. It binds TCP ports, whose domains are known only later, and
+    /// reads `/proc`. It creates no outgoing connection and no thread, and opens no file for
+    /// writing.
     Ros2Daemon,
     /// Packets, the model and the kernel's maps. No capability if the kernel lets the owner of maps
-    /// change them, otherwise `CAP_BPF`. Opens no socket, and no file for writing.
+    /// change them, otherwise `CAP_BPF`. It opens no socket, and no file for writing.
     Capture {
-        /// As determined by [`Role::capture`].
+        /// Whether the kernel requires `CAP_BPF`, as [`Role::capture`] determines.
         needs_bpf: bool,
     },
     /// Reading shared memory. `CAP_SYS_PTRACE`, if granted, opens `/proc/<pid>/root` and hence the
     /// shared memory of containers. `CAP_SYS_NICE` is kept if no limit allows its priority.
     SharedMemory {
-        /// As determined by [`Role::shared_memory`].
+        /// Whether the priority requires `CAP_SYS_NICE`, as [`Role::shared_memory`] determines.
         needs_nice: bool,
     },
     /// Attaching the host hook to a recreated control group: `CAP_NET_ADMIN`, and `CAP_BPF` if the
-    /// kernel requires it. Creates links, and opens no socket and no file for writing.
+    /// kernel requires it. It creates links, but opens no socket and no file for writing.
     Reattach {
-        /// As determined by [`Role::reattach`].
+        /// Whether the kernel requires `CAP_BPF`, as [`Role::reattach`] determines.
         needs_bpf: bool,
     },
-    /// Asking the broker to attach programs to libraries. No capability.
+    /// Requests to the broker, which attaches programs to libraries. No capability.
     Exact,
-    /// As [`Role::Exact`], and reading the programs' maps.
+    /// Like [`Role::Exact`], but also reads the programs' maps.
     Inside,
-    /// The broker, a process of its own: the capabilities that [`uprobe::useful`] returns. Forks,
-    /// accepts connections, and opens files for reading; creates no connection.
+    /// The broker, a process of its own with the capabilities that [`uprobe::useful`] returns. It
+    /// forks, accepts connections, and opens files for reading, but creates no connection.
     Broker,
 }
 
@@ -99,7 +100,7 @@ pub enum SpawnError {
 }
 
 impl Sandbox {
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(&self) -> &'static str {
         match self {
@@ -108,7 +109,7 @@ impl Sandbox {
         }
     }
 
-    /// Reason why system calls are not filtered. `None` if they are.
+    /// Returns the reason why system calls are not filtered; `None` if they are.
     #[must_use]
     pub const fn reason(&self) -> Option<&str> {
         match self {
@@ -120,21 +121,21 @@ impl Sandbox {
 }
 
 impl Role {
-    /// Role of the capture thread on this kernel.
+    /// Returns the role of the capture thread on this kernel.
     #[must_use]
     pub fn capture() -> Self {
         let needs_bpf = map_updates_need_bpf();
         Self::Capture { needs_bpf }
     }
 
-    /// Role of the thread that attaches the host hook again, on this kernel.
+    /// Returns the role of the thread that attaches the host hook again, on this kernel.
     #[must_use]
     pub fn reattach() -> Self {
         let needs_bpf = map_updates_need_bpf();
         Self::Reattach { needs_bpf }
     }
 
-    /// Role of the thread that reads shared memory. Raises a limit of the process.
+    /// Returns the role of the thread that reads shared memory. Raises a limit of the process.
     #[must_use]
     pub fn shared_memory() -> Self {
         let needs_nice = !allow_running_first();
@@ -173,7 +174,8 @@ impl Role {
 ///
 /// # Errors
 ///
-/// The kernel refuses to drop capabilities, which is not expected.
+/// Fails if the kernel refuses to drop capabilities, which is not expected, or if the filter cannot
+/// be built.
 pub fn confine(role: Role) -> Result<(), ConfineError> {
     give_up(role)?;
     rustix::thread::set_no_new_privs(true).map_err(|error| ConfineError::Gain(error.into()))?;
@@ -190,22 +192,22 @@ pub fn confine(role: Role) -> Result<(), ConfineError> {
 ///
 /// # Errors
 ///
-/// The kernel refuses, which is not expected for capabilities that the thread has.
+/// Fails if the kernel refuses, which is not expected for capabilities that the thread has.
 pub fn give_up(role: Role) -> Result<(), DropError> {
     capabilities::keep(role.capabilities())
 }
 
-/// State of the filter in this process.
+/// Returns the state of the filter in this process.
 #[must_use]
 pub fn sandbox() -> Sandbox {
     SANDBOX.get().cloned().unwrap_or(Sandbox::Never)
 }
 
-/// Starts a thread that is confined before any other work. Returns after it is.
+/// Starts a thread that is confined before any other work, and returns once it is confined.
 ///
 /// # Errors
 ///
-/// The thread cannot be started or confined.
+/// Fails if the thread cannot be started or confined.
 pub fn spawn(
     role: Role,
     thread: Builder,
@@ -228,7 +230,7 @@ pub fn spawn(
 ///
 /// # Errors
 ///
-/// As [`spawn`].
+/// Fails like [`spawn`].
 pub fn spawn_export(thread: Builder, work: Box<dyn FnOnce() + Send>) -> io::Result<JoinHandle<()>> {
     spawn(Role::Export, thread, work).map_err(io::Error::other)
 }
@@ -237,7 +239,7 @@ pub fn spawn_export(thread: Builder, work: Box<dyn FnOnce() + Send>) -> io::Resu
 ///
 /// # Errors
 ///
-/// As [`spawn`].
+/// Fails like [`spawn`].
 pub fn spawn_source(
     task: Task,
     thread: Builder,

@@ -1,9 +1,10 @@
-//! Privileges of the agent. It starts with those that attaching needs. Once sockets and kernel
-//! programs are open, every thread drops the capabilities and system calls that it no longer needs.
+//! Privileges of the agent, which starts with those that attaching kernel programs requires. Once
+//! sockets and kernel programs are open, every thread drops the capabilities and system calls that
+//! it no longer needs.
 //!
-//! Both belong to threads, and a new thread inherits those of its creator. A thread that needs more
-//! is started by [`spawn`] before its creator is confined. The agent never gains privileges beyond
-//! those of its start.
+//! Capabilities and filters belong to threads, and a new thread inherits those of its creator. A
+//! thread that needs more is started by [`spawn`] before its creator is confined. The agent never
+//! gains privileges beyond those of its start.
 
 mod calls;
 mod capabilities;

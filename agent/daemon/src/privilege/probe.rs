@@ -1,5 +1,5 @@
-//! Whether the owner of a map can change it without `CAP_BPF` on this kernel. From Linux 5.19 on it
-//! can; before, only if unprivileged BPF is enabled.
+//! Determines whether the owner of a map can change it without `CAP_BPF` on this kernel. Since
+//! Linux 5.19 the owner can; earlier kernels allow it only if unprivileged BPF is enabled.
 //!
 //! A probe decides instead of the version, because distributions backport such changes.
 
@@ -25,7 +25,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn capabilities_are_required_where_the_kernel_requires_them() {
+    fn map_updates_need_cap_bpf_on_kernels_that_require_it() {
         let release = std::fs::read_to_string("/proc/sys/kernel/osrelease").unwrap();
         let mut numbers = release.split('.').map_while(|number| number.parse().ok());
         let version: (u32, u32) = (numbers.next().unwrap(), numbers.next().unwrap());

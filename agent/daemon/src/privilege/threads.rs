@@ -1,5 +1,5 @@
 //! Privileges of each thread of this process as the kernel reports them. `/health` shows these
-//! values, not remembered ones.
+//! values, not those that the agent has set.
 
 use std::fs;
 
@@ -12,13 +12,13 @@ use super::capabilities::capability_names;
 pub struct ThreadCapabilities {
     /// Name of the thread; `rp` for the first one.
     pub name: String,
-    /// Names of its effective capabilities.
+    /// Names of its permitted capabilities.
     pub capabilities: Vec<String>,
     /// Whether the kernel refuses system calls outside of its role.
     pub filtered: bool,
 }
 
-/// All threads in the order of their start. Empty if `/proc` is unreadable.
+/// Returns all threads in the order of their start; an empty list if `/proc` is unreadable.
 #[must_use]
 pub fn threads() -> Vec<ThreadCapabilities> {
     let entries = fs::read_dir("/proc/self/task").into_iter().flatten();
@@ -52,7 +52,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn powers_are_read_from_what_the_kernel_writes() {
+    fn capabilities_and_filter_are_parsed_from_a_status_file() {
         let status = "Name:\tshm\nUmask:\t0077\nState:\tS (sleeping)\nCapInh:\t0000000000000000\n\
             CapPrm:\t0000000000880000\nCapEff:\t0000000000880000\nCapBnd:\t000001ffffffffff\n\
             CapAmb:\t0000000000000000\nNoNewPrivs:\t1\nSeccomp:\t2\nSeccomp_filters:\t1\n";

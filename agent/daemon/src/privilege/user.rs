@@ -26,8 +26,8 @@ pub enum Identity {
     Root(String),
 }
 
-/// Becomes that user if this process is root and there is one. Call it while the process has one
-/// thread, after everything is opened and before any file is written.
+/// Switches to the package's user if this process is root and the user exists. Call it while the
+/// process has one thread, after everything is opened and before any file is written.
 #[must_use]
 pub fn become_own_user() -> Identity {
     if !geteuid().is_root() {
@@ -50,8 +50,8 @@ pub fn become_own_user() -> Identity {
     }
 }
 
-/// Ids of the package's user and its group, or else of the user's primary group. `None` if the user
-/// does not exist, or is root.
+/// Returns the ids of the package's user and group; without the group, the user's primary group.
+/// `None` if the user does not exist, or is root.
 fn find(users: &str, groups: &str) -> Option<(Uid, Gid)> {
     let line = |text: &str| -> Option<Vec<String>> {
         let mut lines = text.lines().map(|line| line.split(':'));
@@ -66,7 +66,7 @@ fn find(users: &str, groups: &str) -> Option<(Uid, Gid)> {
     Some((Uid::from_raw(user), Gid::from_raw(group)))
 }
 
-/// Id of a user; `None` if it does not exist.
+/// Returns the id of a user; `None` if the user does not exist.
 #[must_use]
 pub fn user_id(name: &str) -> Option<u32> {
     let users = fs::read_to_string("/etc/passwd").ok()?;
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn an_agent_that_becomes_another_user_keeps_capabilities_and_nothing_of_root() {
+    fn switching_the_user_keeps_capabilities_and_drops_the_ids_of_root() {
         assert!(geteuid().is_root(), "this takes root: run `make test`");
         let thread = std::thread::spawn(|| {
             let before = capabilities(None).unwrap().effective;

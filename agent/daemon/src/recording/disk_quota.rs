@@ -38,7 +38,7 @@ enum QuotaExceeded {
 }
 
 impl DiskQuota {
-    /// Quota for bags below this directory, which may not exist yet.
+    /// Creates a quota for bags below `directory`, which may not exist yet.
     #[must_use]
     pub fn new(directory: &Path, limits: RecordingLimits) -> Self {
         Self {
@@ -52,7 +52,7 @@ impl DiskQuota {
     ///
     /// # Errors
     ///
-    /// A limit would be exceeded.
+    /// Fails if a limit would be exceeded.
     pub fn take(&mut self, bag: u64, more: u64) -> Result<(), Error> {
         if let Some(limit) = self.limits.max_bytes
             && bag.saturating_add(more) > limit
@@ -71,7 +71,7 @@ impl DiskQuota {
     ///
     /// # Errors
     ///
-    /// A limit is exceeded.
+    /// Fails if a limit is exceeded.
     pub fn check(&self) -> Result<(), Error> {
         if let Some(limit) = self.limits.max_total_bytes {
             let used = used(&self.directory);
@@ -100,7 +100,7 @@ impl From<QuotaExceeded> for Error {
     }
 }
 
-/// Bytes of all files in the subdirectories of `directory`.
+/// Returns the size of all files in the subdirectories of `directory`, in bytes.
 fn used(directory: &Path) -> u64 {
     let entries = |path: &Path| std::fs::read_dir(path).into_iter().flatten().flatten();
     let bags = entries(directory);
@@ -112,11 +112,11 @@ fn used(directory: &Path) -> u64 {
 /// Space of a file system, in bytes.
 struct FilesystemSpace {
     size: u64,
-    /// Available to users without privileges.
+    /// Free space available to users without privileges.
     free: u64,
 }
 
-/// Space of the file system of an existing or future directory.
+/// Returns the space of the file system of an existing or future directory.
 fn space(directory: &Path) -> io::Result<FilesystemSpace> {
     let existing = directory.ancestors().find(|path| path.exists());
     let path = existing.unwrap_or(directory);
@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bag_all_bags_and_the_reserve_are_each_bounded() {
+    fn the_limits_of_a_bag_of_all_bags_and_of_the_reserve_are_enforced() {
         let directory = tempfile::tempdir().unwrap();
         let bags = directory.path().join("bags");
         let none = RecordingLimits {

@@ -11,7 +11,7 @@ pub struct RecordingFigures {
     pub active: AtomicU64,
     /// Messages written to bags.
     pub messages: AtomicU64,
-    /// Bytes of those messages.
+    /// Bytes of the messages written to bags.
     pub bytes: AtomicU64,
     /// Messages that were sent and are in no bag.
     pub missing: AtomicU64,
@@ -23,7 +23,7 @@ pub struct RecordingFigures {
 pub struct SnapshotFigures {
     /// Messages in memory.
     pub messages: u64,
-    /// Memory of those messages, in bytes.
+    /// Memory used by the messages, in bytes.
     pub bytes: u64,
     /// Messages evicted before the end of the time span, for lack of memory.
     pub crowded_out: u64,
@@ -31,7 +31,7 @@ pub struct SnapshotFigures {
     pub written: u64,
     /// Bags that could not be written.
     pub failed: u64,
-    /// Triggers during another bag, or within the minimum interval.
+    /// Triggers ignored during another bag, or within the minimum interval.
     pub suppressed: u64,
     /// Old triggered bags removed for new ones.
     pub removed: u64,
@@ -54,7 +54,7 @@ impl RecordingFigures {
         snapshots.insert(name.to_owned(), figures);
     }
 
-    /// State of all snapshots.
+    /// Returns the state of all snapshots.
     #[must_use]
     pub fn snapshots(&self) -> Vec<(String, SnapshotFigures)> {
         let snapshots = self

@@ -27,7 +27,7 @@ fn an_empty_file_means_the_defaults() {
 }
 
 #[test]
-fn the_ros2_daemon_is_a_word_or_a_map() {
+fn ros2_daemon_accepts_a_word_or_a_map() {
     let read = |text: &str| parse(text.as_bytes()).unwrap().ros2_daemon;
     let setting = |is_on, distro| Ros2DaemonSettings { is_on, distro };
     for (text, expected) in [
@@ -68,7 +68,7 @@ fn the_ros2_daemon_is_a_word_or_a_map() {
 }
 
 #[test]
-fn every_mistake_is_reported_with_its_place() {
+fn every_mistake_is_reported_with_its_position() {
     let source = "\
 watch:
   - /points
@@ -124,7 +124,7 @@ metrics: {listen: localhost}
 }
 
 #[test]
-fn triggers_of_a_snapshot_have_known_names_and_an_earlier_form() {
+fn snapshot_triggers_accept_known_names_and_the_earlier_form() {
     let triggers = |keys: &str| {
         let source = format!("recordings: {{snapshots: [{{name: a, topics: [/a]{keys}}}]}}");
         let config = parse(source.as_bytes()).unwrap();
@@ -151,7 +151,7 @@ fn triggers_of_a_snapshot_have_known_names_and_an_earlier_form() {
 }
 
 #[test]
-fn values_are_compared_with_each_other() {
+fn contradicting_and_repeated_watch_entries_are_reported() {
     let source = "\
 watch:
   - {topic: /a, min_rate_hz: 5, max_rate_hz: 1}
@@ -211,7 +211,7 @@ capture:
 }
 
 #[test]
-fn an_otlp_section_is_checked_down_to_the_names_an_operator_chooses() {
+fn an_otlp_section_is_checked_down_to_its_headers_and_attributes() {
     let source = "\
 otlp:
   endpoint: collector:4317
@@ -234,7 +234,7 @@ otlp:
 }
 
 #[test]
-fn a_version_that_is_known_or_left_out_changes_nothing() {
+fn a_supported_or_missing_version_changes_nothing() {
     for same in [
         "version: 1\nlog: debug\n",
         "log: debug\n",
@@ -258,7 +258,7 @@ fn a_version_that_is_known_or_left_out_changes_nothing() {
 }
 
 #[test]
-fn a_newer_file_is_refused_with_one_line_and_its_remedy() {
+fn a_newer_version_is_refused_with_one_line_and_its_remedy() {
     let newer = "watch: {points: {colour: red}}\nversion: 2\nclouds: 7\n";
     let version = env!("CARGO_PKG_VERSION");
     assert_eq!(
@@ -271,7 +271,7 @@ fn a_newer_file_is_refused_with_one_line_and_its_remedy() {
 }
 
 #[test]
-fn a_key_that_is_called_otherwise_is_named() {
+fn a_commonly_mistaken_key_is_reported_with_the_correct_name() {
     assert_eq!(
         report("watchlist: []"),
         "f:1:1: watchlist: unknown key; use `watch`"
@@ -289,7 +289,7 @@ fn a_key_written_twice_is_reported() {
 }
 
 #[test]
-fn broken_yaml_is_reported_with_its_place() {
+fn invalid_yaml_is_reported_with_its_position() {
     for (source, place) in [
         ("watch: [", "f:2:1:"),
         ("watch:\n\t- /a", "f:2:2:"),
@@ -311,7 +311,7 @@ fn broken_yaml_is_reported_with_its_place() {
 }
 
 #[test]
-fn bombs_are_refused_quickly() {
+fn yaml_bombs_are_refused_quickly() {
     let aliases = "a: &a [x,x]\nb: &b [*a,*a]\nc: [*b,*b]\n";
     assert!(report(aliases).contains("aliases are not supported"));
     assert!(report(&"[".repeat(200)).contains("nested too deep"));
@@ -338,7 +338,7 @@ fn bombs_are_refused_quickly() {
 }
 
 #[test]
-fn a_full_file_is_understood() {
+fn a_file_with_many_sections_is_parsed() {
     let source = "\
 watch:
   - /tf
@@ -384,7 +384,7 @@ log: debug
 }
 
 #[test]
-fn no_cut_of_a_good_file_panics() {
+fn parsing_a_truncated_file_never_panics() {
     let source = include_bytes!("../../../../../config/ros2probe.yaml");
     for end in 0..source.len() {
         let _ = parse(source.get(..end).unwrap());
@@ -392,7 +392,7 @@ fn no_cut_of_a_good_file_panics() {
 }
 
 #[test]
-fn a_chain_has_two_topics_by_name_and_is_listed_once() {
+fn a_chain_with_equal_ends_a_glob_or_a_duplicate_is_reported() {
     let mistakes = |yaml: &str| Config::parse(yaml.as_bytes()).unwrap_err().report("file");
     let same = mistakes("chains: [{from: /a, to: /a}]");
     assert!(
@@ -413,7 +413,7 @@ fn a_chain_has_two_topics_by_name_and_is_listed_once() {
 }
 
 #[test]
-fn ports_of_zenoh_are_few_and_none_is_zero() {
+fn too_many_and_invalid_ports_of_zenoh_are_reported() {
     let ports = |source: &str| parse(source.as_bytes()).unwrap().capture.zenoh_ports;
     assert_eq!(
         ports("capture: {zenoh: {ports: [7447, 17447]}}"),

@@ -1,4 +1,4 @@
-//! Each filter in its own thread: refused and allowed calls.
+//! Refused and allowed calls of each filter, in a thread of its own.
 
 use std::io::{Read as _, Write as _};
 use std::net::ToSocketAddrs as _;
@@ -98,7 +98,7 @@ fn socket(family: i32, kind: c_long) -> Option<i32> {
 }
 
 #[test]
-fn no_thread_executes_debugs_mounts_enters_loads_or_makes_code() {
+fn no_thread_can_execute_trace_mount_or_make_memory_executable() {
     for role in ROLES {
         confined(role, move || {
             for (name, number, arguments) in REFUSED_TO_ALL {
@@ -113,7 +113,7 @@ fn no_thread_executes_debugs_mounts_enters_loads_or_makes_code() {
             }
             let writable = [0, 4096, READ_WRITE, PRIVATE, -1, 0];
             assert_eq!(call(libc::SYS_mmap, writable), None, "{role:?}");
-            // If the call succeeded, the child would exit at once.
+            // If the call succeeded, the child would exit immediately.
             let fork = [libc::SIGCHLD.into(), 0, 0, 0, 0, 0];
             assert_eq!(call(libc::SYS_clone, fork), Some(libc::EPERM), "{role:?}");
             assert_eq!(
@@ -126,7 +126,7 @@ fn no_thread_executes_debugs_mounts_enters_loads_or_makes_code() {
 }
 
 #[test]
-fn only_threads_with_connections_create_sockets_and_of_no_other_kind() {
+fn only_threads_with_connections_create_sockets_of_the_allowed_kinds() {
     let refused = Some(libc::EPERM);
     for role in ROLES {
         confined(role, move || {
@@ -161,7 +161,7 @@ fn only_threads_with_connections_create_sockets_and_of_no_other_kind() {
 
 /// Ways to redirect a connection: `connect` after a disconnect, and messages with an address.
 #[test]
-fn an_accepted_connection_cannot_be_connected_elsewhere() {
+fn an_accepted_connection_cannot_be_redirected() {
     for role in [Role::Serve, Role::Ros2Daemon] {
         cannot_lead_elsewhere(role);
     }
@@ -220,7 +220,7 @@ fn cannot_lead_elsewhere(role: Role) {
 }
 
 #[test]
-fn kernel_maps_probes_and_memory_are_of_the_threads_that_need_them() {
+fn only_threads_that_need_kernel_maps_can_read_them_and_none_can_probe() {
     let lookup = [LOOK_UP_MAP, 0, 0, 0, 0, 0];
     let may = call(libc::SYS_bpf, lookup);
     for role in ROLES {
@@ -240,7 +240,7 @@ fn kernel_maps_probes_and_memory_are_of_the_threads_that_need_them() {
 }
 
 #[test]
-fn the_broker_attaches_and_creates_no_socket_no_file_and_no_namespace() {
+fn the_broker_attaches_probes_but_creates_no_socket_file_or_namespace() {
     confined(Role::Broker, || {
         let probe = call(libc::SYS_perf_event_open, [0, 0, -1, -1, 0, 0]);
         assert_ne!(probe, Some(libc::EPERM));
@@ -261,7 +261,7 @@ fn the_broker_attaches_and_creates_no_socket_no_file_and_no_namespace() {
 }
 
 #[test]
-fn threads_of_the_capture_open_nothing_for_writing() {
+fn capture_threads_cannot_open_a_file_for_writing() {
     let directory = tempfile::tempdir().unwrap();
     for role in ROLES {
         let file = directory.path().join(format!("{role:?}"));
@@ -277,8 +277,8 @@ fn threads_of_the_capture_open_nothing_for_writing() {
 
 /// Privileges of single threads: links, file notifications, their own scheduling.
 #[test]
-fn links_inotify_and_scheduling_are_of_the_threads_that_need_them() {
-    // A link without a program, and a call without parameters.
+fn only_threads_that_need_links_inotify_or_scheduling_can_use_them() {
+    // The link has no program, and the scheduling call has no parameters.
     let link = [command::LINK_CREATE.into(), 0, 0, 0, 0, 0];
     let running_first = [0, libc::SCHED_FIFO.into(), 0, 0, 0, 0];
     let when_idle = [0, libc::SCHED_IDLE.into(), 0, 0, 0, 0];
@@ -304,7 +304,7 @@ fn links_inotify_and_scheduling_are_of_the_threads_that_need_them() {
 }
 
 #[test]
-fn threads_begin_names_are_resolved_and_memory_grows_as_before() {
+fn a_confined_thread_can_start_threads_resolve_names_and_allocate() {
     confined(Role::Export, || {
         let named = std::thread::Builder::new().name("another".to_owned());
         let thread = named.spawn(|| vec![1_u8; 64 << 20].len()).unwrap();
@@ -315,7 +315,7 @@ fn threads_begin_names_are_resolved_and_memory_grows_as_before() {
 
 /// A signal handler writes to a socket, in a thread that the kernel chooses.
 #[test]
-fn every_thread_can_pass_a_signal_on() {
+fn every_thread_can_forward_a_signal() {
     for role in ROLES {
         let (one, mut other) = UnixStream::pair().unwrap();
         let passed = confined(role, move || (&one).write_all(&[1]).is_ok());
@@ -344,7 +344,7 @@ fn a_confined_thread_has_no_capability_and_an_unconfined_one_is_refused() {
 }
 
 #[test]
-fn a_filter_is_some_hundred_instructions_and_made_for_both_architectures() {
+fn a_filter_is_below_the_kernel_limit_and_builds_for_both_architectures() {
     for role in ROLES {
         let calls = Allowed::to(role).unwrap().0.len();
         let length = program(role).unwrap().len();
