@@ -1,7 +1,8 @@
 //! Selection of topics for a recording, with the options of `ros2 bag record`.
 //!
-//! It is evaluated again after each change of the graph, so that later topics are included. Topics
-//! of service events belong to services, and options for topics do not apply to them.
+//! The selection is evaluated again after each change of the graph, so that later topics are
+//! included. Topics of service events belong to services, and options for topics do not apply to
+//! them.
 
 use std::collections::HashSet;
 
@@ -14,9 +15,9 @@ use crate::subscriptions::{Choice, ChoiceError, Selection};
 /// Suffix of the name of a service's event topic.
 const SERVICE_EVENT: &str = "/_service_event";
 const EVERY_SERVICE_EVENT: &str = "/_service_event$";
-/// Most names, types and services in one selection.
+/// Maximum length of each list of names, types or services in a selection.
 const MAX_NAMES: usize = 1024;
-/// Most characters of a regular expression.
+/// Maximum length of a regular expression, in bytes.
 const MAX_EXPRESSION: usize = 1024;
 
 /// Facts about a topic that the selection uses.
@@ -41,7 +42,7 @@ pub struct Filter {
     only: Option<HashSet<String>>,
 }
 
-/// The options are invalid.
+/// Why options are invalid.
 #[derive(Debug, thiserror::Error)]
 pub enum FilterError {
     /// No topic can ever match.
@@ -68,7 +69,7 @@ impl Filter {
     ///
     /// # Errors
     ///
-    /// Nothing could match, or an expression or a name is invalid.
+    /// Fails if nothing could match, a list is too long, or an expression or a name is invalid.
     pub fn new(options: FilterOptions) -> Result<Self, FilterError> {
         let names = [
             &options.topics,
@@ -110,17 +111,17 @@ impl Filter {
         })
     }
 
-    /// Options of the selection.
+    /// Returns the options of the selection.
     #[must_use]
     pub const fn options(&self) -> &FilterOptions {
         &self.options
     }
 
-    /// Topics to subscribe to: all that [`Self::takes`] may accept, and few more.
+    /// Returns the topics to subscribe to: all that [`Self::takes`] may accept, and a few others.
     ///
     /// # Errors
     ///
-    /// A name cannot be that of a topic.
+    /// Fails if a name is not valid for a topic.
     pub fn selection(&self) -> Result<Selection, ChoiceError> {
         let options = &self.options;
         let event = |service: &String| Choice::Name(format!("{service}{SERVICE_EVENT}"));
@@ -152,7 +153,8 @@ impl Filter {
         })
     }
 
-    /// [`Self::selection`] as a query of the API's `/samples`, with a queue of `queue_bytes`.
+    /// Returns [`Self::selection`] as a query of the API's `/samples`, with a queue of
+    /// `queue_bytes`.
     #[must_use]
     pub fn query(&self, domain_id: u32, queue_bytes: u64) -> String {
         let options = &self.options;
@@ -277,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn all_topics_are_those_that_are_not_hidden_and_no_service_events() {
+    fn all_topics_excludes_hidden_topics_and_service_events() {
         let all = FilterOptions::everything();
         assert!(takes(all.clone(), "/chatter"));
         assert!(!takes(all.clone(), "/fibonacci/_action/feedback"));
@@ -291,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn a_named_topic_is_taken_though_it_is_hidden() {
+    fn a_hidden_topic_is_recorded_if_it_is_named() {
         let options = FilterOptions {
             topics: strings(&["/a/_hidden"]),
             ..FilterOptions::default()
@@ -301,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn a_regular_expression_adds_and_another_takes_away() {
+    fn one_regular_expression_adds_topics_and_another_excludes_some() {
         let options = FilterOptions {
             topics: strings(&["/chatter"]),
             regex: Some("camera/.*".to_owned()),
@@ -315,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn services_are_chosen_by_their_own_names() {
+    fn services_are_selected_by_the_name_of_the_service() {
         let options = FilterOptions {
             services: strings(&["/add"]),
             ..FilterOptions::default()
@@ -332,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn types_and_the_graph_around_a_topic_decide() {
+    fn types_publishers_and_subscribers_decide_whether_a_topic_is_recorded() {
         let typed = FilterOptions {
             topic_types: strings(&["std_msgs/msg/String"]),
             ..FilterOptions::default()
@@ -389,7 +391,7 @@ mod tests {
     }
 
     #[test]
-    fn the_requested_selection_covers_every_recorded_topic() {
+    fn the_query_of_the_api_covers_every_recorded_topic() {
         let options = FilterOptions {
             topics: strings(&["/a", "/b"]),
             services: strings(&["/add"]),

@@ -1,5 +1,5 @@
 //! Facts about topics for a bag and its report: from a snapshot within the agent, or from an
-//! agent's answers in a client.
+//! agent's responses in a client.
 
 use std::collections::HashMap;
 
@@ -38,9 +38,9 @@ pub struct PublishedTopic {
     pub message_types: Vec<String>,
     /// Whether it has a subscriber.
     pub subscribed: bool,
-    /// Transport of most pairs, if none of them uses the network.
+    /// Transport of most pairs of writer and reader, if no pair uses the network.
     pub other_transport: Option<String>,
-    /// Whether every message in shared memory is seen at present.
+    /// Whether every message in shared memory is captured now.
     pub is_exact: bool,
     /// Publishers that send stored samples to late joiners.
     pub durable_publishers: Vec<DurablePublisher>,
@@ -53,11 +53,11 @@ pub struct PublishedTopic {
 pub struct DurablePublisher {
     /// GUID.
     pub guid: String,
-    /// Its last message, if the agent keeps such messages.
+    /// State of its last message, if the agent retains such messages.
     pub latched: Option<Latched>,
 }
 
-/// Topics of one domain by the names that messages have: ROS names of topics, else DDS names.
+/// Returns the topics of one domain by name: the ROS name of a ROS topic, otherwise the DDS name.
 #[must_use]
 pub fn by_name(topics: &[Topic<'_>], domain_id: u32) -> HashMap<String, DiscoveredTopic> {
     let topics = topics.iter();
@@ -74,7 +74,7 @@ pub fn by_name(topics: &[Topic<'_>], domain_id: u32) -> HashMap<String, Discover
 }
 
 impl GraphSnapshot {
-    /// Graph from an agent's answers.
+    /// Returns the graph from an agent's responses.
     #[must_use]
     pub fn answered(topics: &[Topic<'_>], unknown_writers: Vec<UnknownWriter<'_>>) -> Self {
         let topics = topics.iter();
@@ -129,7 +129,7 @@ impl From<&Topic<'_>> for PublishedTopic {
     }
 }
 
-/// Returns whether the topic has a ROS name. Kinds unknown to this version count as such.
+/// Returns whether the topic has a ROS name. Kinds unknown to this version count as ROS topics.
 fn is_ros_topic(kind: &str) -> bool {
     TopicKind::parse(kind).is_none_or(TopicKind::is_ros_topic)
 }
@@ -213,8 +213,8 @@ pub struct Publisher {
 }
 
 impl Publisher {
-    /// Returns whether late joiners receive its last samples. These were sent earlier and are
-    /// repeated only to them.
+    /// Returns whether late joiners receive its last samples, which were sent earlier and are
+    /// repeated only to late joiners.
     #[must_use]
     pub fn is_durable(&self) -> bool {
         self.qos.durability != VOLATILE
@@ -284,7 +284,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_api_reports_what_a_bag_stores_about_publishers() {
+    fn publishers_in_a_response_of_the_api_have_the_qos_for_a_bag() {
         let json = r#"{"message_types": ["std_msgs/msg/String"], "type_hashes": [], "name": "/x",
             "subscriptions": [{"guid": "a"}],
             "publishers": [{"guid": "0110.1", "node": "/n", "qos": {"reliability": "BEST_EFFORT",

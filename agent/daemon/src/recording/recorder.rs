@@ -1,8 +1,8 @@
 //! One recording: samples in, a bag and a report out.
 //!
-//! It has no thread and no clock: its owner feeds it from a subscription or from an agent's stream,
-//! and times come with the items. The first error of the storage ends it. Earlier samples are in
-//! the bag, and missing ones are counted.
+//! A recorder has no thread and no clock: its owner feeds it from a subscription or from an agent's
+//! stream, and times come with the items. The first error of the storage ends the recording.
+//! Earlier samples are in the bag, and missing ones are counted.
 
 mod unrecorded;
 
@@ -31,25 +31,25 @@ use ros2probe_model::facts::dispatch::{Offered, Sample};
 use ros2probe_model::report::snapshot::Transport;
 
 /// Interval of writes to the operating system, by the time of samples. A killed process loses at
-/// most this much.
+/// most one interval.
 const FLUSH: Duration = Duration::from_secs(1);
-/// Interval of syncs to disk. A power failure loses at most this much.
+/// Interval of syncs to disk. A power failure loses at most one interval.
 const SYNC: Duration = Duration::from_secs(5);
 
 /// Sources of facts that samples do not contain.
 pub struct Sources<'a> {
-    /// Current announcements about topics of these names, in their order.
+    /// Returns the current announcements about the named topics, in the order of the names.
     pub announced: Box<Announcements<'a>>,
-    /// Current graph of all domains.
+    /// Returns the current graph of all domains.
     pub graph: Box<dyn FnMut() -> GraphSnapshot + Send + 'a>,
-    /// Schema of a type, by its name and announced hash.
+    /// Returns the schema of a type, by its name and announced hash.
     pub schema: Box<Schemas<'a>>,
 }
 
-/// Announcements about several topics, requested at once, since each request may take long.
+/// Returns announcements about several topics in one call, since each request may take long.
 pub type Announcements<'a> = dyn FnMut(&[String]) -> Vec<DiscoveredTopic> + Send + 'a;
 
-/// Schema of a type, by its name and announced hash.
+/// Returns the schema of a type, by its name and announced hash.
 pub type Schemas<'a> = dyn FnMut(&str, Option<&str>) -> Option<Schema> + Send + 'a;
 
 /// A bag in progress.
@@ -61,9 +61,9 @@ pub struct Recorder<'a> {
     filter: Filter,
     sources: Sources<'a>,
     topics: Bounded<RecordedTopics, HashMap<String, TopicDecision>>,
-    /// Bytes of their names and types.
+    /// Bytes of the names and types of `topics`.
     names: Sum<RecordedNames>,
-    /// Writers of all topics.
+    /// Number of writers of all topics.
     writers: Sum<RecordingWriters>,
     /// Topics in the bag, in order.
     order: Vec<String>,
@@ -91,14 +91,14 @@ enum TopicDecision {
     Recorded(Box<RecordedTopic>),
     /// The filter excludes the topic.
     Excluded,
-    /// The filter takes the topic, and the recording has no room for it.
+    /// The filter selects the topic, but the recording has reached a cap.
     NoRoom,
 }
 
 struct RecordedTopic {
     id: TopicId,
     description: TopicDescription,
-    /// Offered QoS of each publisher with its GUID, in their order, for the description.
+    /// Offered QoS of each publisher, sorted by GUID, for the description.
     offered: Bounded<RecordedWriters, Vec<(String, Qos)>>,
     /// Sequence number of the first recorded sample of each writer.
     first: Bounded<RecordedWriters, HashMap<Guid, SequenceNumber>>,
@@ -111,13 +111,13 @@ pub struct Finished {
     pub summary: Option<Summary>,
     /// Recorded and missing messages.
     pub report: Report,
-    /// Error of the storage; the bag is complete up to it.
+    /// Error of the storage; the bag is complete up to the error.
     pub error: Option<Error>,
 }
 
 impl<'a> Recorder<'a> {
-    /// Records topics selected by `filter` in one domain into the bag of `writer`. `before` is the
-    /// graph before the first sample.
+    /// Creates a recorder of topics that `filter` selects in one domain, into the bag of `writer`.
+    /// `before` is the graph before the first sample.
     #[must_use]
     pub fn new(
         writer: Writer,
@@ -168,7 +168,7 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    /// Ends with an error when the quota is exhausted.
+    /// Makes the recording end with an error when the quota is exhausted.
     #[must_use]
     pub fn within(self, quota: DiskQuota) -> Self {
         Self {
@@ -181,7 +181,7 @@ impl<'a> Recorder<'a> {
     ///
     /// # Errors
     ///
-    /// The storage fails.
+    /// Fails if the storage fails.
     pub fn snapshot(&mut self) -> Result<(), Error> {
         let waiting: Vec<_> = self.ring.iter_mut().flat_map(SampleRing::drain).collect();
         for sample in waiting {
@@ -190,14 +190,14 @@ impl<'a> Recorder<'a> {
         self.writer.flush()
     }
 
-    /// Report so far.
+    /// Returns the report so far.
     #[must_use]
     pub const fn report(&self) -> &Report {
         &self.report
     }
 
-    /// Selected and published topics among those of `graph` that have no message yet for a known
-    /// reason. By name, with the reason as in [`Report::unobserved`].
+    /// Returns the selected and published topics of `graph` that have no message yet for a known
+    /// reason. The values are the reasons, as in [`Report::unobserved`].
     #[must_use]
     pub fn unobserved(&self, graph: &GraphSnapshot) -> BTreeMap<String, String> {
         let topics = graph.topics.iter();
@@ -209,7 +209,7 @@ impl<'a> Recorder<'a> {
             }
             let why = match &topic.other_transport {
                 _ if !topic.subscribed => NO_SUBSCRIBER.to_owned(),
-                // Nothing was sent.
+                // Every message is captured, so nothing was sent.
                 Some(transport)
                     if topic.is_exact && transport == Transport::SharedMemory.label() =>
                 {
@@ -222,7 +222,7 @@ impl<'a> Recorder<'a> {
         topics.collect()
     }
 
-    /// Options of the selection.
+    /// Returns the options of the selection.
     #[must_use]
     pub const fn options(&self) -> &FilterOptions {
         self.filter.options()
@@ -239,18 +239,18 @@ impl<'a> Recorder<'a> {
         })
     }
 
-    /// Topics with messages sampled in shared memory.
+    /// Returns the topics with messages sampled in shared memory.
     #[must_use]
     pub const fn sampled(&self) -> &BTreeSet<String> {
         &self.sampled
     }
 
-    /// Topics in the bag, in order of their addition.
+    /// Iterates over the topics in the bag, in order of their addition.
     pub fn topics(&self) -> impl Iterator<Item = &str> {
         self.order.iter().map(String::as_str)
     }
 
-    /// Writer of the bag.
+    /// Returns the writer of the bag.
     #[must_use]
     pub const fn writer(&self) -> &Writer {
         &self.writer
@@ -271,12 +271,12 @@ impl<'a> Recorder<'a> {
     ///
     /// # Errors
     ///
-    /// The storage fails.
+    /// Fails if the storage fails.
     pub fn split(&mut self) -> Result<(), Error> {
         self.writer.split()
     }
 
-    /// Complete files to compress on another thread.
+    /// Returns complete files to compress on another thread.
     pub fn take_compressions(&mut self) -> Vec<FileCompression> {
         self.writer.take_file_compressions()
     }
@@ -285,7 +285,7 @@ impl<'a> Recorder<'a> {
     ///
     /// # Errors
     ///
-    /// The storage fails.
+    /// Fails if the storage fails.
     pub fn compressed(&mut self, done: &Compressed) -> Result<(), Error> {
         self.writer.compressed(done)
     }
@@ -294,7 +294,7 @@ impl<'a> Recorder<'a> {
     ///
     /// # Errors
     ///
-    /// The storage fails.
+    /// Fails if the storage fails.
     pub fn declare<'t>(
         &mut self,
         topics: impl IntoIterator<Item = (&'t str, &'t str)>,
@@ -305,7 +305,7 @@ impl<'a> Recorder<'a> {
         let announced = self.discover(&names);
         for ((name, message_type), announced) in topics.into_iter().zip(announced) {
             let place = self.decide(name, message_type, None, &announced, false)?;
-            // Other topics may still be published later, or have room.
+            // Other topics are decided again later, since they may be published or fit by then.
             if matches!(place, TopicDecision::Recorded(_)) {
                 self.keep(name, place);
             }
@@ -317,7 +317,7 @@ impl<'a> Recorder<'a> {
     ///
     /// # Errors
     ///
-    /// The storage fails; [`Self::finish`] completes the bag nevertheless.
+    /// Fails if the storage fails; [`Self::finish`] completes the bag nevertheless.
     pub fn take(&mut self, item: &Item) -> Result<(), Error> {
         match item {
             Item::Sample(sample) if sample.payload.is_none() => Ok(()),
@@ -342,13 +342,14 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    /// Completes the bag. `error` is the storage error that ended it, if any.
+    /// Completes the bag. `error` is the storage error that ended the recording, if any.
     #[must_use]
     pub fn finish(self, error: Option<Error>) -> Finished {
         self.finish_with(error, |work| work.run().map(Some))
     }
 
-    /// As [`Self::finish`], with whole files compressed by `compress`: see [`Writer::close_with`].
+    /// Does the same as [`Self::finish`], but compresses whole files with `compress`: see
+    /// [`Writer::close_with`].
     #[must_use]
     pub fn finish_with(
         mut self,
@@ -361,7 +362,7 @@ impl<'a> Recorder<'a> {
         let graph = (self.sources.graph)();
         self.note_what_was_sent_before(&graph);
         self.note_what_was_not_observed(graph);
-        // Before the report is added to the bag.
+        // Unwritten messages are known before the report is added to the bag.
         self.writer.settle();
         for (topic, messages, bytes) in self.writer.unwritten() {
             take_back(&mut self.report, topic, messages, bytes);
@@ -442,7 +443,8 @@ impl<'a> Recorder<'a> {
         !matches!(self.topics.get(name), Some(TopicDecision::Excluded))
     }
 
-    /// State of a topic with this many messages. `None` if it is not recorded.
+    /// Returns the state of a topic with `messages` new messages; `None` if the topic is not
+    /// recorded.
     fn place(&mut self, topic: &Topic, messages: u64) -> Result<Option<&mut RecordedTopic>, Error> {
         let Topic {
             name, message_type, ..
@@ -480,8 +482,8 @@ impl<'a> Recorder<'a> {
         Ok(Some(taken))
     }
 
-    /// Remembers the decision about a topic. Excluded ones leave half of the room to others, and are
-    /// decided again beyond that.
+    /// Stores the decision about a topic. Excluded topics take at most half of the table; beyond
+    /// that, they are decided again each time.
     fn keep(&mut self, name: &str, place: TopicDecision) {
         let bytes = match &place {
             TopicDecision::Recorded(taken) => name.len() + taken.description.type_name.len(),
@@ -499,7 +501,7 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    /// Announcements about these topics, one result per name.
+    /// Returns the announcements about the named topics, one result per name.
     fn discover(&mut self, names: &[String]) -> Vec<DiscoveredTopic> {
         if names.is_empty() {
             return Vec::new();
@@ -561,7 +563,8 @@ impl<'a> Recorder<'a> {
             type_hash,
             publishers: offered.iter().map(|(_, qos)| qos.clone()).collect(),
         };
-        // The description precedes the first message, and includes that of its writer.
+        // The bag describes a topic before its first message; `describe_again` adds the QoS of the
+        // writer.
         let id = self.writer.topic(description.clone())?;
         // The schema is in the bag now.
         description.schema = None;

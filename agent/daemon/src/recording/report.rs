@@ -1,4 +1,4 @@
-//! Counts recorded and missing messages. The report is an answer of the API and part of the bag's
+//! Counts recorded and missing messages. The report is part of the API's responses and of the bag's
 //! metadata.
 
 use std::collections::BTreeMap;
@@ -7,7 +7,7 @@ use ros2probe_api::recording_report::{MissingRun, Report};
 
 use crate::subscriptions::{Missed, MissedReason};
 
-/// Most runs of missing samples listed; further ones are counted.
+/// Maximum number of listed runs of missing samples; further runs are only counted.
 const RUNS: usize = 256;
 /// Key of the report in the bag's custom data.
 pub(super) const CUSTOM_DATA: &str = "ros2probe";
@@ -64,7 +64,7 @@ pub(super) fn take_back(report: &mut Report, topic: &str, messages: u64, bytes: 
     topic.unwritten += messages;
 }
 
-/// Report for a bag's metadata: one line of JSON.
+/// Returns the report for a bag's metadata: one line of JSON.
 pub(super) fn custom_data(report: &Report) -> BTreeMap<String, String> {
     // Numbers and strings cannot fail to serialize.
     let text = serde_json::to_string(report).unwrap_or_default();
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn missing_messages_are_counted_by_reason_and_named_with_their_numbers() {
+    fn missing_messages_are_counted_by_reason_and_listed_by_sequence_number() {
         let mut report = Report::default();
         add_written(&mut report, "/points", 100);
         add_missed(&mut report, &missed(2, 3, MissedReason::Incomplete));
@@ -117,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_list_of_runs_is_cut_and_counted() {
+    fn runs_beyond_the_maximum_are_counted_but_not_listed() {
         let mut report = Report::default();
         for first in 0..RUNS as u64 + 5 {
             add_missed(

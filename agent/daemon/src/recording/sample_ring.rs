@@ -35,13 +35,13 @@ impl SampleRing {
         }
     }
 
-    /// Bytes in the ring.
+    /// Returns the size of the ring in bytes.
     #[must_use]
     pub const fn bytes(&self) -> usize {
         self.bytes
     }
 
-    /// Number of samples in the ring.
+    /// Returns the number of samples in the ring.
     #[must_use]
     pub fn len(&self) -> usize {
         self.samples.len()
@@ -53,7 +53,7 @@ impl SampleRing {
         self.samples.is_empty()
     }
 
-    /// Number of samples evicted before the end of the span, for lack of memory.
+    /// Returns the number of samples evicted before the end of the span, for lack of memory.
     #[must_use]
     pub const fn crowded_out(&self) -> u64 {
         self.crowded_out
@@ -79,7 +79,7 @@ impl SampleRing {
         }
     }
 
-    /// All samples, oldest first.
+    /// Iterates over all samples, oldest first.
     pub fn iter(&self) -> impl Iterator<Item = &Arc<Sample>> {
         self.samples.iter()
     }
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn the_bytes_stay_below_the_limit_and_what_had_to_go_is_counted() {
+    fn bytes_stay_below_the_limit_and_evicted_samples_are_counted() {
         let mut ring = SampleRing::new(3000, None);
         for second in 0..5 {
             ring.push(sample(second, 1000));

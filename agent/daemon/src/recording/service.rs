@@ -33,12 +33,12 @@ use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::Library;
 use ros2probe_wire::DomainId;
 
-/// Most ended recordings whose report is kept.
+/// Maximum number of ended recordings whose report is kept.
 const ENDED: usize = 16;
-/// Largest chunk of a bag, and largest index of a file, kept in memory, in bytes.
+/// Maximum sizes of a bag's chunk and of a file's index in memory, in bytes.
 const CHUNK_BYTES: u64 = 1 << 20;
 const INDEX_BYTES: u64 = 1 << 20;
-/// Longest name of a recording, in bytes.
+/// Maximum length of the name of a recording, in bytes.
 const NAME: usize = 128;
 
 /// All recordings of an agent.
@@ -65,7 +65,7 @@ pub struct Components {
     pub directory: Option<PathBuf>,
     /// Limits of disk usage.
     pub limits: RecordingLimits,
-    /// Bytes of each recording that may wait for the storage.
+    /// Maximum number of bytes of each recording that wait for the storage.
     pub queue_bytes: usize,
     /// Latest snapshot of the model.
     pub latest: Arc<SnapshotCell>,
@@ -139,7 +139,7 @@ pub struct Status {
     pub error: Option<String>,
 }
 
-/// A recording was refused.
+/// Why a recording was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum Refusal {
     /// No directory is available.
@@ -303,7 +303,7 @@ impl Recordings {
         })
     }
 
-    /// All recordings in the order of their start.
+    /// Returns all recordings in the order of their start.
     #[must_use]
     pub fn all(&self) -> Vec<Arc<Recording>> {
         let mut list = self.list();
@@ -311,10 +311,10 @@ impl Recordings {
         list.clone()
     }
 
-    /// The recording of this name. `None` if it does not exist.
+    /// Returns the recording of this name; `None` if it does not exist.
     #[must_use]
     pub fn find(&self, name: &str) -> Option<Arc<Recording>> {
-        // The latest one, since a deleted name can be used again.
+        // The latest recording counts, since the name of a deleted one can be used again.
         self.list().iter().rfind(|each| each.name == name).cloned()
     }
 
@@ -334,19 +334,19 @@ impl Recordings {
         }
     }
 
-    /// Directory of the bags. `None` if recordings are refused.
+    /// Returns the directory of the bags; `None` if recordings are refused.
     #[must_use]
     pub fn directory(&self) -> Option<&Path> {
         self.directory.as_deref()
     }
 
-    /// Limits of disk usage.
+    /// Returns the limits of disk usage.
     #[must_use]
     pub const fn limits(&self) -> RecordingLimits {
         self.limits
     }
 
-    /// Quota for a bag at this path.
+    /// Creates a quota for a bag at this path.
     pub(super) fn quota(&self, bag: &Path) -> DiskQuota {
         DiskQuota::new(bag.parent().unwrap_or(bag), self.limits)
     }
@@ -378,7 +378,7 @@ impl Recordings {
         })?)
     }
 
-    /// Sources for a recorder, from the snapshot and the library.
+    /// Returns the sources for a recorder, from the snapshot and the library.
     pub(super) fn sources(&self, domain_id: u32) -> Sources<'static> {
         let (latest, library) = (Arc::clone(&self.latest), Arc::clone(&self.library));
         let seen = Arc::clone(&self.latest);
@@ -402,7 +402,7 @@ impl Recordings {
         }
     }
 
-    /// Validated name and path of a new bag.
+    /// Returns the validated name and the path of a new bag.
     pub(super) fn bag_directory(&self, name: Option<String>) -> Result<(String, PathBuf), Refusal> {
         let Some(directory) = &self.directory else {
             return Err(Refusal::NoDirectory);
@@ -426,7 +426,7 @@ impl Recordings {
 }
 
 impl Recording {
-    /// Status, at most half a second old.
+    /// Returns the status, which is at most half a second old.
     #[must_use]
     pub fn status(&self) -> Status {
         locked(&self.status).clone()
@@ -438,7 +438,7 @@ impl Recording {
         let _ = locked(&self.commands).send(command);
     }
 
-    /// Waits at most `timeout` for the bag to be complete. Returns whether it is.
+    /// Waits at most `timeout` for the bag to be complete. Returns whether the bag is complete.
     pub async fn over(&self, timeout: Duration) -> bool {
         let wait = async {
             loop {
@@ -499,7 +499,7 @@ impl Recording {
             reason: error.clone(),
         });
         self.finish(ended, error);
-        // A bag of many topics uses much memory, and the next one may be far off.
+        // A bag of many topics uses much memory, and the next recording may begin much later.
         give_back_memory();
     }
 
@@ -537,7 +537,7 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Definition of a type for a bag. `None` if no definition has this name and hash.
+/// Returns the definition of a type for a bag; `None` if no definition has this name and hash.
 pub fn schema(library: &Library, name: &str, hash: Option<&str>) -> Option<Schema> {
     let found = library.find(name, hash).ok()?;
     let (encoding, text) = found.schema_text();
@@ -547,7 +547,7 @@ pub fn schema(library: &Library, name: &str, hash: Option<&str>) -> Option<Schem
     })
 }
 
-/// Name of a bag from the local time, in the format of rosbag2.
+/// Returns the name of a bag from the local time, in the format of rosbag2.
 #[must_use]
 pub fn default_name() -> String {
     Zoned::now()
@@ -564,7 +564,7 @@ pub(super) fn refusal(name: &str, error: ros2probe_bag::Error) -> Refusal {
     }
 }
 
-/// Text of an error with its causes.
+/// Returns the text of an error with its causes.
 pub(super) fn causes(error: &ros2probe_bag::Error) -> String {
     let mut text = error.to_string();
     let mut cause = std::error::Error::source(error);

@@ -16,11 +16,11 @@ use super::recorder::{Finished, Recorder};
 use crate::subscriptions::{Item, NextItem};
 use ros2probe_bag::{Compressed, Error, FileCompression, Progress};
 
-/// Longest delay of a command.
+/// Maximum delay of a command.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Interval of status reports.
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
-/// Longest wait for the next of the messages sent before the end.
+/// Maximum time to wait for the next message that was sent before the end.
 const DRAIN: Duration = Duration::from_secs(2);
 
 /// Command to a recording.
@@ -38,7 +38,7 @@ pub enum Command {
     Snapshot,
     /// Complete the bag.
     Stop,
-    /// Complete the bag without slow steps: messages in flight, compression of whole files.
+    /// Complete the bag without waiting for messages in flight or compressing whole files.
     Hurry,
 }
 
@@ -65,14 +65,14 @@ struct Compressing {
     task: Option<CompressionTask>,
 }
 
-/// A file in compression on its own thread.
+/// Compression of a file on its own thread.
 struct CompressionTask {
     thread: JoinHandle<Result<Compressed, Error>>,
     progress: Arc<Progress>,
     bytes: u64,
 }
 
-/// Commands and the listener during the completion of the bag.
+/// Commands and the callback for reports during the completion of the bag.
 struct Completion<'a, T> {
     commands: &'a Receiver<Command>,
     report_activity: T,
@@ -89,7 +89,7 @@ pub fn record<E>(
     mut report_activity: impl FnMut(Activity<'_>),
 ) -> (Finished, Option<E>) {
     let mut compressing = Compressing::default();
-    // When the end was requested, and when the last item came since then.
+    // Time at which the end was requested, and time of the last item since then.
     let mut stopping: Option<(Timestamp, Instant)> = None;
     let mut hurry = false;
     let mut reported = Instant::now();
@@ -177,7 +177,7 @@ fn carry_out(
             Ok(Command::Split) => recorder.split()?,
             Ok(Command::Snapshot) => recorder.snapshot()?,
             Ok(Command::Hurry) => return Ok(CommandOutcome::Hurry),
-            // All senders of commands are gone.
+            // All senders of commands were dropped.
             Ok(Command::Stop) | Err(TryRecvError::Disconnected) => return Ok(CommandOutcome::Stop),
             Err(TryRecvError::Empty) => return Ok(outcome),
         }
@@ -219,7 +219,8 @@ impl Compressing {
 }
 
 impl CompressionTask {
-    /// `None` without a thread: the file then stays uncompressed, which loses nothing.
+    /// Starts the compression; returns `None` if no thread can be spawned. The file then stays
+    /// uncompressed, which loses nothing.
     fn begin(work: FileCompression) -> Option<Self> {
         let progress = Arc::new(Progress::default());
         let (watched, bytes) = (Arc::clone(&progress), work.bytes());
@@ -236,7 +237,8 @@ impl CompressionTask {
         self.thread.join().ok()
     }
 
-    /// Waits for the compression of the file. `None` if it was cancelled.
+    /// Waits for the compression of the file; returns `None` if it was cancelled or its thread
+    /// panicked.
     fn wait(
         self,
         completion: &mut Completion<'_, impl FnMut(Activity<'_>)>,

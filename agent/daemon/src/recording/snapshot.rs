@@ -1,9 +1,9 @@
 //! Snapshots: the last seconds of selected topics in memory, written into a bag on an event of the
 //! configuration, a client's request, or SIGUSR1. After an event, the following seconds are added.
 //!
-//! The memory is bounded in bytes and seconds, and reported. Repeated events cannot fill the disk:
-//! triggered bags have a minimum interval, and their number and bytes are limited. A requested bag
-//! is never removed.
+//! The memory is bounded in bytes and seconds, and its use is reported. Repeated events cannot fill
+//! the disk: triggered bags have a minimum interval, and their number and bytes are limited. A
+//! requested bag is never removed.
 
 mod bag;
 mod retention;
@@ -24,7 +24,7 @@ use super::service::{Recordings, Refusal};
 use crate::config::SnapshotSettings;
 use crate::subscriptions::Selection;
 
-/// Most clients that wait for a bag at once.
+/// Maximum number of clients that wait for a bag at the same time.
 const CLIENTS: usize = 8;
 
 /// A bag that was written.
@@ -41,7 +41,7 @@ pub struct WrittenBag {
 /// Why a requested bag was not written.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Unwritten {
-    /// [`CLIENTS`] clients wait already.
+    /// [`CLIENTS`] clients are already waiting.
     #[error("too many clients wait for this snapshot")]
     Busy,
     /// The snapshot's thread has ended.
@@ -74,7 +74,8 @@ impl Snapshots {
     ///
     /// # Errors
     ///
-    /// No directory is available, a subscription is refused, or a thread cannot be started.
+    /// Fails if no directory is available, a subscription is refused, or a thread cannot be
+    /// started.
     pub fn start(
         settings: &[SnapshotSettings],
         recordings: &Arc<Recordings>,
@@ -107,12 +108,13 @@ impl Snapshots {
         Ok(Self { list, stop })
     }
 
-    /// Settings of all snapshots.
+    /// Iterates over the settings of all snapshots.
     pub fn settings(&self) -> impl Iterator<Item = &SnapshotSettings> {
         self.list.iter().map(|snapshot| &snapshot.settings)
     }
 
-    /// Writes the messages in memory at once, regardless of earlier bags. `None` if it does not exist.
+    /// Writes the messages in memory immediately, regardless of earlier bags; returns `None` if the
+    /// snapshot does not exist.
     pub async fn write(&self, name: &str) -> Option<Result<WrittenBag, Unwritten>> {
         let snapshot = self.list.iter().find(|each| each.settings.name == name)?;
         let (answer, written) = oneshot::channel();
@@ -123,7 +125,7 @@ impl Snapshots {
         Some(written.unwrap_or(Err(Unwritten::ShuttingDown)))
     }
 
-    /// Writes all snapshots.
+    /// Requests a bag of each snapshot.
     pub fn write_all(&self) {
         for snapshot in &self.list {
             snapshot.asked.store(true, Ordering::Relaxed);

@@ -16,7 +16,7 @@ pub enum CaptureTime {
 }
 
 impl CaptureTime {
-    /// Absolute time in a capture that begins at `beginning`.
+    /// Returns the absolute time in a capture that begins at `beginning`.
     #[must_use]
     pub fn in_capture(self, beginning: Timestamp) -> Timestamp {
         match self {
@@ -61,7 +61,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn moments_keep_their_nanoseconds() {
+    fn a_capture_time_keeps_its_nanoseconds() {
         let at = |text: &str| text.parse::<CaptureTime>();
         let exact = Timestamp(1_795_142_407_300_015_394);
         assert_eq!(at("1795142407.300015394"), Ok(CaptureTime::At(exact)));

@@ -1,5 +1,5 @@
 //! Working thread of the agent: reads packets from the source, feeds the model, and publishes
-//! snapshots. Surfaces only read those.
+//! snapshots. Surfaces only read snapshots.
 
 mod capture_time;
 pub mod replay;
@@ -32,25 +32,25 @@ use ros2probe_model::observe::observer::Observer;
 use ros2probe_model::report::snapshot::Snapshot;
 pub use source::{Source, probe};
 
-/// Longest time of a replay without checking commands.
+/// Maximum time for which a replay runs without checking commands.
 const SLICE: Duration = Duration::from_millis(250);
-/// Longest time of a live source without checking commands and the clock. Captured frames, a
-/// half-full record ring and commands end it earlier. Each round costs a wake-up, and on a quiet
-/// host nothing else does.
+/// Maximum time for which a live source waits without checking commands and the clock. Captured
+/// frames, a half-full record ring and commands end the wait earlier. Each round costs a wake-up,
+/// and on a quiet host nothing else wakes the thread.
 const SLICE_LIVE: Duration = Duration::from_secs(1);
-/// Least interval of snapshots without requests: they are due each second, give or take the delay
-/// of a wake-up.
+/// Minimum interval of snapshots without requests. They are due each second, and a wake-up may be
+/// early or late.
 const PUBLISH: Duration = Duration::from_millis(900);
-/// Least interval of snapshots with requests.
+/// Minimum interval of snapshots with requests.
 const PUBLISH_ASKED: Duration = Duration::from_millis(50);
-/// Longest interval of snapshots without a reader, while the graph does not change.
+/// Maximum interval of snapshots without a reader, while the graph does not change.
 const SNAPSHOT_UNREAD: Duration = Duration::from_secs(5);
-/// Longest interval of clock items to subscribers during silence.
+/// Maximum interval of clock items to subscribers during silence.
 const SLICE_SUBSCRIBED: Duration = Duration::from_millis(90);
-/// Longest time that readers wait for breakpoints in the processes that send to them.
+/// Maximum time for which readers wait for breakpoints in the processes that send to them.
 const ATTACHES_WITHIN: Duration = Duration::from_secs(5);
 const CLOCK_INTERVAL: Duration = Duration::from_millis(100);
-/// Step back of the clock that means it was set.
+/// Minimum step back of the clock which means that the clock was set.
 const SET_BACK: Duration = Duration::from_secs(1);
 
 /// The working thread ended with an error.
@@ -59,7 +59,7 @@ pub enum RunError {
     /// Capturing on this host failed.
     #[error("the capture failed")]
     Capture(#[from] CaptureError),
-    /// The rest of a capture cannot be read; packets before it are published.
+    /// The remaining part of a capture cannot be read; earlier packets are published.
     #[error("the rest of the capture is unreadable")]
     Replay(#[source] PcapError),
 }
@@ -68,19 +68,20 @@ pub enum RunError {
 pub struct Run {
     source: Source,
     observer: Observer,
-    /// Participants whose last message the kernel filter records.
+    /// Participants for which the kernel filter records the time of the last message.
     followed: BTreeSet<GuidPrefix>,
     outputs: Outputs,
     drops: DropMonitor,
     watches: Arc<Watches>,
     subscriptions: Arc<Subscriptions>,
-    /// Requests that subscriptions wait for.
+    /// Requests of subscriptions that are not in force yet.
     sample_requests: Option<Arc<Vec<SampleRequest>>>,
-    /// Requests in force whose readers wait until every message is seen, and since when.
+    /// Requests in force whose readers wait until every message is captured, and the start of this
+    /// wait.
     unconfirmed: Option<(Arc<Vec<SampleRequest>>, Instant)>,
     /// Last clock item sent to subscriptions.
     published_until: Timestamp,
-    /// When the latest snapshot was taken, and the revision of the graph in it.
+    /// Time of the latest snapshot, and the revision of the graph in it.
     taken: Option<(Instant, u64)>,
     stop: CancellationToken,
     keeper: Option<StateWriter>,
@@ -145,7 +146,7 @@ impl Run {
     ///
     /// # Errors
     ///
-    /// The source fails permanently.
+    /// Fails if the source fails permanently.
     pub fn run(mut self) -> Result<(), RunError> {
         let ended = self.work();
         self.subscriptions.end(match &ended {
@@ -232,7 +233,8 @@ impl Run {
         Ok(())
     }
 
-    /// Longest wait without requests: until the next decision of the model, or the end of a second.
+    /// Returns the maximum wait without requests: until the next decision of the model, or the end
+    /// of a second.
     fn idle_slice(&self) -> Duration {
         if let Source::Replay(_) = self.source {
             return SLICE;
@@ -243,8 +245,8 @@ impl Run {
         (next - self.source.clock()).min(SLICE_LIVE)
     }
 
-    /// Next time at which a replay has to return: for a clock item to subscriptions, or at the end
-    /// of a second. `None` if neither is needed.
+    /// Returns the next time at which a replay has to return: for a clock item to subscriptions, or
+    /// at the end of a second. `None` if neither is needed.
     fn step(&self, subscribed: bool) -> Option<Timestamp> {
         let published_until = subscribed.then(|| self.published_until + CLOCK_INTERVAL);
         let second = self.history.as_ref().map(History::due);
@@ -264,13 +266,13 @@ impl Run {
         };
         history.take(now, self.observer.measured(now));
         let latest = &self.outputs.latest;
-        // Ten minutes are a list of 600 seconds, which may have no reader.
+        // Ten minutes of history are a list of 600 seconds, which may have no reader.
         if latest.wants_past() || !matches!(self.source, Source::Live(_)) {
             latest.publish_past(history.past());
         }
     }
 
-    /// Passes new items to the outputs. Slow readers do not block it.
+    /// Passes new items to the outputs. Slow readers do not block this thread.
     fn hand_over(&mut self) {
         let now = self.source.clock();
         let output = self.observer.drain();
@@ -290,14 +292,14 @@ impl Run {
     }
 
     /// Passes changed watches and requests to the model. Returns whether every topic was matched
-    /// against them. With many topics and globs, packets are read in between, and further changes
-    /// wait.
+    /// against the lists. With many topics and globs, packets are read between the parts of this
+    /// work, and further changes wait.
     fn take_watches(&mut self) -> bool {
         if self.apply_lists() {
             if let Some(watchlist) = self.watches.take_changed() {
                 self.subscriptions.retain(watchlist.watches());
                 if let Source::Live(live) = &self.source {
-                    // Its expectations begin now, not at the last round.
+                    // The expectations of the new list begin now, not at the last round.
                     self.observer.input(Input::Time(live.clock()));
                 }
                 self.observer.input(Input::Watchlist(watchlist));
@@ -311,22 +313,23 @@ impl Run {
         self.apply_lists()
     }
 
-    /// Gives readers the retained samples of requests that are in force in the kernel, before the next
-    /// packets.
+    /// Delivers the retained samples to readers whose requests are in force in the kernel, before
+    /// the next packets.
     fn confirm_requests(&mut self) {
         if let Some(sample_requests) = self.sample_requests.take() {
             let observer = &mut self.observer;
             (self.subscriptions).in_force(&sample_requests, |request| observer.latched(request));
             self.unconfirmed = Some((Arc::clone(&sample_requests), Instant::now()));
             if sample_requests.is_empty() {
-                // Buffers of large messages are free now, and the next subscription may be far off.
+                // Buffers of large messages are free now, and the next subscription may begin much
+                // later.
                 give_back_memory();
             }
         }
     }
 
-    /// Confirms requests in force once every message is seen, or after a while. Readers report the
-    /// reason then.
+    /// Confirms requests in force once every message is captured, or after [`ATTACHES_WITHIN`].
+    /// Readers then report why messages may be missing.
     fn confirm_complete(&mut self) {
         let Some((_, since)) = self.unconfirmed else {
             return;
@@ -343,8 +346,8 @@ impl Run {
         }
     }
 
-    /// Applies new lists of watches and subscriptions to further topics. Returns whether all are
-    /// done; a replay waits for it.
+    /// Applies new lists of watches and subscriptions to further topics. Returns whether all topics
+    /// are done; a replay waits until they are.
     fn apply_lists(&mut self) -> bool {
         while !self.observer.has_applied_lists() {
             self.observer.input(Input::MoreLists);
@@ -390,7 +393,8 @@ impl Run {
         was_read || !is_current || !matches!(self.source, Source::Live(_))
     }
 
-    /// Returns the state of the agent, and reports what it has missed.
+    /// Returns the facts about the agent. Also saves changed discovery state, and records events
+    /// about losses.
     fn facts(&mut self) -> AgentFacts {
         let mut facts = self.source.facts();
         facts.subscriptions = self.subscriptions.facts();

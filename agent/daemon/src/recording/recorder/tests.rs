@@ -54,7 +54,7 @@ fn durable_publishers() -> DiscoveredTopic {
     DiscoveredTopic::from(&topic)
 }
 
-/// A publisher of `/tf_static` with stored samples.
+/// Returns a graph with a publisher of `/tf_static` that has stored samples.
 fn static_transforms() -> GraphSnapshot {
     GraphSnapshot {
         topics: vec![PublishedTopic {
@@ -79,7 +79,7 @@ fn recorder(directory: &std::path::Path, options: FilterOptions) -> Recorder<'st
     )
 }
 
-/// Recorder with a graph at its start and at its end.
+/// Creates a recorder with a graph at its start and at its end.
 fn recorder_of(
     directory: &std::path::Path,
     options: FilterOptions,
@@ -152,7 +152,7 @@ fn selected_messages_are_in_the_bag_and_missing_ones_in_the_report() {
 }
 
 #[test]
-fn a_recording_ends_at_its_size_with_the_limit_in_its_report() {
+fn a_recording_ends_at_its_maximum_size_and_reports_the_limit() {
     let directory = tempfile::tempdir().unwrap();
     let limits = crate::config::RecordingLimits {
         max_bytes: Some(10_000),
@@ -175,7 +175,7 @@ fn a_recording_ends_at_its_size_with_the_limit_in_its_report() {
 }
 
 #[test]
-fn samples_go_by_while_it_is_paused() {
+fn samples_during_a_pause_are_not_recorded() {
     let directory = tempfile::tempdir().unwrap();
     let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
     recorder.take(&sample("/a", 1)).unwrap();
@@ -192,7 +192,7 @@ fn samples_go_by_while_it_is_paused() {
 }
 
 #[test]
-fn a_topic_of_two_types_keeps_the_first_and_reports_it() {
+fn a_topic_of_two_types_is_recorded_with_the_first_and_reported() {
     let directory = tempfile::tempdir().unwrap();
     let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
     recorder.take(&sample("/a", 1)).unwrap();
@@ -218,7 +218,7 @@ fn messages_sent_before_the_recording_are_reported_unless_they_are_recorded() {
         recorder.take(&sample("/a", 2)).unwrap();
         assert_eq!(recorder.finish(None).report.sent_before.len(), expected);
     }
-    // Without any message, the topic is in the bag by its name.
+    // Without any message, the bag still names the topic.
     let directory = tempfile::tempdir().unwrap();
     let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
     let topics = [
@@ -232,7 +232,7 @@ fn messages_sent_before_the_recording_are_reported_unless_they_are_recorded() {
 }
 
 #[test]
-fn received_messages_are_on_the_disk_after_a_second_of_samples() {
+fn samples_are_written_to_the_file_after_a_second() {
     let directory = tempfile::tempdir().unwrap();
     let bag = directory.path().join("bag");
     let mut recorder = recorder(&bag, FilterOptions::everything());
@@ -293,7 +293,7 @@ fn unobserved_messages_are_counted_from_the_start_of_the_recording() {
     assert_eq!(others, [(7, 2, Some(40)), (8, 1, None)]);
 }
 
-/// A sample of the numbered writer with its QoS.
+/// Returns a sample of the numbered writer with its QoS.
 fn sample_of(name: &str, number: u32) -> Item {
     let Item::Sample(sample) = sample(name, 1) else {
         unreachable!()
@@ -310,18 +310,18 @@ fn sample_of(name: &str, number: u32) -> Item {
     Item::Sample(Arc::new(sample))
 }
 
-/// Resident memory of this process.
+/// Returns the resident memory of this process, in bytes.
 fn resident_bytes() -> u64 {
     let text = std::fs::read_to_string("/proc/self/statm").unwrap();
     text.split(' ').nth(1).unwrap().parse::<u64>().unwrap() * 4096
 }
 
 #[test]
-fn topics_and_writers_without_end_fill_a_recording_to_its_caps_and_are_counted() {
+fn topics_and_writers_beyond_the_caps_of_a_recording_are_counted() {
     const MOST_BYTES: u64 = 10 << 20;
     let directory = tempfile::tempdir().unwrap();
     let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
-    // Pages and buffers of the first use.
+    // The first samples allocate pages and buffers that are reused.
     (0..9).for_each(|number| recorder.take(&sample_of("/first", number)).unwrap());
     let before = resident_bytes();
     let topics = u32::try_from(RecordedTopics::CAP).unwrap() + 500;
@@ -350,7 +350,7 @@ fn topics_and_writers_without_end_fill_a_recording_to_its_caps_and_are_counted()
 }
 
 #[test]
-fn long_names_and_many_writers_of_one_topic_keep_within_their_caps() {
+fn long_names_and_many_writers_of_one_topic_stay_within_their_caps() {
     let directory = tempfile::tempdir().unwrap();
     let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
     for number in 0..2 * u32::try_from(RecordedWriters::CAP).unwrap() {
@@ -368,7 +368,7 @@ fn long_names_and_many_writers_of_one_topic_keep_within_their_caps() {
 }
 
 #[test]
-fn excluded_topics_without_end_leave_room_for_others() {
+fn any_number_of_excluded_topics_leaves_space_for_others() {
     let directory = tempfile::tempdir().unwrap();
     let options = FilterOptions {
         exclude_regex: Some("/excluded_.*".to_owned()),

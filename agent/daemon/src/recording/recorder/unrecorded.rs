@@ -1,5 +1,5 @@
-//! Notes in the final report about messages that were sent before, were not observed, or belong to
-//! another domain.
+//! Parts of the final report about messages that were sent before the recording, were not observed,
+//! or belong to another domain.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -9,8 +9,9 @@ use ros2probe_api::latched::Latched;
 use ros2probe_api::recording_report::OtherDomain;
 
 impl Recorder<'_> {
-    /// Notes publishers with stored samples for late joiners of which the bag has neither the first
-    /// sample nor the one that the agent keeps.
+    /// Reports topics with a durable publisher whose stored samples may be missing in the bag. They
+    /// are not missing if the bag has its first sample, or any sample while the agent retains the
+    /// last one.
     pub(super) fn note_what_was_sent_before(&mut self, graph: &GraphSnapshot) {
         let topics = graph.topics.iter();
         let mut names: Vec<String> = Vec::new();
@@ -40,7 +41,7 @@ impl Recorder<'_> {
         self.report.sent_before = names;
     }
 
-    /// Notes topics that would have been recorded if they had been visible, announced, or in this
+    /// Reports topics that would have been recorded if they had been visible, announced, or in this
     /// domain.
     pub(super) fn note_what_was_not_observed(&mut self, graph: GraphSnapshot) {
         let mut domains: BTreeMap<u32, OtherDomain> = BTreeMap::new();

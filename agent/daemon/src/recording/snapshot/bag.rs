@@ -51,7 +51,7 @@ pub(super) struct TriggerData {
     /// Name of the event that met the trigger.
     #[serde(skip_serializing_if = "Option::is_none")]
     event: Option<String>,
-    /// Id of this event.
+    /// Id of the event that met the trigger.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) event_id: Option<String>,
     /// Time of the event, RFC 3339.
@@ -69,9 +69,9 @@ pub(super) struct SnapshotBag {
     name: String,
     directory: PathBuf,
     settings: SnapshotSettings,
-    /// Bytes that the bag may have.
+    /// Maximum size of the bag, in bytes.
     bytes: u64,
-    /// Number of bags removed for it.
+    /// Number of old bags removed for this bag.
     removed: u64,
     topics: Topics,
 }
@@ -84,7 +84,7 @@ pub(super) struct Failed {
     pub(super) cause: Cause,
     pub(super) name: String,
     pub(super) reason: String,
-    /// Number of bags removed for it.
+    /// Number of old bags removed for this bag.
     pub(super) removed: u64,
 }
 
@@ -92,14 +92,14 @@ pub(super) struct Failed {
 pub(super) struct Ended {
     pub(super) cause: Cause,
     pub(super) bag: WrittenBag,
-    /// Number of bags removed for it.
+    /// Number of old bags removed for this bag.
     pub(super) removed: u64,
-    /// Error of the storage; the bag is complete up to it.
+    /// Error of the storage; the bag is complete up to the error.
     pub(super) error: Option<Error>,
 }
 
 impl Cause {
-    /// Name of the trigger, `request` or `signal`.
+    /// Returns the name of the trigger, `request` or `signal`.
     pub(super) const fn name(&self) -> &'static str {
         match self {
             Self::Request => "request",
@@ -108,7 +108,7 @@ impl Cause {
         }
     }
 
-    /// Id of the event, if an event is the cause.
+    /// Returns the id of the event, if an event is the cause.
     pub(super) fn event_id(&self) -> Option<&str> {
         match self {
             Self::Event { id, .. } => Some(id),
@@ -183,8 +183,8 @@ impl SnapshotBag {
     ///
     /// # Errors
     ///
-    /// The storage fails, or a limit of the snapshot is reached. [`Self::finish`] completes the bag
-    /// nevertheless.
+    /// Fails if the storage fails or a limit of the snapshot is reached. [`Self::finish`] completes
+    /// the bag nevertheless.
     pub(super) fn take(&mut self, item: &Item) -> Result<(), Error> {
         if let Item::Sample(sample) = item {
             let payload = sample
@@ -203,7 +203,7 @@ impl SnapshotBag {
         self.recorder.take(item)
     }
 
-    /// Removes further old bags, so that this one may have `size` bytes.
+    /// Removes further old bags, so that this bag may have `size` bytes.
     fn grow(&mut self, size: u64) -> Result<(), Error> {
         let others = self.settings.max_count;
         let space = make_space(&self.directory, &self.settings, others, size);
@@ -215,7 +215,7 @@ impl SnapshotBag {
         Ok(())
     }
 
-    /// Completes the bag. `error` is the storage error that ended it, if any.
+    /// Completes the bag. `error` is the storage error that ended the bag, if any.
     pub(super) fn finish(self, error: Option<Error>) -> Ended {
         let ended = self.recorder.finish(error);
         Ended {
@@ -250,7 +250,7 @@ fn no_space(settings: &SnapshotSettings) -> Error {
     ))
 }
 
-/// Name for a new bag, with a number if others of the same second exist.
+/// Returns a name for a new bag, with a number if bags of the same second exist.
 fn unused_name(recordings: &Recordings, snapshot: &str) -> String {
     let base = format!("{snapshot}_{}", default_name());
     let Some(directory) = recordings.directory() else {
@@ -265,7 +265,7 @@ fn unused_name(recordings: &Recordings, snapshot: &str) -> String {
     name
 }
 
-/// Recorder of an empty bag.
+/// Creates an empty bag with its recorder.
 fn recorder(
     recordings: &Recordings,
     settings: &SnapshotSettings,

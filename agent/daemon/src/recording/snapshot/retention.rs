@@ -1,5 +1,5 @@
-//! Space for the bags of one snapshot on disk. The oldest triggered bags give way to new ones;
-//! bags that a person requested stay.
+//! Space for the bags of one snapshot on disk. The oldest triggered bags are removed for new ones;
+//! requested bags are kept.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,15 +10,15 @@ use ros2probe_bag::metadata::{self, Metadata};
 use super::bag::{TRIGGER_DATA, TriggerData};
 use crate::config::SnapshotSettings;
 
-/// Largest metadata.yaml that is read.
+/// Maximum size of a metadata.yaml that is read, in bytes.
 const METADATA_BYTES: u64 = 1 << 20;
 
 /// Space for a new bag.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Space {
-    /// Bytes that the new bag may have.
+    /// Maximum size of the new bag, in bytes.
     pub(super) bytes: u64,
-    /// Number of bags that were removed for it.
+    /// Number of bags that were removed for the new one.
     pub(super) removed: u64,
 }
 
@@ -28,8 +28,8 @@ struct KeptBag {
     modified: SystemTime,
 }
 
-/// Removes the oldest triggered bags of the snapshot until the bag at `new` may have `needed` bytes.
-/// At most `others` of them remain beside it.
+/// Removes the oldest triggered bags of the snapshot until the bag at `new` may have `needed`
+/// bytes. At most `others` triggered bags remain beside it.
 pub(super) fn make_space(
     new: &Path,
     settings: &SnapshotSettings,
@@ -66,7 +66,7 @@ pub(super) fn make_space(
     }
 }
 
-/// The triggered bags of the snapshot beside `new`, and the bytes of all others.
+/// Returns the triggered bags of the snapshot, and the bytes of all its bags, each except `new`.
 fn kept(new: &Path, settings: &SnapshotSettings) -> (Vec<KeptBag>, u64) {
     let directory = new.parent().unwrap_or(new);
     let prefix = format!("{}_rosbag2_", settings.name);

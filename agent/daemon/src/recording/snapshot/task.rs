@@ -17,11 +17,12 @@ use crate::recording::sample_ring::SampleRing;
 use crate::recording::service::{Recordings, causes};
 use crate::subscriptions::{Item, Subscription};
 
-/// Longest delay of commands and events.
+/// Maximum delay of commands and events.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
-/// Longest time between an incident and its event, by which the memory reaches further back.
+/// Maximum time between an incident and its event. The memory reaches further back by this time.
 const EVENT_DELAY: Duration = Duration::from_secs(2);
-/// Longest wait for messages after an event, beyond the configured time, if the source stops.
+/// Maximum time to wait for messages after an event, beyond the configured time, if the source
+/// stops.
 const SOURCE_DELAY: Duration = Duration::from_secs(5);
 
 /// State of a snapshot's thread.
@@ -42,7 +43,8 @@ pub(super) struct SnapshotTask {
 
 struct OpenBag {
     bag: SnapshotBag,
-    /// First and last time of its messages. In a replay, both may lie ahead.
+    /// First and last time of its messages. In a replay, both times may be later than the current
+    /// message.
     since: Timestamp,
     end: Timestamp,
     deadline: Instant,
@@ -63,7 +65,7 @@ impl SnapshotTask {
         }
     }
 
-    /// Works until `stop`, then completes the open bag.
+    /// Runs until `stop`, then completes the open bag.
     pub(super) fn work(
         mut self,
         mut subscription: Subscription,
@@ -145,7 +147,7 @@ impl SnapshotTask {
         }
     }
 
-    /// Begins a bag, unless one is open or the last one is too recent.
+    /// Begins a bag, unless one is open or the last trigger is too recent.
     fn trigger(&mut self, name: &'static str, record: Record) {
         // Events of the agent have the time of this host, which differs in a replay.
         let is_of_agent = record.definition.name.starts_with("ros2probe.");
@@ -156,7 +158,7 @@ impl SnapshotTask {
             self.figures.suppressed += 1;
             return;
         }
-        // A topic without any message is not worth a bag.
+        // A bag without messages would be useless.
         if self.ring.is_empty() && self.settings.after.is_zero() {
             return;
         }
@@ -189,7 +191,7 @@ impl SnapshotTask {
         self.finish(bag, None)
     }
 
-    /// Creates a bag with the messages in memory since this time.
+    /// Creates a bag with the messages in memory that are not older than `since`.
     fn create(&mut self, cause: Cause, since: Timestamp) -> Result<SnapshotBag, Unwritten> {
         let samples = self.ring.iter().filter(|sample| sample.time >= since);
         let samples: Vec<_> = samples.map(Arc::clone).collect();
@@ -236,7 +238,7 @@ impl SnapshotTask {
     }
 
     fn report(&mut self, cause: &Cause, name: String, messages: u64, reason: Option<String>) {
-        // A client of the API gets the reason as its answer.
+        // A client of the API receives the reason in the response.
         let unasked = !matches!(cause, Cause::Request);
         if let Some(reason) = reason.as_ref().filter(|_| unasked) {
             let snapshot = self.settings.name.as_str();

@@ -166,7 +166,7 @@ impl Robot {
         });
     }
 
-    /// Numbers in each bag, by the bag's name.
+    /// Returns the sequence numbers in each bag, by the bag's name.
     fn bags(&self) -> BTreeMap<String, Vec<u64>> {
         let bags = std::fs::read_dir(self.directory.path()).unwrap();
         let bags = bags.map(|bag| bag.unwrap());
@@ -205,7 +205,7 @@ impl Robot {
     }
 }
 
-/// Sequence numbers of all messages of a bag.
+/// Returns the sequence numbers of all messages of a bag.
 fn numbers(bag: &Path) -> Vec<u64> {
     let mut numbers = Vec::new();
     let files = std::fs::read_dir(bag)
@@ -222,7 +222,7 @@ fn numbers(bag: &Path) -> Vec<u64> {
 }
 
 #[test]
-fn a_bag_holds_the_seconds_before_and_after_its_event_and_names_it() {
+fn a_bag_has_the_seconds_around_its_event_and_names_the_event() {
     let mut robot = Robot::new(settings(&["message_lost"], 3, 2));
     robot.run(100);
     let incident = robot.now;
@@ -286,7 +286,7 @@ fn an_event_ahead_of_the_messages_selects_the_same_messages() {
 }
 
 #[test]
-fn only_problems_of_the_domain_meet_a_short_name_and_every_event_meets_its_full_name() {
+fn a_short_name_matches_problems_of_the_domain_and_a_full_name_every_event() {
     let mut robot = Robot::new(settings(&["participant_lost"], 1, 0));
     robot.run(20);
     robot.lose_participant(churn::Event::Disposed, 0);
@@ -388,7 +388,7 @@ fn a_new_finding_triggers_the_snapshots_of_its_kind() {
 }
 
 #[test]
-fn a_thousand_triggers_in_a_minute_cost_bounded_disk() {
+fn a_thousand_triggers_in_a_minute_use_bounded_disk_space() {
     let limit = 200_000;
     let mut robot = Robot::new(SnapshotSettings {
         max_count: 3,
@@ -405,13 +405,13 @@ fn a_thousand_triggers_in_a_minute_cost_bounded_disk() {
     }
     robot.run(20);
     let figures = robot.shown();
-    // Each bag takes a second. The other triggers begin none.
+    // Each bag takes a second. The other triggers do not begin a bag.
     assert!((50..=60).contains(&figures.written), "{figures:?}");
     assert_eq!(figures.suppressed + figures.written, 1200, "{figures:?}");
     let bags = robot.bags();
     assert!((1..=3).contains(&bags.len()), "{:?}", bags.keys());
     assert_eq!(figures.removed + bags.len() as u64, figures.written);
-    // The newest ones remain.
+    // The newest bags remain.
     let last = bags.values().filter_map(|numbers| numbers.last()).max();
     assert!(last.is_some_and(|last| *last + 40 > robot.now));
     assert!(robot.bytes() <= limit, "{}", robot.bytes());
@@ -447,7 +447,7 @@ fn a_requested_bag_is_never_removed_for_others() {
     }
     let bags = robot.bags();
     assert!(bags.len() == 2 && bags.contains_key(&requested), "{bags:?}");
-    // Requested bags that use up the space are kept, too, and the error says what to do.
+    // Requested bags that use up the space are kept, too, and the error names the limit.
     robot.payload = 4000;
     robot.run(20);
     let mut results = (0..5).map(|_| robot.task.write_memory(Cause::Request));
@@ -484,7 +484,7 @@ fn a_bag_with_an_oversized_metadata_file_is_kept() {
 }
 
 #[test]
-fn a_bag_that_reaches_the_limit_after_its_event_keeps_what_it_has() {
+fn a_bag_that_reaches_its_limit_after_the_event_keeps_its_messages() {
     let mut robot = Robot::new(SnapshotSettings {
         max_total_bytes: 100_000,
         ..settings(&["message_lost"], 1, 60)
