@@ -23,7 +23,7 @@ pub struct Settings {
     pub histograms: bool,
     /// Whether watched topics have series per writer.
     pub per_writer: bool,
-    /// Caps; those of the start stay in force.
+    /// Caps, which never change after the start.
     pub limits: Limits,
 }
 
@@ -37,7 +37,7 @@ pub struct Reload {
 }
 
 impl Settings {
-    /// Settings of `config`.
+    /// Returns the settings of `config`.
     #[must_use]
     pub fn new(config: &Config) -> Self {
         Self {
@@ -63,13 +63,13 @@ impl SettingsCell {
         }
     }
 
-    /// Settings in force.
+    /// Returns the settings in force.
     #[must_use]
     pub fn settings(&self) -> Arc<Settings> {
         self.settings.load_full()
     }
 
-    /// Result of the last reload.
+    /// Returns the result of the last reload.
     #[must_use]
     pub fn reload(&self) -> Reload {
         **self.reload.load()

@@ -16,9 +16,9 @@ use ros2probe_capture::bell::Bell;
 use ros2probe_model::measure::history::Past;
 use ros2probe_model::report::snapshot::Snapshot;
 
-/// Age above which the state no longer describes the robot.
+/// Maximum age of a state that still describes the robot.
 const FRESH: Duration = Duration::from_secs(5);
-/// Seconds after a reading of the last seconds in which each further one is published.
+/// Number of further seconds that are published after a client has read the last seconds.
 const PAST_SECONDS: u8 = 5;
 
 /// Time for which calls inside processes are observed after the last request for them.
@@ -29,13 +29,13 @@ const CALLS_HELD: Duration = Duration::from_secs(10);
 pub struct SnapshotCell {
     state: ArcSwap<State>,
     past: ArcSwap<Past>,
-    /// How many more seconds are published for a reader of the last seconds.
+    /// Number of further seconds that are published for a reader of the last seconds.
     past_wanted: AtomicU8,
     /// Whether a reader waits for a newer state.
     asked: AtomicBool,
     /// Whether the state was read since [`Self::was_read`].
     read: AtomicBool,
-    /// When a client last needed calls inside processes.
+    /// Time at which a client last needed calls inside processes.
     calls_wanted: ArcSwapOption<Instant>,
     bell: Arc<CaptureBell>,
     publication: Notify,
@@ -49,8 +49,8 @@ pub struct CaptureBell(Option<Bell>);
 /// State published by the capture thread.
 #[derive(Clone, Debug)]
 pub struct State {
-    /// State of the robot; `None` until the first snapshot. Without readers it is renewed every few
-    /// seconds and when the graph changes, but the state of the agent each second.
+    /// State of the robot; `None` until the first snapshot. Without readers, it is renewed every
+    /// few seconds and when the graph changes, while `agent` is renewed each second.
     pub snapshot: Option<Arc<Snapshot>>,
     /// State of the agent.
     pub agent: AgentFacts,
@@ -68,8 +68,8 @@ impl CaptureBell {
         }
     }
 
-    /// Descriptor that is readable after [`Self::ring`] until [`Self::silence`]. `None` without a
-    /// socket pair.
+    /// Returns the descriptor that is readable after [`Self::ring`] until [`Self::silence`]; `None`
+    /// without a socket pair.
     #[must_use]
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
         Some(self.0.as_ref()?.descriptor())
@@ -115,7 +115,7 @@ impl SnapshotCell {
         state
     }
 
-    /// Replaces the state of the agent alone. Readers that wait for a newer state go on waiting.
+    /// Replaces the state of the agent alone. Readers that wait for a newer state continue to wait.
     pub fn publish_agent(&self, agent: AgentFacts) {
         let snapshot = self.state.load().snapshot.clone();
         self.state.store(Arc::new(State { snapshot, agent }));
@@ -160,22 +160,23 @@ impl SnapshotCell {
         self.past.store(Arc::new(past));
     }
 
-    /// Measurements of the last seconds, as of the last state that a reader waited for
-    /// ([`Self::refresh`]) or of a later one. A reader that returns every second gets each second.
+    /// Returns the measurements of the last seconds. They are at least as new as the last state
+    /// that a reader waited for ([`Self::refresh`]). A reader that calls this every second gets
+    /// each second.
     #[must_use]
     pub fn past(&self) -> Arc<Past> {
         self.past_wanted.store(PAST_SECONDS, Ordering::Relaxed);
         self.past.load_full()
     }
 
-    /// The latest state. A reader that returns every second gets a new one each time.
+    /// Returns the latest state. A reader that calls this every second gets a new state each time.
     #[must_use]
     pub fn state(&self) -> Arc<State> {
         self.read.store(true, Ordering::Relaxed);
         self.state.load_full()
     }
 
-    /// The latest state, for a reader that needs the state of the agent alone.
+    /// Returns the latest state, for a reader that needs the state of the agent alone.
     #[must_use]
     pub fn own_state(&self) -> Arc<State> {
         self.state.load_full()
@@ -187,7 +188,7 @@ impl SnapshotCell {
         self.asked.load(Ordering::Relaxed)
     }
 
-    /// Bell of the capture thread.
+    /// Returns the bell of the capture thread.
     #[must_use]
     pub const fn bell(&self) -> &Arc<CaptureBell> {
         &self.bell
@@ -230,7 +231,7 @@ pub enum Unready {
 }
 
 impl State {
-    /// State of the robot; empty until the first snapshot.
+    /// Returns the state of the robot; empty until the first snapshot.
     #[must_use]
     pub fn known(&self) -> &Snapshot {
         static NOTHING: LazyLock<Snapshot> = LazyLock::new(Snapshot::default);
@@ -280,7 +281,7 @@ mod tests {
     use ros2probe_capture::system::wait;
 
     #[test]
-    fn an_agent_is_ready_only_while_it_sees() {
+    fn an_agent_is_ready_only_while_it_captures() {
         let cell = SnapshotCell::new(SourceKind::Wire);
         let start = Instant::now();
         assert_eq!(cell.state().ready(start), Err(Unready::Starting));
@@ -312,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn an_agent_whose_cgroup_is_gone_works_and_is_not_ready() {
+    fn an_agent_whose_cgroup_was_removed_progresses_but_is_not_ready() {
         let start = Instant::now();
         let gone = "the cgroup /robot was removed".to_owned();
         let mut state = State {
@@ -328,13 +329,13 @@ mod tests {
         assert!(state.progresses(later).is_err());
         state.agent.gone = None;
         assert_eq!(state.ready(start), Ok(()));
-        // So are the figures of a part that makes no progress.
+        // A part that makes no progress has the same effect.
         let stalled = "capture.inside: its thread has made no progress for 5 s".to_owned();
         state.agent.stalled = Some(stalled.clone());
         assert_eq!(state.ready(start), Err(Unready::Unseen(stalled)));
         assert_eq!(state.progresses(start), Ok(()));
         state.agent.stalled = None;
-        // Breakpoints that are still to be set are missing as well.
+        // Breakpoints that are not set yet have the same effect.
         let pending = "capture.inside: not inspected yet".to_owned();
         state.agent.pending = Some(pending.clone());
         assert_eq!(state.ready(start), Err(Unready::Unseen(pending)));
@@ -356,7 +357,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_new_state_of_the_agent_alone_is_not_what_a_reader_waits_for() {
+    async fn new_facts_about_the_agent_alone_do_not_end_the_wait_of_a_reader() {
         let cell = SnapshotCell::new(SourceKind::Wire);
         let start = Instant::now();
         let at = |seconds| AgentFacts::new(SourceKind::Wire, start + Duration::from_secs(seconds));
@@ -381,7 +382,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_refresh_gets_the_next_state_and_waits_for_a_stuck_writer_up_to_a_timeout() {
+    async fn a_refresh_waits_for_the_next_state_up_to_its_timeout() {
         let cell = SnapshotCell::new(SourceKind::Wire);
         let writer = async {
             while !cell.is_asked() {
@@ -398,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn the_last_seconds_are_wanted_for_some_seconds_after_they_were_read() {
+    fn the_last_seconds_are_published_for_some_seconds_after_they_were_read() {
         let cell = SnapshotCell::new(SourceKind::Wire);
         assert!(!cell.wants_past());
         let _ = cell.past();
@@ -420,7 +421,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn asking_rings_the_bell_until_it_is_heard() {
+    async fn a_request_rings_the_bell_until_it_is_silenced() {
         let cell = SnapshotCell::new(SourceKind::Wire);
         let rings = || {
             let listener = cell.bell().descriptor().unwrap();

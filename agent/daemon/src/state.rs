@@ -2,7 +2,7 @@
 //! the same directory (`watches`).
 //!
 //! JSON files are replaced as a whole: new file, fsync, rename, fsync of the directory. A power
-//! failure therefore leaves the old or the new one. A separate thread writes, so that the capture
+//! failure therefore leaves the old or the new file. A separate thread writes, so that the capture
 //! never waits. No failure here ends the agent: an unreadable file is moved aside, and a full disk
 //! is counted and logged once. Each agent needs its own directory.
 
@@ -34,13 +34,13 @@ const FORM: Form<Document> = Form {
 const FILE: &str = "discovery.json";
 /// Name of the file while it is written.
 const NEW_FILE: &str = "discovery.json.new";
-/// Largest file accepted, in bytes.
+/// Maximum size of the file, in bytes.
 const MAX_BYTES: u64 = 64 << 20;
-/// Least time between two writes.
+/// Minimum time between two writes.
 const PERIOD: Duration = Duration::from_secs(3);
 /// Time after a failure until the next attempt, if nothing has changed.
 const RETRY_INTERVAL: Duration = Duration::from_secs(10);
-/// Longest wait for the file system at the agent's end.
+/// Maximum time to wait for the file system when the agent ends.
 pub(crate) const ENDING: Duration = Duration::from_secs(10);
 const POLL: Duration = Duration::from_millis(5);
 const BOOT_ID: &str = "/proc/sys/kernel/random/boot_id";
@@ -49,13 +49,13 @@ const BOOT_ID: &str = "/proc/sys/kernel/random/boot_id";
 #[derive(Debug)]
 pub struct StateDirectory {
     path: PathBuf,
-    /// Holds the lock; its fsync makes renames durable.
+    /// Descriptor that holds the lock; its fsync makes renames durable.
     directory: File,
     writes: AtomicU64,
     failures: AtomicU64,
 }
 
-/// The state directory cannot be opened.
+/// Why the state directory cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum StateError {
     /// The directory is unusable.
@@ -79,10 +79,10 @@ pub enum StateError {
 pub enum Loaded {
     /// No file exists.
     Nothing,
-    /// The file belongs to another boot of this host. Its participants are gone or on another host,
-    /// and process ids, from which Fast DDS derives GUIDs, are reused.
+    /// The file belongs to another boot of this host. Its participants have ended or are on another
+    /// host, and process ids, from which Fast DDS derives GUIDs, are reused.
     AnotherBoot,
-    /// State of the last agent.
+    /// State of the previous agent.
     Known(Memory),
     /// A newer version wrote the file; it must not be overwritten.
     Newer(Newer),
@@ -157,7 +157,7 @@ pub struct StateWriter {
     inbox: SyncSender<Memory>,
     thread: JoinHandle<()>,
     done: Arc<Done>,
-    /// Last revision handed over, and its time.
+    /// Last revision passed to the thread, and its time.
     handed: Option<(u64, Instant)>,
 }
 
@@ -175,17 +175,17 @@ pub struct StateFacts {
     pub writes: u64,
     /// Failed writes.
     pub failures: u64,
-    /// Time since which the file system has not answered, if that is long.
+    /// Time for which the file system has not answered, if it is unusually long.
     pub stalled: Option<Duration>,
 }
 
 impl StateDirectory {
-    /// Opens and locks an existing directory. It need not be writable: state in a full or read-only
-    /// directory is still read.
+    /// Opens and locks an existing directory. The directory need not be writable: state in a full
+    /// or read-only directory is still read.
     ///
     /// # Errors
     ///
-    /// The directory does not exist, cannot be entered, or is used by another agent.
+    /// Fails if the directory does not exist, cannot be entered, or is used by another agent.
     pub fn open(path: &Path) -> Result<Self, StateError> {
         let unusable = |source| StateError::Unusable {
             path: path.to_path_buf(),
@@ -202,9 +202,10 @@ impl StateDirectory {
             }
             Err(TryLockError::Error(error)) => return Err(unusable(error)),
         }
-        // Otherwise nothing could be read from it or written to it.
+        // This fails for a directory that cannot be entered, where nothing could be read or
+        // written.
         fs::metadata(path.join(".")).map_err(unusable)?;
-        // Left by an agent that was killed during a write.
+        // An agent that was killed during a write leaves this file.
         let _ = fs::remove_file(path.join(NEW_FILE));
         Ok(Self {
             path: path.to_path_buf(),
@@ -214,13 +215,13 @@ impl StateDirectory {
         })
     }
 
-    /// Path of the directory.
+    /// Returns the path of the directory.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Reads the state of the last agent. Invalid files are moved aside.
+    /// Reads the state of the previous agent. Invalid files are moved aside.
     #[must_use]
     pub fn load(&self) -> Loaded {
         match self.read(&FORM) {
@@ -233,7 +234,7 @@ impl StateDirectory {
     }
 
     /// Reads a document of any known version. An invalid file is moved aside; the file of a newer
-    /// version stays in place for it.
+    /// version stays in place for that version.
     pub(crate) fn read<T>(&self, form: &Form<T>) -> Found<T> {
         let file = form.file;
         let path = self.path.join(file);
@@ -250,7 +251,7 @@ impl StateDirectory {
         let version = match serde_json::from_slice::<Version>(&bytes) {
             Ok(Version { version }) => version,
             Err(error) => match begins_with_version(&bytes) {
-                // Too large or not JSON here, but a newer version may be able to read it.
+                // The file is too large or not JSON, but a newer version may be able to read it.
                 Some(version) if version > known => version,
                 _ if is_whole => return self.set_aside(file, error.to_string()),
                 _ => return self.set_aside(file, format!("it is larger than {MAX_BYTES} bytes")),
@@ -316,7 +317,8 @@ pub(crate) fn from_json<T: DeserializeOwned>(bytes: &[u8]) -> serde_json::Result
     serde_json::from_slice(bytes)
 }
 
-/// Version at the start of a file; all versions begin with it. `None` if it is unreadable.
+/// Returns the version at the start of a file, which is there in all versions; `None` if it is
+/// unreadable.
 fn begins_with_version(bytes: &[u8]) -> Option<u32> {
     let rest = bytes.strip_prefix(b"{\"version\":")?;
     let digits = rest.iter().take_while(|byte| byte.is_ascii_digit());
@@ -343,7 +345,7 @@ fn write_new(path: &Path, document: &impl Serialize) -> io::Result<()> {
     file.sync_all()
 }
 
-/// Boot id of the kernel. Empty if it is unavailable.
+/// Returns the boot id of the kernel; empty if it is unavailable.
 fn boot() -> String {
     let boot = fs::read_to_string(BOOT_ID).unwrap_or_default();
     boot.trim().to_owned()
@@ -354,7 +356,7 @@ impl StateWriter {
     ///
     /// # Errors
     ///
-    /// The thread cannot be started.
+    /// Fails if the thread cannot be started.
     pub fn start(directory: Arc<StateDirectory>) -> io::Result<Self> {
         let target = Arc::clone(&directory);
         Self::start_with(directory, move |memory| target.write(memory))
@@ -380,7 +382,7 @@ impl StateWriter {
         })
     }
 
-    /// Returns whether the state at `revision` is to be handed over now.
+    /// Returns whether the state at `revision` should be passed to [`Self::keep`] now.
     #[must_use]
     pub fn wants(&self, revision: u64, now: Instant) -> bool {
         let is_failing = self.done.is_failing.load(Ordering::Relaxed);
@@ -390,8 +392,8 @@ impl StateWriter {
         })
     }
 
-    /// Hands over the state without blocking. While a write is in progress, a later state replaces
-    /// it.
+    /// Passes the state to the thread without blocking. If an earlier state still waits, this one
+    /// is dropped, and a later call passes a newer state.
     pub fn keep(&mut self, memory: Memory, revision: u64, now: Instant) {
         match self.inbox.try_send(memory) {
             Ok(()) => self.handed = Some((revision, now)),
@@ -413,7 +415,7 @@ impl StateWriter {
         let Self { inbox, thread, .. } = self;
         let mut last = Some(memory);
         while let Some(memory) = last.take() {
-            // Other errors: the thread has panicked, which is in the log.
+            // Any other error means that the thread has panicked, which is in the log.
             if let Err(TrySendError::Full(memory)) = inbox.try_send(memory)
                 && Instant::now() < deadline
             {
@@ -425,7 +427,7 @@ impl StateWriter {
         join_until(thread, deadline)
     }
 
-    /// Counters of all writes to the directory, watches of clients included.
+    /// Returns the counters of all writes to the directory, including the watches of clients.
     #[must_use]
     pub fn facts(&self) -> StateFacts {
         StateFacts {
@@ -436,8 +438,8 @@ impl StateWriter {
     }
 }
 
-/// Waits until the thread has ended, at most until then. Returns whether it has. If it has panicked,
-/// the panic is in the log.
+/// Waits until the thread has ended, but at most until `deadline`. Returns whether it has ended. If
+/// it has panicked, the panic is in the log.
 pub(crate) fn join_until(thread: JoinHandle<()>, deadline: Instant) -> bool {
     while !thread.is_finished() {
         if Instant::now() >= deadline {

@@ -33,10 +33,10 @@ use tokio_util::sync::CancellationToken;
 
 use crate::logging::Log;
 
-/// Polling interval of readiness until the agent is ready, and of the watchdog from then on.
+/// Polling intervals of readiness until the agent is ready, and of the watchdog afterwards.
 const STARTING_TICK: Duration = Duration::from_millis(100);
 const TICK: Duration = Duration::from_secs(2);
-/// Time for answers in progress and for the working thread's last round.
+/// Maximum time for answers in progress and for the working thread's last round.
 const DRAIN: Duration = Duration::from_secs(3);
 
 /// Supervisor of an agent.
@@ -56,7 +56,7 @@ pub(crate) struct Supervisor {
     pub(crate) ros2_daemon: Option<Ros2Daemon>,
 }
 
-/// Bound listeners that do not answer yet.
+/// Bound listeners that do not answer requests yet.
 pub(crate) struct Surfaces {
     pub(crate) metrics: Option<Server>,
     pub(crate) control: api::Server,
@@ -74,7 +74,7 @@ struct Signals {
     terminate: Signal,
     interrupt: Signal,
     hangup: Signal,
-    /// Writes all snapshots.
+    /// SIGUSR1, which writes all snapshots.
     snapshot: Signal,
 }
 
@@ -181,7 +181,7 @@ impl Supervisor {
         if drained && worker.thread.join().is_err() {
             tracing::error!("the working thread panicked while shutting down");
         }
-        // After the working thread, whose last state is exported.
+        // The exporter ends after the working thread, whose last state is exported.
         if let Some(exporter) = self.exporter.take() {
             exporter.finish().await;
         }
@@ -276,7 +276,7 @@ fn ticks(period: Duration) -> Interval {
     ticks
 }
 
-/// Mistakes, one a line.
+/// Returns the mistakes, one per line.
 fn mistakes(error: &ConfigError) -> Vec<String> {
     let mut text = error.to_string();
     let mut cause = std::error::Error::source(error);
@@ -305,7 +305,7 @@ impl Responder {
         let (report, ended) = oneshot::channel();
         let thread = std::thread::Builder::new().name("http".to_owned());
         privilege::spawn(Role::Serve, thread, move || {
-            // An agent that fails to start, or prints a report, answers nothing.
+            // An agent that fails to start, or prints a report, answers no requests.
             if let Ok(surfaces) = begins.blocking_recv() {
                 let _ = report.send(surfaces.answer());
             }
@@ -323,7 +323,7 @@ impl Responder {
 impl Surfaces {
     /// Answers requests until the agent stops.
     fn answer(self) -> Result<()> {
-        // Capabilities belong to threads: those of this one are verified, too.
+        // Capabilities belong to threads, so those of this thread are verified, too.
         let _: (Unprivileged, Unprivileged) = (self.powerless, Unprivileged::verify()?);
         // Blocking threads create bags for clients; the unit allows 32 threads in total.
         let runtime = tokio::runtime::Builder::new_current_thread()
@@ -380,7 +380,7 @@ impl Worker {
         })
     }
 
-    /// Works until the capture ends.
+    /// Runs until the capture ends.
     pub(crate) fn finish(self, run: Run) -> Result<()> {
         let ended = self.begin(run).ended.blocking_recv();
         Ok(ended.map_err(|_| anyhow!("the working thread panicked"))??)
@@ -425,7 +425,7 @@ impl Watchdog {
         for event in self.sight.check(&ready, state.agent.attached_anew, now) {
             events.record(event);
         }
-        // A restart cannot restore a missing target.
+        // A missing target does not stop the watchdog, since a restart cannot restore it.
         if state.progresses(now).is_err() || (ready.is_err() && !self.ready) {
             return false;
         }

@@ -1,7 +1,8 @@
 //! All watched topics: those of the configuration, of the command line, and of clients at run time.
 //!
 //! Each pattern and domain has one entry; the configuration takes precedence. The capture thread
-//! reads the latest merged list from a slot and is woken on changes. No thread waits for it.
+//! reads the latest merged list from a slot and is woken on changes. No thread waits for the
+//! capture thread.
 
 mod persistence;
 
@@ -53,13 +54,13 @@ pub struct InForce {
 pub enum Done {
     /// It was added.
     Added,
-    /// It replaced one with other settings.
+    /// It replaced a watch with other settings.
     Replaced,
     /// The same watch exists already.
     Unchanged,
 }
 
-/// A change of the watches was refused.
+/// Why a change of the watches was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum Refused {
     /// The configuration or the command line has this watch; clients cannot override it.
@@ -106,7 +107,7 @@ struct Lists {
 }
 
 impl Origin {
-    /// Name in the API.
+    /// Returns the name in the API.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -116,7 +117,7 @@ impl Origin {
         }
     }
 
-    /// Name within a sentence.
+    /// Returns the name within a sentence.
     #[must_use]
     pub const fn phrase(self) -> &'static str {
         match self {
@@ -128,14 +129,14 @@ impl Origin {
 }
 
 impl InForce {
-    /// All watches: of the configuration, of the command line, then of clients in order of their
-    /// addition.
+    /// Returns all watches: of the configuration, of the command line, then of clients in order of
+    /// their addition.
     #[must_use]
     pub fn entries(&self) -> &[Entry] {
         &self.entries
     }
 
-    /// The watches without their origins.
+    /// Returns the watches without their origins.
     #[must_use]
     pub fn watchlist(&self) -> &Watchlist {
         &self.watchlist
@@ -149,7 +150,7 @@ impl InForce {
         patterns.filter(|pattern| pattern.contains('*'))
     }
 
-    /// The watch with this pattern and domain. `None` if it does not exist.
+    /// Returns the watch with this pattern and domain; `None` if it does not exist.
     #[must_use]
     pub fn find(&self, pattern: &str, domain_id: Option<u32>) -> Option<&Entry> {
         let place = self.watchlist.position(pattern, domain_id.map(DomainId))?;
@@ -162,7 +163,7 @@ impl Watches {
     ///
     /// # Errors
     ///
-    /// There are too many watches or globs.
+    /// Fails if there are too many watches or globs.
     pub fn new(
         limits: Arc<LimitFigures>,
         events: Arc<EventLog>,
@@ -193,11 +194,12 @@ impl Watches {
         Ok(watches)
     }
 
-    /// Restores watches that clients of the last agent had added. Returns how many did not fit.
+    /// Restores watches that clients of the previous agent had added. Returns the number of watches
+    /// that did not fit.
     ///
     /// # Errors
     ///
-    /// There are too many globs; nothing changes.
+    /// Fails if there are too many globs; then nothing changes.
     pub fn restore(&self, watches: Vec<Watch>) -> Result<usize, Refused> {
         let in_force = self.in_force();
         let mut room = self.cap().saturating_sub(in_force.entries().len());
@@ -232,10 +234,10 @@ impl Watches {
     ///
     /// # Errors
     ///
-    /// The thread cannot be started.
+    /// Fails if the thread cannot be started.
     pub fn keep_in(&self, directory: Arc<StateDirectory>) -> io::Result<()> {
         let keeper = WatchWriter::start(directory)?;
-        // Only the first one is ever used.
+        // Only the first directory is used.
         let _ = self.keeper.set(keeper);
         Ok(())
     }
@@ -258,7 +260,7 @@ impl Watches {
     ///
     /// # Errors
     ///
-    /// There would be too many watches or globs; nothing changes.
+    /// Fails if there would be too many watches or globs; then nothing changes.
     pub fn configure(&self, watches: Vec<Watch>) -> Result<(), Refused> {
         self.change(|lists, _| {
             lists.configured = watches.into_iter().map(Arc::new).collect();
@@ -271,7 +273,7 @@ impl Watches {
     ///
     /// # Errors
     ///
-    /// It exists with other settings, or there is no room.
+    /// Fails if it exists with other settings, or if a limit would be exceeded.
     pub fn add(&self, watch: Watch) -> Result<Done, Refused> {
         self.put(watch, false)
     }
@@ -280,7 +282,8 @@ impl Watches {
     ///
     /// # Errors
     ///
-    /// The configuration has it with other settings, or there is no room.
+    /// Fails if the configuration or the command line has it with other settings, or if a limit
+    /// would be exceeded.
     pub fn replace(&self, watch: Watch) -> Result<Done, Refused> {
         self.put(watch, true)
     }
@@ -289,7 +292,7 @@ impl Watches {
     ///
     /// # Errors
     ///
-    /// The watch does not exist, or is not a client's.
+    /// Fails if the watch does not exist, or if no client added it.
     pub fn remove(&self, pattern: &str, domain_id: Option<u32>) -> Result<(), Refused> {
         self.change(|lists, in_force| {
             match in_force.find(pattern, domain_id) {
@@ -311,13 +314,13 @@ impl Watches {
         Ok(())
     }
 
-    /// Watches in force.
+    /// Returns the watches in force.
     #[must_use]
     pub fn in_force(&self) -> Arc<InForce> {
         self.in_force.load_full()
     }
 
-    /// For the capture thread: the watches, if they changed since the last call.
+    /// For the capture thread: returns the watches, if they changed since the last call.
     #[must_use]
     pub fn take_changed(&self) -> Option<Arc<Watchlist>> {
         self.unread.swap(None)
@@ -430,7 +433,7 @@ mod tests {
     use crate::snapshot_cell::SnapshotCell;
 
     #[test]
-    fn of_two_clients_that_add_the_same_watch_at_once_one_comes_second() {
+    fn of_two_clients_that_add_the_same_watch_only_one_succeeds() {
         let watches = Watches::new(
             Arc::new(LimitFigures::new(Default::default())),
             Arc::new(EventLog::new()),

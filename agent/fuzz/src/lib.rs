@@ -1,8 +1,8 @@
 //! Bodies of the fuzz targets: plain functions, so that the tests run them too, over the committed
 //! seeds and all their truncations (`agent/cli/tests/surface/fuzz_seeds.rs`).
 //!
-//! Each reads its bytes as the agent does and asserts what must hold for any bytes: it never
-//! panics, delivers nothing that was not there, ends, and stays at its end.
+//! Each function reads its bytes as the agent does, and asserts what must hold for any bytes. A
+//! reader never panics, returns nothing that is not in its input, ends, and stays at its end.
 
 use std::fs;
 use std::io::{Cursor, Write as _};
@@ -37,10 +37,10 @@ use ros2probe_wire::walk::{self, Envelope};
 use ros2probe_wire::{Expansion, Timestamp};
 use zerocopy::FromBytes as _;
 
-/// Length of the block's header, and of a frame's with its address.
+/// Lengths of a block's header, and of a frame's header with its address.
 const BLOCK_HEADER: usize = 48;
 const FRAME_HEADER: usize = 48;
-/// Most packets read: a compressed capture may be of any length.
+/// Maximum number of packets read: a compressed capture may have any length.
 const PACKETS: u64 = 10_000;
 
 /// Reads a capture file, through reassembly and walk.
@@ -63,7 +63,7 @@ pub fn capture(bytes: &[u8]) {
     assert!(matches!(reader.next_packet(), Ok(None)));
 }
 
-/// Reads a message of a viewer. An accepted message has no more ids than its text has room for.
+/// Reads a message of a viewer. An accepted message has no more ids than fit into its text.
 pub fn viewer(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else {
         return;
@@ -76,7 +76,7 @@ pub fn viewer(bytes: &[u8]) {
     }
 }
 
-/// Reads a request of the `ros2` command line. An accepted one has no more text than the request.
+/// Reads a request of the `ros2` command line. An accepted call has no more text than the request.
 pub fn ros2_daemon(bytes: &[u8]) {
     let Ok(Call { method, arguments }) = call::parse(bytes) else {
         return;
@@ -185,7 +185,7 @@ pub fn definition(bytes: &[u8]) {
             assert!((1..=lines).contains(&mistake.line), "{mistake} of {lines}");
         }
         match Definition::parse_idl(name(), text) {
-            // Its text is equivalent.
+            // The text of the definition is equivalent.
             Ok(read) => assert_eq!(Definition::parse(name(), &read.text), Ok(read)),
             Err(mistake) => assert!((1..=lines).contains(&mistake.line), "{mistake} of {lines}"),
         }
@@ -203,7 +203,7 @@ pub fn definition(bytes: &[u8]) {
     }
 }
 
-/// Types as which payloads are read; the first byte chooses one.
+/// Types with which payloads are decoded; the first byte selects one.
 static TYPES: LazyLock<Vec<MessageType>> = LazyLock::new(|| {
     macro_rules! text {
         ($name:literal) => {
@@ -281,8 +281,8 @@ pub fn message(bytes: &[u8]) {
     }
 }
 
-/// Reads a condition, a line break, and the message on which it is evaluated, which [`message`]
-/// reads.
+/// Reads a condition, a line break, and the message on which the condition is evaluated, in the
+/// form that [`message`] reads.
 pub fn filter(bytes: &[u8]) {
     let mut parts = bytes.splitn(2, |byte| *byte == b'\n');
     let (Some(condition), Some(rest)) = (parts.next(), parts.next()) else {
@@ -313,7 +313,7 @@ pub fn filter(bytes: &[u8]) {
 }
 
 /// Reads a bag of one file. The first byte chooses the file's name, the next two are the length of
-/// its metadata.yaml, little-endian; 0 means that it has none.
+/// its metadata.yaml, little-endian; 0 means that the bag has none.
 pub fn bag_file(bytes: &[u8]) {
     let Some(([choice, low, high], rest)) = bytes.split_first_chunk::<3>() else {
         return;
@@ -338,7 +338,7 @@ pub fn bag_file(bytes: &[u8]) {
     assert_eq!(report.files.len(), 1);
     let of_file = &report.files[0];
     assert!(!path.with_extension("mcap.part").exists());
-    // A completed bag is complete: a second run reports the same.
+    // A second run on the completed bag reports the same.
     reported(directory);
     let again = reindex(directory, Expansion::Limited).expect("what was written");
     assert_eq!(again.metadata.message_count, report.metadata.message_count);
@@ -352,7 +352,7 @@ pub fn bag_file(bytes: &[u8]) {
     }
 }
 
-/// Reads everything that can be reported of a bag or a file.
+/// Reads everything that can be reported about a bag or a file.
 fn reported(path: &Path) {
     let Ok(opened) = Bag::open(path, Expansion::Limited) else {
         return;
@@ -383,8 +383,8 @@ pub fn library(bytes: &[u8]) {
     }
 }
 
-/// Passes inputs to the model as a source does. Each has a kind, the time since the previous one in
-/// 10 ms, a length (little-endian), and that many bytes.
+/// Passes inputs to the model as a source does. Each input has a kind, the time since the previous
+/// one in units of 10 ms, a length (little-endian), and that many bytes.
 pub fn model(bytes: &[u8]) {
     const START: u64 = 1_795_143_000_000_000_000;
     const STEP: u64 = 10_000_000;
@@ -510,7 +510,7 @@ fn brought(observer: &mut Observer, kind: u8, now: u64, content: &[u8]) {
     }
 }
 
-/// Collects the datagrams in frames.
+/// Reassembles the datagrams in frames.
 struct Inside(Reassembly);
 
 impl Default for Inside {

@@ -20,13 +20,13 @@ use ros2probe_model::observe::observer::Observer;
 
 /// Interval of progress reports on a terminal.
 const PROGRESS: Duration = Duration::from_secs(1);
-/// Gap between packets that the replay skips in one step.
+/// Minimum gap between packets that the replay skips in one step.
 const FAR: Duration = Duration::from_secs(3600);
 
 /// Polling interval of requests while a replay is paused.
 const PAUSE_POLL: Duration = Duration::from_millis(5);
 
-/// Creates both ends of a pause, which lasts until it is resumed.
+/// Creates a pause point and its control, which ends the pause.
 #[must_use]
 pub fn pause_at(at: Option<CaptureTime>) -> (PausePoint, ReplayControl) {
     let (resume, resumed) = mpsc::channel();
@@ -45,7 +45,7 @@ pub fn pause_at(at: Option<CaptureTime>) -> (PausePoint, ReplayControl) {
 pub struct PausePoint {
     /// Time of the pause. `None` means the beginning.
     at: Option<CaptureTime>,
-    /// Receives the time of the next pause; `None` resumes for the rest of the capture.
+    /// Receives the time of the next pause; `None` resumes without another pause.
     resumed: mpsc::Receiver<Option<CaptureTime>>,
     is_reported: bool,
     /// Number of pauses so far.
@@ -99,12 +99,12 @@ pub struct Replay {
     progress: Option<Instant>,
     until: Option<CaptureTime>,
     pause: Option<PausePoint>,
-    /// Whether the replay ends before the capture.
+    /// Whether the replay ended before the end of the capture.
     cut: bool,
     finished: bool,
 }
 
-/// Facts about a packet; its bytes are in `bytes`.
+/// A packet that was read but is not due yet.
 struct Waiting {
     time: Timestamp,
     link: Link,
@@ -118,7 +118,7 @@ impl Replay {
     ///
     /// # Errors
     ///
-    /// The file cannot be read, is not a capture, or has an unsupported link layer.
+    /// Fails if the file cannot be read, is not a capture, or has an unsupported link layer.
     pub fn open(
         path: &Path,
         expansion: Expansion,
@@ -148,7 +148,7 @@ impl Replay {
         })
     }
 
-    /// Ends at this time, as if the capture ended there.
+    /// Makes the replay end at this time, as if the capture ended there.
     #[must_use]
     pub fn until(self, until: Option<CaptureTime>) -> Self {
         Self { until, ..self }
@@ -163,7 +163,7 @@ impl Replay {
         }
     }
 
-    /// Pauses at some time until it is resumed.
+    /// Makes the replay pause at this point until it is resumed.
     #[must_use]
     pub fn pausing_at(self, pause: PausePoint) -> Self {
         Self {
@@ -177,7 +177,7 @@ impl Replay {
     ///
     /// # Errors
     ///
-    /// The rest of the capture cannot be read; earlier packets have been delivered.
+    /// Fails if the remaining capture cannot be read; earlier packets have been delivered.
     pub fn poll(
         &mut self,
         timeout: Duration,
@@ -254,7 +254,7 @@ impl Replay {
         Ok(())
     }
 
-    /// Reads one packet ahead, into the memory of the last one.
+    /// Reads one packet ahead, into the memory of the previous one.
     fn next(&mut self) -> Result<(), PcapError> {
         let memory = self.waiting.take().map(|waiting| waiting.bytes);
         match self.reader.next_packet() {
@@ -345,13 +345,13 @@ impl Replay {
             .is_some_and(|(time, pause)| pause.at_or_behind(time, beginning) && !pause.is_reported)
     }
 
-    /// Returns whether the replay is paused and its waiter knows it.
+    /// Returns whether the replay is paused and the pause was reported.
     #[must_use]
     pub fn is_paused(&self) -> bool {
         self.pause.as_ref().is_some_and(|pause| pause.is_reported)
     }
 
-    /// Reports the pause to its waiter.
+    /// Reports the pause to [`ReplayControl`].
     pub fn report_pause(&mut self) {
         if let Some(pause) = &mut self.pause {
             pause.is_reported = true;
@@ -359,14 +359,14 @@ impl Replay {
         }
     }
 
-    /// Time of the end, if it was before that of the capture.
+    /// Returns the time at which the replay ended, if that was before the end of the capture.
     #[must_use]
     pub fn cut(&self) -> Option<Timestamp> {
         self.cut.then_some(self.clock)
     }
 
-    /// Clock of the capture: the time of its last packet, which advances during the wait for the
-    /// next one.
+    /// Returns the clock of the capture: the time of its last packet, which advances during the
+    /// wait for the next one.
     #[must_use]
     pub const fn clock(&self) -> Timestamp {
         self.clock
@@ -378,13 +378,13 @@ impl Replay {
         self.finished
     }
 
-    /// Start of the capture. `None` until its first packet is read.
+    /// Returns the start of the capture; `None` until its first packet is read.
     #[must_use]
     pub const fn began(&self) -> Option<Timestamp> {
         self.began
     }
 
-    /// Fraction of the file that was read, 0 to 1. `None` if unknown.
+    /// Returns the fraction of the file that was read, 0 to 1; `None` if unknown.
     #[must_use]
     pub fn part_read(&self) -> Option<f64> {
         if self.finished {
@@ -393,25 +393,25 @@ impl Replay {
         self.reader.part_read()
     }
 
-    /// Number of packets and of their bytes so far.
+    /// Returns the number of packets and of their bytes so far.
     #[must_use]
     pub const fn progress(&self) -> (u64, u64) {
         (self.packets, self.bytes)
     }
 
-    /// Packets of unsupported link layers, by the layer's number.
+    /// Returns the number of packets of unsupported link layers, by the layer's number.
     #[must_use]
     pub const fn unsupported(&self) -> &BTreeMap<u16, u64> {
         &self.unsupported
     }
 
-    /// Connections of Zenoh, for their counters.
+    /// Returns the connections of Zenoh, for their counters.
     #[must_use]
     pub const fn streams(&self) -> &Streams {
         self.decoder.streams()
     }
 
-    /// Reassembly of fragments, for its counters.
+    /// Returns the reassembly of fragments, for its counters.
     #[must_use]
     pub const fn reassembly(&self) -> &Reassembly {
         self.decoder.reassembly()
@@ -434,7 +434,7 @@ impl Replay {
     }
 }
 
-/// Real duration of a tenth of a second of the capture.
+/// Returns the real duration of a tenth of a second of the capture.
 fn step(speed: Speed) -> Duration {
     match speed {
         Speed::Max => Duration::ZERO,
@@ -448,7 +448,7 @@ impl PausePoint {
     }
 }
 
-/// Time of the capture when a packet is `delay` away.
+/// Returns the time of the capture at which the packet of `time` is still `delay` away.
 fn before(time: Timestamp, delay: Duration, speed: Speed) -> Timestamp {
     let Speed::Times(factor) = speed else {
         return time;

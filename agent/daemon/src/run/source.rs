@@ -1,6 +1,6 @@
 //! Source of packets: this host or a capture, with one interface for the working thread.
 //!
-//! It also logs its abilities at the start, and adds facts about itself to each snapshot.
+//! The source also logs its abilities at the start, and adds facts about itself to each snapshot.
 
 use std::os::fd::BorrowedFd;
 use std::path::PathBuf;
@@ -27,7 +27,7 @@ use ros2probe_model::facts::bounded::Declared as _;
 use ros2probe_model::observe::observer::Observer;
 use ros2probe_model::report::snapshot::TableFacts;
 
-/// Why no calls are observed on demand.
+/// Reason why calls are not observed on demand.
 const INSIDE_RESTS: &str = "capture.inside is auto, and no client needs calls";
 
 /// Source of packets.
@@ -38,19 +38,19 @@ pub enum Source {
     Replay(Box<Replay>),
 }
 
-/// Abilities of an agent with these settings on this host. The taps are opened briefly, and read
-/// nothing.
+/// Returns the facts about an agent with these settings on this host. The taps are opened briefly,
+/// but nothing is read.
 ///
 /// # Errors
 ///
-/// A capability is missing, or the kernel refuses.
+/// Fails if a capability is missing or the kernel refuses.
 pub fn probe(settings: &CaptureSettings) -> Result<AgentFacts, CaptureError> {
     let live = LiveSource::open(settings, Limits::default())?;
     Ok(Source::Live(Box::new(live)).facts())
 }
 
 impl Source {
-    /// Kind of the source.
+    /// Returns the kind of the source.
     #[must_use]
     pub const fn kind(&self) -> SourceKind {
         match self {
@@ -134,7 +134,7 @@ impl Source {
         }
     }
 
-    /// Time at which a replay ended before its capture. `None` if it did not.
+    /// Returns the time at which a replay ended before its capture; `None` if it did not.
     pub(super) fn cut(&self) -> Option<Timestamp> {
         match self {
             Self::Live(_) => None,
@@ -150,7 +150,7 @@ impl Source {
         }
     }
 
-    /// Returns whether a replay is paused. Its state is current at no cost.
+    /// Returns whether a replay is paused. The state of a paused replay is always current.
     pub(super) fn is_paused(&self) -> bool {
         match self {
             Self::Live(_) => false,
@@ -263,7 +263,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
     };
     AgentFacts {
         interfaces,
-        // Bytes are not events; copied ones are counted below.
+        // Bytes are not events; copied bytes are counted below.
         filter_events: counters
             .iter()
             .filter(|(counter, _)| *counter != Counter::CapturedBytes)
@@ -294,7 +294,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
     }
 }
 
-/// Batches and gaps that were read in connections of Zenoh.
+/// Returns the number of batches and gaps that were read in connections of Zenoh.
 fn streams(live: &LiveSource) -> [(&'static str, u64); 2] {
     let (mut batches, mut gaps) = (0, 0);
     for counters in live.streams().map(Streams::counters) {
@@ -304,7 +304,7 @@ fn streams(live: &LiveSource) -> [(&'static str, u64); 2] {
     [("zenoh_read_batches", batches), ("zenoh_read_gaps", gaps)]
 }
 
-/// State of the source inside processes. `None` if it is off.
+/// Returns the state of the source inside processes; `None` if it is off.
 fn inside(live: &LiveSource) -> Option<InsideSourceFacts> {
     let Some(facts) = live.inside() else {
         let reason = live.without_inside()?;
@@ -334,13 +334,13 @@ fn inside(live: &LiveSource) -> Option<InsideSourceFacts> {
     })
 }
 
-/// Why a part of the source is stalled; `None` if it is not.
+/// Returns why a part of the source is stalled; `None` if it is not.
 fn stalled(live: &LiveSource, part: Part) -> Option<String> {
     let stalled = live.stalled().find(|stalled| stalled.part == part);
     stalled.map(|stalled| stalled.to_string())
 }
 
-/// State of exact mode for each library. Empty if it is off.
+/// Returns the state of exact mode for each library; empty if exact mode is off.
 fn exact(live: &LiveSource) -> Vec<ExactFacts> {
     let whole = |reason: &str| ExactFacts {
         library: String::new(),
@@ -353,7 +353,7 @@ fn exact(live: &LiveSource) -> Vec<ExactFacts> {
         library: library.path.display().to_string(),
         refused: library.refused,
     });
-    // Containers have the same library by the same name.
+    // Several containers may have the same library at the same path.
     let mut libraries: Vec<_> = libraries.collect();
     libraries.sort();
     libraries.dedup();
@@ -387,11 +387,11 @@ fn shared_memory(facts: shm::Facts) -> SharedMemoryFacts {
     }
 }
 
-/// Abilities of this source on this kernel and with this configuration.
+/// Returns the abilities of this source on this kernel and with this configuration.
 fn abilities(live: &LiveSource) -> Vec<Ability> {
     let mut abilities = kind(live).abilities().to_vec();
     if live.host().is_some_and(|host| host.detached().is_some()) {
-        // Its sockets, processes and their shared memory have gone with the cgroup.
+        // The sockets, the processes and their shared memory ended with the cgroup.
         return match live.is_on_the_wire() {
             true => vec![Ability::Forwarded],
             false => Vec::new(),
@@ -420,7 +420,7 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
     abilities
 }
 
-/// Missing abilities that this source gains while a client needs them.
+/// Returns missing abilities that this source gains while a client needs them.
 fn on_demand(live: &LiveSource) -> Vec<Ability> {
     let is_exact_resting = live.exact().is_some_and(|facts| facts.is_resting);
     let is_inside_resting = live.inside().is_some_and(|facts| facts.is_resting);
@@ -431,7 +431,7 @@ fn on_demand(live: &LiveSource) -> Vec<Ability> {
     abilities.into_iter().flatten().collect()
 }
 
-/// Reasons for missing abilities, if known.
+/// Returns the reasons for missing abilities, if known.
 fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
     if let Some(reason) = live.host().and_then(HostTap::detached) {
         let able = abilities(live);
@@ -454,7 +454,7 @@ fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
     blind
 }
 
-/// Abilities that depend on tracepoints of the kernel.
+/// Returns the abilities that depend on tracepoints of the kernel.
 fn tracepoint_abilities(live: &LiveSource) -> Option<[(Ability, &Result<(), Reason>); 3]> {
     let abilities = live.host()?.abilities()?;
     Some([

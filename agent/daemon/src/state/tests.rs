@@ -19,7 +19,7 @@ fn unusable(directory: &StateDirectory) -> String {
 }
 
 #[test]
-fn a_written_file_is_read_again_and_no_other_file_is_left() {
+fn a_written_file_is_read_back_and_no_other_file_remains() {
     let (place, directory) = directory();
     assert_eq!(directory.load(), Loaded::Nothing);
     directory.write(Memory::default()).unwrap();
@@ -32,7 +32,7 @@ fn a_written_file_is_read_again_and_no_other_file_is_left() {
 }
 
 #[test]
-fn a_file_that_is_no_state_is_kept_aside_and_a_new_one_begun() {
+fn an_invalid_state_file_is_moved_aside_and_a_new_one_is_written() {
     let (place, directory) = directory();
     let file = place.path().join(FILE);
     directory.write(Memory::default()).unwrap();
@@ -55,7 +55,7 @@ fn a_file_that_is_no_state_is_kept_aside_and_a_new_one_begun() {
 }
 
 #[test]
-fn a_file_of_a_newer_agent_stays_in_place_even_if_cut_or_of_another_form() {
+fn a_file_of_a_newer_agent_stays_in_place_even_if_it_is_unreadable() {
     let (place, directory) = directory();
     let file = place.path().join(FILE);
     for (newer, version) in [
@@ -124,7 +124,7 @@ fn every_version_is_read_by_its_own_reader_and_the_last_one_is_written() {
 }
 
 #[test]
-fn a_file_of_the_first_agent_is_read() {
+fn a_file_in_the_first_format_is_read() {
     let (place, directory) = directory();
     let boot = boot();
     // Format before shared memory and requested QoS were added.
@@ -154,7 +154,7 @@ fn state_of_an_earlier_boot_is_not_used() {
 }
 
 #[test]
-fn half_a_file_of_an_agent_that_was_killed_is_neither_believed_nor_kept() {
+fn a_partial_file_of_a_killed_agent_is_ignored_and_removed() {
     let (place, directory) = directory();
     directory.write(Memory::default()).unwrap();
     drop(directory);
@@ -188,7 +188,7 @@ fn a_link_in_place_of_a_state_file_is_neither_read_nor_written_through() {
 }
 
 #[test]
-fn a_pipe_or_a_directory_in_place_of_a_state_file_does_not_hang_the_start() {
+fn a_pipe_or_a_directory_in_place_of_a_state_file_does_not_block_the_start() {
     let (place, directory) = directory();
     let path = place.path().join(FILE);
     mknodat(CWD, &path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
@@ -214,7 +214,7 @@ fn two_agents_do_not_share_a_directory() {
 }
 
 #[test]
-fn a_disk_that_cannot_be_written_costs_a_counter_and_nothing_else() {
+fn a_failed_write_of_the_state_is_counted_and_retried() {
     let (place, directory) = directory();
     // A file cannot replace a directory.
     let obstacle = place.path().join(NEW_FILE);
@@ -242,7 +242,7 @@ fn a_disk_that_cannot_be_written_costs_a_counter_and_nothing_else() {
 }
 
 #[test]
-fn a_file_system_that_never_answers_delays_neither_the_agent_nor_its_end() {
+fn a_hanging_file_system_delays_neither_the_agent_nor_its_end() {
     let (_place, directory) = directory();
     let (answer, answers) = std::sync::mpsc::channel::<()>();
     let keeper = StateWriter::start_with(Arc::new(directory), move |_| {
@@ -260,7 +260,7 @@ fn a_file_system_that_never_answers_delays_neither_the_agent_nor_its_end() {
 }
 
 #[test]
-fn a_file_of_more_bytes_than_are_read_is_kept_aside() {
+fn a_state_file_beyond_the_maximum_size_is_moved_aside() {
     let (place, directory) = directory();
     let file = File::create(place.path().join(FILE)).unwrap();
     file.set_len(MAX_BYTES + 1).unwrap();

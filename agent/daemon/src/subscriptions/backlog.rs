@@ -1,8 +1,8 @@
 //! Items that wait for one reader, in order of arrival and by topic.
 //!
-//! For eviction, the oldest sample of the topic with most bytes goes first: a few point clouds
-//! rather than all of `/tf`. Clock items go before any sample, since a later one supersedes them.
-//! This module has no limit and counts no losses.
+//! The oldest sample of the topic with most bytes is evicted first: a few point clouds rather than
+//! all of `/tf`. Clock items are evicted before any sample, since a later one supersedes them. This
+//! module has no limit and counts no losses.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap, VecDeque};
@@ -16,7 +16,7 @@ use ros2probe_model::facts::names::DdsName;
 #[derive(Debug, Default)]
 pub(super) struct Backlog {
     entries: BTreeMap<u64, Entry>,
-    /// Arrival numbers assigned so far.
+    /// Number of arrival numbers assigned so far.
     places: u64,
     bytes: usize,
     topics: HashMap<Key, Held>,
@@ -43,7 +43,7 @@ struct Held {
 }
 
 impl Backlog {
-    /// Bytes that wait.
+    /// Returns the size of all entries in bytes.
     pub(super) const fn bytes(&self) -> usize {
         self.bytes
     }
@@ -68,7 +68,7 @@ impl Backlog {
         self.entries.insert(place, entry);
     }
 
-    /// The newest entry, if any. Callers must not change its topic or size.
+    /// Returns the newest entry, if any. Callers must not change its topic or size.
     pub(super) fn last_mut(&mut self) -> Option<&mut Item> {
         let last = self.entries.last_entry()?;
         Some(&mut last.into_mut().item)
@@ -84,7 +84,7 @@ impl Backlog {
     pub(super) fn sacrifice(&mut self) -> Option<Item> {
         let time = self.times.front().copied();
         let place = time.or_else(|| {
-            // Among equals, the one that has waited longest.
+            // Among topics with equal bytes, the one with the oldest entry is chosen.
             let rank = |held: &&Held| (held.bytes, Reverse(held.places.front().copied()));
             self.topics
                 .values()
@@ -96,7 +96,7 @@ impl Backlog {
         self.remove(place)
     }
 
-    /// Removes the first entry of all or of its topic.
+    /// Removes an entry, which must be the oldest of its topic, or the oldest without a topic.
     fn remove(&mut self, place: u64) -> Option<Item> {
         let entry = self.entries.remove(&place)?;
         self.bytes -= entry.bytes;

@@ -61,14 +61,14 @@ struct Queue {
     waiting: Backlog,
     /// Samples dropped since the last report to the reader.
     dropped: Bounded<QueueLosses, Vec<Missed>>,
-    /// Number of those that are not counted yet.
+    /// Number of dropped samples that are not counted yet.
     uncounted: u64,
     end: Option<&'static str>,
-    /// Whether the reader has gone.
+    /// Whether the stream was closed by the reader, or after its end.
     closed: bool,
 }
 
-/// Bytes that count towards the sum of all queues while this lives.
+/// Bytes that count towards the sum of all queues until this value is dropped.
 #[derive(Debug)]
 pub(super) struct QueuedBytes {
     queued: Arc<AtomicUsize>,
@@ -76,7 +76,7 @@ pub(super) struct QueuedBytes {
 }
 
 impl QueuedBytes {
-    /// For one payload, which may be in several queues.
+    /// Counts the bytes of one payload, which may be in several queues.
     pub(super) fn new(queued: &Arc<AtomicUsize>, bytes: usize) -> Arc<Self> {
         queued.fetch_add(bytes, Ordering::Relaxed);
         Arc::new(Self {
@@ -133,7 +133,7 @@ impl Channel {
         Arc::clone(&self.wanted().selection)
     }
 
-    /// Replaces the selection by topics. The retained samples of those in `fresh` are due.
+    /// Replaces the selection by `topics`. The retained samples of the topics in `fresh` are due.
     pub(super) fn select(&self, topics: BTreeSet<TopicKey>, mut fresh: BTreeSet<TopicKey>) {
         let mut wanted = self.wanted();
         let due = wanted.fresh.take();
@@ -155,7 +155,8 @@ impl Channel {
         }
     }
 
-    /// Removes the topics whose retained samples are due, if `in_force` is the latest selection.
+    /// Removes and returns the topics whose retained samples are due, if `in_force` is the latest
+    /// selection.
     pub(super) fn take_fresh(&self, in_force: &Arc<Selection>) -> Option<Arc<Selection>> {
         let mut wanted = self.wanted();
         let is_latest = Arc::ptr_eq(&wanted.selection, in_force);
@@ -174,8 +175,8 @@ impl Channel {
         }
     }
 
-    /// Queues a sample. During a replay, this and the other calls wait for room until the reader
-    /// goes or the agent ends.
+    /// Queues a sample. During a replay, every method that queues an item waits for space until the
+    /// reader closes or the agent ends.
     pub(super) fn sample(
         &self,
         sample: &Arc<Sample>,
@@ -219,7 +220,7 @@ impl Channel {
         self.wake();
     }
 
-    /// Marks that the reader has gone.
+    /// Closes the stream for its reader.
     pub(super) fn close(&self) {
         let mut queue = self.lock();
         queue.closed = true;
@@ -234,7 +235,7 @@ impl Channel {
         self.changed.notify_all();
     }
 
-    /// Bytes that could be evicted.
+    /// Returns the number of bytes that could be evicted.
     pub(super) fn droppable(&self) -> usize {
         match self.request.overflow {
             Overflow::DropOldest => self.bytes.load(Ordering::Relaxed),
@@ -253,7 +254,7 @@ impl Channel {
         std::mem::take(&mut self.lock().uncounted)
     }
 
-    /// Removes the next item for the reader. `None` if nothing waits.
+    /// Removes the next item for the reader; returns `None` if the queue is empty.
     pub(super) fn take(&self) -> Option<Item> {
         let mut queue = self.lock();
         self.pop(&mut queue)
@@ -307,7 +308,7 @@ impl Channel {
         Some(Item::End(reason))
     }
 
-    /// Locks the queue; during a replay, after it has room.
+    /// Locks the queue; during a replay, waits before that until `bytes` fit.
     fn wait_for_room(&self, bytes: usize, stop: &CancellationToken) -> MutexGuard<'_, Queue> {
         let mut queue = self.lock();
         while self.request.overflow == Overflow::Wait
@@ -335,7 +336,7 @@ impl Channel {
         {}
     }
 
-    /// Evicts an entry. Returns `false` if the queue has no more samples.
+    /// Evicts an entry. Returns `false` if the queue is empty.
     fn drop_one(&self, queue: &mut Queue) -> bool {
         let Some(item) = queue.waiting.sacrifice() else {
             return false;
@@ -382,7 +383,7 @@ impl Queue {
         } else if let Some(missed) = self.dropped.push(missed)
             && let Some(last) = self.dropped.last_mut()
         {
-            // Their writers are no longer reported, only their number.
+            // For further writers, only the number of losses is reported.
             last.samples += missed.samples;
         }
     }

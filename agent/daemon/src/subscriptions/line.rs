@@ -10,7 +10,7 @@ use ros2probe_wire::{RtpsDuration, Timestamp};
 use super::Item;
 use ros2probe_model::facts::dispatch::{Missed, MissedReason, Offered, Sample, Topic};
 
-/// Line of an item.
+/// Returns the line of an item.
 #[must_use]
 pub fn line(item: &Item) -> Line {
     match item {
@@ -69,7 +69,7 @@ fn missed(missed: &Missed) -> samples::Missed {
     }
 }
 
-/// Offered QoS of a writer in the form of a line.
+/// Returns the offered QoS of a writer in the form of a line.
 #[must_use]
 pub fn offered(offered: &Offered) -> samples::Offered {
     samples::Offered {
@@ -93,7 +93,7 @@ fn offered_qos(qos: &Qos) -> OfferedQos {
     }
 }
 
-/// QoS policies; unknown words stay unknown.
+/// Parses QoS policies; an unknown word becomes an unknown value.
 #[must_use]
 pub fn qos(words: &OfferedQos) -> Qos {
     let unknown = u32::MAX;
@@ -154,7 +154,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_line_is_read_as_it_was_written() {
+    fn every_line_is_read_back_unchanged() {
         let lines = [
             (
                 Line::Clock(Clock { time_ns: 17 }),

@@ -1,5 +1,5 @@
-//! Subscriptions to single samples, for streams of the API and recordings. A subscription keeps its
-//! topics captured while it lives; dropping it ends that.
+//! Subscriptions to single samples, for streams of the API and recordings. The topics of a
+//! subscription are captured until it is dropped.
 //!
 //! A queue connects the capture thread with each reader; bytes are bounded per queue and in total.
 //! A slow reader loses the oldest samples of the topics that hold most of its queue, and receives
@@ -33,24 +33,24 @@ pub use ros2probe_model::facts::selection::{
     Candidate, Choice, ChoiceError, Depth, Selection, TopicKey,
 };
 
-/// Most regular expressions in all subscriptions together.
+/// Maximum number of regular expressions in all subscriptions together.
 const MAX_REGEXES: usize = 16;
 
 /// Caps on subscriptions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Caps {
-    /// Most open subscriptions.
+    /// Maximum number of open subscriptions.
     pub subscriptions: usize,
-    /// Most bytes in all queues.
+    /// Maximum number of bytes in all queues.
     pub bytes: usize,
 }
 
-/// Treatment of samples for which a queue has no room.
+/// Treatment of samples that do not fit into a queue.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Overflow {
     /// Evict the oldest samples of the topic with most bytes; the reader receives their number.
     DropOldest,
-    /// The source waits for the reader. Only for replays.
+    /// The source waits for the reader. This is only for replays.
     Wait,
 }
 
@@ -71,7 +71,7 @@ pub struct Request {
     pub label: String,
 }
 
-/// A subscription was refused.
+/// Why a subscription was refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Refused {
     /// The number of open subscriptions is at its limit.
@@ -89,9 +89,10 @@ pub enum Refused {
 /// Item for a reader.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Item {
-    /// A message. Each arrives once, those of a reliable writer in order.
+    /// A message. Each message arrives once, and messages of a reliable writer arrive in order.
     Sample(Arc<Sample>),
-    /// All items up to this time have been delivered; at least ten times a second.
+    /// All items up to this time have been delivered. This item is sent at least ten times a
+    /// second.
     Clock(Timestamp),
     /// Messages that will not be delivered.
     Missed(Missed),
@@ -171,7 +172,7 @@ impl Subscriptions {
     ///
     /// # Errors
     ///
-    /// There are too many subscriptions, or too many patterns.
+    /// Fails if there are too many subscriptions or too many patterns.
     pub fn open(self: &Arc<Self>, request: Request) -> Result<Subscription, Refused> {
         let mut opened = self.changing();
         let channels = self.channels.load();
@@ -208,7 +209,7 @@ impl Subscriptions {
         })
     }
 
-    /// Figures of all subscriptions.
+    /// Returns the figures of all subscriptions.
     #[must_use]
     pub fn facts(&self) -> SubscriptionFacts {
         let missed = self.missed.each_ref();
@@ -229,13 +230,13 @@ impl Subscriptions {
         !self.channels.load().is_empty()
     }
 
-    /// For the capture thread: all requests, if they changed since the last call.
+    /// For the capture thread: returns all requests, if they changed since the last call.
     #[must_use]
     pub fn take_changed(&self) -> Option<Arc<Vec<SampleRequest>>> {
         self.unread.swap(None)
     }
 
-    /// For the capture thread: requests the messages for which these watches ask.
+    /// For the capture thread: requests the messages that watches with `retain: last` need.
     pub fn retain(&self, watches: &[Arc<Watch>]) {
         let changing = self.changing();
         let retained = Arc::new(retained::sample_requests(watches));
@@ -247,8 +248,9 @@ impl Subscriptions {
         drop(changing);
     }
 
-    /// For the capture thread: these requests are in force in model and kernel. Readers first receive
-    /// the last messages, which `latched` returns, of topics that are new to them.
+    /// For the capture thread: handles requests that are now in force in the model and the kernel.
+    /// Readers first receive the last messages of topics that are new to them, which `latched`
+    /// returns.
     pub fn in_force(
         &self,
         sample_requests: &[SampleRequest],
@@ -276,7 +278,8 @@ impl Subscriptions {
         }
     }
 
-    /// For the capture thread: marks these requests as in force, with every message seen from now on.
+    /// For the capture thread: marks these requests as in force, with every message captured from
+    /// now on.
     pub fn confirm(&self, sample_requests: &[SampleRequest]) {
         for channel in self.channels.load().iter() {
             if sample_requests
@@ -393,12 +396,12 @@ impl Subscriptions {
     }
 }
 
-/// Waits until a subscription is in force.
+/// Handle to wait until a subscription is in force.
 #[derive(Clone, Debug)]
 pub struct Begin(Arc<Channel>);
 
 impl Begin {
-    /// Waits as [`Subscription::in_force`]. One task may wait at a time.
+    /// Waits like [`Subscription::in_force`]. Only one task may wait at a time.
     pub async fn in_force(&self, timeout: Duration) -> bool {
         let known = self.0.in_force();
         tokio::time::timeout(timeout, known).await.is_ok()
@@ -406,17 +409,17 @@ impl Begin {
 }
 
 impl Subscription {
-    /// Waits for the next item. `None` after [`Item::End`].
+    /// Waits for the next item; returns `None` after [`Item::End`].
     pub async fn next(&mut self) -> Option<Item> {
         self.channel.next().await
     }
 
-    /// The next item, if one is queued.
+    /// Returns the next item, if one is queued.
     pub fn try_next(&mut self) -> Option<Item> {
         self.channel.take()
     }
 
-    /// Waits for the next item for at most `timeout`. `None` also after [`Item::End`].
+    /// Waits for the next item for at most `timeout`; also returns `None` after [`Item::End`].
     pub fn next_blocking(&mut self, timeout: Duration) -> Option<Item> {
         self.channel.next_blocking(timeout)
     }
@@ -433,13 +436,13 @@ impl Subscription {
         Begin(Arc::clone(&self.channel))
     }
 
-    /// Selection of topics.
+    /// Returns the selection of topics.
     #[must_use]
     pub fn selection(&self) -> Arc<Selection> {
         self.channel.selection()
     }
 
-    /// Replaces the selection by these topics. The retained samples of those in `fresh` follow.
+    /// Replaces the selection by `topics`. The retained samples of the topics in `fresh` follow.
     pub fn select(&self, topics: BTreeSet<TopicKey>, fresh: BTreeSet<TopicKey>) {
         let changing = self.all.changing();
         self.channel.select(topics, fresh);
@@ -451,7 +454,7 @@ impl Subscription {
 
 impl Drop for Subscription {
     fn drop(&mut self) {
-        // First of all, so that a source that waits for this reader continues.
+        // The channel is closed first, so that a source that waits for this reader continues.
         self.channel.close();
         self.all.close(self.channel.id());
     }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use crate::config::{Retain, Watch};
 use ros2probe_model::facts::selection::{Depth, SampleRequest, Selection};
 
-/// First id of these requests; lower ids belong to readers.
+/// First id of the requests of watches; lower ids belong to readers.
 const FIRST: u64 = 1 << 63;
 
 /// Returns the requests of these watches.
@@ -29,7 +29,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn watches_that_ask_for_the_last_message_request_all_of_their_topics() {
+    fn a_watch_with_retain_last_requests_all_of_its_topics() {
         let asking = Watch {
             retain: Retain::Last,
             ..Watch::named("/maps/**").unwrap()

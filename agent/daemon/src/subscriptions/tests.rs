@@ -99,7 +99,7 @@ fn each_reader_gets_its_samples_and_payloads_only_on_request() {
 }
 
 #[test]
-fn a_slow_reader_loses_the_oldest_and_gets_their_number_before_the_rest() {
+fn a_slow_reader_loses_the_oldest_samples_and_receives_their_number_first() {
     let all = subscriptions(caps());
     let mut slow = all
         .open(request(Depth::Payloads, 4 * 1256, Overflow::DropOldest))
@@ -118,7 +118,7 @@ fn a_slow_reader_loses_the_oldest_and_gets_their_number_before_the_rest() {
 }
 
 #[test]
-fn a_full_queue_loses_the_oldest_of_the_topic_that_holds_most_of_it() {
+fn a_full_queue_drops_the_oldest_samples_of_its_largest_topic() {
     let all = subscriptions(caps());
     let mut slow = all
         .open(request(Depth::Payloads, 20_000, Overflow::DropOldest))
@@ -156,7 +156,7 @@ fn a_full_queue_loses_the_oldest_of_the_topic_that_holds_most_of_it() {
 }
 
 #[test]
-fn one_message_larger_than_the_queue_takes_nothing_else_with_it() {
+fn a_message_larger_than_the_queue_evicts_no_other_message() {
     let all = subscriptions(caps());
     let mut slow = all
         .open(request(Depth::Payloads, 2000, Overflow::DropOldest))
@@ -171,7 +171,7 @@ fn one_message_larger_than_the_queue_takes_nothing_else_with_it() {
 }
 
 #[test]
-fn all_queues_together_keep_their_cap_and_a_payload_counts_once() {
+fn all_queues_together_stay_within_their_cap_and_a_payload_counts_once() {
     let all = subscriptions(Caps {
         subscriptions: 12,
         bytes: 10_000,
@@ -196,7 +196,7 @@ fn all_queues_together_keep_their_cap_and_a_payload_counts_once() {
 }
 
 #[test]
-fn on_a_replay_the_source_waits_for_the_reader_and_not_for_one_that_has_gone() {
+fn during_a_replay_the_source_waits_for_readers_but_not_for_closed_ones() {
     let all = subscriptions(caps());
     let mut reader = all
         .open(request(Depth::Payloads, 3000, Overflow::Wait))
@@ -229,7 +229,7 @@ fn on_a_replay_the_source_waits_for_the_reader_and_not_for_one_that_has_gone() {
 }
 
 #[test]
-fn a_waiting_source_goes_on_when_the_agent_ends() {
+fn a_waiting_source_continues_when_the_agent_ends() {
     let all = subscriptions(caps());
     let _reader = all
         .open(request(Depth::Payloads, 1, Overflow::Wait))
@@ -247,7 +247,7 @@ fn a_waiting_source_goes_on_when_the_agent_ends() {
 }
 
 #[test]
-fn dropping_a_subscription_closes_its_interest_and_makes_room_for_another() {
+fn dropping_a_subscription_ends_its_request_and_allows_another_one() {
     let all = subscriptions(caps());
     let open = || all.open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest));
     let mut readers: Vec<_> = (0..4).map(|_| open().unwrap()).collect();
@@ -296,7 +296,7 @@ fn patterns_of_all_subscriptions_together_are_bounded() {
 }
 
 #[tokio::test]
-async fn a_reader_is_woken_gets_the_end_and_then_nothing() {
+async fn a_reader_receives_its_items_then_the_end_and_then_none() {
     let all = subscriptions(caps());
     let mut reader = all
         .open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest))
@@ -326,7 +326,7 @@ async fn a_reader_is_woken_gets_the_end_and_then_nothing() {
 }
 
 #[test]
-fn losses_of_more_writers_than_are_reported_apart_count_with_the_last_one() {
+fn losses_of_further_writers_count_with_the_last_reported_writer() {
     const WRITERS: u64 = 2 * QueueLosses::CAP as u64;
     let all = subscriptions(caps());
     let mut slow = all

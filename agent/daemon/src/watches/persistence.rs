@@ -29,7 +29,7 @@ const FORM: Form<Document> = Form {
     file: FILE,
     readers: &[(VERSION, from_json)],
 };
-/// Changes within this time are written once.
+/// Delay of a write, so that changes within this time are written together.
 const WRITE_DELAY: Duration = Duration::from_millis(50);
 /// Time after a failure until the next attempt.
 const AGAIN: Duration = Duration::from_secs(5);
@@ -39,7 +39,7 @@ const AGAIN: Duration = Duration::from_secs(5);
 pub enum LoadedWatches {
     /// No file exists.
     Nothing,
-    /// These watches.
+    /// The saved watches.
     These(Vec<Watch>),
     /// A newer version wrote the file; it must not be overwritten.
     Newer(Newer),
@@ -88,7 +88,7 @@ pub(super) struct WatchWriter {
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
-/// Mailbox of the thread.
+/// Mailbox of the writing thread.
 #[derive(Debug, Default)]
 struct Mailbox {
     pending: Mutex<Pending>,
@@ -104,7 +104,7 @@ struct Pending {
     is_closed: bool,
 }
 
-/// Reads watches of the last agent's clients. An invalid file is moved aside.
+/// Reads the watches that clients of the previous agent added. An invalid file is moved aside.
 #[must_use]
 pub fn load(directory: &StateDirectory) -> LoadedWatches {
     let document = match directory.read(&FORM) {
@@ -142,7 +142,7 @@ enum InvalidList {
     Watches(usize),
     #[error("it has {0}")]
     Globs(#[from] ManyGlobs),
-    /// The pattern of a watch matches no topic.
+    /// The pattern of a watch is invalid.
     #[error("`{topic}` {error}")]
     Pattern { topic: String, error: PatternError },
     #[error(transparent)]
@@ -227,13 +227,13 @@ impl WatchWriter {
         })
     }
 
-    /// Hands over the list to save, without blocking.
+    /// Passes the list to the writing thread, without blocking.
     pub(super) fn keep(&self, watches: Vec<Arc<Watch>>) {
         self.mailbox.pending().latest = Some(watches);
         self.mailbox.changed.notify_one();
     }
 
-    /// Returns whether the last write succeeded, and the present one takes no longer than usual.
+    /// Returns whether the last write succeeded, and the current one takes no longer than usual.
     pub(super) fn works(&self) -> bool {
         !self.mailbox.pending().is_failing && self.mailbox.progress.stalled().is_none()
     }
@@ -267,7 +267,7 @@ impl Mailbox {
             self.progress.rest();
             let mut pending = self.pending();
             let failed_before = mem::replace(&mut pending.is_failing, written.is_err());
-            // At the end, a failing disk is not retried forever.
+            // At the end, a failed write is not retried.
             if pending.is_failing && !pending.is_closed {
                 pending.latest.get_or_insert(watches);
             }
@@ -285,7 +285,7 @@ impl Mailbox {
         }
     }
 
-    /// Waits for the next list to write. `None` at the end.
+    /// Waits for the next list to write; returns `None` at the end.
     fn next(&self) -> Option<Vec<Arc<Watch>>> {
         let mut pending = self.pending();
         if pending.is_failing && !pending.is_closed {
@@ -337,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn added_watches_are_read_again_unchanged() {
+    fn saved_watches_are_read_back_unchanged() {
         let (_place, directory) = directory();
         assert_eq!(load(&directory), LoadedWatches::Nothing);
         let keeper = WatchWriter::start(Arc::clone(&directory)).unwrap();
@@ -348,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_no_list_of_watches_is_kept_aside() {
+    fn an_invalid_list_of_watches_is_moved_aside() {
         let (place, directory) = directory();
         let file = place.path().join(FILE);
         let document = Document {
@@ -381,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn a_saved_list_whose_globs_take_too_long_is_kept_aside() {
+    fn a_saved_list_with_too_costly_globs_is_moved_aside() {
         let (place, directory) = directory();
         let glob = |number| format!("/{}_{number}/**", "a*".repeat(7));
         let globs = (0..1000).map(|number| Watch::named(&glob(number)).unwrap());
@@ -399,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn watches_of_a_newer_agent_are_left_for_it_and_those_of_the_first_one_are_read() {
+    fn a_list_of_a_newer_agent_is_kept_and_one_in_the_first_format_is_read() {
         let (place, directory) = directory();
         let file = place.path().join(FILE);
         let newer = r#"{"version":2,"watches":[{"topic":"/points","colour":"red"}]}"#;
@@ -429,7 +429,7 @@ mod tests {
     }
 
     #[test]
-    fn a_disk_that_cannot_be_written_ends_nothing_and_is_tried_again() {
+    fn a_failed_write_of_watches_is_retried() {
         let (place, directory) = directory();
         // A file cannot replace a directory.
         let obstacle = place.path().join("watches.json.new");
