@@ -625,7 +625,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_unique_and_carry_type_and_unit() {
+    fn metric_names_are_unique_and_contain_type_and_unit() {
         let mut names: Vec<&str> = CATALOGUE.iter().map(|metric| metric.name).collect();
         names.sort_unstable();
         names.dedup();
@@ -657,7 +657,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stem_and_its_suffixes_make_the_name() {
+    fn a_family_name_lacks_the_suffix_of_its_samples() {
         assert_eq!(TOPIC_BYTES.family(), "ros2_topic_bytes");
         assert_eq!(TOPIC_MESSAGES.family(), "ros2_topic_messages");
         assert_eq!(

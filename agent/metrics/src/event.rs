@@ -45,7 +45,7 @@ pub struct Record {
     pub number: u64,
     /// Time of the event, by the source's clock.
     pub at: Timestamp,
-    /// Time of its record, by this host's clock.
+    /// Time at which it was recorded, by this host's clock.
     pub observed: Timestamp,
     /// Definition of the event.
     pub definition: &'static Definition,
@@ -74,7 +74,7 @@ pub enum Value {
 pub struct Batch {
     /// Number of events overwritten before they were read.
     pub lagged: u64,
-    /// Events after those.
+    /// Events after the overwritten ones.
     pub records: Vec<Record>,
     /// Number of the last event, after which to continue.
     pub last: u64,
@@ -91,7 +91,7 @@ pub trait EventSource: fmt::Debug + Send + Sync {
 }
 
 impl Severity {
-    /// `SeverityText`.
+    /// Returns the `SeverityText`.
     #[must_use]
     pub const fn text(self) -> &'static str {
         match self {
@@ -101,7 +101,7 @@ impl Severity {
         }
     }
 
-    /// `SeverityNumber`.
+    /// Returns the `SeverityNumber`.
     #[must_use]
     pub const fn number(self) -> u8 {
         match self {
@@ -131,7 +131,7 @@ impl Definition {
         }
     }
 
-    /// Replaces the severity of a relief.
+    /// Sets the severity of events that report the end of a condition or an intended change.
     #[must_use]
     pub const fn relief(self, relief: Severity) -> Self {
         Self { relief, ..self }
@@ -139,22 +139,22 @@ impl Definition {
 }
 
 impl Record {
-    /// Value of an attribute. `None` if it is absent.
+    /// Returns the value of an attribute; `None` if it is absent.
     #[must_use]
     pub fn attribute(&self, name: &str) -> Option<&Value> {
         let mut attributes = self.attributes.iter();
         attributes.find_map(|(key, value)| (*key == name).then_some(value))
     }
 
-    /// Time of the event in RFC 3339 format.
+    /// Returns the time of the event in RFC 3339 format.
     #[must_use]
     pub fn time(&self) -> String {
         rfc3339(self.at)
     }
 }
 
-/// UTC with nanoseconds (RFC 3339, 5.6). Days are counted from 1 March of the year 0, so that the
-/// leap day is the last day of a year.
+/// Formats UTC with nanoseconds (RFC 3339, 5.6). Days are counted from 1 March of the year 0, so
+/// that the leap day is the last day of a year.
 fn rfc3339(at: Timestamp) -> String {
     let (days, rest) = (
         at.whole_seconds() / SECONDS_OF_A_DAY,
@@ -187,7 +187,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn times_are_utc_with_leap_years() {
+    fn times_are_formatted_as_utc_with_leap_years() {
         for (seconds, expected) in [
             (0, "1970-01-01T00:00:00.000000000Z"),
             (951_782_399, "2000-02-28T23:59:59.000000000Z"),

@@ -1,9 +1,9 @@
 //! Exemplars of chains on an OpenMetrics page.
 //!
 //! `prometheus-client` 0.26 encodes exemplars, but only its own histograms create them: the fields
-//! of its `Exemplar` are private, and it has no constructor. The collector therefore hands them to
-//! the writer of the page, which appends each to the line of its bucket. This module goes once the
-//! library has a constructor.
+//! of its `Exemplar` are private, and it has no constructor. The collector therefore passes
+//! exemplars to the writer of the page, which appends each one to the line of its bucket. This
+//! module can be removed once the library has a constructor.
 
 use std::collections::VecDeque;
 use std::fmt::{self, Write};
@@ -16,7 +16,7 @@ use ros2probe_model::derive::chain::exemplar::{Exemplar, Exemplars};
 const FAMILIES: [&str; 2] = [CHAIN_LATENCY.name, HOP_LATENCY.name];
 const NANOSECONDS: u64 = 1_000_000_000;
 
-/// Exemplars of the histograms of [`FAMILIES`] whose lines are not written yet, in their order.
+/// Exemplars of the histograms of [`FAMILIES`] whose lines are not written yet, in order.
 #[derive(Debug, Default)]
 pub(crate) struct Waiting(Mutex<VecDeque<(Exemplars, usize)>>);
 
@@ -73,7 +73,7 @@ impl<'a, W: Write> ExemplarLines<'a, W> {
     }
 }
 
-/// A page ends with a line break.
+/// A page must end with a line break, since only complete lines are written.
 impl<W: Write> Write for ExemplarLines<'_, W> {
     fn write_str(&mut self, text: &str) -> fmt::Result {
         for part in text.split_inclusive('\n') {

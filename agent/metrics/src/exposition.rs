@@ -2,7 +2,7 @@
 //! `prometheus-client` writes both from one collector over the agent's figures; its registry holds
 //! no series.
 //!
-//! Classic text stays because some clients request nothing else: VictoriaMetrics
+//! Classic text remains because some clients request nothing else: VictoriaMetrics
 //! (`lib/promscrape/client.go`), Netdata (`src/go/plugins/pkg/prometheus`) and Telegraf
 //! (`plugins/inputs/prometheus`) by default, the Datadog agent without `use_latest_spec`, and
 //! browsers.
@@ -79,7 +79,7 @@ impl Format {
         }
     }
 
-    /// Returns the value of the answer's `Content-Type`.
+    /// Returns the value of the response's `Content-Type`.
     #[must_use]
     pub const fn content_type(self) -> &'static str {
         match self {

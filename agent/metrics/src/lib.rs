@@ -3,7 +3,8 @@
 //! - [`catalogue`] declares each metric once. [`metric_sink`] accepts their samples.
 //! - [`exposition`] writes a page for a scrape.
 //! - [`otlp`] pushes metrics, events, spans and the log to a receiver.
-//! - [`metric_source`] and [`event`] are the interfaces through which both read an agent.
+//! - [`metric_source`] and [`event`] are the interfaces through which pages and exports read an
+//!   agent.
 //!
 //! This crate knows neither the configuration file nor privileges. The caller translates settings,
 //! and passes a function that starts the thread of exports.

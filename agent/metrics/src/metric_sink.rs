@@ -1,5 +1,5 @@
 //! Metric families and samples, written from facts in the catalogue's order, to the encoder of a
-//! page or as OTLP data points. Writers need not know which.
+//! page or as OTLP data points. The code that writes them does not depend on the destination.
 //!
 //! No state is kept between two pages: series vanish with their facts.
 
@@ -25,13 +25,14 @@ use crate::exemplar_lines::Waiting;
 use crate::otlp::points::Points;
 use ros2probe_model::facts::histogram::{BOUNDS, Histogram};
 
-/// Longest label value in bytes; ROS allows 255 characters, so longer ones are hostile.
+/// Maximum length of a label value in bytes. ROS allows 255 characters, so longer values are
+/// hostile.
 const MAX_LABEL_BYTES: usize = 256;
 
 /// A label value.
 #[derive(Clone, Copy, Debug)]
 pub enum Label<'a> {
-    /// A name or another text; long ones are cut.
+    /// A name or another text; long texts are shortened.
     Text(&'a str),
     /// A whole number.
     Number(u64),
@@ -74,7 +75,8 @@ enum FamilyOut<'a> {
 }
 
 impl<'a> MetricSink<'a> {
-    /// Creates the sink of a page; `exemplars` accepts those of its histograms, if it shows them.
+    /// Creates the sink of a page; `exemplars` accepts the exemplars of its histograms, if the page
+    /// shows them.
     pub(crate) const fn page(
         encoder: DescriptorEncoder<'a>,
         exemplars: Option<Arc<Waiting>>,
@@ -116,7 +118,7 @@ impl<'a> MetricSink<'a> {
     /// Writes a family with one sample and no labels.
     ///
     /// # Errors
-    /// As [`Self::family`].
+    /// Fails like [`Self::family`].
     pub fn single(&mut self, metric: &'static Metric, value: impl Into<Number>) -> fmt::Result {
         self.family(metric, |family| family.sample(&[], value))
     }
@@ -151,7 +153,7 @@ impl Family<'_> {
     /// Writes an info sample.
     ///
     /// # Errors
-    /// As [`Self::sample`].
+    /// Fails like [`Self::sample`].
     pub fn info(&mut self, labels: &[Label<'_>]) -> fmt::Result {
         self.sample(labels, 1_u64)
     }
@@ -159,7 +161,7 @@ impl Family<'_> {
     /// Writes a histogram.
     ///
     /// # Errors
-    /// As [`Self::sample`].
+    /// Fails like [`Self::sample`].
     pub fn histogram(&mut self, labels: &[Label<'_>], values: &Histogram) -> fmt::Result {
         self.traced_histogram(labels, values, None)
     }
@@ -167,7 +169,7 @@ impl Family<'_> {
     /// Writes a histogram, with its exemplars if it has any.
     ///
     /// # Errors
-    /// As [`Self::sample`].
+    /// Fails like [`Self::sample`].
     pub fn traced_histogram(
         &mut self,
         labels: &[Label<'_>],
@@ -304,7 +306,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn long_values_are_cut_but_stay_apart() {
+    fn long_label_values_are_shortened_but_stay_distinct() {
         let capped = |text: &str| {
             let mut out = String::new();
             write_capped(&mut out, text).unwrap();

@@ -4,8 +4,9 @@ use std::borrow::Cow;
 
 use ros2probe_model::facts::topic_kind::TopicKind;
 
-/// ROS name of a topic. Topics of services and actions keep their DDS names, because a request, its
-/// reply and a topic may share their ROS name. A DDS name that looks like a ROS name is marked.
+/// Returns the ROS name of a topic. Topics of services, including those of actions, keep their DDS
+/// names, because a request, its reply and a topic may share their ROS name. A DDS name that looks
+/// like a ROS name is marked.
 #[must_use]
 pub fn series_name<'a>(kind: TopicKind, name: &'a str, dds_name: &'a str) -> Cow<'a, str> {
     match kind {

@@ -1,4 +1,4 @@
-//! Metrics of chains: their latency and that of their hops.
+//! Metrics of chains: the latency of chains and of their hops.
 
 use super::Metric;
 

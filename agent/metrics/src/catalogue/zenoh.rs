@@ -1,4 +1,4 @@
-//! Metrics of Zenoh: connections, and what of them cannot be read.
+//! Metrics of Zenoh: connections, and the parts of them that cannot be read.
 
 use super::Metric;
 

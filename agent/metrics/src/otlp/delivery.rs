@@ -1,8 +1,8 @@
 //! Delivery of one signal, in order and with bounded memory.
 //!
 //! The library repeats a request within its timeout. The delivery then offers the same batch again,
-//! until the receiver takes or refuses it. One batch is in progress, and callers collect no other
-//! before it is settled. Items that never arrive are counted by reason.
+//! until the receiver accepts or refuses it. Only one batch is in progress, and callers collect no
+//! other before it is settled. Undelivered items are counted by reason.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -17,7 +17,7 @@ use super::reports::Report;
 /// Pauses before a batch is offered again.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
-/// Time for the last batches, out of the two seconds for stopping.
+/// Time for the last batches, of the two seconds for stopping.
 const LAST: Duration = Duration::from_millis(1_400);
 
 /// An exporter of the library and the form of its batches.
@@ -37,10 +37,10 @@ pub(super) trait Queue {
     /// The exporter's form of items.
     type Batch;
 
-    /// Completes once items wait.
+    /// Completes once the queue has items.
     async fn filled(&self);
 
-    /// Returns the oldest items, or `None` without any, and the number of items that had no room.
+    /// Returns the oldest items, or `None` without any, and the number of items that did not fit.
     fn take(&mut self) -> (Option<Self::Batch>, u64);
 }
 
@@ -55,10 +55,10 @@ pub(super) struct Delivery<E> {
     works: Option<bool>,
 }
 
-/// What became of a batch.
+/// Result of the delivery of a batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Settled {
-    /// The receiver took or refused it.
+    /// The receiver accepted or refused it.
     Answered,
     /// Newer points replace it. It is counted as dropped.
     Overtaken,
@@ -95,8 +95,8 @@ impl<E: Export> Delivery<E> {
         self.drop(Reason::Overflow, items);
     }
 
-    /// Delivers the items of a queue until the agent stops. Those that arrive within `gather` after
-    /// the first one are collected into its request.
+    /// Delivers the items of a queue until the agent stops. Items that arrive within `gather` after
+    /// the first one are collected into the same request.
     pub(super) async fn drain(mut self, mut queue: impl Queue<Batch = E::Batch>, gather: Duration) {
         let mut left = Vec::new();
         while left.is_empty() {
@@ -174,7 +174,7 @@ impl<E: Export> Delivery<E> {
         }
     }
 
-    /// Offers a batch until the receiver takes or refuses it.
+    /// Offers a batch until the receiver accepts or refuses it.
     async fn offer(&mut self, batch: &E::Batch) {
         let (mut pause, mut is_again) = (FIRST_PAUSE, false);
         while let Err((error, is_refused)) = self.send(batch, is_again).await {
@@ -189,7 +189,8 @@ impl<E: Export> Delivery<E> {
         }
     }
 
-    /// Sends a batch and counts a success. An error comes with whether the receiver refuses it.
+    /// Sends a batch and counts a success. An error includes whether the receiver refuses the
+    /// batch.
     async fn send(&mut self, batch: &E::Batch, is_again: bool) -> Result<(), (String, bool)> {
         let report = Report::new(self.signal, Arc::clone(&self.exports), is_again);
         let (result, report) = report.of(self.exporter.export(batch)).await;
@@ -251,7 +252,8 @@ impl<E: Export> Delivery<E> {
 }
 
 /// Returns whether the connection broke below the request. The library does not repeat such a
-/// request, because tonic reports it with the code `Unknown`; it appends the cause only then.
+/// request, because tonic reports it with the code `Unknown`; it appends the cause only to such an
+/// error.
 fn is_of_connection(error: &str) -> bool {
     let after = error.split_once("gRPC code: ");
     after.is_some_and(|(_, after)| after.contains(": "))

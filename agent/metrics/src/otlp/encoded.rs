@@ -2,10 +2,11 @@
 //! and gauges that are infinite.
 //!
 //! The model counts samples in buckets. An instrument of `opentelemetry_sdk` 0.33 only records
-//! single values, and the types of aggregated data have no public constructor. Of opentelemetry-rust,
-//! pull request 3489 (constructors, for issue 3469) and issue 2505 (`MetricProducer`) are open, and
-//! 0.33.1 is the newest release. Its instruments drop values that are not finite (issue 3656), but a
-//! lag that is not known is infinite. This module goes once the SDK takes such points.
+//! single values, and the types of aggregated data have no public constructor. In
+//! opentelemetry-rust, pull request 3489 (constructors, for issue 3469) and issue 2505
+//! (`MetricProducer`) are open, and 0.33.1 is the newest release. Its instruments drop values that
+//! are not finite (issue 3656), but an unknown lag is infinite. This module can be removed once the
+//! SDK accepts such points.
 
 use std::io::Write as _;
 use std::sync::{Arc, PoisonError};
@@ -38,7 +39,7 @@ use crate::catalogue::Metric;
 use ros2probe_model::derive::chain::exemplar::Exemplar;
 use ros2probe_model::facts::histogram::Histogram;
 
-/// Families of such points, until they are sent.
+/// Families of points that the SDK cannot carry, until they are sent.
 #[derive(Debug)]
 pub(super) struct Encoded {
     resource: Resource,
@@ -162,7 +163,7 @@ fn encoded(exemplar: &Exemplar) -> EncodedExemplar {
     }
 }
 
-/// Sends such requests over the connection of an exporter, with its headers.
+/// Sends requests with such points over the connection of an exporter, with the exporter's headers.
 pub(super) struct EncodedSender {
     way: Way,
     headers: SentHeaders,
@@ -193,8 +194,8 @@ impl EncodedSender {
         }
     }
 
-    /// Sends a request once: the next collection replaces one that fails in passing. The exporter
-    /// has sent the other points before, so its headers are known.
+    /// Sends a request once. The delivery offers a failed request again, until the next collection
+    /// replaces it. The exporter has sent the other points before, so its headers are known.
     pub(super) async fn send(&self, request: &ExportMetricsServiceRequest) -> OTelSdkResult {
         let headers = self
             .headers

@@ -21,7 +21,7 @@ use crate::event::{self, Batch, EventSource, Record, Value};
 
 /// Time for which events are collected into one request.
 pub(super) const GATHER: Duration = Duration::from_millis(500);
-/// Largest number of events per request: about 200 KB.
+/// Maximum number of events per request: about 200 KB.
 const MOST: usize = 256;
 
 /// Exports log records.

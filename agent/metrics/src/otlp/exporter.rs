@@ -26,15 +26,16 @@ use super::transport::Transport;
 use crate::event::EventSource;
 use crate::metric_source::MetricSource;
 
-/// Longest time to stop, whatever the receiver does.
+/// Maximum time to stop, whatever the receiver does.
 const ENDING: Duration = Duration::from_secs(2);
 
-/// Starts a thread with only the privileges of exports, and returns after the others are dropped.
+/// Starts a thread with only the privileges of exports, and returns after all other privileges are
+/// dropped.
 ///
-/// Fails if the system has no thread left, or if the thread cannot be confined.
+/// Fails if the system cannot create the thread, or if the thread cannot be confined.
 pub type Spawn = fn(thread::Builder, Box<dyn FnOnce() + Send>) -> io::Result<JoinHandle<()>>;
 
-/// What is exported, and the counters of exports.
+/// Data to export, and the counters of exports.
 #[derive(Debug)]
 pub struct Inputs {
     /// Metrics.
@@ -133,7 +134,7 @@ impl Jobs {
         stop: &CancellationToken,
         runtime: &Runtime,
     ) -> Result<Self, SettingsError> {
-        // Connections need the runtime from their creation on.
+        // The runtime must be entered before connections are created.
         let _inside = runtime.enter();
         let resource = &settings.resource;
         let exports = &inputs.exports;

@@ -165,7 +165,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_is_counted_for_itself_and_only_enabled_signals_are_shown() {
+    fn signals_and_reasons_are_counted_apart_and_only_enabled_signals_shown() {
         let exports = Exports::default();
         assert_eq!(exports.signals().count(), 0);
         exports.enable(Signal::Traces);

@@ -1,14 +1,14 @@
 //! The catalogue as observable instruments of the SDK.
 //!
-//! Counters have one provider for the life of the agent: the SDK starts the series of an instrument
-//! when it is created. It has one start for all points of a metric (`data::Sum`, opentelemetry_sdk
-//! 0.33; issue 2472). So a series that begins later or again has the agent's start, too. Gauges get
-//! a new provider in each collection: the SDK keeps the memory of their series, and reserves it for
-//! the largest number.
+//! Counters have one provider for the lifetime of the agent: the SDK starts the series of an
+//! instrument when the instrument is created. All points of a metric have one start (`data::Sum`,
+//! opentelemetry_sdk 0.33; issue 2472). A series that begins later or again thus has the agent's
+//! start, too. Gauges get a new provider in each collection: the SDK keeps the memory of their
+//! series, and reserves it for the largest number of series.
 //!
 //! Observable instruments report only the series that their callback observes, so series vanish
-//! with their facts. The limit on series exceeds what one request holds: none is merged into
-//! `otel.metric.overflow`.
+//! with their facts. The limit on series exceeds the number in one request, so that no series is
+//! merged into `otel.metric.overflow`.
 
 use std::collections::HashMap;
 use std::ops::Range;
@@ -28,7 +28,7 @@ use opentelemetry_sdk::metrics::{
 use crate::catalogue::{CATALOGUE, Kind, Metric};
 use crate::metric_sink::Number;
 
-/// Largest number of points in one request.
+/// Maximum number of points in one request.
 pub(super) const REQUEST_POINTS: usize = 8192;
 
 /// Instruments of all metrics.
@@ -62,7 +62,7 @@ impl Points {
         self.points.len()
     }
 
-    /// Adds a point; those of a metric follow each other.
+    /// Adds a point; the points of a metric must follow each other.
     pub(super) fn push(&mut self, metric: &'static Metric, labels: &[KeyValue], value: Number) {
         let begin = self.attributes.len();
         self.attributes.extend_from_slice(labels);
@@ -75,7 +75,7 @@ impl Points {
         }
     }
 
-    /// Returns whether the metric has whole values, and real ones.
+    /// Returns whether the metric has whole values, and whether it has real values.
     fn kinds(&self, metric: &Metric) -> [bool; 2] {
         let is_whole = |(value, _): (Number, _)| matches!(value, Number::Count(_));
         let whole = self.of(metric).any(is_whole);
@@ -172,7 +172,7 @@ fn stream(limit: usize) -> Option<Stream> {
     Stream::builder().with_cardinality_limit(limit).build().ok()
 }
 
-/// Returns whether a counter has real values: of the units, only seconds are not whole.
+/// Returns whether a counter has real values: only seconds are not whole numbers.
 pub(super) fn is_real(counter: &Metric) -> bool {
     counter.unit == Some("seconds")
 }
@@ -227,7 +227,7 @@ impl Readable {
 
     fn collect(&self) -> ResourceMetrics {
         let mut collected = ResourceMetrics::default();
-        // Fails only after the provider's end.
+        // Fails only after the provider has shut down.
         let _ = self.reader.collect(&mut collected);
         collected
     }

@@ -18,7 +18,7 @@ use super::points::{Batch, Collection, Points};
 use crate::metric_sink::MetricSink;
 use crate::metric_source::MetricSource;
 
-/// Longest time to wait for a fresh snapshot, as for a scrape.
+/// Maximum time to wait for a fresh snapshot, as for a scrape.
 const REFRESH_TIMEOUT: Duration = Duration::from_millis(600);
 
 /// Exports metrics.
@@ -87,7 +87,7 @@ impl Collector {
                     Settled::Answered => false,
                     Settled::Overtaken => true,
                     Settled::Stopped => {
-                        // The last collection replaces it.
+                        // The last collection replaces the batch.
                         delivery.superseded(&batch);
                         true
                     }
@@ -99,7 +99,7 @@ impl Collector {
         delivery.finish(batches).await;
     }
 
-    /// Returns all metrics as of now.
+    /// Collects all metrics at the time `now`.
     pub(super) fn collect(&mut self, now: SystemTime) -> Collection {
         let begun = Instant::now();
         self.points.begin(unix_nanoseconds(now));

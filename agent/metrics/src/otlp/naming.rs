@@ -6,7 +6,7 @@
 
 use crate::catalogue::{Kind, Metric};
 
-/// Namespaces, which are the beginnings of names.
+/// Prefixes of names, which become namespaces.
 const NAMESPACES: &[&str] = &[
     "build",
     "capture",
@@ -36,7 +36,7 @@ const UNITS: &[(&str, &str)] = &[
     ("_ratio", "1"),
 ];
 
-/// Counted items as UCUM annotations, which no mapping turns into a suffix.
+/// Counted items as UCUM annotations, which the mapping does not turn into a suffix.
 const ANNOTATIONS: &[(&str, &str)] = &[
     ("datagrams", "{datagram}"),
     ("deliveries", "{delivery}"),
@@ -96,7 +96,8 @@ impl Metric {
         words.filter_map(thing).next().map_or("", |(_, unit)| unit)
     }
 
-    /// Splits into namespace and name, such as `ros2` and `topic_messages`, without `_total`.
+    /// Splits the name into its namespace and the remainder, such as `ros2` and `topic_messages`,
+    /// without `_total`.
     fn split(&self) -> (&'static str, &'static str) {
         let name = match self.kind {
             Kind::Counter => self.name.strip_suffix("_total").unwrap_or(self.name),
@@ -151,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn mapped_forward_each_name_is_the_one_on_the_page() {
+    fn each_name_maps_back_to_its_prometheus_name() {
         for metric in CATALOGUE {
             let (name, unit) = (metric.otlp_name(), metric.ucum());
             assert_eq!(forward(&name, unit, metric.kind), metric.name, "{name}");
@@ -166,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn names_read_as_opentelemetry_s_do() {
+    fn names_and_units_follow_the_conventions_of_opentelemetry() {
         let named = |name: &str| {
             let metric = CATALOGUE.iter().find(|metric| metric.name == name).unwrap();
             (metric.otlp_name(), metric.ucum())

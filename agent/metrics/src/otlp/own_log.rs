@@ -1,6 +1,6 @@
 //! The agent's own log as log records, on request (`otlp.log`).
 //!
-//! `opentelemetry-appender-tracing` makes a record of each event, and a queue holds it until the
+//! `opentelemetry-appender-tracing` creates a record of each event, and a queue holds it until the
 //! export thread sends it. The thread that logs never waits. The export thread's own lines are not
 //! exported.
 
@@ -22,8 +22,8 @@ use tracing_subscriber::registry::LookupSpan;
 
 use super::delivery::Queue;
 
-/// Largest number of lines in the queue, their largest size in bytes, and the largest number in one
-/// request.
+/// Maximum number of lines in the queue, their maximum size in bytes, and the maximum number of
+/// lines in one request.
 const LINES: usize = 1024;
 const LINES_BYTES: usize = 1 << 20;
 const REQUEST: usize = 256;
@@ -47,7 +47,7 @@ struct Waiting {
 }
 
 impl LogQueue {
-    /// Returns a layer that queues the agent's lines of this level or a more severe one.
+    /// Returns a layer that queues the agent's lines of this level and of more severe ones.
     pub fn layer<S>(queue: &Arc<Self>, level: LevelFilter) -> impl Layer<S> + use<S>
     where
         S: Subscriber + for<'span> LookupSpan<'span>,
@@ -55,7 +55,7 @@ impl LogQueue {
         let provider = SdkLoggerProvider::builder()
             .with_log_processor(Queueing(Arc::clone(queue)))
             .build();
-        // Libraries below the exporter log, too.
+        // The exporter's libraries write log lines, too, which are not exported.
         let own = Targets::new().with_target("ros2probe", level);
         OpenTelemetryTracingBridge::new(&provider).with_filter(own)
     }
@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn lines_of_the_agent_are_queued_and_those_of_libraries_and_of_exports_are_not() {
+    fn only_lines_of_the_agent_are_queued_not_those_of_libraries_or_exports() {
         let (_, lines) = queued(|| {
             tracing::warn!(socket = 7, "the socket drops packets");
             tracing::info!("the capture has ended");
@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_of_lines_is_bounded_in_lines_and_bytes_and_counted() {
+    fn the_queue_bounds_lines_and_bytes_and_counts_overflowing_lines() {
         let (queue, lines) = queued(|| {
             for line in 0..LINES + 5 {
                 tracing::warn!(line, "short");

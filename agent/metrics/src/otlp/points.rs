@@ -1,5 +1,6 @@
-//! A collection as requests: points gather until a request is full, and become the SDK's form then.
-//! Requests stay well below the 4 MiB that receivers accept by default.
+//! Divides a collection into requests: points are gathered until a request is full, and then
+//! converted to the SDK's form. Requests stay well below the 4 MiB that receivers accept by
+//! default.
 //!
 //! Texts are shared between the points of a collection, so a large robot's names are in memory once.
 
@@ -21,7 +22,7 @@ use ros2probe_model::facts::histogram::Histogram;
 
 /// Estimated size in bytes at which a request ends.
 const REQUEST_BYTES: usize = 1 << 20;
-/// Largest estimated size of a collection; further points are dropped and counted.
+/// Maximum estimated size of a collection; further points are dropped and counted.
 const COLLECTION_BYTES: usize = 16 << 20;
 /// Estimated size of a point without attributes, of a bucket, of an exemplar, and of an attribute
 /// without its texts.
@@ -29,7 +30,7 @@ const POINT_BYTES: usize = 30;
 const BUCKET_BYTES: usize = 17;
 const EXEMPLAR_BYTES: usize = 38;
 const ATTRIBUTE_BYTES: usize = 8;
-/// Name of the instrumentation scope. Queries use it, so it is not that of this crate.
+/// Name of the instrumentation scope. Queries use it, so it does not follow the name of this crate.
 const SCOPE: &str = "ros2probe-daemon";
 
 /// Gathers one collection after the other.
@@ -188,8 +189,9 @@ impl Points {
         encoded.histogram(metric, &self.attributes, values, [start, self.now]);
     }
 
-    /// Converts labels to attributes of the next point, whose estimated size it returns. Empty
-    /// labels are omitted, as Prometheus treats them as missing. `None` if the collection is full.
+    /// Converts labels to attributes of the next point. Returns the estimated size of the point;
+    /// `None` if the collection is full. Empty labels are omitted, as Prometheus treats them as
+    /// missing.
     fn attributes(
         &mut self,
         metric: &Metric,
@@ -273,7 +275,7 @@ struct Names {
 impl Names {
     fn shared(&mut self, text: &str) -> Arc<str> {
         self.capped.clear();
-        // As on the page, the cap keeps text from the network from determining the size of a
+        // As on the page, the cap prevents text from the network from determining the size of a
         // request. Writing to memory cannot fail.
         let _ = write_capped(&mut self.capped, text);
         if let Some(known) = self.known.get(self.capped.as_str()) {
@@ -353,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn each_kind_becomes_what_maps_back_to_it() {
+    fn each_kind_of_metric_becomes_the_matching_kind_of_otlp_data() {
         let mut points = empty();
         let topic = [Label::Number(5), Label::Text("/points")];
         let mut histogram = Histogram::default();
@@ -421,7 +423,7 @@ mod tests {
     }
 
     #[test]
-    fn a_label_whose_text_is_empty_is_no_attribute() {
+    fn an_empty_label_does_not_become_an_attribute() {
         let mut points = empty();
         points.begin(1);
         let subscriber = metric("ros2_subscriber_received_messages_total");
@@ -445,7 +447,7 @@ mod tests {
     }
 
     #[test]
-    fn a_large_robot_comes_in_several_requests_and_no_point_twice_or_never() {
+    fn points_of_a_large_robot_are_in_several_requests_each_point_once() {
         const POINTS: u64 = 60_000;
         let mut points = empty();
         points.begin(1);
@@ -478,7 +480,7 @@ mod tests {
     }
 
     #[test]
-    fn points_without_room_are_counted() {
+    fn points_beyond_the_size_of_a_collection_are_counted_as_dropped() {
         let mut points = empty();
         let name = "x".repeat(250);
         points.begin(1);
@@ -506,7 +508,7 @@ mod tests {
     }
 
     #[test]
-    fn a_series_that_is_gone_is_in_no_later_collection() {
+    fn a_series_that_ended_is_in_no_later_collection() {
         let mut points = empty();
         for (now, topics) in [(1, &["/imu", "/points"][..]), (2, &["/points"]), (3, &[])] {
             points.begin(now);
@@ -532,7 +534,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_keep_their_kind_and_a_lag_that_is_not_known_stays_infinite() {
+    fn real_numbers_stay_real_and_an_unknown_lag_stays_infinite() {
         let mut points = empty();
         points.begin(1);
         points.open(metric("process_cpu_seconds_total"));

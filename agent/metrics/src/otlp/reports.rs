@@ -1,10 +1,10 @@
 //! Outcomes of requests that `opentelemetry-otlp` does not return.
 //!
-//! The library returns a text for every failure. It reports a part that the receiver rejected, and a
-//! request that must not be repeated, as `tracing` events only (`*.PartialSuccess`,
-//! `Export.Failed.NonRetryable`). The export thread therefore has a subscriber of its own. It turns
-//! these events into outcomes of the request in progress, and drops the library's other events. All
-//! other lines of the thread go to the agent's log, so a receiver that is away costs one line there.
+//! The library returns only a text for a failure. It reports rejected items, and requests that must
+//! not be repeated, only as `tracing` events (`*.PartialSuccess`, `Export.Failed.NonRetryable`).
+//! The export thread therefore has a subscriber of its own. It turns these events into outcomes of
+//! the request in progress, and drops the library's other events. All other lines of the thread go
+//! to the agent's log, so an unavailable receiver causes one line there.
 
 use std::cell::Cell;
 use std::fmt;
@@ -23,7 +23,7 @@ tokio::task_local! {
     static REPORT: Report;
 }
 
-/// What is known about a request.
+/// Facts about a request.
 #[derive(Clone, Debug)]
 pub(super) struct Report {
     signal: Signal,
@@ -34,8 +34,8 @@ pub(super) struct Report {
 }
 
 impl Report {
-    /// Creates the report of a request. A further attempt of it counts as retried; `is_again` makes
-    /// the first one of this report a further attempt.
+    /// Creates the report of a request. Every attempt but the first counts as retried; with
+    /// `is_again`, the first one counts, too.
     pub(super) fn new(signal: Signal, exports: Arc<Exports>, is_again: bool) -> Self {
         Self {
             signal,
@@ -63,7 +63,7 @@ impl Report {
         self.is_refused.get()
     }
 
-    /// Returns the number of items that the receiver rejected while it took the others.
+    /// Returns the number of items that the receiver rejected while it accepted the others.
     pub(super) fn rejected(&self) -> u64 {
         self.rejected.get()
     }
@@ -97,7 +97,7 @@ pub(super) struct Reports {
 }
 
 impl Reports {
-    /// Creates a subscriber that passes other events on to the current one.
+    /// Creates a subscriber that passes other events on to the current subscriber.
     pub(super) fn dispatch() -> Dispatch {
         let log = tracing::dispatcher::get_default(Clone::clone);
         Dispatch::new(Self { log })

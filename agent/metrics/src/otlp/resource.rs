@@ -44,8 +44,8 @@ impl Host {
     }
 }
 
-/// Returns the resource for `host`; attributes of the environment take precedence, then those of the
-/// file.
+/// Returns the resource for `host`. Attributes of the environment override those of the host, and
+/// attributes of the file override both.
 pub(super) fn resource(host: &Host, file: &OtlpSettings) -> Resource {
     let of_host = [("host.name", &host.name), ("host.id", &host.id)];
     let of_host = of_host
@@ -92,7 +92,7 @@ fn service_name() -> Option<KeyValue> {
 }
 
 /// Returns a UUID (version 8) that survives restarts, so that a robot's series continue. It is
-/// derived, because a machine id should not be published.
+/// derived from the machine id, which should not be published itself.
 fn instance(host: &Host) -> String {
     let mut bits = host.bits();
     bits = bits & !(0xf << 76) | 0x8 << 76;
@@ -114,7 +114,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_instance_is_identified_by_its_host_and_stays_the_same() {
+    fn an_instance_id_depends_on_the_host_and_stays_the_same() {
         let host = |id: &str| Host {
             name: Some("robot-7".to_owned()),
             id: Some(id.to_owned()),
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn given_attributes_replace_detected_ones() {
+    fn configured_attributes_replace_detected_ones() {
         let attributes = [("host.name", "R2"), ("service.instance.id", "")];
         let file = OtlpSettings {
             robot: Some("marvin".to_owned()),

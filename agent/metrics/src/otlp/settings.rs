@@ -1,8 +1,8 @@
 //! Export settings: the file's `otlp` section, then the standard `OTEL_*` variables, then defaults.
 //! They are read once at startup.
 //!
-//! `opentelemetry-otlp` reads the variables of headers itself. It cannot leave a signal without an
-//! endpoint unexported, and takes no settings for the connection of `transport.rs`.
+//! `opentelemetry-otlp` reads the variables of headers itself. However, it exports a signal even
+//! without an endpoint, and accepts no settings for the connection of `transport.rs`.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -23,7 +23,7 @@ use super::resource::{Host, resource};
 /// Default interval of metric exports, and default timeout of a request.
 const INTERVAL: Duration = Duration::from_secs(15);
 const TIMEOUT: Duration = Duration::from_secs(10);
-/// Largest size of a file with headers.
+/// Maximum size of a file with headers, in bytes.
 const HEADERS_BYTES: u64 = 1 << 20;
 
 /// Reads a text of at most this many bytes.
@@ -52,7 +52,7 @@ pub struct OtlpSettings {
     pub events: Option<bool>,
     /// Whether spans are exported, for watches with `trace`.
     pub traces: Option<bool>,
-    /// Least severe level of exported lines of the log; no line is exported without it.
+    /// Minimum severity of exported lines of the log; `None` exports no line.
     pub log: Option<LevelFilter>,
     /// Name of the robot.
     pub robot: Option<String>,
@@ -99,7 +99,7 @@ pub(super) struct Target {
     /// Whether requests use gRPC rather than HTTP with protobuf.
     pub(super) is_grpc: bool,
     pub(super) endpoint: Uri,
-    /// Headers of the file.
+    /// Headers of the configuration.
     pub(super) headers: HeaderMap,
     pub(super) timeout: Duration,
     pub(super) gzip: bool,
@@ -168,7 +168,7 @@ pub enum SettingsError {
 
 impl Settings {
     /// Returns the settings from `file` and the environment; `None` if nothing is exported. `read`
-    /// returns a text of at most this many bytes.
+    /// reads the file with headers.
     ///
     /// # Errors
     /// Fails if an endpoint or header is invalid.
@@ -289,7 +289,7 @@ fn target(
     let endpoint = if is_grpc {
         otlp_endpoint(&value)
     } else {
-        // The URL of a single signal is whole.
+        // The URL of a single signal already has a path.
         let is_whole = name.ends_with(&format!("_{}_ENDPOINT", standard(signal)));
         http_endpoint(&value, if is_whole { "" } else { path(signal) })
     };
@@ -329,7 +329,7 @@ fn http_endpoint(text: &str, path: &str) -> Option<Uri> {
     format!("{}{path}", text.trim_end_matches('/')).parse().ok()
 }
 
-/// Returns the headers of the file.
+/// Returns the headers of the configuration and of its file with headers.
 fn headers(file: &OtlpSettings, read: ReadText) -> Result<HeaderMap, SettingsError> {
     let mut headers = HeaderMap::new();
     let mut add = |place: &str, name: &str, value: &str| {
@@ -447,7 +447,7 @@ mod tests {
     }
 
     #[test]
-    fn over_http_each_signal_has_its_path_below_the_endpoint_of_all() {
+    fn over_http_each_signal_has_its_path_below_the_common_endpoint() {
         let environment = [
             ("OTEL_EXPORTER_OTLP_ENDPOINT", "https://otlp.example/base/"),
             (
@@ -476,7 +476,7 @@ mod tests {
     }
 
     #[test]
-    fn the_file_wins_over_the_environment() {
+    fn the_file_takes_precedence_over_the_environment() {
         let file = OtlpSettings {
             interval: Some(Duration::from_secs(30)),
             timeout: Some(Duration::from_secs(3)),
@@ -534,7 +534,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_of_headers_keeps_secrets_out_of_the_configuration() {
+    fn headers_are_read_from_a_file_and_not_logged() {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), "# token\nAuthorization: Bearer a:b=\n\n").unwrap();
         let settings = OtlpSettings {

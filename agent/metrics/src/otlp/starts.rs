@@ -1,7 +1,8 @@
 //! Start times of cumulative series, which OTLP requires in every point.
 //!
-//! A new or reset series starts at the previous collection, and the first ones at the agent's
-//! start. The number of series is bounded; further ones start at the agent's start, too.
+//! A new or reset series starts at the previous collection, and a series of the first collection at
+//! the agent's start. The number of series is bounded; further series start at the agent's start,
+//! too.
 
 use std::collections::HashMap;
 use std::collections::hash_map::RandomState;
@@ -96,7 +97,7 @@ mod tests {
     use crate::catalogue::CATALOGUE;
 
     #[test]
-    fn a_series_counts_since_it_was_not_there_or_began_again() {
+    fn a_new_or_reset_series_starts_at_the_previous_collection() {
         let [metric, other] = CATALOGUE.first_chunk().unwrap();
         let mut starts = Starts::new(100);
         let points = [Label::Number(0), Label::Text("/points")];
@@ -119,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_of_series_is_not_remembered() {
+    fn series_beyond_the_cap_start_with_the_agent() {
         let [metric, ..] = CATALOGUE else { panic!() };
         let mut starts = Starts::new(100);
         starts.begin(200);

@@ -30,7 +30,7 @@ use ros2probe_model::derive::trace::{Span, SpanStage, Spans};
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::identity::Identity;
 
-/// Largest number of spans in one request.
+/// Maximum number of spans in one request.
 const REQUEST: usize = 512;
 /// Time for which spans are collected into one request.
 pub(super) const GATHER: Duration = Duration::from_secs(1);
@@ -47,9 +47,9 @@ pub struct SpanQueue {
 /// A span in the queue.
 #[derive(Clone, Debug)]
 enum QueuedSpan {
-    /// Of a message.
+    /// A span of a message.
     Message(Span),
-    /// Of a chain.
+    /// A span of a chain.
     Chain(ChainSpan),
 }
 
@@ -79,7 +79,7 @@ impl SpanSink {
 }
 
 impl SpanQueue {
-    /// Appends spans and returns how many did not fit.
+    /// Appends spans and returns the number of spans that did not fit.
     fn put(&self, spans: impl IntoIterator<Item = QueuedSpan>) -> u64 {
         let mut spans = spans.into_iter().peekable();
         if spans.peek().is_none() {
@@ -143,7 +143,7 @@ impl Queue for Tracing {
         self.queue.filled().await;
     }
 
-    /// The sink counts spans that have no room.
+    /// The sink counts spans that do not fit.
     fn take(&mut self) -> (Option<Vec<SpanData>>, u64) {
         let spans = self.queue.take();
         let exported = spans.iter().map(|span| match span {
@@ -235,7 +235,7 @@ fn context(trace_id: u128, id: u64) -> SpanContext {
     SpanContext::new(trace_id, id, flags, false, TraceState::NONE)
 }
 
-/// Returns the id of the span of the message with this trace at its departure.
+/// Returns the id of the send span of the message with this trace.
 fn send_id(trace_id: u128) -> u64 {
     let mut identity = Identity::of(b"send");
     identity.add(&trace_id.to_be_bytes());
@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn two_hosts_report_one_trace_in_which_each_has_its_own_part() {
+    fn two_hosts_report_one_send_span_and_own_receive_spans_in_one_trace() {
         let reader = Guid::new(GuidPrefix([2; 12]), EntityId([0, 0, 1, 4]));
         let (one, two) = (
             Tracing::new(1, Arc::default()),

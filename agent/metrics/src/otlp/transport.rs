@@ -1,9 +1,9 @@
 //! Connections to the receiver, one per signal. `opentelemetry-otlp` encodes, compresses, sends and
 //! retries, and reads `OTEL_EXPORTER_OTLP_*_HEADERS`.
 //!
-//! The connections themselves come from tonic and hyper, with rustls. The library's own gRPC channel
-//! sends no HTTP/2 pings, so requests would wait for minutes after a network that vanished. Points
-//! that the SDK cannot carry (`encoded.rs`) use the same connection.
+//! The connections themselves come from tonic and hyper, with rustls. The library's own gRPC
+//! channel sends no HTTP/2 pings, so requests would wait for minutes after a failure of the
+//! network. Points that the SDK cannot carry (`encoded.rs`) use the same connection.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -23,7 +23,7 @@ use super::encoded::EncodedSender;
 use super::reports;
 use super::settings::{SettingsError, Target};
 
-/// A connection that does not answer a ping within this time is reopened.
+/// Interval of HTTP/2 pings; a connection that does not answer a ping is reopened.
 const PING: Duration = Duration::from_secs(30);
 
 /// The connection of a signal; opened at the first request, and again after a failure.

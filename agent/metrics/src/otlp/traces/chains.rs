@@ -1,4 +1,4 @@
-//! Spans of chains: from the model's form to that of the SDK.
+//! Converts spans of chains from the model's form to that of the SDK.
 
 use opentelemetry::KeyValue;
 use opentelemetry::trace::{Link, SpanKind};
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn a_span_of_a_host_has_another_id_there_and_all_others_the_same() {
+    fn the_id_of_a_hop_depends_on_the_host_and_other_ids_do_not() {
         for stage in [ChainStage::Node, ChainStage::Hop] {
             let span = span(stage, None);
             let (one, two) = (parts(&span, 1), parts(&span, 2));
