@@ -2,8 +2,8 @@
 //!
 //! Records have the same order as in rosbag2's files. A file grows by whole pieces only: an
 //! incomplete write is truncated. Before a piece is written, space is reserved for it and for the
-//! summary. A full disk is thus detected while the file can still be completed. Of topics, this
-//! module knows only the channels.
+//! summary. A full disk is thus detected while the file can still be completed. This module knows
+//! channels, but not the topics behind them.
 
 use std::collections::BTreeMap;
 use std::fs::File;

@@ -67,7 +67,7 @@ pub struct Details {
     calls: BTreeMap<String, Calls>,
 }
 
-/// Client and sequence number of each request and each response seen.
+/// Client and sequence number of each request and each response that was read.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 struct Calls {
     requests: BTreeSet<([u8; 16], i64)>,

@@ -154,7 +154,7 @@ fn files(directory: &Path) -> Result<Vec<String>, ReindexError> {
     Ok(names)
 }
 
-/// Returns the number of a file, `12` for `bag_12.mcap`; files without one come first.
+/// Returns the number of a file, `12` for `bag_12.mcap`; files without a number are first.
 fn number(name: &str) -> Option<u64> {
     let (stem, _) = name.split_once(".mcap")?;
     stem.rsplit_once('_')?.1.parse().ok()

@@ -1,4 +1,5 @@
-//! Reads the messages of a bag in rosbag2's sqlite3 storage: a table of topics, and one of messages.
+//! Reads the messages of a bag in rosbag2's sqlite3 storage: a table of topics, and one of
+//! messages.
 //!
 //! The file format is that of <https://www.sqlite.org/fileformat.html>: trees of pages. Only the
 //! trees of tables are read, not the indexes, the write-ahead log and the free list. Page numbers

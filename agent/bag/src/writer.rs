@@ -32,7 +32,7 @@ pub struct TopicDescription {
     pub type_name: String,
     /// Type hash `RIHS01_...`, if a publisher announced it.
     pub type_hash: Option<String>,
-    /// QoS of every publisher seen.
+    /// QoS of every observed publisher.
     pub publishers: Vec<Qos>,
     /// Definition of its messages, if known.
     pub schema: Option<Schema>,

@@ -171,9 +171,9 @@ pub enum Ability {
 pub struct InterfaceFacts {
     /// Name, preceded by the namespace unless it is the agent's own.
     pub name: String,
-    /// Packets that passed the filter. `None` if there is no such counter.
+    /// Packets that passed the filter. `None` without such a counter.
     pub packets: Option<u64>,
-    /// Packets lost because the ring was full. `None` if there is no such counter.
+    /// Packets lost because the ring was full. `None` without such a counter.
     pub dropped: Option<u64>,
 }
 

@@ -225,7 +225,7 @@ pub enum Unready {
     /// The last snapshot is this many seconds old.
     #[error("the last snapshot is {0} s old")]
     Outdated(u64),
-    /// The source does not see its target, for this reason.
+    /// The source does not observe its target, for this reason.
     #[error("{0}")]
     Unseen(String),
 }

@@ -194,8 +194,8 @@ impl Supervisor {
         }
     }
 
-    /// Lets the ros2 daemon answer, if it is configured. Returns a future that resolves if its thread
-    /// ends, and the notification of reloads.
+    /// Lets the ros2 daemon answer, if it is configured. Returns a future that resolves if its
+    /// thread ends, and the notification of reloads.
     fn begin_ros2_daemon(&mut self) -> (impl Future<Output = Ended> + Unpin + use<>, Arc<Notify>) {
         let reloaded = Arc::<Notify>::default();
         let ended = self.ros2_daemon.take().map(|daemon| {

@@ -1,4 +1,4 @@
-//! Declarations of the daemon's tables: what clients, viewers and robots can fill, and how far.
+//! Declarations of the daemon's bounded tables, which clients, viewers and robots can fill.
 
 use ros2probe_model::facts::bounded::Rule::Oldest;
 

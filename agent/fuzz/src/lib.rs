@@ -246,7 +246,7 @@ static TYPES: LazyLock<Vec<MessageType>> = LazyLock::new(|| {
 
 /// Reads a payload, whole and in part, and prints it.
 pub fn message(bytes: &[u8]) {
-    // A payload of few octets gives far more text: one line per octet.
+    // Maximum length of the text per octet of payload: each octet may have a line of its own.
     const LONGEST: usize = 64;
     let Some((choice, payload)) = bytes.split_first() else {
         return;

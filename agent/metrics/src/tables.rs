@@ -1,4 +1,4 @@
-//! Declarations of the tables of exports: what robots can fill, and how far.
+//! Declarations of the bounded tables of exports, which robots can fill.
 
 ros2probe_model::tables! {
     /// Spans that wait for export

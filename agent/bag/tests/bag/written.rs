@@ -268,7 +268,7 @@ fn flushed_messages_survive_the_end_of_the_writer() {
 }
 
 #[test]
-fn an_existing_directory_is_not_written_into() {
+fn creating_a_bag_in_an_existing_directory_fails() {
     let directory = tempfile::tempdir().unwrap();
     let error = Writer::create(directory.path(), Options::default()).unwrap_err();
     let text = format!(
@@ -325,7 +325,7 @@ fn later_publishers_are_listed_apart_from_the_topic() {
 }
 
 #[test]
-fn the_form_follows_the_distribution() {
+fn the_form_of_a_bag_follows_the_distribution() {
     let directory = tempfile::tempdir().unwrap();
     for (distro, version, begins) in [("humble", 5, "- history: 1\n"), ("jazzy", 9, "")] {
         let path = directory.path().join(distro);

@@ -506,7 +506,8 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
     }
 }
 
-/// Returns whether the text is an origin as browsers send it: a scheme and, except for files, a host.
+/// Returns whether the text is an origin as browsers send it: a scheme and, except for files, a
+/// host.
 fn is_origin(text: &str) -> bool {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "-._:[]".contains(c);
     match text.split_once("://") {

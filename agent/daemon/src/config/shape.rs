@@ -26,8 +26,8 @@ pub(super) struct ConfigShape {
     /// Topics to measure: names (`/points`), globs (`/camera/*/image_raw`, `/**`), or maps with
     /// expectations. With an empty list, only the graph is reported. Applied on reload.
     pub(super) watch: Option<Vec<WatchShape>>,
-    /// Chains of messages with a limit for their latency. The topics between their ends are measured
-    /// if their messages begin with a header.
+    /// Chains of messages with a limit for their latency. The topics between their ends are
+    /// measured if their messages begin with a header.
     pub(super) chains: Option<Vec<ChainShape>>,
     /// Caps of the agent's tables; `ros2probe_limit_reached_total` counts entries beyond them.
     pub(super) limits: Option<LimitsShape>,
@@ -63,8 +63,8 @@ pub(super) struct ConfigShape {
     #[serde(default)]
     pub(super) retain: RetainChoice,
     /// Directory of the saved discovery state, so that a restart on a running robot loses no name:
-    /// an absolute path, `off`, or `auto`: `$STATE_DIRECTORY` as set by the service manager, else
-    /// /var/lib/ros2probe if it exists and is writable.
+    /// an absolute path, `off` or `auto`. `auto` is `$STATE_DIRECTORY` as set by the service
+    /// manager, else /var/lib/ros2probe if it exists and is writable.
     #[serde(default = "defaults::state_directory")]
     pub(super) state_directory: String,
     /// Minimum severity of log lines on standard error. Applied on reload.
@@ -96,9 +96,9 @@ pub(super) struct WatchEntryShape {
     /// received by each subscriber), in addition to those per topic.
     #[serde(default)]
     pub(super) per_subscriber: bool,
-    /// Fraction of each matching topic's messages for which spans are exported (`otlp`), 0 to 1:
-    /// the time on the wire, and the acknowledgements of each reliable reader. The same fraction of
-    /// the chains that begin with the topic is exported, too.
+    /// Fraction of each matching topic's messages for which spans are exported (`otlp`), 0 to 1.
+    /// Spans cover the time on the wire, and the acknowledgements of each reliable reader. The same
+    /// fraction of the chains that begin with the topic is exported, too.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub(super) trace: Option<f64>,
     /// `last`: keep the last message of each matching transient-local writer in memory, for
@@ -112,7 +112,7 @@ pub(super) struct WatchEntryShape {
     #[schemars(range(min = 0.0, max = 1_000_000.0))]
     pub(super) max_rate_hz: Option<f64>,
     /// Window of `min_rate_hz` and `max_rate_hz`, in whole seconds, for a rate that varies from
-    /// second to second; default: the shortest one with at least three expected messages.
+    /// second to second. Default: the shortest window with at least three expected messages.
     #[schemars(range(min = 1, max = 10))]
     pub(super) window_s: Option<u32>,
     /// Maximum fraction of lost messages, 0 to 1.
@@ -179,8 +179,8 @@ pub(super) struct CaptureShape {
     /// Further network namespaces for `source: wire`, by path (`/run/netns/robot`). Needs
     /// CAP_SYS_ADMIN. `source: host` covers all of them.
     pub(super) network_namespaces: Option<Vec<String>>,
-    /// Packet ring of each network namespace, in bytes. The ring for messages that processes write to
-    /// shared memory is 4 times as large, up to 16 MiB.
+    /// Packet ring of each network namespace, in bytes. The ring for messages that processes write
+    /// to shared memory is 4 times as large, up to 16 MiB.
     #[schemars(range(min = 262_144, max = 1_073_741_824))]
     pub(super) ring_bytes: usize,
     /// Ring for measurement records from the kernel filter, in bytes.
@@ -193,8 +193,8 @@ pub(super) struct CaptureShape {
     /// `full`: also callbacks, timers and lifecycle transitions; `auto`: as `full`, while a client
     /// needs calls. Each observed call costs the process some microseconds.
     pub(super) inside: InsideChoice,
-    /// Socket of the process that attaches breakpoints (`rp attach`). Without a socket there, an agent
-    /// with the privileges starts one of its own.
+    /// Socket of the process that attaches breakpoints (`rp attach`). Without a socket there, an
+    /// agent with the privileges starts one of its own.
     pub(super) broker: String,
     /// Connections of Zenoh (rmw_zenoh).
     pub(super) zenoh: Option<ZenohShape>,
@@ -229,7 +229,7 @@ pub(super) struct ShmShape {
     #[schemars(range(min = 0.1, max = 100))]
     pub(super) cpu_percent: f64,
     /// Share of one CPU for polling, in percent, while messages of a topic in shared memory are
-    /// recorded, echoed, retained or measured, which needs frequent polls.
+    /// recorded, echoed, retained or measured. These uses need frequent polls.
     #[schemars(range(min = 0.1, max = 100))]
     pub(super) reading_cpu_percent: f64,
 }
@@ -270,8 +270,9 @@ pub(super) struct ApiShape {
     /// IP address and port to listen on, or `off`. Any address but a loopback one needs
     /// `token_file`.
     pub(super) listen: String,
-    /// Additional unix socket, for members of its group: a path, `off`, or `auto`: api.sock in
-    /// `$RUNTIME_DIRECTORY` as set by the service manager, else in /run/ros2probe if that exists.
+    /// Additional unix socket, for members of its group: a path, `off` or `auto`. `auto` is
+    /// api.sock in `$RUNTIME_DIRECTORY` as set by the service manager, else in /run/ros2probe if
+    /// that exists.
     pub(super) socket: String,
     /// Rights of clients without a token at a loopback `listen`; any user of this host can be such
     /// a client. `read`: graph, figures and events; `watch`: also add watches; `all`: also message
@@ -284,8 +285,8 @@ pub(super) struct ApiShape {
     pub(super) page: PageChoice,
 }
 
-/// The WebSocket server for viewers. Clients have the rights of `api.loopback`, or all with the token
-/// of `api.token_file` or of `rp foxglove` in the address (`?token=`).
+/// The WebSocket server for viewers. Clients have the rights of `api.loopback`, or all with the
+/// token of `api.token_file` or of `rp foxglove` in the address (`?token=`).
 #[derive(Debug, Deserialize, JsonSchema)]
 #[schemars(inline)]
 #[serde(deny_unknown_fields, default)]
@@ -469,11 +470,12 @@ pub(super) struct SnapshotShape {
     #[schemars(range(min = 65_536, max = 4_294_967_296_u64))]
     #[serde(default = "defaults::snapshot_bytes")]
     pub(super) max_bytes: usize,
-    /// Events that write a bag: `expectation`, `message_lost`, `participant_lost`, a kind of finding
-    /// such as `qos_incompatible`, or an event's name. Default: `[expectation]`.
+    /// Events that write a bag: `expectation`, `message_lost`, `participant_lost`, a kind of
+    /// finding such as `qos_incompatible`, or an event's name. Default: `[expectation]`.
     #[schemars(length(max = 32))]
     pub(super) trigger: Option<Vec<String>>,
-    /// Minimum seconds between two triggered bags. Default: `seconds` and `seconds_after`, at least 10.
+    /// Minimum seconds between two triggered bags. Default: `seconds` and `seconds_after`, at least
+    /// 10.
     #[schemars(range(min = 0, max = 86_400))]
     pub(super) min_interval_s: Option<u64>,
     /// Maximum number of triggered bags; the oldest is removed first.

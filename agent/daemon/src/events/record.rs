@@ -568,7 +568,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_disposed_participant_is_no_warning_and_an_expired_lease_is_one() {
+    fn a_disposed_participant_is_reported_as_info_and_an_expired_one_as_warning() {
         let lost = |change| {
             Occurrence::Robot(EventKind::Participant {
                 change,

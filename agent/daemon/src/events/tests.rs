@@ -175,7 +175,7 @@ fn a_burst_of_agent_events_is_limited_by_the_clock_of_the_agent() {
 }
 
 #[test]
-fn a_replay_at_full_speed_records_the_same_events_as_at_the_capture_s_speed() {
+fn replays_at_full_and_at_capture_speed_record_the_same_events() {
     let events: Vec<_> = (0..430).map(|number| node(number * SECOND / 100)).collect();
     let (at_once, paced) = (EventLog::new(), EventLog::new());
     at_once.add(taken(events.clone()), second(5));

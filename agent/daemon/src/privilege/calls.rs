@@ -2,7 +2,7 @@
 //!
 //! A refused call fails with `EPERM`, as without a privilege. Newer calls fail with `ENOSYS`, so
 //! that C libraries use an older, allowed one instead. Some calls are restricted by their
-//! arguments: memory never becomes executable, only the broker creates processes, and threads that
+//! arguments: memory never becomes executable, and only the broker creates processes. Threads that
 //! read the network or other processes open no file for writing.
 
 use std::collections::BTreeMap;

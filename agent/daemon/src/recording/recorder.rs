@@ -1,7 +1,7 @@
 //! One recording: samples in, a bag and a report out.
 //!
-//! A recorder has no thread and no clock: its owner feeds it from a subscription or from an agent's
-//! stream, and times come with the items. The first error of the storage ends the recording.
+//! A recorder has no thread and no clock. Its owner feeds it from a subscription or from an agent's
+//! stream, and times are part of the items. The first error of the storage ends the recording.
 //! Earlier samples are in the bag, and missing ones are counted.
 
 mod unrecorded;

@@ -1,5 +1,5 @@
-//! Requests for topics whose watch has `retain: last`: all their messages are captured, as for a
-//! client, so that the model has the last one, whatever its size.
+//! Requests for topics whose watch has `retain: last`. All messages of these topics are captured,
+//! as for a client, so that the model has the last one, whatever its size.
 
 use std::sync::Arc;
 

@@ -165,7 +165,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn signals_and_reasons_are_counted_apart_and_only_enabled_signals_shown() {
+    fn signals_are_counted_apart_and_only_enabled_ones_are_shown() {
         let exports = Exports::default();
         assert_eq!(exports.signals().count(), 0);
         exports.enable(Signal::Traces);

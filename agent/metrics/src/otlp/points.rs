@@ -2,7 +2,8 @@
 //! converted to the SDK's form. Requests stay well below the 4 MiB that receivers accept by
 //! default.
 //!
-//! Texts are shared between the points of a collection, so a large robot's names are in memory once.
+//! Texts are shared between the points of a collection, so a large robot's names are in memory
+//! once.
 
 use std::collections::HashSet;
 use std::sync::Arc;

@@ -73,7 +73,8 @@ pub(super) fn resource(host: &Host, file: &OtlpSettings) -> Resource {
     Resource::builder_empty().with_attributes(kept).build()
 }
 
-/// Returns the attributes of `OTEL_RESOURCE_ATTRIBUTES`. The SDK leaves their values percent-encoded.
+/// Returns the attributes of `OTEL_RESOURCE_ATTRIBUTES`. The SDK leaves their values
+/// percent-encoded.
 fn environment(detected: &Resource) -> Vec<KeyValue> {
     let decoded = |value: &Value| {
         let value = value.as_str();

@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn two_hosts_report_one_send_span_and_own_receive_spans_in_one_trace() {
+    fn two_hosts_share_the_send_span_of_a_trace_and_have_own_receive_spans() {
         let reader = Guid::new(GuidPrefix([2; 12]), EntityId([0, 0, 1, 4]));
         let (one, two) = (
             Tracing::new(1, Arc::default()),

@@ -248,7 +248,7 @@ fn a_bag_has_the_seconds_around_its_event_and_names_the_event() {
 
 /// An event arrives up to two seconds after the incident; the bag reaches back from the incident.
 #[test]
-fn the_delay_of_an_event_does_not_shorten_the_time_before() {
+fn a_late_event_does_not_shorten_the_time_before_the_incident() {
     let mut robot = Robot::new(settings(&["message_lost"], 3, 2));
     robot.run(100);
     let incident = robot.time();
@@ -418,7 +418,7 @@ fn a_thousand_triggers_in_a_minute_use_bounded_disk_space() {
 }
 
 #[test]
-fn the_minimum_interval_separates_bags() {
+fn triggers_within_the_minimum_interval_begin_no_bag() {
     let mut robot = Robot::new(SnapshotSettings {
         min_interval: Duration::from_secs(20),
         ..settings(&["message_lost"], 1, 0)
