@@ -2,7 +2,7 @@
 //! prints it.
 //!
 //! A comma only follows a value: empty values at the beginning of a message or an array leave no
-//! trace. This is the original's format, which its users parse.
+//! trace. Users of ros2cli parse this format.
 
 use crate::python;
 use crate::truncation::Truncation;
@@ -43,7 +43,7 @@ fn elements(array: &Array<'_>, shown: &Truncation) -> String {
             for value in scalars.iter().take(count) {
                 separate(&mut line);
                 match value {
-                    // numpy prints the digits of its own width.
+                    // numpy prints a float32 with the digits of a float32.
                     Scalar::Float32(number) if array.is_fixed() => {
                         line.push_str(&python::float32(number));
                     }

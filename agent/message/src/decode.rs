@@ -4,7 +4,7 @@
 //! the result is bounded by [`Limits`]. Supports XCDR1 and XCDR2 (plain and delimited) in both byte
 //! orders; parameter lists are rejected by name.
 //!
-//! Strings that are not UTF-8 and invalid booleans are shown as the original shows them, and
+//! Strings that are not UTF-8 and invalid booleans are shown as `ros2 topic echo` shows them, and
 //! counted ([`Oddities`]). A missing NUL at a string's end is accepted.
 
 use std::borrow::Cow;
@@ -14,19 +14,20 @@ use ros2probe_wire::cursor::{Cursor, Endianness, Reason, WireError};
 use crate::definition::{Element, Field, MessageType, Shape, Structure, TypeName};
 use crate::value::{Array, Items, Message, Scalar, ScalarKind, Scalars, Value};
 
-/// Every XCDR structure is aligned relative to the first byte after this.
+/// Size of the encapsulation header. XCDR aligns relative to the first byte after it.
 const ENCAPSULATION: usize = 4;
-/// Padding of submessages in RTPS: most bytes after the last field.
+/// Maximum number of padding bytes after the last field: RTPS aligns submessages to four bytes.
 const PADDING: usize = 3;
 
 /// Limits of one decoded message.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
-    /// Levels of nested messages.
+    /// Maximum number of levels of nested messages.
     pub depth: usize,
-    /// Values that are kept; an array of numbers is one value.
+    /// Maximum number of values that are kept. An array of numbers is one value.
     pub values: usize,
-    /// Elements that are kept per array of messages or strings; the others are only validated.
+    /// Maximum number of elements that are kept per array of messages or strings. Further elements
+    /// are only validated.
     pub kept: usize,
 }
 
@@ -52,11 +53,11 @@ pub struct Decoded<'a> {
 /// Deviations that do not prevent a message from being shown.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Oddities {
-    /// Bytes after the last field, more than padding.
+    /// Number of bytes after the last field; 0 if they may be padding.
     pub trailing: usize,
-    /// Strings that are not UTF-8 (UTF-16 for `wstring`).
+    /// Number of strings that are not UTF-8 (UTF-16 for `wstring`).
     pub texts: usize,
-    /// Booleans that are neither 0 nor 1: they count as true.
+    /// Number of booleans that are neither 0 nor 1. They count as true.
     pub booleans: usize,
 }
 
@@ -92,7 +93,7 @@ pub enum DecodeError {
 /// Decodes a payload that begins with its encapsulation header.
 ///
 /// # Errors
-/// Fails if the payload cannot be of this type, or exceeds the limits.
+/// Fails if the payload cannot be of this type or exceeds the limits.
 pub fn decode<'a>(
     message_type: &'a MessageType,
     payload: &'a [u8],
@@ -129,7 +130,7 @@ struct Encoding {
     widest: usize,
     /// Whether collections of anything but numbers are preceded by their size in bytes.
     sized: bool,
-    /// Whether structures are preceded by their size, too.
+    /// Whether structures are also preceded by their size in bytes.
     delimited: bool,
 }
 
@@ -320,7 +321,8 @@ impl<'a> Reader<'a> {
         length: usize,
         depth: usize,
     ) -> Result<Vec<Message<'a>>, DecodeError> {
-        // The smallest message is an octet, or its own size if the encoding writes it.
+        // A message takes at least one octet, or the four bytes of its size if the encoding writes
+        // sizes.
         let least = if self.encoding.delimited { 4 } else { 1 };
         let kept = self.keep(cursor, length, least)?;
         let mut messages = Vec::with_capacity(kept);
@@ -489,8 +491,8 @@ fn within(cursor: &Cursor<'_>, length: usize, shape: Shape) -> Result<(), Decode
     }
 }
 
-/// Returns UTF-16 text; an invalid code unit counts as a character of its own. A byte order mark at
-/// the begin is not a part of the text, and determines its order, as in rclpy.
+/// Returns UTF-16 text; an invalid code unit counts as a character of its own. As in rclpy, a byte
+/// order mark at the beginning determines the byte order and is not part of the text.
 fn wide(units: &Scalars<'_>) -> String {
     const MARK: u64 = 0xfeff;
     const SWAPPED: u64 = 0xfffe;

@@ -16,11 +16,11 @@ pub use crate::name::{Kind, NotATypeName, TypeName};
 use implicit_types::implicit_types;
 use parse::ParseError;
 
-/// Deepest nesting of types.
+/// Maximum depth of nested types.
 pub const MAX_DEPTH: usize = 32;
-/// Most types in one type.
+/// Maximum number of types in the definition of one type.
 pub const MAX_TYPES: usize = 1024;
-/// Most text that defines one type, including its nested types.
+/// Maximum size of the text that defines one type, including its nested types, in bytes.
 pub const MAX_TEXT: usize = 4 << 20;
 /// One member of a message.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -29,7 +29,7 @@ pub struct Field {
     pub name: String,
     /// Type of the value, or of an array's elements.
     pub element: Element,
-    /// Whether it is a single value or an array, and the array's length.
+    /// Whether the field is a single value or an array, and the array's length.
     pub shape: Shape,
 }
 
@@ -40,7 +40,7 @@ pub enum Element {
     Bool,
     /// `byte`, an octet.
     Byte,
-    /// `char`, an octet too.
+    /// `char`, also an octet.
     Char,
     /// `int8`.
     Int8,
@@ -64,15 +64,15 @@ pub enum Element {
     Float64,
     /// `string`, `string<=N`.
     String {
-        /// Most characters; `None` = unbounded.
+        /// Maximum number of characters; `None` = unbounded.
         bound: Option<u32>,
     },
     /// `wstring`, `wstring<=N`.
     WString {
-        /// Most characters; `None` = unbounded.
+        /// Maximum number of characters; `None` = unbounded.
         bound: Option<u32>,
     },
-    /// Another type.
+    /// Another message type.
     Nested(TypeName),
 }
 
@@ -99,7 +99,7 @@ pub struct Structure {
     pub fields: Vec<Field>,
 }
 
-/// One file with its types, including those that services and actions imply.
+/// The types of one file, including the types that services and actions imply.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Definition {
     /// The type after which the file is named.
@@ -297,7 +297,7 @@ impl MessageType {
         self.structures.get(name).map(Arc::as_ref)
     }
 
-    /// Iterates over all its types, itself included, sorted by name.
+    /// Iterates over the type and all types nested in it, sorted by name.
     pub fn structures(&self) -> impl Iterator<Item = &Structure> {
         self.structures.values().map(Arc::as_ref)
     }
@@ -306,13 +306,13 @@ impl MessageType {
 /// Why a schema's text is invalid.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SchemaError {
-    /// The line that names a part is not one of `MSG: package/Type`.
+    /// The line that begins a part does not have the form `MSG: package/Type`.
     #[error("line {line}: expected `MSG: package/Type` below the line of `=`")]
     Heading {
         /// Line number, counted from 1.
         line: usize,
     },
-    /// One of its definitions cannot be parsed.
+    /// A definition in the schema cannot be parsed.
     #[error("definition of {0}")]
     Definition(TypeName, #[source] ParseError),
     /// The definitions do not form one type.
@@ -375,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    fn types_are_nested_up_to_the_limit() {
+    fn types_nested_deeper_than_the_limit_are_refused() {
         let root = name("a/msg/T0");
         let deepest = MessageType::parse(&root, &chain(MAX_DEPTH - 1)).unwrap();
         assert_eq!(deepest.structures().count(), MAX_DEPTH);
@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn a_type_has_a_bounded_number_of_types() {
+    fn a_type_of_more_types_than_the_limit_is_refused() {
         let mut text = String::new();
         for index in 0..=MAX_TYPES {
             text.push_str(&format!("other/T{index} f{index}\n"));

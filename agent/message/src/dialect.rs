@@ -1,7 +1,6 @@
 //! Distributions of ROS 2 that differ in definitions and command-line output.
 
-/// A distribution of ROS 2, together with those that have the same definitions and print alike;
-/// oldest first.
+/// A group of distributions with the same definitions and the same output, oldest first.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Dialect {
     /// Humble and older.
@@ -16,7 +15,7 @@ pub enum Dialect {
 }
 
 impl Dialect {
-    /// Returns the name as in `ROS_DISTRO`.
+    /// Returns the distribution's name as in `ROS_DISTRO`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -45,7 +44,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_distribution_has_a_dialect_and_dialects_have_an_order() {
+    fn every_distribution_has_a_dialect_and_dialects_are_ordered_by_age() {
         assert_eq!(Dialect::of_distro("lyrical"), Some(Dialect::Rolling));
         assert_eq!(Dialect::of_distro("galactic"), Some(Dialect::Humble));
         assert_eq!(Dialect::of_distro("noetic"), None);

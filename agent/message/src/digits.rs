@@ -7,12 +7,13 @@
 use std::fmt::LowerExp;
 use std::str::FromStr;
 
-/// Returns digits with an exponent: `5.25e-7`. Infinities and NaN as Rust writes them.
+/// Returns digits with an exponent: `5.25e-7`. Infinities and NaN are written as Rust writes them.
 pub(super) fn scientific<T: LowerExp + FromStr + PartialEq + Copy>(value: T) -> String {
     let shortest = format!("{value:e}");
     let mantissa = shortest.split('e').next().unwrap_or_default();
     let precision = mantissa.split_once('.').map_or(0, |(_, part)| part.len());
-    // Correctly rounded, ties to even. Just above a power of two that may be another float.
+    // Rust rounds correctly here, with ties to even. Just above a power of two, the result may be
+    // another float.
     let nearest = format!("{value:.precision$e}");
     match nearest.parse::<T>() {
         Ok(read) if read == value => nearest,
@@ -49,7 +50,7 @@ mod tests {
 
     /// `ros2 topic echo` prints a float32 as the double of the same value.
     #[test]
-    fn of_two_equally_near_candidates_the_even_one_is_taken() {
+    fn the_even_one_of_two_equally_near_candidates_is_used() {
         for (value, digits) in [
             (540.926_086_425_781_2, "540.9260864257812"),
             (-540.926_086_425_781_2, "-540.9260864257812"),
@@ -68,7 +69,7 @@ mod tests {
     }
 
     #[test]
-    fn a_nearer_candidate_that_reads_back_as_another_float_is_not_taken() {
+    fn a_nearer_candidate_that_reads_back_as_another_float_is_not_used() {
         assert_eq!(scientific(2_f64.powi(-44)), "5.684341886080802e-14");
         assert_eq!(scientific(2_f32.powi(-96)), "1.2621775e-29");
         assert_eq!(scientific(5e-324), "5e-324");

@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn every_heading_is_read_and_no_comment_is_there() {
+    fn every_heading_is_read_and_no_definition_has_comments() {
         let headings: usize = PACKAGES
             .iter()
             .map(|(_, text)| text.lines().filter(|line| line.starts_with('=')).count())
@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_hash_the_dialects_own_definition_is_taken() {
+    fn without_a_hash_the_dialects_own_definition_is_used() {
         let libraries = DIALECTS.map(|(distribution, dialect)| (distribution, library(dialect)));
         let mut hashes: BTreeMap<&str, usize> = BTreeMap::new();
         for line in HASHES.lines() {
@@ -233,7 +233,7 @@ mod tests {
             }
         }
         assert!(hashes.values().all(|count| *count == DIALECTS.len()));
-        // Definitions without a hash in the other implementation still must be complete.
+        // Definitions without a reference hash must be complete, too.
         for (name, one) in all() {
             let definition = Definition::parse(name.clone(), one.text).unwrap();
             for structure in &definition.structures {
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn schemas_have_the_parts_of_a_real_bags_in_their_order() {
+    fn schemas_have_the_parts_of_a_real_bags_schemas_in_the_same_order() {
         let library = library(Dialect::Humble);
         let mut count = 0;
         for schema in SCHEMAS.split("@ ").skip(1) {
@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn a_hash_that_no_variant_has_is_refused_with_the_one_that_is_here() {
+    fn a_hash_that_no_variant_has_is_refused_with_the_hash_of_an_embedded_one() {
         let announced = format!("RIHS01_{}", "0".repeat(64));
         let failure = library(Dialect::Jazzy).find("std_msgs/msg/String", Some(&announced));
         let failure = failure.unwrap_err();

@@ -13,9 +13,9 @@ use std::fmt;
 
 pub use evaluate::Subject;
 
-/// Longest expression, in bytes.
+/// Maximum length of an expression, in bytes.
 const MAX_LENGTH: usize = 4096;
-/// Most tokens: a chain of operators is as deep as it is long.
+/// Maximum number of tokens: a chain of operators is as deep as it is long.
 const MAX_WORDS: usize = 400;
 
 /// A condition.
@@ -55,8 +55,7 @@ impl FilterError {
 impl Filter {
     /// Parses an expression.
     ///
-    /// # Errors
-    /// Fails if it is outside of the subset, too long or too deep.
+    /// Fails if the expression is outside of the subset, too long or too deep.
     pub fn parse(text: &str) -> Result<Self, FilterError> {
         if text.len() > MAX_LENGTH {
             return Err(FilterError::new(

@@ -1,4 +1,4 @@
-//! The type hash of ROS 2 from Iron on: REP-2011, version 01.
+//! The type hash of ROS 2 since Iron: REP-2011, version 01.
 //!
 //! SHA-256 of a JSON text with names and types of all fields, with exactly the spaces that Python's
 //! `json.dumps` writes. Names are ASCII identifiers, so nothing needs escaping.

@@ -20,12 +20,12 @@ use crate::library::search::Search;
 
 /// Directory of ROS installations, one subdirectory per distribution.
 const INSTALLED: &str = "/opt/ros";
-/// Most sources searched: a workspace installed package by package has hundreds.
+/// Maximum number of sources searched: a workspace installed package by package has hundreds.
 pub(super) const MAX_SOURCES: usize = 1024;
-/// Most types kept, and most bytes of text.
+/// Maximum number of cached types, and maximum size of their text in bytes.
 const MAX_KEPT: usize = 1024;
 const MAX_KEPT_TEXT: usize = 32 << 20;
-/// Prefix of the only version of type hashes.
+/// Prefix of type hashes of the only known version.
 const HASH: &str = "RIHS01_";
 
 /// Sources to search, in this order.
@@ -158,7 +158,7 @@ pub enum NotFound {
     },
 }
 
-/// Returns ` (in X)` unless the missing type is the requested one.
+/// Returns ` (part of X)` unless the missing type is the requested one.
 fn of(missing: &TypeName, root: &TypeName) -> String {
     if missing == root {
         String::new()
@@ -254,7 +254,7 @@ mod tests {
     use super::*;
     use crate::definition::parse::MAX_TEXT;
 
-    /// An installed ROS with these files: path `a/msg/B.msg` and text.
+    /// Creates an installed ROS with these files, each a path such as `a/msg/B.msg` and its text.
     fn prefix(files: &[(&str, &str)]) -> TempDir {
         let directory = tempfile::tempdir().unwrap();
         for (name, text) in files {
@@ -300,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn a_named_directory_comes_before_what_is_installed_and_needs_no_share() {
+    fn a_named_directory_precedes_an_installation_and_needs_no_share() {
         let installed = prefix(&[("a/msg/B.msg", "int8 x")]);
         for share in ["", "share"] {
             let named = tempfile::tempdir().unwrap();
@@ -327,7 +327,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_come_from_another_place_where_only_so_the_hash_agrees() {
+    fn parts_come_from_another_source_if_only_then_the_hash_matches() {
         let workspace = prefix(&[("w/msg/W.msg", "a/B b\nstd_msgs/Header header")]);
         let below = prefix(&[("a/msg/B.msg", "int8 x")]);
         let nodes = prefix(&[("a/msg/B.msg", "int16 x")]);
@@ -345,7 +345,7 @@ mod tests {
     }
 
     #[test]
-    fn services_events_and_actions_are_found_by_the_names_that_are_announced() {
+    fn services_events_and_actions_are_found_by_their_announced_names() {
         let here = prefix(&[
             ("a/srv/S.srv", "# S\nint8 x\n---\nstd_msgs/String y # why\n"),
             (
@@ -445,7 +445,7 @@ mod tests {
     }
 
     #[test]
-    fn an_idl_file_counts_where_it_is_alone() {
+    fn an_idl_file_is_used_only_if_the_type_has_no_other_file() {
         let idl =
             "module a { module msg { struct B { long long x; std_msgs::msg::Header y; }; }; };";
         let here = prefix(&[
@@ -497,9 +497,9 @@ mod tests {
     }
 
     #[test]
-    fn hostile_trees_end_with_a_reason() {
-        // Each type of two sources names two of the next: a tree of 2^40 paths, and each source has
-        // another variant.
+    fn a_search_of_hostile_definition_trees_ends_with_a_reason() {
+        // Each type has two fields of the next type: a tree of 2^40 paths. The two sources have
+        // different variants of all types.
         let make = |extra: &str| {
             let file = |index| {
                 let text = format!("T{0} a\nT{0} b\n{extra}", index + 1);
@@ -538,7 +538,7 @@ mod tests {
     }
 
     #[test]
-    fn kept_definitions_are_bounded() {
+    fn the_number_of_cached_definitions_is_bounded() {
         let here = prefix(&[("a/msg/B.msg", "int8 x")]);
         let library = library(&[&here]);
         for index in 0..=MAX_KEPT {
@@ -551,7 +551,7 @@ mod tests {
     }
 
     #[test]
-    fn the_dialects_distribution_comes_first_then_newer_ones() {
+    fn the_dialects_distribution_comes_first_then_the_others_newest_first() {
         let here = tempfile::tempdir().unwrap();
         for name in ["humble", "iron", "jazzy", "rolling"] {
             fs::create_dir(here.path().join(name)).unwrap();

@@ -6,7 +6,7 @@ use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;
 
-/// Longest name of a package or type: both are file names.
+/// Maximum length of the name of a package or type, which is also a file name.
 const MAX_NAME: usize = 200;
 
 /// Kind of file that defines a type.
@@ -57,7 +57,7 @@ impl TypeName {
         })
     }
 
-    /// Creates the name of a message that this program refers to.
+    /// Creates the name of a message that this crate refers to.
     pub(super) fn message(package: &'static str, name: &'static str) -> Self {
         Self {
             package: package.into(),
@@ -71,7 +71,7 @@ impl TypeName {
         &self.package
     }
 
-    /// Returns the kind of file that defines it.
+    /// Returns the kind of file that defines the type.
     pub fn kind(&self) -> Kind {
         self.kind
     }
@@ -90,8 +90,8 @@ impl TypeName {
         }
     }
 
-    /// Returns the files that may define this type: its own, and those of services and actions
-    /// whose name with an implied suffix gives this name.
+    /// Returns the files that may define this type: its own, and the service and action files whose
+    /// name with an implied suffix equals this name.
     pub(super) fn files(&self) -> Vec<Self> {
         const SERVICE: [&str; 3] = ["_Request", "_Response", "_Event"];
         const ACTION: [&str; 12] = [
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_three_identifiers() {
+    fn only_three_identifiers_form_a_name() {
         for text in [
             "std_msgs/msg/String",
             "a/srv/B_Request",
@@ -211,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_ordered_as_their_text_is() {
+    fn names_are_ordered_like_their_text() {
         let texts = [
             "a/action/Z",
             "a/msg/B",

@@ -118,7 +118,8 @@ pub fn type_name<'a>(value: &Value<'a>) -> &'a str {
     }
 }
 
-/// Returns whether it is kept in an `array.array` or a numpy array: booleans and octets are not.
+/// Returns whether rclpy keeps the array in an `array.array` or a numpy array: booleans and octets
+/// are in lists.
 fn is_numeric(array: &Array<'_>) -> bool {
     match &array.items {
         Items::Scalars(scalars) => !matches!(scalars.kind(), ScalarKind::Bool | ScalarKind::Byte),
@@ -130,19 +131,19 @@ fn quote(single: bool, double: bool) -> char {
     if single && !double { '"' } else { '\'' }
 }
 
-/// Returns whether `str.isprintable()` is true, by the same Unicode categories in a newer version
-/// than Humble's Python.
+/// Returns whether Python's `str.isprintable()` is true. Rust knows the same categories, in a newer
+/// version of Unicode than Humble's Python.
 fn is_printable(character: char) -> bool {
     if character.is_ascii() {
         return !character.is_control();
     }
-    // After another character Rust escapes combining ones only if they are not printable.
+    // After another character, Rust escapes a combining character only if it is not printable.
     let text: String = ['a', character].iter().collect();
     text.escape_debug().count() == 2
 }
 
-/// Formats with an exponent below 1e-4 and from 1e16 on; the exponent has a sign and at least two
-/// digits.
+/// Formats a float as Python does: with an exponent below 1e-4 and from 1e16. The exponent has a
+/// sign and at least two digits.
 fn laid_out<T: LowerExp + FromStr + PartialEq + Copy>(value: T) -> String {
     let text = digits::scientific(value);
     let Some((mantissa, exponent)) = text.split_once('e') else {

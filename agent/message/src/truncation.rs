@@ -7,16 +7,16 @@ use crate::value::Array;
 /// Limits of the printed arrays and strings.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Truncation {
-    /// Most elements and characters; `...` replaces the others.
+    /// Maximum number of elements and characters; `...` replaces the others.
     pub truncate: Option<usize>,
-    /// Print arrays only by type and length.
+    /// Whether arrays are printed only by type and length.
     pub no_arrays: bool,
-    /// Print strings only by length.
+    /// Whether strings are printed only by length.
     pub no_strings: bool,
 }
 
 impl Truncation {
-    /// Returns a string within the limits; `None` if it is unchanged.
+    /// Returns the shortened string; `None` if it is within the limits.
     pub fn text(&self, text: &str) -> Option<String> {
         if self.no_strings {
             return Some(format!("<string length: <{}>>", text.chars().count()));
@@ -58,7 +58,7 @@ impl Truncation {
     }
 }
 
-/// Returns an element's type name in IDL, to which ROS converts messages.
+/// Returns the name of an element's type in IDL, to which ROS converts messages.
 fn element_name(element: &Element) -> String {
     match element {
         Element::Bool => "boolean".to_owned(),

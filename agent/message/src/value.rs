@@ -57,7 +57,7 @@ pub struct Array<'a> {
 }
 
 impl Array<'_> {
-    /// Returns whether the type gives it a fixed length.
+    /// Returns whether the array has a fixed length.
     pub fn is_fixed(&self) -> bool {
         matches!(self.field.shape, Shape::Array(_))
     }
@@ -283,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn half_an_element_at_the_end_is_none() {
+    fn an_incomplete_element_at_the_end_is_ignored() {
         let scalars = Scalars::new(ScalarKind::UInt16, Endianness::Little, &[1, 0, 2, 0, 3]);
         assert_eq!(scalars.len(), 2);
         assert_eq!(

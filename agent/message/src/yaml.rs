@@ -47,7 +47,7 @@ struct Writer<'a> {
     text: String,
     shown: &'a Truncation,
     style: Style,
-    /// Inside of a sequence in flow style, where fewer strings are plain.
+    /// Whether the writer is in a sequence in flow style, where fewer strings are plain.
     is_in_flow: bool,
 }
 

@@ -25,7 +25,7 @@ const ECHO: Truncation = Truncation {
 };
 
 #[test]
-fn every_golden_payload_prints_as_the_original_prints_it() {
+fn every_golden_payload_prints_as_ros2_topic_echo_prints_it() {
     let mut count = 0;
     let library = library();
     for case in cases() {
@@ -55,7 +55,7 @@ fn every_golden_payload_prints_as_the_original_prints_it() {
     assert_eq!(count, 154);
 }
 
-/// Compares with the output of Python, PyYAML and numpy (`data/python/forms.py`).
+/// Compares the output with that of Python, PyYAML and numpy (`data/python/forms.py`).
 #[test]
 fn strings_numbers_and_arrays_print_as_python_prints_them() {
     let mut wrong = 0;
@@ -72,10 +72,10 @@ fn strings_numbers_and_arrays_print_as_python_prints_them() {
     assert_eq!(wrong, 0);
 }
 
-/// However a payload is cut or changed, decoding returns, and with the same result whether elements
-/// are kept or not.
+/// Decoding returns however a payload is cut or changed. The result does not depend on whether
+/// elements are kept.
 #[test]
-fn damaged_payloads_are_read_or_refused_and_never_more() {
+fn damaged_payloads_are_decoded_or_refused_without_a_panic() {
     let library = library();
     let few = Limits {
         kept: 2,
@@ -116,7 +116,7 @@ fn damaged_payloads_are_read_or_refused_and_never_more() {
     }
 }
 
-/// The second oracle: PyPI `rosbags`, which has no `wstring`.
+/// Compares with a second oracle: `rosbags` of PyPI, which has no `wstring`.
 #[test]
 fn rosbags_reads_the_same_values() {
     let library = library();
@@ -128,7 +128,7 @@ fn rosbags_reads_the_same_values() {
         }
         let message_type = library.find(&case.message_type, None).unwrap();
         let decoded = decode(&message_type, &case.payload, &Limits::default()).unwrap();
-        // rosbags rejects bytes behind the last field.
+        // rosbags rejects bytes after the last field.
         let length = case.payload.len() - decoded.oddities.trailing;
         let payload = golden::hex(&case.payload[..length]);
         lines.push_str(&serde_json::to_string(&(&case.message_type, payload)).unwrap());

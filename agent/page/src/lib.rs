@@ -1,4 +1,4 @@
-//! Files of the web page, as the folder around this crate holds them.
+//! Files of the web page, embedded from the directory of this crate.
 //!
 //! ```
 //! let index = ros2probe_page::FILES.iter().find(|file| file.path == "index.html");

@@ -27,7 +27,7 @@ const NESTED: &str = "Inner[] inner\nint64 last\n
 MSG: a/Inner\nuint8 small\nuint32 middle\nfloat64 large\nstring name";
 
 #[test]
-fn xcdr1_aligns_to_eight_and_xcdr2_to_four() {
+fn xcdr1_aligns_to_eight_bytes_and_xcdr2_to_four() {
     let xcdr1 = b"\0\x01\0\0\x01\0\0\0\x05\0\0\0\x09\0\0\0\0\0\0\0\0\0\0\0\0\0\xf8\x3f\
         \x02\0\0\0x\0\0\0\x07\0\0\0\0\0\0\0";
     let shown = "a.msg.B(inner=[a.msg.Inner(small=5, middle=9, large=1.5, name='x')], last=7)";
@@ -36,7 +36,7 @@ fn xcdr1_aligns_to_eight_and_xcdr2_to_four() {
     let plain = b"\0\x07\0\0\x1a\0\0\0\x01\0\0\0\x05\0\0\0\x09\0\0\0\0\0\0\0\0\0\xf8\x3f\
         \x02\0\0\0x\0\0\0\x07\0\0\0\0\0\0\0";
     assert_eq!(text(NESTED, plain), shown);
-    // Each structure is preceded by its size, too.
+    // Each structure is also preceded by its size.
     let delimited = b"\0\x09\0\0\x2c\0\0\0\x1e\0\0\0\x01\0\0\0\x16\0\0\0\x05\0\0\0\x09\0\0\0\
         \0\0\0\0\0\0\xf8\x3f\x02\0\0\0x\0\0\0\x07\0\0\0\0\0\0\0";
     assert_eq!(text(NESTED, delimited), shown);
@@ -56,7 +56,7 @@ fn big_endian_numbers_and_strings_are_read() {
 }
 
 #[test]
-fn utf_16_is_put_together_also_where_a_unit_has_four_octets() {
+fn utf_16_surrogates_combine_in_code_units_of_two_and_of_four_octets() {
     let one = b"\0\x01\0\0\x02\0\0\0\x3d\xd8\0\0\0\xde\0\0";
     assert_eq!(text("wstring w", one), "a.msg.B(w='\u{1f600}')");
     let two = b"\0\x07\0\0\x04\0\0\0\x3d\xd8\0\xde";
@@ -70,7 +70,7 @@ fn utf_16_is_put_together_also_where_a_unit_has_four_octets() {
 }
 
 #[test]
-fn a_byte_order_mark_begins_no_wide_string() {
+fn a_leading_byte_order_mark_is_not_part_of_a_wide_string() {
     for (units, shown) in [
         (&b"\xff\xfea\0"[..], "a"),
         (b"\xfe\xff\0a", "a"),
@@ -107,7 +107,7 @@ fn unsupported_encapsulations_are_refused_by_name() {
 }
 
 #[test]
-fn a_length_beyond_the_payload_is_refused_before_anything_is_made_of_it() {
+fn a_length_beyond_the_payload_is_refused_before_allocation() {
     let payload = [0, 1, 0, 0, 0x00, 0xe1, 0xf5, 0x05];
     for schema in [
         NESTED,
@@ -135,7 +135,7 @@ MSG: a/Empty\n";
 }
 
 #[test]
-fn kept_values_are_bounded_and_the_others_are_still_checked() {
+fn values_beyond_the_limit_are_validated_but_not_kept() {
     let schema = "Inner[] a\nstring[] b\n
 ================================================================================
 MSG: a/Inner\nuint8 x\nuint8 y";
@@ -192,7 +192,7 @@ fn oddities_are_shown_and_counted() {
     let odd = |payload: &[u8]| read("uint8 a", payload).unwrap().1.trailing;
     assert_eq!(odd(&[0, 1, 0, 0, 1, 2, 3, 4]), 0);
     assert_eq!(odd(&[0, 1, 0, 0, 1, 2, 3, 4, 5]), 4);
-    // A string without its NUL, and one whose length excludes even that.
+    // A string without a NUL, and one whose length is 0 although a NUL counts.
     assert_eq!(
         text("string a", b"\0\x01\0\0\x02\0\0\0ab"),
         "a.msg.B(a='ab')"
@@ -201,7 +201,7 @@ fn oddities_are_shown_and_counted() {
 }
 
 #[test]
-fn bounds_are_kept() {
+fn a_value_beyond_its_bound_is_refused() {
     let payload = b"\0\x01\0\0\x03\0\0\0ab\0";
     assert_eq!(text("string<=2 a", payload), "a.msg.B(a='ab')");
     assert!(read("string<=1 a", payload).is_err());

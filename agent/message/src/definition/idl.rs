@@ -13,7 +13,7 @@ use crate::definition::schema;
 use crate::definition::{Definition, Element, Field, Kind, Shape, Structure, TypeName};
 use crate::name::is_identifier;
 
-/// Deepest nesting of modules; ROS uses two.
+/// Maximum depth of nested modules; ROS uses two.
 const MAX_MODULES: usize = 16;
 /// Field that rosidl adds to a type without fields.
 const NO_MEMBER: &str = "structure_needs_at_least_one_member";
@@ -55,7 +55,7 @@ pub(crate) fn definition(name: TypeName, text: &str) -> Result<Definition, Parse
     ))
 }
 
-/// Reads token by token.
+/// Reads a file token by token.
 struct Reader<'a> {
     name: &'a TypeName,
     rest: &'a str,
@@ -264,7 +264,7 @@ impl<'a> Reader<'a> {
         {
             return Ok(declared.clone());
         }
-        // Names of message types begin with this.
+        // Names of message types begin with a capital letter.
         let is_message =
             kind == "msg" && name.starts_with(|first: char| first.is_ascii_uppercase());
         TypeName::new(package, Kind::Message, name)
@@ -476,7 +476,7 @@ module a {
 "#;
 
     #[test]
-    fn idl_written_by_rosidl_is_read_as_its_message() {
+    fn idl_that_rosidl_generates_from_a_message_is_read_as_that_message() {
         let message = "\
 std_msgs/Header header
 float64 x

@@ -9,9 +9,9 @@ use std::collections::BTreeSet;
 use crate::definition::{Element, Field, Kind, Shape, Structure, TypeName};
 use crate::name::is_identifier;
 
-/// Longest file accepted, in bytes: the longest in use has 30 kB.
+/// Maximum size of a file, in bytes. The largest file in use has 30 kB.
 pub(crate) const MAX_TEXT: usize = 1 << 18;
-/// Most fields per type.
+/// Maximum number of fields per type.
 pub(crate) const MAX_FIELDS: usize = 4096;
 /// Separates a service's request and response, and the parts of an action.
 pub(crate) const SEPARATOR: &str = "---";
@@ -44,7 +44,7 @@ pub enum Problem {
     /// A field is declared twice.
     #[error("`{0}` is declared twice")]
     Twice(String),
-    /// Neither a basic type nor the name of a message.
+    /// The text is neither a basic type nor the name of a message.
     #[error("`{0}` is not a type")]
     Type(String),
     /// The bound of a string or an array is invalid.
@@ -233,7 +233,7 @@ fn field_type(package: &str, text: &str) -> Result<(Element, Shape), Problem> {
     Ok((Element::Nested(nested), shape))
 }
 
-/// Parses a type that needs no file.
+/// Parses a basic type; returns `None` for any other.
 fn basic(text: &str) -> Result<Option<Element>, Problem> {
     let (name, bound) = match text.split_once("<=") {
         Some((name, bound)) => (name, Some(size(bound)?)),
@@ -326,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn comments_constants_and_empty_lines_are_no_fields() {
+    fn comments_constants_and_empty_lines_are_not_fields() {
         let text = "\u{feff}# head\n\nuint8 A=1\nint8 B = -1 # b\nstring C=\nstring<=5 D=\"=#\"\n\
                     \t# indented\nfloat32 value # m\nbyte E=0x1\n@key\n";
         let fields = fields(text).unwrap();
@@ -414,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn sizes_are_bounded() {
+    fn too_long_files_and_too_many_fields_are_refused() {
         let long = "#".repeat(MAX_TEXT + 1);
         assert_eq!(fields(&long).unwrap_err().problem, Problem::TooLong);
         let many: String = (0..=MAX_FIELDS)

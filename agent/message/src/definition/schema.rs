@@ -1,7 +1,8 @@
 //! A type's definition as one text, in the form of bags (encoding `ros2msg` of MCAP's registry).
 //!
 //! Uses the order of `rosbag2_cpp`: the type's own text, then each nested message once, below a
-//! line of `=`. Those of a file are sorted, each followed by its own nested messages.
+//! line of `=`. The messages that a file uses are sorted. Each is followed by its own nested
+//! messages.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -43,8 +44,8 @@ impl MessageType {
             .map(AsRef::as_ref)
     }
 
-    /// Appends a file and the types that it uses. Recurses as deep as types are nested, which is
-    /// bounded.
+    /// Appends a file and the types that it uses. The recursion is as deep as the types are nested,
+    /// which is bounded.
     fn append_file<'a>(
         &'a self,
         text: &mut String,
@@ -165,7 +166,7 @@ pub(crate) fn parts<'a>(
     Ok(parts)
 }
 
-/// Parses `package/Type`, or `package/msg/Type` as some writers have it.
+/// Parses `package/Type`, or `package/msg/Type` as some programs write it.
 fn message(text: &str) -> Option<TypeName> {
     if let Ok(name) = text.parse() {
         return Some(name);
@@ -225,7 +226,7 @@ uint32 nanosec
     }
 
     #[test]
-    fn both_ways_of_writing_a_heading_are_read() {
+    fn headings_with_and_without_msg_are_read_and_others_are_refused() {
         let text = format!("B b\n{LINE}\nMSG: a/msg/B\nint8 x\n");
         let read = MessageType::parse(&"a/msg/A".parse().unwrap(), &text).unwrap();
         assert_eq!(read.structures().count(), 2);
@@ -236,7 +237,7 @@ uint32 nanosec
         }
     }
 
-    /// Returns the files in a real bag, one after the other, with their comments.
+    /// Returns the name and the text of each schema in a real bag.
     fn real() -> Vec<(String, String)> {
         let bag =
             "../../../shared/fixtures/cyclonedds/bag-record-2ns/bag_default/bag_default_0.mcap.gz";
@@ -268,7 +269,7 @@ uint32 nanosec
                     .join(name.package())
                     .join("msg");
                 std::fs::create_dir_all(&package).unwrap();
-                // The line before the next heading belongs to the heading.
+                // The empty line before the next heading belongs to the heading.
                 let is_last = expected.ends_with(text);
                 let text = if is_last {
                     text
@@ -293,7 +294,7 @@ uint32 nanosec
             let text = members(&structure);
             let read = Definition::parse(structure.name.clone(), &text).unwrap();
             prop_assert_eq!(&*read.structures[0], &structure);
-            // The same as a nested type.
+            // The same structure is read as a nested type.
             let root = "a/msg/Root".parse().unwrap();
             let text = format!("B b\n{}{LINE}\nMSG: a/B\n{}", members(&more), members(&structure));
             if let Ok(read) = MessageType::parse(&root, &text) {
@@ -303,7 +304,7 @@ uint32 nanosec
         }
 
         #[test]
-        fn any_text_is_read_or_refused(words in vec(select(WORDS), 0..60)) {
+        fn any_text_is_parsed_or_refused_without_a_panic(words in vec(select(WORDS), 0..60)) {
             let text = words.join(" ");
             for name in ["a/msg/B", "a/srv/B", "a/action/B"] {
                 let name = || name.parse::<TypeName>().unwrap();

@@ -8,7 +8,8 @@ use super::{Comparison, FilterError, Function, Kind, Method, Node, Operator};
 use crate::python;
 use crate::value::{Array, Items, Message, Scalar, Value};
 
-/// Why an expression has no value: what Python would raise. Types have their names in Python.
+/// Why an expression has no value: the exception that Python would raise. Types have their Python
+/// names.
 #[derive(Debug, thiserror::Error)]
 enum Exception {
     #[error("'{0}' object has no attribute '{1}'")]
@@ -60,7 +61,7 @@ enum Exception {
 pub enum Subject<'a> {
     /// The whole message.
     Message(&'a Message<'a>),
-    /// The part of it selected by `--field`.
+    /// The part of the message that `--field` selects.
     Value(&'a Value<'a>),
     /// The payload, with `--raw`.
     Bytes(&'a [u8]),
@@ -139,7 +140,7 @@ impl<'a> Object<'a> {
         name.to_owned()
     }
 
-    /// Returns the value as a number, which a boolean is, too; `None` for other values.
+    /// Returns a number or boolean as a number; `None` for other values.
     fn number(&self) -> Option<Number> {
         match self {
             Self::Bool(value) => Some(Number::Int(i128::from(*value))),
@@ -338,7 +339,8 @@ fn binary<'a>(
     if let (Number::Int(one), Number::Int(other)) = (one, other) {
         let remainder = |one: i128, other: i128| {
             let remainder = one.wrapping_rem(other);
-            // The result has the divisor's sign, so the sum of both is nearer to 0 than either.
+            // The result has the divisor's sign. Operands of different signs cannot overflow in the
+            // sum.
             let differs = remainder != 0 && (remainder < 0) != (other < 0);
             if differs {
                 remainder + other
@@ -349,7 +351,8 @@ fn binary<'a>(
         let floor = |one: i128, other: i128| {
             let quotient = one.checked_div(other)?;
             let rest = one.wrapping_rem(other);
-            // With a remainder, the divisor is at least 2, so the quotient has room below.
+            // With a remainder, the divisor is not 1 or -1, so subtracting 1 from the quotient
+            // cannot overflow.
             let below = rest != 0 && (rest < 0) != (other < 0);
             Some(quotient - i128::from(below))
         };

@@ -3,7 +3,7 @@
 use super::tokens::{Token, TokenKind};
 use super::{Comparison, FilterError, Function, Kind, Method, Node, Operator};
 
-/// Deepest nesting of parentheses, lists and signs.
+/// Maximum depth of nested parentheses, lists and signs.
 const MAX_DEPTH: usize = 32;
 
 /// Parses all tokens as one expression.
@@ -220,7 +220,7 @@ impl<'a> Parser<'a> {
 
     fn postfix(&mut self) -> Result<Node, FilterError> {
         let mut node = self.atom()?;
-        // Each step is also a level of the value.
+        // Each attribute, call or index adds a level to the node.
         let mut steps = 0;
         loop {
             let column = self.column();
@@ -303,7 +303,7 @@ impl<'a> Parser<'a> {
         Ok(Node { column, kind })
     }
 
-    /// Parses the content of parentheses; with a comma it is a list.
+    /// Parses the content of parentheses, which is a list if it has a comma.
     fn parenthesis(&mut self, column: usize) -> Result<Node, FilterError> {
         if self.sign(")") {
             return Ok(Node {

@@ -31,7 +31,7 @@ fn evaluate(text: &str) -> Result<bool, FilterError> {
 }
 
 #[test]
-fn expressions_mean_what_they_mean_in_python() {
+fn expressions_evaluate_as_in_python() {
     for (text, value) in [
         ("m.x > 2 and m.n < 0", true),
         ("1 < m.x <= 2.5 < 3", true),
@@ -83,7 +83,7 @@ fn expressions_mean_what_they_mean_in_python() {
 }
 
 #[test]
-fn mistakes_name_their_column() {
+fn a_mistake_is_reported_with_its_column() {
     for (text, error) in [
         ("m.x = 3", "column 5: `=` assigns; `==` compares"),
         ("m.x >", "column 6: expected a value: the expression ends"),
@@ -120,7 +120,7 @@ fn mistakes_name_their_column() {
 }
 
 #[test]
-fn depth_and_length_are_bounded() {
+fn too_deep_and_too_long_expressions_are_refused() {
     for text in [
         "(".repeat(300),
         "-".repeat(300),
@@ -155,7 +155,7 @@ fn depth_and_length_are_bounded() {
 
 proptest! {
     #[test]
-    fn no_text_makes_it_panic(
+    fn no_expression_causes_a_panic(
         tokens in prop::collection::vec(prop::sample::select(vec![
             "m", ".x", ".n", ".name", ".names", ".three", "[", "]", "(", ")", "0", "1", "-1", "2.5",
             "'a'", "+", "-", "*", "/", "//", "%", "**", "<", "==", "in", "not", "and", "or", ",",

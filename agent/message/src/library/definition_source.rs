@@ -42,8 +42,8 @@ impl DefinitionSource {
     }
 
     /// Returns the file that defines a type, even if it is unreadable, so that the error can be
-    /// reported. An installed package also has an `.idl` file for every other one; it counts only
-    /// if it is alone.
+    /// reported. An installed package also has an `.idl` file for every `.msg`, `.srv` and
+    /// `.action` file. It is used only without such a file.
     fn file(&self, name: &TypeName) -> Option<PathBuf> {
         let kind = name.kind().as_str();
         let directories = match self {
@@ -112,7 +112,7 @@ fn open(path: &Path) -> io::Result<File> {
     }
 }
 
-/// Reads a file; of one longer than [`MAX_TEXT`], one byte more than that.
+/// Reads a file, but at most one byte more than [`MAX_TEXT`].
 fn read_bytes(path: &Path) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?

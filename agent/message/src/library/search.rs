@@ -9,11 +9,11 @@ use crate::definition::{Definition, MessageType, NotClosed, TypeName};
 use crate::library::definition_source::DefinitionSource;
 use crate::library::{MAX_SOURCES, NotFound};
 
-/// Most attempts to assemble a type with the announced hash.
+/// Maximum number of attempts to assemble a type with the announced hash.
 const MAX_TRIES: usize = 256;
-/// Most file system queries of one search.
+/// Maximum number of file system queries of one search.
 const MAX_ASKED: usize = 1 << 18;
-/// Most bytes of text held by a search.
+/// Maximum size of the text that a search keeps, in bytes.
 const MAX_HELD: usize = 16 << 20;
 
 /// Content of a file, if it still exists.
@@ -45,8 +45,8 @@ impl<'a> Search<'a> {
     }
 
     /// Returns the first type that can be assembled, or that matches the hash. Usually all parts
-    /// are from one source and those after it. A workspace over another ROS than the nodes' may
-    /// need the type from one source and the rest from another.
+    /// are from one source and the sources after it. A workspace may be built over another ROS than
+    /// the nodes'. The type is then from one source and its parts from another.
     pub(crate) fn run(&mut self, announced: Option<&str>) -> Result<MessageType, NotFound> {
         let mut firsts = BTreeSet::new();
         for file in self.root.files() {
@@ -56,7 +56,7 @@ impl<'a> Search<'a> {
             let Some(first) = firsts.first() else {
                 return Err(self.nowhere(self.root.clone()));
             };
-            // Without a hash, later sources are no better: do not guess.
+            // Without a hash, nothing shows that a later source is better.
             return self.assemble(*first, *first);
         };
         let mut tries: Vec<_> = firsts.iter().map(|first| (*first, *first)).collect();
@@ -177,7 +177,7 @@ impl<'a> Search<'a> {
 
 /// Why parts could not be assembled.
 enum Failure {
-    /// A part's own error.
+    /// The error of one part.
     Known(NotFound),
     NotClosed(NotClosed),
 }

@@ -11,7 +11,7 @@ const PRECISION: usize = 8;
 const THRESHOLD: usize = 1000;
 const EDGE: usize = 3;
 const WIDTH: usize = 75;
-/// From this magnitude on, and below [`SMALL`], all numbers are written with an exponent.
+/// If a number has at least this magnitude or is below [`SMALL`], all numbers have an exponent.
 const LARGE: f64 = 1e8;
 const SMALL: f64 = 1e-4;
 /// The same applies if the largest number is more than this many times the smallest.
@@ -106,7 +106,7 @@ impl Layout {
     }
 }
 
-/// Formats all numbers in one width.
+/// Formats all numbers with the same width.
 fn columns(scalars: &[Scalar]) -> Vec<String> {
     let floats = |scalar: &Scalar| match scalar {
         Scalar::Float32(number) => Some(Float::Single(*number)),
@@ -139,7 +139,8 @@ impl Float {
         }
     }
 
-    /// Returns the shortest digits, at most the precision after the point, as whole and fraction.
+    /// Returns the shortest digits as whole part and fraction, which has at most `PRECISION`
+    /// digits.
     fn positional(self) -> (String, String) {
         let (short, exact) = match self {
             Self::Single(number) => (digits::positional(number), format!("{number:.PRECISION$}")),
@@ -160,7 +161,7 @@ impl Float {
         (format!("{mantissa}{point}"), exponent.parse().unwrap_or(0))
     }
 
-    /// Returns the shortest digits with an exponent, as whole, fraction and exponent.
+    /// Returns the shortest digits with an exponent, as whole part, fraction and exponent.
     fn scientific(self) -> (String, String, i32) {
         let (short, exact) = match self {
             Self::Single(number) => (digits::scientific(number), format!("{number:.PRECISION$e}")),
@@ -222,7 +223,7 @@ fn float_columns(floats: &[Float]) -> Vec<String> {
         left = width(&mut parts.iter().map(|(whole, _)| whole.len()));
         right = width(&mut parts.iter().map(|(_, fraction)| fraction.len()));
     }
-    // Characters right of the whole part; `nan` and `inf` may need more room than numbers.
+    // Characters after the whole part; `nan` and `inf` may be wider than the numbers.
     let behind = if scientific {
         right + exponents + 3
     } else {

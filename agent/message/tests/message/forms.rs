@@ -49,7 +49,7 @@ pub fn read() -> Vec<Form> {
 }
 
 impl Form {
-    /// Returns the number of forms, and those that are printed differently here.
+    /// Returns the index of the form's kind, and the outputs that differ from Python's.
     pub fn differences(&self) -> (usize, Vec<String>) {
         match self {
             Self::Text {

@@ -20,7 +20,7 @@ pub struct Case {
     pub message_type: String,
     pub label: String,
     pub payload: Vec<u8>,
-    /// Output of `echo`, and with `--full-length`.
+    /// Output of `echo`, and of `echo --full-length`.
     pub yaml_echo: String,
     pub yaml_full: String,
     pub csv: String,
