@@ -1,5 +1,5 @@
 //! Checks of the agent itself: whether it answers, observes, loses nothing and persists its state.
-//! Without a running agent, obstacles to starting one.
+//! If no agent runs, obstacles to starting one.
 
 use std::fs;
 use std::net::SocketAddr;
@@ -22,12 +22,12 @@ const STATE: &str = "/var/lib/ros2probe";
 const SOCKETS: [&str; 2] = ["/proc/net/tcp", "/proc/net/tcp6"];
 /// State of a listening socket in `/proc/net/tcp` and `/proc/net/tcp6`.
 const LISTENING: &str = "0A";
-/// Bytes read of each of those files.
+/// Maximum number of bytes read of each of [`SOCKETS`].
 const MAX_SOCKETS: u64 = 8 << 20;
-/// Most watches in one sentence.
+/// Maximum number of watches in one sentence.
 const NAMED: usize = 5;
 
-/// Findings about an agent that answers.
+/// Returns the findings about an agent that answers.
 #[must_use]
 pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> {
     let health = &answers.health;
@@ -44,7 +44,7 @@ pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> 
     findings
 }
 
-/// Findings for a host without an answering agent. `reason` is why the request failed.
+/// Returns the findings for a host without an answering agent. `reason` is why the request failed.
 #[must_use]
 pub fn absent(host: &HostState, config: &Config, reason: &str, is_denied: bool) -> Vec<Finding> {
     let finding = if is_denied {
@@ -69,7 +69,7 @@ pub fn absent(host: &HostState, config: &Config, reason: &str, is_denied: bool) 
     findings
 }
 
-/// Finding for a configuration that prevents the agent from starting.
+/// Returns the finding for a configuration that prevents the agent from starting.
 #[must_use]
 pub fn misconfigured(path: &Path, mistakes: &str) -> Finding {
     let first = mistakes.lines().next().unwrap_or_default();
@@ -168,7 +168,7 @@ fn losses(health: &Health) -> Vec<Finding> {
     findings
 }
 
-/// Findings for limits of the configuration that are or were reached, each with the key to change.
+/// Returns the findings for limits that are or were reached, each with the key to change.
 fn limits(health: &Health) -> Vec<Finding> {
     let full = |limit: &&Limit| limit.reached > 0 || (limit.cap > 0 && limit.used >= limit.cap);
     let full = health.limits.iter().filter(full);
@@ -219,8 +219,8 @@ fn limits(health: &Health) -> Vec<Finding> {
     .collect()
 }
 
-/// Findings for full tables that are not among the limits the agent reports. Older agents report
-/// no limits.
+/// Returns the findings for full tables that are not among the limits the agent reports. Older
+/// agents report no limits.
 fn evictions(health: &Health) -> Vec<Finding> {
     let is_reported = |table: &str| {
         let limit = limit(table);
@@ -262,7 +262,7 @@ fn evictions(health: &Health) -> Vec<Finding> {
     findings
 }
 
-/// Configuration key of a table's limit. `None` for most tables, which have a fixed limit.
+/// Returns the configuration key of a table's limit; `None` for most tables, whose limit is fixed.
 fn limit(table: &str) -> Option<&'static str> {
     const KEYS: [(&str, &str); 7] = [
         ("deliveries", "flows"),
@@ -316,7 +316,7 @@ fn watches(answers: &Answers) -> Finding {
     }
 }
 
-/// Findings about connections of Zenoh that cannot be read.
+/// Returns the findings about connections of Zenoh that cannot be read.
 fn zenoh(health: &Health) -> Vec<Finding> {
     let mut abilities = health.abilities.iter();
     let is_counted = abilities.any(|ability| ability.ability == "inside" && ability.able);
@@ -347,7 +347,7 @@ fn zenoh(health: &Health) -> Vec<Finding> {
     findings.collect()
 }
 
-/// Finding for the listener for viewers: its address, the rights of viewers, and their number.
+/// Returns the finding for the listener for viewers: its address, their rights and their number.
 fn foxglove(listener: &Foxglove) -> Finding {
     let Foxglove {
         address,
@@ -415,7 +415,7 @@ fn kept(health: &Health) -> Finding {
     )
 }
 
-/// Findings for listen addresses that are already in use.
+/// Returns the findings for listen addresses that are already in use.
 fn ports(host: &HostState, config: &Config) -> Vec<Finding> {
     let wanted = [
         ("metrics.listen", config.metrics.listen),
@@ -449,7 +449,8 @@ fn listening(host: &HostState) -> Vec<u16> {
         let bytes = host.files.bytes(path, MAX_SOCKETS).unwrap_or_default();
         let text = String::from_utf8_lossy(&bytes);
         ports.extend(text.lines().skip(1).filter_map(|line| {
-            // Number, local address and port in hexadecimal, remote ones, state.
+            // The fields are number, local address and port in hexadecimal, remote address and
+            // port, state.
             let mut fields = line.split_whitespace();
             let (_, port) = fields.nth(1)?.rsplit_once(':')?;
             (fields.nth(1)? == LISTENING).then(|| u16::from_str_radix(port, 16).ok())?
@@ -458,7 +459,7 @@ fn listening(host: &HostState) -> Vec<u16> {
     ports
 }
 
-/// Finding for a state directory that an agent could not write.
+/// Returns the finding for a state directory that an agent could not write.
 fn state_directory(host: &HostState, choice: &StateChoice) -> Option<Finding> {
     let path = match choice {
         StateChoice::Off => return None,
@@ -502,7 +503,7 @@ fn state_directory(host: &HostState, choice: &StateChoice) -> Option<Finding> {
     Some(finding)
 }
 
-/// Duration in whole seconds, minutes, hours or days.
+/// Returns a duration in whole seconds, minutes, hours or days.
 fn duration(seconds: f64) -> String {
     match seconds {
         seconds if seconds < 120.0 => format!("{seconds:.0} s"),

@@ -25,7 +25,7 @@ impl Answers {
     ///
     /// # Errors
     ///
-    /// The agent is unreachable or sends an unexpected answer.
+    /// Fails if the agent is unreachable or sends an unexpected answer.
     pub fn ask(agent: &Agent, domain_id: Option<u32>) -> Result<Self, ClientError> {
         let within = domain_id.map_or_else(String::new, |domain| format!("?domain_id={domain}"));
         Ok(Self {

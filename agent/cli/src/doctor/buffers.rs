@@ -26,7 +26,7 @@ const REASSEMBLY: [(Sysctl, Sysctl); 2] = [
     ),
 ];
 const MEBIBYTE: u64 = 1 << 20;
-/// Bytes above which a message travels in several datagrams or IP fragments.
+/// Size in bytes above which a message travels in several datagrams or IP fragments.
 const LARGE: u64 = 64 << 10;
 /// Assumed message size without measurements: a typical camera image or lidar scan.
 const USUAL: u64 = 4 * MEBIBYTE;
@@ -34,21 +34,21 @@ const MESSAGES_IN_BUFFER: u64 = 2;
 const MESSAGES_IN_REASSEMBLY: u64 = 16;
 /// Ratio of lost messages above which the finding is a problem.
 const MANY: f64 = 0.01;
-/// Most topics in one sentence.
+/// Maximum number of topics in one sentence.
 const NAMED: usize = 3;
 
 /// Name of a kernel parameter.
 #[derive(Clone, Copy, Debug)]
 struct Sysctl(&'static str);
 
-/// Largest measured messages.
+/// Topic with the largest measured messages, and their mean size.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Largest {
     bytes: u64,
     topic: String,
 }
 
-/// Findings of all buffer checks.
+/// Returns the findings of all buffer checks.
 #[must_use]
 pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
     let topics = answers.map_or(&[][..], |answers| &answers.topics.topics);
@@ -100,8 +100,8 @@ pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
     findings
 }
 
-/// Topic with the largest mean message size. `None` without measurements. Sizes vary little within
-/// a topic.
+/// Returns the topic with the largest mean message size; `None` without measurements. Sizes vary
+/// little within a topic.
 fn largest(topics: &[Topic<'_>]) -> Option<Largest> {
     let mean = |measured: &Measurement| measured.bytes.checked_div(measured.messages);
     let of_topic = |topic: &Topic<'_>| {
@@ -121,7 +121,7 @@ fn largest(topics: &[Topic<'_>]) -> Option<Largest> {
     Some(Largest { bytes, topic })
 }
 
-/// Bytes for `messages` of the largest messages, in whole mebibytes.
+/// Returns the size of `messages` of the largest messages, rounded up to whole mebibytes.
 fn wanted(largest: Option<&Largest>, messages: u64) -> u64 {
     let bytes = largest.map_or(USUAL, |largest| largest.bytes);
     bytes
@@ -194,7 +194,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
         };
         let report = |severity, sentence: String| Finding::new(AREA, check, severity, sentence);
         let Ok(most) = bytes else {
-            // The parameter is absent without IPv6.
+            // Without IPv6, its parameter does not exist.
             if number == 0 {
                 let sentence = "the memory limit of IP reassembly is unknown".to_owned();
                 let finding =
@@ -238,7 +238,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
     findings
 }
 
-/// Finding for messages lost at one place. `None` if no message was.
+/// Returns the finding for messages lost at `place`; `None` if no message was lost.
 fn lost(
     topics: &[Topic<'_>],
     check: &'static str,
@@ -293,7 +293,7 @@ impl Sysctl {
         format!("sudo sysctl -w {}={value}", self.0)
     }
 
-    /// Command that sets the value, and the file that makes it permanent.
+    /// Returns the command that sets the value, and the file that makes it permanent.
     fn set(self, value: u64) -> String {
         format!(
             "{}    # permanent: /etc/sysctl.d/60-ros.conf",
@@ -315,7 +315,7 @@ fn ratio(lost: u64, received: u64) -> f64 {
     lost as f64 / lost.saturating_add(received).max(1) as f64
 }
 
-/// Size with a unit for people.
+/// Returns a size with a unit for people.
 #[expect(clippy::cast_precision_loss, reason = "a size for people")]
 fn size(bytes: u64) -> String {
     let bytes = bytes as f64;
@@ -359,7 +359,7 @@ mod tests {
     const CLOUD: &str = r#"{"name":"/points","measurement":{"messages":100,"bytes":272000000}}"#;
 
     #[test]
-    fn the_buffer_of_a_point_cloud_is_computed() {
+    fn the_buffer_for_a_measured_point_cloud_is_computed() {
         let findings = found(&USUALLY, CLOUD);
         let receive = find(&findings, "receive");
         assert_eq!(receive.severity, Severity::Warning);
@@ -392,7 +392,7 @@ mod tests {
     }
 
     #[test]
-    fn small_messages_need_nothing_and_unmeasured_ones_are_noted() {
+    fn small_messages_need_no_change_and_missing_measurements_lead_to_a_note() {
         let small =
             r#"{"name":"/imu","publishers":[{"measurement":{"messages":10,"bytes":3200}}]}"#;
         let findings = found(&USUALLY, small);
@@ -410,7 +410,7 @@ mod tests {
     }
 
     #[test]
-    fn losses_at_a_buffer_are_a_warning_and_many_are_a_problem() {
+    fn few_losses_at_a_buffer_are_a_warning_and_many_are_a_problem() {
         let topic = |lost: u64| {
             format!(
                 r#"{{"name":"/points","received":{{"messages":1000,

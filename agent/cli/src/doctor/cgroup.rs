@@ -1,4 +1,4 @@
-//! The hierarchy of control groups, found as the capture finds it.
+//! The hierarchy of control groups, found in the same way as by the capture.
 
 use std::path::{Path, PathBuf};
 
@@ -9,7 +9,7 @@ use ros2probe_capture::cgroup::{Cgroup, CgroupError, has_version_1, topmost};
 pub enum CgroupHierarchy {
     /// No hierarchy is mounted.
     NotMounted,
-    /// The same, beside hierarchies of version 1.
+    /// Only hierarchies of version 1 are mounted.
     Version1,
     /// The hierarchy of the whole host, at this mount point.
     WholeHost(PathBuf),

@@ -17,7 +17,7 @@ const KEEPERS: [&str; 7] = [
 /// Estimated error in microseconds above which latencies between hosts are unreliable.
 const COARSE: i64 = 10_000;
 
-/// Findings of all clock checks.
+/// Returns the findings of all clock checks.
 #[must_use]
 pub fn check(host: &HostState) -> Vec<Finding> {
     let keepers = keepers(host);
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn a_good_clock_is_reported_with_its_error_and_its_keeper() {
+    fn a_synchronized_clock_is_reported_with_its_error_and_its_daemon() {
         let good = found(Ok(state(true, 120, 3_400)));
         assert_eq!(good.severity, Severity::Ok);
         assert_eq!(
@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn a_coarse_a_free_and_an_unknown_clock_are_distinguished() {
+    fn coarse_unsynchronized_and_unknown_clocks_are_distinguished() {
         assert_eq!(
             found(Ok(state(true, 50_000, 90_000))).severity,
             Severity::Note

@@ -96,7 +96,7 @@ pub enum RemedyTarget {
 }
 
 impl Area {
-    /// Heading of the area.
+    /// Returns the heading of the area.
     #[must_use]
     pub const fn title(self) -> &'static str {
         match self {
@@ -124,7 +124,7 @@ impl Severity {
         Self::Ok,
     ];
 
-    /// Label in the printed report.
+    /// Returns the label in the printed report.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -163,7 +163,7 @@ impl Finding {
         self
     }
 
-    /// Adds a command. Four spaces and `#` begin a comment, here and below.
+    /// Adds a command. In this and the next two methods, four spaces and `#` begin a comment.
     #[must_use]
     pub fn remedy(self, line: impl Into<String>) -> Self {
         self.with(RemedyTarget::Command, line.into())

@@ -15,11 +15,11 @@ const AREA: Area = Area::Graph;
 /// Adds remedies to a finding.
 type Helps = fn(Finding) -> Finding;
 
-/// Most topics in one sentence.
+/// Maximum number of topics in one sentence.
 const NAMED: usize = 3;
 
-/// Findings of all graph checks. `processes` is the number of ROS processes on the agent's host, if
-/// it is known.
+/// Returns the findings of all graph checks. `processes` is the number of ROS processes on the
+/// agent's host, if it is known.
 #[must_use]
 pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
     let participants = &answers.participants.participants;
@@ -127,7 +127,7 @@ fn alone(participants: &[Participant<'_>]) -> Option<Finding> {
     Some(finding.remedy(format!("{remedy}    # requests them: a few packets")))
 }
 
-/// Finding for participants that started before the agent and whose names are unknown.
+/// Returns the finding for participants that started before the agent and whose names are unknown.
 fn names(participants: &[Participant<'_>]) -> Option<Finding> {
     let is_nameless = |each: &&Participant<'_>| {
         let has_nothing = each.writers == 0 && each.readers == 0;
@@ -202,7 +202,7 @@ fn secured(participants: &[Participant<'_>]) -> Option<Finding> {
     )
 }
 
-/// Findings for topics without a pair of endpoints on the network.
+/// Returns the findings for topics without a pair of endpoints on the network.
 fn off_the_network(answers: &Answers) -> Vec<Finding> {
     let transports = [
         shared_memory(&answers.health),
@@ -244,7 +244,7 @@ fn off_the_network(answers: &Answers) -> Vec<Finding> {
     findings.collect()
 }
 
-/// Whether calls inside the processes show the topic's messages.
+/// Returns whether calls inside the processes show the topic's messages.
 fn is_counted_inside(topic: &Topic<'_>) -> bool {
     let is_observed = topic
         .passages
@@ -283,7 +283,7 @@ impl OffNetwork {
     }
 }
 
-/// Texts about shared memory of Fast DDS, by the agent's abilities.
+/// Returns the texts about shared memory of Fast DDS, by the agent's abilities.
 fn shared_memory(health: &Health) -> OffNetwork {
     let able = |ability: &str| {
         let mut abilities = health.abilities.iter();
@@ -313,7 +313,7 @@ fn shared_memory(health: &Health) -> OffNetwork {
     }
 }
 
-/// Transport of most pairs, if no pair uses the network.
+/// Returns the transport of most pairs, if no pair uses the network.
 fn off_network<'a>(topic: &'a Topic<'_>) -> Option<&'a str> {
     if topic
         .passages
@@ -326,7 +326,7 @@ fn off_network<'a>(topic: &'a Topic<'_>) -> Option<&'a str> {
     Some(&most.passage)
 }
 
-/// Findings for endpoints with incompatible types or QoS.
+/// Returns the findings for endpoints with incompatible types or QoS.
 fn mismatches(topics: &[Topic<'_>]) -> Vec<Finding> {
     const KINDS: [(&str, &str, &str); 3] = [
         (
@@ -391,7 +391,7 @@ mod tests {
     }
 
     #[test]
-    fn an_empty_graph_is_no_problem_where_connections_cannot_be_read() {
+    fn an_empty_graph_is_not_a_problem_if_connections_cannot_be_read() {
         let unseen = |reason: &str| {
             let health =
                 format!(r#"{{"zenoh":{{"unseen":[{{"reason":"{reason}","connections":2}}]}}}}"#);
@@ -416,7 +416,7 @@ mod tests {
         {"domain_id":7,"vendor":"Eclipse Cyclone DDS","readers":2}]}"#;
 
     #[test]
-    fn a_graph_that_is_known_is_one_line() {
+    fn a_completely_known_graph_leads_to_one_line() {
         let findings = check(&answers(WELL, "", ""), None);
         assert_eq!(findings.len(), 1);
         assert_eq!(
@@ -426,7 +426,7 @@ mod tests {
     }
 
     #[test]
-    fn an_empty_graph_is_a_problem_only_where_participants_are_expected() {
+    fn an_empty_graph_is_a_problem_only_if_participants_are_expected() {
         let nobody = answers("{}", "", "");
         assert_eq!(check(&nobody, None)[0].severity, Severity::Note);
         assert_eq!(check(&nobody, Some(0))[0].severity, Severity::Note);
@@ -459,7 +459,7 @@ mod tests {
     }
 
     #[test]
-    fn a_participant_that_is_alone_in_its_domain_announces_nothing() {
+    fn a_participant_alone_in_its_domain_is_reported_apart_from_missing_names() {
         let of = |participants: &str| {
             let participants = format!(r#"{{"participants":[{participants}]}}"#);
             check(&answers(&participants, "", ""), None)
@@ -481,7 +481,7 @@ mod tests {
         let two = of(r#"{"domain_id":3},{"domain_id":3,"writers":2}"#);
         assert_eq!(severity(&two, "alone"), None);
         assert_eq!(severity(&two, "names"), Some(Severity::Warning));
-        // Names are known, or the participant has none.
+        // The names are known, or the participant has none.
         assert_eq!(severity(&of(r#"{"readers":1}"#), "alone"), None);
         assert_eq!(severity(&of(r#"{"secured":true}"#), "alone"), None);
         let apart = of(r#"{"domain_id":1},{"domain_id":2}"#);
@@ -490,7 +490,7 @@ mod tests {
     }
 
     #[test]
-    fn topics_beside_the_network_are_reported_by_passage() {
+    fn topics_on_other_transports_than_the_network_are_reported_by_transport() {
         let topic =
             |name: &str, passages: &str| format!(r#"{{"name":"{name}","passages":[{passages}]}}"#);
         let pairs = |way: &str| format!(r#"{{"passage":"{way}","pairs":2}}"#);
@@ -530,7 +530,7 @@ mod tests {
     }
 
     #[test]
-    fn endpoints_that_do_not_fit_are_named_by_topic() {
+    fn incompatible_endpoints_are_reported_by_topic() {
         let topics = r#"{"name":"/a","diagnoses":[{"kind":"qos_incompatible"},{"kind":"unmatched_publisher"}]},
             {"name":"/b","diagnoses":[{"kind":"qos_incompatible"}]},{"name":"/c"}"#;
         let findings = check(&answers(WELL, topics, ""), None);

@@ -14,15 +14,15 @@ use rustix::param::page_size;
 use rustix::process::{Gid, getegid, geteuid, getgroups};
 use rustix::thread::{CapabilitySet, capabilities};
 
-/// Default limit for the size of one file, in bytes.
+/// Default maximum size of one file, in bytes.
 const MAX_FILE: u64 = 256 << 10;
-/// Most names read from one directory.
+/// Maximum number of names read from one directory.
 const MAX_NAMES: usize = 1 << 16;
 
 /// State of a host.
 #[derive(Debug)]
 pub struct HostState {
-    /// `/proc`, `/sys`, `/etc` and `/run`.
+    /// Files of `/proc`, `/sys`, `/etc` and `/run`.
     pub files: Files,
     /// Size of a memory page in bytes.
     pub page_bytes: u64,
@@ -32,7 +32,7 @@ pub struct HostState {
     pub user_id: u32,
     /// Groups of this process.
     pub group_ids: Vec<u32>,
-    /// Variables of this shell.
+    /// Environment variables of this shell.
     pub environment: BTreeMap<String, String>,
     /// Clock state of the kernel.
     pub clock: Result<ClockState, Unread>,
@@ -82,13 +82,13 @@ impl HostState {
 }
 
 impl Files {
-    /// Files below `root`.
+    /// Returns the files below `root`.
     #[must_use]
     pub fn below(root: impl Into<PathBuf>) -> Self {
         Self { root: root.into() }
     }
 
-    /// Maps an absolute path to its place below the root.
+    /// Maps an absolute path to the path below the root.
     #[must_use]
     pub fn path(&self, path: &str) -> PathBuf {
         self.root.join(path.trim_start_matches('/'))
@@ -98,7 +98,7 @@ impl Files {
     ///
     /// # Errors
     ///
-    /// The file cannot be read.
+    /// Fails if the file cannot be read.
     pub fn text(&self, path: &str) -> Result<String, Unread> {
         let bytes = self.bytes(path, MAX_FILE)?;
         Ok(String::from_utf8_lossy(&bytes).trim_end().to_owned())
@@ -108,7 +108,7 @@ impl Files {
     ///
     /// # Errors
     ///
-    /// The file cannot be read.
+    /// Fails if the file cannot be read.
     pub fn bytes(&self, path: &str, most: u64) -> Result<Vec<u8>, Unread> {
         let mut bytes = Vec::new();
         let file = File::open(self.path(path))?;
@@ -120,18 +120,18 @@ impl Files {
     ///
     /// # Errors
     ///
-    /// The file cannot be read, or does not contain a number.
+    /// Fails if the file cannot be read, or if it does not contain a number.
     pub fn number<T: FromStr>(&self, path: &str) -> Result<T, Unread> {
         let text = self.text(path)?;
         let number = text.parse();
         number.map_err(|_| Unread::Other(format!("`{text}` is not a number")))
     }
 
-    /// Sorted names of a directory.
+    /// Returns the sorted names in a directory.
     ///
     /// # Errors
     ///
-    /// The directory cannot be read.
+    /// Fails if the directory cannot be read.
     pub fn names(&self, path: &str) -> Result<Vec<String>, Unread> {
         let entries = fs::read_dir(self.path(path))?;
         let entries = entries.flatten().take(MAX_NAMES);
@@ -148,7 +148,7 @@ impl Files {
         self.path(path).exists()
     }
 
-    /// Process ids, sorted.
+    /// Returns the sorted process ids.
     #[must_use]
     pub fn processes(&self) -> Vec<u32> {
         let names = self.names("/proc").unwrap_or_default();
@@ -168,7 +168,7 @@ impl From<io::Error> for Unread {
     }
 }
 
-/// Last part of a path.
+/// Returns the last component of a path.
 #[must_use]
 pub fn base_name(path: &str) -> &str {
     Path::new(path)
@@ -197,7 +197,7 @@ fn environment() -> BTreeMap<String, String> {
 pub(super) mod tests {
     use super::*;
 
-    /// Host with only these files, no variables and no privileges.
+    /// Creates a host with only these files, no variables and no privileges.
     pub(in crate::doctor) fn host(files: &[(&str, &str)]) -> (tempfile::TempDir, HostState) {
         let directory = tempfile::tempdir().unwrap();
         for (path, text) in files {
@@ -218,7 +218,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn files_are_read_below_the_root_and_no_further_than_allowed() {
+    fn files_are_read_below_the_root_and_up_to_the_size_limit() {
         let long = "x".repeat(300 << 10);
         let (_directory, host) =
             host(&[("/proc/a", "12\n"), ("/proc/b", &long), ("/proc/7/c", "")]);
@@ -233,7 +233,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn this_host_can_be_read() {
+    fn the_state_of_this_host_can_be_read() {
         let host = HostState::read();
         assert!(host.files.processes().contains(&std::process::id()));
         assert!(host.page_bytes >= 4096);

@@ -12,7 +12,7 @@ const OWN: &str = "/proc/self/net/dev";
 const UP: u32 = 0x1;
 const LOOPBACK: u32 = 0x8;
 const MULTICAST: u32 = 0x1000;
-/// Most interfaces listed by name; a container host has hundreds.
+/// Maximum number of interfaces listed by name; a container host has hundreds.
 const LISTED: usize = 6;
 /// MTU below which every Cyclone DDS fragment is fragmented again by IP, in bytes.
 const SMALL_MTU: u32 = 1400;
@@ -26,8 +26,8 @@ struct Interface {
     carrier: bool,
 }
 
-/// Findings of all interface checks. `localhost` is whether some ROS process is limited to its own
-/// host.
+/// Returns the findings of all interface checks. `localhost` is whether any ROS process is limited
+/// to its own host.
 #[must_use]
 pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<Finding> {
     let names = match host.files.names(PLACE) {
@@ -83,7 +83,8 @@ pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<F
     findings
 }
 
-/// Finding for a `/sys` that shows another network namespace: the one in which it was mounted.
+/// Returns the finding for a `/sys` that was mounted in another network namespace and shows that
+/// one.
 fn elsewhere(host: &HostState, names: &[String]) -> Option<Finding> {
     let table = host.files.text(OWN).ok()?;
     let own = table
@@ -244,7 +245,7 @@ mod tests {
     use super::super::host_state::tests::host;
     use super::*;
 
-    /// Findings for interfaces given as name, flags, MTU and state.
+    /// Returns the findings for interfaces with these names, flags, MTUs and states.
     fn found(interfaces: &[(&str, &str, &str, &str)], localhost: bool) -> Vec<Finding> {
         let mut files = Vec::new();
         for (name, flags, mtu, state) in interfaces {
@@ -269,7 +270,7 @@ mod tests {
     const ETH: (&str, &str, &str, &str) = ("eth0", "0x1003", "1500", "up");
 
     #[test]
-    fn an_ordinary_host_is_fine() {
+    fn an_ordinary_host_passes_every_interface_check() {
         let findings = found(&[LO, ETH, ("docker0", "0x1003", "1500", "down")], false);
         assert!(
             findings.iter().all(|each| each.severity == Severity::Ok),
@@ -316,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn interfaces_of_another_namespace_are_not_taken_for_this_one_s() {
+    fn interfaces_of_another_network_namespace_are_recognized() {
         let table = "Inter-| Receive\n face |bytes\n    lo: 0 0\n  eth9: 1 2\n";
         let of = |interfaces: &[(&str, &str)]| {
             let mut files = vec![(OWN, table)];
@@ -336,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn a_host_alone_and_a_tunnel_of_small_packets_are_noted() {
+    fn a_host_without_a_network_and_a_tunnel_with_a_small_mtu_lead_to_notes() {
         assert_eq!(
             severity(&found(&[LO], false), "interfaces"),
             Some(Severity::Note)
@@ -375,7 +376,7 @@ mod tests {
     }
 
     #[test]
-    fn a_host_of_many_containers_gets_a_short_line() {
+    fn a_host_with_many_interfaces_leads_to_a_short_line() {
         let names: Vec<String> = (0..300).map(|number| format!("veth{number:03}")).collect();
         let all: Vec<_> = names
             .iter()

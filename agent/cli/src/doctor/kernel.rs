@@ -19,10 +19,10 @@ const LIMITS: &str = "/proc/self/limits";
 const OLDEST: (u32, u32) = (5, 10);
 /// First release that does not charge BPF maps to locked memory.
 const NO_MEMLOCK: (u32, u32) = (5, 11);
-/// Bytes of rings and tables of one source, with a margin.
+/// Size of the rings and tables of one source with a margin, in bytes.
 const LOCKED_BYTES: u64 = 64 << 20;
 
-/// Findings of all kernel checks. `is_agent_running`: an agent of this host answers.
+/// Returns the findings of all kernel checks. `is_agent_running`: an agent of this host answers.
 #[must_use]
 pub fn check(host: &HostState, is_agent_running: bool) -> Vec<Finding> {
     let release = host.files.text(RELEASE);
@@ -159,7 +159,7 @@ fn control_groups(host: &HostState) -> Finding {
             if hierarchy == CgroupHierarchy::NotMounted {
                 return finding.remedy("sudo mount -t cgroup2 none /sys/fs/cgroup");
             }
-            // A mount at the usual place would hide the controllers of version 1.
+            // A mount at the usual path would hide the controllers of version 1.
             return finding
                 .remedy(
                     "sudo mkdir -p /run/cgroup2 && sudo mount -t cgroup2 none /run/cgroup2    \
@@ -213,8 +213,8 @@ fn pages(host: &HostState) -> Finding {
     finding.seen(host.page_bytes.to_string(), "sysconf(_SC_PAGESIZE)")
 }
 
-/// Finding for the limit on locked memory, on kernels that charge BPF maps to it.
-/// A running agent has a limit of its own.
+/// Returns the finding for the limit on locked memory, on kernels that charge BPF maps to it. A
+/// running agent has a limit of its own.
 fn locked_memory(host: &HostState, is_agent_running: bool) -> Finding {
     let severity = match is_agent_running {
         true => Severity::Note,
@@ -296,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn a_new_kernel_with_everything_is_fine() {
+    fn a_new_kernel_with_all_features_passes_every_check() {
         let found = severities(&[]);
         assert!(
             found.iter().all(|(check, severity)| match *check {
@@ -334,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn locked_memory_matters_to_kernels_that_charge_it() {
+    fn the_limit_on_locked_memory_matters_on_kernels_that_charge_it() {
         let limit =
             |value: &str| format!("Max locked memory         {value}    {value}    bytes\n");
         for (release, limit, severity) in [
@@ -355,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn a_limit_of_locked_memory_is_no_problem_of_a_running_agent() {
+    fn a_low_limit_on_locked_memory_is_not_a_problem_if_an_agent_runs() {
         let (_directory, host) = host(&[
             (RELEASE, "5.10.0"),
             (
@@ -367,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mount_beside_version_1_hides_none_of_its_controllers() {
+    fn the_mount_beside_version_1_hides_none_of_its_controllers() {
         for (mounts, place) in [
             (
                 "24 18 0:22 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu",
@@ -383,7 +383,7 @@ mod tests {
     }
 
     #[test]
-    fn pages_of_another_size_are_not_known() {
+    fn an_unsupported_page_size_leads_to_unknown() {
         let (_directory, mut host) = host(&[]);
         for (bytes, severity) in [
             (4096, Severity::Ok),

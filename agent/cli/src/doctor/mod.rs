@@ -118,7 +118,8 @@ pub fn examine_capture(answers: &Answers, name: &str) -> Report {
     Report::new(name, graph::check(answers, None))
 }
 
-/// Findings of a trial load of the kernel programs, if permitted. Uprobes are not attached.
+/// Returns the findings of a trial load of the kernel programs, if permitted. Does not attach
+/// uprobes.
 fn tried(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
     if let Some(missing) = privilege::missing(host.capabilities, settings) {
         return visibility::untried(&format!("lacks {}", missing.needs()));
@@ -152,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn without_files_and_privileges_each_line_is_still_printed_once_in_order() {
+    fn without_files_and_privileges_each_area_is_reported_once_in_order() {
         let (_directory, host) = host(&[]);
         let report = examine(&host, &configured(), &Reach::Nobody("no agent".to_owned()));
         let listed = areas(&report);
@@ -174,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn doctor_asks_an_agent_that_answers_instead_of_trying_the_source() {
+    fn an_agent_that_answers_replaces_the_trial_of_the_source() {
         let (_directory, host) = host(&[]);
         let answers = Box::<Answers>::default();
         let report = examine(
@@ -191,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn elsewhere_and_in_a_capture_this_host_is_not_looked_at() {
+    fn a_remote_agent_and_a_capture_are_checked_without_this_host() {
         let answers = Answers::default();
         assert_eq!(
             areas(&examine_remote(&answers, "robot2")),
@@ -201,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_configuration_comes_first() {
+    fn an_invalid_configuration_is_the_first_finding() {
         let (_directory, host) = host(&[]);
         let mut configured = configured();
         configured.mistakes = Some((PathBuf::from("/etc/x.yaml"), "bad".to_owned()));

@@ -28,7 +28,7 @@ const SERVICES: [&str; 3] = [
 /// Words in paths of control groups that belong to containers.
 const CONTAINERS: [&str; 4] = ["docker", "containerd", "kubepods", "libpod"];
 
-/// Findings of all permission checks.
+/// Returns the findings of all permission checks.
 #[must_use]
 pub fn check(
     host: &HostState,
@@ -88,7 +88,8 @@ fn of_agent(health: &Health) -> Finding {
     )
 }
 
-/// Finding for shared memory of containers, which is reached through `/proc/<pid>/root`.
+/// Returns the finding for shared memory of containers, which is reached through
+/// `/proc/<pid>/root`.
 fn containers(answers: &Answers) -> Option<Finding> {
     let has = |name: &str| answers.health.capabilities.iter().any(|held| held == name);
     let looks = answers
@@ -111,10 +112,10 @@ fn containers(answers: &Answers) -> Option<Finding> {
     ))
 }
 
-/// Lets systemd listen for the broker.
+/// Command that makes systemd listen for the broker.
 const ENABLE_BROKER: &str = "sudo systemctl unmask ros2probe-attach.socket; sudo systemctl start ros2probe-attach.socket    # or sudo rp run, with its own broker";
 
-/// Finding for uprobes, if they are configured.
+/// Returns the finding for uprobes, if they are configured.
 fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
     let is_exact = settings.shm.mode != ShmMode::Off && settings.shm.exact != ExactChoice::Off;
     let is_inside = settings.inside != InsideChoice::Off;
@@ -143,13 +144,13 @@ pub fn is_installed(host: &HostState) -> bool {
     host.files.exists(SYSTEMD) && installed(host).is_some()
 }
 
-/// Path of the service's unit. `None` if it is not installed.
+/// Returns the directory of the service's unit; `None` if it is not installed.
 fn installed(host: &HostState) -> Option<&'static str> {
     let mut places = UNITS.into_iter();
     places.find(|place| host.files.exists(&format!("{place}/{UNIT}")))
 }
 
-/// Finding about the service, on hosts with systemd.
+/// Returns the finding about the service, on hosts with systemd.
 fn unit(host: &HostState, is_answering: bool) -> Option<Finding> {
     if !host.files.exists(SYSTEMD) {
         return None;
@@ -275,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn shared_memory_of_containers_takes_a_capability() {
+    fn shared_memory_of_containers_needs_a_capability() {
         let answers = |held: &str, group: &str| {
             let health = format!(
                 r#"{{"abilities":[{{"ability":"shared_memory","able":true}}],"capabilities":["{held}"]}}"#

@@ -2,8 +2,8 @@
 //! for discovery are a common fault.
 //!
 //! A process belongs to ROS if it maps a DDS or RMW library, or if the agent knows a participant of
-//! it. Values that a process controls are untrusted: their size is limited here, and they are
-//! escaped in the output.
+//! the process. Values that a process controls are untrusted: their size is limited here, and they
+//! are escaped in the output.
 
 use std::collections::BTreeMap;
 
@@ -14,17 +14,17 @@ use ros2probe_api::participants::ParticipantList;
 use ros2probe_attach::functions::Library;
 
 const AREA: Area = Area::Processes;
-/// Bytes read of a process's memory map.
+/// Maximum number of bytes read of a process's memory map.
 const MAX_MAP: u64 = 4 << 20;
-/// Bytes read of its command line and of its variables.
+/// Maximum number of bytes read of a process's command line and of its variables.
 const MAX_LINE: u64 = 64 << 10;
-/// Characters shown of a command.
+/// Maximum number of characters shown of a command.
 const MAX_COMMAND: usize = 40;
-/// Most processes named in one sentence, per group.
+/// Maximum number of processes named in one sentence, per group.
 const NAMED: usize = 4;
 /// Name of the daemon of the `ros2` command line.
 const ROS2_DAEMON: &str = "ros2 daemon";
-/// Most ROS processes inspected.
+/// Maximum number of ROS processes inspected.
 const MAX_PROCESSES: usize = 2000;
 
 /// One ROS process.
@@ -52,7 +52,7 @@ impl Processes {
     pub fn find(host: &HostState, known: Option<&ParticipantList<'_>>) -> Self {
         let mut domains = BTreeMap::new();
         for participant in known.into_iter().flat_map(|known| &known.participants) {
-            // For a participant with a socket on this host, the number is a process id of this
+            // If the participant has a socket on this host, the number is a process id of this
             // host.
             if let (Some(id), Some(_)) =
                 (participant.process.process_id, &participant.process.cgroup)
@@ -89,7 +89,7 @@ impl Processes {
         processes
     }
 
-    /// Number of ROS processes.
+    /// Returns the number of ROS processes.
     #[must_use]
     pub fn count(&self) -> usize {
         self.found.len()
@@ -102,14 +102,14 @@ impl Processes {
         daemons.map(|process| (process.id, process.domain_id()))
     }
 
-    /// Returns whether some process is limited to its own host.
+    /// Returns whether any process is limited to its own host.
     #[must_use]
     pub fn is_any_local(&self) -> bool {
         let mut found = self.found.iter();
         found.any(|process| process.variables.range() == Range::Localhost)
     }
 
-    /// Findings for differences among the processes and from this shell.
+    /// Returns the findings for differences among the processes and from this shell.
     #[must_use]
     pub fn check(&self, host: &HostState) -> Vec<Finding> {
         let mut findings = vec![self.overview()];
@@ -159,7 +159,7 @@ impl Processes {
         findings
     }
 
-    /// Finding for processes that cannot be inspected. `None` if all can.
+    /// Returns the finding for processes that cannot be inspected; `None` if all can be inspected.
     fn unseen(&self, is_root: bool) -> Option<Finding> {
         let first = self.closed.first()?;
         let which = match self.closed.len() {
@@ -304,7 +304,7 @@ fn read_process(
     }))
 }
 
-/// RMW implementation, from the mapped libraries. `None` if no library is one.
+/// Returns the RMW implementation of the mapped libraries; `None` if no library belongs to one.
 fn implementation(map: &str) -> Option<&'static str> {
     const LIBRARIES: [(&str, &str); 7] = [
         ("librmw_zenoh_cpp.so", "Zenoh"),
@@ -338,7 +338,7 @@ fn implementation(map: &str) -> Option<&'static str> {
     }
 }
 
-/// Name of the program or script. Empty for kernel threads.
+/// Returns the name of the program or script; empty for kernel threads.
 fn command(host: &HostState, id: u32) -> String {
     let line = host.files.bytes(&format!("/proc/{id}/cmdline"), MAX_LINE);
     let line = line.unwrap_or_default();
@@ -388,7 +388,7 @@ mod tests {
     const FAST: &str = "7f00-7f01 r-xp 0 fe:00 12 /opt/ros/lib/libfastrtps.so.2.14\n";
     const CYCLONE: &str = "7f00-7f01 r-xp 0 fe:00 12 /opt/ros/lib/libddsc.so.0.10.5\n";
 
-    /// Findings for processes given as id, command line, variables and memory map.
+    /// Returns the findings for processes with these ids, command lines, variables and memory maps.
     fn found(processes: &[(u32, &str, &str, &str)], shell: &[(&str, &str)]) -> Vec<Finding> {
         let mut files = Vec::new();
         for (id, command, variables, map) in processes {
@@ -414,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn processes_that_agree_are_one_line() {
+    fn processes_with_equal_settings_lead_to_one_line() {
         let findings = found(
             &[
                 (11, "/opt/talker", "ROS_DOMAIN_ID=3", FAST),
@@ -434,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn processes_that_differ_are_named_smallest_group_first() {
+    fn processes_with_different_settings_are_named_smallest_group_first() {
         let findings = found(
             &[
                 (11, "talker", "ROS_DOMAIN_ID=3", FAST),
@@ -468,7 +468,7 @@ mod tests {
     }
 
     #[test]
-    fn code_on_the_command_line_is_not_taken_for_a_name() {
+    fn python_code_on_the_command_line_is_not_used_as_a_name() {
         let daemon = "python3\0-c\0from ros2cli.daemon.daemonize import main; main()\0--name";
         for (line, expected) in [
             (daemon, "ros2 daemon"),
@@ -481,7 +481,7 @@ mod tests {
     }
 
     #[test]
-    fn servers_and_security_are_compared_too() {
+    fn discovery_servers_and_security_settings_are_compared() {
         let findings = found(
             &[
                 (11, "talker", "ROS_DISCOVERY_SERVER=10.0.0.1:11811", FAST),
@@ -494,7 +494,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shell_in_another_domain_than_all_others_gets_the_command() {
+    fn a_shell_in_another_domain_than_all_processes_gets_the_command() {
         let one = [(11, "talker", "ROS_DOMAIN_ID=3", FAST)];
         let findings = found(&one, &[("ROS_DISTRO", "jazzy")]);
         let finding = findings
@@ -509,7 +509,7 @@ mod tests {
     }
 
     #[test]
-    fn the_agent_knows_a_process_by_its_participant() {
+    fn a_process_with_a_participant_known_to_the_agent_belongs_to_ros() {
         let (_directory, host) = host(&[
             ("/proc/21/cmdline", "robot"),
             ("/proc/21/environ", "ROS_DOMAIN_ID=nonsense"),
@@ -528,7 +528,7 @@ mod tests {
     }
 
     #[test]
-    fn unreadable_processes_are_unknown_and_for_root_a_note() {
+    fn unreadable_processes_are_unknown_or_for_root_a_note() {
         let closed = |closed: &[u32]| Processes {
             closed: closed.to_vec(),
             ..Processes::default()
@@ -548,7 +548,7 @@ mod tests {
     }
 
     #[test]
-    fn a_hostile_command_is_cut_and_does_no_harm() {
+    fn a_long_hostile_command_is_truncated() {
         let long = format!("{}\x1b[2J", "a".repeat(1000));
         let findings = found(&[(11, &long, "ROS_DOMAIN_ID=\x1b[2J", FAST)], &[]);
         assert!(findings[0].sentence.len() < 80, "{}", findings[0].sentence);

@@ -38,7 +38,7 @@ impl Report {
         self.severity == Severity::Problem
     }
 
-    /// Number of findings of each severity, as text.
+    /// Returns the number of findings of each severity, as text.
     #[must_use]
     pub fn headline(&self) -> String {
         let count = |severity: Severity| {
@@ -71,14 +71,14 @@ mod tests {
     }
 
     #[test]
-    fn only_a_problem_is_a_problem() {
+    fn only_a_finding_with_severity_problem_counts_as_a_problem() {
         assert!(!report(&[]).has_problems());
         assert!(!report(&[Severity::Ok, Severity::Warning, Severity::Unknown]).has_problems());
         assert!(report(&[Severity::Problem, Severity::Ok]).has_problems());
     }
 
     #[test]
-    fn the_headline_counts_the_worst_first() {
+    fn the_headline_counts_the_worst_severity_first() {
         let report = report(&[
             Severity::Ok,
             Severity::Ok,
@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn the_report_is_json_for_fleets() {
+    fn a_report_serializes_to_json() {
         let json = serde_json::to_value(report(&[Severity::Warning])).unwrap();
         assert_eq!(json["verdict"], "warning");
         assert_eq!(json["findings"][0]["area"], "kernel");

@@ -7,14 +7,14 @@ use ros2probe_api::health::Ros2DaemonPort;
 const AREA: Area = Area::Processes;
 const CHECK: &str = "ros2_daemon";
 const FROM: &str = "GET /health ros2_daemon";
-/// Commands that only ask the daemon.
+/// Commands that only query the daemon.
 const FREE: &str = "topic list/info/type/find, node list/info, service list/type/find/info, \
     action list/info/type, completion";
 /// Commands that create a participant with any daemon.
 const NOT_FREE: &str = "topic echo/hz/bw/delay/pub, param, lifecycle get/set/list, service call, \
     action send_goal, doctor, --no-daemon";
 
-/// Findings about the ports of the agent, and the real daemons on this host by process id and domain.
+/// Returns the findings about the agent's ports and about real daemons, by process id and domain.
 #[must_use]
 pub fn check(ports: &[Ros2DaemonPort], daemons: &[(u32, Option<u32>)]) -> Vec<Finding> {
     if ports.is_empty() {
@@ -27,7 +27,7 @@ pub fn check(ports: &[Ros2DaemonPort], daemons: &[(u32, Option<u32>)]) -> Vec<Fi
     findings
 }
 
-/// Finding for the domains that the agent answers for.
+/// Returns the finding for the domains that the agent answers for.
 fn answering(ports: &[Ros2DaemonPort]) -> Option<Finding> {
     let listening = ports.iter().filter(|port| port.state == "listening");
     let domains: Vec<_> = listening.map(|port| port.domain_id.to_string()).collect();
@@ -43,7 +43,7 @@ fn answering(ports: &[Ros2DaemonPort]) -> Option<Finding> {
     Some(finding.seen(format!("still a participant for: {NOT_FREE}"), FROM))
 }
 
-/// Finding for a port that the agent does not have.
+/// Returns the finding for a port that the agent does not have.
 fn elsewhere(port: &Ros2DaemonPort, daemons: &[(u32, Option<u32>)]) -> Finding {
     let Ros2DaemonPort {
         domain_id,
@@ -95,7 +95,7 @@ fn elsewhere(port: &Ros2DaemonPort, daemons: &[(u32, Option<u32>)]) -> Finding {
     }
 }
 
-/// Finding for real daemons while the agent does not answer in their place.
+/// Returns the finding for real daemons while the agent does not answer in their place.
 fn unused(daemons: &[(u32, Option<u32>)]) -> Option<Finding> {
     let (first, domain) = daemons.first()?;
     let which = match (daemons.len(), domain) {
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn the_commands_without_a_participant_are_named_while_the_agent_answers() {
+    fn commands_without_a_participant_are_named_while_the_agent_answers() {
         let found = check(&[port(0, "listening"), port(3, "listening")], &[]);
         let [only] = found.as_slice() else {
             panic!("{found:?}");
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn a_real_daemon_is_named_and_stopped_or_replaced() {
+    fn a_real_daemon_is_reported_with_the_command_or_key_that_ends_its_use() {
         let daemons = [(77, Some(3))];
         let found = check(&[port(3, "occupied")], &daemons);
         assert_eq!(found[0].severity, Severity::Warning);

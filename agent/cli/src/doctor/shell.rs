@@ -7,18 +7,19 @@ use super::variables::{Range, Variables};
 
 const AREA: Area = Area::Shell;
 const FROM: &str = "this shell";
-/// The implementation without UDP ports of a domain and without DDS's discovery.
+/// The RMW implementation without UDP ports of a domain and without DDS discovery.
 const ZENOH: &str = "rmw_zenoh_cpp";
 const PORTS: &str = "/proc/sys/net/ipv4/ip_local_port_range";
 /// RTPS 2.5, 9.6.2.3: first port of domain 0, and ports per domain.
 const PORT_BASE: u32 = 7400;
 const DOMAIN_GAIN: u32 = 250;
-/// Highest offset from that port for fifty participants on one host: 11, plus two each.
+/// Maximum offset from the first port, for fifty participants on one host: 11, plus two for each
+/// other.
 const PORTS_OF_FIFTY: u32 = 11 + 2 * 49;
-/// Bytes read of an XML profile.
+/// Maximum number of bytes read of an XML profile.
 const MAX_PROFILE: u64 = 256 << 10;
 
-/// Findings of all shell checks.
+/// Returns the findings of all shell checks.
 #[must_use]
 pub fn check(host: &HostState) -> Vec<Finding> {
     let variables = Variables::of(&host.environment);
@@ -89,7 +90,7 @@ fn domain(host: &HostState, variables: &Variables) -> Finding {
     finding.seen(shown, format!("ROS_DOMAIN_ID, {FROM}"))
 }
 
-/// Range of ephemeral ports, if it is readable.
+/// Returns the range of ephemeral ports, if it is readable.
 fn ephemeral(host: &HostState) -> Option<(u32, u32)> {
     let text = host.files.text(PORTS).ok()?;
     let mut numbers = text.split_whitespace().map(str::parse);
@@ -186,7 +187,7 @@ fn server(variables: &Variables) -> Option<Finding> {
     Some(finding.remedy("export ROS_SUPER_CLIENT=TRUE    # ros2 tools need it"))
 }
 
-/// Finding for transports selected by Fast DDS variables.
+/// Returns the finding for transports selected by Fast DDS variables.
 fn transports(variables: &Variables) -> Option<Finding> {
     let name = "FASTDDS_BUILTIN_TRANSPORTS";
     let value = variables.shown(name)?;
@@ -370,7 +371,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shell_without_ros_needs_nothing_and_sudo_is_named() {
+    fn a_shell_without_ros_leads_to_a_note_and_sudo_to_a_remedy() {
         assert_eq!(found(&[])[0].severity, Severity::Note);
         assert_eq!(
             found(&[("SUDO_USER", "me")])[0].remedies[0].line,
@@ -379,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn an_ordinary_shell_is_fine() {
+    fn an_ordinary_shell_passes_every_check() {
         let findings = found(&[
             ("ROS_DISTRO", "jazzy"),
             ("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp"),
@@ -419,7 +420,7 @@ mod tests {
     }
 
     #[test]
-    fn each_variable_has_its_consequence() {
+    fn each_variable_leads_to_its_severity() {
         let (note, warning) = (Severity::Note, Severity::Warning);
         gives("RMW_IMPLEMENTATION", "rmw_zenoh_cpp", "rmw", Severity::Ok);
         gives("RMW_IMPLEMENTATION", "rmw_connextdds", "rmw", note);
@@ -487,7 +488,7 @@ mod tests {
     }
 
     #[test]
-    fn variables_that_ros_ignores_because_of_the_old_one_are_reported() {
+    fn variables_that_ros_ignores_because_of_ros_localhost_only_are_reported() {
         let findings = found(&[
             ("ROS_LOCALHOST_ONLY", "1"),
             ("ROS_STATIC_PEERS", "10.0.0.9"),

@@ -11,19 +11,19 @@ use ros2probe_daemon::escape::visible;
 const WIDTH: usize = 80;
 /// Columns before a sentence: two spaces, the severity and a space.
 const INDENT: usize = 11;
-/// Most lines of evidence for one finding without `--verbose`.
+/// Maximum number of lines of evidence for one finding without `--verbose`.
 const EVIDENCE: usize = 3;
 /// Path of the configuration file, as printed after a line of configuration.
 const FILE: &str = "in /etc/ros2probe/ros2probe.yaml";
-/// Most characters of one value.
+/// Maximum number of characters of one value.
 const MAX_VALUE: usize = 200;
 
 /// Options of the output.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Style {
-    /// Print all evidence, also of findings without a problem.
+    /// Whether all evidence is printed, also of findings without a problem.
     pub verbose: bool,
-    /// Use colours.
+    /// Whether colours are used.
     pub colours: bool,
 }
 
@@ -99,7 +99,7 @@ impl Page {
         }
     }
 
-    /// Prints a remedy. A command is never wrapped, since it is to be pasted; a long comment
+    /// Prints a remedy. A command is never wrapped, so that it can be pasted; a long comment
     /// precedes it.
     fn remedy(&mut self, remedy: &Remedy) {
         let line = visible(&remedy.line);
@@ -148,8 +148,7 @@ const fn colour(severity: Severity) -> &'static str {
     }
 }
 
-/// Wraps a text after the indentation. Longer words stay whole unless they exceed any plausible
-/// length.
+/// Wraps a text to the width after the indentation. A word longer than a line is split.
 fn wrapped(text: &str) -> Vec<String> {
     let width = WIDTH - INDENT;
     let mut lines = vec![String::new()];

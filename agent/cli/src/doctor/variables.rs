@@ -1,15 +1,15 @@
 //! ROS settings in the variables of a shell or a process: domain, implementation and discovery
 //! range.
 //!
-//! Only the variables named here are ever shown. Those of DDS security are paths and switches; the
-//! files that they name are not opened.
+//! Only the variables named here are ever shown. Variables of DDS security are paths and switches;
+//! the files that they name are not opened.
 
 use std::collections::BTreeMap;
 
-/// Longest value shown, in characters.
+/// Maximum length of a shown value, in characters.
 const MAX_VALUE: usize = 120;
 
-/// A value of `ROS_DOMAIN_ID` that is not a valid domain, cut to the longest value shown.
+/// A value of `ROS_DOMAIN_ID` that is not a valid domain, truncated to [`MAX_VALUE`].
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error("`{0}` is not a domain ID")]
 pub struct InvalidDomain(String);
@@ -58,7 +58,7 @@ pub enum Range {
 }
 
 impl Variables {
-    /// ROS variables of a shell.
+    /// Returns the ROS variables of a shell.
     #[must_use]
     pub fn of(environment: &BTreeMap<String, String>) -> Self {
         let known = NAMES.into_iter().filter_map(|name| {
@@ -80,20 +80,20 @@ impl Variables {
             if let Some(name) = NAMES.into_iter().find(|known| *known == name)
                 && !value.is_empty()
             {
-                // Among duplicates, getenv(3) returns the first.
+                // Of several values of one variable, getenv(3) returns the first.
                 known.entry(name).or_insert_with(|| value.to_owned());
             }
         }
         Self(known)
     }
 
-    /// Value of a variable. `None` if it is unset.
+    /// Returns the value of a variable; `None` if it is unset.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<&str> {
         self.0.get(name).map(String::as_str)
     }
 
-    /// Value of a variable, cut to the longest value shown. `None` if it is unset.
+    /// Returns the value of a variable, truncated to [`MAX_VALUE`]; `None` if it is unset.
     #[must_use]
     pub fn shown(&self, name: &str) -> Option<String> {
         let value = self.get(name)?;
@@ -109,7 +109,7 @@ impl Variables {
         self.0.keys().any(|name| *name != "CYCLONEDDS_URI")
     }
 
-    /// Domain of the environment.
+    /// Returns the domain of the environment.
     ///
     /// # Errors
     ///
@@ -129,7 +129,7 @@ impl Variables {
         self.get("ROS_LOCALHOST_ONLY") == Some("1")
     }
 
-    /// Discovery range.
+    /// Returns the discovery range.
     #[must_use]
     pub fn range(&self) -> Range {
         if self.is_localhost_only() {
@@ -155,7 +155,7 @@ impl Variables {
 }
 
 impl Range {
-    /// Settings as text.
+    /// Returns the range as text.
     #[must_use]
     pub fn words(&self) -> String {
         match self {
@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_is_known_is_taken_from_a_process() {
+    fn only_known_variables_of_a_process_are_kept() {
         let found = variables(
             "SECRET=x ROS_DOMAIN_ID=7 ROS_DOMAIN_ID=8 ROS_SECURITY_X=pass RMW_IMPLEMENTATION=",
         );
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn a_domain_is_a_number_that_has_ports() {
+    fn a_number_without_ports_is_not_a_domain() {
         assert_eq!(variables("A=b").domain(), Ok(0));
         assert_eq!(variables("ROS_DOMAIN_ID=232").domain(), Ok(232));
         assert_eq!(
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn the_old_variable_goes_before_the_new_one() {
+    fn ros_localhost_only_takes_precedence_over_the_discovery_range() {
         for (text, range) in [
             ("", Range::Subnet),
             ("ROS_LOCALHOST_ONLY=0", Range::Subnet),

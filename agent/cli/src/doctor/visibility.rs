@@ -1,5 +1,5 @@
-//! Checks of visibility on this host: as reported by the running agent, or from a trial without
-//! one. `capture` provides the reasons; this module adds their consequences.
+//! Checks of visibility on this host, as reported by the running agent, or else from a trial.
+//! `capture` provides the reasons; this module adds their consequences.
 
 use super::finding::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
@@ -27,7 +27,7 @@ pub struct Visibility {
 }
 
 impl Visibility {
-    /// Visibility that a running agent reports.
+    /// Returns the visibility that a running agent reports.
     #[must_use]
     pub fn of_agent(health: &Health) -> Self {
         let known = |label: &str| Ability::ALL.into_iter().find(|each| each.label() == label);
@@ -45,7 +45,7 @@ impl Visibility {
         }
     }
 
-    /// Visibility found by a trial.
+    /// Returns the visibility found by a trial.
     #[must_use]
     pub fn of_trial(facts: AgentFacts) -> Self {
         Self {
@@ -58,7 +58,7 @@ impl Visibility {
     }
 }
 
-/// Finding for a host without an agent and without permission for a trial.
+/// Returns the findings for a host without an agent and without permission for a trial.
 #[must_use]
 pub fn untried(reason: &str) -> Vec<Finding> {
     let sentence = "kernel support was not tested";
@@ -70,7 +70,7 @@ pub fn untried(reason: &str) -> Vec<Finding> {
     ]
 }
 
-/// Finding for a trial that failed.
+/// Returns the findings for a trial that failed.
 #[must_use]
 pub fn failed(error: &str) -> Vec<Finding> {
     let sentence = format!("the agent cannot observe this host: {error}");
@@ -82,7 +82,7 @@ pub fn failed(error: &str) -> Vec<Finding> {
     ]
 }
 
-/// One finding for the source, and one for each unavailable ability.
+/// Returns one finding for the source, and one for each unavailable ability.
 #[must_use]
 pub fn check(visibility: &Visibility) -> Vec<Finding> {
     let mut findings = vec![source(visibility)];
@@ -130,7 +130,7 @@ fn source(visibility: &Visibility) -> Finding {
     finding.seen(&visibility.source, visibility.from)
 }
 
-/// Text for an available ability.
+/// Returns the text for an available ability.
 const fn words(ability: Ability) -> &'static str {
     match ability {
         Ability::Subscribers => "what each subscriber received",
@@ -146,7 +146,7 @@ const fn words(ability: Ability) -> &'static str {
     }
 }
 
-/// Finding for an unavailable ability. `None` if the source's own line covers it.
+/// Returns the finding for an unavailable ability; `None` if the source's own line covers it.
 fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
     let reason = visibility
         .reasons
@@ -158,7 +158,7 @@ fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
         Ability::Subscribers if is_host => {
             (Severity::Warning, format!("not {}", words(ability)), None)
         }
-        // The wire source has none of these; the source's line covers them.
+        // The wire source has none of these abilities, and its own line covers them.
         Ability::Subscribers
         | Ability::SocketLosses
         | Ability::ReassemblyLosses
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_from_inside_processes_are_an_ability_with_the_key_that_switches_them_on() {
+    fn missing_counts_from_inside_processes_are_reported_with_their_key() {
         let findings = check(&host(&Ability::ALL));
         let seen = &find(&findings, "abilities").unwrap().sentence;
         assert!(seen.contains("counts from inside processes"), "{seen}");
@@ -276,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn the_wire_is_a_choice_or_a_warning_and_lists_no_consequence_twice() {
+    fn a_configured_wire_source_is_a_note_and_a_fallback_to_it_a_warning() {
         let mut visibility = Visibility {
             source: "wire".to_owned(),
             able: vec![Ability::Sent, Ability::Forwarded],
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn an_agent_of_another_version_may_have_abilities_that_are_not_known() {
+    fn unknown_abilities_of_an_agent_of_another_version_are_ignored() {
         let health: Health = serde_json::from_str(
             r#"{"source":"host","abilities":[{"ability":"x","able":true},
             {"ability":"owners","able":true},{"ability":"socket_losses","able":false,"reason":"no"}]}"#,
@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_trial_there_is_the_command_that_makes_one() {
+    fn without_a_trial_the_command_for_one_is_reported() {
         let findings = untried("CAP_BPF is missing");
         assert_eq!(findings[0].severity, Severity::Unknown);
         assert_eq!(findings[0].remedies[0].line, "sudo rp doctor");

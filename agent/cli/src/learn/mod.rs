@@ -1,8 +1,9 @@
 //! Learns a watchlist from a healthy robot: the figures of its topics become expectations.
 //!
 //! [`Learner`] takes the agent's view of all topics about once a second, and counts each topic in
-//! whole seconds. [`thresholds`] chooses expectations from them, and drops those that the same
-//! seconds would violate. [`watchlist`] writes the file. Nothing here performs I/O or reads a clock.
+//! whole seconds. [`thresholds`] chooses expectations from these counts, and drops expectations
+//! that the same seconds would violate. [`watchlist`] writes the file. Nothing here performs I/O or
+//! reads a clock.
 
 mod observation;
 pub mod statistics;
@@ -18,17 +19,17 @@ use crate::ros2::name::is_hidden;
 use observation::Observation;
 use thresholds::Lesson;
 
-/// Longest time to learn from, in seconds. Bounds the memory of a topic.
+/// Maximum time to learn from, in seconds. It bounds the memory of a topic.
 pub const MAX_SECONDS: u32 = 2 * 3600;
-/// Time between two views, in seconds, below which the later one is skipped.
+/// Minimum time between two views, in seconds. An earlier view is skipped.
 const MIN_STEP: f64 = 0.5;
-/// Longest time between two views, in seconds, that is split into seconds.
+/// Maximum time between two views, in seconds, that is split into seconds.
 const MAX_STEP: f64 = 60.0;
 
 /// Kinds of topics that a watch covers by their ROS name.
 const KINDS: [&str; 4] = ["topic", "action_feedback", "action_status", "service_event"];
 
-/// Names and globs of the topics to learn. Without any, all that `ros2 topic list` shows.
+/// Names and globs of the topics to learn. If empty, all topics that `ros2 topic list` shows.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Selection(Vec<String>);
 
@@ -41,7 +42,7 @@ pub struct Learner {
     period: Option<(f64, f64)>,
     /// Whole seconds that were counted.
     seconds: u32,
-    /// Topics that a watch cannot name, or beyond the limit of watches.
+    /// Topics that a watch cannot name, or that are beyond the limit of watches.
     unnamed: BTreeMap<String, &'static str>,
 }
 
@@ -82,7 +83,7 @@ impl Selection {
             .map(Self)
     }
 
-    /// Names and globs.
+    /// Returns the names and globs.
     #[must_use]
     pub fn patterns(&self) -> &[String] {
         &self.0
@@ -114,25 +115,25 @@ impl Learner {
         }
     }
 
-    /// Number of topics that were seen.
+    /// Returns the number of topics that were seen.
     #[must_use]
     pub fn topics(&self) -> usize {
         self.topics.len()
     }
 
-    /// Number of whole seconds that were counted.
+    /// Returns the number of whole seconds that were counted.
     #[must_use]
     pub const fn seconds(&self) -> u32 {
         self.seconds
     }
 
-    /// Time of the last view, in Unix seconds.
+    /// Returns the time of the last view, in Unix seconds.
     #[must_use]
     pub fn latest(&self) -> Option<f64> {
         self.period.map(|(_, last)| last)
     }
 
-    /// Names and globs that cover no topic so far.
+    /// Returns the names and globs that cover no topic so far.
     pub fn unseen(&self) -> impl Iterator<Item = &str> {
         let names = || self.topics.keys();
         let is_unseen = move |pattern: &&String| !names().any(|name| glob::covers(pattern, name));
@@ -143,7 +144,7 @@ impl Learner {
             .map(String::as_str)
     }
 
-    /// Counts what happened since the last view. Views that follow at once are skipped.
+    /// Counts what happened since the last view. A view that follows too early is skipped.
     pub fn observe(&mut self, list: &TopicList<'_>) {
         let now = list.timestamp_seconds;
         let elapsed = self.period.map_or(0.0, |(_, last)| now - last);
@@ -182,7 +183,8 @@ impl Learner {
         })
     }
 
-    /// Returns the counts of a topic. `None` if no watch can name it, or too many are known.
+    /// Returns the counts of a topic; `None` if no watch can name it, or if too many topics are
+    /// known.
     fn observation(&mut self, name: &str) -> Option<&mut Observation> {
         let limit = Limit::Watches.row().default;
         if !self.topics.contains_key(name) {

@@ -1,4 +1,4 @@
-//! What a topic did, in whole seconds.
+//! Counts of a topic in whole seconds.
 
 use ros2probe_api::Open;
 use ros2probe_api::topics::{ReasonCode, Topic};
@@ -7,16 +7,16 @@ use ros2probe_daemon::config::rehearsal::Second;
 /// Counts of one topic.
 #[derive(Debug, Default)]
 pub struct Observation {
-    /// Number of the second before the first one, counted from the beginning of learning.
+    /// Seconds of learning before the topic's first second.
     start: u32,
-    /// The topic's seconds.
+    /// Counts of each second of the topic.
     seconds: Vec<Second>,
     totals: Option<Totals>,
     /// Whether messages were sampled in shared memory.
     pub is_sampled: bool,
-    /// Messages with a timestamp later than their capture, or an hour away from it.
+    /// Number of messages with a timestamp later than their capture, or an hour away from it.
     pub odd_timestamps: u64,
-    /// Why the agent sees no message, in its words.
+    /// The agent's explanation of why it sees no message.
     pub reason: Option<String>,
 }
 
@@ -53,13 +53,13 @@ impl Observation {
         }
     }
 
-    /// The topic's seconds so far.
+    /// Returns the topic's seconds so far.
     pub fn seconds(&self) -> &[Second] {
         &self.seconds
     }
 
-    /// Adds what happened since the last view, `elapsed` seconds ago, as `steps` seconds. Counts of
-    /// the first view belong to the time before.
+    /// Adds the counts since the last view, `elapsed` seconds ago, as `steps` seconds. Counts of
+    /// the first view belong to the time before it.
     pub fn observe(&mut self, topic: &Topic<'_>, now: f64, elapsed: f64, steps: u32) {
         let before = self.totals;
         let measurement = topic.measurement.as_ref();
@@ -79,7 +79,7 @@ impl Observation {
             (Some(before), Some(totals)) => totals.since(before),
             _ => Totals::default(),
         };
-        // Views are about a second apart, and rates are counts of whole seconds.
+        // Views are about a second apart, and rates count whole seconds.
         let messages = scaled(since.messages, f64::from(steps) / elapsed);
         for step in 0..steps {
             let left = f64::from(steps - step - 1);
@@ -102,7 +102,7 @@ impl Observation {
         self.totals = totals.or(before);
     }
 
-    /// Fills the seconds of a view without the topic: it has no endpoint then.
+    /// Adds empty seconds for a view without the topic, which then has no endpoint.
     pub fn complete(&mut self, seconds: u32) {
         let wanted = usize::try_from(seconds.saturating_sub(self.start)).unwrap_or(usize::MAX);
         if self.seconds.len() < wanted {
@@ -112,7 +112,7 @@ impl Observation {
 }
 
 impl Totals {
-    /// Difference to an earlier view. Counters that were reset count as nothing.
+    /// Returns the difference to an earlier view. Counters that were reset count as 0.
     fn since(self, before: Self) -> Self {
         Self {
             messages: self.messages.saturating_sub(before.messages),
@@ -125,7 +125,7 @@ impl Totals {
     }
 }
 
-/// Why messages may exist that the agent does not see.
+/// Returns why messages may exist that the agent does not see.
 fn reason(topic: &Topic<'_>) -> Option<String> {
     let mut reasons = topic.reasons.iter();
     let is_cause = |code: &Open<ReasonCode>| {

@@ -6,7 +6,7 @@ const NORMAL: f64 = 1.4826;
 /// Significant digits of a threshold.
 const DIGITS: i32 = 3;
 
-/// A set of values in a few numbers.
+/// Summary statistics of a set of values.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Summary {
     /// Smallest value.
@@ -80,7 +80,8 @@ fn rounded(value: f64, round: fn(f64) -> f64) -> f64 {
     }
     let shift = DIGITS - 1 - value.log10().floor() as i32;
     let scale = 10_f64.powi(shift.abs());
-    // The quotient of integers is the float nearest to the decimal number, which prints shortly.
+    // The quotient of integers is the float nearest to the decimal number, so it prints with few
+    // digits.
     if shift >= 0 {
         // Noise of the multiplication, as in 0.07 * 10_000, changes no digit.
         let scaled = value * scale;

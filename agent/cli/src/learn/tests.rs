@@ -8,7 +8,7 @@ use super::thresholds::Remark;
 use super::watchlist::{Source, text};
 use super::*;
 
-/// A topic in virtual time, with the counters of its messages.
+/// A robot in virtual time, whose topics have counters of their messages.
 struct Robot {
     now: f64,
     learner: Learner,
@@ -55,7 +55,7 @@ impl Robot {
         });
     }
 
-    /// Lets one second pass, in which the first topic does this.
+    /// Advances time by one second, in which the first topic has this activity.
     fn second(&mut self, activity: Activity) {
         self.now += 1.0;
         let counted = self.topics[0].measurement.as_mut().unwrap();
@@ -151,7 +151,7 @@ fn busy(second: u32) -> u32 {
 }
 
 #[test]
-fn a_busy_robot_at_half_its_rate_is_found_and_at_its_full_rate_never_reported() {
+fn a_busy_robot_violates_its_expectations_at_half_its_rate_and_not_otherwise() {
     let seconds = |from: u32, count: u32, part: u32| -> Vec<Second> {
         let second = |second: u32| Second {
             messages: busy(second) / part,
@@ -180,7 +180,8 @@ fn a_busy_robot_at_half_its_rate_is_found_and_at_its_full_rate_never_reported() 
     // A day of the same robot.
     let day = rehearsal::violations(&expectations, &seconds(120, 86_400, 1));
     assert_eq!(day, Vec::<&str>::new());
-    // From full to half the rate: within the window, and two evaluations in a row.
+    // The rate drops from full to half. The violation follows within the window and two
+    // evaluations.
     let within = 2 + window as usize;
     let mut halved = learnt;
     halved.extend(seconds(120, within as u32, 2));
@@ -204,7 +205,7 @@ fn a_topic_that_pauses_most_of_the_time_has_no_rate() {
 }
 
 #[test]
-fn rare_messages_give_a_silence_only_if_they_are_regular() {
+fn rare_messages_lead_to_a_limit_of_silence_only_if_they_are_regular() {
     let mut regular = Robot::new(&["/map"]);
     for second in 0..200 {
         regular.second(Activity {
@@ -260,7 +261,7 @@ fn values_that_cannot_be_learnt_are_explained() {
 }
 
 #[test]
-fn globs_select_and_hidden_topics_are_selected_by_name_alone() {
+fn globs_select_topics_and_only_names_select_hidden_ones() {
     let typed = |names: &[&str]| {
         let names: Vec<_> = names.iter().map(|name| (*name).to_owned()).collect();
         Selection::new(&names)
@@ -307,7 +308,7 @@ fn views_too_close_or_too_far_apart_count_whole_seconds() {
 }
 
 #[test]
-fn names_of_topics_cannot_break_the_file() {
+fn hostile_names_of_topics_do_not_corrupt_the_file() {
     let mut robot = Robot::new(&["/imu", "/a: b\n- x", "/scan"]);
     for _ in 0..30 {
         robot.second(STEADY);
@@ -361,7 +362,7 @@ fn a_file_is_never_larger_than_an_agent_reads() {
 }
 
 proptest! {
-    /// Whatever a robot does, it does not violate what was learnt from it.
+    /// A robot never violates what was learnt from it.
     #[test]
     fn no_robot_violates_its_own_watchlist(
         seconds in prop::collection::vec((0..30_u32, 0..3_u32, 0.0..0.1_f32, 0..3_u16, 0..3_u16), 20..120),
@@ -382,7 +383,7 @@ proptest! {
 
     /// A learnt band excludes half the rate, at every rate.
     #[test]
-    fn half_the_rate_violates(rate in 0.5..500.0_f64, jitter in 0.0..0.05_f64) {
+    fn half_the_rate_violates_the_learnt_band(rate in 0.5..500.0_f64, jitter in 0.0..0.05_f64) {
         let count = |factor: f64, second: u32| {
             let noise = 1.0 + jitter * f64::from(second % 7).sin();
             let upto = |second: u32| (rate * factor * noise * f64::from(second)).floor() as u32;

@@ -1,8 +1,8 @@
 //! Chooses the expectations of a topic from its measured seconds.
 //!
 //! Each threshold begins at a robust statistic (median, 95th percentile, MAD) with a margin. If the
-//! topic's own seconds violate it, by the agent's evaluation, it widens to the extreme value that
-//! was seen. If that is too wide to find a fault, the expectation is left out, with the reason.
+//! topic's own seconds violate it, by the agent's evaluation, the threshold widens to the observed
+//! extreme. If it is then too wide to find a fault, the expectation is left out, with the reason.
 
 use std::ops::RangeInclusive;
 
@@ -17,30 +17,30 @@ use super::statistics::{Summary, rounded_down, rounded_up};
 pub const RATE_MARGIN: f64 = 0.2;
 /// Margin of a rate, in deviations.
 pub const RATE_DEVIATIONS: f64 = 4.0;
-/// Widest band of a rate, as parts of its median. A topic at half its rate stays outside.
+/// Limits of the band of a rate, as parts of its median. A topic at half its rate stays outside.
 const RATE_LIMITS: (f64, f64) = (0.6, 1.6);
-/// Least distance of the lowest rate from half the median, in messages of a window: half the rate
-/// then violates it, in spite of the agent's tolerance of one message.
+/// Minimum distance of the minimum rate from half the median, in messages of a window. Half the
+/// rate then violates the minimum, in spite of the agent's tolerance of one message.
 const TOLERANCE: f64 = 1.0;
 /// Windows in seconds for rates that vary too much in the agent's default window.
 const WINDOWS: [u64; 4] = [2, 3, 5, rehearsal::SECONDS];
-/// Slowest rate with a band: three messages are due in the agent's longest window of 10 s.
+/// Minimum rate with a band: three messages are due in the agent's longest window of 10 s.
 const SLOWEST: f64 = 0.3;
-/// Least number of seconds and of messages to learn from.
+/// Minimum number of seconds and of messages to learn from.
 const LEAST: usize = 10;
-/// Margin of a silence: times the longest one that was seen.
+/// Margin of a silence, as a factor of the longest observed one.
 pub const SILENCE_MARGIN: f64 = 3.0;
-/// Shortest learnt silence in seconds, since the agent evaluates once a second.
+/// Minimum learnt silence in seconds, since the agent evaluates once a second.
 const SHORTEST_SILENCE: f64 = 2.0;
-/// Part of the time that the longest silence may take, for topics without a rate.
+/// Maximum share of the time that the longest silence may take, for topics without a rate.
 const SILENCE_PART: f64 = 0.2;
-/// Smallest learnt loss ratio.
+/// Minimum learnt loss ratio.
 pub const LEAST_LOSS: f64 = 0.01;
-/// Largest learnt loss ratio.
+/// Maximum learnt loss ratio.
 const MOST_LOSS: f64 = 0.5;
 /// Seconds over which the agent evaluates a loss.
 const LOSS_WINDOW: usize = 10;
-/// Margin of a latency in deviations, and its smallest one in seconds.
+/// Margin of a latency in deviations, and its minimum in seconds.
 pub const LATENCY_DEVIATIONS: f64 = 6.0;
 const LATENCY_MARGIN: f64 = 0.005;
 
@@ -49,9 +49,9 @@ const LATENCY_MARGIN: f64 = 0.005;
 pub struct Lesson {
     /// ROS name.
     pub topic: String,
-    /// The expectations.
+    /// Values of the expectations.
     pub values: ExpectationValues,
-    /// Their explanations, in the order of the configuration's keys.
+    /// Explanations of the values, in the order of the configuration's keys.
     pub remarks: Vec<Remark>,
 }
 
@@ -89,7 +89,7 @@ pub fn lesson(topic: &str, observation: &Observation) -> Lesson {
 struct Windows {
     /// Length in seconds.
     seconds: u64,
-    /// Whether the agent chooses this length by itself.
+    /// Whether the agent uses this length by default.
     is_default: bool,
     rates: Summary,
 }
@@ -98,7 +98,7 @@ struct Windows {
 struct Draft<'a> {
     observation: &'a Observation,
     seconds: &'a [Second],
-    /// Seconds after that of the first message, which is incomplete.
+    /// Seconds after the second of the first message, which is incomplete.
     complete: &'a [Second],
     messages: u64,
     values: ExpectationValues,
@@ -120,7 +120,7 @@ impl<'a> Draft<'a> {
         }
     }
 
-    /// Returns whether the topic's own seconds violate these values, or they are invalid.
+    /// Returns whether the topic's own seconds violate these values, or the values are invalid.
     fn violates(&self, values: ExpectationValues) -> bool {
         match Expectations::try_from(values) {
             Ok(expectations) => !rehearsal::violations(&expectations, self.seconds).is_empty(),
@@ -174,7 +174,7 @@ impl<'a> Draft<'a> {
         let Some(shortest) = windows.first() else {
             return self.leave_out(KEYS, "no message arrived for most of the time");
         };
-        // The shortest window that finds half the rate and that the topic never violates.
+        // The shortest window is best that detects half the rate and that the topic never violates.
         let usual = |it: &&Windows| it.is_above(it.lows()[0]) && self.accepts_low(it, it.lows()[0]);
         let widest = |it: &&Windows| self.accepts_low(it, it.lows()[1]);
         let chosen = windows.iter().find(usual);
@@ -182,7 +182,7 @@ impl<'a> Draft<'a> {
         self.band(chosen.unwrap_or(shortest));
     }
 
-    /// Chooses the lowest and the highest rate.
+    /// Chooses the minimum and the maximum rate.
     fn band(&mut self, windows: &Windows) {
         let Windows { seconds, rates, .. } = windows;
         let [usual, widest] = windows.lows();
@@ -215,13 +215,13 @@ impl<'a> Draft<'a> {
         }
     }
 
-    /// Returns whether this lowest rate finds half the rate, and the topic does not violate it.
+    /// Returns whether this minimum rate detects half the rate, and the topic does not violate it.
     fn accepts_low(&self, windows: &Windows, rate: f64) -> bool {
         let limits = windows.least()..=f64::INFINITY;
         limits.contains(&rate) && !self.violates(windows.expecting(Some(rate), None))
     }
 
-    /// Returns the rates in windows of this many seconds. `None` if most have no message.
+    /// Returns the rates in windows of this many seconds; `None` if most windows have no message.
     fn windows(&self, seconds: u64, default: u64) -> Option<Windows> {
         let rates = Summary::of(self.rates(seconds)).filter(|rates| rates.median > 0.0)?;
         Some(Windows {
@@ -231,7 +231,7 @@ impl<'a> Draft<'a> {
         })
     }
 
-    /// Rates of all windows of this many seconds with a publisher.
+    /// Returns the rates of all windows of this many seconds with a publisher.
     fn rates(&self, window: u64) -> Vec<f64> {
         let length = usize::try_from(window).unwrap_or(1).max(1);
         let windows = self.complete.windows(length);
@@ -382,7 +382,7 @@ impl<'a> Draft<'a> {
         (self.values.publishers, self.values.subscribers) = (publishers, subscribers);
     }
 
-    /// Seconds in which the agent evaluates the numbers of endpoints.
+    /// Returns the seconds in which the agent evaluates the numbers of endpoints.
     fn settled(&self) -> Vec<Second> {
         let mut published = 0;
         let mut settled = Vec::new();
@@ -399,7 +399,7 @@ impl<'a> Draft<'a> {
         settled
     }
 
-    /// Chooses a least number of endpoints: the median, or the smallest number that was seen.
+    /// Chooses a minimum number of endpoints: the median, or the smallest observed number.
     fn least(
         &mut self,
         key: &'static str,
@@ -432,8 +432,8 @@ impl<'a> Draft<'a> {
         least
     }
 
-    /// Leaves out what the topic's own seconds violate together: bad seconds of different
-    /// expectations in a row count as one violation.
+    /// Leaves out expectations that the topic's own seconds violate together: bad seconds of
+    /// different expectations in a row count as one violation.
     fn reconcile(&mut self) {
         let Ok(expectations) = Expectations::try_from(self.values) else {
             return;
@@ -474,13 +474,13 @@ impl<'a> Draft<'a> {
 }
 
 impl Windows {
-    /// Returns the usual lowest rate, and the widest one: just below the lowest that was seen.
+    /// Returns the usual minimum rate, and the widest one, just below the lowest observed rate.
     fn lows(&self) -> [f64; 2] {
         let lows = [self.rates.median - self.half(), self.rates.minimum * 0.95];
         lows.map(rounded_down)
     }
 
-    /// Returns the usual highest rate, and the widest one: just above the highest that was seen.
+    /// Returns the usual maximum rate, and the widest one, just above the highest observed rate.
     fn highs(&self) -> [f64; 2] {
         let highs = [self.rates.median + self.half(), self.rates.maximum * 1.05];
         highs.map(rounded_up)
@@ -492,20 +492,20 @@ impl Windows {
         (RATE_MARGIN * rates.median).max(RATE_DEVIATIONS * rates.deviation)
     }
 
-    /// Returns the smallest lowest rate that half the rate violates.
+    /// Returns the smallest minimum rate that half the rate violates.
     fn least(&self) -> f64 {
         let median = self.rates.median;
         let half = 0.5 * median + TOLERANCE / number(self.seconds);
         half.max(RATE_LIMITS.0 * median)
     }
 
-    /// Returns whether no window violates this lowest rate.
+    /// Returns whether no window violates this minimum rate.
     fn is_above(&self, rate: f64) -> bool {
         let seconds = number(self.seconds);
         rate * seconds < self.rates.minimum * seconds + TOLERANCE
     }
 
-    /// Returns whether no window violates this highest rate.
+    /// Returns whether no window violates this maximum rate.
     fn is_below(&self, rate: f64) -> bool {
         let seconds = number(self.seconds);
         rate * seconds + TOLERANCE > self.rates.maximum * seconds
@@ -523,7 +523,7 @@ impl Windows {
     }
 }
 
-/// Text of a statistic, with three digits.
+/// Returns a statistic as text with three digits.
 fn short(value: f64) -> String {
     if value <= 0.0 {
         return "0".to_owned();

@@ -11,13 +11,13 @@ use ros2probe_daemon::escape::visible;
 
 /// Column at which reasons begin.
 const COLUMN: usize = 28;
-/// Largest configuration file that an agent reads, in bytes.
+/// Maximum size of a configuration file that an agent reads, in bytes.
 const MAX_BYTES: usize = 1 << 20;
 
 /// Origin of a watchlist.
 #[derive(Clone, Copy, Debug)]
 pub struct Source<'a> {
-    /// The agent or the capture, as text for people.
+    /// Name of the agent or the capture, as text for people.
     pub place: &'a str,
     /// Domain id.
     pub domain_id: u32,
@@ -25,11 +25,11 @@ pub struct Source<'a> {
     pub names_domain: bool,
     /// Time of the first and the last view.
     pub period: (&'a str, &'a str),
-    /// Number of whole seconds.
+    /// Number of whole seconds of learning.
     pub seconds: u32,
 }
 
-/// Returns the file. If the reasons make it larger than an agent reads, they are left out.
+/// Returns the text of the file. If reasons make it larger than an agent reads, they are left out.
 #[must_use]
 pub fn text(learnt: &Learnt, source: &Source<'_>) -> String {
     let explained = entries(learnt, source, true);

@@ -66,7 +66,7 @@ fn each_fault_of_an_agent_is_reported_separately() {
 }
 
 #[test]
-fn a_cap_that_is_or_was_reached_is_a_warning_with_the_line_to_change() {
+fn a_cap_that_is_or_was_reached_leads_to_a_warning_with_the_line_to_change() {
     let full = r#"{"ready":true,"version":"1.0.0","source":"host","watches_kept":true,
             "topics_rejected":2,"tables":[{"table":"deliveries","limit":10,"evictions":3},
             {"table":"nodes","limit":5,"evictions":1}],
@@ -96,7 +96,7 @@ fn a_cap_that_is_or_was_reached_is_a_warning_with_the_line_to_change() {
 }
 
 #[test]
-fn an_agent_that_has_no_room_for_newcomers_is_a_problem_with_the_price_of_more() {
+fn an_agent_at_a_limit_of_the_graph_leads_to_a_problem_with_the_cost_of_more() {
     let full = r#"{"ready":true,"version":"1.0.0","source":"host","watches_kept":true,
             "limits":[{"limit":"participants","cap":1000,"used":1000,"reached":345,"at_limit":true},
             {"limit":"topics","cap":1000,"used":900,"reached":3,"at_limit":false},
@@ -135,7 +135,7 @@ fn an_agent_that_has_no_room_for_newcomers_is_a_problem_with_the_price_of_more()
 }
 
 #[test]
-fn connections_of_zenoh_that_cannot_be_read_are_named_with_what_is_missing() {
+fn unreadable_connections_of_zenoh_are_reported_with_their_reason() {
     let health = r#"{"ready":true,"version":"1.0.0","source":"host","zenoh":{"unseen":[
             {"reason":"tls","text":"encrypted with TLS","connections":1},
             {"reason":"compression","text":"with compressed batches","connections":2},
@@ -210,13 +210,13 @@ fn viewers_are_shown_with_their_rights_and_a_busy_port_with_a_remedy() {
 }
 
 #[test]
-fn nothing_watched_is_a_note_with_the_command() {
+fn an_agent_without_watches_leads_to_a_note_with_the_command() {
     let findings = check(&answers(WELL, "{}"), "here", "1.0.0");
     assert_eq!(severity(&findings, "watches"), Some(Severity::Note));
 }
 
 #[test]
-fn a_port_that_is_taken_keeps_an_agent_from_starting() {
+fn a_port_in_use_is_reported_as_an_obstacle_to_starting_an_agent() {
     let table = "  sl  local_address rem_address   st\n\
             0: 0100007F:43F8 00000000:0000 0A 00000000:00000000\n\
             1: 0100007F:43F9 00000000:0000 01 00000000:00000000\n";
@@ -236,7 +236,7 @@ fn a_port_that_is_taken_keeps_an_agent_from_starting() {
 }
 
 #[test]
-fn an_agent_that_refuses_access_is_unknown_and_nothing_else_is_guessed() {
+fn an_agent_that_refuses_access_leads_to_one_unknown_finding() {
     let (_directory, host) = host(&[]);
     let findings = absent(&host, &Config::default(), "permission denied", true);
     assert_eq!(findings.len(), 1);
@@ -244,7 +244,7 @@ fn an_agent_that_refuses_access_is_unknown_and_nothing_else_is_guessed() {
 }
 
 #[test]
-fn where_state_would_be_kept_is_looked_at() {
+fn a_missing_or_unusable_state_directory_is_reported() {
     let (_directory, mut host) = host(&[("/var/lib/ros2probe/x", ""), ("/file", "")]);
     let of =
         |host: &HostState, choice| state_directory(host, &choice).map(|finding| finding.severity);
@@ -259,7 +259,7 @@ fn where_state_would_be_kept_is_looked_at() {
 }
 
 #[test]
-fn a_wrong_configuration_is_a_problem_with_its_first_mistake() {
+fn an_invalid_configuration_is_a_problem_with_its_first_mistake() {
     let finding = misconfigured(Path::new("/etc/x.yaml"), "x:1: bad\nx:2: worse");
     assert_eq!(finding.severity, Severity::Problem);
     assert_eq!(
