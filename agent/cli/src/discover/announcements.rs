@@ -27,7 +27,7 @@ pub struct AnnouncedEndpoint {
 }
 
 impl Announcements {
-    /// Announcements received by the session.
+    /// Returns the announcements that the session received.
     #[must_use]
     pub fn of(session: &Session) -> Self {
         let with = |role| {

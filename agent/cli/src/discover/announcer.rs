@@ -42,7 +42,7 @@ impl Announcer {
         }
     }
 
-    /// Available sequence numbers that have not arrived, lowest first.
+    /// Returns the available sequence numbers that have not arrived, lowest first.
     pub(super) fn missing(&self) -> impl Iterator<Item = SequenceNumber> + '_ {
         let (first, last) = match &self.available {
             Some(range) => (*range.start(), *range.end()),
@@ -55,7 +55,7 @@ impl Announcer {
             .filter(|number| !self.received.contains(number))
     }
 
-    /// Sequence numbers for the next request, as many as one request holds.
+    /// Returns the sequence numbers for the next request, at most as many as one request holds.
     pub(super) fn next_request(&mut self) -> BTreeSet<SequenceNumber> {
         let first = self.missing().next().unwrap_or_default();
         let wanted: BTreeSet<_> = self

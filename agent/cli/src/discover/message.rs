@@ -1,7 +1,8 @@
 //! The few RTPS messages that `rp discover` sends, byte for byte (RTPS 2.5, 8.3 and 9.4).
 //!
 //! The only encoder of RTPS in the product. It announces a bare participant and one reader of
-//! `ros_discovery_info`, requests samples, and says goodbye. All messages carry its own identity.
+//! `ros_discovery_info`, requests samples, and says goodbye. All messages carry the identity of
+//! that participant.
 
 use std::net::SocketAddrV4;
 
@@ -23,14 +24,14 @@ const SPDP_READER: EntityId = EntityId([0x00, 0x01, 0x00, 0xc7]);
 /// Multicast address of discovery in all domains (RTPS 2.5, 9.6.2.4).
 const MULTICAST: [u8; 4] = [239, 255, 0, 1];
 /// SPDP writer, SEDP publications reader, SEDP subscriptions writer and reader. Fast DDS accepts a
-/// goodbye only from participants with the first.
+/// goodbye only from participants with an SPDP writer.
 const BUILTIN_ENDPOINTS: u32 = 0x39;
-/// Lease of the participant, for the case that the goodbye is lost.
+/// Lease of the participant, in case the goodbye is lost.
 const LEASE_SECONDS: u32 = 3;
-/// Most sequence numbers in one ACKNACK (RTPS 2.5, 9.4.2.6).
+/// Maximum number of sequence numbers in one ACKNACK (RTPS 2.5, 9.4.2.6).
 pub const MOST_NUMBERS: u64 = 256;
 
-/// Only flag E.
+/// No flags. The encoder adds flag E to each submessage.
 const NONE: SubmessageFlags = SubmessageFlags(0);
 const PL_CDR_LE: [u8; 4] = [0x00, 0x03, 0x00, 0x00];
 /// Disposed and unregistered; STATUS_INFO is always big-endian (RTPS 2.5, 9.6.4.9).
@@ -61,8 +62,9 @@ impl Message {
 
     /// Adds the SPDP announcement.
     ///
-    /// Without user data it is not a ROS participant, so no node list or graph shows it. Cyclone
-    /// DDS forgets the address after the goodbye only if there is a multicast locator.
+    /// The announcement has no user data, so the participant does not belong to ROS and no node
+    /// list or graph shows it. Cyclone DDS forgets the address after the goodbye only if there is a
+    /// multicast locator.
     #[must_use]
     pub fn announce(self, local: LocalParticipant) -> Self {
         let own = Guid::new(local.prefix, EntityId::PARTICIPANT);
@@ -155,7 +157,7 @@ impl Message {
     }
 
     /// Adds a NACK_FRAG: these fragments of this sample are missing (RTPS 2.5, 9.4.5.14). Cyclone
-    /// DDS repeats only the first fragment of a requested sample, and waits for this.
+    /// DDS repeats only the first fragment of a requested sample, and waits for a NACK_FRAG.
     #[must_use]
     pub fn nack_frag(
         self,
@@ -181,7 +183,7 @@ impl Message {
         self.submessage(SubmessageId::NACK_FRAG, NONE, &body)
     }
 
-    /// Bytes of the message.
+    /// Returns the bytes of the message.
     #[must_use]
     pub fn bytes(self) -> Vec<u8> {
         self.0
@@ -195,7 +197,7 @@ impl Message {
 
     fn submessage(mut self, id: SubmessageId, flags: SubmessageFlags, body: &[&[u8]]) -> Self {
         let body = body.concat();
-        // Bodies here have a few hundred bytes at most.
+        // Bodies of these messages have a few hundred bytes at most.
         let length = u16::try_from(body.len()).unwrap_or(0);
         let flags = flags.with(SubmessageFlags::ENDIANNESS);
         self.0.extend_from_slice(&[id.0, flags.0]);
@@ -213,7 +215,8 @@ fn data_head(reader: EntityId, writer: EntityId, sequence_number: u32) -> Vec<u8
     [&fixed[..], &reader.0, &writer.0, &number].concat()
 }
 
-/// numBits and bitmap of a set of sequence numbers from `base` on (RTPS 2.5, 9.4.2.6).
+/// Returns numBits and bitmap of a set of sequence numbers that begins at `base` (RTPS 2.5,
+/// 9.4.2.6).
 fn bitmap(base: u64, numbers: impl IntoIterator<Item = u64>) -> Vec<u8> {
     let mut words = [0u32; 8];
     let mut bits = 0u32;
@@ -301,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn the_announcement_is_the_one_that_was_measured_and_can_be_read() {
+    fn the_announcement_has_the_measured_size_and_can_be_parsed() {
         let bytes = message().announce(LOCAL).bytes();
         assert_eq!(bytes.len(), 208);
         let found = walked(&bytes);
@@ -353,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn the_reader_is_one_that_a_ros_writer_matches() {
+    fn the_announced_reader_matches_the_writer_of_the_node_list() {
         let bytes = message().read_nodes(LOCAL).bytes();
         let found = walked(&bytes);
         let payload = Payload::Data(found[0].payload);
@@ -384,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn a_request_asks_for_exactly_the_missing_numbers() {
+    fn a_request_contains_exactly_the_missing_sequence_numbers() {
         let asked = |base: u64, missing: &[u64]| -> (Record, Vec<u64>) {
             let writer = EntityId::SEDP_PUBLICATIONS_WRITER;
             let numbers = missing.iter().copied().map(SequenceNumber);

@@ -3,8 +3,8 @@
 //! This is the only part of the product that sends, and it runs only on request. [`zenoh`] sends to
 //! a router, the other modules to participants of DDS. A bare participant exists for a few
 //! milliseconds. It announces itself by unicast to one running participant at a time, requests its
-//! announcements, and says goodbye. A conversation has at most [`session::MOST_PACKETS`] packets. No
-//! other participant receives them, no user endpoint is created, and no trace remains.
+//! announcements, and says goodbye. A conversation has at most [`session::MOST_PACKETS`] packets.
+//! No other participant receives them, no user endpoint is created, and no trace remains.
 
 pub mod announcements;
 mod announcer;
@@ -27,19 +27,19 @@ use ros2probe_model::report::snapshot::ParticipantFacts;
 
 /// Interval at which the session advances without input.
 const SLICE: Duration = Duration::from_millis(5);
-/// Wait after the goodbye for packets in flight; a closed port would make the kernel answer them.
+/// Wait after the goodbye for packets in flight, which a closed port would make the kernel answer.
 const LINGER: Duration = Duration::from_millis(50);
-/// Largest UDP payload in bytes.
+/// Maximum size of a UDP payload, in bytes.
 const DATAGRAM: usize = 65_507;
 
 /// Reason why a participant receives no request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
-    /// DDS security is enabled: it ignores unauthenticated participants.
+    /// The participant uses DDS security, so it ignores unauthenticated participants.
     Secured,
-    /// It announces no IPv4 address for discovery.
+    /// The participant announces no IPv4 address for discovery.
     NoAddress,
-    /// It is another running `rp discover`.
+    /// The participant is another running `rp discover`.
     Asking,
 }
 
@@ -68,7 +68,7 @@ pub enum DiscoverError {
 }
 
 impl Target {
-    /// Target for a participant.
+    /// Returns the target for a participant.
     ///
     /// # Errors
     ///
@@ -83,7 +83,8 @@ impl Target {
         let addresses = &participant.addresses;
         let metatraffic = reachable(&addresses.metatraffic).ok_or(Refusal::NoAddress)?;
         let default = &addresses.default;
-        // Among several addresses, prefers one on the same interface as the other address.
+        // Among several default addresses, prefers one with the IP address of the discovery
+        // endpoints.
         let same = default.iter().filter(|it| it.ip() == *metatraffic.ip());
         let same: Vec<SocketAddr> = same.copied().collect();
         let default = reachable(&same).or_else(|| reachable(default));
@@ -96,7 +97,7 @@ impl Target {
 }
 
 impl Refusal {
-    /// Text of the reason.
+    /// Returns the text of the reason.
     #[must_use]
     pub const fn reason(self) -> &'static str {
         match self {
@@ -112,7 +113,7 @@ impl Refusal {
 ///
 /// # Errors
 ///
-/// The socket cannot be opened, or random numbers are unavailable.
+/// Fails if the socket cannot be opened, or if random numbers are unavailable.
 pub fn local_participant(
     target: &Target,
     domain_id: u32,
@@ -148,7 +149,7 @@ pub fn local_participant(
 ///
 /// # Errors
 ///
-/// The network fails; a goodbye is attempted nevertheless.
+/// Fails if the network fails. A goodbye is attempted nevertheless.
 pub fn converse(session: &mut Session, socket: &UdpSocket) -> Result<Duration, DiscoverError> {
     let began = Instant::now();
     // The session's time begins at 1, since 0 precedes all events.
@@ -183,8 +184,8 @@ fn listen(
 ) -> Result<(), DiscoverError> {
     match socket.recv_from(buffer) {
         Ok((length, _)) => session.datagram(now(), buffer.get(..length).unwrap_or_default()),
-        // Connection refused: an earlier packet reached a closed port. The session handles the
-        // silence.
+        // A connection was refused because an earlier packet reached a closed port. The session
+        // handles the silence.
         Err(error) if is_passing(&error) => {}
         Err(source) => {
             let target = session.target().metatraffic;
@@ -213,8 +214,8 @@ fn send(socket: &UdpSocket, outgoing: &[Outgoing]) -> Result<(), DiscoverError> 
     Ok(())
 }
 
-/// First IPv4 address with a route. A loopback address only if there is no other, because RustDDS
-/// announces its own to all hosts.
+/// Returns the first IPv4 address with a route. A loopback address is used only if there is no
+/// other, because RustDDS announces its own to all hosts.
 fn reachable(addresses: &[SocketAddr]) -> Option<SocketAddrV4> {
     let mut candidates: Vec<SocketAddrV4> = addresses
         .iter()
@@ -231,7 +232,7 @@ fn reachable(addresses: &[SocketAddr]) -> Option<SocketAddrV4> {
         .find(|address| leaving(*address).is_ok())
 }
 
-/// Local address of packets to the target. Connecting a UDP socket sends nothing.
+/// Returns the local address of packets to the target. Connecting a UDP socket sends nothing.
 fn leaving(target: SocketAddrV4) -> io::Result<Ipv4Addr> {
     let probe = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
     probe.connect(target)?;

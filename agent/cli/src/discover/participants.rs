@@ -47,7 +47,7 @@ pub struct HeardParticipant {
     pub process_id: Option<u32>,
     /// Host, if known.
     pub host: Option<String>,
-    /// Target of requests, or the reason why it receives none.
+    /// Target of requests, or the reason why the participant receives none.
     pub target: Result<Target, Refusal>,
 }
 
@@ -84,7 +84,7 @@ pub fn listen(configured: CaptureSettings, listening: &Listening) -> Result<Vec<
 }
 
 /// Parses a GUID prefix of 24 hexadecimal digits. The entity id that the `participant` label of
-/// metrics appends is accepted. `None` for another text.
+/// metrics appends is accepted. Returns `None` for any other text.
 #[must_use]
 pub fn prefix(text: &str) -> Option<GuidPrefix> {
     let text = text.strip_suffix(".000001c1").unwrap_or(text);
@@ -109,7 +109,7 @@ impl HeardParticipant {
     }
 }
 
-/// Configured capture, or the capture of one interface.
+/// Returns the configured capture, or the capture of one interface.
 fn capture(mut configured: CaptureSettings, interface: Option<&str>) -> CaptureSettings {
     // Participants announce themselves on the network.
     configured.shm.mode = ShmMode::Off;
@@ -131,7 +131,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_participant_is_named_as_the_metrics_name_it() {
+    fn a_participant_can_be_named_as_in_the_metrics() {
         let digits = "010f1a2b3c4d5e6f00000000";
         assert_eq!(prefix(digits).unwrap().to_string(), digits);
         assert_eq!(prefix(&format!("{digits}.000001c1")), prefix(digits));

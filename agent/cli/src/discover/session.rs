@@ -2,8 +2,8 @@
 //!
 //! A state machine without socket and clock: time and datagrams in, datagrams out. It sends at most
 //! [`MOST_PACKETS`] packets whatever the participant does, and the last one is the goodbye.
-//! HEARTBEATs are not answered individually: Fast DDS sends several while it repeats itself, and
-//! restarts after each answer.
+//! HEARTBEATs are not answered individually: Fast DDS sends several while it repeats its
+//! announcements, and restarts after each answer.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddrV4;
@@ -27,19 +27,19 @@ use ros2probe_model::facts::observation::{Content, Observation, Sample};
 use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::graph::discovery_fragments::DiscoveryFragments;
 
-/// Most packets sent to one participant, including the goodbye.
+/// Maximum number of packets sent to one participant, including the goodbye.
 pub const MOST_PACKETS: u32 = 6;
 
 /// Silence after which the announcement is repeated once. Both vendors announce
 /// themselves within 2 ms.
 const SILENCE: Duration = Duration::from_millis(500);
-/// Time from the first HEARTBEAT to the request, for the second one to arrive.
+/// Time from the first HEARTBEAT to the request, so that the second one can arrive.
 const GATHER: Duration = Duration::from_millis(20);
-/// Longest wait for requested samples before another request.
+/// Maximum wait for requested samples before another request.
 const TIMEOUT: Duration = Duration::from_millis(300);
-/// Longest wait for the node list after everything else.
+/// Maximum wait for the node list after everything else.
 const NODES_TIMEOUT: Duration = Duration::from_millis(500);
-/// Longest conversation.
+/// Maximum duration of a conversation.
 const LIMIT: Duration = Duration::from_secs(3);
 const NODES_TOPIC: &str = "ros_discovery_info";
 
@@ -103,7 +103,7 @@ pub struct Session {
 
 #[derive(Debug)]
 enum Nodes {
-    /// Not requested, since this time.
+    /// Not requested. `since` is when everything else was complete.
     Open { since: Option<Timestamp> },
     /// Requested at this time.
     Requested(Timestamp),
@@ -139,7 +139,7 @@ impl Session {
         }
     }
 
-    /// Packets of a conversation without losses, with requests of maximal size.
+    /// Returns the packets of a conversation without losses, with requests of maximum size.
     #[must_use]
     pub fn plan(&self) -> Vec<Outgoing> {
         let first = SequenceNumber::FIRST;
@@ -208,7 +208,7 @@ impl Session {
         outgoing
     }
 
-    /// The target of the session.
+    /// Returns the target of the session.
     #[must_use]
     pub const fn target(&self) -> &Target {
         &self.target
@@ -226,7 +226,7 @@ impl Session {
         self.heard.is_some()
     }
 
-    /// Number of available announcements that did not arrive.
+    /// Returns the number of available announcements that did not arrive.
     #[must_use]
     pub fn missing(&self) -> usize {
         let both = [&self.publications, &self.subscriptions];
@@ -235,13 +235,13 @@ impl Session {
             .sum()
     }
 
-    /// Endpoints of the participant.
+    /// Returns the endpoints of the participant.
     #[must_use]
     pub fn endpoints(&self) -> &BTreeMap<Guid, EndpointAnnouncement> {
         &self.endpoints
     }
 
-    /// Nodes of the participant. `None` if the list did not arrive.
+    /// Returns the nodes of the participant; `None` if the list did not arrive.
     #[must_use]
     pub fn nodes(&self) -> Option<&[NodeEntities]> {
         match &self.nodes {
@@ -256,7 +256,7 @@ impl Session {
         self.wants_nodes && self.nodes_writer().is_some()
     }
 
-    /// Sent traffic, and received traffic.
+    /// Returns the sent traffic and the received traffic.
     #[must_use]
     pub const fn cost(&self) -> (Traffic, Traffic) {
         (self.sent, self.received)
@@ -307,7 +307,7 @@ impl Session {
         }
     }
 
-    /// Payload of a sample. `None` until its last fragment arrives.
+    /// Returns the payload of a sample; `None` until its last fragment arrives.
     fn complete_payload<'a>(
         &mut self,
         now: Timestamp,
@@ -366,7 +366,7 @@ impl Session {
         }
     }
 
-    /// Writer of the node list. `None` before its announcement.
+    /// Returns the writer of the node list; `None` before its announcement.
     fn nodes_writer(&self) -> Option<EntityId> {
         let mut endpoints = self.endpoints.values();
         let writer = endpoints.find(|endpoint| {
@@ -466,7 +466,7 @@ impl Session {
             };
             self.send(datagram, outgoing);
         }
-        // They have the same timeout as other requests.
+        // Fragments have the same timeout as other requests.
         let later = now + TIMEOUT - GATHER;
         for at in self.partial.values_mut() {
             *at = later;
@@ -506,8 +506,8 @@ impl Session {
         Message::new(self.local, self.target.prefix)
     }
 
-    /// Request for these sequence numbers from their bases on. The first request announces the
-    /// reader of the node list.
+    /// Returns the request for these sequence numbers, each list with its base. The first request
+    /// announces the reader of the node list.
     fn request<N: IntoIterator<Item = SequenceNumber>>(
         &self,
         wanted: [(SequenceNumber, N); 2],
@@ -548,7 +548,7 @@ impl Session {
     }
 }
 
-/// Payload of a sample, borrowed or reassembled.
+/// Payload of a sample, either borrowed or reassembled.
 enum SamplePayload<'a> {
     Borrowed(Payload<'a>),
     Joined(Vec<u8>),

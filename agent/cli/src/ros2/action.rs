@@ -1,4 +1,4 @@
-//! `ros2 action`: `list` and `info`; `type` and `find` are those of topics. As in the original, an
+//! `ros2 action`: `list` and `info`; `type` and `find` are those of topics. As in ros2cli, an
 //! action exists if its feedback topic exists.
 
 use std::borrow::Cow;
@@ -14,19 +14,19 @@ const FEEDBACK: &str = "/_action/feedback";
 /// Suffix of the feedback topic's type.
 const MESSAGE: &str = "_FeedbackMessage";
 
-/// Name of an action's feedback topic.
+/// Returns the name of an action's feedback topic.
 #[must_use]
 pub fn feedback_of(name: &str) -> String {
     format!("{name}{FEEDBACK}")
 }
 
-/// Actions among topics, including hidden ones.
+/// Returns the actions among topics, including hidden ones.
 pub fn of_topics(topics: &[TopicName<'_>]) -> impl Iterator<Item = Named<'static>> {
     let actions = topics.iter();
     actions.filter_map(|topic| of_name(&topic.name, &topic.types))
 }
 
-/// Actions whose feedback topics are among a node's topics.
+/// Returns the actions whose feedback topics are among a node's topics.
 pub(super) fn of_feedback(topics: &[Named<'_>]) -> Vec<Named<'static>> {
     let actions = topics.iter();
     actions
@@ -41,7 +41,7 @@ fn of_name(name: &str, types: &[Cow<'_, str>]) -> Option<Named<'static>> {
     (!types.is_empty()).then_some(Named { name, types })
 }
 
-/// Text of `action list`.
+/// Returns the text of `action list`.
 #[must_use]
 pub fn list<'a>(actions: impl Iterator<Item = Named<'a>>, show_types: bool, count: bool) -> String {
     if count {
@@ -58,7 +58,7 @@ pub fn list<'a>(actions: impl Iterator<Item = Named<'a>>, show_types: bool, coun
     text
 }
 
-/// Text of `action info`, from the feedback topic if it exists.
+/// Returns the text of `action info`, from the feedback topic if it exists.
 #[must_use]
 pub fn info(name: &str, feedback: Option<&Topic<'_>>, show_types: bool, count: bool) -> String {
     let mut text = format!("Action: {name}\n");
@@ -86,7 +86,7 @@ pub fn info(name: &str, feedback: Option<&Topic<'_>>, show_types: bool, count: b
     text
 }
 
-/// Each node once with its types, in the order of GIDs. As in the original, endpoints without a
+/// Returns each node once with its types, in the order of GIDs. As in ros2cli, endpoints without a
 /// node are left out.
 fn nodes<'a>(endpoints: &'a [Endpoint<'_>]) -> Vec<(&'a str, Vec<&'a str>)> {
     let mut endpoints: Vec<_> = endpoints.iter().collect();
@@ -132,14 +132,14 @@ mod tests {
     }
 
     #[test]
-    fn a_topic_with_feedback_is_an_action() {
+    fn a_feedback_topic_is_listed_as_an_action() {
         assert_eq!(list(actions(), false, false), "/fib\n");
         assert_eq!(list(actions(), true, false), "/fib [a/action/Fib]\n");
         assert_eq!(list(actions(), true, true), "1\n");
     }
 
     #[test]
-    fn info_names_nodes_with_their_namespace_once() {
+    fn info_lists_each_node_once_with_its_namespace() {
         let end = |guid: &str, node: Option<&'static str>| Endpoint {
             guid: guid.to_owned(),
             node: node.map(Cow::Borrowed),

@@ -21,7 +21,7 @@ pub enum Sort {
     Count,
 }
 
-/// Text of `ros2 bag info` in the time zone of this host. With `details`, as `-v` prints it.
+/// Returns the text of `ros2 bag info` in the time zone of this host. `details` are those of `-v`.
 #[must_use]
 pub fn info(bag: &Bag, dialect: Dialect, sort: Sort, details: Option<&Details>) -> String {
     let zone = &TimeZone::system();
@@ -87,7 +87,7 @@ pub fn info(bag: &Bag, dialect: Dialect, sort: Sort, details: Option<&Details>) 
     text
 }
 
-/// Text of `ros2 bag info -t`: topic names without those of services and actions.
+/// Returns the text of `ros2 bag info -t`: topic names without those of services and actions.
 #[must_use]
 pub fn names(bag: &Bag, dialect: Dialect, sort: Sort) -> String {
     let parts = Parts::of(&bag.metadata.topics, dialect, sort);
@@ -114,7 +114,7 @@ struct Parts<'a> {
     topics: Vec<&'a Topic>,
     services: Vec<&'a Topic>,
     actions: Vec<Action<'a>>,
-    /// Messages of services and actions.
+    /// Number of messages of services and actions.
     apart: u64,
 }
 
@@ -285,12 +285,12 @@ fn topic_line(topic: &Topic, details: Option<&Details>) -> String {
     )
 }
 
-/// Lines one below the other, indented to the column of values.
+/// Joins lines, indented to the column of values.
 fn lines_of(lines: &[String]) -> String {
     lines.join(&format!("\n{:LABEL$}", ""))
 }
 
-/// Size in the largest unit that keeps the number below 1024.
+/// Returns a size in the largest unit that keeps the number below 1024.
 #[expect(clippy::cast_precision_loss, reason = "one decimal is printed")]
 fn size(bytes: u64) -> String {
     if bytes < 1024 {

@@ -4,7 +4,7 @@ use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
 use super::Dialect;
 
-/// Parser of `--distro`.
+/// Returns the parser of `--distro`.
 #[must_use]
 pub fn parser() -> impl TypedValueParser<Value = Dialect> {
     let values = [
@@ -31,7 +31,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_value_that_is_offered_names_a_dialect() {
+    fn every_offered_value_names_a_dialect() {
         let parse = |name: &str| {
             let option = Arg::new("distro").long("distro").value_parser(parser());
             let command = Command::new("rp").arg(option);

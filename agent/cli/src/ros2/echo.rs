@@ -18,7 +18,7 @@ use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::yaml::{self, Style};
 use ros2probe_message::{Decoded, Limits, MessageType, Truncation, Value, csv, decode, python};
 
-/// Most writers whose unreadable messages are counted separately.
+/// Maximum number of writers whose unreadable messages are counted separately.
 const MAX_WRITERS: usize = 256;
 /// Event types of `service_msgs/msg/ServiceEventInfo`, in the order of its constants.
 const EVENTS: [&str; 4] = [
@@ -33,19 +33,19 @@ const EVENTS: [&str; 4] = [
 pub struct Options {
     /// Dialect of the output.
     pub dialect: Dialect,
-    /// Print values in one line instead of YAML.
+    /// Whether values are printed in one line instead of YAML.
     pub csv: bool,
     /// Style of YAML.
     pub style: Style,
     /// Truncation of arrays and strings.
     pub shown: Truncation,
-    /// Print the payload's bytes instead of the message.
+    /// Whether the payload's bytes are printed instead of the message.
     pub raw: bool,
-    /// Print these fields instead of the whole message.
+    /// Fields that are printed instead of the whole message.
     pub fields: Vec<FieldPath>,
-    /// Print only messages that match.
+    /// Filter of the printed messages.
     pub filter: Option<Filter>,
-    /// Print times and sequence numbers before each message.
+    /// Whether times and sequence numbers are printed before each message.
     pub include_info: bool,
 }
 
@@ -77,9 +77,9 @@ pub struct Echo {
 /// Text for one message.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct MessageText {
-    /// For stdout. `None` if the message did not pass the filter or cannot be read.
+    /// Text for stdout. `None` if the message did not pass the filter or cannot be read.
     pub out: Option<String>,
-    /// For stderr, whole lines.
+    /// Whole lines for stderr.
     pub err: String,
 }
 
@@ -93,11 +93,11 @@ impl Echo {
         }
     }
 
-    /// Text of a message as `topic echo` prints it. With `raw` no type is needed.
+    /// Returns the text of a message as `topic echo` prints it. With `raw`, no type is needed.
     ///
     /// # Errors
     ///
-    /// A selected field does not exist, or the filter has no value.
+    /// Fails if a selected field does not exist, or if the filter has no value.
     pub fn message(
         &mut self,
         sample: &Sample,
@@ -127,8 +127,8 @@ impl Echo {
         Ok(MessageText { out, err })
     }
 
-    /// Text of a service event as `service echo` prints it. `interface` is the part of an action
-    /// that `action echo` prints above it.
+    /// Returns the text of a service event as `service echo` prints it. `interface` is the part of
+    /// an action that `action echo` prints above it.
     #[must_use]
     pub fn event(
         &mut self,
@@ -156,7 +156,7 @@ impl Echo {
         }
     }
 
-    /// Number of messages that could not be read.
+    /// Returns the number of messages that could not be read.
     #[must_use]
     pub fn unreadable(&self) -> u64 {
         self.unreadable.values().sum()
@@ -231,7 +231,7 @@ impl Echo {
         for field in &self.options.fields {
             parts.push(field.select(message)?);
         }
-        // With one field, `m` is that field, as in the original.
+        // With one field, `m` is that field, as in ros2cli.
         let subject = match parts.as_slice() {
             [one] => one.subject(),
             _ => Subject::Message(message),
@@ -291,7 +291,7 @@ impl Echo {
     }
 }
 
-/// The original's warning on stdout about publishers with different QoS.
+/// Returns ros2cli's warning on stdout about publishers with different QoS.
 #[must_use]
 pub fn mixed_offers(publishers: &[Endpoint<'_>]) -> String {
     let some = |offers: &dyn Fn(&Endpoint<'_>) -> bool| {
@@ -322,8 +322,8 @@ pub fn mixed_offers(publishers: &[Endpoint<'_>]) -> String {
     text
 }
 
-/// Times and sequence numbers. The middleware provides no reception number; the original prints
-/// `null`.
+/// Returns times and sequence numbers. The middleware provides no reception number, so ros2cli
+/// prints `null`.
 fn info_document(sample: &Sample) -> String {
     let Sample {
         sequence_number,

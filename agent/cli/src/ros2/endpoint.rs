@@ -7,14 +7,14 @@ use ros2probe_api::endpoints::{Endpoint, Qos};
 
 use super::Dialect;
 
-/// The original's node name for an endpoint whose participant has not announced its nodes yet.
+/// ros2cli's node name for an endpoint whose participant has not announced its nodes yet.
 const UNKNOWN: [&str; 2] = ["_NODE_NAME_UNKNOWN_", "_NODE_NAMESPACE_UNKNOWN_"];
-/// The original's node name for an endpoint of a participant without ROS.
+/// ros2cli's node name for an endpoint of a participant without ROS.
 const BARE: [&str; 2] = ["_CREATED_BY_BARE_DDS_APP_"; 2];
 /// Trailing zero bytes of a GID in Humble, which is longer than a GUID.
 const PADDING: usize = 8;
 
-/// The block without the empty line after it.
+/// Returns the block without the empty line after it.
 #[must_use]
 pub fn block(endpoint: &Endpoint<'_>, kind: &str, dialect: Dialect) -> String {
     let mut text = String::new();
@@ -33,7 +33,7 @@ pub fn block(endpoint: &Endpoint<'_>, kind: &str, dialect: Dialect) -> String {
     text
 }
 
-/// Name and namespace of the endpoint's node.
+/// Returns name and namespace of the endpoint's node.
 fn node<'a>(endpoint: &'a Endpoint<'_>) -> [&'a str; 2] {
     match (&endpoint.node, &endpoint.enclave) {
         (Some(node), _) => match node.rsplit_once('/') {
@@ -46,9 +46,9 @@ fn node<'a>(endpoint: &'a Endpoint<'_>) -> [&'a str; 2] {
     }
 }
 
-/// Bytes of a GID with points between.
+/// Returns the bytes of a GID, separated by points.
 fn gid(endpoint: &Endpoint<'_>, dialect: Dialect) -> String {
-    // Older agents report the GUID only.
+    // Older agents report only the GUID.
     let text = match endpoint.gid.as_str() {
         "" => &endpoint.guid,
         gid => gid,
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn a_block_is_that_of_the_distribution() {
+    fn a_block_has_the_format_of_the_distribution() {
         let qos = "QoS profile:\n  Reliability: RELIABLE\n  History (Depth): KEEP_LAST (10)\n  \
             Durability: TRANSIENT_LOCAL\n  Lifespan: 10000000000 nanoseconds\n  \
             Deadline: Infinite\n  Liveliness: AUTOMATIC\n  Liveliness lease duration: Infinite\n";
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_that_is_not_known_has_the_placeholder_of_its_participant() {
+    fn an_unknown_node_has_the_placeholder_of_its_participant() {
         let named = |name: Option<&str>, enclave: Option<&str>| {
             let endpoint = Endpoint {
                 node: name.map(Cow::Borrowed),

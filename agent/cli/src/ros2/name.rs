@@ -2,11 +2,11 @@
 
 use super::Refused;
 
-/// Full name of a topic. A relative name is in the root namespace, like the original's own node.
+/// Returns the full name of a topic. A relative name is in the root namespace, as in ros2cli.
 ///
 /// # Errors
 ///
-/// The name is invalid. The text marks the invalid character, as the original's does.
+/// Fails if the name is invalid. The text marks the invalid character, as in ros2cli.
 pub fn full_name(typed: &str) -> Result<String, Refused> {
     let name = if typed.is_empty() || typed.starts_with('/') {
         typed.to_owned()
@@ -37,7 +37,7 @@ pub fn is_hidden_node(name: &str) -> bool {
         .is_some_and(|name| name.starts_with('_'))
 }
 
-/// The first mistake of a name, with the index of its character. `None` for a valid name.
+/// Returns the first mistake of a name, with the index of its character; `None` for a valid name.
 fn mistake(name: &str) -> Option<(&'static str, usize)> {
     if name.is_empty() {
         return Some(("topic name must not be empty", 0));
@@ -70,13 +70,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_node_is_hidden_by_its_own_name_alone() {
+    fn only_its_own_name_hides_a_node() {
         assert!(is_hidden("/fib/_action/status") && is_hidden("/_a/b") && !is_hidden("/a_/b"));
         assert!(is_hidden_node("/a/_ros2cli_1") && !is_hidden_node("/_a/b"));
     }
 
     #[test]
-    fn a_relative_name_is_in_the_root() {
+    fn a_relative_name_is_in_the_root_namespace() {
         for (typed, name) in [
             ("/robot1/imu", "/robot1/imu"),
             ("chatter", "/chatter"),

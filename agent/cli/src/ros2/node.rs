@@ -11,13 +11,13 @@ use ros2probe_api::nodes::{Named, Node};
 /// Output of a verb on nodes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NodeText {
-    /// For stdout.
+    /// Text for stdout.
     pub text: String,
     /// Warning for stderr.
     pub warning: Option<String>,
 }
 
-/// Text of `node list`.
+/// Returns the text of `node list`.
 #[must_use]
 pub fn list(nodes: &[NodeName<'_>], all: bool, count: bool) -> NodeText {
     let shown = || {
@@ -27,7 +27,7 @@ pub fn list(nodes: &[NodeName<'_>], all: bool, count: bool) -> NodeText {
         shown.flat_map(|node| std::iter::repeat_n(node.name.as_ref(), node.instances))
     };
     if count {
-        // Without the warning, as in the original.
+        // The number has no warning, as in ros2cli.
         return NodeText {
             text: format!("{}\n", shown().count()),
             warning: None,
@@ -45,11 +45,11 @@ pub fn list(nodes: &[NodeName<'_>], all: bool, count: bool) -> NodeText {
     NodeText { text, warning }
 }
 
-/// Text of `node info`. Pass `None` as `node` if it does not exist.
+/// Returns the text of `node info`. Pass `None` as `node` if it does not exist.
 ///
 /// # Errors
 ///
-/// The node does not exist, or it is hidden and `hidden` is `false`.
+/// Fails if the node does not exist, or if it is hidden and `hidden` is `false`.
 pub fn info(name: &str, node: Option<&Node<'_>>, hidden: bool) -> Result<NodeText, Refused> {
     let node = node.filter(|node| node.name == name && (hidden || !is_hidden_node(name)));
     let node = node.ok_or_else(|| Refused(format!("Unable to find node '{name}'")))?;
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn a_list_keeps_doubles_and_warns_of_them() {
+    fn a_list_repeats_nodes_of_one_name_and_warns_of_them() {
         let nodes = names(&[("/_ros2cli_1", 1), ("/_robot/lidar", 1), ("/talker", 2)]);
         let printed = list(&nodes, false, false);
         assert_eq!(printed.text, "/_robot/lidar\n/talker\n/talker\n");

@@ -1,4 +1,4 @@
-//! Errors that the original prints on stderr.
+//! Errors that ros2cli prints on stderr.
 
 /// Text printed on stderr without a prefix; the exit code is 1.
 #[derive(Clone, Debug, thiserror::Error, PartialEq, Eq)]

@@ -10,13 +10,13 @@ use super::{Dialect, Refused};
 /// Options of `service list`.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct List {
-    /// Print types.
+    /// Whether types are printed.
     pub show_types: bool,
-    /// Print only the number of services.
+    /// Whether only the number of services is printed.
     pub count: bool,
 }
 
-/// Text of `service list` for these services.
+/// Returns the text of `service list` for these services.
 #[must_use]
 pub fn list<'a>(services: impl Iterator<Item = &'a ServiceName<'a>>, options: List) -> String {
     if options.count {
@@ -33,12 +33,12 @@ pub fn list<'a>(services: impl Iterator<Item = &'a ServiceName<'a>>, options: Li
     text
 }
 
-/// Text of `service info`. A server is counted by its reply writer, in later distributions by its
-/// request reader.
+/// Returns the text of `service info`. A server is counted by its reply writer, in later
+/// distributions by its request reader.
 ///
 /// # Errors
 ///
-/// The service does not exist.
+/// Fails if the service does not exist.
 pub fn info<'a>(
     name: &str,
     mut services: impl Iterator<Item = &'a ServiceName<'a>>,
@@ -61,7 +61,7 @@ pub fn info<'a>(
     ))
 }
 
-/// Text about the calls of a service, which `service info` prints below with `-v`.
+/// Returns the text about the calls of a service, which `service info -v` appends.
 #[must_use]
 pub fn calls(service: &Service<'_>) -> String {
     let mut text = match &service.calls {
@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn a_list_is_names_or_their_number() {
+    fn a_list_prints_names_or_their_number() {
         let printed = |show_types, count| list(services().iter(), List { show_types, count });
         assert_eq!(printed(false, false), "/add\n/fib/_action/send_goal\n");
         assert_eq!(
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn calls_are_printed_with_what_is_not_seen() {
+    fn calls_are_printed_with_the_transports_of_unseen_calls() {
         let mut service = Service {
             unseen: vec!["shared_memory".into()],
             ..Service::default()
@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn servers_are_counted_by_their_replies_and_later_by_requests() {
+    fn servers_are_counted_by_replies_and_in_rolling_by_requests() {
         let printed = |dialect| info("/add", services().iter(), dialect).unwrap();
         for dialect in [Dialect::Jazzy, Dialect::Kilted] {
             let text = "Type: a/srv/Add\nClients count: 3\nServices count: 1\n";

@@ -11,15 +11,15 @@ use super::{Dialect, Refused, endpoint};
 /// Options of `topic list`.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct List {
-    /// Print types.
+    /// Whether types are printed.
     pub show_types: bool,
-    /// Print only the number of topics.
+    /// Whether only the number of topics is printed.
     pub count: bool,
-    /// Group by publishers and subscribers.
+    /// Whether topics are grouped by publishers and subscribers.
     pub verbose: bool,
 }
 
-/// Text of `topic list` for these topics.
+/// Returns the text of `topic list` for these topics.
 #[must_use]
 pub fn list<'a>(topics: impl Iterator<Item = &'a TopicName<'a>>, options: List) -> String {
     let mut text = String::new();
@@ -45,11 +45,11 @@ pub fn list<'a>(topics: impl Iterator<Item = &'a TopicName<'a>>, options: List) 
     text
 }
 
-/// Text of `topic info`. Pass `None` as `topic` if it does not exist.
+/// Returns the text of `topic info`. Pass `None` as `topic` if it does not exist.
 ///
 /// # Errors
 ///
-/// The topic does not exist.
+/// Fails if the topic does not exist.
 pub fn info(
     name: &str,
     topic: Option<&Topic<'_>>,
@@ -79,7 +79,7 @@ pub fn info(
     Ok(text)
 }
 
-/// One type as it is, several as a Python list.
+/// Returns one type as it is, and several as a Python list.
 fn types(types: &[Cow<'_, str>]) -> String {
     match types {
         [only] => only.to_string(),
@@ -87,8 +87,8 @@ fn types(types: &[Cow<'_, str>]) -> String {
     }
 }
 
-/// Text of `topic type`, `service type` and `action type`, one type a line. `None` if the name is
-/// unknown, which only the exit code reports.
+/// Returns the text of `topic type`, `service type` and `action type`, one type per line. Returns
+/// `None` if the name is unknown, which only the exit code reports.
 #[must_use]
 pub fn type_of<'a>(
     name: &str,
@@ -98,7 +98,8 @@ pub fn type_of<'a>(
     Some(types.iter().map(|each| format!("{each}\n")).collect())
 }
 
-/// Text of `topic find`, `service find` and `action find`: names one a line, or their number.
+/// Returns the text of `topic find`, `service find` and `action find`: one name per line, or their
+/// number.
 #[must_use]
 pub fn find<'a>(
     wanted: &str,
@@ -144,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn a_list_is_names_and_counting_wins() {
+    fn a_list_prints_names_and_a_count_overrides_other_options() {
         let printed = |show_types, count, verbose| {
             let options = List {
                 show_types,
@@ -183,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn info_counts_and_verbose_info_shows_endpoints_by_gid() {
+    fn info_prints_counts_and_verbose_info_prints_endpoints_by_gid() {
         let topic = topic(&["std_msgs/msg/String"]);
         let printed = |verbose| info("/chatter", Some(&topic), verbose, Dialect::Jazzy).unwrap();
         assert_eq!(
@@ -204,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn several_types_are_a_list_of_python() {
+    fn several_types_print_as_a_list_of_python() {
         let topic = topic(&["a/msg/X", "b/msg/Y"]);
         let printed = info("/chatter", Some(&topic), false, Dialect::Humble).unwrap();
         assert!(
@@ -214,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn a_topic_without_ends_or_under_another_name_is_unknown() {
+    fn a_topic_without_endpoints_or_without_its_full_name_is_unknown() {
         let gone = Topic {
             publishers: Vec::new(),
             ..topic(&["a/msg/X"])

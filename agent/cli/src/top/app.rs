@@ -1,5 +1,5 @@
 //! State of `rp top`, and its changes by keys and facts. Keys and facts come in; state and commands
-//! go out. It draws nothing, sends no request and reads no clock.
+//! go out. This module draws nothing, sends no request and reads no clock.
 
 use std::collections::{BTreeMap, HashMap};
 use std::time::{Duration, Instant};
@@ -106,7 +106,7 @@ impl Filter {
 /// State of the screen.
 #[derive(Debug, Default)]
 pub struct App {
-    /// Domain to request; `None` for all.
+    /// Domain to request; `None` for all domains.
     pub domain_id: Option<u32>,
     /// Address of the agent, shown if the agent does not report its host.
     pub place: String,
@@ -150,7 +150,7 @@ pub struct App {
     pub heights: Heights,
     /// State of the agent, and the time of its receipt.
     pub health: Option<(Health, Instant)>,
-    /// Start and reason of the agent's silence, while it does not answer.
+    /// Start of the agent's silence and its reason, while the agent does not answer.
     pub gone: Option<(Instant, String)>,
     /// Time of the last topic list.
     pub updated: Option<Instant>,
@@ -176,7 +176,7 @@ pub struct Heights {
 }
 
 impl App {
-    /// Initial state for the agent at `place`.
+    /// Creates the initial state for the agent at `place`.
     #[must_use]
     pub fn new(options: &Options, place: String) -> Self {
         Self {
@@ -194,21 +194,21 @@ impl App {
         }
     }
 
-    /// Topics that pass the filter, in order.
+    /// Returns the topics that pass the filter, in order.
     pub fn shown(&self) -> impl ExactSizeIterator<Item = &Row> {
-        // Indices are computed with the rows.
+        // The indices are computed together with the rows.
         let rows = |at: &usize| self.rows.get(*at);
         let shown: Vec<_> = self.shown.iter().filter_map(rows).collect();
         shown.into_iter()
     }
 
-    /// All known topics.
+    /// Returns all known topics.
     #[must_use]
     pub fn rows(&self) -> &[Row] {
         &self.rows
     }
 
-    /// Index of the selected topic in the table. `None` if it is not shown.
+    /// Returns the index of the selected topic in the table; `None` if it is not shown.
     #[must_use]
     pub fn place_of_selected(&self) -> Option<usize> {
         let selected = self.selected.as_ref()?;
@@ -216,7 +216,7 @@ impl App {
         rows.position(|row| row.key == *selected)
     }
 
-    /// The answer to the last key, while it is recent.
+    /// Returns the answer to the last key, while it is recent.
     #[must_use]
     pub fn status(&self, now: Instant) -> Option<&str> {
         let (at, text) = self.status.as_ref()?;
@@ -230,7 +230,7 @@ impl App {
         dropped_at.is_some_and(|at| now.saturating_duration_since(at) < RECENT)
     }
 
-    /// Age of the topic list. `None` before the first.
+    /// Returns the age of the topic list; `None` before the first list.
     #[must_use]
     pub fn age(&self, now: Instant) -> Option<Duration> {
         let age = now.saturating_duration_since(self.updated?);
@@ -302,8 +302,8 @@ impl App {
         self.arrange()
     }
 
-    /// Sorts and filters. The selected topic stays selected; if it has gone, the topic in its place
-    /// is selected.
+    /// Sorts and filters. The selected topic stays selected. If it no longer exists, the topic at
+    /// its position is selected.
     pub fn arrange(&mut self) -> Vec<Command> {
         let place = self.place_of_selected().unwrap_or(0);
         let (sort, reverse) = (self.sort, self.reverse);
@@ -469,7 +469,7 @@ impl App {
         self.reverse = false;
     }
 
-    /// Focuses a pane that opens, and unfocuses one that closes.
+    /// Focuses a pane that opens while zoomed, and unfocuses one that closes.
     fn settle(&mut self, pane: Pane, is_open: bool) {
         match is_open {
             true if self.zoomed => self.focus = pane,
@@ -531,7 +531,7 @@ impl App {
         Vec::new()
     }
 
-    /// Name of the selected topic, for the heading of the details.
+    /// Returns the name of the selected topic, for the heading of the details.
     #[must_use]
     pub fn selected_name(&self) -> Option<String> {
         let details = self

@@ -16,15 +16,15 @@ use super::row::{is_measured, shown_name};
 use super::text::{beginning, bound, bytes, counted, end, rate, ratio, safe, seconds};
 use super::theme::{Kind, Theme};
 
-/// Most receivers and destinations without a known reader.
+/// Maximum number of receivers and destinations without a known reader.
 const MAX_OTHERS: usize = 16;
-/// Columns of a node's name.
+/// Width of a node's name, in columns.
 const NODE: usize = 24;
 
 /// A line and its style.
 pub type Styled = (String, Kind);
 
-/// All lines. Drawing cuts longer ones.
+/// Returns all lines. Drawing truncates longer ones.
 #[must_use]
 pub fn lines(details: &TopicDetails<'_>, width: usize, theme: Theme) -> Vec<Styled> {
     let topic = &details.topic;
@@ -217,7 +217,7 @@ fn delivered(it: &Delivered) -> String {
     }
 }
 
-/// Causes of lost messages, as text.
+/// Returns the causes of lost messages, as text.
 fn causes(it: &Delivered) -> String {
     let causes = [
         ("before this host", it.lost_before_host_messages),
@@ -295,7 +295,7 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
     }
 }
 
-/// Text for the reason of `unmatched_publisher` and `unmatched_subscription`.
+/// Returns the text for the reason of `unmatched_publisher` and `unmatched_subscription`.
 fn unmatched(reason: &str) -> &str {
     match reason {
         "qos" => "incompatible QoS",
@@ -359,7 +359,7 @@ fn histograms(details: &TopicDetails<'_>, width: usize, theme: Theme, lines: &mu
     }
 }
 
-/// One line for each bucket, from the first to the last that is not empty.
+/// Returns one line per bucket, from the first to the last that is not empty.
 #[must_use]
 pub fn bars(buckets: &[Bucket], width: usize, theme: Theme) -> Vec<String> {
     let is_filled = |bucket: &Bucket| bucket.count > 0;
@@ -470,7 +470,7 @@ fn subscribers(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>
     }
 }
 
-/// Lines for receivers without a known reader, and for other destinations.
+/// Adds the lines for receivers without a known reader, and for other destinations.
 fn others(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>) {
     let mut others: BTreeMap<String, Delivered> = BTreeMap::new();
     for delivery in &details.deliveries {
@@ -550,7 +550,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_histogram_leaves_out_what_is_empty_on_both_ends() {
+    fn a_histogram_omits_empty_buckets_at_both_ends() {
         let bucket = |upper_seconds, count| Bucket {
             upper_seconds,
             count,

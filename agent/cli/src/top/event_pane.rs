@@ -7,7 +7,7 @@ use super::text::safe;
 use ros2probe_api::attributes::Value;
 use ros2probe_api::events::{Event, Lagged};
 
-/// Most events kept for scrolling.
+/// Maximum number of events kept for scrolling.
 const KEPT: usize = 1_000;
 
 /// Line of one event.
@@ -54,7 +54,7 @@ impl EventPane {
                 text.push_str(&shown(value));
             }
         }
-        // Identities are long and of least interest.
+        // Identities come last, since they are long and of little interest.
         let mut attributes: Vec<_> = event.attributes.0.iter().collect();
         attributes.sort_unstable_by_key(|(key, _)| key);
         for is_identity in [false, true] {
@@ -86,7 +86,7 @@ impl EventPane {
         });
     }
 
-    /// Lines to show, oldest first.
+    /// Returns the lines to show, oldest first.
     pub fn shown(&self) -> impl DoubleEndedIterator<Item = &Line> {
         let lines = self.lines.iter();
         lines.filter(|line| line.is_warning || !self.only_warnings)
@@ -100,14 +100,14 @@ impl EventPane {
     }
 }
 
-/// Time of day in `2026-11-20T14:02:11.123456789Z`.
+/// Returns the time of day of `2026-11-20T14:02:11.123456789Z`.
 fn clock(time: &str) -> String {
     let time = safe(time);
     let (_, clock) = time.split_once('T').unwrap_or_default();
     clock.chars().take(8).collect()
 }
 
-/// Value of an attribute as text.
+/// Returns the value of an attribute as text.
 #[must_use]
 pub fn shown(value: &Value<'_>) -> String {
     match value {
@@ -119,7 +119,7 @@ pub fn shown(value: &Value<'_>) -> String {
     }
 }
 
-/// Texts separated by commas.
+/// Returns texts separated by commas.
 #[must_use]
 pub fn shown_list(texts: &[Cow<'_, str>]) -> String {
     let texts: Vec<_> = texts.iter().map(|text| safe(text)).collect();
@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn an_event_begins_with_what_it_is_about() {
+    fn the_line_of_an_event_begins_with_its_name_and_topic() {
         let mut events = EventPane::default();
         let lost = event(json!({
             "time": "2026-11-20T14:02:11.123Z", "name": "ros2.message.lost", "severity": "WARN",

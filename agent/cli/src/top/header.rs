@@ -15,7 +15,7 @@ use super::theme::{Kind, Theme};
 /// Age above which the table is stale, as in the agent itself.
 const FRESH: Duration = Duration::from_secs(5);
 
-/// At most `most` lines. With a `width` of 0, lines are as wide as their text.
+/// Returns at most `most` lines. With a `width` of 0, lines are as wide as their text.
 #[must_use]
 pub fn lines(app: &App, width: usize, most: usize, theme: Theme, now: Instant) -> Vec<Styled> {
     let mut lines = vec![
@@ -35,7 +35,7 @@ pub fn lines(app: &App, width: usize, most: usize, theme: Theme, now: Instant) -
     lines
 }
 
-/// `rp top  robot1  domain 0  24 topics, 20 measured, 3 with problems      0.4 s old`.
+/// Returns `rp top  robot1  domain 0  24 topics, 20 measured, 3 with problems      0.4 s old`.
 fn robot(app: &App, width: usize, now: Instant) -> String {
     let host = app
         .health
@@ -71,7 +71,7 @@ fn robot(app: &App, width: usize, now: Instant) -> String {
         .is_some_and(|(health, _)| health.finished);
     let age = match app.age(now).map(|age| age.as_secs_f64()) {
         None => "no data".to_owned(),
-        // Nothing is newer than the end of a capture.
+        // No data is newer than the end of a capture.
         Some(_) if is_over && app.gone.is_none() => "at its end".to_owned(),
         Some(age) if age >= 100.0 => format!("{age:.0} s old"),
         Some(age) => format!("{age:.1} s old"),
@@ -86,7 +86,7 @@ fn robot(app: &App, width: usize, now: Instant) -> String {
     format!("{age}  {left}")
 }
 
-/// Line about the agent, and about the table's sorting and filter.
+/// Returns the line about the agent, and about the table's sorting and filter.
 fn agent(app: &App) -> String {
     let state = match (&app.health, &app.gone) {
         (_, Some(_)) => "AGENT GONE".to_owned(),
@@ -130,7 +130,7 @@ fn agent(app: &App) -> String {
     line
 }
 
-/// Dropped data by kind.
+/// Returns the dropped data by kind.
 fn dropped(health: &Health) -> String {
     let kinds = [
         (health.dropped_packets, "packets"),

@@ -1,4 +1,4 @@
-//! Help about keys, on one screen of 80x24.
+//! Help about keys, on a screen of 80x24.
 
 use super::details::Styled;
 use super::theme::Kind;
@@ -27,7 +27,7 @@ rp top: a robot's topics as its agent sees them     any key: back
             gone; with !: slow fast late loss silent against what is expected,
             qos type hash: endpoints do not match; unseen: agent is blind here";
 
-/// Lines of the help.
+/// Returns the lines of the help.
 #[must_use]
 pub fn lines() -> Vec<Styled> {
     let kind = |at: usize| if at == 0 { Kind::Heading } else { Kind::Plain };
@@ -42,7 +42,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_help_fits_the_smallest_usual_screen() {
+    fn the_help_fits_a_screen_of_80_by_24() {
         let lines = lines();
         assert!(lines.len() <= 24, "{}", lines.len());
         for (line, _) in lines {

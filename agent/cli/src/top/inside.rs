@@ -7,7 +7,7 @@ use ros2probe_api::inside::TopicInside;
 
 use super::text::{ratio, safe, seconds};
 
-/// Text of a problem that only calls inside processes show; `None` for another one.
+/// Returns the text of a problem that only calls inside processes show; `None` for any other.
 pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
     let who = |node: &Option<Cow<'_, str>>, process: &u32| match node {
         Some(node) => safe(node),
@@ -69,7 +69,7 @@ pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
     })
 }
 
-/// One line about a topic's counts inside processes.
+/// Returns one line about a topic's counts inside processes.
 pub(super) fn counts(inside: &TopicInside<'_>) -> String {
     let mut line = format!(
         "inside processes: {} published, {} taken",

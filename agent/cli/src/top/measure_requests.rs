@@ -18,7 +18,7 @@ use ros2probe_api::watches::{Watch, WatchRequest};
 
 /// Interval at which a connection checks whether it is still needed.
 const POLL_INTERVAL: Duration = Duration::from_millis(200);
-/// Checks between two attempts to reopen a connection.
+/// Number of checks between two attempts to reopen a connection.
 const PAUSE: u32 = 10;
 
 /// All topics measured on behalf of this program.
@@ -31,9 +31,9 @@ pub(super) struct MeasureRequests {
 
 #[derive(Debug)]
 enum MeasureRequest {
-    /// By a connection, until this flag is set.
+    /// Measured by a connection, until this flag is set.
     Stream(Arc<AtomicBool>),
-    /// By a watch of this name.
+    /// Measured by a watch at this path.
     Watch(String),
 }
 
@@ -46,7 +46,7 @@ impl MeasureRequests {
         }
     }
 
-    /// Topics and the mark of each in the table.
+    /// Returns the topics and the mark of each in the table.
     pub(super) fn shown(&self) -> BTreeMap<Key, MeasuredBy> {
         let hold = |held: &MeasureRequest| match held {
             MeasureRequest::Stream(_) => MeasuredBy::Session,

@@ -1,7 +1,7 @@
 //! `rp top`: a live table of topics in a terminal, or one table as text.
 //!
-//! It shows the answers of the agent's API. Names from the network are escaped (`text`), and the
-//! terminal is restored on every exit (`terminal`). Topics that it measures are released at its
+//! `rp top` shows the answers of the agent's API. Names from the network are escaped (`text`), and
+//! the terminal is restored on every exit (`terminal`). Topics that it measures are released at its
 //! end, unless `W` keeps them.
 
 mod app;
@@ -32,13 +32,13 @@ use table::Table;
 use terminal::Screen;
 use theme::Theme;
 
-/// Longest time between two drawings, which update the shown age.
+/// Maximum time between two drawings, which update the shown age.
 const TICK: Duration = Duration::from_millis(500);
-/// Least time between two drawings caused by facts. Keys redraw at once.
+/// Minimum time between two drawings caused by facts. Keys redraw immediately.
 const CALM: Duration = Duration::from_millis(100);
-/// Most keys and facts that wait for a slow terminal. Senders block beyond that.
+/// Maximum number of keys and facts that wait for a slow terminal. Senders block beyond it.
 const MAX_WAITING: usize = 64;
-/// Most lines of the header in text without scrolling.
+/// Maximum number of header lines in text without scrolling.
 const MAX_HEADER: usize = 16;
 
 /// Initial view.
@@ -52,9 +52,9 @@ pub struct Options {
     pub reverse: bool,
     /// Text in the name, type or state of shown topics.
     pub filter: String,
-    /// Only topics with problems.
+    /// Whether only topics with problems are shown.
     pub problems: bool,
-    /// Also hidden topics.
+    /// Whether hidden topics are shown as well.
     pub hidden: bool,
 }
 
@@ -62,7 +62,7 @@ pub struct Options {
 ///
 /// # Errors
 ///
-/// The agent is unreachable or refuses.
+/// Fails if the agent is unreachable or refuses.
 pub fn once(agent: &Agent, options: &Options) -> Result<String, ClientError> {
     let (health, topics) = poller::ask(agent, options.domain_id, options.hidden)?;
     let (mut app, now) = (App::new(options, agent.place()), Instant::now());
@@ -88,7 +88,7 @@ pub fn once(agent: &Agent, options: &Options) -> Result<String, ClientError> {
 ///
 /// # Errors
 ///
-/// Standard output is not a terminal, or a thread cannot be started.
+/// Fails if standard output is not a terminal, or if a thread cannot be started.
 pub fn live(agent: Agent, options: &Options, interval: Duration) -> io::Result<u8> {
     let theme = Theme::of(|name| std::env::var(name).ok());
     let mut app = App::new(options, agent.place());

@@ -1,5 +1,5 @@
-//! Polls the agent's API on its own threads, so that a slow agent never delays a key. It continues
-//! while the agent is unreachable. Facts go into a channel.
+//! Polls the agent's API on its own threads, so that a slow agent never delays a key. Polling
+//! continues while the agent is unreachable. Facts go into a channel.
 
 use std::io;
 use std::sync::Arc;
@@ -67,7 +67,7 @@ impl Poller {
     ///
     /// # Errors
     ///
-    /// A thread cannot be started.
+    /// Fails if a thread cannot be started.
     pub fn start(
         agent: Agent,
         domain_id: Option<u32>,
@@ -95,7 +95,7 @@ impl Poller {
 
     /// Executes a command.
     pub fn command(&self, command: Command) {
-        // The thread lives as long as the program: its panic ends both.
+        // The thread lives as long as the program, because a panic of the thread ends the program.
         let _ = self.requests.send(Request::Command(command));
     }
 }
@@ -104,7 +104,7 @@ impl Poller {
 ///
 /// # Errors
 ///
-/// The agent is unreachable or refuses.
+/// Fails if the agent is unreachable or refuses.
 pub fn ask(
     agent: &Agent,
     domain_id: Option<u32>,
@@ -161,7 +161,7 @@ impl Poll {
         match self.agent.get::<TopicDetails<'_>>(&path) {
             Ok(topic) => self.send(Fact::Details(key, Some(Box::new(topic)))),
             Err(ClientError::Refused(_)) => self.send(Fact::Details(key, None)),
-            // The next round detects that the agent is unreachable.
+            // The next poll detects that the agent is unreachable.
             Err(_) => {}
         }
     }
@@ -194,7 +194,7 @@ impl Poll {
     }
 
     fn send(&self, fact: Fact) {
-        // Fails only while the program ends, as its main thread reads the channel.
+        // The main thread reads the channel, so sending fails only while the program ends.
         let _ = self.inputs.send(Input::Fact(fact));
     }
 }

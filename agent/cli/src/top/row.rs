@@ -1,5 +1,5 @@
-//! One line of the table: the shown values of a topic, its problems, and the sort order. It derives
-//! them from the agent's current facts and those of the last seconds.
+//! One line of the table: the shown values of a topic, its problems, and the sort order. The values
+//! are derived from the agent's current facts and the facts of the last seconds.
 
 use std::cmp::Ordering;
 use std::collections::VecDeque;
@@ -11,7 +11,7 @@ use ros2probe_api::topics::{ReasonCode, Topic};
 
 /// Time span of losses in the table, so that an old loss does not hide a new one.
 const WINDOW: Duration = Duration::from_secs(30);
-/// Least time between two samples of the counters.
+/// Minimum time between two samples of the counters.
 const STEP: Duration = Duration::from_millis(900);
 
 /// Identity of a topic within all domains.
@@ -23,31 +23,31 @@ pub struct Key {
     pub dds_name: String,
 }
 
-/// State of a topic, the worst first.
+/// State of a topic, from worst to best.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Standing {
     /// An expectation is violated.
     Violated,
-    /// Published, but without messages.
+    /// The topic is published, but has no messages.
     Silent,
-    /// Watched by its name, without a publisher.
+    /// The topic is watched by its name and has no publisher.
     NotPublished,
     /// Messages are invisible, for a known reason.
     Unseen,
-    /// Published without a subscriber.
+    /// The topic is published and has no subscriber.
     NoSubscriber,
-    /// Measured without expectations, and without recent messages.
+    /// The topic is measured without expectations and has no recent messages.
     Quiet,
     /// Messages arrive as expected.
     Ok,
-    /// No watch or subscription measures it.
+    /// No watch or subscription measures the topic.
     Unwatched,
-    /// Its last endpoint has gone.
+    /// The topic has no endpoints any more.
     Gone,
 }
 
 impl Standing {
-    /// Label in the table.
+    /// Returns the label in the table.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -75,11 +75,11 @@ pub struct Row {
     pub message_type: String,
     /// Whether messages are counted.
     pub is_measured: bool,
-    /// Messages a second.
+    /// Messages per second.
     pub rate: Option<f64>,
-    /// Lowest and highest expected rate, in messages a second.
+    /// Minimum and maximum expected rate, in messages per second.
     pub wanted: (Option<f64>, Option<f64>),
-    /// Payload bytes a second.
+    /// Payload bytes per second.
     pub bandwidth: Option<f64>,
     /// Ratio of messages that the worst subscriber lost.
     pub loss: Option<f64>,
@@ -111,8 +111,8 @@ pub struct Past {
 }
 
 impl Past {
-    /// Loss ratio of the last [`WINDOW`], or in total if nothing was sent in it. The flag is
-    /// whether messages were lost in the window.
+    /// Returns the loss ratio of the last [`WINDOW`], or the total one if nothing was sent in it.
+    /// The flag is whether messages were lost in the window.
     fn loss(&mut self, topic: &Topic<'_>, now: Instant) -> (Option<f64>, bool) {
         let latest = Counters::of(topic);
         let first = self.notes.front().map(|(_, counters)| *counters);
@@ -143,8 +143,8 @@ impl Counters {
         })
     }
 
-    /// The ratio, and whether messages were lost. `None` if none was expected, or the counters
-    /// restarted.
+    /// Returns the ratio, and whether messages were lost. Returns `None` if no messages were
+    /// expected, or if the counters restarted.
     #[expect(
         clippy::cast_precision_loss,
         reason = "a ratio of counts far below 2^52"
@@ -190,7 +190,7 @@ impl Row {
         }
     }
 
-    /// State as text: the problems, or the label of the state.
+    /// Returns the state as text: the problems, or the label of the state.
     #[must_use]
     pub fn state(&self) -> String {
         if self.problems.is_empty() {
@@ -203,7 +203,7 @@ impl Row {
     }
 }
 
-/// Displayed name: the ROS name, or the DDS name for topics of a service.
+/// Returns the displayed name: the ROS name, or the DDS name for topics of a service.
 #[must_use]
 pub fn shown_name(topic: &Topic<'_>) -> String {
     match topic.kind.as_ref() {
@@ -212,7 +212,7 @@ pub fn shown_name(topic: &Topic<'_>) -> String {
     }
 }
 
-/// Returns whether messages are counted now. Values remain after the measurement ends.
+/// Returns whether messages are counted now. Values remain after the end of the measurement.
 #[must_use]
 pub fn is_measured(topic: &Topic<'_>) -> bool {
     let mut publishers = topic.publishers.iter();
@@ -220,7 +220,7 @@ pub fn is_measured(topic: &Topic<'_>) -> bool {
         && (!topic.watches.is_empty() || publishers.any(|it| it.measurement.is_some()))
 }
 
-/// Tightest of all expectations about the topic's rate.
+/// Returns the tightest of all expectations about the topic's rate.
 fn wanted(topic: &Topic<'_>) -> (Option<f64>, Option<f64>) {
     let watches = || topic.watches.iter();
     (
@@ -308,7 +308,7 @@ fn problems(topic: &Topic<'_>, standing: Standing, is_losing: bool) -> Vec<&'sta
             "qos_incompatible" => say("qos"),
             "type_conflict" => say("type"),
             "type_hash_conflict" => say("hash"),
-            // Common: a tool that publishes without a subscriber.
+            // Tools that publish without a subscriber are common.
             "unmatched_publisher" | "unmatched_subscription" | "" => {}
             _ => say("graph"),
         }
@@ -330,9 +330,9 @@ pub enum Column {
     Loss,
     /// 99th percentile of latency, the worst first.
     Latency,
-    /// Publishers, most first.
+    /// Number of publishers, the highest first.
     Publishers,
-    /// Subscribers, most first.
+    /// Number of subscribers, the highest first.
     Subscribers,
     /// Problems first.
     State,
@@ -351,7 +351,7 @@ impl Column {
         Self::State,
     ];
 
-    /// Name of the column in the header.
+    /// Returns the name of the column in the header.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -443,7 +443,7 @@ mod tests {
     }
 
     #[test]
-    fn an_invisible_topic_is_not_called_quiet() {
+    fn an_invisible_topic_is_not_shown_as_quiet() {
         let quiet = json!({"messages": 0, "rate_hertz": 0.0});
         let one = json!([{"measurement": quiet}]);
         let state = |code: &str| {
@@ -461,7 +461,7 @@ mod tests {
     }
 
     #[test]
-    fn a_loss_counts_while_it_is_new_for_the_worst_subscriber() {
+    fn only_recent_losses_of_the_worst_subscriber_are_a_problem() {
         let start = Instant::now();
         let at = |seconds: u64| start + Duration::from_secs(seconds);
         let facts = |expected: u64, lost: u64| {

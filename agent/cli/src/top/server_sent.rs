@@ -9,12 +9,12 @@ pub struct Message {
     pub data: String,
 }
 
-/// Assembles lines into events. The client limits the length of a line; an event here has one line
-/// of data.
+/// Assembles lines into events. The client limits the length of a line, and an event has one line
+/// of data here.
 #[derive(Debug, Default)]
 pub struct Messages {
     next: Message,
-    /// Id of the last event, from which to resume after a break.
+    /// Id of the last event, after which to resume the stream.
     pub last_id: Option<String>,
 }
 
@@ -49,7 +49,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn messages_end_with_an_empty_line_and_ids_outlive_them() {
+    fn an_empty_line_ends_a_message_and_the_last_id_is_kept() {
         let mut messages = Messages::default();
         let stream = ": ros2probe\nretry: 2000\nid: 5-0\n\nevent: a.b\nid: 5-1\ndata: {\"x\": \"y: z\"}\n\n:\n\nevent: cut";
         let all: Vec<_> = stream

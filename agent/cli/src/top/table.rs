@@ -5,9 +5,9 @@ use std::collections::BTreeSet;
 use super::row::{Column, Row};
 use super::text;
 
-/// Least width of the name column.
+/// Minimum width of the name column.
 const NAME: usize = 20;
-/// Largest width of the state column.
+/// Maximum width of the state column.
 const MAX_STATE: usize = 28;
 
 /// Column of the table.
@@ -26,7 +26,7 @@ enum Field {
     State,
 }
 
-/// Selected columns with their widths.
+/// The selected columns with their widths.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Table {
     columns: Vec<(Field, usize)>,
@@ -64,7 +64,7 @@ impl Field {
         }
     }
 
-    /// Least width of the column.
+    /// Returns the minimum width of the column.
     const fn width(self) -> usize {
         match self {
             Self::Name => NAME,
@@ -181,7 +181,7 @@ impl Table {
         }
     }
 
-    /// All columns, each as wide as its widest cell.
+    /// Returns all columns, each as wide as its widest cell.
     #[must_use]
     pub fn whole(rows: &[&Row], cut: char) -> Self {
         let is_expected = rows.iter().any(|row| row.wanted != (None, None));
@@ -198,7 +198,7 @@ impl Table {
         }
     }
 
-    /// The heading, and the range of the sorted column in it.
+    /// Returns the heading, and the range of the sorted column in it.
     #[must_use]
     pub fn heading(&self, sort: Column) -> (String, Option<(usize, usize)>) {
         let (mut line, mut sorted) = (String::new(), None);
@@ -214,7 +214,7 @@ impl Table {
         (line, sorted)
     }
 
-    /// Line of one topic.
+    /// Returns the line of one topic.
     #[must_use]
     pub fn line(&self, row: &Row) -> String {
         let mut line = String::new();
@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn eighty_columns_have_room_for_all_that_is_measured() {
+    fn eighty_columns_show_all_measured_values() {
         let rows = rows("/camera/image");
         let table = Table::plan(78, &[&rows[0]], '~');
         let (heading, _) = table.heading(Column::Name);

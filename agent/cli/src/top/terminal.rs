@@ -1,5 +1,5 @@
-//! Terminal in raw mode on its alternate screen. It is restored at the end, also after a panic of
-//! any thread.
+//! Terminal in raw mode on its alternate screen. The terminal is restored at the end, also after a
+//! panic of any thread.
 
 use std::io::{self, BufWriter, IsTerminal as _, Stdout, Write as _};
 use std::panic;
@@ -24,13 +24,13 @@ const PANICKED: i32 = 101;
 /// Offset that a shell adds to the number of a signal.
 const SIGNALLED: u8 = 128;
 
-/// Longest drawing; a signal then ends the program without waiting for it.
+/// Maximum duration of a drawing. A signal then ends the program without waiting for the drawing.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Whether the terminal is in raw mode.
 static TAKEN: AtomicBool = AtomicBool::new(false);
 
-/// Terminal in raw mode, until this is dropped.
+/// The terminal in raw mode, until this value is dropped.
 #[derive(Debug)]
 pub struct Screen {
     terminal: Terminal<CrosstermBackend<BufWriter<Stdout>>>,
@@ -41,7 +41,7 @@ impl Screen {
     ///
     /// # Errors
     ///
-    /// The terminal is missing or cannot be configured.
+    /// Fails if the terminal is missing or cannot be configured.
     pub fn open() -> io::Result<Self> {
         if !io::stdout().is_terminal() {
             let reason = "rp top needs a terminal; `rp top --once` prints the table and ends";
@@ -51,7 +51,7 @@ impl Screen {
         panic::set_hook(Box::new(move |panic| {
             give_back();
             before(panic);
-            // A reading thread has panicked: the screen would never update again.
+            // After a panic of a reading thread, the screen would never update again.
             std::process::exit(PANICKED);
         }));
         TAKEN.store(true, Ordering::Relaxed);
@@ -67,7 +67,7 @@ impl Screen {
         }
     }
 
-    /// The terminal to draw on.
+    /// Returns the terminal to draw on.
     pub const fn terminal(&mut self) -> &mut Terminal<CrosstermBackend<BufWriter<Stdout>>> {
         &mut self.terminal
     }
@@ -88,11 +88,11 @@ fn give_back() {
     }
 }
 
-/// Starts a thread that passes on keys and sizes.
+/// Starts a thread that forwards keys and sizes.
 ///
 /// # Errors
 ///
-/// The thread cannot be started.
+/// Fails if the thread cannot be started.
 pub fn listen(inputs: SyncSender<Input>) -> io::Result<()> {
     let thread = thread::Builder::new().name("keys".to_owned());
     let read = move || {
@@ -113,11 +113,11 @@ pub fn listen(inputs: SyncSender<Input>) -> io::Result<()> {
     thread.spawn(read).map(drop)
 }
 
-/// Passes on signals that end a program.
+/// Forwards signals that end a program.
 ///
 /// # Errors
 ///
-/// The signal handlers cannot be installed.
+/// Fails if the signal handlers cannot be installed.
 pub fn listen_to_signals(inputs: SyncSender<Input>) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
@@ -144,7 +144,7 @@ pub fn listen_to_signals(inputs: SyncSender<Input>) -> io::Result<()> {
         let code = SIGNALLED.saturating_add(number);
         let _ = inputs.try_send(Input::End(code));
         thread::sleep(TIMEOUT);
-        // The terminal is blocked and drawing waits for it: only its settings can be restored.
+        // The terminal is blocked and drawing waits for it, so only its settings can be restored.
         let _ = disable_raw_mode();
         std::process::exit(code.into());
     };
@@ -160,13 +160,13 @@ mod tests {
 
     use super::*;
 
-    /// Test that [`a_panic_of_any_thread_gives_the_terminal_back`] starts as a process.
+    /// The test that [`a_panic_of_any_thread_restores_the_terminal`] starts as a process.
     const PANICS: &str = "top::terminal::tests::panics_on_a_screen";
 
     #[test]
     #[ignore = "started by another test, on a terminal of its own"]
     fn panics_on_a_screen() {
-        // A plain test run has no such terminal.
+        // A plain test run has no terminal of this kind.
         if std::env::var_os("PANICS_ON_A_SCREEN").is_some() {
             let _screen = Screen::open().unwrap();
             let reader = thread::spawn(|| panic!("the reason"));
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn a_panic_of_any_thread_gives_the_terminal_back() {
+    fn a_panic_of_any_thread_restores_the_terminal() {
         let mut command = Command::new(std::env::current_exe().unwrap());
         command
             .args(["--exact", PANICS, "--ignored", "--nocapture"])

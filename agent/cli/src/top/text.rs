@@ -3,7 +3,7 @@
 //! Names come from the network, so only printable ASCII passes. No name can move the cursor or
 //! change colours, and every character is one column wide.
 
-/// Longest name, in characters; longer ones are cut.
+/// Maximum length of a name, in characters. Longer names are truncated.
 const MAX_CHARACTERS: usize = 256;
 
 /// Escapes all characters of `text` other than printable ASCII.
@@ -23,7 +23,7 @@ pub fn safe(text: &str) -> String {
     shown
 }
 
-/// Beginning of `text` in at most `width` columns; `mark` replaces the cut part.
+/// Returns the beginning of `text` in at most `width` columns; `mark` replaces the cut part.
 #[must_use]
 pub fn beginning(text: &str, width: usize, mark: char) -> String {
     if text.chars().count() <= width {
@@ -36,7 +36,7 @@ pub fn beginning(text: &str, width: usize, mark: char) -> String {
     cut
 }
 
-/// End of `text` in at most `width` columns: names differ most at their ends.
+/// Returns the end of `text` in at most `width` columns, since names differ most at their ends.
 #[must_use]
 pub fn end(text: &str, width: usize, mark: char) -> String {
     let length = text.chars().count();
@@ -50,7 +50,7 @@ pub fn end(text: &str, width: usize, mark: char) -> String {
     marks.into_iter().chain(kept).take(width).collect()
 }
 
-/// Rate in at most six columns.
+/// Formats a rate in at most six columns.
 #[must_use]
 pub fn rate(hertz: f64) -> String {
     match hertz {
@@ -62,7 +62,7 @@ pub fn rate(hertz: f64) -> String {
     }
 }
 
-/// Expected rate, without needless digits.
+/// Formats an expected rate without needless digits.
 #[must_use]
 pub fn bound(hertz: f64) -> String {
     let text = format!("{hertz:.2}");
@@ -70,7 +70,8 @@ pub fn bound(hertz: f64) -> String {
     text.to_owned()
 }
 
-/// Bytes, or bytes a second, in at most six columns, in decimal units as in `ros2 topic bw`.
+/// Formats bytes, or bytes per second, in at most six columns and in the decimal units of `ros2
+/// topic bw`.
 #[must_use]
 pub fn bytes(bytes: f64) -> String {
     if bytes < 999.5 {
@@ -86,7 +87,7 @@ pub fn bytes(bytes: f64) -> String {
     format!("{:.0}T", scaled / 1e3)
 }
 
-/// Duration in at most five columns.
+/// Formats a duration in at most five columns.
 #[must_use]
 pub fn seconds(seconds: f64) -> String {
     match seconds {
@@ -101,7 +102,7 @@ pub fn seconds(seconds: f64) -> String {
     }
 }
 
-/// Ratio in at most five columns. Only 0 is `0%`, and only 1 is `100%`.
+/// Formats a ratio in at most five columns. Only 0 is `0%`, and only 1 is `100%`.
 #[must_use]
 pub fn ratio(ratio: f64) -> String {
     match ratio {
@@ -113,7 +114,7 @@ pub fn ratio(ratio: f64) -> String {
     }
 }
 
-/// Count with its noun.
+/// Returns a count with its noun.
 #[must_use]
 pub fn counted(count: u64, noun: &str) -> String {
     let plural = if count == 1 { "" } else { "s" };
@@ -127,7 +128,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_hostile_name_cannot_steer_the_terminal() {
+    fn a_hostile_name_cannot_control_the_terminal() {
         let hostile = "/a\x1b[2J\x1b]0;title\x07\r\n\t\u{9b}31m\u{202e}gpj\u{200b}\u{7f}\u{fffd}";
         let shown = safe(hostile);
         assert!(shown.chars().all(|each| (' '..='~').contains(&each)));

@@ -29,7 +29,8 @@ pub enum Kind {
 }
 
 impl Theme {
-    /// Theme from environment variables: the locale as libc finds it, and <https://no-color.org>.
+    /// Reads the theme from environment variables: the locale as in libc, and
+    /// <https://no-color.org>.
     #[must_use]
     pub fn of(variable: impl Fn(&str) -> Option<String>) -> Self {
         let set = |name: &&str| variable(name).is_some_and(|value| !value.is_empty());
@@ -45,13 +46,13 @@ impl Theme {
         }
     }
 
-    /// Character that replaces cut text.
+    /// Returns the character that replaces cut text.
     #[must_use]
     pub const fn cut(self) -> char {
         if self.unicode { '…' } else { '~' }
     }
 
-    /// Character of the line above a pane.
+    /// Returns the character of the line above a pane.
     #[must_use]
     pub const fn rule(self, is_focused: bool) -> char {
         match (self.unicode, is_focused) {
@@ -62,7 +63,7 @@ impl Theme {
         }
     }
 
-    /// Bar of `part` of `width` columns, with at least one character unless `part` is 0.
+    /// Returns a bar for `part` of `width` columns, with at least one character unless `part` is 0.
     #[must_use]
     #[expect(
         clippy::cast_possible_truncation,
@@ -83,7 +84,7 @@ impl Theme {
         "█".repeat(eighths / 8) + rest
     }
 
-    /// Style of this kind of text.
+    /// Returns the style of this kind of text.
     #[must_use]
     pub const fn style(self, kind: Kind) -> Style {
         let style = Style::new();
@@ -111,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn the_locale_decides_about_characters_and_no_color_about_colours() {
+    fn the_locale_enables_unicode_and_no_color_disables_colours() {
         let xterm = ("TERM", "xterm-256color");
         let utf = theme(&[xterm, ("LANG", "en_US.UTF-8")]);
         assert_eq!((utf.unicode, utf.colours), (true, true));
@@ -126,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bar_shows_that_there_is_something() {
+    fn a_bar_of_a_tiny_part_has_one_character() {
         let ascii = Theme::default();
         let bars = [0.0, 1e-9, 0.5, 1.0].map(|part| ascii.bar(part, 4));
         assert_eq!(bars, ["", "#", "##", "####"]);

@@ -15,7 +15,7 @@ use super::table::Table;
 use super::text::{beginning, safe};
 use super::theme::{Kind, Theme};
 
-/// Least usable size: columns and lines.
+/// Minimum usable size: columns and lines.
 pub const LEAST: (u16, u16) = (40, 8);
 /// Columns before each topic for two marks: selected, and measured on behalf of this program.
 const MARKS: usize = 2;
@@ -163,7 +163,7 @@ fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
     }
 }
 
-/// Reason for an empty table.
+/// Returns the reason for an empty table.
 fn nothing(app: &App) -> &'static str {
     match (app.updated, app.rows().is_empty()) {
         (None, _) => "  waiting for the agent",
@@ -250,14 +250,14 @@ const fn below(area: Rect) -> Rect {
     }
 }
 
-/// Draws lines from `first` on, as many as fit.
+/// Draws as many lines as fit, beginning with `first`.
 fn write(frame: &mut Frame<'_>, area: Rect, lines: &[Styled], theme: Theme, first: usize) {
     for ((text, kind), at) in lines.iter().skip(first).zip(0..area.height) {
         put(frame, area, at, text, theme, *kind);
     }
 }
 
-/// Draws one line, cut at the end of the area.
+/// Draws one line, truncated at the end of the area.
 fn put(frame: &mut Frame<'_>, area: Rect, at: u16, text: &str, theme: Theme, kind: Kind) {
     if at >= area.height {
         return;

@@ -56,12 +56,12 @@ impl RouterAddress {
         })
     }
 
-    /// Returns the addresses in the order of attempts. Those of this host and numeric ones need no
-    /// look-up, which would ask a name server.
+    /// Returns the addresses in the order of attempts. This host and numeric addresses are resolved
+    /// without a name server.
     ///
     /// # Errors
     ///
-    /// The name cannot be resolved.
+    /// Fails if the name cannot be resolved.
     pub fn resolve(&self) -> io::Result<Vec<SocketAddr>> {
         if self.host.eq_ignore_ascii_case(LOCALHOST) {
             let both = [Ipv4Addr::LOCALHOST.into(), Ipv6Addr::LOCALHOST.into()];
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn a_host_has_the_port_of_routers_unless_it_names_another() {
+    fn a_host_without_a_port_has_the_default_port_of_routers() {
         assert_eq!(written("localhost"), "localhost:7447");
         assert_eq!(written("robot-1.local:7448"), "robot-1.local:7448");
         assert_eq!(written("tcp/10.0.0.5:7447"), "10.0.0.5:7447");
@@ -115,14 +115,14 @@ mod tests {
     }
 
     #[test]
-    fn localhost_is_both_loopback_addresses_without_a_look_up() {
+    fn localhost_resolves_to_both_loopback_addresses_without_a_look_up() {
         let resolved = RouterAddress::default().resolve().unwrap();
         let resolved: Vec<_> = resolved.iter().map(ToString::to_string).collect();
         assert_eq!(resolved, ["127.0.0.1:7447", "[::1]:7447"]);
     }
 
     #[test]
-    fn other_texts_are_refused() {
+    fn an_invalid_address_of_a_router_is_refused() {
         for wrong in [
             "",
             ":7447",

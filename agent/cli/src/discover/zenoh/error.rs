@@ -7,30 +7,30 @@ use std::time::Duration;
 use super::address::RouterAddress;
 use super::session::Unusable;
 
-/// The conversation failed. Each text says what to do.
+/// The conversation failed. Each text names the remedy.
 #[derive(Debug, thiserror::Error)]
 pub enum RouterError {
     /// The name has no address.
     #[error("cannot find the host of {address}: write its IP address, or correct the name")]
     Resolve {
-        /// As given.
+        /// Address on the command line.
         address: RouterAddress,
         /// Error of the operating system.
         source: io::Error,
     },
-    /// Nothing listens.
+    /// No program listens at the address.
     #[error(
         "no Zenoh router at {address}: start `ros2 run rmw_zenoh_cpp rmw_zenohd` there, or name \
          another address: --router HOST:PORT"
     )]
     Refused {
-        /// As given.
+        /// Address on the command line.
         address: RouterAddress,
     },
     /// The host cannot be reached.
     #[error("cannot connect to {address}: check the address, the network and firewalls")]
     Connect {
-        /// As given.
+        /// Address on the command line.
         address: RouterAddress,
         /// Error of the operating system.
         source: io::Error,
@@ -45,7 +45,7 @@ pub enum RouterError {
     Broken {
         /// The router.
         peer: SocketAddr,
-        /// The last message.
+        /// The last message that was sent.
         after: &'static str,
         /// Error of the operating system.
         source: io::Error,
@@ -58,7 +58,7 @@ pub enum RouterError {
     Ended {
         /// The router.
         peer: SocketAddr,
-        /// The last message.
+        /// The last message that was sent.
         after: &'static str,
     },
     /// The router is silent.
@@ -69,28 +69,28 @@ pub enum RouterError {
     Silent {
         /// The router.
         peer: SocketAddr,
-        /// The last message.
+        /// The last message that was sent.
         after: &'static str,
-        /// How long it was.
+        /// Maximum wait for the answer.
         limit: Duration,
     },
-    /// The answer is of no use.
+    /// The answer cannot be used.
     #[error("no graph from {peer}: {why}; {}", remedy(*.why))]
     Unusable {
         /// The router.
         peer: SocketAddr,
-        /// What it answered.
+        /// Why the answer cannot be used.
         why: Unusable,
     },
 }
 
-/// Returns what to do about an answer that is of no use.
+/// Returns the remedy for an answer that cannot be used.
 const fn remedy(why: Unusable) -> &'static str {
     match why {
         Unusable::Tls => "name one of the router's `tcp/` endpoints, without TLS",
         Unusable::NotZenoh => "name the address of `rmw_zenohd`, which listens on port 7447",
         Unusable::Version(_) => "rp needs a router of Zenoh 1.x",
-        // Zenoh 1.8 gives 0 if it requires a user, and 2 if `max_sessions` is reached.
+        // Zenoh 1.8 sends 0 if it requires a user, and 2 if `max_sessions` is reached.
         Unusable::Closed(0..=2) => {
             "see the router's log: rp needs Zenoh 1.x, no user and password, and room for a session"
         }

@@ -35,14 +35,14 @@ pub(super) struct Tokens {
 #[derive(Debug)]
 struct Described {
     domain: DomainId,
-    /// `None`: a node.
+    /// `None` for a node.
     kind: Option<EndpointKind>,
     name: String,
     ros_type: String,
 }
 
 impl Tokens {
-    /// Adds a token. Returns whether there was room.
+    /// Adds a token. Returns `false` if the cap is reached.
     pub(super) fn add(&mut self, token: &str) -> bool {
         let described = match Token::parse(token) {
             Ok(Token::Node(node)) => Described {

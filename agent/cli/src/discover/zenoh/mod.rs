@@ -20,17 +20,17 @@ use self::address::RouterAddress;
 use self::error::RouterError;
 use self::session::{Session, Step};
 
-/// Longest wait for the connection, for each answer, and between two parts of the last.
+/// Maximum wait for the connection, for each answer, and between two parts of the last answer.
 const TIMEOUT: Duration = Duration::from_secs(3);
-/// Longest wait for all tokens.
+/// Maximum wait for all tokens.
 const LIMIT: Duration = Duration::from_secs(30);
-/// Wait for the router to end the connection after the goodbye. Ending it first, with bytes of the
-/// router in flight, resets it.
+/// Wait for the router to close the connection after the goodbye. If this side closed it first,
+/// bytes of the router in flight would reset it.
 const LINGER: Duration = Duration::from_millis(200);
-/// Bytes read at once.
+/// Maximum number of bytes per read.
 const READ: usize = 64 << 10;
 
-/// Number of batches, and their bytes with the lengths in front.
+/// Number of batches, and their bytes including the lengths before them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Traffic {
     /// Number of batches.
@@ -42,13 +42,13 @@ pub struct Traffic {
 /// A conversation that ended, perhaps at a cap.
 #[derive(Debug)]
 pub struct Answer {
-    /// What the router announced.
+    /// The session with the announcements of the router.
     pub session: Session,
     /// Sent traffic.
     pub sent: Traffic,
     /// Received traffic.
     pub received: Traffic,
-    /// From the introduction to the goodbye.
+    /// Time from the introduction to the goodbye.
     pub took: Duration,
 }
 
@@ -59,7 +59,7 @@ pub struct Planned {
     pub what: &'static str,
     /// Bytes with the default configuration of routers.
     pub bytes: usize,
-    /// How the router decides on the bytes.
+    /// How the number of bytes depends on the router.
     pub note: &'static str,
 }
 
@@ -81,11 +81,11 @@ pub fn plan(domain_id: Option<u32>) -> [Planned; 4] {
     ]
 }
 
-/// Connects to the router. Sends nothing beyond TCP's handshake, and the look-up of a name.
+/// Connects to the router. Sends nothing beyond the handshake of TCP and the look-up of a name.
 ///
 /// # Errors
 ///
-/// Nothing listens at the address, or it cannot be reached.
+/// Fails if nothing listens at the address, or if the address cannot be reached.
 pub fn connect(address: &RouterAddress) -> Result<(TcpStream, SocketAddr), RouterError> {
     let resolved = address.resolve().map_err(|source| RouterError::Resolve {
         address: address.clone(),
@@ -117,7 +117,7 @@ pub fn connect(address: &RouterAddress) -> Result<(TcpStream, SocketAddr), Route
 ///
 /// # Errors
 ///
-/// The router breaks, ends or refuses the conversation, or is silent.
+/// Fails if the router breaks, ends or refuses the conversation, or is silent.
 pub fn converse(
     stream: TcpStream,
     peer: SocketAddr,
@@ -138,7 +138,7 @@ pub fn converse(
     conversation.send("introduction (INIT)", &introduction)?;
     let mut session = Session::new(domain_id);
     let ended = conversation.listen(&mut session);
-    // A peer that is no router gets nothing more.
+    // A peer that is not a router receives nothing more.
     if session.router().is_some() {
         let said = conversation.send("goodbye (CLOSE)", &message::goodbye());
         if ended.is_ok() {
@@ -156,7 +156,7 @@ pub fn converse(
     })
 }
 
-/// Returns an id of 16 bytes. The last is not zero, so that Zenoh writes all of them.
+/// Returns an id of 16 bytes. The last byte is not zero, so that Zenoh writes all of them.
 fn random_id() -> io::Result<[u8; 16]> {
     let mut id = [0; 16];
     File::open("/dev/urandom")?.read_exact(&mut id)?;
@@ -170,10 +170,10 @@ struct Conversation {
     peer: SocketAddr,
     /// The last message that was sent.
     after: &'static str,
-    /// Time for the answer, and when it is over.
+    /// Maximum wait for the answer, and its deadline.
     limit: Duration,
     deadline: Instant,
-    /// Received bytes behind the last complete batch: less than a batch and a read.
+    /// Received bytes after the last complete batch: less than one batch and one read.
     buffer: Vec<u8>,
     sent: Traffic,
     received: Traffic,
@@ -190,7 +190,7 @@ impl Conversation {
         Ok(())
     }
 
-    /// Sets the time for the next answer.
+    /// Sets the maximum wait for the next answer.
     fn within(&mut self, limit: Duration) {
         self.limit = limit;
         self.deadline = Instant::now() + limit;

@@ -14,9 +14,9 @@ use ros2probe_wire::{DomainId, WireError};
 use super::graph::{DomainGraph, Tokens};
 use super::message;
 
-/// Most bytes of a router's answers, with aliases written out.
+/// Maximum size of a router's answers, in bytes, with aliases written out.
 pub const MOST_BYTES: usize = 16 << 20;
-/// Most bytes of one message in FRAGMENTs. A declaration has a key of at most 64 KiB.
+/// Maximum size of one message in FRAGMENTs, in bytes. A declaration has a key of at most 64 KiB.
 pub const MOST_MESSAGE_BYTES: usize = 128 << 10;
 
 /// A batch to send.
@@ -28,7 +28,7 @@ pub struct Outgoing {
     pub bytes: Vec<u8>,
 }
 
-/// Why an answer is of no use.
+/// Why an answer cannot be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Unusable {
     /// A TLS record.
@@ -40,13 +40,13 @@ pub enum Unusable {
     /// Zenoh with another wire format.
     #[error("it speaks version {0} of Zenoh's wire format, not {VERSION}")]
     Version(u8),
-    /// It refuses or ends the session, with this reason.
+    /// The router refuses or ends the session, with this reason.
     #[error("it ended the session: {}", reason(*.0))]
     Closed(u8),
-    /// It accepted a feature that was not offered.
+    /// The router accepted a feature that was not offered.
     #[error("it compresses batches or sends no frames, which was not offered")]
     Framing,
-    /// A message that cannot be read.
+    /// A message cannot be read.
     #[error("its answer is malformed ({0})")]
     Malformed(#[from] WireError),
     /// Messages in the wrong order, or a missing fragment.
@@ -54,7 +54,7 @@ pub enum Unusable {
     Unexpected(&'static str),
 }
 
-/// Text of the reason of a CLOSE (`zenoh-protocol`, `transport/close.rs`).
+/// Returns the text of the reason of a CLOSE (`zenoh-protocol`, `transport/close.rs`).
 const fn reason(reason: u8) -> &'static str {
     match reason {
         0 => "no reason given",
@@ -80,7 +80,7 @@ pub enum Step {
     Request,
     /// All tokens have arrived.
     Complete,
-    /// A cap is reached: what has arrived is a part.
+    /// A cap is reached, so the graph is incomplete.
     Full,
 }
 
@@ -95,7 +95,7 @@ pub struct Session {
     aliases: BTreeMap<u16, Box<str>>,
     chains: BTreeMap<Lane, Chain>,
     tokens: Tokens,
-    /// Bytes up to the cap.
+    /// Number of bytes left below the cap.
     room: usize,
 }
 
@@ -123,11 +123,11 @@ impl Session {
         }
     }
 
-    /// Judges the first bytes of the stream, which may be less than a batch.
+    /// Checks the first bytes of the stream, which may be less than a batch.
     ///
     /// # Errors
     ///
-    /// They cannot be the beginning of an answer.
+    /// Fails if the bytes cannot be the beginning of an answer.
     pub fn beginning(&self, stream: &[u8]) -> Result<(), Unusable> {
         if self.step != Step::Introduction {
             return Ok(());
@@ -147,7 +147,7 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// The batch is of no use; the conversation is over.
+    /// Fails if the batch cannot be used. The conversation is then over.
     pub fn receive(&mut self, batch: &[u8]) -> Result<Vec<Outgoing>, Unusable> {
         let mut outgoing = Vec::new();
         if !self.spend(batch.len()) {
@@ -185,7 +185,7 @@ impl Session {
         matches!(self.step, Step::Complete | Step::Full)
     }
 
-    /// Id of the router, once it has introduced itself.
+    /// Returns the id of the router, once it has introduced itself.
     #[must_use]
     pub const fn router(&self) -> Option<ZenohId> {
         self.router
@@ -300,7 +300,7 @@ impl Session {
         Ok(())
     }
 
-    /// Returns the key of an expression. `None` if its alias is unknown, or the cap is reached.
+    /// Returns the key of an expression; `None` if its alias is unknown, or if the cap is reached.
     fn resolve(&mut self, expression: &WireExpr<'_>) -> Option<String> {
         if let Some(key) = expression.key() {
             return Some(key.to_owned());
@@ -314,7 +314,7 @@ impl Session {
         self.spend(key.len()).then_some(key)
     }
 
-    /// Takes bytes from the room that is left. Returns whether there was enough.
+    /// Subtracts bytes from those left below the cap. Returns `false` if the cap is reached.
     fn spend(&mut self, bytes: usize) -> bool {
         match self.room.checked_sub(bytes) {
             Some(room) => self.room = room,

@@ -9,7 +9,7 @@ use ros2probe_message::{Value, python};
 /// Path to a part of a message.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FieldPath {
-    /// Text as typed, which the original repeats in its errors.
+    /// Text as typed, which ros2cli repeats in its errors.
     text: String,
     steps: Vec<Step>,
 }

@@ -1,5 +1,5 @@
-//! Reports of lost messages. The original learns of losses from its middleware; here the agent's
-//! stream reports them.
+//! Reports of lost messages. ros2cli learns of losses from its middleware; here the agent's stream
+//! reports them.
 
 use ros2probe_api::samples::{Missed, MissedReason};
 
@@ -10,12 +10,12 @@ pub struct Lost {
 }
 
 impl Lost {
-    /// Records messages that will not arrive. Returns the original's text, or nothing if they were
-    /// on the wire. As in the original, no line break precedes `---`.
+    /// Records messages that will not arrive. Returns ros2cli's text, or nothing if the messages
+    /// were on the wire. As in ros2cli, no line break precedes `---`.
     pub fn missed(&mut self, missed: &Missed) -> String {
         match missed.reason {
             MissedReason::Incomplete | MissedReason::Lost => {}
-            // They were on the wire.
+            // These messages were on the wire.
             MissedReason::Unannounced | MissedReason::NotCaptured | MissedReason::QueueFull => {
                 return String::new();
             }
@@ -45,7 +45,7 @@ mod tests {
     }
 
     #[test]
-    fn lost_and_incomplete_messages_add_up_and_what_this_reader_missed_does_not_count() {
+    fn only_lost_and_incomplete_messages_add_to_the_reported_count() {
         let mut lost = Lost::default();
         let text = "A message was lost!!!\n\ttotal count change:2\n\ttotal count: 2---\n";
         assert_eq!(lost.missed(&missed(2, 3, MissedReason::Lost)), text);

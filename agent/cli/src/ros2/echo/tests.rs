@@ -78,7 +78,7 @@ fn fields_print_as_yaml_or_as_python() {
 }
 
 #[test]
-fn fields_that_are_not_there_are_refused_in_the_originals_words() {
+fn missing_fields_are_refused_with_the_text_of_ros2cli() {
     for (path, reason) in [
         ("x", "'B' object has no attribute 'x'"),
         ("header.x", "'Header' object has no attribute 'x'"),
@@ -119,7 +119,7 @@ fn message_info_is_printed_before_the_message() {
 }
 
 #[test]
-fn a_filter_sees_the_selected_field() {
+fn a_filter_is_evaluated_on_the_selected_field() {
     let mut options = fields(&["header"]);
     options.filter = Some(Filter::parse("m.sec == 5").unwrap());
     assert!(echo(options.clone()).unwrap().is_some());
@@ -138,7 +138,7 @@ fn a_filter_sees_the_selected_field() {
 }
 
 #[test]
-fn a_writer_whose_messages_cannot_be_read_is_named_once() {
+fn a_writer_of_unreadable_messages_is_reported_once() {
     let mut echo = Echo::new(Options::default());
     let message_type = message_type();
     let mut tell = |payload: &[u8]| {
@@ -159,7 +159,7 @@ fn a_writer_whose_messages_cannot_be_read_is_named_once() {
 }
 
 #[test]
-fn events_have_names_in_both_styles() {
+fn types_of_events_print_as_names_in_both_styles() {
     let event = "a/Info info\nuint8[] request\n
 ================================================================================
 MSG: a/Info\nuint8 event_type\nint64 sequence_number";
@@ -188,7 +188,7 @@ MSG: a/Info\nuint8 event_type\nint64 sequence_number";
 }
 
 #[test]
-fn publishers_that_differ_are_reported() {
+fn publishers_with_different_qos_are_reported() {
     let publisher = |reliability: &'static str, durability: &'static str| Endpoint {
         qos: Qos {
             reliability: reliability.into(),

@@ -1,8 +1,8 @@
 //! Bandwidth of one topic, as `ros2 topic bw` reports it.
 //!
 //! The interval reaches from the oldest message of the window to now, so the value decays during
-//! silence. A size is the serialized payload with its encapsulation, without headers of RTPS and
-//! UDP.
+//! silence. A size is that of the serialized payload with its encapsulation, without headers of
+//! RTPS and UDP.
 
 use super::NANOSECOND;
 use super::window::Window;
@@ -19,7 +19,7 @@ pub struct Sizes {
 /// Values of one report, as text in one unit.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Bandwidth {
-    /// Bytes a second, with `/s`.
+    /// Bytes per second, with `/s`.
     pub bandwidth: String,
     /// Number of messages in the window.
     pub window: String,
@@ -31,8 +31,8 @@ pub struct Bandwidth {
     pub max: String,
 }
 
-/// The time is not after the oldest message, because the clock was set back. The window is empty
-/// now.
+/// The time is not after the oldest message, because the clock was set back. The window is now
+/// empty.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TimeReset;
 
@@ -55,7 +55,7 @@ impl Sizes {
         self.newest = time;
     }
 
-    /// Report at `now`. `None` with fewer than two messages.
+    /// Returns the report at `now`; `None` with fewer than two messages.
     ///
     /// # Errors
     ///
@@ -85,7 +85,7 @@ impl Sizes {
         }))
     }
 
-    /// Report at `now` if a message arrived since the last one (Lyrical and later).
+    /// Returns the report at `now` if a message arrived since the last one (Lyrical and later).
     ///
     /// # Errors
     ///
@@ -99,7 +99,7 @@ impl Sizes {
 }
 
 impl Bandwidth {
-    /// The two lines of a single topic.
+    /// Returns the two lines of a single topic.
     #[must_use]
     pub fn lines(&self) -> String {
         format!(
@@ -132,7 +132,7 @@ impl Unit {
         match self {
             Self::Bytes => format!("{bytes:.0} B"),
             Self::Kilobytes => format!("{:.2} KB", bytes / 1000.0),
-            // Two divisions, as in the original: one division by a million can round differently.
+            // Two divisions, as in ros2cli: one division by a million can round differently.
             Self::Megabytes => format!("{:.2} MB", bytes / 1000.0 / 1000.0),
         }
     }
@@ -145,7 +145,7 @@ mod tests {
     use super::super::SECOND;
 
     #[test]
-    fn the_span_goes_until_now() {
+    fn the_interval_of_a_bandwidth_reaches_to_the_present() {
         let mut sizes = Sizes::new(100);
         sizes.arrived(10 * SECOND, 28);
         assert_eq!(sizes.report(11 * SECOND), Ok(None));
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn one_unit_serves_all_numbers() {
+    fn all_numbers_of_a_report_have_one_unit() {
         let mut sizes = Sizes::new(100);
         for _ in 0..3 {
             sizes.arrived(SECOND, 644_148);

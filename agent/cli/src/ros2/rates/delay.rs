@@ -1,6 +1,6 @@
 //! Age of one topic's messages by the stamp in their header, as `ros2 topic delay` reports it.
 //!
-//! The age is that at capture; time spent in a subscriber's process is not included.
+//! The age is the one at capture; time spent in a subscriber's process is not included.
 
 use super::NANOSECOND;
 use super::window::Window;
@@ -41,8 +41,8 @@ impl Ages {
         }
     }
 
-    /// Adds a message. The first message is not counted. One earlier than the first restarts the
-    /// measurement, since the clock was set back.
+    /// Adds a message. The first message is not counted. A message earlier than the first restarts
+    /// the measurement, since the clock was set back.
     pub fn arrived(&mut self, time: i64, stamp: i64) {
         if self.first.is_none_or(|first| first > time) {
             self.first = Some(time);
@@ -58,7 +58,7 @@ impl Ages {
         self.newest = self.newest.max(time);
     }
 
-    /// Lines of a periodic report. `None` before the second message.
+    /// Returns the lines of a periodic report; `None` before the second message.
     pub fn lines(&mut self) -> Option<String> {
         if self.ages.is_empty() {
             return None;
@@ -70,7 +70,7 @@ impl Ages {
         Some(text)
     }
 
-    /// Periodic report. `None` without a message since the last report.
+    /// Returns a periodic report; `None` without a message since the last report.
     pub fn report(&mut self) -> Option<Age> {
         if self.printed == Some(self.newest) {
             return None;
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_whose_stamp_was_not_seen_are_new_messages_all_the_same() {
+    fn messages_with_an_unseen_stamp_count_as_new_messages() {
         let mut ages = Ages::new(10);
         ages.passed(900 * MILLISECOND);
         assert_eq!(ages.lines(), None);
@@ -132,11 +132,11 @@ mod tests {
     }
 
     #[test]
-    fn a_stamp_of_the_future_is_a_delay_below_zero() {
+    fn a_stamp_in_the_future_leads_to_a_negative_delay() {
         let mut ages = Ages::new(10);
         ages.arrived(1000 * MILLISECOND, 0);
         ages.arrived(1000 * MILLISECOND, 1000 * MILLISECOND + 400_000);
-        // Half a millisecond and less rounds to a zero that keeps its sign, as in the original.
+        // Half a millisecond and less rounds to a zero that keeps its sign, as in ros2cli.
         let text =
             "average delay: -0.000\n\tmin: -0.000s max: -0.000s std dev: 0.00000s window: 1\n";
         assert_eq!(ages.lines().as_deref(), Some(text));

@@ -17,7 +17,7 @@ pub struct Intervals {
 /// Values of one report, as text.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Rate {
-    /// Messages a second.
+    /// Messages per second.
     pub rate: String,
     /// Shortest interval, in seconds.
     pub min: String,
@@ -41,7 +41,7 @@ impl Intervals {
         }
     }
 
-    /// Adds a message. The first message begins the measurement. One earlier than the first
+    /// Adds a message. The first message begins the measurement. A message earlier than the first
     /// restarts it, since the clock was set back.
     pub fn arrived(&mut self, time: i64) {
         if self.first.is_none_or(|first| first > time) {
@@ -53,8 +53,9 @@ impl Intervals {
         self.newest = time;
     }
 
-    /// Report caused by a message (Humble, Jazzy): one that arrived at least a second after that of
-    /// the last report. The first interval only starts the count. `None` if no report is due.
+    /// Returns the report that a message causes (Humble, Jazzy) a second or more after the message
+    /// of the last report. The first interval only starts the count. Returns `None` if no report is
+    /// due.
     pub fn report_at_message(&mut self) -> Option<Rate> {
         if self.between.is_empty() {
             return None;
@@ -63,15 +64,16 @@ impl Intervals {
             self.printed = Some(self.newest);
             return None;
         };
-        // After the clock is set back, the newest message is before the printed one. Reports resume
-        // a second after the printed one.
+        // After the clock was set back, the newest message is earlier than the one of the last
+        // report. Reports resume a second after the latter.
         if self.newest < printed.saturating_add(SECOND) {
             return None;
         }
         self.report()
     }
 
-    /// Periodic report (Kilted and later). `None` without a message since the last report.
+    /// Returns a periodic report (Kilted and later); `None` without a message since the last
+    /// report.
     pub fn report_at_second(&mut self) -> Option<Rate> {
         if self.printed == Some(self.newest) {
             return None;
@@ -98,7 +100,7 @@ impl Intervals {
 }
 
 impl Rate {
-    /// The two lines of a single topic.
+    /// Returns the two lines of a single topic.
     #[must_use]
     pub fn lines(&self) -> String {
         format!(
@@ -120,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn a_message_a_second_after_the_last_report_brings_the_next() {
+    fn a_message_a_second_after_the_last_report_causes_the_next_one() {
         let mut intervals = Intervals::new(10_000);
         // Messages every 100 ms: the second one starts the count of seconds.
         for step in 0..=10 {
@@ -137,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_topic_reports_with_each_message_from_the_third_on() {
+    fn each_message_of_a_slow_topic_after_the_second_causes_a_report() {
         let mut intervals = Intervals::new(10_000);
         assert_eq!(at(&mut intervals, 0), None);
         assert_eq!(at(&mut intervals, 5000), None);
@@ -158,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_set_back_begins_again() {
+    fn a_clock_set_back_restarts_the_intervals() {
         let mut intervals = Intervals::new(100);
         at(&mut intervals, 10_000);
         at(&mut intervals, 10_100);
@@ -169,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_at_the_same_instant_have_no_rate() {
+    fn messages_at_the_same_instant_have_a_rate_of_zero() {
         let mut intervals = Intervals::new(100);
         intervals.arrived(START);
         intervals.arrived(START);
@@ -178,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn a_second_without_a_message_has_no_report() {
+    fn a_second_without_a_message_leads_to_no_report() {
         let mut intervals = Intervals::new(100);
         intervals.arrived(START);
         assert_eq!(intervals.report_at_second(), None);

@@ -28,10 +28,10 @@ const SECOND: i64 = 1_000_000_000;
 const NANOSECOND: f64 = 1e-9;
 /// Clears a terminal, as `--all` does before each table.
 const CLEAR: &str = "\x1b[H\x1b[2J\n";
-/// Largest step of the clock. After a larger one, the clock was set and the skipped seconds are not
-/// reported.
+/// Maximum step of the clock. A larger step means that the clock was set, and skipped seconds are
+/// not reported.
 const LONGEST_JUMP: i64 = 3600 * SECOND;
-/// Most messages that wait for the clock, which ticks ten times a second.
+/// Maximum number of messages that wait for the clock, which ticks ten times a second.
 const WAITING: usize = 65_536;
 
 /// Measured quantity.
@@ -39,7 +39,7 @@ const WAITING: usize = 65_536;
 pub enum Quantity {
     /// Rate of messages, `hz`.
     Rate,
-    /// Bytes a second, `bw`.
+    /// Bytes per second, `bw`.
     Bandwidth,
     /// Age of messages, `delay`.
     Delay,
@@ -68,16 +68,16 @@ pub struct Rates {
 /// Text for the two outputs.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Output {
-    /// For standard output.
+    /// Text for standard output.
     pub out: String,
-    /// For standard error.
+    /// Text for standard error.
     pub err: String,
 }
 
 /// Reason for the end of a command.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum End {
-    /// No topic to measure.
+    /// There is no topic to measure.
     Idle,
     /// The command failed, with this text.
     Refused(Refused),
@@ -95,11 +95,11 @@ pub struct Named {
 /// One message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Arrival {
-    /// Time of its capture, in nanoseconds since the epoch.
+    /// Time of the message's capture, in nanoseconds since the epoch.
     pub time: i64,
-    /// Bytes of its serialized payload with encapsulation.
+    /// Size of the serialized payload with encapsulation, in bytes.
     pub size: u32,
-    /// Stamp in its header, in nanoseconds since the epoch.
+    /// Stamp in the header, in nanoseconds since the epoch.
     pub header_stamp: Option<i64>,
 }
 
@@ -112,14 +112,14 @@ pub struct Origin<'a> {
     pub number: u64,
     /// The writer's timestamp, in nanoseconds since the epoch.
     pub source_timestamp: Option<i64>,
-    /// Whether it was sampled in shared memory, so that others may have been missed.
+    /// Whether the message was sampled in shared memory, so that others may have been missed.
     pub is_sampled: bool,
 }
 
 #[derive(Debug)]
 struct Watched {
     topic: Named,
-    /// `None` until the topic exists.
+    /// Type of the messages; `None` until the topic exists.
     message_type: Option<String>,
     /// Whether only samples of the messages are seen.
     sampled: bool,
@@ -217,7 +217,7 @@ impl Rates {
     ///
     /// # Errors
     ///
-    /// The topic has several types.
+    /// Fails if the topic has several types.
     pub fn appeared(&mut self, name: &str, types: &[String]) -> Result<(), End> {
         if self.all && !self.places.contains_key(name) && self.measurable(types) {
             self.add(Named::absolute(name));
@@ -252,12 +252,12 @@ impl Rates {
         Ok(())
     }
 
-    /// Adds a message. It counts once the clock has passed it: messages from network and shared
-    /// memory arrive out of order.
+    /// Adds a message. The message counts once the clock has passed it, because messages from
+    /// network and shared memory arrive out of order.
     ///
     /// # Errors
     ///
-    /// The delay is measured and the message has no header.
+    /// Fails if the delay is measured and the message has no header.
     pub fn arrived(&mut self, name: &str, arrival: Arrival) -> Result<(), End> {
         let Some(place) = self.places.get(name).copied() else {
             return Ok(());
@@ -286,13 +286,13 @@ impl Rates {
         self.tick(now);
     }
 
-    /// As [`Self::arrived`], with the message's number. A sampled message counts at the time of the
-    /// writer's timestamp, except for a delay. Messages between it and the writer's last one also
-    /// count, at interpolated times.
+    /// Adds a message as [`Self::arrived`] does, with its number. A sampled message counts at the
+    /// time of the writer's timestamp, except for a delay. Messages between it and the writer's
+    /// last one also count, at interpolated times.
     ///
     /// # Errors
     ///
-    /// As [`Self::arrived`].
+    /// Fails as [`Self::arrived`] does.
     pub fn arrived_from(
         &mut self,
         name: &str,
@@ -327,7 +327,7 @@ impl Rates {
         self.arrived(name, arrival)
     }
 
-    /// Counts messages that were sent between `since` and this one.
+    /// Counts messages that were sent between `since` and `arrival`.
     fn unseen(&mut self, name: &str, place: usize, arrival: Arrival, count: u64, since: i64) {
         let Some(watched) = self.topics.get_mut(place) else {
             return;
@@ -365,7 +365,7 @@ impl Rates {
         self.settle(i64::MAX);
     }
 
-    /// Counts the messages up to this time in their order.
+    /// Counts the messages up to this time in the order of their times.
     fn settle(&mut self, until: i64) {
         self.waiting.sort_by_key(|(arrival, _)| arrival.time);
         let passed = self
@@ -410,7 +410,7 @@ impl Rates {
                 self.clear();
                 now.saturating_add(SECOND)
             }
-            // The clock was set back or far ahead: the seconds are counted from here.
+            // The clock was set back or far ahead, so the seconds are counted from `now`.
             Some(next) if next.saturating_sub(now) > 2 * SECOND => now.saturating_add(SECOND),
             Some(next) if now.saturating_sub(next) > LONGEST_JUMP => now,
             Some(next) => next,
@@ -596,7 +596,7 @@ impl Rates {
 }
 
 impl Named {
-    /// A topic by its full name alone.
+    /// Creates a topic from its full name alone.
     #[must_use]
     pub fn absolute(name: &str) -> Self {
         let name = name.to_owned();

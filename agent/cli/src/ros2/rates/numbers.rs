@@ -1,8 +1,8 @@
 //! Sequence numbers of one writer whose messages are sampled in shared memory.
 //!
-//! The numbers between two seen messages show how many were not seen. The time of a poll shows
-//! little about when a message was sent, so the writer's timestamp counts: both have the clock of
-//! the host. The first poll also finds messages from before it, whose time is unknown. The
+//! The numbers between two seen messages show how many were not seen. The time of a poll hardly
+//! shows when a message was sent. A message therefore counts at the writer's timestamp, which is of
+//! the same host's clock. The first poll also finds earlier messages of unknown time, so the
 //! measurement begins after them.
 
 use std::collections::VecDeque;
@@ -10,16 +10,16 @@ use std::ops::RangeInclusive;
 
 use super::SECOND;
 
-/// Largest gap of sequence numbers within one measurement; a larger one restarts it.
+/// Maximum gap of sequence numbers within one measurement. A larger gap restarts the measurement.
 const MAX_UNSEEN: u64 = 10_000;
-/// Distance below the newest number up to which a message is late. A lower number belongs to a
-/// writer that began anew.
+/// Maximum distance of a late message's number from the newest number. A lower number belongs to a
+/// restarted writer.
 const LATE: u64 = 256;
-/// Longest time by which a message is late.
+/// Maximum time by which a message is late.
 const LATE_FOR: i64 = 2 * SECOND;
-/// Longest time from a writer's timestamp to the poll that finds the message.
+/// Maximum time from a writer's timestamp to the poll that finds the message.
 const LONGEST_POLL: i64 = 10 * SECOND;
-/// Gaps that are remembered, because their messages may still be seen.
+/// Maximum number of remembered gaps, whose messages may still be seen.
 const GAPS: usize = 16;
 
 /// A message of the writer.
@@ -31,11 +31,11 @@ pub(super) struct Message {
     pub(super) captured: i64,
     /// The writer's timestamp.
     pub(super) sent: Option<i64>,
-    /// Whether it was sampled, so that others may have been missed.
+    /// Whether the message was sampled, so that others may have been missed.
     pub(super) is_sampled: bool,
 }
 
-/// Numbers of one writer.
+/// Sequence numbers of one writer.
 #[derive(Debug)]
 pub(super) struct Numbers {
     newest: Message,
@@ -48,21 +48,21 @@ pub(super) struct Numbers {
 /// How a message counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Place {
-    /// It counts at its time.
+    /// The message counts at its time.
     Counts,
-    /// It is counted already, or was sent before the measurement.
+    /// The message is counted already, or was sent before the measurement.
     Counted,
-    /// It counts, and so do messages before it that were not seen.
+    /// The message counts, and so do unseen messages before it.
     After {
-        /// Their number.
+        /// Number of unseen messages.
         unseen: u64,
-        /// Time of the last seen message before them.
+        /// Time of the last seen message before the unseen ones.
         since: i64,
     },
 }
 
 impl Message {
-    /// Returns the time at which it counts.
+    /// Returns the time at which the message counts.
     pub(super) fn time(&self) -> i64 {
         let age = |sent: &i64| self.captured.saturating_sub(*sent);
         let sent = self.sent.filter(|_| self.is_sampled);
@@ -70,14 +70,14 @@ impl Message {
         sent.unwrap_or(self.captured)
     }
 
-    /// Returns whether its time is only that of the poll that found it.
+    /// Returns whether the only known time of the message is that of the poll that found it.
     const fn is_undated(&self) -> bool {
         self.is_sampled && self.sent.is_none()
     }
 }
 
 impl Numbers {
-    /// Begins with a message.
+    /// Begins with the first message of a writer.
     pub(super) const fn new(message: Message) -> (Self, Place) {
         let numbers = Self {
             newest: message,
@@ -98,7 +98,7 @@ impl Numbers {
         }
         self.newest = message;
         if !self.has_begun {
-            // A writer without timestamps counts from the second poll on.
+            // A writer without timestamps counts since the second poll.
             self.has_begun = !message.is_undated() || message.captured != newest.captured;
             return match self.has_begun {
                 true => Place::Counts,
@@ -106,7 +106,7 @@ impl Numbers {
             };
         }
         let unseen = message.number - newest.number - 1;
-        // Numbers that are missing on the network were lost.
+        // Numbers that are missing on the network belong to lost messages.
         let may_be_unseen = message.is_sampled || newest.is_sampled;
         if !may_be_unseen || !(1..=MAX_UNSEEN).contains(&unseen) {
             return Place::Counts;
@@ -132,7 +132,7 @@ impl Numbers {
         let is_late = newest.number - message.number < LATE
             && message.captured.saturating_sub(newest.captured) < LATE_FOR;
         match (is_late, message.is_sampled) {
-            // A duplicate, or one from before the measurement.
+            // The message is a duplicate, or was sent before the measurement.
             (true, true) => Place::Counted,
             (true, false) => Place::Counts,
             (false, _) => {
@@ -154,7 +154,7 @@ mod tests {
         1_795_142_000 * SECOND + milliseconds * MILLISECOND
     }
 
-    /// A message of the network.
+    /// Returns a message of the network.
     fn received(number: u64, captured: i64) -> Message {
         Message {
             number,
@@ -164,7 +164,7 @@ mod tests {
         }
     }
 
-    /// A message of shared memory, read 3 ms after it was sent.
+    /// Returns a message of shared memory, read 3 ms after it was sent.
     fn sampled(number: u64, sent: i64) -> Message {
         Message {
             number,
@@ -174,7 +174,7 @@ mod tests {
         }
     }
 
-    /// A message that was in shared memory before the first poll.
+    /// Returns a message that was in shared memory before the first poll.
     fn undated(number: u64, captured: i64) -> Message {
         Message {
             sent: None,
@@ -196,13 +196,13 @@ mod tests {
             assert_eq!(numbers.place(received(number, 150)), Place::Counted);
         }
         assert_eq!(numbers.place(received(200, 150)), Place::Counts);
-        // Here every message is seen: what is missing is lost, and what is late arrives.
+        // On the network, every message is seen: missing messages are lost, and late ones arrive.
         assert_eq!(numbers.place(received(203, 165)), Place::Counts);
         assert_eq!(numbers.place(received(202, 166)), Place::Counts);
     }
 
     #[test]
-    fn messages_of_the_first_poll_were_sent_before_it() {
+    fn messages_that_were_sent_before_the_first_poll_do_not_count() {
         let (mut numbers, first) = Numbers::new(undated(100, 0));
         assert_eq!(first, Place::Counted);
         for number in [101, 120, 140] {
@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn a_writer_without_timestamps_counts_from_the_second_poll_on() {
+    fn a_writer_without_timestamps_counts_since_the_second_poll() {
         let (mut numbers, _) = Numbers::new(undated(100, 0));
         assert_eq!(numbers.place(undated(101, 0)), Place::Counted);
         assert_eq!(numbers.place(undated(105, 20)), Place::Counts);
@@ -221,19 +221,19 @@ mod tests {
     }
 
     #[test]
-    fn messages_between_the_network_and_shared_memory_are_not_forgotten() {
+    fn messages_between_network_and_shared_memory_count_as_unseen() {
         let (mut numbers, _) = Numbers::new(received(10, 0));
         assert_eq!(numbers.place(sampled(100, 450)), after(89, 0));
     }
 
     #[test]
-    fn a_delayed_poll_delays_no_message() {
+    fn a_delayed_poll_does_not_change_the_time_of_a_message() {
         let late = Message {
             captured: at(900),
             ..sampled(1, 5)
         };
         assert_eq!(late.time(), at(5));
-        // Another clock, or a stamp of the application.
+        // The timestamp is of another clock, or one of the application.
         for sent in [at(901), at(-20_000)] {
             let sent = Some(sent);
             assert_eq!(Message { sent, ..late }.time(), at(900));
@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn a_writer_that_begins_anew_is_counted_anew() {
+    fn a_restarted_writer_restarts_the_count() {
         let (mut numbers, _) = Numbers::new(sampled(900, 0));
         assert_eq!(numbers.place(sampled(1, 100)), Place::Counts);
         assert_eq!(numbers.place(sampled(2, 105)), Place::Counts);

@@ -5,7 +5,7 @@
 
 use std::fmt::Write as _;
 
-/// Text of the table. Empty without rows.
+/// Returns the text of the table; empty without rows.
 #[must_use]
 pub fn table<const COLUMNS: usize>(
     headings: [&str; COLUMNS],
@@ -40,8 +40,8 @@ fn length(text: &str) -> usize {
     text.chars().count()
 }
 
-/// Centres as Python's `str.center`. For an odd remainder, the larger half is on the left if the
-/// width is odd, and on the right if it is even.
+/// Centres a text like Python's `str.center`. For an odd remainder, the larger half is on the left
+/// if the width is odd, and on the right if it is even.
 fn centre(text: &str, width: usize) -> String {
     let room = width.saturating_sub(length(text));
     let left = room / 2 + (room & width & 1);
@@ -54,7 +54,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_heading_is_centred_as_python_does() {
+    fn a_heading_is_centred_as_in_python() {
         // Results of `"ab".center(5)` and others.
         for (text, width, expected) in [
             ("ab", 5, "  ab "),
@@ -68,7 +68,7 @@ mod tests {
     }
 
     #[test]
-    fn cells_are_filled_up() {
+    fn cells_are_padded_to_the_width_of_the_column() {
         let row = |name: &str, rate: &str| [name.to_owned(), rate.to_owned()];
         let found = table(
             ["topic", "rate"],

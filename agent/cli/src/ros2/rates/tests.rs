@@ -17,7 +17,7 @@ struct Case {
 }
 
 #[test]
-fn numbers_are_those_of_python() {
+fn the_numbers_of_reports_are_those_of_python() {
     for line in include_str!("golden/reports.jsonl").lines() {
         let case: Case = serde_json::from_str(line).unwrap();
         let mut intervals = Intervals::new(case.window);
@@ -52,7 +52,7 @@ fn at(milliseconds: i64) -> i64 {
     START + milliseconds * MILLISECOND
 }
 
-/// Adds a message at each of these times, of 100 bytes and 2 ms of age. Returns the output.
+/// Adds messages at these times, each of 100 bytes and 2 ms of age. Returns the output.
 fn messages(rates: &mut Rates, name: &str, times: impl IntoIterator<Item = i64>) -> String {
     for time in times {
         let header_stamp = Some(at(time - 2));
@@ -85,7 +85,7 @@ fn a_missing_topic_is_reported_once_and_awaited() {
     assert_eq!(rates.take().out, "Subscribed to [x]\n");
     rates.clock(at(6000));
     messages(&mut rates, "/x", [6100, 6600]);
-    // The seconds count from the topic's appearance.
+    // The seconds count from the time at which the topic appears.
     rates.clock(at(6999));
     assert_eq!(rates.take().out, "");
     rates.clock(at(7000));
@@ -149,7 +149,7 @@ fn silence_is_reported_by_dialect() {
 }
 
 #[test]
-fn several_topics_share_a_table_that_leaves_out_the_silent_ones() {
+fn several_topics_share_a_table_without_silent_topics() {
     let mut rates = Rates::of(
         Quantity::Rate,
         Dialect::Kilted,
@@ -184,7 +184,7 @@ fn several_topics_share_a_table_that_leaves_out_the_silent_ones() {
 }
 
 #[test]
-fn bandwidths_of_several_topics_each_have_their_unit() {
+fn each_bandwidth_of_several_topics_has_its_own_unit() {
     let mut rates = Rates::of(
         Quantity::Bandwidth,
         Dialect::Rolling,
@@ -216,7 +216,7 @@ fn bandwidths_of_several_topics_each_have_their_unit() {
 }
 
 #[test]
-fn all_topics_are_those_that_are_there_and_those_that_come() {
+fn all_topics_include_topics_that_appear_later() {
     let mut rates = Rates::of_all(Quantity::Rate, Dialect::Kilted, 100);
     rates
         .opened(&present(&[("/a", IMU), ("/b", STRING)]))
@@ -238,7 +238,7 @@ fn all_topics_are_those_that_are_there_and_those_that_come() {
 }
 
 #[test]
-fn with_no_topic_at_all_there_is_nothing_to_do() {
+fn without_any_topic_the_command_ends() {
     let mut rates = Rates::of_all(Quantity::Rate, Dialect::Kilted, 100);
     assert_eq!(rates.opened(&[]), Err(End::Idle));
     assert_eq!(rates.take().out, "No topics available\n");
@@ -259,7 +259,7 @@ fn a_topic_of_several_types_cannot_be_measured() {
 }
 
 #[test]
-fn a_delay_needs_a_header() {
+fn a_message_without_a_header_ends_the_measurement_of_a_delay() {
     let mut rates = Rates::of(Quantity::Delay, Dialect::Jazzy, 100, named(&["/chatter"]));
     rates.opened(&present(&[("/chatter", STRING)])).unwrap();
     let arrival = Arrival {
@@ -276,7 +276,7 @@ fn a_delay_needs_a_header() {
 fn messages_count_in_the_order_of_their_times() {
     let mut rates = Rates::of(Quantity::Rate, Dialect::Jazzy, 100, named(&["/imu"]));
     rates.opened(&present(&[("/imu", IMU)])).unwrap();
-    // Messages of one writer arrive at once, those of the other 50 ms later.
+    // Each message of the second writer arrives after the next one of the first writer.
     for time in [
         0, 200, 100, 400, 300, 600, 500, 800, 700, 1000, 900, 1200, 1100, 1400,
     ] {
@@ -298,7 +298,7 @@ fn messages_count_in_the_order_of_their_times() {
 fn messages_unseen_in_shared_memory_count_by_their_sequence_numbers() {
     let mut rates = Rates::of(Quantity::Rate, Dialect::Jazzy, 100, named(&["/imu"]));
     rates.opened(&present(&[("/imu", IMU)])).unwrap();
-    // Ten messages a second are sent, of which a third is seen.
+    // Ten messages a second are sent, and a third of them is seen.
     for step in 0..8 {
         let time = step * 300;
         let arrival = Arrival {
@@ -330,7 +330,7 @@ fn messages_unseen_in_shared_memory_count_by_their_sequence_numbers() {
 }
 
 #[test]
-fn a_sampled_rate_is_right_from_the_first_line_although_polls_are_late() {
+fn a_sampled_rate_is_correct_in_the_first_report_despite_late_polls() {
     for dialect in [Dialect::Humble, Dialect::Kilted] {
         let mut rates = Rates::of(Quantity::Rate, dialect, 10_000, named(&["/imu"]));
         rates.opened(&present(&[("/imu", IMU)])).unwrap();
@@ -374,7 +374,7 @@ fn a_sampled_rate_is_right_from_the_first_line_although_polls_are_late() {
 }
 
 #[test]
-fn a_clock_that_was_set_is_no_flood_and_no_silence() {
+fn a_clock_step_leads_neither_to_many_reports_nor_to_none() {
     let mut rates = Rates::of(Quantity::Bandwidth, Dialect::Humble, 100, named(&["/imu"]));
     rates.opened(&present(&[("/imu", IMU)])).unwrap();
     rates.clock(at(0));

@@ -1,7 +1,7 @@
-//! Newest values of a quantity, with their mean, extremes and deviation.
+//! The newest values of a quantity, with their mean, extremes and deviation.
 //!
 //! A window is a number of values, not a duration: an old pause stays in it until enough newer
-//! values have arrived. This matches the original.
+//! values have arrived. This matches ros2cli.
 
 use std::collections::VecDeque;
 
@@ -17,9 +17,9 @@ pub struct Window {
 pub struct Statistics {
     /// Arithmetic mean.
     pub mean: f64,
-    /// The smallest value.
+    /// Minimum value.
     pub min: i64,
-    /// The largest value.
+    /// Maximum value.
     pub max: i64,
     /// Standard deviation of the population: the sum of squares is divided by the number of values.
     pub standard_deviation: f64,
@@ -54,25 +54,25 @@ impl Window {
         self.values.is_empty()
     }
 
-    /// The oldest value. `None` if the window is empty.
+    /// Returns the oldest value; `None` if the window is empty.
     #[must_use]
     pub fn oldest(&self) -> Option<i64> {
         self.values.front().copied()
     }
 
-    /// Number of values.
+    /// Returns the number of values.
     #[must_use]
     pub fn count(&self) -> usize {
         self.values.len()
     }
 
-    /// Sum of all values.
+    /// Returns the sum of all values.
     #[must_use]
     pub fn sum(&self) -> i128 {
         self.values.iter().map(|value| i128::from(*value)).sum()
     }
 
-    /// Statistics of the window. `None` if it is empty.
+    /// Returns the statistics of the window; `None` if it is empty.
     #[must_use]
     pub fn statistics(&self) -> Option<Statistics> {
         let (min, max) = (self.values.iter().min()?, self.values.iter().max()?);
@@ -106,8 +106,8 @@ mod tests {
     }
 
     #[test]
-    fn the_deviation_is_of_the_population() {
-        // Mean 5, squares 9 + 1 + 1 + 1 + 0 + 0 + 4 + 16 = 32, 32 / 8 = 4.
+    fn the_deviation_is_that_of_the_population() {
+        // Mean 5, squares 9 + 1 + 1 + 1 + 0 + 0 + 4 + 16 = 32, variance 32 / 8 = 4.
         let found = window(100, &[2, 4, 4, 4, 5, 5, 7, 9]).statistics();
         let expected = Statistics {
             mean: 5.0,
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_goes_first() {
+    fn a_full_window_drops_the_oldest_value() {
         let window = window(2, &[100, 1, 3]);
         assert_eq!(window.oldest(), Some(1));
         let found = window.statistics().unwrap();
@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn values_below_zero_and_of_any_size_are_summed() {
+    fn negative_values_and_values_of_any_size_are_summed() {
         let window = window(4, &[i64::MAX, i64::MAX, -1]);
         assert_eq!(window.sum(), 2 * i128::from(i64::MAX) - 1);
         assert_eq!(window.statistics().map(|found| found.min), Some(-1));

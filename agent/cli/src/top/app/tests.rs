@@ -58,7 +58,7 @@ fn names(app: &App) -> Vec<String> {
 }
 
 #[test]
-fn keys_sort_and_a_second_one_reverses() {
+fn keys_select_the_column_and_the_direction_of_the_order() {
     let mut app = app();
     assert_eq!(names(&app), ["/a", "/b", "/c", "/d"]);
     keys(&mut app, "s");
@@ -84,11 +84,11 @@ fn keys_sort_and_a_second_one_reverses() {
 }
 
 #[test]
-fn the_filter_narrows_while_it_is_typed_and_escape_undoes_it() {
+fn the_filter_applies_while_it_is_typed_and_escape_reverts_it() {
     let mut app = app();
     keys(&mut app, "/IMU");
     assert_eq!(names(&app), ["/d"]);
-    // Keys are text during an edit.
+    // During an edit, keys are text.
     assert_eq!(keys(&mut app, "q"), [Command::Select(None)]);
     press(&mut app, KeyCode::Backspace);
     press(&mut app, KeyCode::Enter);
@@ -113,7 +113,7 @@ fn the_filter_narrows_while_it_is_typed_and_escape_undoes_it() {
 }
 
 #[test]
-fn the_selection_follows_its_topic_and_asks_for_details_once() {
+fn the_selection_follows_its_topic_and_requests_details_once() {
     let mut app = app();
     assert_eq!(press(&mut app, KeyCode::Down), [Command::Select(key("/b"))]);
     assert_eq!(keys(&mut app, "s"), []);
@@ -124,7 +124,7 @@ fn the_selection_follows_its_topic_and_asks_for_details_once() {
     assert_eq!(press(&mut app, KeyCode::End), [Command::Select(key("/d"))]);
     assert_eq!(press(&mut app, KeyCode::Down), []);
     assert_eq!(press(&mut app, KeyCode::Home), [Command::Select(key("/b"))]);
-    // The topic is gone: the next one in its place is selected.
+    // After the selected topic is gone, the next topic at its position is selected.
     let left = json!([{"name": "/c", "dds_name": "rt/c"}]);
     assert_eq!(
         app.take(topics(&left), Instant::now()),
@@ -149,7 +149,7 @@ fn details_of_another_topic_are_not_shown() {
 }
 
 #[test]
-fn w_and_capital_w_ask_for_the_selected_topic() {
+fn the_keys_w_and_capital_w_measure_the_selected_topic() {
     let mut app = app();
     press(&mut app, KeyCode::End);
     let (key, name) = (key("/d").unwrap(), "/d".to_owned());
@@ -163,7 +163,7 @@ fn w_and_capital_w_ask_for_the_selected_topic() {
 }
 
 #[test]
-fn quitting_works_from_everywhere() {
+fn control_c_and_q_quit_in_every_state() {
     let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
     for state in ["", "?", "/text", "e", "d"] {
         let mut app = app();
@@ -178,7 +178,7 @@ fn quitting_works_from_everywhere() {
 }
 
 #[test]
-fn arrows_scroll_the_pane_in_focus_and_escape_leads_back() {
+fn arrow_keys_scroll_the_focused_pane_and_escape_leaves_it() {
     let mut app = app();
     app.heights = Heights {
         topics: 3,
@@ -205,7 +205,7 @@ fn arrows_scroll_the_pane_in_focus_and_escape_leads_back() {
 }
 
 #[test]
-fn a_reader_of_old_events_is_not_evicted_by_new_ones() {
+fn new_events_do_not_move_a_pane_that_shows_old_ones() {
     let mut app = app();
     app.heights.events = 2;
     let event = || Fact::Event(Box::default());

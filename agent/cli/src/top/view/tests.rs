@@ -18,17 +18,17 @@ const ASCII: Theme = Theme {
     colours: false,
 };
 
-/// Robot with a topic in each state.
+/// Returns a robot with a topic in each state.
 pub(in crate::top) fn robot() -> TopicList<'static> {
     serde_json::from_value(robot_answer()).unwrap()
 }
 
-/// Details of one of its topics.
+/// Returns the details of one of the robot's topics.
 fn details(number: usize) -> TopicDetails<'static> {
     serde_json::from_value(robot_answer()["topics"][number].clone()).unwrap()
 }
 
-/// The topic list as JSON, with a topic in each state.
+/// Returns the topic list as JSON, with a topic in each state.
 fn robot_answer() -> Value {
     let measured = |rate: f64, size: f64, lost: u64| {
         json!({
@@ -181,10 +181,10 @@ fn press(app: &mut App, keys: &str) {
     }
 }
 
-/// Screen as text, without trailing spaces.
+/// Returns the screen as text, without trailing spaces.
 fn screen(app: &mut App, size: (u16, u16), theme: Theme, now: Instant) -> String {
     let mut terminal = Terminal::new(TestBackend::new(size.0, size.1)).unwrap();
-    // Drawn twice, since the first drawing determines the sizes of the panes.
+    // The screen is drawn twice, since the first drawing determines the sizes of the panes.
     for _ in 0..2 {
         terminal.draw(|frame| draw(app, frame, theme, now)).unwrap();
     }
@@ -213,7 +213,7 @@ fn compare(name: &str, shown: &str) {
 }
 
 #[test]
-fn the_screens_are_as_they_were_looked_at() {
+fn the_screens_match_the_reviewed_texts() {
     let start = Instant::now();
     let now = start + Duration::from_millis(300);
     let mut shown = app(start);
@@ -317,7 +317,7 @@ fn every_size_can_be_drawn_in_every_state() {
 }
 
 #[test]
-fn no_colour_is_used_where_none_is_wanted() {
+fn colours_are_used_only_if_they_are_enabled() {
     let now = Instant::now();
     let mut shown = app(now);
     press(&mut shown, "e");
