@@ -20,20 +20,20 @@ use rustix::net::{
 };
 use rustix::process::{getpid, set_child_subreaper};
 
-/// Time without a connection after which a broker that systemd starts on demand ends.
+/// Time without a connection after which a broker exits if systemd started it on demand.
 const IDLE: Duration = Duration::from_secs(10);
-/// A broker that a person starts stays.
+/// A broker that was started by hand does not exit when it is idle.
 const FOREVER: Duration = Duration::from_secs(u64::MAX / 4);
-/// Connections that may wait to be accepted.
+/// Maximum number of connections that wait to be accepted.
 const WAITING: i32 = 8;
 const NO_SOCKET: &str =
     "standard input is not a socket: start ros2probe-attach.socket, or pass --listen PATH";
 /// Permissions of the socket. The broker itself accepts one user only.
 const PERMISSIONS: u32 = 0o666;
 
-/// Answers requests of agents for breakpoints and for facts of other processes. `path`: a new socket.
-/// Without it, standard input is the listening socket of systemd, or the connection of the agent
-/// that started the broker. `user`: the agents' user.
+/// Answers requests of agents for breakpoints and for facts of other processes. `path` is a new
+/// socket. Without it, standard input is the listening socket of systemd, or the connection of the
+/// agent that started the broker. `user` is the agents' user.
 ///
 /// # Errors
 /// Fails without a socket, or if the process cannot be confined.
@@ -55,7 +55,8 @@ pub(crate) fn run(path: Option<&Path>, user: &str) -> Result<()> {
     if id.is_none() {
         tracing::warn!(user, "the user does not exist: only root may connect");
     }
-    // Waits for requests that the kernel does not end before it ends itself.
+    // Adopts the processes of requests that outlive their parents, so that the broker can reap
+    // them.
     set_child_subreaper(Some(getpid())).context("cannot adopt child processes")?;
     confine()?;
     tracing::info!(user, "listening");
@@ -75,7 +76,7 @@ fn is_socket(path: &Path) -> bool {
     std::fs::symlink_metadata(path).is_ok_and(|file| file.file_type().is_socket())
 }
 
-/// Listens at a new socket. An old one without a listener is replaced.
+/// Listens at a new socket. Replaces an old socket without a listener.
 fn bound(path: &Path) -> Result<OwnedFd> {
     let kind = SocketType::SEQPACKET;
     let socket = socket_with(AddressFamily::UNIX, kind, SocketFlags::CLOEXEC, None)?;
@@ -84,7 +85,7 @@ fn bound(path: &Path) -> Result<OwnedFd> {
     let shown = path.display();
     match connect(&probe, &address) {
         Ok(()) => bail!("another broker listens at {shown}"),
-        // A file that is not a socket refuses connections, too.
+        // A file that is not a socket also refuses connections.
         Err(Errno::CONNREFUSED) if is_socket(path) => std::fs::remove_file(path)
             .with_context(|| format!("cannot replace the socket {shown}"))?,
         Err(_) => {}

@@ -85,7 +85,7 @@ fn one(chain: &Chain<'_>, with_nodes: bool, text: &mut String) {
             ("transit", hop.transit),
             ("wait", hop.wait),
             ("callback", hop.callback),
-            // The sum of both, if they are not known.
+            // The sum of wait and callback, if they are not known separately.
             ("node", hop.processing.filter(|_| hop.callback.is_none())),
         ];
         for (name, figures) in parts {

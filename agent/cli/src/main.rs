@@ -24,7 +24,7 @@ use cli::{Arguments, Command, UserError};
 /// `EX_NOPERM` and `EX_CONFIG` of sysexits.h.
 const NO_PERMISSION: u8 = 77;
 const BAD_CONFIG: u8 = 78;
-/// Exit code that a shell reports for a process that `SIGPIPE` ended.
+/// Exit code that a shell reports for a process ended by `SIGPIPE`.
 const BROKEN_PIPE: u8 = 141;
 
 fn main() -> ExitCode {
@@ -61,8 +61,8 @@ fn check_config(file: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Text of an error with its causes. Mistakes of a configuration are printed as they are, one a
-/// line.
+/// Returns the text of an error with its causes. Mistakes of a configuration are printed as they
+/// are, one per line.
 fn message(error: &anyhow::Error) -> String {
     match error.downcast_ref::<ConfigError>() {
         Some(mistakes @ ConfigError::Invalid { .. }) => mistakes.to_string(),

@@ -161,7 +161,7 @@ mod tests {
         );
         let remedy = "`sudo systemd-run --slice=robot.slice --pipe --wait rp discover --router`";
         assert!(note.ends_with(remedy), "{note}");
-        // A name that only begins alike is another group.
+        // A group whose name has the same prefix is another group.
         assert!(outside(observed, "0::/robot.slice2\n").is_some());
         let container = Path::new("/sys/fs/cgroup/docker/0123");
         let note = outside(container, "0::/\n").unwrap();

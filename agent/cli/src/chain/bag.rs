@@ -17,31 +17,31 @@ use ros2probe_wire::{Expansion, Timestamp};
 
 /// Interval of progress reports, in messages.
 const PROGRESS: u64 = 65_536;
-/// Messages of this type describe those of an image topic, with the same stamps.
+/// Type of messages that describe the images of another topic and have the same stamps.
 const COMPANION: &str = "sensor_msgs/msg/CameraInfo";
 
 /// Chains in a bag.
 #[derive(Debug)]
 pub struct BagChains {
     facts: RecordedFacts,
-    /// Messages that were read.
+    /// Number of messages that were read.
     pub messages: u64,
     /// Parts of the bag that were not read, as lines for people.
     pub faults: Vec<String>,
 }
 
-/// Topics that share their stamps.
+/// A topic, and others with the same stamps.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SharedStamps {
     /// Name of the topic.
     pub topic: String,
-    /// Names of the others.
+    /// Names of the other topics.
     pub others: Vec<String>,
 }
 
 impl BagChains {
-    /// Reads a bag between these times of reception. `ends` are the topics at which its chains are
-    /// cut. `progress` receives the number of messages read, and that in the bag if known.
+    /// Reads a bag between these times of reception. Its chains are cut at the topics `ends`.
+    /// `progress` receives the number of messages read, and the number in the bag if known.
     ///
     /// # Errors
     /// Fails if nothing in the bag can be read.
@@ -53,7 +53,7 @@ impl BagChains {
         progress: &mut dyn FnMut(u64, Option<u64>),
     ) -> Result<Self, MessagesError> {
         let mut chains = RecordedChains::default();
-        // The name of each topic whose messages begin with a header.
+        // By name of a topic; `None` if its messages do not begin with a header.
         let mut stamped: HashMap<String, Option<TopicName>> = HashMap::new();
         let mut first = None;
         let mut seen = 0_u64;
@@ -95,13 +95,13 @@ impl BagChains {
         parts(self.facts.chains.iter(), from.map(lead), to.map(lead))
     }
 
-    /// Returns which times the durations are computed from: `publish` or `log`.
+    /// Returns the kind of time from which durations are computed: `publish` or `log`.
     #[must_use]
     pub const fn times(&self) -> &'static str {
         self.facts.times.label()
     }
 
-    /// Returns topics that are published together with others, of which one is in the chains.
+    /// Returns topics that stand for others in the chains, because they are published together.
     #[must_use]
     pub fn together(&self) -> Vec<SharedStamps> {
         let mut all: Vec<SharedStamps> = Vec::new();
@@ -118,7 +118,8 @@ impl BagChains {
         all
     }
 
-    /// Returns topics with the stamps of several others, of which none is known to be the cause.
+    /// Returns topics that share stamps with several others, none of which is known to be the
+    /// cause.
     #[must_use]
     pub fn unclear(&self) -> Vec<SharedStamps> {
         let unclear = self
@@ -132,19 +133,19 @@ impl BagChains {
         unclear.collect()
     }
 
-    /// Returns the messages whose stamps are multiples of 100 µs, which were not used.
+    /// Returns the number of messages that were not used: their stamps are multiples of 100 µs.
     #[must_use]
     pub const fn rounded(&self) -> u64 {
         self.facts.rounded
     }
 
-    /// Returns the messages above the caps.
+    /// Returns the number of messages above the caps.
     #[must_use]
     pub const fn refused(&self) -> u64 {
         self.facts.refused
     }
 
-    /// Returns the topic that stands for this one.
+    /// Returns the topic that stands for this one in the chains.
     fn lead<'a>(&'a self, name: &'a str) -> &'a str {
         let mut together = self.facts.together.iter();
         let known = together.find(|(topic, _)| **topic == *name);
@@ -157,7 +158,7 @@ fn is_stamped(message: &Message<'_>) -> bool {
     if message.type_name == COMPANION {
         return false;
     }
-    // The text of the type comes first, those of its fields after a line of `=`.
+    // The text of the type itself comes first. The types of its fields follow a line of `=`.
     let fields = message.definition.lines().map(|line| {
         let line = line.split_once('#').map_or(line, |(line, _)| line);
         line.trim()
@@ -172,7 +173,7 @@ fn is_stamped(message: &Message<'_>) -> bool {
     }
 }
 
-/// Reads the stamp at the begin of a payload (XTYPES 1.3, 7.6.3.1.2).
+/// Reads the stamp at the beginning of a payload (XTYPES 1.3, 7.6.3.1.2).
 fn stamp(begin: &[u8]) -> Option<(i32, u32)> {
     let (encapsulation, body) = begin.split_first_chunk::<4>()?;
     let [0, kind, ..] = *encapsulation else {
@@ -216,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn a_definition_that_begins_with_a_header_is_stamped_whatever_its_type() {
+    fn messages_that_begin_with_a_header_are_stamped_whatever_their_type() {
         let message = |type_name, definition| Message {
             topic: "/a",
             type_name,

@@ -82,7 +82,8 @@ enum Storage {
 }
 
 impl Bag {
-    /// Exit code of an immediate end by Ctrl-C. `None` for a recording, which is completed first.
+    /// Exit code if Ctrl-C ends the command immediately. `None` for a recording, which is
+    /// completed.
     pub(crate) const fn interrupted(&self) -> Option<u8> {
         match self.verb {
             Some(Verb::Record(_) | Verb::Convert(_)) => None,
@@ -158,7 +159,7 @@ impl Reindex {
     }
 }
 
-/// Ends with a usage error if the path does not exist, as the original does.
+/// Ends with a usage error if the path does not exist, as `ros2 bag` does.
 fn require(path: &std::path::Path, verb: &str) {
     if path.exists() {
         return;

@@ -37,10 +37,10 @@ const PROGRESS: Duration = Duration::from_secs(1);
     rp chain --replay drive --from +60 --json       of a bag, without its first minute"
 )]
 pub(crate) struct Chain {
-    /// First topic, e.g. /points; by default that of each chain
+    /// First topic, e.g. /points [default: the first topic of each chain]
     #[arg(value_name = "FROM", value_parser = topic)]
     first_topic: Option<String>,
-    /// Last topic, e.g. /cmd_vel; by default that of each chain
+    /// Last topic, e.g. /cmd_vel [default: the last topic of each chain]
     #[arg(value_name = "TO", value_parser = topic)]
     last_topic: Option<String>,
     /// Print the answer of the API
@@ -135,7 +135,7 @@ impl Chain {
     }
 }
 
-/// Returns the answer of `--json` for a bag. Domain and nodes are null: a bag has neither.
+/// Returns the output of `--json` for a bag. Domain and nodes are null, since a bag has neither.
 fn answer(bag: &BagChains, chains: &[ros2probe_api::chains::Chain<'_>]) -> Result<Value> {
     let mut chains = serde_json::to_value(chains)?;
     for chain in chains.as_array_mut().into_iter().flatten() {
@@ -160,7 +160,7 @@ fn answer(bag: &BagChains, chains: &[ros2probe_api::chains::Chain<'_>]) -> Resul
     }))
 }
 
-/// Returns lines about what was not read, and about topics that are in no chain.
+/// Returns lines about what could not be read, and about topics that are in no chain.
 fn notes(bag: &BagChains) -> Vec<String> {
     let mut notes = bag.faults.clone();
     for SharedStamps { topic, others } in bag.together() {
@@ -190,7 +190,7 @@ fn notes(bag: &BagChains) -> Vec<String> {
     notes
 }
 
-/// Parses a topic's name; a relative one is in the root namespace, as ros2 takes it.
+/// Parses a topic's name. A relative name is in the root namespace, as in ros2cli.
 fn topic(text: &str) -> Result<String, UserError> {
     let name = match text.starts_with('/') {
         true => text.to_owned(),

@@ -170,7 +170,8 @@ impl Echo {
         })
     }
 
-    /// Name of the expected type. Fails if the topic has several types and the command names none.
+    /// Returns the name of the expected type. Fails if the topic has several types and the command
+    /// line names none.
     fn expected(&self, known: &Topic<'_>) -> Result<Option<String>> {
         if self.message_type.is_some() {
             return Ok(self.message_type.clone());
@@ -315,7 +316,7 @@ fn hint(name: &str, known: &Topic<'_>, expected: Option<&str>) {
     }
 }
 
-/// Returns why messages of latched publishers that were sent before are not printed.
+/// Returns why earlier messages of latched publishers are not printed.
 fn missing_latched(name: &str, publishers: &[Endpoint<'_>]) -> BTreeSet<String> {
     let latched = publishers
         .iter()

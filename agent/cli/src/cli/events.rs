@@ -124,7 +124,7 @@ impl ActionEcho {
     }
 }
 
-/// Parsed `--interfaces`. An unknown part fails with the original's message.
+/// Returns the parts that `--interfaces` selects. An unknown part fails with ros2cli's message.
 fn chosen(interfaces: Option<&str>) -> Result<Vec<(&'static str, &'static str)>, Refused> {
     let Some(interfaces) = interfaces else {
         return Ok(PARTS.to_vec());

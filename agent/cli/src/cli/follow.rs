@@ -25,16 +25,16 @@ use super::notes::Notes;
 pub(crate) const AGENT_ENDED: &str = "the agent has ended: `systemctl status ros2probe` shows why, `rp run` starts one in a terminal";
 /// Note at the end of a replay.
 pub(crate) const END_OF_CAPTURE: &str = "end of capture";
-/// Most writers with a remembered type.
+/// Maximum number of writers with a remembered type.
 const MAX_WRITERS: usize = 1024;
 
-/// Options for printing messages, and places of their definitions.
+/// Options for printing messages, and directories of their definitions.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct Printing {
     /// Print all fields of a message in one line, separated by commas
     #[arg(long)]
     pub(crate) csv: bool,
-    /// Print all elements of arrays and all of strings
+    /// Print all elements of arrays and all characters of strings
     #[arg(long, short = 'f')]
     full_length: bool,
     /// Print at most this many elements of arrays and characters of strings, then `...`
@@ -77,7 +77,7 @@ impl Printing {
     }
 }
 
-/// Definitions from these directories, from an installed ROS, and from `rp` itself.
+/// Returns the definitions in these directories, in an installed ROS, and in `rp` itself.
 pub(crate) fn library(target: &Target, directories: Vec<PathBuf>) -> Library {
     let installed = std::env::var_os("AMENT_PREFIX_PATH");
     Library::new(Sources::new(
@@ -170,7 +170,7 @@ pub(crate) fn follow(
     Err(UserError(AGENT_ENDED.to_owned()).into())
 }
 
-/// The agent's facts about a topic. `None` if the topic does not exist.
+/// Returns the agent's facts about a topic; `None` if the topic does not exist.
 pub(crate) fn topic(agent: &Agent, domain_id: u32, name: &str) -> Result<Option<Topic<'static>>> {
     let path = encoded(name.strip_prefix('/').unwrap_or(name));
     match agent.get(&format!("/topics/{path}?domain_id={domain_id}")) {
@@ -197,13 +197,14 @@ impl Types {
         }
     }
 
-    /// Definition of a type named on the command line, or shared by all writers of a topic.
+    /// Returns the definition of a type named on the command line, or shared by all writers of a
+    /// topic.
     pub(crate) fn find(&self, name: &str, hash: Option<&str>) -> Result<Arc<MessageType>> {
         let found = self.library.find(name, hash);
         found.map_err(|error| UserError(error_chain(&error)).into())
     }
 
-    /// Definition for a message. `None` if there is no definition of its type.
+    /// Returns the definition for a message; `None` if there is no definition of its type.
     pub(crate) fn of(&mut self, sample: &Sample) -> Option<Arc<MessageType>> {
         if let Some(known) = self.writers.get(&sample.writer) {
             return known.clone();
@@ -273,7 +274,7 @@ impl MessageFilter {
     }
 }
 
-/// Error and its causes in one line.
+/// Returns an error and its causes in one line.
 fn error_chain(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut source = error.source();
@@ -290,7 +291,7 @@ mod tests {
     use ros2probe_daemon::escape::visible_lines;
 
     #[test]
-    fn no_message_commands_a_terminal() {
+    fn control_characters_of_a_message_are_escaped() {
         let text = "a\tb\u{1b}[2J\u{9b}1m\u{7}\n\u{e9}";
         assert_eq!(visible_lines(text), "a\tb\\u{1b}[2J\\u{9b}1m\\u{7}\n\u{e9}");
     }

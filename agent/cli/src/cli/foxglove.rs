@@ -63,7 +63,7 @@ impl Foxglove {
     }
 }
 
-/// SSH command that forwards the port of another host to this one.
+/// Returns the SSH command that forwards the port of another host to this one.
 fn tunnel(name: &str) -> String {
     format!(
         "ssh -L {PORT}:127.0.0.1:{PORT} {name}\n\
@@ -76,7 +76,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_tunnel_leads_to_the_port_of_viewers() {
+    fn the_ssh_command_forwards_the_port_for_viewers() {
         let shown = tunnel("pi@robot1");
         assert!(
             shown.starts_with("ssh -L 8765:127.0.0.1:8765 pi@robot1\n"),

@@ -34,7 +34,7 @@ Examples:
   rp inside /nav
   rp inside /scan --json | jq '.callbacks[].duration.p99_seconds'")]
 pub(crate) struct Inside {
-    /// Only what belongs to this node or topic
+    /// Print only entries of this node or topic
     #[arg(value_name = "NODE|TOPIC")]
     name: Option<String>,
     /// Print one JSON object, as GET /inside answers

@@ -1,5 +1,5 @@
-//! Handles Ctrl-C: a verb ends at once with the exit code of the original. That code depends on
-//! verb and distribution, and differs from that of a process ended by a signal.
+//! Handles Ctrl-C: a verb ends immediately with the exit code of ros2cli. The code depends on verb
+//! and distribution, and differs from that of a process ended by a signal.
 
 use std::io;
 use std::sync::Arc;
@@ -7,14 +7,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use tokio::signal::unix::{SignalKind, signal};
 
-/// The original's default exit code after Ctrl-C.
+/// ros2cli's default exit code after Ctrl-C.
 pub(crate) const INTERRUPTED: u8 = 2;
 
 /// Makes Ctrl-C end the process with `code`.
 ///
 /// # Errors
 ///
-/// The signal handler cannot be installed.
+/// Fails if the signal handler cannot be installed.
 pub(crate) fn listen(code: u8) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
@@ -36,7 +36,7 @@ pub(crate) fn listen(code: u8) -> io::Result<()> {
 ///
 /// # Errors
 ///
-/// The signal handlers cannot be installed.
+/// Fails if the signal handlers cannot be installed.
 pub(crate) fn flag() -> io::Result<Arc<AtomicBool>> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()

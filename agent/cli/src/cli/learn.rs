@@ -28,9 +28,9 @@ use file::Destination;
 
 /// Interval between two views of the topics.
 const INTERVAL: Duration = Duration::from_secs(1);
-/// Longest wait for a line before the flag of Ctrl-C is checked.
+/// Maximum wait for a line before the flag of Ctrl-C is checked.
 const POLL: Duration = Duration::from_millis(100);
-/// Queue of the stream, whose lines are not read.
+/// Size of the stream's queue, in bytes. The stream's lines are discarded.
 const QUEUE_BYTES: usize = 64 << 10;
 const MAX_MINUTES: u16 = (MAX_SECONDS / 60) as u16;
 
@@ -41,7 +41,7 @@ The file is a configuration with one watch for each topic. A comment at each val
 statistic that it comes from, or why an expectation is left out. Check it with `rp check-config`,
 and move its entries to the agent's configuration.")]
 pub(crate) struct Learn {
-    /// Topics to learn, as /imu, or globs, as /camera/**; all topics without any
+    /// Topics to learn, e.g. /imu, or globs, e.g. /camera/** [default: all topics]
     #[arg(value_name = "TOPIC|GLOB")]
     topics: Vec<String>,
     /// Minutes to watch [default: 10; of a capture, all up to 120]
@@ -146,7 +146,8 @@ impl Session {
         Ok(())
     }
 
-    /// Views the topics. An agent that has just ended fails to answer before its stream ends.
+    /// Views the topics. A request fails shortly before the stream of an agent that is stopping
+    /// ends.
     fn view_while(&mut self, lines: &mut Lines<'_>, agent: &Agent) -> Result<()> {
         let viewed = self.view(agent);
         match viewed {
@@ -261,7 +262,7 @@ fn ends_soon(lines: &mut Lines<'_>) -> bool {
     false
 }
 
-/// Selection in the syntax of `/samples`.
+/// Returns the selection in the syntax of `/samples`.
 fn query(selection: &Selection) -> String {
     if selection.patterns().is_empty() {
         return "all=true".to_owned();
@@ -270,7 +271,7 @@ fn query(selection: &Selection) -> String {
     format!("topic={}", names.join(","))
 }
 
-/// Time of day in UTC, to the second.
+/// Returns a time in UTC, to the second.
 fn time(seconds: f64) -> String {
     let duration = Duration::try_from_secs_f64(seconds).unwrap_or_default();
     let time = jiff::SignedDuration::try_from(duration).ok();
@@ -282,7 +283,7 @@ fn time(seconds: f64) -> String {
 /// A line on stderr that is updated in place; nothing if stderr is not a terminal.
 struct Progress {
     is_shown: bool,
-    /// Whether the end of a capture ends the command, at an unknown time.
+    /// Whether the command ends with a capture, at an unknown time.
     is_whole: bool,
 }
 

@@ -77,7 +77,7 @@ pub(crate) enum Command {
 #[derive(Debug, Subcommand)]
 #[expect(clippy::large_enum_variant, reason = "there is one")]
 pub(crate) enum Question {
-    /// Recordings on disk, as `ros2 bag` makes and reads them
+    /// Record, convert and inspect bags, as `ros2 bag` does
     Bag(bag::Bag),
     /// List, inspect and measure topics, as `ros2 topic` does
     Topic(topic::Topic),
@@ -125,7 +125,7 @@ impl Question {
         }
     }
 
-    /// Exit code of an immediate end by Ctrl-C. `None` for commands that end by themselves.
+    /// Exit code if Ctrl-C ends the command immediately. `None` for commands that handle Ctrl-C.
     fn interrupted(&self) -> Option<u8> {
         match self {
             Self::Bag(bag) => bag.interrupted(),
@@ -144,7 +144,7 @@ impl Question {
     }
 }
 
-/// Prints the help of a command without a verb, as the original does.
+/// Prints the help of a command without a verb, as ros2cli does.
 pub(crate) fn help(names: &[&str]) -> Result<ExitCode> {
     let mut command = Arguments::command();
     command.build();
@@ -163,12 +163,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_command_line_is_consistent() {
+    fn clap_accepts_the_definition_of_the_command_line() {
         Arguments::command().debug_assert();
     }
 
     #[test]
-    fn every_option_of_the_original_is_accepted() {
+    fn every_option_of_ros2cli_is_accepted() {
         let options = include_str!("../../tests/fixtures/cli/options.json");
         let options: BTreeMap<String, Vec<String>> = serde_json::from_str(options).unwrap();
         assert!(options.contains_key("topic list"));

@@ -41,7 +41,7 @@ struct List {
 
 #[derive(Args, Debug)]
 struct Info {
-    /// Fully qualified name of the node, as /robot1/lidar
+    /// Fully qualified name of the node, e.g. /robot1/lidar
     node_name: String,
     /// Also print hidden topics, services and actions
     #[arg(long)]

@@ -1,6 +1,6 @@
 //! Notes on stderr beside the output of a verb: sampled topics, messages that could not be
-//! captured, and reasons for silence. Each is printed once, as soon as it is known; stdout matches
-//! the original.
+//! captured, and reasons for silence. Each note is printed once, as soon as it is known. The output
+//! on stdout matches ros2cli.
 
 use std::collections::{BTreeMap, HashSet};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -21,11 +21,11 @@ use super::shared::names_of;
 
 /// Silence after which the reason is requested.
 pub(crate) const SILENT: Duration = Duration::from_secs(5);
-/// Least time between two reports of a topic's missing messages.
+/// Minimum time between two reports of a topic's missing messages.
 const PAUSE: Duration = Duration::from_secs(5);
 /// Consequence of sampling for verbs that print messages.
 pub(crate) const NOT_ALL_PRINTED: &str = "not every message is printed";
-/// Most topics named in one line.
+/// Maximum number of topics named in one line.
 const NAMES: usize = 8;
 /// Remedy for sampled topics.
 const SWITCH: &str = "`capture.shm.exact: auto` captures each message";
@@ -37,7 +37,7 @@ pub(crate) struct Notes<'a> {
     is_replay: bool,
     /// Topics on the command line; empty for all topics.
     names: Vec<String>,
-    /// Whether one existing topic suffices.
+    /// Whether one existing topic among the names is enough.
     are_parts: bool,
     /// Consequence of sampling for this verb.
     consequence: &'static str,
@@ -48,8 +48,8 @@ pub(crate) struct Notes<'a> {
     is_explained: bool,
 }
 
-/// Missing messages that are not reported yet. Global, because Ctrl-C may end the process, which
-/// has only one verb.
+/// Missing messages that are not reported yet. The variable is global, because Ctrl-C may end the
+/// process. A process runs only one verb.
 static MISSING: Mutex<Missing> = Mutex::new(Missing(BTreeMap::new()));
 
 /// Missing messages by topic and reason: the unreported count, and the time of the last report.
@@ -64,7 +64,7 @@ pub(crate) fn end() {
 }
 
 impl<'a> Notes<'a> {
-    /// Reports sampled topics. `names` are those on the command line.
+    /// Reports sampled topics. `names` are the topics on the command line.
     pub(crate) fn begin(
         agent: &'a Agent,
         domain_id: u32,
@@ -106,7 +106,7 @@ impl<'a> Notes<'a> {
         }
     }
 
-    /// Topics that were reported as sampled.
+    /// Returns the topics that were reported as sampled.
     pub(crate) fn sampled(&self) -> impl Iterator<Item = &str> {
         self.sampled.iter().map(String::as_str)
     }
@@ -136,7 +136,7 @@ impl<'a> Notes<'a> {
         missing.report(false);
     }
 
-    /// Reports once why nothing arrived, after enough time.
+    /// Reports once why no message arrived, after [`SILENT`].
     pub(crate) fn now(&mut self) -> Result<()> {
         Missing::all().report(false);
         if self.is_replay || self.is_explained || self.begun.elapsed() < SILENT {
@@ -145,7 +145,7 @@ impl<'a> Notes<'a> {
         self.explain()
     }
 
-    /// Reports what remains at the end of the stream.
+    /// At the end of the stream, reports missing messages and the reason for silence.
     pub(crate) fn end(&mut self) -> Result<()> {
         Missing::all().report(true);
         if self.is_explained {
@@ -185,7 +185,7 @@ impl<'a> Notes<'a> {
         Ok(())
     }
 
-    /// Text of a reason and its remedy. `None` if a message may still arrive.
+    /// Returns the text of a reason and its remedy; `None` if a message may still arrive.
     fn words(&self, reason: &Reason) -> Option<String> {
         let Open::Known(code) = &reason.code else {
             return None;
@@ -240,7 +240,7 @@ impl<'a> Notes<'a> {
         self.sampled.extend(topics.iter().cloned());
     }
 
-    /// The topics of the verb. Empty if the agent does not answer.
+    /// Returns the topics of the verb; empty if the agent does not answer.
     fn topics(&self) -> Vec<PublishedTopic> {
         let topics = match self.names.as_slice() {
             [name] => {
@@ -295,16 +295,16 @@ impl Missing {
 
 /// How the agent sees messages in shared memory.
 pub(crate) enum Sampling {
-    /// It sees every message, or no message uses shared memory.
+    /// The agent sees every message, or no message uses shared memory.
     Nothing,
-    /// It will see every message soon, because a client reads them.
+    /// The agent will see every message soon, because this client reads them.
     OnDemand,
-    /// It sees samples, with the remedy or the reason.
+    /// The agent sees only samples. The text is the remedy or the reason.
     Sampled(String),
 }
 
 impl Sampling {
-    /// Returns how this agent sees them at present.
+    /// Returns how this agent sees messages in shared memory at present.
     pub(crate) fn at(agent: &Agent) -> Self {
         let health = agent.get("/health");
         health.map_or(Self::Nothing, |health: Health| Self::of(&health))
@@ -318,7 +318,8 @@ impl Sampling {
             _ if !is_read => Self::Nothing,
             Some(exact) if exact.able => Self::Nothing,
             Some(exact) if exact.on_demand => Self::OnDemand,
-            // It is configured, so the remedy would be none.
+            // If exact capture is configured, the text has the reason of its failure instead of a
+            // remedy.
             exact => {
                 let reason = exact.and_then(|exact| exact.reason.clone());
                 Self::Sampled(reason.unwrap_or_else(|| SWITCH.to_owned()))
@@ -326,8 +327,8 @@ impl Sampling {
         }
     }
 
-    /// Returns whether sampled messages show a lasting state. They do not while breakpoints attach
-    /// after `begun`.
+    /// Returns whether sampled messages show a lasting state. While breakpoints attach after
+    /// `begun`, they do not.
     pub(crate) fn is_known(&mut self, agent: &Agent, begun: Instant) -> bool {
         if matches!(self, Self::OnDemand) {
             if begun.elapsed() < SILENT {
@@ -341,8 +342,8 @@ impl Sampling {
         true
     }
 
-    /// Text about sampled topics: the consequence, and the remedy or the reason. `None` if the
-    /// topics are not sampled.
+    /// Returns the text about sampled topics: the consequence, and the remedy or the reason.
+    /// Returns `None` if the topics are not sampled.
     pub(crate) fn text(&self, topics: &[String], consequence: &str) -> Option<String> {
         let Self::Sampled(remedy) = self else {
             return None;
@@ -359,7 +360,7 @@ pub(crate) fn is_sampled(topic: &PublishedTopic) -> bool {
     topic.subscribed && topic.other_transport.as_deref() == Some("shared_memory")
 }
 
-/// Text about a topic whose messages are counted inside processes only. `None` for others.
+/// Returns a text if the topic's messages are counted only inside processes; `None` for others.
 fn counted_inside(topic: &Topic<'_>) -> Option<String> {
     let measured = topic
         .measurement

@@ -3,8 +3,8 @@
 
 use std::io::{self, Write as _};
 
-/// A line printed on stderr without a prefix, as the original prints its errors; the exit code is
-/// 1. As the error of a value's parser, clap prints it with the argument.
+/// An error that is printed on stderr without a prefix, as ros2cli prints its errors. The exit code
+/// is 1. If a value's parser returns this error, clap prints it with the argument.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub(crate) struct UserError(pub(crate) String);
@@ -26,15 +26,15 @@ impl Output {
     ///
     /// # Errors
     ///
-    /// The reader has closed the output, or the disk is full.
+    /// Fails if the reader has closed the output, or if the disk is full.
     pub(crate) fn write(&mut self, text: &str) -> io::Result<()> {
         self.write_bytes(text.as_bytes())
     }
 
-    /// As [`Self::write`].
+    /// Writes bytes as [`Self::write`] writes text.
     ///
     /// # Errors
-    /// As [`Self::write`].
+    /// Fails as [`Self::write`] does.
     pub(crate) fn write_bytes(&mut self, bytes: &[u8]) -> io::Result<()> {
         let mut stdout = self.stdout.lock();
         stdout.write_all(bytes)?;

@@ -29,7 +29,7 @@ Examples:
   rp page --open
   rp page --host robot1")]
 pub(crate) struct Page {
-    /// Open it in the browser of this desktop; its users may see the token in the list of processes
+    /// Open the page in the browser of this desktop; other local users may see the token in `ps`
     #[arg(long)]
     open: bool,
     #[command(flatten)]
@@ -68,7 +68,7 @@ impl Page {
     }
 }
 
-/// Host name and port of an address.
+/// Returns host name and port of an address.
 pub(super) fn parts(host: &str) -> (&str, &str) {
     match host.rsplit_once(':') {
         Some((name, port)) if !name.ends_with(':') && port.parse::<u16>().is_ok() => (name, port),
@@ -82,7 +82,7 @@ pub(super) fn is_near(name: &str) -> bool {
     name == "localhost" || address.is_ok_and(|address| address.is_loopback())
 }
 
-/// SSH command that forwards the page of another host to this one.
+/// Returns the SSH command that forwards the page of another host to this one.
 fn tunnel(name: &str, port: &str) -> String {
     format!(
         "ssh -L {port}:127.0.0.1:{port} {name}\n\
@@ -111,7 +111,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_tunnel_has_the_port_of_the_agent() {
+    fn the_ssh_command_forwards_the_port_of_the_agent() {
         let of = |host: &str| {
             let (name, port) = parts(host);
             tunnel(name, port)
@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn addresses_of_this_host_need_no_tunnel() {
+    fn addresses_of_this_host_need_no_ssh_command() {
         for (host, expected) in [
             ("localhost", true),
             ("127.0.0.1:9000", true),

@@ -72,7 +72,7 @@ pub(crate) struct Delay {
 
 #[derive(Args, Debug)]
 struct Topics {
-    /// Topics to measure, as /chatter
+    /// Topics to measure, e.g. /chatter
     #[arg(value_name = "TOPIC")]
     names: Vec<String>,
     /// Measure all topics, also those that appear later
@@ -108,7 +108,7 @@ impl Hz {
         )
     }
 
-    /// Exit code after Ctrl-C.
+    /// Returns the exit code after Ctrl-C.
     pub(crate) fn interrupted(&self) -> u8 {
         since(Dialect::Kilted, &self.options.target)
     }
@@ -126,7 +126,7 @@ impl Bandwidth {
         )
     }
 
-    /// Exit code after Ctrl-C.
+    /// Returns the exit code after Ctrl-C.
     pub(crate) fn interrupted(&self) -> u8 {
         since(Dialect::Rolling, &self.options.target)
     }
@@ -145,7 +145,7 @@ impl Delay {
     }
 }
 
-/// Exit code after Ctrl-C: 0 from distribution `first` on.
+/// Returns the exit code after Ctrl-C: 0 in `first` and later distributions.
 fn since(first: Dialect, target: &Target) -> u8 {
     if target.dialect() < first {
         INTERRUPTED
@@ -251,7 +251,7 @@ impl Measurement<'_> {
                 Ok(())
             }
             Line::Missed(missed) => {
-                // Arrivals are counted without their payload.
+                // Missing payloads do not change the counts of arrivals.
                 if matches!(
                     missed.reason,
                     MissedReason::QueueFull | MissedReason::Unannounced
@@ -307,7 +307,7 @@ impl Measurement<'_> {
 }
 
 impl Topics {
-    /// Topics to measure. `None` for all topics.
+    /// Returns the topics to measure; `None` for all topics.
     fn names(self, quantity: Quantity, dialect: Dialect) -> Result<Option<Vec<Named>>> {
         if self.all {
             if !self.names.is_empty() {
@@ -328,7 +328,7 @@ impl Topics {
     }
 }
 
-/// Consequence of sampling for this quantity.
+/// Returns the consequence of sampling for this quantity.
 const fn sampled(quantity: Quantity) -> &'static str {
     match quantity {
         Quantity::Rate | Quantity::Bandwidth => {
@@ -342,8 +342,8 @@ fn user_error(refused: Refused) -> anyhow::Error {
     UserError(refused.0).into()
 }
 
-/// The original's message for a command without topics. A usage error in distributions that accept
-/// only one topic.
+/// Returns ros2cli's message for a command without topics. It is a usage error in distributions
+/// that accept only one topic.
 fn unnamed(quantity: Quantity, dialect: Dialect) -> anyhow::Error {
     let several = match quantity {
         Quantity::Rate => dialect >= Dialect::Kilted,

@@ -1,5 +1,5 @@
 //! `rp bag record`: this process writes a bag in its own directory and with its own rights, from an
-//! agent's stream. Stderr has the original's messages.
+//! agent's stream. The messages on stderr are those of `ros2 bag record`.
 
 mod graph_cache;
 mod keys;
@@ -34,7 +34,7 @@ use output::{RecordingOutput, log, report};
 use read_ahead::ReadAhead;
 use signals::{Phase, listen};
 
-/// Default bytes of messages that wait for the storage, as the original's cache.
+/// Default size of messages that wait for the storage, in bytes, as in `ros2 bag record`.
 const CACHE: u64 = 100 << 20;
 
 /// `rp bag record`.
@@ -63,7 +63,7 @@ pub(crate) struct Record {
     /// Record all topics of these types
     #[arg(long, value_name = "TYPE", num_args = 1..)]
     topic_types: Vec<String>,
-    /// Record all topics; from Jazzy on all services, too
+    /// Record all topics; since Jazzy also all services
     #[arg(long, short = 'a')]
     all: bool,
     /// Record all topics
@@ -111,8 +111,8 @@ pub(crate) struct Record {
     /// Split when a file reaches this many seconds; 0 = never
     #[arg(long, short = 'd', value_name = "SECONDS", default_value_t = 0)]
     max_bag_duration: u64,
-    /// Bytes of messages that may wait for the storage in this process; more wait in the agent, and
-    /// those that do not fit there are dropped, counted and reported
+    /// Bytes of messages that may wait for the storage in this process. Further messages wait in
+    /// the agent, and those that do not fit there are dropped, counted and reported
     #[arg(long, value_name = "BYTES", default_value_t = CACHE)]
     max_cache_size: u64,
     /// Compress files after they are complete: file
@@ -148,7 +148,7 @@ pub(crate) struct Record {
     is_batch: bool,
 }
 
-/// Options of the original without effect.
+/// Options of `ros2 bag record` without effect.
 #[derive(Args, Debug)]
 struct Unused {
     /// Accepted without effect, as are other options of subscriptions and threads
@@ -173,8 +173,8 @@ struct Unused {
 }
 
 impl Record {
-    /// Options of `rp bag convert`: writes `capture` into `bag`, with all topics unless some are
-    /// selected.
+    /// Sets the options of `rp bag convert`: writes `capture` into `bag`, with all topics unless
+    /// some are selected.
     pub(crate) fn of_capture(mut self, capture: PathBuf, bag: PathBuf) -> Self {
         self.all |= self.positional.is_empty()
             && self.topics.is_empty()
@@ -202,7 +202,7 @@ impl Record {
         let agent = Agent::reach_stream_measured(&self.target)?;
         let query = filter.query(domain_id, self.max_cache_size);
         let graph_cache = Arc::new(Mutex::new(GraphCache::new(&agent, domain_id)));
-        // The replay continues with the stream.
+        // The replay continues when the stream is opened.
         let before = locked(&graph_cache).latest_snapshot();
         let mut samples = Samples::open(&agent, &query)?;
         let filter = if self.no_discovery {
@@ -267,7 +267,7 @@ impl Record {
         }
     }
 
-    /// Directory of the bag, which must not exist yet.
+    /// Returns the directory of the bag, which must not exist yet.
     fn directory(&self) -> Result<PathBuf> {
         let directory = self.output.clone().unwrap_or_else(|| default_name().into());
         if directory.exists() {
@@ -280,7 +280,7 @@ impl Record {
         Ok(directory)
     }
 
-    /// Sources of facts that samples do not contain.
+    /// Returns the sources of facts that samples do not contain.
     fn sources<'a>(&self, graph_cache: &Arc<Mutex<GraphCache<'a>>>) -> Sources<'a> {
         let places = Places::new(
             self.definitions.clone(),
@@ -296,7 +296,7 @@ impl Record {
         }
     }
 
-    /// The recorder in its initial state: recording, paused, or with a ring in memory.
+    /// Returns the recorder in its initial state: recording, paused, or with a ring in memory.
     fn begun<'a>(&self, mut recorder: Recorder<'a>) -> Recorder<'a> {
         if self.snapshot_mode {
             let room = usize::try_from(self.max_cache_size).unwrap_or(usize::MAX);
@@ -365,7 +365,7 @@ fn refused(error: &FilterError) -> anyhow::Error {
     UserError(format!("{error}")).into()
 }
 
-/// Distribution of this shell, if it is set.
+/// Returns the ROS distribution of the environment; empty if it is not set.
 fn installed() -> String {
     std::env::var("ROS_DISTRO").unwrap_or_default()
 }

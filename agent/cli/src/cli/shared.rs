@@ -19,7 +19,7 @@ use serde::de::DeserializeOwned;
 
 use super::{Output, UserError};
 
-/// Options of the original's own node, accepted for existing scripts.
+/// Options of ros2cli's own node, accepted for existing scripts.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct Spinning {
     /// Accepted without effect: answers need no waiting
@@ -33,7 +33,7 @@ pub(crate) struct Spinning {
     no_daemon: bool,
 }
 
-/// QoS options of the original's own subscription, accepted for existing scripts.
+/// QoS options of ros2cli's own subscription, accepted for existing scripts.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct Matching {
     /// Accepted without effect, as all QoS options: rp does not subscribe
@@ -54,7 +54,7 @@ pub(crate) struct Matching {
 }
 
 impl Matching {
-    /// Returns whether any option is set that makes the original ignore the QoS of publishers.
+    /// Returns whether any option is set that makes ros2cli ignore the QoS of publishers.
     pub(crate) fn any(&self) -> bool {
         let given = [
             &self.qos_depth,
@@ -82,13 +82,13 @@ impl Graph {
         Ok(Self { agent, domain_id })
     }
 
-    /// All names, as [`names_of`] returns them.
+    /// Returns all names, as [`names_of`] does.
     pub(crate) fn names(&self) -> Result<Names<'static>> {
         names_of(&self.agent, self.domain_id)
     }
 
-    /// All names, and the answer about some of them. The reason for missing names is printed only
-    /// without an answer: names that are missing change nothing about those that are known.
+    /// Returns what `answer` selects from all names. The reason for missing names is printed only
+    /// without an answer, because missing names do not affect known ones.
     pub(crate) fn find<T>(
         &self,
         answer: impl FnOnce(&Names<'static>) -> Option<T>,
@@ -101,17 +101,17 @@ impl Graph {
         Ok(answer)
     }
 
-    /// The topic of this name. `None` if it does not exist.
+    /// Returns the topic of this name; `None` if it does not exist.
     pub(crate) fn topic(&self, name: &str) -> Result<Option<Topic<'static>>> {
         self.thing("topics", name, Code::NoSuchTopic)
     }
 
-    /// The node of this name, with hidden entities. `None` if it does not exist.
+    /// Returns the node of this name, with hidden entities; `None` if it does not exist.
     pub(crate) fn node(&self, name: &str) -> Result<Option<Node<'static>>> {
         self.thing("nodes", name, Code::NoSuchNode)
     }
 
-    /// All services, with hidden ones and their calls.
+    /// Returns all services, including hidden ones, with their calls.
     pub(crate) fn services(&self) -> Result<ServiceList<'static>> {
         let domain_id = self.domain_id;
         let path = format!("/services?domain_id={domain_id}&hidden=true");
@@ -139,8 +139,8 @@ impl Graph {
 /// Whether the note about missing names has been printed.
 static EXPLAINED: Once = Once::new();
 
-/// All names in a domain, including hidden ones. The reason for missing names is printed once on
-/// stderr.
+/// Returns all names in a domain, including hidden ones. The reason for missing names is printed
+/// once on stderr.
 pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names<'static>> {
     let names = fetch(agent, domain_id)?;
     explain(&names, agent, domain_id);
@@ -151,7 +151,7 @@ fn fetch(agent: &Agent, domain_id: u32) -> Result<Names<'static>> {
     Ok(agent.get_visible(&format!("/names?domain_id={domain_id}&hidden=true"))?)
 }
 
-/// Prints why names are missing, if any may be.
+/// Prints why names may be missing, if there is a reason.
 fn explain(names: &Names<'_>, agent: &Agent, domain_id: u32) {
     let others = names.domains.iter().filter(|other| **other != domain_id);
     let others: Vec<String> = others.map(u32::to_string).collect();
@@ -171,8 +171,9 @@ fn explain_late(names: &Names<'_>, agent: &Agent) {
     }
 }
 
-/// Note about announcements that were made before the agent or the capture started. Endpoints are
-/// announced once, and only to other participants. `None` if nothing is missing.
+/// Returns a note about announcements that were made before the agent or the capture started.
+/// Endpoints are announced once, and only to other participants. Returns `None` if nothing is
+/// missing.
 fn late(names: &Names<'_>, is_replay: bool) -> Option<String> {
     let Names {
         participants,
@@ -204,7 +205,7 @@ fn late(names: &Names<'_>, is_replay: bool) -> Option<String> {
     })
 }
 
-/// Prints the names of one type, or their number with `count`. `found` returns the text of either.
+/// Prints the names of one type, or their number with `count`. `found` returns the text.
 pub(crate) fn print_found(
     graph: &Graph,
     count: bool,
@@ -224,12 +225,12 @@ pub(crate) fn print_text(text: &str) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// As [`print_text`]; a refusal goes to stderr.
+/// Prints a text as [`print_text`] does; a refusal goes to stderr.
 pub(crate) fn answer(text: Result<String, Refused>) -> Result<ExitCode> {
     print_text(&text.map_err(|refused| UserError(refused.0))?)
 }
 
-/// As [`print_text`]; without a text, only the exit code reports the failure.
+/// Prints a text as [`print_text`] does. Without a text, only the exit code reports the failure.
 pub(crate) fn print_or_fail(text: Option<&str>) -> Result<ExitCode> {
     match text {
         Some(text) => print_text(text),

@@ -11,7 +11,7 @@ use ros2probe_daemon::agent::Speed;
 
 use super::{Output, UserError};
 
-/// Longest interval between two requests, in seconds.
+/// Maximum interval between two requests, in seconds.
 const MAX_INTERVAL: f64 = 3600.0;
 
 /// `rp top`.
@@ -46,7 +46,7 @@ pub(crate) struct Top {
     /// Show only topics with problems
     #[arg(long)]
     problems: bool,
-    /// Also show hidden topics and those of services
+    /// Also show hidden topics and the topics of services
     #[arg(long)]
     hidden: bool,
     /// Interval between requests to the agent
@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_interval_is_neither_too_short_nor_endless() {
+    fn a_too_short_or_too_long_interval_is_refused() {
         assert_eq!(interval("0.5").unwrap(), Duration::from_millis(500));
         for wrong in ["0", "-1", "inf", "nan", "", "1s", "1e9"] {
             assert!(interval(wrong).is_err(), "{wrong}");

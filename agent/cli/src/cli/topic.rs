@@ -104,7 +104,7 @@ struct Find {
 }
 
 impl Topic {
-    /// Exit code after Ctrl-C.
+    /// Returns the exit code after Ctrl-C.
     pub(crate) fn interrupted(&self) -> u8 {
         match &self.verb {
             Some(Verb::Hz(hz)) => hz.interrupted(),

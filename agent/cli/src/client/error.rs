@@ -23,7 +23,7 @@ pub enum ClientError {
         /// Path of the socket.
         path: PathBuf,
     },
-    /// No agent listens at the given place.
+    /// No agent listens at the given address.
     #[error("no agent answers at {place}: {}", because(source))]
     Unreachable {
         /// Socket path, or host and port.
@@ -54,7 +54,7 @@ pub enum ClientError {
         /// Whether the request had a token.
         offered: bool,
     },
-    /// Another program listens there.
+    /// Another program listens at the address.
     #[error("{place} is not a ros2probe agent")]
     NotAnAgent {
         /// Socket path, or host and port.
@@ -155,7 +155,7 @@ impl ClientError {
     }
 }
 
-/// Text of an I/O error without the operating system's number.
+/// Returns the text of an I/O error without the error number of the operating system.
 fn because(error: &io::Error) -> String {
     let text = error.to_string();
     let end = text.find(" (os error").unwrap_or(text.len());
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reason_is_without_the_number_of_the_system() {
+    fn a_reason_omits_the_error_number_of_the_system() {
         let refused = io::Error::from_raw_os_error(111);
         assert_eq!(because(&refused), "connection refused");
         assert_eq!(because(&io::Error::other("Name unknown")), "name unknown");

@@ -35,13 +35,13 @@ impl LineReader {
         }
     }
 
-    /// First line of the stream.
+    /// Returns the first line of the stream.
     pub(super) const fn opened(&self) -> &Open {
         &self.open
     }
 
-    /// The item of a line. `None` for [`Line::Open`]. `payload` holds the bytes after the line of a
-    /// sample.
+    /// Returns the item of a line; `None` for [`Line::Open`]. `payload` holds the bytes after the
+    /// line of a sample.
     pub(super) fn item(&mut self, line: &Line, payload: Bytes) -> Option<Item> {
         Some(match line {
             Line::Open(_) => return None,
@@ -81,7 +81,7 @@ impl LineReader {
         topic
     }
 
-    /// Topic of a line. Without a type, the type of an earlier line applies.
+    /// Returns the topic of a line. If the line has no type, the type of an earlier line applies.
     fn topic(
         &mut self,
         domain_id: u32,
@@ -129,7 +129,7 @@ fn sample(topic: Arc<Topic>, facts: &samples::Sample, payload: Bytes) -> Sample 
     }
 }
 
-/// Offered QoS of a writer in the form of discovery.
+/// Converts the offered QoS of a writer to the form of discovery.
 fn announced(offered: &samples::Offered) -> Offered {
     Offered {
         type_hash: offered.type_hash.as_deref().and_then(TypeHash::parse),
@@ -165,7 +165,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_stream_of_endless_topics_and_writers_is_read_and_not_remembered() {
+    fn topics_and_writers_beyond_the_caps_are_read_but_not_kept() {
         let mut reader = LineReader::new(Open { topics: Vec::new() });
         let cap = StreamTopics::CAP as u64;
         for number in (0..cap + 100).chain([3]) {
@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn writers_and_stamps_are_read_as_they_are_written() {
+    fn guids_and_stamps_are_read_in_the_form_in_which_they_are_written() {
         let writer = Guid {
             prefix: GuidPrefix([1, 0x0f, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]),
             entity: EntityId([0, 0, 0x12, 3]),

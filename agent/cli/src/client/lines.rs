@@ -9,12 +9,12 @@ use tokio::time::timeout;
 
 use super::{Agent, ClientError};
 
-/// Time for data that has already arrived, after the limit on silence has passed.
+/// Time to read data that has already arrived, after the limit on silence has passed.
 const GRACE: Duration = Duration::from_millis(500);
-/// Longest line, in bytes.
+/// Maximum length of a line, in bytes.
 const MAX_LINE: usize = 1 << 20;
 
-/// Longest run of raw bytes after a line.
+/// Maximum number of raw bytes after a line.
 const MAX_BYTES: usize = 1 << 30;
 
 /// Lines of one open response.
@@ -23,10 +23,10 @@ pub struct Lines<'a> {
     agent: &'a Agent,
     body: Incoming,
     buffer: BytesMut,
-    /// Leading bytes of the buffer without a line end.
+    /// Number of leading bytes of the buffer that contain no line end.
     searched: usize,
     ended: bool,
-    /// Longest silence, and the time waited since the agent last sent data.
+    /// Maximum silence, and the time waited since the agent last sent data.
     silence: Option<Duration>,
     waited: Duration,
 }
@@ -55,7 +55,7 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// The agent that sends the stream.
+    /// Returns the agent that sends the stream.
     pub(super) const fn agent(&self) -> &'a Agent {
         self.agent
     }
@@ -64,7 +64,7 @@ impl<'a> Lines<'a> {
     ///
     /// # Errors
     ///
-    /// The connection broke, the agent is silent for too long, or a line is too long.
+    /// Fails if the connection broke, the agent is silent for too long, or a line is too long.
     pub fn line(&mut self) -> Result<Option<Bytes>, ClientError> {
         let agent = self.agent;
         agent.runtime.block_on(self.next_line())
@@ -74,7 +74,7 @@ impl<'a> Lines<'a> {
     ///
     /// # Errors
     ///
-    /// As [`Self::line`].
+    /// Fails as [`Self::line`] does.
     pub fn line_within(&mut self, longest: Duration) -> Result<Next, ClientError> {
         let agent = self.agent;
         agent.runtime.block_on(async {
@@ -93,7 +93,7 @@ impl<'a> Lines<'a> {
     ///
     /// # Errors
     ///
-    /// The stream ends early, or `count` exceeds the limit.
+    /// Fails if the stream ends early, or if `count` exceeds the limit.
     pub fn bytes(&mut self, count: usize) -> Result<Bytes, ClientError> {
         let agent = self.agent;
         if count > MAX_BYTES {
@@ -153,7 +153,7 @@ impl<'a> Lines<'a> {
         Ok(false)
     }
 
-    /// Receives the next frame, or `None` after too long a silence.
+    /// Receives the next frame; `None` at the end of the stream. Fails after too long a silence.
     async fn frame(&mut self) -> Result<Option<Result<Frame<Bytes>, hyper::Error>>, ClientError> {
         let Some(silence) = self.silence else {
             return Ok(self.body.frame().await);
@@ -161,7 +161,8 @@ impl<'a> Lines<'a> {
         let left = silence.saturating_sub(self.waited);
         let mut frame = timeout(left, self.body.frame()).await;
         if frame.is_err() {
-            // This process may have been stopped for a while: data that has arrived is read first.
+            // This process may have been stopped for a while, so data that has arrived is read
+            // first.
             frame = timeout(GRACE, self.body.frame()).await;
         }
         self.waited = Duration::ZERO;

@@ -1,6 +1,6 @@
 //! Blocking client of an agent's API.
 //!
-//! An agent on this host is reached by its unix socket or loopback, one on another robot by
+//! An agent on this host is reached by its unix socket or loopback, an agent on another robot by
 //! `--host` and a token. A capture is replayed into an agent within this process, which answers the
 //! same requests.
 //!
@@ -44,14 +44,14 @@ pub use samples::Samples;
 pub use target::{InvalidEnvironment, Target};
 use transport::Transport;
 
-/// Longest wait for a whole answer. Graphs of thousands of topics take less than a second.
+/// Maximum wait for a whole answer. Graphs of thousands of topics take less than a second.
 const TIMEOUT: Duration = Duration::from_secs(30);
-/// Longest silence of an agent: before its answer, within it, and in a stream of messages, which
-/// has a clock.
+/// Maximum silence of an agent: before its answer, within it, and in a stream of messages, which
+/// contains the clock.
 const SILENCE: Duration = Duration::from_secs(5);
-/// Longest silence in a stream of events, which has a heartbeat every 15 s.
+/// Maximum silence in a stream of events, which has a heartbeat every 15 s.
 const BEATS: Duration = Duration::from_secs(40);
-/// Bytes of the largest answer. Streams have no such limit.
+/// Maximum size of an answer, in bytes. Streams have no such limit.
 const MAX_ANSWER: usize = 256 << 20;
 
 /// Connection to one agent.
@@ -67,45 +67,46 @@ impl Agent {
     ///
     /// # Errors
     ///
-    /// The agent is not running, its token cannot be read, or the capture cannot be read.
+    /// Fails if the agent is not running, or if its token or the capture cannot be read.
     pub fn reach(target: &Target) -> Result<Self, ClientError> {
         Self::find(target, Pace::ToEnd, false)
     }
 
-    /// As [`Self::reach`], but a capture is replayed only to `--from`, or not at all. The replay
-    /// continues with the first [`Self::stream`].
+    /// Finds an agent like [`Self::reach`], but replays a capture only to `--from`, or not at all.
+    /// The replay continues with the first [`Self::stream`].
     ///
     /// # Errors
     ///
-    /// As [`Self::reach`].
+    /// Fails as [`Self::reach`] does.
     pub fn reach_stream(target: &Target) -> Result<Self, ClientError> {
         Self::find(target, Pace::Pause, false)
     }
 
-    /// As [`Self::reach`], but all topics of a capture are measured. With `speed`, the replay
-    /// continues at that speed during requests.
+    /// Finds an agent like [`Self::reach`], but measures all topics of a capture. With `speed`, the
+    /// replay continues at that speed during requests.
     ///
     /// # Errors
     ///
-    /// As [`Self::reach`].
+    /// Fails as [`Self::reach`] does.
     pub fn reach_measured(target: &Target, speed: Option<Speed>) -> Result<Self, ClientError> {
         Self::find(target, speed.map_or(Pace::ToEnd, Pace::Live), true)
     }
 
-    /// As [`Self::reach_stream`], but all topics of a capture are measured.
+    /// Finds an agent like [`Self::reach_stream`], but measures all topics of a capture.
     ///
     /// # Errors
     ///
-    /// As [`Self::reach`].
+    /// Fails as [`Self::reach`] does.
     pub fn reach_stream_measured(target: &Target) -> Result<Self, ClientError> {
         Self::find(target, Pace::Pause, true)
     }
 
-    /// As [`Self::reach_stream_measured`], but the replay continues with [`Self::advance`].
+    /// Finds an agent like [`Self::reach_stream_measured`]. The replay continues with
+    /// [`Self::advance`].
     ///
     /// # Errors
     ///
-    /// As [`Self::reach`].
+    /// Fails as [`Self::reach`] does.
     pub fn reach_steps(target: &Target) -> Result<Self, ClientError> {
         Self::find(target, Pace::Steps, true)
     }
@@ -136,28 +137,28 @@ impl Agent {
     ///
     /// # Errors
     ///
-    /// The agent is unreachable, refuses, or sends an unexpected answer.
+    /// Fails if the agent is unreachable, refuses, or sends an unexpected answer.
     pub fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
         self.exchange(Method::GET, path, None, TIMEOUT)
     }
 
-    /// As [`Self::get`], with control characters escaped in all texts. Names come from the network
-    /// and are printed on a terminal.
+    /// Requests `path` like [`Self::get`], and escapes control characters in all texts. Names come
+    /// from the network and are printed on a terminal.
     ///
     /// # Errors
     ///
-    /// As [`Self::get`].
+    /// Fails as [`Self::get`] does.
     pub fn get_visible<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
         let answer = self.get(path)?;
         serde_json::from_value(visible_text(answer))
             .map_err(|source| self.transport.unreadable(path, source))
     }
 
-    /// As [`Self::get`], with at most `longest` for the answer.
+    /// Requests `path` like [`Self::get`], and waits for the answer for at most `longest`.
     ///
     /// # Errors
     ///
-    /// As [`Self::get`].
+    /// Fails as [`Self::get`] does.
     pub fn get_within<T: DeserializeOwned>(
         &self,
         path: &str,
@@ -170,7 +171,7 @@ impl Agent {
     ///
     /// # Errors
     ///
-    /// As [`Self::get`].
+    /// Fails as [`Self::get`] does.
     pub fn post<B: Serialize, T: DeserializeOwned>(
         &self,
         path: &str,
@@ -183,7 +184,7 @@ impl Agent {
     ///
     /// # Errors
     ///
-    /// As [`Self::get`].
+    /// Fails as [`Self::get`] does.
     pub fn put<B: Serialize, T: DeserializeOwned>(
         &self,
         path: &str,
@@ -196,7 +197,7 @@ impl Agent {
     ///
     /// # Errors
     ///
-    /// As [`Self::get`].
+    /// Fails as [`Self::get`] does.
     pub fn delete(&self, path: &str) -> Result<(), ClientError> {
         self.runtime.block_on(async {
             let answer = self.send(Method::DELETE, path, None).await?;
@@ -204,12 +205,12 @@ impl Agent {
         })
     }
 
-    /// Opens a stream of lines, some with raw bytes after them. It lasts until either end closes
-    /// it.
+    /// Opens a stream of lines, some with raw bytes after them. It lasts until the client or the
+    /// agent closes it.
     ///
     /// # Errors
     ///
-    /// As [`Self::get`].
+    /// Fails as [`Self::get`] does.
     pub fn stream(&self, path: &str) -> Result<Lines<'_>, ClientError> {
         self.runtime.block_on(async {
             let answer = self.send(Method::GET, path, None).await?;
@@ -237,7 +238,7 @@ impl Agent {
         serde_json::from_slice(text).map_err(|source| self.transport.unreadable(path, source))
     }
 
-    /// Error of a connection that closed before the answer.
+    /// Returns the error of a connection that closed before the answer.
     fn hung_up(&self, path: &str) -> ClientError {
         self.transport
             .broke(format!("{path} ended before its first byte"))
@@ -249,13 +250,13 @@ impl Agent {
         matches!(self.transport, Transport::ReplayAgent(_))
     }
 
-    /// How the replay of a capture ended. `None` for a live agent and during the replay.
+    /// Returns how the replay of a capture ended; `None` for a live agent and during the replay.
     #[must_use]
     pub fn outcome(&self) -> Option<Outcome> {
         self.transport.outcome()
     }
 
-    /// Address of the agent as text for people.
+    /// Returns the address of the agent as text for people.
     #[must_use]
     pub fn place(&self) -> String {
         self.transport.to_string()
@@ -365,7 +366,7 @@ mod tests {
     use ros2probe_api::names::{NodeName, TopicName};
 
     #[test]
-    fn no_name_reaches_a_terminal_with_control_characters() {
+    fn control_characters_in_names_are_escaped() {
         let node = r#"{"name": "/\u001b[2J\n/é", "instances": 1}"#;
         let node = visible_text(serde_json::from_str(node).unwrap());
         let node: NodeName<'_> = serde_json::from_value(node).unwrap();

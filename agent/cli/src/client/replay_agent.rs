@@ -1,5 +1,5 @@
-//! Agent within this process that replays a capture. Clients send requests over pipes in memory, as
-//! over sockets to other agents. The same code thus describes a capture and a robot.
+//! Agent within this process that replays a capture. Clients send requests over pipes in memory
+//! instead of sockets. The same code thus describes a capture and a robot.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -29,7 +29,7 @@ use tokio_util::sync::CancellationToken;
 const PIPE_BYTES: usize = 1 << 20;
 /// Cap on topics. A capture is read offline, so the limit of a live agent does not apply.
 const TOPICS: usize = 16_384;
-/// Longest wait for the end of a replay whose streams have ended.
+/// Maximum wait for the end of a replay whose streams have ended.
 const TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Range and pace of a replay.
@@ -50,13 +50,14 @@ pub(super) struct ReplayOptions {
 /// Pace of a replay during requests.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Pace {
-    /// It ends before the first request.
+    /// The replay ends before the first request.
     ToEnd,
-    /// It pauses until [`ReplayAgent::resume`].
+    /// The replay pauses until [`ReplayAgent::resume`].
     Pause,
-    /// It pauses until [`ReplayAgent::advance`], which names the next pause. It reports no progress.
+    /// The replay pauses until [`ReplayAgent::advance`], which names the next pause, and reports no
+    /// progress.
     Steps,
-    /// It continues at this speed.
+    /// The replay continues at this speed.
     Live(Speed),
 }
 
@@ -75,7 +76,7 @@ pub(super) struct ReplayAgent {
 pub struct Outcome {
     /// Reason why the rest of the capture was not read.
     pub fault: Option<String>,
-    /// Packets of unsupported link layers.
+    /// Number of packets of unsupported link layers.
     pub unsupported_packets: u64,
 }
 
@@ -92,8 +93,8 @@ pub(super) enum ReplayError {
 
 impl ReplayAgent {
     /// Replays `capture` on its own thread. `report` receives a line for each unreadable part of
-    /// the capture, except with [`Pace::Live`]; earlier packets count. Call it within a tokio
-    /// runtime, which serves the requests.
+    /// the capture, except with [`Pace::Live`]. Packets before such a part are processed. Call it
+    /// within a tokio runtime, which serves the requests.
     ///
     /// # Errors
     ///
@@ -139,7 +140,7 @@ impl ReplayAgent {
         })
     }
 
-    /// Result of the replay. `None` until its end.
+    /// Returns the result of the replay; `None` until its end.
     #[must_use]
     pub(super) fn outcome(&self) -> Option<Outcome> {
         let deadline = Instant::now() + TIMEOUT;
@@ -174,7 +175,7 @@ impl ReplayAgent {
         }
     }
 
-    /// Path of the capture.
+    /// Returns the path of the capture.
     #[must_use]
     pub(super) fn capture(&self) -> &Path {
         &self.capture
@@ -187,7 +188,7 @@ impl Drop for ReplayAgent {
     }
 }
 
-/// Opens the capture, with a control of its pause if there is one.
+/// Opens the capture, and the control of its pauses if it has any.
 fn open(
     capture: &Path,
     options: ReplayOptions,
@@ -267,11 +268,11 @@ struct Report {
     print: fn(&str),
 }
 
-/// Thread of a replay.
+/// The thread of a replay.
 struct Running {
     /// Result of the replay.
     outcome: Arc<OnceLock<Outcome>>,
-    /// Receives its error at the end.
+    /// Receives the error of the thread, if any, at its end.
     ended: oneshot::Receiver<Option<RunError>>,
 }
 
@@ -302,7 +303,7 @@ fn spawn(
     Ok(Running { outcome, ended })
 }
 
-/// Unreadable parts of a capture with their remedies, one a line.
+/// Returns the unreadable parts of a capture with their remedies, one per line.
 fn faults(
     capture: &Path,
     result: &Result<(), RunError>,

@@ -22,7 +22,7 @@ impl<'a> Samples<'a> {
     ///
     /// # Errors
     ///
-    /// The agent is unreachable, refuses, or sends an unexpected answer.
+    /// Fails if the agent is unreachable, refuses, or sends an unexpected answer.
     pub fn open(agent: &'a Agent, query: &str) -> Result<Self, ClientError> {
         let path = format!("/samples?payload=true&{query}");
         let mut lines = agent.stream(&path)?;
@@ -42,7 +42,7 @@ impl<'a> Samples<'a> {
         })
     }
 
-    /// Topics at the start of the stream.
+    /// Returns the topics at the start of the stream.
     #[must_use]
     pub const fn opened(&self) -> &Open {
         self.reader.opened()
@@ -52,7 +52,7 @@ impl<'a> Samples<'a> {
     ///
     /// # Errors
     ///
-    /// The connection broke, or an item cannot be decoded.
+    /// Fails if the connection broke, or if an item cannot be decoded.
     pub fn next_within(&mut self, timeout: Duration) -> Result<NextItem, ClientError> {
         let agent = self.lines.agent();
         let line = match self.lines.line_within(timeout)? {

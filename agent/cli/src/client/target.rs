@@ -10,7 +10,7 @@ use crate::ros2::{Dialect, dialect};
 use ros2probe_api::MAX_DOMAIN_ID;
 use ros2probe_daemon::run::CaptureTime;
 
-/// Largest token file, in bytes.
+/// Maximum size of a token file, in bytes.
 const MAX_TOKEN: u64 = 4096;
 
 /// Agent, domain and distribution of a command. Flatten it last, because of its heading.
@@ -53,11 +53,11 @@ pub struct Target {
 pub struct InvalidEnvironment(String);
 
 impl Target {
-    /// Domain of the command.
+    /// Returns the domain of the command.
     ///
     /// # Errors
     ///
-    /// `ROS_DOMAIN_ID` is not a valid domain.
+    /// Fails if `ROS_DOMAIN_ID` is not a valid domain.
     pub fn domain(&self) -> Result<u32, InvalidEnvironment> {
         if let Some(domain_id) = self.domain_id {
             return Ok(domain_id);
@@ -73,7 +73,7 @@ impl Target {
         }
     }
 
-    /// Dialect of the output.
+    /// Returns the dialect of the output.
     #[must_use]
     pub fn dialect(&self) -> Dialect {
         let named = || Dialect::of_distro(&std::env::var("ROS_DISTRO").ok()?);

@@ -28,10 +28,10 @@ const SOCKET: &str = "/run/ros2probe/api.sock";
 const LOOPBACK: &str = "127.0.0.1:17401";
 /// Default port of an agent on another host.
 const PORT: &str = "17401";
-/// Longest wait for a connection.
+/// Maximum wait for a connection.
 const TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Way to reach an agent.
+/// A transport to an agent.
 #[derive(Debug)]
 pub(super) enum Transport {
     /// Path of a unix socket.
@@ -89,7 +89,7 @@ impl Transport {
         }
     }
 
-    /// Value of the `Host` header.
+    /// Returns the value of the `Host` header.
     pub(super) fn host(&self) -> &str {
         match self {
             Self::Socket(_) | Self::ReplayAgent(_) => "localhost",
@@ -137,7 +137,7 @@ impl Transport {
         }
     }
 
-    /// How a replay ended; `None` for other transports and during the replay.
+    /// Returns how a replay ended; `None` for other transports and during the replay.
     pub(super) fn outcome(&self) -> Option<Outcome> {
         match self {
             Self::ReplayAgent(replayed) => replayed.outcome(),
@@ -264,7 +264,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_host_gets_a_port() {
+    fn a_host_without_a_port_gets_the_default_port() {
         for (host, address) in [
             ("robot1", "robot1:17401"),
             ("robot1:80", "robot1:80"),

@@ -1,5 +1,5 @@
-//! The file of a watchlist. Whether it can be written is checked before the robot is watched, so
-//! that a wrong path fails at once. Nothing is left of it before the text is complete.
+//! The file of a watchlist. A check before the robot is watched shows whether the file can be
+//! written, so that a wrong path fails early. No file remains until the text is complete.
 
 use std::convert::Infallible;
 use std::fs::{self, File};
@@ -34,7 +34,7 @@ impl Destination {
     ///
     /// # Errors
     ///
-    /// The file exists and `force` is not set, or it cannot be written.
+    /// Fails if the file exists and `force` is not set, or if it cannot be written.
     pub(super) fn check(&self, force: bool) -> Result<()> {
         let Self::File(path) = self else {
             return Ok(());
@@ -46,11 +46,12 @@ impl Destination {
         Ok(())
     }
 
-    /// Writes the text. If the file fails, standard output receives the text, as it took minutes.
+    /// Writes the text. If the file fails, standard output receives the text, which took minutes to
+    /// learn.
     ///
     /// # Errors
     ///
-    /// As [`Self::check`], or the disk is full.
+    /// Fails as [`Self::check`] does, or if the disk is full.
     pub(super) fn write(&self, text: &str, force: bool) -> Result<()> {
         let path = match self {
             Self::StandardOutput => return Ok(Output::new().write(text)?),
@@ -59,7 +60,7 @@ impl Destination {
         let written = open(path, force).and_then(|(file, is_new)| {
             let replaced = replace(file, text).with_context(|| unwritable(path));
             if replaced.is_err() && is_new {
-                // The error of the writing is reported.
+                // The error of the write is reported.
                 let _ = fs::remove_file(path);
             }
             replaced
@@ -70,7 +71,7 @@ impl Destination {
         written
     }
 
-    /// End of a sentence about the result.
+    /// Returns the end of a sentence about the result.
     pub(super) fn phrase(&self) -> String {
         match self {
             Self::StandardOutput => String::new(),

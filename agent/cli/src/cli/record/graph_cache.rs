@@ -1,4 +1,4 @@
-//! The agent's facts about topics, requested for all topics at once and cached for a second.
+//! The agent's facts about topics, requested for all topics together and cached for a second.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -9,7 +9,7 @@ use ros2probe_api::participants::{ParticipantList, UnknownWriter};
 use ros2probe_api::topics::TopicList;
 use ros2probe_daemon::recording::{DiscoveredTopic, GraphSnapshot, by_name};
 
-/// Longest wait for an answer about the graph, and its longest age.
+/// Maximum wait for an answer about the graph, and maximum age of the answer.
 const GRAPH_TIMEOUT: Duration = Duration::from_secs(2);
 const GRAPH_AGE: Duration = Duration::from_secs(1);
 
@@ -33,7 +33,7 @@ impl<'a> GraphCache<'a> {
         }
     }
 
-    /// Facts about these topics. The last known ones if the agent no longer answers.
+    /// Returns facts about these topics; the last known facts if the agent no longer answers.
     pub(super) fn of(&mut self, names: &[String]) -> Vec<DiscoveredTopic> {
         let is_old = self.at.is_none_or(|at| at.elapsed() > GRAPH_AGE);
         if is_old || names.iter().any(|name| !self.known.contains_key(name)) {
@@ -48,7 +48,7 @@ impl<'a> GraphCache<'a> {
         self.graph.clone()
     }
 
-    /// Writers whose announcement the agent missed. Empty if the agent no longer answers.
+    /// Returns writers whose announcement the agent missed; empty if the agent no longer answers.
     pub(super) fn unknown_writers(&self) -> Vec<UnknownWriter<'static>> {
         let participants = self
             .agent
@@ -77,7 +77,7 @@ impl<'a> GraphCache<'a> {
     }
 }
 
-/// Locks the cache. A poisoned lock is usable, since the contents are always consistent.
+/// Locks the cache. A poisoned lock is usable, since the content is always consistent.
 pub(super) fn locked<'l, 'a>(
     graph_cache: &'l Mutex<GraphCache<'a>>,
 ) -> MutexGuard<'l, GraphCache<'a>> {

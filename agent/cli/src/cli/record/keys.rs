@@ -46,6 +46,6 @@ pub(super) fn read_keys(give: Sender<Command>) {
         }
     };
     let thread = std::thread::Builder::new().name("keys".to_owned());
-    // Without this thread only the keys are missing.
+    // Without this thread, only the keys have no effect.
     let _ = thread.spawn(read);
 }

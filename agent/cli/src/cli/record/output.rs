@@ -1,4 +1,4 @@
-//! Messages of a recording on stderr, in the original's form: its state, its files and its end.
+//! Messages of a recording on stderr, in rosbag2's format: its state, its files and its end.
 
 use std::collections::{BTreeSet, HashMap};
 use std::io::{self, IsTerminal as _};
@@ -18,15 +18,15 @@ use super::super::notes::{SILENT, Sampling, is_sampled};
 use super::graph_cache::{GraphCache, locked};
 use super::shortfalls::{shortfalls, unobserved_lines};
 
-/// Interval at which writers without a known topic are requested, and at which they are reported
-/// while they send.
+/// Interval of requests for writers without a known topic, and of reports about them while they
+/// send.
 const LOOK: Duration = Duration::from_secs(2);
 const REPEAT: Duration = Duration::from_secs(10);
 
 /// Exit code of a conversion whose bag lacks messages of the capture.
 const INCOMPLETE: u8 = 3;
 
-/// Messages printed so far.
+/// Prints the messages, and keeps what was printed.
 pub(super) struct RecordingOutput<'a> {
     /// Source of reasons for silent topics, if available.
     graph_cache: Option<Arc<Mutex<GraphCache<'a>>>>,
@@ -46,11 +46,11 @@ pub(super) struct RecordingOutput<'a> {
 
 /// Writers whose messages a recording lacks because their topics are unknown.
 struct UnknownWriters<'a> {
-    /// Source, if available.
+    /// Source of the writers, if available.
     graph_cache: Option<Arc<Mutex<GraphCache<'a>>>>,
     looked: Option<Instant>,
     reported: Option<Instant>,
-    /// Messages of each at the last look.
+    /// Number of messages of each writer at the last report.
     messages: HashMap<String, u64>,
 }
 
@@ -64,7 +64,8 @@ impl<'a> UnknownWriters<'a> {
         }
     }
 
-    /// Returns the warning if it is due: at once, and from time to time while such writers send.
+    /// Returns the warning if it is due: first immediately, then at intervals while such writers
+    /// send.
     fn warning(&mut self, options: &FilterOptions, now: Instant) -> Option<String> {
         let is_due = |at: Option<Instant>, after| at.is_none_or(|at| now - at >= after);
         if !is_due(self.looked, LOOK) {
@@ -100,7 +101,7 @@ impl<'a> UnknownWriters<'a> {
     }
 }
 
-/// Returns whether the recording takes topics that are not known yet.
+/// Returns whether the recording may include topics that are not known yet.
 fn may_record_more(options: &FilterOptions, is_known: impl Fn(&str) -> bool) -> bool {
     options.all_topics
         || options.all_services
@@ -111,7 +112,7 @@ fn may_record_more(options: &FilterOptions, is_known: impl Fn(&str) -> bool) -> 
 }
 
 impl<'a> RecordingOutput<'a> {
-    /// `live`: the agent of a live recording, and its facts.
+    /// Creates the output. `live` is the agent of a live recording, and the cache of its facts.
     pub(super) fn new(live: Option<(&'a Agent, Arc<Mutex<GraphCache<'a>>>)>) -> Self {
         let (agent, graph_cache) = live.unzip();
         Self {
@@ -269,7 +270,7 @@ pub(super) fn report(ended: &Finished, outcome: &Outcome, is_replay: bool) -> Ex
         log("WARN", &line);
     }
     if let Some(error) = &ended.error {
-        // Includes the causes.
+        // This format includes the causes.
         let error = format!("{:#}", anyhow!(error.to_string()));
         log(
             "ERROR",
@@ -298,7 +299,7 @@ pub(super) fn report(ended: &Finished, outcome: &Outcome, is_replay: bool) -> Ex
     }
 }
 
-/// Prints a line in the original's log format.
+/// Prints a line in rosbag2's log format.
 pub(super) fn log(level: &str, text: &str) {
     let now = SystemTime::now().duration_since(UNIX_EPOCH);
     let now = now.unwrap_or_default();

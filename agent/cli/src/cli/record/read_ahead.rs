@@ -12,7 +12,7 @@ use ros2probe_daemon::subscriptions::{Item, NextItem};
 
 /// Memory of a waiting item besides its payload, in bytes.
 const OVERHEAD: usize = 256;
-/// Longest time until the reader notices that the recording has ended.
+/// Maximum time until the reader notices that the recording has ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Items between the reader and the storage, bounded in bytes.
@@ -29,12 +29,12 @@ struct Queue {
     bytes: usize,
     /// How the stream ended.
     end: Option<Result<(), ClientError>>,
-    /// Whether nobody takes items any more.
+    /// Whether the consumer has ended.
     is_closed: bool,
 }
 
 impl ReadAhead {
-    /// Returns an empty queue for this many bytes; it takes one larger item, too.
+    /// Returns an empty queue for this many bytes. It also holds a single larger item.
     pub(super) fn new(most_bytes: usize) -> Self {
         Self {
             most_bytes,
@@ -43,8 +43,8 @@ impl ReadAhead {
         }
     }
 
-    /// Reads until the stream ends or [`Self::close`]. While the queue is full, the stream waits in
-    /// the agent.
+    /// Reads until the stream ends or [`Self::close`] is called. While the queue is full, the
+    /// stream waits in the agent.
     pub(super) fn read(&self, samples: &mut Samples<'_>) {
         loop {
             let end = match samples.next_within(POLL_INTERVAL) {
@@ -72,7 +72,7 @@ impl ReadAhead {
     ///
     /// # Errors
     ///
-    /// The stream broke, and every item before that was returned.
+    /// Fails if the stream broke, after every earlier item was returned.
     pub(super) fn next(&self, timeout: Duration) -> Result<NextItem, ClientError> {
         let deadline = Instant::now() + timeout;
         let mut queue = self.lock();
@@ -101,7 +101,7 @@ impl ReadAhead {
         self.changed.notify_all();
     }
 
-    /// Adds an item when there is room.
+    /// Adds an item as soon as the queue has space.
     fn push(&self, item: Item) {
         let bytes = size(&item);
         let mut queue = self.lock();
@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn closing_releases_a_reader_that_waits_for_room() {
+    fn closing_the_queue_releases_a_reader_that_waits_for_space() {
         let ahead = ReadAhead::new(1);
         ahead.push(Item::Clock(Timestamp(1)));
         std::thread::scope(|scope| {
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn the_end_of_the_stream_comes_after_its_items() {
+    fn the_end_of_the_stream_is_returned_after_its_last_item() {
         let ahead = ReadAhead::new(OVERHEAD);
         ahead.push(Item::Clock(Timestamp(7)));
         ahead.lock().end = Some(Ok(()));

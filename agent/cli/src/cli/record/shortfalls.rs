@@ -7,7 +7,7 @@ use ros2probe_api::recording_report::{NO_SUBSCRIBER, OtherDomain, Report, Unknow
 use ros2probe_api::topics::UNSUBSCRIBED;
 use ros2probe_daemon::tables::RecordedTopics;
 
-/// Most topics named in one line.
+/// Maximum number of topics named in one line.
 const NAMES: usize = 8;
 /// Reasons for a published topic without visible messages, with their texts.
 const UNOBSERVED: [(&str, &str); 5] = [
@@ -30,7 +30,7 @@ const UNOBSERVED: [(&str, &str); 5] = [
     ),
 ];
 
-/// Text about missing messages, one line per topic. Empty if nothing is missing.
+/// Returns text about missing messages, one line per topic; empty if nothing is missing.
 pub(super) fn shortfalls(report: &Report) -> Vec<String> {
     let mut lines = Vec::new();
     for (name, topic) in &report.topics {
@@ -106,7 +106,7 @@ pub(super) fn shortfalls(report: &Report) -> Vec<String> {
     lines
 }
 
-/// Text about invisible topics, one line per reason.
+/// Returns text about invisible topics, one line per reason.
 pub(super) fn unobserved_lines(unobserved: &BTreeMap<String, String>) -> Vec<String> {
     let lines = UNOBSERVED.iter().filter_map(|(why, what)| {
         let topics = unobserved.iter().filter(|(_, reason)| reason == why);
@@ -123,7 +123,7 @@ fn counted(count: u64, thing: &str) -> String {
     format!("{count} {thing}{plural}")
 }
 
-/// The first names of a list.
+/// Returns the first names of a list, and the number of others.
 fn few(names: &[&str]) -> String {
     let shown = names
         .iter()
@@ -142,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn missing_messages_of_a_topic_are_one_line_with_their_reasons() {
+    fn missing_messages_of_a_topic_are_reported_in_one_line_with_their_reasons() {
         let mut report = Report::default();
         let topic = report.topic("/points");
         (topic.messages, topic.incomplete, topic.dropped) = (1, 3, 1);
@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn a_limit_another_type_and_topics_without_room_are_reported() {
+    fn a_reached_limit_a_second_type_and_topics_beyond_the_cap_are_reported() {
         let report = Report {
             no_room: 501,
             left_out: vec!["/a".to_owned()],
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_without_a_topic_of_the_bag_are_named_and_make_it_incomplete() {
+    fn messages_of_topics_that_a_bag_lacks_are_named_and_make_it_incomplete() {
         let mut report = Report::default();
         let unobserved = |why: &str| ("/imu".to_owned(), why.to_owned());
         report.unobserved.extend([unobserved(NO_SUBSCRIBER)]);

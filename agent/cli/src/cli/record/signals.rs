@@ -24,7 +24,7 @@ impl Phase {
         Self(Arc::new(AtomicU8::new(Self::STARTING)))
     }
 
-    /// Marks that a bag exists, which a signal completes.
+    /// Marks that a bag exists, so that a signal completes it.
     pub(super) fn begin(&self) {
         if !self.turn(Self::BEGUN) {
             // The process is about to end.
@@ -89,7 +89,7 @@ pub(super) fn listen(give: Sender<Command>, phase: Phase) -> io::Result<()> {
                     std::process::exit(INTERRUPTED.into());
                 }
             };
-            // A recording that has ended accepts no command.
+            // A recording that has ended accepts no commands.
             let _ = give.send(command);
         }
     };
