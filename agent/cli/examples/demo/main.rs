@@ -1,9 +1,9 @@
 //! `make demo`: a robot and an operator's host in separate network namespaces, the agent on the
-//! robot, and a live summary of its metrics. The machine's own network is not touched. The metrics,
-//! the control API and the page are relayed to ports of this machine: `rp`, `curl` and a browser
-//! reach them as on a real host.
+//! robot, and a live summary of its metrics. The machine's own network does not change. Metrics,
+//! control API and page are relayed to ports of this machine. `rp`, `curl` and a browser reach them
+//! there as on a real host.
 //!
-//! It reads only `/metrics`, which is public.
+//! The summary reads only `/metrics`, which is public.
 
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -24,14 +24,14 @@ mod relay;
 mod summary;
 
 const REFRESH: Duration = Duration::from_secs(2);
-/// The agent's default ports, used here too if they are free.
+/// The agent's default ports, which are also used here if they are free.
 const METRICS: u16 = 17400;
 const API: u16 = 17401;
 
 #[derive(Parser)]
 #[command(about = "Shows the agent watching a small robot; needs root for network namespaces")]
 struct Options {
-    /// The agent; default: `rp` of the same build
+    /// Program of the agent [default: `rp` of the same build]
     #[arg(long)]
     agent: Option<PathBuf>,
     #[arg(long, default_value = "config/ros2probe.yaml")]
@@ -55,7 +55,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// One thread: the processes started below live as long as it does.
+/// Runs on one thread: the processes started below live as long as this thread.
 #[tokio::main(flavor = "current_thread")]
 async fn demo(options: &Options) -> Result<()> {
     if let Some(socket) = &options.relay {

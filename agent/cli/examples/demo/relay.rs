@@ -37,7 +37,7 @@ impl Relays {
 }
 
 impl Relay {
-    /// Listens on `port` of this machine, or on any free port if it is taken.
+    /// Listens on `port` of this machine, or on any free port if `port` is in use.
     pub(crate) fn start(host: &Namespace, directory: &Path, port: u16) -> Result<Relay> {
         let socket = directory.join(format!("relay-{port}"));
         let program = std::env::current_exe().context("cannot tell where this program is")?;
@@ -85,7 +85,7 @@ pub(crate) fn serve(socket: &Path, port: u16) -> Result<()> {
     Ok(())
 }
 
-/// Copies both ways until both sides have closed; an error only ends the connection.
+/// Copies in both directions until both sides have closed. An error only ends the connection.
 fn carry(tcp: &TcpStream, unix: &UnixStream) {
     std::thread::scope(|scope| {
         scope.spawn(|| {

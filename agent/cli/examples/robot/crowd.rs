@@ -1,4 +1,4 @@
-//! Many small topics at once: the graph of a large robot without its sensors.
+//! Many small topics: the graph of a large robot without its sensors.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -32,7 +32,7 @@ pub(crate) async fn talk(
         spin(&mut node)?;
     }
     println!("ready");
-    // One after the other, as if each node had its own timer.
+    // The topics follow one another, as if each node had its own timer.
     let sending = periodic(rate * topics as f64, stop, move |count| {
         let turn = usize::try_from(count).unwrap_or_default() % topics;
         let publisher = publishers.get(turn).context("a publisher is missing");

@@ -60,7 +60,7 @@ struct Options {
     depth: usize,
     #[arg(long, default_value_t = 0)]
     domain: u16,
-    /// Fully qualified node name; each further one gets a silent endpoint on `<topic>_<n>`
+    /// Fully qualified node name; each further name gets a silent endpoint on `<topic>_<n>`
     #[arg(long)]
     node: Vec<String>,
     /// Write one JSON object per event to this file
@@ -95,7 +95,7 @@ enum Role {
     Sub,
     /// `--topics` topics of an Imu at `--rate`
     Talkers,
-    /// Subscribes to them
+    /// Subscribes to the topics of `talkers`
     Listeners,
 }
 
@@ -135,8 +135,8 @@ async fn lidar(
     let mut imu = node(context, "/imu_driver", NodeOptions::new())?;
     let points = advertise(&mut lidar, "/points", "sensor_msgs/PointCloud2", &sensor)?;
     let scan = advertise(&mut lidar, "/scan", "sensor_msgs/LaserScan", &sensor)?;
-    // RustDDS drops samples that its history overwrites before they are sent: half a second
-    // survives a busy CPU.
+    // RustDDS drops samples that its history overwrites before they are sent. A history of half a
+    // second is enough on a busy CPU.
     let patient = QosProfile::default().history(History::KeepLast { depth: 100 });
     let measurements = advertise(&mut imu, "/imu", "sensor_msgs/Imu", &patient)?;
     spin(&mut lidar)?;
@@ -240,7 +240,7 @@ async fn monitor(
     join([driving])
 }
 
-/// Runs the `pub` role: waits for its peers, sends `count` samples at `rate`, logs each.
+/// Runs the `pub` role: waits for its peers, sends `count` samples at `rate`, and logs each.
 async fn publish(
     context: &Context,
     options: &Options,
@@ -424,8 +424,8 @@ async fn wait_for_line() -> Result<()> {
     .await?
 }
 
-/// The event log: one JSON object per line, flushed at once, so that a killed process leaves a
-/// complete log.
+/// The event log: one JSON object per line. Each line is flushed immediately, so that a killed
+/// process leaves a complete log.
 struct Log {
     file: Option<Mutex<File>>,
 }

@@ -1,5 +1,5 @@
 //! The robot's ROS messages, with fields in the order of their `.msg` definitions, which serde and
-//! CDR follow. Contains the messages of the roles only, all of them complete.
+//! CDR follow. The module contains only the messages of the roles, all of them complete.
 
 use std::fmt;
 
@@ -9,8 +9,8 @@ use ros2_client::builtin_interfaces::Time;
 use serde::de::{Deserializer, Visitor};
 use serde::{Deserialize, Serialize, Serializer};
 
-/// Bytes of a serialized `PointCloud2` besides its `data` if `fields` is empty and `frame_id` is
-/// `lidar`: 4 bytes of encapsulation, 48 before the data and 1 after.
+/// Size of a serialized `PointCloud2` besides its `data`: 4 bytes of encapsulation, 48 before the
+/// data and 1 after it. Assumes empty `fields` and the `frame_id` `lidar`.
 const POINT_CLOUD_OVERHEAD: usize = 53;
 const FLOAT32: u8 = 7;
 
@@ -109,7 +109,7 @@ impl PointCloud2 {
     }
 }
 
-/// Returns the byte at an offset of the points: adjacent bytes differ, and so do fragments. Equals
+/// Returns the byte at an offset of the points. Adjacent bytes differ, and so do fragments. Equals
 /// `pattern` in `agent/cli/tests/peers/peer.hpp`.
 fn pattern(place: usize) -> u8 {
     let [low, ..] = (place * 7 + (place >> 8) * 13 + (place >> 16)).to_le_bytes();

@@ -1,10 +1,10 @@
 //! Allows the process to be stopped and continued. SIGCONT, like a debugger, interrupts
-//! `epoll_wait` with EINTR, which RustDDS 0.15 treats as the end of its event loop: it would never
+//! `epoll_wait` with EINTR. RustDDS 0.15 treats EINTR as the end of its event loop and would never
 //! receive again.
 
 use std::ffi::c_int;
 
-/// Replaces the C library's function in this program: waits again after an interruption.
+/// Replaces the C library's function in this program. Waits again after an interruption.
 ///
 /// # Safety
 /// The same as for `epoll_wait(2)`: `events` has room for `max_events`.

@@ -1,4 +1,4 @@
-//! Memory of every table when it is full: forges participants, endpoints and samples up to the
+//! Memory of every table when it is full. Forges participants, endpoints and samples up to the
 //! default caps, one kind after the other, and prints the agent's memory after each. It checks
 //! nothing.
 
@@ -17,15 +17,15 @@ const PARTICIPANTS: u32 = 1000;
 const ENDPOINTS: u32 = 8192;
 /// Each participant has a writer for samples, one for `ros_discovery_info`, and readers.
 const READERS: u32 = ENDPOINTS / PARTICIPANTS - 2;
-/// No process listens on this port: only the agent sees the packets.
+/// No process listens on this port, so only the agent sees the packets.
 const NOBODY: u16 = 7399;
-/// Packets between pauses: fast enough for leases of 12 s, slow enough for every ring.
+/// Number of packets between pauses: fast enough for leases of 12 s, slow enough for every ring.
 const BURST: usize = 8;
 const PAUSE: Duration = Duration::from_millis(2);
-/// Participants that announce their endpoints before all participants renew their leases.
+/// Number of participants that announce their endpoints before all participants renew their leases.
 const GROUP: usize = 250;
 const SAMPLE: usize = 320;
-/// A history of a minute's samples and several snapshots.
+/// Number of rounds: enough for the samples of a minute of history and several snapshots.
 const ROUNDS: u32 = 20;
 
 /// Memory of one kind of entry.
@@ -102,7 +102,7 @@ pub(crate) fn measure(program: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Prints the table of what each kind of entry costs, and the cost of a scrape.
+/// Prints the table of the cost of each kind of entry, and the cost of a scrape.
 fn print(steps: Vec<Step>, page: Scraped) {
     println!(
         "| entries | how many | MB unreclaimable | bytes each |\n| --- | ---: | ---: | ---: |"
@@ -166,7 +166,7 @@ fn scraped(agent: &Agent<'_>) -> Result<Scraped> {
     })
 }
 
-/// Returns all announcements of a participant: two writers, its readers, its node.
+/// Returns all announcements of a participant: two writers, its readers and its node.
 fn announced((talker, number): (&Talker, u32)) -> Vec<Vec<u8>> {
     let [_, entities, samples, node] = talker.introduction(&format!("node{number}"));
     let readers = (0..READERS).map(|reader| {

@@ -1,6 +1,6 @@
 //! Footprint of the shipped agent: its file size, its startup time, and its memory with the default
 //! configuration. Memory is measured idle without scrapes, and with 200 measured topics and a
-//! scrape every 5 s. Only memory that cannot be reclaimed counts; it does not depend on the
+//! scrape every 5 s. Only memory that cannot be reclaimed counts. It does not depend on the
 //! machine's load, so too much of it is a failure.
 
 use std::fmt;
@@ -28,14 +28,14 @@ pub(crate) const TOPICS: usize = 200;
 /// Messages per second of each topic.
 const RATE: &str = "5";
 const SCRAPES: Duration = Duration::from_secs(5);
-/// Interval of reading the memory: a scrape's page exists for some 20 ms.
+/// Interval of reading the memory, since a scrape's page exists for some 20 ms.
 const SAMPLING: Duration = Duration::from_millis(5);
 /// Time after the start until one-time work is done.
 const SETTLED: Duration = Duration::from_secs(10);
 const STARTS: usize = 5;
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Most unreclaimable memory of the agent, when idle, and while it measures [`TOPICS`].
+/// Maximum unreclaimable memory of the agent, when idle, and while it measures [`TOPICS`].
 const IDLE: u64 = 8_000_000;
 const BUSY: u64 = 16_000_000;
 
@@ -49,20 +49,20 @@ pub(crate) struct Footprint {
 /// Figures with one source.
 struct OfSource {
     name: &'static str,
-    /// Medians.
+    /// Medians of the startup times.
     start: Start,
     idle: Memory,
     busy: Memory,
-    /// Topics with messages at the end.
+    /// Number of topics with messages at the end.
     topics: usize,
 }
 
 /// Times from the start of the process.
 #[derive(Clone, Copy)]
 struct Start {
-    /// Until it notified the service manager that it is ready.
+    /// Time until the process notified the service manager that it is ready.
     ready: Duration,
-    /// Until it served the first metrics page.
+    /// Time until the process served the first metrics page.
     scrape: Duration,
 }
 
@@ -158,7 +158,7 @@ impl Start {
             UnixDatagram::bind(notify).context("cannot bind a socket for READY=1")?;
         agent_totals.set_nonblocking(true)?;
         let began = Instant::now();
-        // It ends with this thread in any case.
+        // The process ends with this thread in any case.
         let mut command = Command::new("setpriv");
         command.args(["--pdeathsig", "KILL"]).arg(program);
         command.args(["run", "--config"]).arg(configuration);
@@ -267,8 +267,8 @@ impl Drop for Killed {
     }
 }
 
-/// Returns the shipped configuration with one source; at the sockets of these hosts only, because
-/// other processes on this machine may send.
+/// Returns the shipped configuration with one source. It observes only the sockets of these hosts,
+/// because other processes on this machine may send.
 pub(crate) fn configured(source: &str, link: &Link) -> Result<String> {
     let mut text = CONFIGURATION.to_owned();
     let cgroup = link.cgroup().display().to_string();
@@ -302,7 +302,7 @@ pub(crate) fn crowd(link: &Link) -> Result<[Process; 2]> {
     ])
 }
 
-/// Returns the number of topics with messages, after all have some or a timeout expires.
+/// Returns the number of topics with messages, once all topics have some or a timeout expires.
 pub(crate) fn wait_for_topics(agent: &Agent<'_>) -> Result<usize> {
     let deadline = Instant::now() + PATIENCE;
     loop {

@@ -1,12 +1,12 @@
-//! `make bench`: the cost of observing. Each workload runs between two hosts in turns: without an
-//! observer, with the agent (host hook, then packet sockets), and with an additional Cyclone DDS
-//! subscriber in C++. The table shows CPU time and memory of the observer, and the total of all
-//! processes.
+//! `make bench`: the cost of observing. Each workload runs between two hosts, alternately without
+//! an observer, with the agent (host hook, then packet sockets), and with a Cyclone DDS subscriber
+//! in C++. The table shows CPU time and memory of the observer, and the total of all processes.
 //!
-//! Before that it measures the agent's footprint (`footprint`) and the cost of open pages (`tabs`).
+//! Before that, it measures the agent's footprint (`footprint`) and the cost of open pages
+//! (`tabs`).
 //!
 //! Figures that do not depend on the machine's load (memory, bytes copied, messages counted) are
-//! checked and end the run with a failure; CPU time is compared with its targets, and only
+//! checked and end the run with a failure. CPU time is compared with its targets, and only
 //! reported.
 
 mod caps;
@@ -32,7 +32,7 @@ use ros2probe_testing::harness::peer::{Stack, Stream};
 #[derive(Parser)]
 #[command(about = "Measures what observing costs; needs root for network namespaces")]
 struct Options {
-    /// The agent; default: the shipped static binary
+    /// Program of the agent [default: the shipped static binary]
     #[arg(long)]
     agent: Option<PathBuf>,
     /// Length of each measurement
@@ -51,7 +51,8 @@ struct Options {
     /// Prints minimum, median and maximum of each kind instead of the table
     #[arg(long)]
     spread: bool,
-    /// With `--spread`: another binary of the agent, whose windows alternate with the first one's
+    /// With `--spread`: another binary of the agent, whose windows alternate with those of the
+    /// first
     #[arg(long, requires = "spread")]
     before: Option<PathBuf>,
     /// With `--spread`: only these kinds
@@ -76,7 +77,8 @@ struct Workload {
     reference: Option<f64>,
 }
 
-/// Two lidars of 435 and 103 Mbit/s, four cameras of 36, a depth camera of 147, and small topics.
+/// Two lidars of 435 and 103 Mbit/s, four cameras of 36 Mbit/s, a depth camera of 147 Mbit/s, and
+/// small topics.
 const ROBOT: [(usize, f64); 10] = [
     (2_720_000, 20.0),
     (644_000, 20.0),
@@ -164,8 +166,8 @@ fn main() -> Result<ExitCode> {
     })
 }
 
-/// Measures without an observer, with the agent, and with the subscriber, in turns, so that the
-/// machine's other work affects all alike.
+/// Measures alternately without an observer, with the agent, and with the subscriber, so that other
+/// work of the machine affects all of them equally.
 fn measure(workload: &Workload, stack: Stack, program: &Path, options: &Options) -> Result<Row> {
     let streams = workload.streams();
     let seconds = Duration::from_secs(options.seconds);
@@ -181,7 +183,7 @@ fn measure(workload: &Workload, stack: Stack, program: &Path, options: &Options)
 }
 
 /// Measures as [`measure`] does, with each binary of the agent. Every round begins with another
-/// kind, so that none always follows the same one.
+/// kind, so that no kind always follows the same one.
 fn spread(workload: &Workload, stack: Stack, program: &Path, options: &Options) -> Result<Spread> {
     let streams = workload.streams();
     let seconds = Duration::from_secs(options.seconds);

@@ -1,4 +1,4 @@
-//! The table, as Markdown, and the missed targets.
+//! The table, as Markdown, and the targets that were missed.
 
 use std::fmt;
 
@@ -22,24 +22,25 @@ pub(crate) struct Row {
 
 /// Limits for the agent's cost.
 pub(crate) struct Targets {
-    /// Fraction of the subscriber's CPU time.
+    /// Maximum CPU time, as a fraction of the subscriber's.
     of_subscriber: f64,
-    /// Fraction of the reference implementation's CPU time.
+    /// Maximum CPU time, as a fraction of the reference implementation's.
     of_reference: f64,
-    /// Bytes that cannot be reclaimed.
+    /// Maximum number of bytes that cannot be reclaimed.
     unreclaimable: u64,
-    /// Fraction of the traffic that is copied, for large samples.
+    /// Maximum fraction of the traffic that is copied, for large samples.
     copied: f64,
-    /// Fraction of a core for the agent with the host hook.
+    /// Maximum fraction of a core for the agent with the host hook.
     of_core: f64,
-    /// All processes with the host hook, as a fraction of those without it, for large samples.
+    /// Maximum CPU time of all processes with the host hook, as a fraction of that without it, for
+    /// large samples.
     of_workload: f64,
 }
 
 /// One target that was missed.
 pub(crate) struct Miss {
     what: String,
-    /// Whether it is a failure: the figure does not depend on the machine's load.
+    /// Whether the miss is a failure: the figure does not depend on the machine's load.
     pub(crate) fails: bool,
 }
 
@@ -178,8 +179,8 @@ impl Row {
         median(self.of(observer).map(|window| window.cpu))
     }
 
-    /// Returns the additional work of the other processes in the kernel, which is visible only
-    /// here.
+    /// Returns the CPU time of all processes, as a fraction of that without an observer. It
+    /// includes the observer's work in the kernel on behalf of other processes.
     fn beside_nobody(&self, observer: Observer) -> f64 {
         let median = |who| median(self.of(who).map(|window| window.workload));
         median(observer) / median(Observer::None)
@@ -189,7 +190,7 @@ impl Row {
         !self.name.contains("320 B")
     }
 
-    /// Returns medians by observer.
+    /// Returns the median for each observer.
     fn each(&self, value: impl Fn(&Window) -> f64) -> String {
         let medians = Observer::ALL.map(|who| median(self.of(who).map(&value)));
         medians.map(|median| format!("{median:.2}")).join(", ")

@@ -1,4 +1,4 @@
-//! Minimum, median and maximum of windows that take turns, and what each observer adds.
+//! Minimum, median and maximum of alternating windows, and the additional cost of each observer.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ pub(crate) const HEAD: &str = "\
 | workload | observer | windows | its CPU s | workload CPU s | median / alone | counted / sent |
 | --- | --- | ---: | ---: | ---: | ---: | ---: |";
 
-/// One observer, and what its windows took.
+/// One observer, and the cost of its windows.
 pub(crate) struct Subject {
     observer: Observer,
     program: PathBuf,

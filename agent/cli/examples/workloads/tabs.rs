@@ -20,12 +20,12 @@ use ros2probe_testing::harness::usage::Usage;
 
 /// Numbers of streams open at the same time.
 const COUNTS: [usize; 3] = [0, 1, 10];
-/// Time between opening the streams and the measurement, for sending the whole state.
+/// Time between opening the streams and the measurement, so that the whole state has been sent.
 const SETTLED: Duration = Duration::from_secs(5);
-/// Most of a core that one page may use.
+/// Maximum fraction of a core that one page may use.
 const OF_CORE: f64 = 0.01;
 
-/// Figures of the agent with some streams.
+/// Figures of the agent with this number of streams.
 struct Open {
     streams: usize,
     /// CPU time divided by wall time.
@@ -41,7 +41,7 @@ struct Tab {
     bytes: Arc<AtomicU64>,
 }
 
-/// Prints the table. Returns a miss if one page exceeds its share.
+/// Prints the table. Returns a miss if one page exceeds its maximum.
 pub(crate) fn measure(program: &Path, length: Duration) -> Result<Vec<Miss>> {
     let link = Link::new()?;
     let directory = tempfile::tempdir().context("cannot create a directory")?;

@@ -18,7 +18,7 @@ const SAMPLING: Duration = Duration::from_secs(1);
 /// Length of time to which CPU times are scaled.
 pub(crate) const UNIT_SECONDS: f64 = 20.0;
 
-/// The observer.
+/// The observer of a window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum)]
 pub(crate) enum Observer {
     None,
@@ -26,7 +26,7 @@ pub(crate) enum Observer {
     Host,
     /// The agent with packet sockets.
     Wire,
-    /// One more subscriber to everything, Cyclone DDS in C++.
+    /// An additional subscriber to everything, Cyclone DDS in C++.
     Subscriber,
 }
 
@@ -40,13 +40,13 @@ pub(crate) struct Window {
     pub(crate) cpu: f64,
     /// The observer's maximum memory in the window.
     pub(crate) memory: Memory,
-    /// Samples written, from the publishers' first to their last.
+    /// Number of samples written, from the publishers' first to their last.
     pub(crate) sent: u64,
     /// The agent's counters at the end.
     pub(crate) agent_totals: Option<AgentTotals>,
 }
 
-/// The agent's counters over its whole life, startup included.
+/// The agent's counters since its start.
 pub(crate) struct AgentTotals {
     pub(crate) counted: f64,
     pub(crate) lost: f64,
@@ -64,13 +64,13 @@ impl Observer {
         Observer::Subscriber,
     ];
 
-    /// Returns whether it is the agent.
+    /// Returns whether the observer is the agent.
     pub(crate) const fn is_agent(self) -> bool {
         matches!(self, Observer::Host | Observer::Wire)
     }
 
-    /// Returns the configuration if the observer is the agent. With the host hook it observes both
-    /// hosts, as if all nodes ran on one, but nothing else on the machine.
+    /// Returns the configuration if the observer is the agent. With the host hook, the agent
+    /// observes both hosts as if all nodes ran on one, but nothing else on the machine.
     fn configuration(self, link: &Link) -> Option<String> {
         let capture = match self {
             Observer::Host => format!("source: host, cgroup: {}", link.cgroup().display()),
