@@ -175,7 +175,7 @@ pub enum NotClosed {
 
 impl MessageType {
     /// Parses the text of a bag's schema in encoding `ros2msg`: the type's own definition, then its
-    /// nested types, each below a line of 80 `=` and a line `MSG: package/Type`.
+    /// nested types. Each nested type is below a line of 80 `=` and a line `MSG: package/Type`.
     pub fn parse(root: &TypeName, text: &str) -> Result<Self, SchemaError> {
         let mut definitions = HashMap::new();
         for (name, part) in crate::definition::schema::parts(root, text)? {

@@ -6,7 +6,7 @@
 //! - [`yaml`], [`csv`] and [`python`] print values as `ros2 topic echo` prints them; [`Truncation`]
 //!   limits their length. [`filter`] evaluates an expression over a message.
 //!
-//! Definitions are read from files as rosidl reads them; nothing is generated, loaded or executed.
+//! Definitions are read from files as rosidl reads them. Nothing is generated, loaded or executed.
 //! Files, names and payloads are untrusted: every size, number and depth is bounded.
 //!
 //! ```

@@ -1,9 +1,9 @@
 //! A small robot of real ROS 2 participants (crate `ros2-client` on RustDDS), for machines without
-//! ROS: the demo observes it and the tests count its messages. It behaves like any node and does
+//! ROS. The demo observes it, and the tests count its messages. It behaves like any node and does
 //! not communicate with the agent.
 //!
-//! `lidar`, `base` and `monitor` are the demo's processes; `pub` and `sub` are the test peers and
-//! share their command line and log format with `agent/cli/tests/peers`; `talkers` and `listeners`
+//! `lidar`, `base` and `monitor` are the demo's processes. `pub` and `sub` are the test peers, which
+//! share their command line and log format with `agent/cli/tests/peers`. `talkers` and `listeners`
 //! have many small topics (`crowd`).
 
 use std::fs::File;

@@ -29,8 +29,8 @@ Examples:
   rp man | man -l -
   rp man /usr/local/share/man/man1")]
 pub(crate) struct Manual {
-    /// Directory for one page per command: rp.1, rp-topic.1, rp-topic-list.1, ... [default: print the
-    /// page of `rp` to stdout]
+    /// Directory for one page per command: rp.1, rp-topic.1, rp-topic-list.1, ... [default: print
+    /// the page of `rp` to stdout]
     #[arg(value_name = "DIR")]
     directory: Option<PathBuf>,
 }

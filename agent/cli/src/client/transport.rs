@@ -128,8 +128,8 @@ impl Transport {
         }
     }
 
-    /// Replays to this time and pauses again. Returns `false` if the replay has ended, and for other
-    /// transports.
+    /// Replays to this time and pauses again. Returns `false` if the replay has ended, and for
+    /// other transports.
     pub(super) async fn advance(&self, to: CaptureTime) -> bool {
         match self {
             Self::ReplayAgent(replayed) => replayed.advance(to).await,

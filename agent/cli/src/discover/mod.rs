@@ -120,7 +120,8 @@ pub fn local_participant(
 ) -> Result<(LocalParticipant, UdpSocket), DiscoverError> {
     let open = || {
         let address = leaving(target.metatraffic)?;
-        // Fast DDS answers a participant of its own host at 127.0.0.1, whatever address is announced.
+        // Fast DDS answers a participant of its own host at 127.0.0.1, whatever address is
+        // announced.
         let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
         socket.set_read_timeout(Some(SLICE))?;
         let port = socket.local_addr()?.port();

@@ -1,5 +1,6 @@
 //! Checks of permissions: those of this process, of the running agent and of the service, with the
-//! command that grants missing ones. `ros2probe_daemon::privilege` defines the required capabilities.
+//! command that grants missing ones. `ros2probe_daemon::privilege` defines the required
+//! capabilities.
 
 use super::answers::Answers;
 use super::finding::{Area, Finding, Severity};

@@ -1,5 +1,5 @@
-//! Checks of the daemon of the `ros2` command line: whether the agent answers in its place, and which
-//! commands then create no participant.
+//! Checks of the daemon of the `ros2` command line: whether the agent answers in its place, and
+//! which commands then create no participant.
 
 use super::finding::{Area, Finding, Severity};
 use ros2probe_api::health::Ros2DaemonPort;

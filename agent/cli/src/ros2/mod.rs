@@ -1,5 +1,5 @@
-//! Text of `rp topic`, `rp node`, `rp service`, `rp action` and `rp bag info`: the format of the
-//! `ros2` command line in the dialect of a distribution.
+//! Text of `rp topic`, `rp node`, `rp service`, `rp action` and `rp bag info`, in the format of
+//! ros2cli of a distribution.
 //!
 //! Pure functions: no requests, no clock, no output.
 

@@ -97,8 +97,8 @@ fn is_absent(error: &io::Error) -> bool {
     )
 }
 
-/// Opens a regular file for reading. The open never blocks, as it would on a pipe without a writer;
-/// the check is made on the open file, so the path cannot be swapped in between.
+/// Opens a regular file for reading. The open never blocks, as it would on a pipe without a writer.
+/// The check is made on the open file, so the path cannot be swapped in between.
 fn open(path: &Path) -> io::Result<File> {
     let flags = libc::O_NONBLOCK | libc::O_NOCTTY;
     let mut options = OpenOptions::new();

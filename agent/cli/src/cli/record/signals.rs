@@ -48,7 +48,7 @@ impl Phase {
 }
 
 /// Handles Ctrl-C and SIGTERM: the first ends the recording in order, the second skips slow steps,
-/// the third ends at once. SIGUSR1 writes the messages in memory.
+/// and the third ends the process immediately. SIGUSR1 writes the messages in memory.
 pub(super) fn listen(give: Sender<Command>, phase: Phase) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
