@@ -1,6 +1,6 @@
-//! What is shipped: static binaries for two architectures that are the same program. The one for
-//! aarch64 runs under qemu, which has everything but BPF. `make test` runs this on an unoptimized
-//! build of it and the tests' own `rp`, `make dist` on the release binaries (`ROS2PROBE_DIST`).
+//! The shipped static binaries, which are the same program for two architectures. The aarch64
+//! binary runs under qemu, which has everything but BPF. `make test` covers an unoptimized build of
+//! it and the tests' own `rp`. `make dist` covers the release binaries (`ROS2PROBE_DIST`).
 
 mod elf;
 mod program;
@@ -21,7 +21,7 @@ fn data(file: &str) -> String {
     path.to_str().unwrap().to_owned()
 }
 
-/// Captures of two vendors, and one with messages in fragments of which some were lost.
+/// Returns captures of two vendors, and one with fragmented messages of which some were lost.
 fn captures() -> [String; 3] {
     [
         data("../../wire/tests/data/cyclonedds-samehost-any.pcap.gz"),
@@ -30,12 +30,12 @@ fn captures() -> [String; 3] {
     ]
 }
 
-/// A robot with services and actions.
+/// Returns the capture of a robot with services and actions.
 fn graph() -> String {
     data("tests/fixtures/cli/graph.pcap.gz")
 }
 
-/// Runs both programs, and returns their output, which is the same.
+/// Runs both programs, and returns their output after checking that it is the same.
 fn both(arguments: &[&str]) -> Output {
     let native = Program::native().run(arguments);
     let arm = Program::arm().run(arguments);
@@ -48,7 +48,7 @@ fn text(bytes: &[u8]) -> String {
 }
 
 #[test]
-fn binaries_are_static_and_of_their_architecture() {
+fn each_binary_is_static_and_of_its_architecture() {
     for Binary { architecture, path } in program::shipped() {
         let elf = Elf::read(&path);
         let name = path.display();
@@ -61,7 +61,7 @@ fn binaries_are_static_and_of_their_architecture() {
         assert!(!elf.has_interpreter(), "{name} needs a dynamic linker");
         assert_eq!(elf.needed(), 0, "{name} needs shared libraries");
         assert!(!elf.has_executable_stack(), "{name}");
-        // A kernel with pages of 16 or 64 KiB maps nothing that is aligned to less.
+        // A kernel with pages of 16 or 64 KiB cannot map a segment with a smaller alignment.
         if machine == Machine::AARCH64 {
             let alignments = elf.load_alignments();
             let fits = |alignment: &u64| alignment.is_multiple_of(65_536);
@@ -83,7 +83,7 @@ fn the_same_kernel_objects_are_in_each_binary_byte_for_byte() {
         .flat_map(|path| objects.iter().map(move |o| (path, o)))
     {
         let binary = std::fs::read(path).unwrap();
-        // Its offset is a multiple of 8, because it is read in place.
+        // The offset of the object is a multiple of 8, because it is read in place.
         let found = binary
             .chunks_exact(8)
             .zip((0..).step_by(8))
@@ -93,11 +93,11 @@ fn the_same_kernel_objects_are_in_each_binary_byte_for_byte() {
 }
 
 #[test]
-fn version_help_and_what_is_generated_are_the_same() {
+fn version_help_and_generated_texts_are_the_same_on_both_architectures() {
     let version = both(&["--version"]);
     let expected = concat!("rp ", env!("CARGO_PKG_VERSION"), "\n");
     assert_eq!(text(&version.stdout), expected);
-    // It calls itself what its file is called.
+    // Each program calls itself by the name of its file.
     let help = [Program::native(), Program::arm()].map(|program| {
         let help = text(&program.run(&["--help"]).stdout);
         help.replace(&format!("Usage: {} ", program.file_name()), "Usage: rp ")
@@ -123,7 +123,7 @@ fn version_help_and_what_is_generated_are_the_same() {
     assert_eq!(pages(&Program::arm()), native);
 }
 
-/// Names and contents of all files below.
+/// Returns names and contents of all files below a directory.
 fn tree(directory: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     let mut files = Vec::new();
     for entry in std::fs::read_dir(directory).unwrap() {
@@ -139,7 +139,7 @@ fn tree(directory: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     files
 }
 
-/// The page without values of the process, its build and its time.
+/// Returns the page without values of the process, its build and its time.
 fn of_the_robot(page: &str) -> String {
     let other = [
         "ros2probe_build_info{",
@@ -156,7 +156,7 @@ fn of_the_robot(page: &str) -> String {
 }
 
 #[test]
-fn a_replay_gives_the_same_report() {
+fn a_replay_leads_to_the_same_report_on_both_architectures() {
     for capture in captures() {
         let arguments = ["run", "--replay", &capture, "--watch", "/**", "--report"];
         let pages = [Program::native(), Program::arm()].map(|program| {
@@ -178,7 +178,7 @@ fn a_replay_gives_the_same_report() {
     }
 }
 
-/// A replay that has ended and is served.
+/// Returns an agent that serves a replay after its end.
 fn served(program: &Program, capture: &str) -> LocalAgent {
     let arguments = ["--speed", "max", "--watch", "/**"];
     let mut agent = LocalAgent::replay(&mut program.command(), Path::new(capture), &arguments);
@@ -191,7 +191,7 @@ fn ask(agent: &LocalAgent, path: &str) -> Answer {
 }
 
 #[test]
-fn a_replay_is_served_the_same() {
+fn a_replay_is_served_identically_on_both_architectures() {
     let capture = &graph();
     let [native, arm] = [Program::native(), Program::arm()].map(|each| served(&each, capture));
     let pages = [&native, &arm].map(|agent| of_the_robot(&agent.get("/metrics").body));
@@ -215,7 +215,7 @@ fn a_replay_is_served_the_same() {
     let views = views.filter(|(_, methods)| methods.get("get").is_some());
     let mut asked = 0;
     for (view, _) in views {
-        // Streams end with the agent; its own metrics and times differ.
+        // Streams end with the agent; the agent's own metrics and times differ.
         let own = ["/samples", "/health", "/events", "/live", "/processes"];
         if own.contains(&view.as_str()) || view.ends_with("/messages") || view.ends_with("/history")
         {
@@ -244,7 +244,7 @@ fn a_replay_is_served_the_same() {
 }
 
 #[test]
-fn commands_answer_the_same_from_a_capture_and_from_an_agent() {
+fn commands_print_the_same_from_a_capture_and_from_an_agent() {
     let capture = &graph();
     let agent = served(&Program::arm(), capture);
     let host = agent.api.to_string();
@@ -273,7 +273,7 @@ fn commands_answer_the_same_from_a_capture_and_from_an_agent() {
 }
 
 #[test]
-fn a_bag_recorded_from_a_replay_reads_back() {
+fn a_bag_recorded_from_a_replay_can_be_read() {
     let capture = &captures()[0];
     let directory = tempfile::tempdir().unwrap();
     let bags = [Program::native(), Program::arm()].map(|program| {
@@ -292,7 +292,7 @@ fn a_bag_recorded_from_a_replay_reads_back() {
     assert!(reported[0].contains("/chatter"), "{}", reported[0]);
 }
 
-/// Topic, times and bytes of a bag's messages, as the `mcap` crate reads them.
+/// Returns topic, times and bytes of a bag's messages, as the `mcap` crate reads them.
 fn messages(bag: &str) -> Vec<(String, u64, u64, Vec<u8>)> {
     let files = tree(Path::new(bag));
     let mut files = files
@@ -315,7 +315,7 @@ fn messages(bag: &str) -> Vec<(String, u64, u64, Vec<u8>)> {
 }
 
 #[test]
-fn live_capture_where_there_is_no_bpf_is_refused_with_one_line() {
+fn live_capture_without_bpf_is_refused_with_one_line() {
     let refused = Program::arm().run(&["run", "--metrics", "off", "--api", "off"]);
     let said = text(&refused.stderr);
     assert_eq!(refused.status.code(), Some(1), "{said}");
@@ -329,7 +329,7 @@ fn live_capture_where_there_is_no_bpf_is_refused_with_one_line() {
     );
 }
 
-/// The cryptography of rustls, and what compiles it.
+/// The cryptography crate of rustls, and the crate that compiles its C.
 const TLS: [&str; 2] = ["cc", "ring"];
 /// Crates whose build compiles C or needs an installed library.
 const C: [&str; 8] = [
@@ -342,11 +342,11 @@ const C: [&str; 8] = [
     "vcpkg",
     "nasm-rs",
 ];
-/// Declarations of what the system has, in Rust alone.
+/// Crates with declarations of system interfaces, in Rust alone.
 const DECLARATIONS: [&str; 2] = ["linux-raw-sys", "windows-sys"];
 
 #[test]
-fn no_c_but_that_of_ring_is_compiled_into_the_binary() {
+fn ring_is_the_only_crate_that_compiles_c_into_the_binary() {
     for architecture in ["x86_64", "aarch64"] {
         let crates = crates(architecture, "normal,build");
         assert!(
@@ -363,7 +363,7 @@ fn no_c_but_that_of_ring_is_compiled_into_the_binary() {
     }
 }
 
-/// Names of what `rp` is built of, along these edges.
+/// Returns the names of the crates of which `rp` is built, along these edges.
 fn crates(architecture: &str, edges: &str) -> BTreeSet<String> {
     let output = Command::new(env!("CARGO"))
         .args(["tree", "--locked", "--offline", "--package", "ros2probe"])

@@ -1,6 +1,6 @@
-//! What `deploy/` ships fits together: files that are mounted and named exist, Prometheus accepts its
-//! configurations, and the DaemonSet's container may do what the agent needs and nothing else.
-//! There is no container engine here: that the images start is not tested.
+//! The files of `deploy/` fit together. Mounted and named files exist, Prometheus accepts its
+//! configurations, and the DaemonSet's container has exactly the privileges that the agent needs.
+//! No container engine is available here, so no test starts the images.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -37,7 +37,7 @@ fn mounts_of_compose_exist_and_images_are_pinned() -> Result<()> {
 }
 
 #[test]
-fn no_port_but_the_collector_s_is_published_beyond_this_machine() -> Result<()> {
+fn only_the_port_of_the_collector_is_published_beyond_this_machine() -> Result<()> {
     let compose = yaml("compose.yaml")?;
     for service in ["prometheus", "grafana", "collector"] {
         for port in compose["services"][service]["ports"]
@@ -76,7 +76,7 @@ fn grafana_finds_the_data_source_and_the_dashboards() -> Result<()> {
     let path = provider["options"]["path"].as_str().context("no path")?;
     let mounted = mounts.iter().find(|(_, inside)| inside == path);
     let (outside, _) = mounted.with_context(|| format!("{path} is not mounted"))?;
-    // Grafana takes every JSON file below for a dashboard.
+    // Grafana treats every JSON file below this directory as a dashboard.
     let mut found = BTreeSet::new();
     for file in json_files(outside)? {
         let dashboard: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&file)?)?;
@@ -89,7 +89,7 @@ fn grafana_finds_the_data_source_and_the_dashboards() -> Result<()> {
         found.insert(uid);
     }
     ensure!(found.len() == 2, "{found:?}");
-    // Links from one to the other.
+    // Each link between dashboards must lead to an existing one.
     for file in json_files(outside)? {
         for link in std::fs::read_to_string(file)?.split("\"/d/").skip(1) {
             let end = link.find(|c: char| !(c.is_ascii_alphanumeric() || c == '-'));
@@ -104,7 +104,7 @@ fn grafana_finds_the_data_source_and_the_dashboards() -> Result<()> {
 
 #[test]
 fn prometheus_accepts_its_configurations() -> Result<()> {
-    // As in the container: what it names is where compose mounts it.
+    // As in the container, named files are where compose mounts them.
     let compose = yaml("compose.yaml")?;
     let mut text = std::fs::read_to_string(deploy().join("prometheus/prometheus.yaml"))?;
     for (outside, inside) in mounts(&compose["services"]["prometheus"])? {
@@ -142,7 +142,7 @@ fn prometheus_accepts_its_configurations() -> Result<()> {
 }
 
 #[test]
-fn the_alert_rules_know_the_agents_by_the_job_of_every_scrape() -> Result<()> {
+fn every_scrape_configuration_has_the_job_of_the_alert_rules() -> Result<()> {
     for file in [
         "prometheus/prometheus.yaml",
         "fleet/prometheus-agent.yaml",
@@ -159,7 +159,7 @@ fn the_alert_rules_know_the_agents_by_the_job_of_every_scrape() -> Result<()> {
 }
 
 #[test]
-fn collectors_use_what_they_define_and_reach_prometheus() -> Result<()> {
+fn collectors_use_all_defined_components_and_reach_prometheus() -> Result<()> {
     let compose = yaml("compose.yaml")?;
     for file in ["collector/collector.yaml", "fleet/collector-robot.yaml"] {
         let collector = yaml(file)?;
@@ -219,7 +219,7 @@ fn collectors_use_what_they_define_and_reach_prometheus() -> Result<()> {
 }
 
 #[test]
-fn the_daemon_set_may_do_what_the_unit_may_and_nothing_else() -> Result<()> {
+fn the_daemon_set_has_exactly_the_privileges_of_the_unit() -> Result<()> {
     let pod = pod()?;
     let container = &pod["containers"][0];
     ensure!(pod["hostNetwork"] == true && pod["hostPID"] == true);
@@ -242,7 +242,7 @@ fn the_daemon_set_may_do_what_the_unit_may_and_nothing_else() -> Result<()> {
 }
 
 #[test]
-fn the_daemon_set_s_configuration_is_one_and_its_paths_are_mounted() -> Result<()> {
+fn the_configuration_of_the_daemon_set_is_valid_and_its_paths_are_mounted() -> Result<()> {
     let documents = documents("kubernetes/ros2probe.yaml")?;
     let map = documents.iter().find(|one| one["kind"] == "ConfigMap");
     let text = map.context("no ConfigMap")?["data"]["ros2probe.yaml"].as_str();
@@ -322,7 +322,7 @@ fn the_daemon_set_s_configuration_is_one_and_its_paths_are_mounted() -> Result<(
 }
 
 #[test]
-fn the_image_is_what_make_dist_makes_with_the_unit_s_capabilities_and_without_root() -> Result<()> {
+fn the_image_has_the_binary_of_make_dist_the_capabilities_of_the_unit_and_no_root() -> Result<()> {
     let text = std::fs::read_to_string(deploy().join("Dockerfile"))?.replace("\\\n", " ");
     image_is_built_for_this_version_without_root(&text)?;
     image_copies_the_binary_and_the_configuration(&text)?;
@@ -361,7 +361,7 @@ fn image_is_built_for_this_version_without_root(text: &str) -> Result<()> {
     Ok(())
 }
 
-/// The build context holds what the image copies, and no more.
+/// Checks that the build context contains only what the image copies.
 fn image_copies_the_binary_and_the_configuration(text: &str) -> Result<()> {
     let ignored = std::fs::read_to_string(deploy().join("Dockerfile.dockerignore"))?;
     let taken: Vec<&str> = ignored
@@ -389,7 +389,7 @@ fn image_copies_the_binary_and_the_configuration(text: &str) -> Result<()> {
     Ok(())
 }
 
-/// The file's capabilities and those of `docker run` are the unit's.
+/// Checks that the file's capabilities and those of `docker run` are the unit's.
 fn capabilities_are_those_of_the_unit(text: &str) -> Result<()> {
     let set = text
         .split("setcap ")
@@ -473,7 +473,7 @@ fn bounding_set() -> Result<BTreeSet<String>> {
     Ok(set.split(' ').map(str::to_owned).collect())
 }
 
-/// The pod of the DaemonSet.
+/// Returns the pod of the DaemonSet.
 fn pod() -> Result<Value> {
     let documents = documents("kubernetes/ros2probe.yaml")?;
     let set = documents.into_iter().find(|one| one["kind"] == "DaemonSet");
@@ -486,7 +486,7 @@ fn pod() -> Result<Value> {
     Ok(set["spec"]["template"]["spec"].clone())
 }
 
-/// Files of this directory that a service mounts: path here, and path in the service.
+/// Returns the files of this directory that a service mounts: path here, and path in the service.
 fn mounts(service: &Value) -> Result<Vec<(PathBuf, String)>> {
     let mounts = service["volumes"].as_sequence().context("no volumes")?;
     let mut bound = Vec::new();

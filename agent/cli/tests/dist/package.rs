@@ -1,9 +1,9 @@
 //! The Debian package: its content, and the state of a host after it was installed, upgraded,
 //! removed and purged, with systemd and without.
 //!
-//! Tried is a package of the binary that the tests are built with, or, where `ROS2PROBE_PACKAGES`
-//! names a directory, the packages that are there. Hosts are containers of a fresh Debian
-//! (`.ci/prerequisites.sh test` makes it) whose writes go to memory.
+//! The tested package is made of the tests' own binary. If `ROS2PROBE_PACKAGES` names a directory,
+//! its packages are tested instead. Hosts are containers of a fresh Debian, which
+//! `.ci/prerequisites.sh test` creates. Their writes go to memory.
 
 mod installation;
 
@@ -21,7 +21,7 @@ const RUNS: &str = "systemctl is-active ros2probe.service";
 const STARTS_AT_BOOT: &str = "systemctl is-enabled ros2probe.service";
 
 #[test]
-fn the_package_holds_what_an_operator_looks_for() -> Result<()> {
+fn the_package_contains_what_an_operator_expects() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let mut packages = given()?;
     if packages.is_empty() {
@@ -47,7 +47,7 @@ fn the_same_binary_makes_the_same_package() -> Result<()> {
 }
 
 #[test]
-fn a_host_with_systemd_is_served_until_the_package_is_purged() -> Result<()> {
+fn a_host_with_systemd_runs_the_agent_until_the_package_is_purged() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let old = installable(directory.path())?;
     let new = changed(&old, directory.path())?;
@@ -85,7 +85,7 @@ fn prints(host: &Debian, command: &str, expected: &str) -> Result<()> {
     Ok(())
 }
 
-/// Returns what `systemctl` prints as the service's process, with the line break.
+/// Returns the service's process id as `systemctl` prints it, with the line break.
 fn main_process(host: &Debian) -> Result<String> {
     host.run("systemctl show --property MainPID --value ros2probe")
 }
@@ -102,7 +102,7 @@ fn the_service_runs_as_its_user(host: &Debian) -> Result<()> {
     prints(host, &owner, "ros2probe")
 }
 
-/// The drop-in for systemd before 247.
+/// Checks the drop-in for systemd before 247.
 fn an_older_systemd_gives_the_same_privileges(host: &Debian) -> Result<()> {
     host.run(
         "mkdir /run/systemd/system/ros2probe.service.d && \
@@ -119,7 +119,7 @@ fn an_older_systemd_gives_the_same_privileges(host: &Debian) -> Result<()> {
         .map(drop)
 }
 
-/// `api.listen` is off.
+/// Checks access to the socket while `api.listen` is off.
 fn the_socket_admits_the_group_only(host: &Debian) -> Result<()> {
     host.run(&format!(
         "sed -i 's/^  # listen: 127.0.0.1:17401/  listen: off/' {CONFIG}; systemctl restart ros2probe"
@@ -142,7 +142,7 @@ fn the_socket_admits_the_group_only(host: &Debian) -> Result<()> {
     Ok(())
 }
 
-/// Both the default and the operator's file have changed.
+/// Upgrades while both the default and the operator's file have changed.
 fn an_upgrade_keeps_the_operators_configuration(host: &Debian, upgrade: &str) -> Result<()> {
     let before = main_process(host)?;
     host.run(upgrade)?;
@@ -155,7 +155,7 @@ fn an_upgrade_keeps_the_operators_configuration(host: &Debian, upgrade: &str) ->
     .map(drop)
 }
 
-/// A downgrade and an upgrade leave the operator's choice.
+/// Checks that a downgrade and an upgrade keep the operator's choice.
 fn a_stopped_or_disabled_service_stays_so(host: &Debian, old: &str, upgrade: &str) -> Result<()> {
     host.run("systemctl stop ros2probe")?;
     host.run(&format!("dpkg --force-confold --install {old}"))?;
@@ -167,7 +167,7 @@ fn a_stopped_or_disabled_service_stays_so(host: &Debian, old: &str, upgrade: &st
     prints(host, STARTS_AT_BOOT, "disabled")
 }
 
-/// The upgrade succeeds and prints the mistake. With the mistake corrected the service starts.
+/// Checks that the upgrade succeeds and prints the mistake. After a correction, the service starts.
 fn a_wrong_configuration_fails_the_service_only(host: &Debian, upgrade: &str) -> Result<()> {
     host.run(&format!(
         "systemctl enable --now ros2probe; cp {CONFIG} /srv/; echo wach: [] >>{CONFIG}"
@@ -192,7 +192,7 @@ fn a_wrong_configuration_fails_the_service_only(host: &Debian, upgrade: &str) ->
 }
 
 #[test]
-fn a_host_without_systemd_takes_the_package_too() -> Result<()> {
+fn a_host_without_systemd_accepts_the_package() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let old = installable(directory.path())?;
     let new = changed(&old, directory.path())?;
@@ -223,7 +223,7 @@ fn a_host_without_systemd_takes_the_package_too() -> Result<()> {
     nothing_left(&host)
 }
 
-/// A purge leaves the user and dpkg's own records only.
+/// Checks that a purge leaves only the user and dpkg's own records.
 fn nothing_left(host: &Debian) -> Result<()> {
     let left = host.run(
         "find / -xdev \\( -path /proc -o -path /sys -o -path /packages -o -path /var/log \\) -prune \
@@ -234,8 +234,8 @@ fn nothing_left(host: &Debian) -> Result<()> {
         .map(drop)
 }
 
-/// Runs the agent with the unit's user and capabilities on a host without systemd. Root owns none of
-/// the files that the agent writes.
+/// Runs the agent with the unit's user and capabilities on a host without systemd. Root owns none
+/// of the files that the agent writes.
 fn serves_with_the_rights_of_the_unit(host: &Debian) -> Result<()> {
     let unit = host.run("cat /usr/lib/systemd/system/ros2probe.service")?;
     let setting = |key: &str| {
@@ -273,7 +273,7 @@ fn serves_with_the_rights_of_the_unit(host: &Debian) -> Result<()> {
     Ok(())
 }
 
-/// A package's name as a container sees it.
+/// Returns a package's path in a container.
 fn inside(package: &Path) -> Result<String> {
     let name = package.file_name().context("no name")?;
     Ok(format!("/packages/{}", name.to_string_lossy()))
@@ -328,7 +328,7 @@ fn fields_and_scripts_are_complete(archive: &Archive) -> Result<()> {
     Ok(())
 }
 
-/// Each file has its mode, and root owns all of them.
+/// Checks that each file has its mode and that root owns all of them.
 fn files_are_the_expected_ones(archive: &Archive) -> Result<()> {
     let manual = "usr/share/man/man1/";
     let (pages, others): (BTreeMap<_, _>, BTreeMap<_, _>) = archive
@@ -374,7 +374,7 @@ fn files_are_the_expected_ones(archive: &Archive) -> Result<()> {
     Ok(())
 }
 
-/// Returns the package's path of each page of `docs/`, to which the links of the README lead.
+/// Returns the path in the package of each page of `docs/`. The README links to these pages.
 fn book() -> Result<Vec<String>> {
     let docs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs");
     let mut pages = Vec::new();

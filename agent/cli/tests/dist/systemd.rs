@@ -1,4 +1,4 @@
-//! The shipped unit: hardened, and free of what systemd would complain about.
+//! The shipped unit is hardened, and systemd accepts it without complaint.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -15,7 +15,7 @@ fn systemd_analyze(arguments: &[&str], unit: &Path) -> Output {
         .unwrap_or_else(|error| panic!("systemd-analyze: {error}; `apt-get install systemd`"))
 }
 
-/// `make test` leaves this out where systemd is older (`.ci/prerequisites.sh --left-out`).
+/// `make test` omits this test with an older systemd (`.ci/prerequisites.sh --left-out`).
 #[test]
 fn the_exposure_level_is_at_most_2() {
     let output = systemd_analyze(&["security", "--offline=true", "--no-pager"], &unit());
@@ -36,7 +36,7 @@ fn the_exposure_level_is_at_most_2() {
 }
 
 #[test]
-fn systemd_understands_every_line() {
+fn systemd_accepts_every_line_of_the_unit() {
     let directory = tempfile::tempdir().unwrap();
     let copy = directory.path().join("ros2probe.service");
     let text = std::fs::read_to_string(unit()).unwrap();
@@ -115,7 +115,7 @@ fn each_claim_of_the_threat_model_names_tests_that_exist() {
 }
 
 #[test]
-fn the_agent_may_do_what_it_needs_and_nothing_else() {
+fn the_unit_grants_exactly_the_privileges_that_the_agent_needs() {
     let text = std::fs::read_to_string(unit()).unwrap();
     for set in ["CapabilityBoundingSet", "AmbientCapabilities"] {
         let line = format!("\n{set}=CAP_NET_ADMIN CAP_NET_RAW CAP_BPF CAP_PERFMON\n");

@@ -10,7 +10,7 @@ const PT_GNU_STACK: u32 = 0x6474_e551;
 const PF_X: u32 = 1;
 const DT_NEEDED: u64 = 1;
 
-/// `e_machine`.
+/// Value of `e_machine`.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Machine(u16);
 
@@ -22,7 +22,7 @@ impl Machine {
 /// An executable file.
 pub struct Elf(Vec<u8>);
 
-/// One of its program headers.
+/// A program header.
 struct Segment {
     kind: u32,
     flags: u32,
@@ -35,7 +35,7 @@ impl Elf {
     pub fn read(path: &Path) -> Self {
         let bytes =
             std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-        // 64-bit, little-endian.
+        // The file is 64-bit and little-endian.
         assert_eq!(bytes[..6], [0x7f, b'E', b'L', b'F', 2, 1]);
         Self(bytes)
     }

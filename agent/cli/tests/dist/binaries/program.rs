@@ -9,7 +9,7 @@ pub struct Binary {
     pub path: PathBuf,
 }
 
-/// Static binaries: both of `ROS2PROBE_DIST`, else the one that `make arm` has built.
+/// Returns the static binaries: both of `ROS2PROBE_DIST`, else the one that `make arm` has built.
 pub fn shipped() -> Vec<Binary> {
     let binary = |architecture| Binary {
         architecture,
@@ -21,14 +21,14 @@ pub fn shipped() -> Vec<Binary> {
     }
 }
 
-/// These, and the tests' own.
+/// Returns the shipped binaries and the tests' own.
 pub fn all() -> Vec<PathBuf> {
     let own = PathBuf::from(env!("CARGO_BIN_EXE_rp"));
     let shipped = shipped().into_iter().map(|binary| binary.path);
     shipped.chain([own]).collect()
 }
 
-/// Returns the directory of the release binaries, if the tests cover those.
+/// Returns the directory of the release binaries, if the tests cover them.
 pub fn directory() -> Option<PathBuf> {
     std::env::var_os("ROS2PROBE_DIST").map(PathBuf::from)
 }
@@ -38,7 +38,7 @@ fn released(architecture: &str) -> Option<PathBuf> {
     Some(directory()?.join(format!("rp-{version}-{architecture}")))
 }
 
-/// Below the directory that everything is built in.
+/// Returns the unoptimized binary below the directory of all builds.
 fn unoptimized() -> PathBuf {
     let target = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap();
     let path = target.join("aarch64-unknown-linux-musl/debug/rp");
@@ -53,7 +53,7 @@ pub struct Program {
 }
 
 impl Program {
-    /// This machine's.
+    /// Returns the program for this machine.
     pub fn native() -> Self {
         let architecture = std::env::consts::ARCH;
         let own = || PathBuf::from(env!("CARGO_BIN_EXE_rp"));
@@ -63,7 +63,7 @@ impl Program {
         }
     }
 
-    /// The one for Jetsons and Raspberry Pis.
+    /// Returns the program for aarch64, such as Jetsons and Raspberry Pis.
     pub fn arm() -> Self {
         Self {
             architecture: "aarch64",
@@ -80,7 +80,7 @@ impl Program {
         name.to_string_lossy().into_owned()
     }
 
-    /// Returns a name that differs even if both are for one architecture.
+    /// Returns a name that differs even if both programs are for one architecture.
     pub fn name(&self) -> String {
         let kind = self
             .path
@@ -91,7 +91,7 @@ impl Program {
         format!("{}-{}", self.architecture, kind.unwrap_or_default())
     }
 
-    /// Under qemu where this machine is another one.
+    /// Returns a command that uses qemu on a machine of another architecture.
     pub fn command(&self) -> Command {
         let mut command = if self.architecture == std::env::consts::ARCH {
             Command::new(&self.path)
@@ -121,7 +121,7 @@ impl Program {
     }
 }
 
-/// Installed, or as unpacked by `.ci/prerequisites.sh`.
+/// Returns the emulator unpacked by `.ci/prerequisites.sh`, else the installed one.
 fn emulator(architecture: &str) -> PathBuf {
     let name = format!("qemu-{architecture}-static");
     let unpacked = Path::new(env!("CARGO_MANIFEST_DIR"))

@@ -1,4 +1,4 @@
-//! Files that `make dist` leaves, if `ROS2PROBE_DIST` names its directory.
+//! Files that `make dist` creates, in the directory that `ROS2PROBE_DIST` names.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use serde_json::Value;
 use super::program::{self, Binary};
 use super::{crates, text};
 
-/// Panics for an unoptimized build, which lacks these properties.
+/// Returns the directory. Panics for an unoptimized build, which lacks the tested properties.
 fn released() -> PathBuf {
     program::directory().expect("ROS2PROBE_DIST names no release: run `make dist`")
 }
@@ -46,7 +46,7 @@ fn every_file_has_its_checksum() {
 
 #[test]
 #[ignore = "looks at a release: make dist"]
-fn no_path_of_the_machine_that_built_it_is_in_a_binary() {
+fn a_binary_contains_no_path_of_the_machine_that_built_it() {
     released();
     let home = std::env::var("HOME").unwrap();
     let here = ros2probe_testing::repository("").canonicalize().unwrap();
@@ -88,7 +88,7 @@ fn flaw(bill: &Path) -> String {
 
 #[test]
 #[ignore = "looks at a release: make dist"]
-fn the_bill_of_materials_lists_what_is_linked_and_where_it_is_from() {
+fn the_bill_of_materials_lists_linked_crates_and_their_origin() {
     let directory = released();
     for Binary { architecture, .. } in program::shipped() {
         let name = format!("rp-{}-{architecture}.cdx.json", env!("CARGO_PKG_VERSION"));
@@ -117,7 +117,7 @@ fn the_bill_of_materials_lists_what_is_linked_and_where_it_is_from() {
         assert!(missing.is_empty(), "{name}: {missing:?}");
         for component in components {
             let part = component["name"].as_str().unwrap();
-            // What is of this project comes from no registry.
+            // Components of this project come from no registry.
             let own = part.starts_with("ros2probe-") || part.starts_with("agent-ebpf/");
             let from = text(component, "purl").unwrap_or_default();
             assert!(own || from.starts_with("pkg:"), "{component}");

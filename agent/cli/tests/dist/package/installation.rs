@@ -1,4 +1,4 @@
-//! Packages to try: those that are given, or one made of the tests' own binary.
+//! Packages to test: the given ones, or one made of the tests' own binary.
 
 pub(crate) mod archive;
 pub(crate) mod debian;
@@ -8,7 +8,7 @@ use std::process::{Command, Output};
 
 use anyhow::{Context as _, Result, ensure};
 
-/// The packages of the directory that `ROS2PROBE_PACKAGES` names.
+/// Returns the packages of the directory that `ROS2PROBE_PACKAGES` names.
 pub(crate) fn given() -> Result<Vec<PathBuf>> {
     let Some(directory) = std::env::var_os("ROS2PROBE_PACKAGES") else {
         return Ok(Vec::new());
@@ -32,7 +32,7 @@ pub(crate) fn given() -> Result<Vec<PathBuf>> {
     Ok(packages)
 }
 
-/// The given package that this machine can install, or one made here, in `directory`.
+/// Returns the given package that this machine can install, or one made here, in `directory`.
 pub(crate) fn installable(directory: &Path) -> Result<PathBuf> {
     let ending = format!("_{}.deb", architecture());
     let is_own = |path: &PathBuf| path.to_string_lossy().ends_with(&ending);
@@ -44,7 +44,7 @@ pub(crate) fn installable(directory: &Path) -> Result<PathBuf> {
     Ok(copy)
 }
 
-/// A package of the tests' own binary without its symbols, made by `packaging/build.sh`.
+/// Makes a package of the tests' own binary without its symbols, with `packaging/build.sh`.
 pub(crate) fn built(directory: &Path, options: &[&str]) -> Result<PathBuf> {
     std::fs::create_dir_all(directory)?;
     let binary = directory.join("rp");
@@ -62,7 +62,7 @@ pub(crate) fn built(directory: &Path, options: &[&str]) -> Result<PathBuf> {
     Ok(PathBuf::from(said.trim()))
 }
 
-/// The same as a higher version whose default configuration is another one.
+/// Returns the same package with a higher version and another default configuration.
 pub(crate) fn changed(package: &Path, directory: &Path) -> Result<PathBuf> {
     let (parts, package_of_them) = (directory.join("parts"), directory.join("changed.deb"));
     succeed(
@@ -86,7 +86,7 @@ pub(crate) fn changed(package: &Path, directory: &Path) -> Result<PathBuf> {
     Ok(package_of_them)
 }
 
-/// Debian's name for this machine's.
+/// Returns Debian's name of this machine's architecture.
 fn architecture() -> &'static str {
     match std::env::consts::ARCH {
         "aarch64" => "arm64",
@@ -108,7 +108,7 @@ pub(crate) fn succeed(command: &mut Command) -> Result<String> {
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// Returns all output.
+/// Returns stdout and stderr.
 pub(crate) fn all(output: &Output) -> String {
     let stdout = String::from_utf8_lossy(&output.stdout);
     format!("{stdout}{}", String::from_utf8_lossy(&output.stderr))

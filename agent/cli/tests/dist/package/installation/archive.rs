@@ -1,4 +1,4 @@
-//! A package taken apart with Debian's own tools.
+//! A package unpacked with Debian's own tools.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -9,14 +9,14 @@ use anyhow::{Context as _, Result, ensure};
 use super::succeed;
 
 pub(crate) struct Archive {
-    /// By path, without directories.
+    /// Files by path, without directories.
     pub(crate) files: BTreeMap<String, Entry>,
-    /// Fields of its control file.
+    /// Fields of the control file.
     pub(crate) control: BTreeMap<String, String>,
     /// Modes of the other control files.
     pub(crate) scripts: BTreeMap<String, u32>,
     pub(crate) conffiles: String,
-    /// Of the `ar` archive that a package is.
+    /// Members of the `ar` archive.
     pub(crate) members: Vec<String>,
     unpacked: tempfile::TempDir,
 }
@@ -24,7 +24,7 @@ pub(crate) struct Archive {
 #[derive(Debug)]
 pub(crate) struct Entry {
     pub(crate) mode: u32,
-    /// Numbers of user and group.
+    /// Ids of user and group.
     pub(crate) owner: String,
 }
 
@@ -88,7 +88,7 @@ impl Archive {
     }
 }
 
-/// The files of one of the two archives in it.
+/// Returns the files of one of the package's two archives.
 fn listed(package: &Path, which: &str) -> Result<BTreeMap<String, Entry>> {
     let mut list = Command::new("sh");
     list.args([
@@ -117,7 +117,7 @@ fn listed(package: &Path, which: &str) -> Result<BTreeMap<String, Entry>> {
     Ok(entries)
 }
 
-/// `-rwxr-xr-x` as a number.
+/// Parses `-rwxr-xr-x` as a number.
 fn bits(mode: &str) -> u32 {
     mode.chars()
         .skip(1)

@@ -15,28 +15,29 @@ use ros2probe_testing::harness::{PREFIX, require, wait_until};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Start {
     Systemd,
-    /// As in a chroot or in most containers.
+    /// No service manager, as in a chroot or in most containers.
     Nothing,
 }
 
-/// Ends when it is dropped.
+/// A container that ends when this value is dropped.
 pub(crate) struct Debian {
     container: Child,
-    /// Its first process.
+    /// Process id of the container's first process.
     first: u32,
     /// Output of the container and of its first process.
     console: PathBuf,
     cgroup: Cgroup,
 }
 
-/// Writes to memory, over the fresh system; `$0` of it, `$1` for the mounts, then a command.
+/// Runs a command over the fresh system in `$0`, and writes to memory. `$1` is the directory for
+/// the mounts; the command follows.
 const OVER: &str = "set -e; mkdir -p \"$1\"; mount -t tmpfs tmpfs \"$1\"; \
     mkdir \"$1/new\" \"$1/work\" \"$1/root\"; \
     mount -t overlay -o \"lowerdir=$0,upperdir=$1/new,workdir=$1/work\" overlay \"$1/root\"; \
     shift; exec \"$@\" </dev/null";
 
 impl Debian {
-    /// A host whose `/packages` is `packages`.
+    /// Starts a host whose `/packages` is `packages`.
     pub(crate) fn start(start: Start, packages: &Path) -> Result<Self> {
         require()?;
         let system = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../target/tools/debian");
@@ -77,7 +78,7 @@ impl Debian {
         let (program, arguments) = words.split_first().context("no words")?;
         let container = Command::new(program)
             .args(arguments)
-            // As hosts have it; a mixture of both versions is this machine's own.
+            // Hosts have only version 2; a mixture of both versions is specific to this machine.
             .env("SYSTEMD_NSPAWN_UNIFIED_HIERARCHY", "1")
             .stdin(Stdio::null())
             .stdout(log.try_clone()?)
@@ -143,7 +144,7 @@ impl Debian {
             }
             let text = std::fs::read_to_string(&children)?;
             self.first = text.split_whitespace().next().map_or(Ok(0), str::parse)?;
-            // A process that prepares the container precedes its first one, and soon ends.
+            // A process that prepares the container precedes its first process, and soon ends.
             let (is_up, said): (_, &[_]) = match start {
                 Start::Systemd => ("systemctl is-system-running", &["running", "degraded"]),
                 Start::Nothing => ("cat /proc/1/comm", &["(sd-stubinit)"]),
@@ -158,7 +159,7 @@ impl Drop for Debian {
         let _ = self.container.kill();
         let _ = self.container.wait();
         // Kills all processes inside, then removes their groups, also in the hierarchy of version 1
-        // where systemd uses that.
+        // if systemd uses it.
         let _ = std::fs::write(self.cgroup.path().join("cgroup.kill"), "1");
         let own = self.cgroup.path().file_name().unwrap_or_default();
         let own = Path::new("/sys/fs/cgroup/systemd").join(own);
@@ -172,7 +173,7 @@ impl Drop for Debian {
     }
 }
 
-/// Removes the control groups below one.
+/// Removes the control groups below this one.
 fn remove_below(group: &Path) -> io::Result<()> {
     for entry in group.read_dir()? {
         let entry = entry?;
