@@ -1,5 +1,5 @@
-//! Watches that are added and removed beside a running robot: how soon they count, what they leave
-//! behind, and that they outlive the agent.
+//! Watches that are added and removed beside a running robot: how soon they count, what remains
+//! after them, and that they outlive the agent.
 
 use std::collections::BTreeSet;
 use std::io::{Read as _, Write as _};
@@ -19,7 +19,7 @@ const ROUNDS: usize = 3;
 const MANY: usize = 1000;
 
 #[test]
-fn watches_come_and_go_with_the_robot_running() -> Result<()> {
+fn watches_are_added_and_removed_while_a_robot_runs() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let configuration = directory.path().join("ros2probe.yaml");
@@ -56,10 +56,11 @@ fn watches_come_and_go_with_the_robot_running() -> Result<()> {
     state_of_a_newer_rp_stays(&start, &api, &state)
 }
 
-/// Starts an agent with the test's configuration.
+/// A function that starts an agent with the test's configuration.
 type Start<'a> = &'a dyn Fn() -> Result<Agent<'a>>;
 
-/// The watches are in the state directory before the kill, and in the next agent after it.
+/// Checks that the watches are in the state directory before a kill, and in the next agent after
+/// it.
 fn watches_survive_a_kill(
     mut agent: Agent<'_>,
     start: Start<'_>,
@@ -102,7 +103,7 @@ fn a_corrupt_file_is_set_aside(start: Start<'_>, api: &Api<'_>, state: &Path) ->
     Ok(())
 }
 
-/// An older rp runs without the state of a newer one, and leaves its files as they are.
+/// Checks that an older rp runs without the state of a newer one, and leaves its files unchanged.
 fn state_of_a_newer_rp_stays(start: Start<'_>, api: &Api<'_>, state: &Path) -> Result<()> {
     let newer = |name: &str| (state.join(name), format!("{{\"version\":7,\"{name}\":0}}"));
     let newer = [newer("watches.json"), newer("discovery.json")];
@@ -126,10 +127,10 @@ fn state_of_a_newer_rp_stays(start: Start<'_>, api: &Api<'_>, state: &Path) -> R
     Ok(())
 }
 
-/// A thousand watches, and one that matters to the kernel, leave nothing in the kernel's map, in
-/// the agent's tables or on the page.
+/// Checks that a thousand watches, and one that the kernel needs, leave nothing in the kernel's
+/// map, in the agent's tables or on the page.
 fn nothing_stays(agent: &Agent<'_>, api: &Api<'_>) -> Result<()> {
-    // A topic that was watched once keeps what was counted of it.
+    // A topic that was watched before keeps its counts.
     for method in ["POST", "DELETE"] {
         api.ask(method, "imu")?;
         let wanted = f64::from(u8::from(method == "POST"));
@@ -189,7 +190,7 @@ fn nothing_stays(agent: &Agent<'_>, api: &Api<'_>) -> Result<()> {
     Ok(())
 }
 
-/// From asking for a watch to the first sample that counts it takes less than 100 ms.
+/// Checks that a sample counts less than 100 ms after the request for a watch.
 fn soon(agent: &Agent<'_>, api: &Api<'_>, publisher: &Peer) -> Result<()> {
     let labels = [("domain_id", "0"), ("topic", "/imu")];
     let of = |scrape: &Scrape, name| scrape.value(name, &labels).unwrap_or_default();
@@ -221,7 +222,7 @@ fn soon(agent: &Agent<'_>, api: &Api<'_>, publisher: &Peer) -> Result<()> {
     let sent: Vec<f64> = sent.map(|event| event.t as f64 / 1e9).collect();
     let mut quickest = f64::INFINITY;
     for (asked, answered, count, last) in rounds {
-        // A publisher notes the time of a sample before it is seen on its way.
+        // A publisher logs the time of a sample before the agent sees the sample.
         let upto = sent.partition_point(|time| *time <= last);
         let first = upto
             .checked_sub(count as usize)

@@ -22,30 +22,30 @@ use ros2probe_testing::harness::witness::Witness;
 use tempfile::TempDir;
 
 const DIRECTIONS: [Direction; 2] = [Direction::Ingress, Direction::Egress];
-/// Programs of an agent in each direction: for UDP, and for TCP of Zenoh.
+/// Number of programs of an agent in each direction: for UDP, and for TCP of Zenoh.
 const PROGRAMS: u32 = 2;
-/// On a busy machine.
+/// Maximum wait on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(60);
 const ROUNDS: u64 = 20;
-/// Milliseconds: an agent needs about 200 until it is ready.
+/// Lifetimes of agents in milliseconds. An agent needs about 200 until it is ready.
 const LIVES: [u64; 10] = [0, 20, 40, 60, 90, 120, 160, 210, 270, 400];
 
-/// Descriptors of this process are counted: one test at a time.
+/// Runs one test at a time, because descriptors of this process are counted.
 static TURN: Mutex<()> = Mutex::new(());
 
 #[test]
-fn nodes_lose_nothing_while_agents_come_and_go() -> Result<()> {
+fn nodes_lose_no_sample_while_agents_start_and_stop() -> Result<()> {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let above = Cgroup::create(&format!("{PREFIX}-{}-attach", std::process::id()))?;
     let link = Link::below(&above)?;
     let configuration = Configuration::at(above.path())?;
-    // The same without an agent is the baseline of the machine.
+    // The same streams without an agent are the baseline of the machine.
     let mut alone = Talks::start(&link)?;
     std::thread::sleep(Duration::from_secs(3));
     alone.ensure_lossless().context("without any agent")?;
 
     let mut talks = Talks::start(&link)?;
-    // Whatever the library opens once and keeps, it has opened after the first time.
+    // After the first start, the library has opened everything that it keeps open.
     Witness::start(&configuration.text)?.finish()?;
     let descriptors = open_descriptors()?;
     for _ in 0..ROUNDS {
@@ -106,7 +106,7 @@ fn nodes_lose_nothing_while_agents_come_and_go() -> Result<()> {
 }
 
 #[test]
-fn beside_an_exclusive_program_the_agent_reads_the_wire_and_reports_why() -> Result<()> {
+fn an_exclusive_program_makes_the_agent_read_the_wire_and_report_why() -> Result<()> {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let above = Cgroup::create(&format!("{PREFIX}-{}-alone", std::process::id()))?;
     let link = Link::below(&above)?;
@@ -135,10 +135,10 @@ fn beside_an_exclusive_program_the_agent_reads_the_wire_and_reports_why() -> Res
 }
 
 #[test]
-fn a_recreated_cgroup_is_seen_again_and_reported_while_it_is_missing() -> Result<()> {
+fn a_recreated_cgroup_is_observed_again_and_reported_while_it_is_missing() -> Result<()> {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let name = format!("{PREFIX}-{}-anew", std::process::id());
-    // The agent is in none of the groups that go.
+    // The agent is in none of the removed groups.
     let elsewhere = Namespace::alone()?;
     let above = Cgroup::create(&name)?;
     let configuration = Configuration::at(above.path())?;
@@ -191,14 +191,15 @@ fn a_recreated_cgroup_is_seen_again_and_reported_while_it_is_missing() -> Result
 }
 
 #[test]
-fn a_briefly_missing_cgroup_is_reported_and_seen_again() -> Result<()> {
+fn a_briefly_missing_cgroup_is_reported_and_observed_again() -> Result<()> {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let elsewhere = Namespace::alone()?;
     let above = Cgroup::create(&format!("{PREFIX}-{}-moment", std::process::id()))?;
     let configuration = Configuration::at(above.path())?;
     let mut agent = configuration.start(&elsewhere)?;
     agent.wait_ready(PATIENCE)?;
-    // An agent that starts is not blind. The thread that records events looks every 100 ms until then.
+    // A starting agent does not report a blind capture. Until then, the thread of events polls
+    // every 100 ms.
     std::thread::sleep(Duration::from_secs(1));
     for round in 1..=2 {
         std::fs::remove_dir(above.path())?;
@@ -226,7 +227,7 @@ fn a_briefly_missing_cgroup_is_reported_and_seen_again() -> Result<()> {
     ensure_nothing_attached(above.path(), 0)
 }
 
-/// Removes a cgroup after its last process, and waits.
+/// Removes a cgroup after its last process has ended, and waits until `noticed` is true.
 fn remove_until(cgroup: &Path, noticed: impl Fn() -> bool) -> Result<()> {
     eventually(|| Ok(std::fs::remove_dir(cgroup)?))?;
     eventually(|| {
@@ -263,7 +264,7 @@ impl Configuration {
         Agent::start(host, env!("CARGO_BIN_EXE_rp"), &file)
     }
 
-    /// Without waiting.
+    /// Starts the agent without waiting for it.
     fn launch(&self, host: &Namespace) -> Result<Process> {
         let file = self.directory.path().join("ros2probe.yaml");
         let arguments = ["run".as_ref(), "--config".as_ref(), file.as_os_str()];
@@ -285,7 +286,7 @@ impl Talks {
         };
         let streams = [
             (Stack::Cyclone, Stream::small(0)),
-            // A receive buffer holds a third of a second of it.
+            // A receive buffer holds a third of a second of this stream.
             (
                 Stack::Fast,
                 Stream {
@@ -320,13 +321,13 @@ impl Talks {
         for peer in talks.publishers.iter_mut().chain(&mut talks.subscribers) {
             peer.wait_matched()?;
         }
-        // Fast DDS notifies its subscriber first.
+        // Fast DDS notifies its subscriber before the publisher.
         std::thread::sleep(Duration::from_millis(300));
         talks.publishers.iter_mut().try_for_each(Peer::go)?;
         Ok(talks)
     }
 
-    /// Ends the streams.
+    /// Ends the streams, and checks that they lost no sample.
     fn ensure_lossless(&mut self) -> Result<()> {
         for publisher in &mut self.publishers {
             publisher.process.terminate()?;
@@ -355,7 +356,7 @@ impl Talks {
             );
             println!("{} samples, {lost:?} lost", sent.len());
         }
-        // The kernel counts what a program refuses among the other errors.
+        // The kernel counts datagrams that a program refuses among the other errors.
         ensure!(
             counted.receive_errors()? == overflows,
             "a datagram was refused"
@@ -364,7 +365,7 @@ impl Talks {
     }
 }
 
-/// A stream from beginning to end, all of it received.
+/// Runs a stream from beginning to end, and checks that all of it is received.
 fn talk(link: &Link, stream: &Stream) -> Result<()> {
     let host = &link.monitor;
     let mut subscriber = Peer::start(
@@ -390,7 +391,7 @@ fn open_descriptors() -> Result<usize> {
     Ok(std::fs::read_dir("/proc/self/fd")?.count())
 }
 
-/// The kernel takes a process apart a moment after it has ended.
+/// Retries `what`, because the kernel releases a process shortly after it has ended.
 fn eventually(what: impl Fn() -> Result<()>) -> Result<()> {
     let deadline = Instant::now() + PATIENCE;
     loop {

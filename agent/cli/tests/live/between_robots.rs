@@ -1,7 +1,8 @@
-//! Two robots, an agent on each, and packets lost between them: a real Prometheus that scrapes both
-//! subtracts what arrived from what was sent and finds exactly what was lost on the way.
+//! Two robots with an agent each, and packets lost between them. A real Prometheus scrapes both
+//! agents and subtracts received from sent messages. The difference is exactly the number of lost
+//! messages.
 //!
-//! The judges are what the publisher and the subscriber log and the count of dropped datagrams.
+//! The references are the logs of publisher and subscriber, and the count of dropped datagrams.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -15,15 +16,15 @@ use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::prometheus::Prometheus;
 use ros2probe_testing::harness::switch::Switched;
 
-/// Six seconds.
+/// Samples of six seconds.
 const SAMPLES: u64 = 1_200;
 const STRETCH: u64 = 40;
-/// Longest time for repairs, scrapes and rules on a busy machine.
+/// Maximum time for repairs, scrapes and rules on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(40);
-/// Gaps are settled after a second; scrapes and rules take another one each.
+/// Gaps are settled after a second. Scrapes and rules take another second each.
 const STILL: Duration = Duration::from_millis(3500);
 const PER_MILLE: u16 = 200;
-/// Of some 450 that a point cloud takes.
+/// Ratio of dropped frames, of which a point cloud takes some 450.
 const FRAMES_PER_MILLE: u16 = 1;
 
 #[derive(Clone, Copy)]
@@ -38,7 +39,7 @@ struct Journey {
     published: u64,
     received: u64,
     dropped: u64,
-    /// The rules' answers.
+    /// Results of the rules.
     difference: f64,
     ratio: f64,
     before_host: f64,
@@ -46,52 +47,52 @@ struct Journey {
 }
 
 #[test]
-fn fast_dds_samples_lost_between_two_hosts_are_the_difference_on_the_wire() -> Result<()> {
+fn fast_dds_losses_between_hosts_equal_the_difference_of_counts_on_the_wire() -> Result<()> {
     best_effort(Source::Wire, Stack::Fast)
 }
 
 #[test]
-fn cyclone_dds_samples_lost_between_two_hosts_are_the_difference_on_the_wire() -> Result<()> {
+fn cyclone_dds_losses_between_hosts_equal_the_difference_of_counts_on_the_wire() -> Result<()> {
     best_effort(Source::Wire, Stack::Cyclone)
 }
 
 #[test]
-fn rust_dds_samples_lost_between_two_hosts_are_the_difference_on_the_wire() -> Result<()> {
+fn rust_dds_losses_between_hosts_equal_the_difference_of_counts_on_the_wire() -> Result<()> {
     best_effort(Source::Wire, Stack::Rust)
 }
 
 #[test]
-fn fast_dds_samples_lost_between_two_hosts_are_the_difference_at_the_sockets() -> Result<()> {
+fn fast_dds_losses_between_hosts_equal_the_difference_of_counts_at_the_sockets() -> Result<()> {
     best_effort(Source::Host, Stack::Fast)
 }
 
 #[test]
-fn cyclone_dds_samples_lost_between_two_hosts_are_the_difference_at_the_sockets() -> Result<()> {
+fn cyclone_dds_losses_between_hosts_equal_the_difference_of_counts_at_the_sockets() -> Result<()> {
     best_effort(Source::Host, Stack::Cyclone)
 }
 
 #[test]
-fn rust_dds_samples_lost_between_two_hosts_are_the_difference_at_the_sockets() -> Result<()> {
+fn rust_dds_losses_between_hosts_equal_the_difference_of_counts_at_the_sockets() -> Result<()> {
     best_effort(Source::Host, Stack::Rust)
 }
 
 #[test]
-fn repairs_are_no_loss_between_two_hosts_on_the_wire() -> Result<()> {
+fn repaired_samples_do_not_count_as_lost_between_hosts_on_the_wire() -> Result<()> {
     reliable(Source::Wire, Stack::Cyclone)
 }
 
 #[test]
-fn repairs_are_no_loss_between_two_hosts_at_the_sockets() -> Result<()> {
+fn repaired_samples_do_not_count_as_lost_between_hosts_at_the_sockets() -> Result<()> {
     reliable(Source::Host, Stack::Fast)
 }
 
 #[test]
-fn fast_dds_point_clouds_that_lose_a_frame_between_two_hosts_are_the_difference() -> Result<()> {
+fn fast_dds_point_clouds_with_a_lost_frame_equal_the_difference_of_counts() -> Result<()> {
     point_clouds(Stack::Fast)
 }
 
 #[test]
-fn cyclone_dds_point_clouds_that_lose_a_frame_between_two_hosts_are_the_difference() -> Result<()> {
+fn cyclone_dds_point_clouds_with_a_lost_frame_equal_the_difference_of_counts() -> Result<()> {
     point_clouds(Stack::Cyclone)
 }
 
@@ -109,7 +110,7 @@ fn best_effort(source: Source, stack: Stack) -> Result<()> {
         "{} by the rule, {lost} lost",
         seen.difference
     );
-    // The receiver's agent alone counts no loss after the last sample that arrived.
+    // The receiver's agent alone cannot count losses after the last sample that arrived.
     ensure!(
         seen.before_host <= lost as f64 && seen.before_host >= lost as f64 - 20.0,
         "{} of {lost} noticed by the receiver",
@@ -135,7 +136,7 @@ fn reliable(source: Source, stack: Stack) -> Result<()> {
     };
     let seen = Journey::of(source, stack, &stream)?;
     ensure!(seen.dropped > SAMPLES / 10, "{} dropped", seen.dropped);
-    // A few are overwritten in the writer's history before they could be sent again.
+    // Some samples are overwritten in the writer's history before they can be sent again.
     let lost = seen.lost();
     ensure!(lost < seen.dropped / 2, "{lost} lost");
     ensure!(
@@ -147,8 +148,9 @@ fn reliable(source: Source, stack: Stack) -> Result<()> {
     Ok(())
 }
 
-/// Each is hundreds of frames; what loses one of them is lost, in the reassembly of the receiver's
-/// kernel or library. What a full socket buffer swallowed had come.
+/// A point cloud has hundreds of frames. If one frame is lost, so is the point cloud, in the
+/// reassembly of the receiver's kernel or library. A point cloud that a full socket buffer dropped
+/// did arrive at the host.
 fn point_clouds(stack: Stack) -> Result<()> {
     let stream = Stream {
         linger: 60.0,
@@ -167,7 +169,7 @@ fn point_clouds(stack: Stack) -> Result<()> {
     Ok(())
 }
 
-/// The publisher stays until its counts are read.
+/// Returns a stream whose publisher stays until its counts are read.
 fn stream() -> Stream {
     Stream {
         linger: 60.0,
@@ -198,7 +200,7 @@ impl Journey {
         subscriber.wait_matched()?;
         publisher.wait_matched()?;
         prometheus.wait_for("sum(up)", 2.0)?;
-        // Rates begin with the second scrape of a series: nothing is lost before the first.
+        // Rates begin with the second scrape of a series, so losses begin only after the first.
         publisher.go()?;
         let topic = format!("topic=\"{}\"", stream.topic);
         let sent = format!("max(ros2_writer_sent_messages_total{{{topic}}})");
@@ -221,12 +223,13 @@ impl Journey {
             }
         }
         publisher.wait_sent(PATIENCE)?;
-        // Settled, scraped and evaluated, while publisher and subscriber are still there.
+        // The counts settle and are scraped and evaluated while publisher and subscriber still
+        // exist.
         let deadline = Instant::now() + PATIENCE;
         let (mut before, mut since) = (None, Instant::now());
         let mut journey = loop {
             let numbers = Journey::ask(&prometheus, &publisher, &subscriber, stream)?;
-            // The ratio goes on with the clock.
+            // The ratio changes with time.
             let counted = Journey {
                 ratio: 0.0,
                 ..numbers
@@ -245,7 +248,7 @@ impl Journey {
         Ok(journey)
     }
 
-    /// As it is now; nothing is known of what was dropped.
+    /// Reads the present counts. The number of dropped datagrams is not known here.
     fn ask(
         prometheus: &Prometheus<'_>,
         publisher: &Peer,
@@ -295,7 +298,7 @@ fn start<'a>(
     directory: &Path,
 ) -> Result<Agent<'a>> {
     let source = match source {
-        // Both robots are one machine here: each agent keeps to its own.
+        // Both robots are on one machine, so each agent observes only its own robot.
         Source::Host => at_the_sockets_of(host),
         Source::Wire => ON_THE_WIRE.to_owned(),
     };

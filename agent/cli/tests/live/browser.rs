@@ -1,6 +1,7 @@
-//! The page in a real Chromium: beside a running robot, on captures of faults, with hostile names,
-//! without rights, and while the agent or the tab is away. Each test plays a scenario of
-//! `agent/cli/tests/page`, in which nothing may leave the agent's origin or reach the console.
+//! The page in a real Chromium, with a running robot, with captures of faults, with hostile names,
+//! and without rights. In some tests the agent stops or the tab sleeps. Each test plays a scenario
+//! of `agent/cli/tests/page`. No request may leave the agent's origin, and no message may reach the
+//! console.
 
 mod calls;
 mod crowd;
@@ -21,9 +22,9 @@ use ros2probe_testing::harness::bpf::interest_of;
 use ros2probe_testing::local_agent::{self, LocalAgent};
 use serde_json::{Value, json};
 
-/// Topics of the large robot.
+/// Number of topics of the large robot.
 const CROWD: usize = 500;
-/// Chains of hostile names, and hops of the longest one.
+/// Number of chains with hostile names, and number of hops of the longest one.
 const CHAIN_COUNT: usize = 20;
 const LONG_CHAIN: usize = 31;
 /// Chains of the capture `chain-1ns`: one too slow, one within its limit, and none.
@@ -32,14 +33,14 @@ const CHAINS: &str = "chains:
   - {from: /points, to: /filtered, max_latency_ms: 50}
   - {from: /camera, to: /steering, max_latency_ms: 100}
 ";
-/// The API of an agent whose host is its own.
+/// Address of the page of an agent with a network namespace of its own.
 const PAGE: &str = "http://127.0.0.1:17401/";
 
-/// What is measured from the start.
+/// Configuration of the topics that are measured from the start.
 const SENSORS: &str = "watch: [/imu, /points, /scan]\n";
 
 #[test]
-fn every_view_shows_a_robot_that_runs() -> Result<()> {
+fn every_view_shows_a_running_robot() -> Result<()> {
     let place = Place::new()?;
     let _agent = place.agent(SENSORS)?;
     let robot = Robot::start(&place.host)?;
@@ -72,13 +73,13 @@ fn is_accessible(how: &str) -> Result<()> {
     let place = Place::new()?;
     let _agent = place.agent(&format!("{SENSORS}{}", place.recordings()))?;
     let _robot = Robot::start(&place.host)?;
-    // The topic with the longest badge.
+    // This topic has the longest badge.
     let _unmatched = place.publisher("/unmatched", "/alone")?;
     watch(&place.inside(), "access", &[PAGE, how])
 }
 
 #[test]
-fn a_press_measures_a_topic_down_to_the_kernel() -> Result<()> {
+fn a_press_of_a_button_measures_a_topic_down_to_the_kernel() -> Result<()> {
     let place = Place::new()?;
     let agent = place.agent("")?;
     let _robot = Robot::start(&place.host)?;
@@ -98,7 +99,7 @@ fn a_press_measures_a_topic_down_to_the_kernel() -> Result<()> {
 }
 
 #[test]
-fn the_message_of_a_topic_is_a_tree_with_charts_of_its_numbers() -> Result<()> {
+fn a_message_is_shown_as_a_tree_with_charts_of_its_numbers() -> Result<()> {
     let place = Place::new()?;
     let _agent = place.agent("")?;
     let _robot = Robot::start(&place.host)?;
@@ -110,7 +111,7 @@ fn the_message_of_a_topic_is_a_tree_with_charts_of_its_numbers() -> Result<()> {
 }
 
 #[test]
-fn a_recording_goes_from_its_start_to_the_files_that_are_downloaded() -> Result<()> {
+fn a_recording_is_started_ended_and_downloaded_on_the_page() -> Result<()> {
     let place = Place::new()?;
     let bags = place.directory.path().join("bags");
     let snapshots = "  snapshots: [{name: incident, topics: [/imu], seconds: 5}]\n";
@@ -168,7 +169,7 @@ fn the_page_continues_after_the_agent_hung_ended_or_was_killed() -> Result<()> {
 }
 
 #[test]
-fn a_tab_that_slept_for_a_minute_shows_the_robot_of_now() -> Result<()> {
+fn a_tab_that_slept_for_a_minute_shows_the_present_state() -> Result<()> {
     let place = Place::new()?;
     let _agent = place.agent("watch: [/**]\n")?;
     let _robot = Robot::start(&place.host)?;
@@ -186,7 +187,7 @@ fn a_tab_that_slept_for_a_minute_shows_the_robot_of_now() -> Result<()> {
 }
 
 #[test]
-fn an_incident_of_the_past_is_on_the_page_of_its_capture() -> Result<()> {
+fn the_page_of_a_capture_shows_an_incident_of_the_past() -> Result<()> {
     let capture = data("cyclonedds/points-besteffort-lossy-2ns");
     let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "1"]);
     agent.wait_for_log("the capture has ended");
@@ -194,8 +195,8 @@ fn an_incident_of_the_past_is_on_the_page_of_its_capture() -> Result<()> {
 }
 
 #[test]
-fn a_mismatch_of_qos_leads_to_the_policy_that_does_not_fit() -> Result<()> {
-    // The time before the first goodbye.
+fn a_qos_mismatch_leads_to_the_incompatible_policy() -> Result<()> {
+    // The capture ends before the first goodbye.
     let mut capture = tempfile::NamedTempFile::with_suffix(".pcap")?;
     capture.write_all(&beginning(&data("cyclonedds/qos-mismatch-2ns"), 5)?)?;
     let agent = replay(capture.path(), &[]);
@@ -203,14 +204,14 @@ fn a_mismatch_of_qos_leads_to_the_policy_that_does_not_fit() -> Result<()> {
 }
 
 #[test]
-fn five_hundred_hostile_names_stay_text() -> Result<()> {
+fn five_hundred_hostile_names_are_shown_as_text() -> Result<()> {
     let capture = large_robot(true, 20)?;
     let agent = replay(capture.path(), &[]);
     watch(&[], "hostile", &[&page(&agent), &CROWD.to_string()])
 }
 
 #[test]
-fn the_hops_of_a_chain_are_a_waterfall_and_a_way_through_the_graph() -> Result<()> {
+fn a_chain_is_shown_as_a_waterfall_and_as_a_path_in_the_graph() -> Result<()> {
     let mut configured = tempfile::NamedTempFile::with_suffix(".yaml")?;
     configured.write_all(CHAINS.as_bytes())?;
     let path = configured.path().to_str().context("no path")?.to_owned();
@@ -231,7 +232,7 @@ fn the_hops_of_a_chain_are_a_waterfall_and_a_way_through_the_graph() -> Result<(
 }
 
 #[test]
-fn chains_of_hostile_names_stay_text() -> Result<()> {
+fn chains_of_hostile_names_are_shown_as_text() -> Result<()> {
     let mut capture = tempfile::NamedTempFile::with_suffix(".pcap")?;
     let mut lengths = vec![LONG_CHAIN];
     lengths.resize(CHAIN_COUNT, 2);
@@ -244,7 +245,7 @@ fn chains_of_hostile_names_stay_text() -> Result<()> {
 }
 
 #[test]
-fn figures_from_inside_processes_are_on_the_views_of_nodes_and_topics() -> Result<()> {
+fn views_of_nodes_and_topics_show_figures_from_inside_processes() -> Result<()> {
     let place = Place::new()?;
     let _agent = place.agent_inside("watch: [/**]\n")?;
     // The graph knows the node by its participant.
@@ -262,7 +263,7 @@ fn figures_from_inside_processes_are_on_the_views_of_nodes_and_topics() -> Resul
 }
 
 #[test]
-fn rights_that_loopback_does_not_give_come_with_a_token() -> Result<()> {
+fn a_token_grants_rights_that_loopback_does_not_have() -> Result<()> {
     let directory = tempfile::tempdir()?;
     let socket = directory.path().join("api.sock");
     let configured = directory.path().join("config.yaml");
@@ -298,7 +299,7 @@ fn rights_that_loopback_does_not_give_come_with_a_token() -> Result<()> {
     play(&[], "token", &[&page(&agent), &page(&other)], &mut answers)
 }
 
-/// First useful paint with 500 topics, layout of large graphs, memory of a tab.
+/// Measures the first useful paint with 500 topics, the layout of large graphs, and a tab's memory.
 #[test]
 #[ignore = "measures for minutes: make page-bench"]
 fn measurements() -> Result<()> {
@@ -316,7 +317,7 @@ fn measurements() -> Result<()> {
     player::play_for(limit, &[], "measure", &[&page(&agent)], &mut nothing)
 }
 
-/// An agent that has read all of a capture, with everything in it measured.
+/// Returns an agent that has read all of a capture and measured everything in it.
 fn replay(capture: &Path, arguments: &[&str]) -> LocalAgent {
     let mut all = vec!["--speed", "max", "--watch", "/**"];
     all.extend(arguments);
@@ -334,7 +335,7 @@ fn data(name: &str) -> PathBuf {
     data.join(name).join("capture.pcap.gz")
 }
 
-/// The packets of a capture's first seconds.
+/// Returns the packets of a capture's first seconds.
 fn beginning(capture: &Path, seconds: u32) -> Result<Vec<u8>> {
     let mut all = Vec::new();
     MultiGzDecoder::new(std::fs::File::open(capture)?).read_to_end(&mut all)?;
@@ -353,7 +354,7 @@ fn large_robot(hostile: bool, seconds: u64) -> Result<tempfile::NamedTempFile> {
     Ok(file)
 }
 
-/// The number of a list's member with this name.
+/// Returns the number `of` in the list's member whose `key` is this name.
 fn number(list: &Value, key: &str, name: &str, of: &str) -> Result<u64> {
     let mut all = list.as_array().context("no list")?.iter();
     let found = all.find(|each| each[key] == name);

@@ -1,5 +1,6 @@
-//! The agent on either end of a link counts exactly what passed there: three DDS stacks, small
-//! samples with 0, 10 and 20 % loss, point clouds of 644 KB and 2.72 MB.
+//! The agent on either end of a link counts exactly the samples that passed there. The tests use
+//! three DDS stacks, small samples with 0, 10 and 20 % loss, and point clouds of 644 KB and 2.72
+//! MB.
 //!
 //! Datagrams are dropped before the packet taps of the publisher's host, so no agent sees them. The
 //! references are the peers' logs, the count of dropped datagrams, and tshark on recordings of both
@@ -20,14 +21,14 @@ use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 
-/// Three seconds each.
+/// Samples of three seconds.
 const SMALL_SAMPLES: u64 = 600;
 const POINT_CLOUDS: u64 = 60;
-/// How far the clocks of a frame's two observers, the agent's filter and tcpdump, may be apart on
-/// average.
+/// Maximum mean difference in seconds between the clocks of a frame's two observers, the agent's
+/// filter and tcpdump.
 const CLOCK_TOLERANCE: f64 = 0.002;
 
-/// Point clouds take the machine for themselves, also where tests are threads of one process.
+/// Point clouds run alone on the machine, also if tests are threads of one process.
 static MACHINE: RwLock<()> = RwLock::new(());
 
 #[test]
@@ -56,12 +57,12 @@ fn fast_dds_reliable_samples_dropped_at_20_percent_are_counted_as_recovered() ->
 }
 
 #[test]
-fn fast_dds_point_clouds_of_644_kb_are_counted_as_on_the_wire() -> Result<()> {
+fn fast_dds_point_clouds_of_644_kb_are_counted_as_recorded_on_the_wire() -> Result<()> {
     point_clouds(Stack::Fast, 644_000)
 }
 
 #[test]
-fn fast_dds_point_clouds_of_2_72_mb_are_counted_as_on_the_wire() -> Result<()> {
+fn fast_dds_point_clouds_of_2_72_mb_are_counted_as_recorded_on_the_wire() -> Result<()> {
     point_clouds(Stack::Fast, 2_720_000)
 }
 
@@ -91,12 +92,12 @@ fn cyclone_dds_reliable_samples_dropped_at_20_percent_are_counted_as_recovered()
 }
 
 #[test]
-fn cyclone_dds_point_clouds_of_644_kb_are_counted_as_on_the_wire() -> Result<()> {
+fn cyclone_dds_point_clouds_of_644_kb_are_counted_as_recorded_on_the_wire() -> Result<()> {
     point_clouds(Stack::Cyclone, 644_000)
 }
 
 #[test]
-fn cyclone_dds_point_clouds_of_2_72_mb_are_counted_as_on_the_wire() -> Result<()> {
+fn cyclone_dds_point_clouds_of_2_72_mb_are_counted_as_recorded_on_the_wire() -> Result<()> {
     point_clouds(Stack::Cyclone, 2_720_000)
 }
 
@@ -126,12 +127,12 @@ fn rust_dds_reliable_samples_dropped_at_20_percent_are_counted_as_recovered() ->
 }
 
 #[test]
-fn rust_dds_point_clouds_of_644_kb_are_counted_as_on_the_wire() -> Result<()> {
+fn rust_dds_point_clouds_of_644_kb_are_counted_as_recorded_on_the_wire() -> Result<()> {
     point_clouds(Stack::Rust, 644_000)
 }
 
 #[test]
-fn rust_dds_point_clouds_of_2_72_mb_are_counted_as_on_the_wire() -> Result<()> {
+fn rust_dds_point_clouds_of_2_72_mb_are_counted_as_recorded_on_the_wire() -> Result<()> {
     point_clouds(Stack::Rust, 2_720_000)
 }
 
@@ -203,9 +204,9 @@ fn point_clouds(stack: Stack, size: usize) -> Result<()> {
         assert_eq!(counted.lost, end.wire.missing(), "{}", end.name);
         assert_eq!(counted.bytes, passed * size as u64, "{}", end.name);
         assert_eq!(counted.recovered, 0, "{}", end.name);
-        // Every sample of which the last datagram left the publisher was seen in part at least.
+        // Every sample whose last datagram left the publisher was seen at least in part.
         assert!(passed + counted.lost >= POINT_CLOUDS - 1, "{}", end.name);
-        // A sample is one record; what else is copied is discovery, and the stream's beginning.
+        // A sample is one record. Only discovery and the stream's beginning are copied in addition.
         let share = if size == 2_720_000 { 0.01 } else { 0.02 };
         let copied = end.scrape.sum("ros2probe_capture_copied_bytes_total", &[]);
         let traffic = counted.bytes as f64;
@@ -273,8 +274,8 @@ impl Exchange {
                 per_mille,
             )?),
         };
-        // Until the agent has classified both endpoints it reads no ACKNACKs, and samples repaired
-        // at once count as reordered.
+        // Until the agent has classified both endpoints, it reads no ACKNACKs, and samples that are
+        // repaired immediately count as reordered.
         std::thread::sleep(Duration::from_millis(500));
         publisher.go()?;
         publisher
@@ -343,8 +344,8 @@ impl<'a> Observer<'a> {
         })
     }
 
-    /// Waits until the agent has seen the writer go. RustDDS on a busy machine may go without saying
-    /// so: what it sent is decided all the same.
+    /// Waits until the writer has left the agent's graph. On a busy machine, RustDDS may leave
+    /// without a goodbye; its samples are settled nevertheless.
     fn finish(self, stack: Stack, topic: &str, writer: &str) -> Result<End> {
         let gone =
             |page: &Scrape| page.value("ros2_topic_publishers", &[("topic", topic)]) == Some(0.0);
@@ -382,7 +383,7 @@ impl End {
         }
     }
 
-    /// Intervals and latencies fit the messages: one host, one clock.
+    /// Checks that intervals and latencies fit the messages. Both hosts have one clock.
     fn assert_delays(&self, received: &EventLog) -> Result<()> {
         let messages = self.counted().messages;
         let name = self.name;
@@ -402,19 +403,20 @@ impl End {
                 messages,
                 "{name} {latency}"
             );
-            // One clock: anything beyond a busy machine's delays is a wrong epoch or unit.
+            // With one clock, any larger delay than that of a busy machine shows a wrong epoch or
+            // unit.
             let median = self.median(latency)?;
             assert!(median <= 1.0, "{name}: {latency} {median} s");
         }
         let latency = self.sum("ros2_topic_latency_seconds_sum");
         let header_latency = self.sum("ros2_topic_header_latency_seconds_sum");
-        // The message is stamped before it is given to the writer.
+        // The message is stamped before it is passed to the writer.
         assert!(latency > 0.0 && latency <= header_latency, "{name}");
         self.assert_header_latency(received)
     }
 
-    /// The mean time from `Header.stamp` to the capture, against the peers' stamps and tcpdump's
-    /// times of the samples that the subscriber was given.
+    /// Checks the mean time from `Header.stamp` to the capture, with the peers' stamps and
+    /// tcpdump's times of the samples that the subscriber received.
     fn assert_header_latency(&self, received: &EventLog) -> Result<()> {
         let stamped = received
             .0
@@ -440,7 +442,7 @@ impl End {
         Ok(())
     }
 
-    /// The upper bound of the histogram's bucket that holds the median.
+    /// Returns the upper bound of the histogram's bucket that contains the median.
     fn median(&self, histogram: &str) -> Result<f64> {
         let half = self.sum(&format!("{histogram}_count")) / 2.0;
         let bucket = format!("{histogram}_bucket");
@@ -471,7 +473,7 @@ fn writer_of(log: &EventLog, topic: &str) -> Result<String> {
         .context("the publisher logged no GUID")
 }
 
-/// A reliable subscriber gets everything, in time.
+/// Waits until a reliable subscriber has received everything, and fails after a time limit.
 fn wait_received(subscriber: &Peer, count: u64) -> Result<()> {
     let deadline = Instant::now() + Duration::from_secs(60);
     loop {

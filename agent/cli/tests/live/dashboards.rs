@@ -1,5 +1,5 @@
-//! Two robots, an agent on each, and a real Prometheus with the shipped rules: every query of every
-//! panel and every rule is answered with data, but those that are about what does not happen here.
+//! Two robots with an agent each, and a real Prometheus with the shipped rules. Every query of
+//! every panel and every rule returns data, except queries about events that do not happen here.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -14,7 +14,7 @@ use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::prometheus::Prometheus;
 use serde_yaml::Value;
 
-/// Panels' queries without an answer on these robots, and why that is right.
+/// Queries of panels that rightly return no data on these robots, with the reason.
 const RIGHTLY_EMPTY: [(&str, &str); 14] = [
     (
         "robot: Where latency arises B",
@@ -50,7 +50,7 @@ const RIGHTLY_EMPTY: [(&str, &str); 14] = [
     ("robot: Drops of unknown content A", "no socket overflows"),
 ];
 
-/// Alerts whose condition holds here. The others are about agents and links that fail.
+/// Alerts whose condition holds here. The other alerts are about failing agents and links.
 const TRUE_ALERTS: [&str; 8] = [
     "Ros2TopicSilent",
     "Ros2TopicNotPublished",
@@ -65,7 +65,7 @@ const TRUE_ALERTS: [&str; 8] = [
 /// Labels that may be empty, which to Prometheus is the same as absent.
 const MAY_BE_EMPTY: [&str; 2] = ["host", "reason"];
 
-/// One query that must have an answer.
+/// A query that must return data.
 struct Question {
     name: String,
     expression: String,
@@ -90,7 +90,7 @@ fn every_panel_and_every_rule_has_data_of_two_robots() -> Result<()> {
     ] {
         roles.push(Process::start(&host.inside(), robot()?, ["--role", role])?);
     }
-    // A publisher that never starts, and a subscriber that requests more than it offers.
+    // This publisher never starts, and the subscriber requests more than the publisher offers.
     let quiet = Stream {
         topic: "/quiet".to_owned(),
         ..Stream::small(1)
@@ -178,7 +178,8 @@ fn ask(prometheus: &Prometheus<'_>, mut questions: Vec<Question>) -> Result<()> 
 fn of_dashboard(dashboard: &Dashboard, targets: &[String; 2]) -> Result<Vec<Question>> {
     let values = BTreeMap::from([
         ("job", "ros2probe".to_owned()),
-        // The dashboard of one robot names it: the one that also receives. That of the fleet has all.
+        // The dashboard of one robot names the robot that also receives. The dashboard of the fleet
+        // shows all robots.
         (
             "instance",
             match dashboard.file.as_str() {
@@ -204,7 +205,8 @@ fn of_dashboard(dashboard: &Dashboard, targets: &[String; 2]) -> Result<Vec<Ques
         let columns = panel.columns();
         for (index, target) in panel.targets().into_iter().enumerate() {
             let labels = legend_labels(target.legend).into_iter();
-            // A heading is over the columns of all queries together; the first has the key.
+            // The columns of a table cover all its queries together, and only the first query has
+            // the key.
             let labels = labels.chain(
                 columns
                     .iter()
@@ -261,7 +263,7 @@ fn rule_files() -> [PathBuf; 2] {
 
 fn start<'a>(host: &'a Namespace, directory: &Path) -> Result<Agent<'a>> {
     let configuration = directory.join(format!("{}.yaml", host.name()));
-    // More than the topics do, so that expectations are broken.
+    // These expectations exceed what the topics do, so that they are violated.
     let text = format!(
         "watch:\n\
          - {{topic: /**, per_subscriber: true}}\n\

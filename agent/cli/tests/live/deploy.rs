@@ -1,6 +1,5 @@
-//! The promises of `deploy/` for running systems, as far as they need no container engine. An agent
-//! confined as in the DaemonSet sees its whole node. A robot's Prometheus delivers the samples of a
-//! time without link.
+//! Claims of `deploy/` about running systems that need no container engine. An agent confined as in
+//! the DaemonSet sees its whole node. A robot's Prometheus delivers the samples of an outage.
 
 use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt as _;
@@ -16,13 +15,13 @@ use ros2probe_testing::harness::prometheus::{Kind, Prometheus};
 use serde::Deserialize as _;
 use serde_yaml::Value;
 
-/// No capability, as /proc shows it.
+/// An empty capability set, as /proc shows it.
 const NOTHING: &str = "0000000000000000";
 const OUTAGE: Duration = Duration::from_secs(8);
-/// Of a scrape a second, on a busy machine.
+/// Maximum gap between samples of a scrape per second, in seconds, on a busy machine.
 const GAP: f64 = 6.0;
 
-/// Not covered: the runtime's seccomp filter, and its own setup of the confinement.
+/// The runtime's seccomp filter and its own setup of the confinement are not covered.
 #[test]
 fn an_agent_confined_by_the_daemon_set_sees_the_whole_node() -> Result<()> {
     let node = Namespace::alone()?;
@@ -52,8 +51,8 @@ fn an_agent_confined_by_the_daemon_set_sees_the_whole_node() -> Result<()> {
         .map(|name| format!(",+{}", name.to_lowercase()))
         .collect();
 
-    // As a runtime does it: a view of control groups of its own, the node's mounted beside it, and
-    // nothing to write to but the state.
+    // The script confines the agent as a container runtime does. The agent has its own view of
+    // control groups, beside a mount of the node's hierarchy, and can write only its state.
     let own = harness::cgroup::hierarchy()?;
     let own = own.display();
     let script = format!(
@@ -95,13 +94,13 @@ fn an_agent_confined_by_the_daemon_set_sees_the_whole_node() -> Result<()> {
 }
 
 #[test]
-fn figures_measured_out_of_reach_arrive_when_the_link_returns() -> Result<()> {
+fn samples_of_an_outage_arrive_when_the_link_returns() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let configuration = directory.path().join("ros2probe.yaml");
     std::fs::write(&configuration, at_the_sockets_of(&link.robot))?;
     let agent = Agent::start(&link.robot, env!("CARGO_BIN_EXE_rp"), &configuration)?;
-    // The shipped configurations, at other addresses and scraping faster.
+    // The configurations are the shipped ones, with other addresses and shorter scrape intervals.
     let server = std::fs::read_to_string(deploy().join("prometheus/prometheus.yaml"))?;
     let rules = deploy().join("../dashboards/rules");
     let server = server.replace("/etc/ros2probe/rules", &rules.display().to_string());

@@ -1,5 +1,5 @@
-//! Reports of endpoints that do not match, and that they really do not: Fast DDS and Cyclone DDS,
-//! each alone and with the other.
+//! Reports of endpoints that do not match, and checks that they really do not: Fast DDS and Cyclone
+//! DDS, each alone and with the other.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -9,11 +9,11 @@ use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 
-/// Discovery on a busy machine, or what comes after it.
+/// Maximum wait for discovery and its consequences on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 #[test]
-fn a_reliable_subscriber_of_a_best_effort_publisher_is_named_and_hears_nothing() -> Result<()> {
+fn a_reliable_subscriber_of_a_best_effort_publisher_is_reported_and_gets_nothing() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("ros2probe.yaml");
@@ -51,7 +51,7 @@ fn a_reliable_subscriber_of_a_best_effort_publisher_is_named_and_hears_nothing()
             let labels = [("topic", topic.as_str()), ("policy", "reliability")];
             page.sum("ros2_qos_incompatible_pairs", &labels)
         };
-        // One of the two subscribers, and for no other reason.
+        // Only one of the two subscribers is reported, and for no other reason.
         wait(&agent, &topic, |page| {
             by_reliability(page) == 1.0 && pairs(page) == 1.0
         })?;

@@ -1,6 +1,6 @@
-//! Live discovery: robots of sixteen nodes that start at once, before or with the agent, and that
-//! leave or die. Domains run side by side, and writers without an observed announcement are shown
-//! as unknown.
+//! Live discovery: robots of sixteen nodes that start simultaneously, before or with the agent, and
+//! that leave or die. Domains run side by side, and writers without an observed announcement are
+//! shown as unknown.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::panic::resume_unwind;
@@ -15,25 +15,25 @@ use tempfile::TempDir;
 
 const STARTS: usize = 10;
 const NODES: usize = 16;
-/// Longest start of a whole robot on a busy machine.
+/// Maximum time for the start of a whole robot on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Less than the shortest lease, so no participant has expired.
+/// Time for goodbyes, less than the shortest lease, so that no participant has expired.
 const LEAVE: Duration = Duration::from_secs(8);
-/// Nodes that may leave without a goodbye.
+/// Maximum number of nodes that may leave without a goodbye.
 const SILENT: usize = NODES / 2;
 
 #[test]
-fn sixteen_fast_dds_nodes_are_all_there_ten_times_in_a_row() -> Result<()> {
+fn all_sixteen_fast_dds_nodes_are_shown_in_each_of_ten_starts() -> Result<()> {
     all_nodes_are_there_each_time(Stack::Fast)
 }
 
 #[test]
-fn sixteen_cyclone_dds_nodes_are_all_there_ten_times_in_a_row() -> Result<()> {
+fn all_sixteen_cyclone_dds_nodes_are_shown_in_each_of_ten_starts() -> Result<()> {
     all_nodes_are_there_each_time(Stack::Cyclone)
 }
 
 #[test]
-fn sixteen_rust_dds_nodes_are_all_there_ten_times_in_a_row() -> Result<()> {
+fn all_sixteen_rust_dds_nodes_are_shown_in_each_of_ten_starts() -> Result<()> {
     all_nodes_are_there_each_time(Stack::Rust)
 }
 
@@ -53,8 +53,8 @@ fn an_agent_that_starts_after_half_of_the_rust_dds_nodes_shows_all() -> Result<(
 }
 
 #[test]
-fn a_late_agent_shows_writers_it_cannot_name_with_their_rate() -> Result<()> {
-    // Each on a separate link, so none has to wait for the others.
+fn a_late_agent_shows_unknown_writers_with_their_rate() -> Result<()> {
+    // Each stack is on a separate link, so that none waits for the others.
     std::thread::scope(|scope| {
         let stacks = Stack::ALL.map(|stack| scope.spawn(move || late_agent_shows_rate(stack)));
         stacks
@@ -88,14 +88,14 @@ fn late_agent_shows_rate(stack: Stack) -> Result<()> {
     let before = (count()?, Instant::now());
     std::thread::sleep(Duration::from_secs(5));
     let rate = (count()? - before.0) / before.1.elapsed().as_secs_f64();
-    // Counts are as old as the snapshot: up to a second of five.
+    // Counts are as old as the snapshot: up to one of the five seconds.
     assert!((70.0..130.0).contains(&rate), "{stack:?}: {rate} Hz");
     publisher.process.terminate()?;
     Ok(())
 }
 
 #[test]
-fn the_same_topic_of_two_domains_is_two_topics() -> Result<()> {
+fn one_topic_name_in_two_domains_counts_as_two_topics() -> Result<()> {
     let link = Link::new()?;
     let watcher = Watcher::start(&link.monitor)?;
     let mut pairs = Vec::new();
@@ -134,10 +134,11 @@ fn the_same_topic_of_two_domains_is_two_topics() -> Result<()> {
 }
 
 #[test]
-fn nodes_that_stop_are_gone_at_once_and_killed_ones_when_their_lease_ends() -> Result<()> {
+fn stopped_nodes_vanish_immediately_and_killed_ones_when_their_lease_ends() -> Result<()> {
     let link = Link::new()?;
     let watcher = Watcher::start(&link.robot)?;
-    // Each in a separate domain: an assertion of Fast DDS 2.9 fails when it discovers RustDDS.
+    // Each node is in a separate domain, because an assertion of Fast DDS 2.9 fails when it
+    // discovers RustDDS.
     let node = |stack, name| {
         let stream = Stream {
             domain: stack as u16,
@@ -150,7 +151,7 @@ fn nodes_that_stop_are_gone_at_once_and_killed_ones_when_their_lease_ends() -> R
         ("/cyclone_stops", node(Stack::Cyclone, "/cyclone_stops")?),
         ("/rust_stops", node(Stack::Rust, "/rust_stops")?),
     ];
-    // The lease, and how long before the end it may have been renewed for the last time.
+    // The lease, and the maximum time between its last renewal and the end.
     let dying = BTreeMap::from([
         ("/fast_dies", (node(Stack::Fast, "/fast_dies")?, 20, 3)),
         (
@@ -237,7 +238,7 @@ fn late_agent_shows_all_nodes_each_time(stack: Stack) -> Result<()> {
     Ok(())
 }
 
-/// On the wire of one host, and at the sockets of the other.
+/// Starts an agent on the wire of one host, and one at the sockets of the other.
 fn watchers(link: &Link) -> Result<[Watcher<'_>; 2]> {
     Ok([
         Watcher::start(&link.monitor)?,
@@ -267,7 +268,7 @@ impl<'a> Robot<'a> {
     fn launch(&mut self, count: usize) -> Result<()> {
         let first = self.peers.len();
         for number in first..first + count {
-            // Publishers and subscribers on either host.
+            // Each host has publishers and subscribers.
             let host = match number / 2 % 2 {
                 0 => &self.link.robot,
                 _ => &self.link.monitor,
@@ -306,8 +307,8 @@ impl<'a> Robot<'a> {
 
     /// Ends all nodes in order, and returns whether the watchers saw all goodbyes.
     fn stop(mut self, watchers: &[Watcher<'_>]) -> Result<bool> {
-        // The monitor's nodes first: the goodbyes reach the robot's sockets only while some are
-        // open.
+        // The monitor's nodes end first, because goodbyes reach the robot's sockets only while some
+        // of them are open.
         for on_monitor in [1, 0] {
             let peers = self.peers.iter_mut().enumerate();
             let there = peers.filter(|(number, _)| number / 2 % 2 == on_monitor);
@@ -331,9 +332,9 @@ impl<'a> Robot<'a> {
         let Err(error) = left.collect::<Result<Vec<()>>>() else {
             return Ok(true);
         };
-        // RustDDS ends its sending thread right after it queues the goodbye, and a late thread ends
-        // first (dp_event_loop.rs, drain_queues, of 0.15). Nothing is sent then, and watchers of
-        // different kinds on different hosts miss the same ones.
+        // RustDDS 0.15 ends its sending thread right after it queues the goodbye (dp_event_loop.rs,
+        // drain_queues). A late thread ends before it sends. Watchers of different kinds on
+        // different hosts then miss the same goodbyes.
         let stay = |watcher: &Watcher<'_>| {
             let page = watcher.agent.scrape()?;
             anyhow::Ok(page.labels_of("ros2_participant_info", "participant"))

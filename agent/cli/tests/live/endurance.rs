@@ -26,21 +26,21 @@ use tempfile::TempDir;
 use views::{Views, graph_of};
 
 const API: &str = "http://127.0.0.1:17401";
-/// Longest time until an agent shows a change.
+/// Maximum time until an agent shows a change.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Part of `make soak` until the agent's tables are full. The agent keeps vanished topics for ten
-/// minutes.
+/// Part of `make soak` after which the agent's tables are full. The agent keeps vanished topics for
+/// ten minutes.
 const WARM_UP: f64 = 0.15;
-/// Most that memory may rise after the warm-up. The allocator levels off in half an hour, although
-/// the tables stay the same size (`docs/endurance.md`).
+/// Maximum rise of memory after the warm-up. The allocator levels off in half an hour, although the
+/// tables stay the same size (`docs/endurance.md`).
 const FILLING: f64 = 0.06;
-/// Part of the run until the allocator has levelled off.
+/// Part of the run after which the allocator has levelled off.
 const LEVEL: f64 = 0.5;
-/// Most that memory may rise after that.
+/// Maximum rise of memory after the allocator has levelled off.
 const GROWTH: f64 = 0.02;
 
 #[test]
-fn an_hour_of_a_changing_graph_leaves_the_graph_true_and_memory_flat() -> Result<()> {
+fn an_hour_of_graph_changes_leaves_the_graph_correct_and_the_memory_flat() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let program = soak::program(env!("CARGO_BIN_EXE_rp"));
@@ -53,7 +53,7 @@ fn an_hour_of_a_changing_graph_leaves_the_graph_true_and_memory_flat() -> Result
         std::fs::write(&file, text)?;
         Agent::start(host, &program, &file)
     };
-    // One agent watches all topics, as the package's configuration does; the other one a few.
+    // One agent watches all topics, as the package's configuration does, and the other a few.
     let wire = start("wire", &link.monitor, ON_THE_WIRE.to_owned(), "/**")?;
     let sockets = at_the_sockets_of(&link.robot);
     let sockets = start("sockets", &link.robot, sockets, "/measured/**")?;
@@ -71,7 +71,7 @@ fn an_hour_of_a_changing_graph_leaves_the_graph_true_and_memory_flat() -> Result
             memory_is_flat(curve, long)?;
         }
     }
-    // The defaults limit measured topics to 1000, and the agent counts those beyond.
+    // By default, at most 1000 topics are measured, and the agent counts further ones.
     if long.is_some() {
         let refused = wire.scrape()?.sum("ros2probe_topics_rejected_total", &[]);
         ensure!(refused > 0.0, "2000 topics and none refused");
@@ -101,7 +101,7 @@ fn changing(is_long: bool) -> Scale {
     }
 }
 
-/// Lets the crowd live, and returns the memory of each agent over time. Fails if a graph was wrong.
+/// Runs the crowd, and returns the memory of each agent over time. Fails if a graph was wrong.
 fn observed(
     agents: [(&'static str, &Agent<'_>); 2],
     crowd: &mut Crowd<Sender>,
@@ -156,9 +156,9 @@ fn memory_is_flat(curve: &Curve, long: Duration) -> Result<()> {
 }
 
 #[test]
-fn an_agent_stopped_for_seconds_removes_no_participant_and_counts_what_it_missed() -> Result<()> {
+fn an_agent_stopped_for_seconds_keeps_all_participants_and_counts_dropped_frames() -> Result<()> {
     let link = Link::new()?;
-    // Its ring holds a second and a half; one of the default size holds six.
+    // This ring holds a second and a half; one of the default size holds six seconds.
     let robot = Robot::start(
         &link,
         "watch: [/**]\ncapture: {source: wire, ring_bytes: 1048576}\n",
@@ -169,7 +169,7 @@ fn an_agent_stopped_for_seconds_removes_no_participant_and_counts_what_it_missed
     views.compare(&mut crowd)?;
     let pauses = soak::long().map_or(&[5][..], |_| &[5, 60]);
     for pause in pauses.iter().copied().map(Duration::from_secs) {
-        // Until participants that left silently have expired.
+        // The crowd rests until participants that left silently have expired.
         crowd.rest(Duration::from_secs(5))?;
         let expired = robot.expired()?;
         robot.agent.process.signal("STOP")?;
@@ -210,9 +210,9 @@ fn an_agent_stopped_for_seconds_removes_no_participant_and_counts_what_it_missed
 }
 
 #[test]
-fn an_overloaded_agent_counts_what_it_drops_and_is_exact_afterwards() -> Result<()> {
+fn an_overloaded_agent_counts_dropped_records_and_is_exact_afterwards() -> Result<()> {
     let link = Link::new()?;
-    // Room for some 500 records.
+    // This ring holds some 500 records.
     let small = "watch: [/**]\ncapture: {source: wire, record_ring_bytes: 65536}\n";
     let robot = Robot::start(&link, small)?;
     let (mut real, mut flood) = (Talker::new(1, "/real"), Talker::new(2, "/flood"));
@@ -221,12 +221,12 @@ fn an_overloaded_agent_counts_what_it_drops_and_is_exact_afterwards() -> Result<
     introduce(&flood, &mut sender)?;
     talk(&mut real, &mut sender, [320; 100])?;
     robot.agent.settled_scrape("/real", 100)?;
-    // 2 ms of CPU in 100: less than the agent needs.
+    // The agent gets 2 ms of CPU in 100 ms, which is less than it needs.
     let brake = Brake::new(&robot.agent)?;
     let began = Instant::now();
     let span = Duration::from_secs(soak::long().map_or(3, |_| 30));
     while began.elapsed() < span {
-        // Their leases are shorter than a long flood.
+        // The leases of both are shorter than a long flood.
         sender.carry(&real.participant())?;
         sender.carry(&flood.participant())?;
         for _ in 0..200 {
@@ -299,7 +299,7 @@ fn fragments_count_once_while_the_mtu_changes() -> Result<()> {
         let mut before = 1500;
         for mtu in MTUS {
             std::thread::sleep(Duration::from_millis(500));
-            // Never may one end send what the other does not take.
+            // One end may never send frames that the other end does not accept.
             let mut hosts = [&link.robot, &link.monitor];
             if mtu > before {
                 hosts.reverse();
@@ -373,11 +373,11 @@ fn a_removed_network_namespace_is_reported_and_affects_no_other() -> Result<()> 
     std::thread::sleep(Duration::from_secs(2));
     ensure!(robot.readiness()? == "503", "another namespace is observed");
     run(&format!("ip netns delete {}", name))?;
-    // Removes the robot's whole network, with the cable.
+    // Removes the robot's whole network, including the cable.
     drop(sender);
     run(&format!("ip -n {} link delete eth0", link.robot.name()))?;
     std::thread::sleep(Duration::from_secs(2));
-    // The cable is no reason, the namespace is one.
+    // A missing cable is not a reason to be unready; a missing namespace is.
     ensure!(
         robot.readiness()? == "503",
         "ready without a namespace that the configuration names"
@@ -391,8 +391,9 @@ fn a_removed_network_namespace_is_reported_and_affects_no_other() -> Result<()> 
 
 #[test]
 #[ignore = "sets the clock of this machine: make soak ROS2PROBE_SOAK_CLOCK=30"]
-fn the_clock_of_this_machine_is_set_an_hour_forth_and_back() -> Result<()> {
-    // Everything on the machine notices: only on request, by so many seconds or an hour.
+fn clock_steps_forward_and_back_leave_leases_rates_and_readiness_correct() -> Result<()> {
+    // The step affects everything on the machine, so it needs a request: by this many seconds or an
+    // hour.
     let asked = std::env::var("ROS2PROBE_SOAK_CLOCK").context("ROS2PROBE_SOAK_CLOCK")?;
     let step = match asked.parse().context("ROS2PROBE_SOAK_CLOCK")? {
         1 => 3600,
@@ -432,7 +433,7 @@ fn the_clock_of_this_machine_is_set_an_hour_forth_and_back() -> Result<()> {
     Ok(())
 }
 
-/// A few dozen participants with these leases.
+/// Returns a crowd of a few dozen participants with these leases.
 fn few(leases: &'static [(u64, u64)]) -> Scale {
     Scale {
         participants: 60,
@@ -485,7 +486,7 @@ impl<'a> Robot<'a> {
             .sum("ros2_discovery_events_total", &labels))
     }
 
-    /// Status of `/readyz`; 000 when there is no answer within three seconds.
+    /// Returns the status of `/readyz`, or 000 without an answer within three seconds.
     fn readiness(&self) -> Result<String> {
         let [enter, network] = self.link.monitor.outside();
         let output = Command::new(enter)
@@ -510,7 +511,7 @@ impl<'a> Robot<'a> {
     }
 }
 
-/// Leaves a process two hundredths of a CPU.
+/// Limits a process to two hundredths of a CPU.
 struct Brake(PathBuf);
 
 impl Brake {
@@ -540,7 +541,7 @@ impl Drop for Brake {
     }
 }
 
-/// Lives through all phases and compares after each.
+/// Runs the crowd through all phases, and compares the graphs after each.
 fn live<C: Carrier>(
     crowd: &mut Crowd<C>,
     views: &mut Views<'_>,
@@ -563,7 +564,7 @@ fn live<C: Carrier>(
                 .clamp(Duration::from_secs(20), Duration::from_secs(150)),
         )?;
         views.compare(crowd)?;
-        // Most of them go at once, every ten minutes or so.
+        // Every ten minutes or so, most participants leave simultaneously.
         if round % 4 == 0 {
             crowd.aim(200);
             crowd.live(Duration::from_secs(20))?;

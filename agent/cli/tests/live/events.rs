@@ -14,7 +14,7 @@ use ros2probe_testing::rotel::{Item, Rotel, exports};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// The records of one name that are printed whole.
+/// Returns the records of one name that are printed whole.
 fn records(receiver: &Rotel, name: &str) -> Vec<Item> {
     let text = receiver.text();
     let end = text.rfind("\nFlags: ").unwrap_or(0);
@@ -47,7 +47,7 @@ fn wait_for(receiver: &Rotel, name: &str, attribute: &str, value: &str) -> Resul
 }
 
 #[test]
-fn a_receiver_gets_events_of_new_nodes_losses_and_silence() -> Result<()> {
+fn a_receiver_receives_events_of_new_nodes_losses_and_silence() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let [enter, words @ ..] = &link.monitor.outside();
@@ -70,7 +70,7 @@ fn a_receiver_gets_events_of_new_nodes_losses_and_silence() -> Result<()> {
         wait_for(&receiver, "ros2.node.discovered", "ros_node", node)?;
     }
 
-    // Best effort: what is lost is not sent again.
+    // Lost samples are best effort and not sent again.
     let samples = "udp dport != { 7400, 7410, 7412, 7414, 7416 } udp length 200-1000";
     let loss = Loss::of(&link.robot, samples, 300)?;
     let lost = wait_for(&receiver, "ros2.message.lost", "topic", "/imu")?;

@@ -1,5 +1,5 @@
-//! A publisher that leaves announces it within milliseconds after its last sample, and what a frame
-//! announces overtakes nothing: the last samples count.
+//! A leaving publisher announces its end within milliseconds after its last sample. Announcements
+//! in a frame do not overtake samples, so the last samples count.
 
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 
 #[test]
-fn the_last_samples_before_a_farewell_are_counted() -> Result<()> {
+fn the_last_samples_before_a_goodbye_are_counted() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir().context("cannot create a directory")?;
     let configuration = directory.path().join("ros2probe.yaml");

@@ -2,8 +2,8 @@
 //! descriptors, no memory, `kill -9`. The agent continues to observe, reports the fault, recovers,
 //! and leaves nothing behind. `make soak` runs larger numbers.
 //!
-//! Faults of a single part are tested with that part: a recording on a full disk in `live/record`,
-//! a receiver that comes back in `otlp` and `live/otlp`, forged traffic in `live/hostile`.
+//! Faults of a single part are tested with that part. `live/record` has a recording on a full disk,
+//! `otlp` and `live/otlp` have a receiver that returns, and `live/hostile` has forged traffic.
 
 mod clients;
 mod descriptors;
@@ -39,10 +39,10 @@ use tempfile::TempDir;
 const METRICS_PORT: u16 = 17400;
 const API_PORT: u16 = 17401;
 const PATIENCE: Duration = Duration::from_secs(60);
-/// As participants do.
+/// Interval of announcements, as of real participants.
 const REPEAT: Duration = Duration::from_secs(3);
-/// Longest shutdown: 3 s for answers and the last round, 2 s for the last export, and a busy
-/// machine.
+/// Maximum duration of a shutdown: 3 s for answers and the last round, 2 s for the last export, and
+/// 3 s for a busy machine.
 const ENDING: Duration = Duration::from_secs(8);
 
 /// An agent on a separate host, with a directory for its files.
@@ -52,7 +52,7 @@ struct Scene<'a> {
 }
 
 impl<'a> Scene<'a> {
-    /// Starts it behind further words, its log in a file.
+    /// Starts the agent after the words of another command, with its log in a file.
     fn start(
         host: &'a Namespace,
         directory: &TempDir,
@@ -95,7 +95,7 @@ impl<'a> Scene<'a> {
         std::fs::read_to_string(&self.log).unwrap_or_default()
     }
 
-    /// A connection to one of its listeners.
+    /// Returns a connection to one of the agent's listeners.
     fn connect(&self, port: u16) -> Result<TcpStream> {
         let stream = netns::within(&self.agent.host.network(), || {
             TcpStream::connect(("127.0.0.1", port))
@@ -116,7 +116,7 @@ impl<'a> Scene<'a> {
         Ok(())
     }
 
-    /// Ends it as the service manager does.
+    /// Ends the agent as the service manager does. Returns the duration.
     fn end(mut self) -> Result<Duration> {
         let began = Instant::now();
         self.agent.process.signal("TERM")?;
@@ -139,14 +139,14 @@ fn launch(enter: &[String], configuration: &Path, errors: Stdio) -> Result<Proce
     Process::start_with(enter, program, arguments, errors)
 }
 
-/// A topic of which every message is counted, whatever else happens. Its participant repeats itself
-/// until this is dropped.
+/// A topic whose messages are all counted, whatever else happens. Its participant repeats its
+/// announcement until this value is dropped.
 struct Counted {
     talker: Talker,
     sender: Sender,
     topic: String,
     sent: u64,
-    /// Hangs up when it is dropped.
+    /// Ends the announcements when it is dropped.
     _stop: std::sync::mpsc::Sender<()>,
 }
 
@@ -184,7 +184,7 @@ impl Counted {
         )
     }
 
-    /// Fails unless the agent has counted them all, and none as lost.
+    /// Fails unless the agent has counted all messages, and none as lost.
     fn check(&self, agent: &Agent<'_>) -> Result<()> {
         self.check_page(&agent.settled_scrape(&self.topic, self.sent)?)
     }
@@ -203,7 +203,7 @@ impl Counted {
     }
 }
 
-/// One request on a connection that stays open.
+/// Sends one request on a connection that stays open.
 fn ask(
     stream: &mut (impl Read + Write),
     method: &str,

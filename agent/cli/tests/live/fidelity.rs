@@ -1,18 +1,19 @@
 //! Compares the losses that the agent reports for each subscriber with the subscriber's own log:
 //! exactly the lost sequence numbers, each with its cause.
 //!
-//! A best-effort stream of each stack and size passes through stretches, in each of which one thing
-//! is wrong: nothing; every n-th datagram dropped on the link, behind the publisher's socket; all
-//! IP fragments but the first of such datagrams; a subscriber that is stopped again and again, so
-//! that its receive buffer overflows. The publisher waits in between, so the cause is known.
+//! A best-effort stream of each stack and size passes through stretches with at most one fault
+//! each. Every n-th datagram is dropped on the link, after the publisher's socket. Or only the
+//! first IP fragment of such datagrams passes. Or a subscriber is stopped repeatedly, so that its
+//! receive buffer overflows. The publisher waits between stretches, so each loss has a known cause.
 //!
-//! The log holds what the application received. That equals what its socket received only if the
-//! middleware itself drops nothing. So readers' histories hold more than accumulates during a stop
-//! (depth 1000), and receive buffers of point clouds hold more than one sample. RustDDS takes the
-//! end of a stop for the end of its event loop, so it continues to wait (`robot/patience.rs`). An
-//! observer cannot distinguish a loss before the first sample from late joining.
+//! The log contains the samples that the application received. They equal those of its socket only
+//! if the middleware itself drops nothing. Readers' histories therefore hold more than accumulates
+//! during a stop (depth 1000), and receive buffers of point clouds hold more than one sample.
+//! RustDDS treats the end of a stop as the end of its event loop, so its peer waits again
+//! (`robot/patience.rs`). An observer cannot distinguish a loss before the first sample from late
+//! joining.
 //!
-//! Reliable streams are observed on the receiving host only: dropped samples that are sent again,
+//! Reliable streams are observed only on the receiving host: dropped samples that are sent again,
 //! and a tail that HEARTBEATs announce and that never arrives.
 
 mod cell;
@@ -25,77 +26,77 @@ use repair::Repair;
 use ros2probe_testing::harness::peer::Stack;
 
 #[test]
-fn fast_dds_small_samples() -> Result<()> {
+fn lost_small_samples_of_fast_dds_are_reported_with_their_causes() -> Result<()> {
     one_subscriber(Stack::Fast, Size::B320)
 }
 
 #[test]
-fn fast_dds_point_clouds_of_644_kb() -> Result<()> {
+fn lost_point_clouds_of_644_kb_of_fast_dds_are_reported_with_their_causes() -> Result<()> {
     one_subscriber(Stack::Fast, Size::KB644)
 }
 
 #[test]
-fn fast_dds_point_clouds_of_2_72_mb() -> Result<()> {
+fn lost_point_clouds_of_2_72_mb_of_fast_dds_are_reported_with_their_causes() -> Result<()> {
     one_subscriber(Stack::Fast, Size::MB2_72)
 }
 
 #[test]
-fn fast_dds_reliable_samples() -> Result<()> {
+fn repaired_and_lost_reliable_samples_of_fast_dds_are_reported() -> Result<()> {
     Repair::of(Stack::Fast)?.ensure_reported()
 }
 
 #[test]
-fn fast_dds_two_subscribers() -> Result<()> {
+fn losses_of_two_fast_dds_subscribers_are_reported_separately() -> Result<()> {
     two_subscribers(Stack::Fast)
 }
 
 #[test]
-fn cyclone_dds_small_samples() -> Result<()> {
+fn lost_small_samples_of_cyclone_dds_are_reported_with_their_causes() -> Result<()> {
     one_subscriber(Stack::Cyclone, Size::B320)
 }
 
 #[test]
-fn cyclone_dds_point_clouds_of_644_kb() -> Result<()> {
+fn lost_point_clouds_of_644_kb_of_cyclone_dds_are_reported_with_their_causes() -> Result<()> {
     one_subscriber(Stack::Cyclone, Size::KB644)
 }
 
 #[test]
-fn cyclone_dds_point_clouds_of_2_72_mb() -> Result<()> {
+fn lost_point_clouds_of_2_72_mb_of_cyclone_dds_are_reported_with_their_causes() -> Result<()> {
     one_subscriber(Stack::Cyclone, Size::MB2_72)
 }
 
 #[test]
-fn cyclone_dds_reliable_samples() -> Result<()> {
+fn repaired_and_lost_reliable_samples_of_cyclone_dds_are_reported() -> Result<()> {
     Repair::of(Stack::Cyclone)?.ensure_reported()
 }
 
 #[test]
-fn cyclone_dds_two_subscribers() -> Result<()> {
+fn losses_of_two_cyclone_dds_subscribers_are_reported_separately() -> Result<()> {
     two_subscribers(Stack::Cyclone)
 }
 
 #[test]
-fn rust_dds_small_samples() -> Result<()> {
+fn lost_small_samples_of_rust_dds_are_reported_with_their_causes() -> Result<()> {
     one_subscriber(Stack::Rust, Size::B320)
 }
 
 #[test]
-fn rust_dds_point_clouds_of_644_kb() -> Result<()> {
+fn lost_point_clouds_of_644_kb_of_rust_dds_are_reported_with_their_causes() -> Result<()> {
     one_subscriber(Stack::Rust, Size::KB644)
 }
 
 #[test]
-fn rust_dds_point_clouds_of_2_72_mb() -> Result<()> {
+fn lost_point_clouds_of_2_72_mb_of_rust_dds_are_reported_with_their_causes() -> Result<()> {
     one_subscriber(Stack::Rust, Size::MB2_72)
 }
 
 #[test]
-fn rust_dds_reliable_samples() -> Result<()> {
+fn repaired_and_lost_reliable_samples_of_rust_dds_are_reported() -> Result<()> {
     Repair::of(Stack::Rust)?.ensure_reported()
 }
 
 #[test]
-fn rust_dds_two_subscribers() -> Result<()> {
+fn losses_of_two_rust_dds_subscribers_are_reported_separately() -> Result<()> {
     two_subscribers(Stack::Rust)
 }
 
@@ -119,7 +120,7 @@ fn one_subscriber(stack: Stack, size: Size) -> Result<()> {
 }
 
 fn two_subscribers(stack: Stack) -> Result<()> {
-    // RustDDS sends samples to a multicast address: one datagram for both.
+    // RustDDS sends samples to a multicast address, so one datagram serves both subscribers.
     let on_the_link = match stack {
         Stack::Rust => Trouble::Datagrams(20),
         _ => Trouble::DatagramsToTheLast(20),

@@ -59,7 +59,7 @@ fn connect(host: &Namespace) -> Result<Viewer> {
     open(stream, "/", &SUBPROTOCOLS, &[])?.map_err(|refused| anyhow::anyhow!("{refused:?}"))
 }
 
-/// Subscribes and waits until the agent has the interest.
+/// Subscribes, and waits until the agent has the subscription.
 fn subscribe(scene: &Scene<'_>, viewer: &mut Viewer) -> Result<u32> {
     viewer.wait_for_topics(&[TOPIC])?;
     let id = viewer.subscribe(TOPIC)?;
@@ -69,12 +69,12 @@ fn subscribe(scene: &Scene<'_>, viewer: &mut Viewer) -> Result<u32> {
 }
 
 #[test]
-fn payloads_of_fast_dds_reach_a_viewer_as_they_were_sent() -> Result<()> {
+fn payloads_of_fast_dds_reach_a_viewer_unchanged() -> Result<()> {
     payloads_are_as_sent(Stack::Fast, 2_720_000)
 }
 
 #[test]
-fn payloads_of_cyclone_dds_reach_a_viewer_as_they_were_sent() -> Result<()> {
+fn payloads_of_cyclone_dds_reach_a_viewer_unchanged() -> Result<()> {
     payloads_are_as_sent(Stack::Cyclone, 644_000)
 }
 
@@ -160,7 +160,7 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
     viewer.unsubscribe(id)?;
     scene.wait_for("no interest", "ros2probe_subscriptions", 0.0)?;
     if stack == Stack::Cyclone {
-        // The channel goes with the topic, once the lease of killed nodes ends.
+        // The channel vanishes with the topic, once the lease of the killed nodes ends.
         drop((publisher, subscriber));
         let is_gone = |viewer: &Viewer, _: &News| viewer.channel(TOPIC).is_none().then_some(());
         viewer.wait_for("end of the channel", is_gone)?;
@@ -169,7 +169,7 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
 }
 
 #[test]
-fn the_public_client_understands_every_channel_of_the_demo_s_robot() -> Result<()> {
+fn the_public_client_decodes_every_channel_of_the_demo_robot() -> Result<()> {
     let place = Place::new()?;
     let agent = place.agent("watch: [/**]\n")?;
     let _robot = Robot::start(&place.host)?;
@@ -180,10 +180,10 @@ fn the_public_client_understands_every_channel_of_the_demo_s_robot() -> Result<(
     Ok(())
 }
 
-/// Ten viewers: one does not read, one dies without a close. The others and the capture lose nothing.
-/// A status reports the losses of the slow one.
+/// One of ten viewers does not read, and one dies without a close. The other viewers and the
+/// capture lose nothing. A status reports the losses of the slow viewer.
 #[test]
-fn a_viewer_that_is_slow_or_dies_costs_only_itself() -> Result<()> {
+fn a_slow_or_killed_viewer_affects_no_other_viewer_and_no_capture() -> Result<()> {
     const MESSAGES: u64 = 120;
     let host = Namespace::alone()?;
     let configuration = format!(
@@ -224,7 +224,8 @@ fn a_viewer_that_is_slow_or_dies_costs_only_itself() -> Result<()> {
         .collect();
     publisher.go()?;
     std::thread::sleep(Duration::from_millis(500));
-    // As the kernel closes the sockets of a killed process: no close frame, and unread data.
+    // The kernel closes the sockets of a killed process in the same way: without a close frame, and
+    // with unread data.
     drop(dying);
     let mut kept = Vec::new();
     for other in others {
@@ -274,7 +275,7 @@ fn a_viewer_that_is_slow_or_dies_costs_only_itself() -> Result<()> {
     );
     ensure!(page.sum("ros2_topic_lost_messages_total", &label) == 0.0);
     let dropped = page.sum("ros2probe_foxglove_dropped_messages_total", &[]);
-    // The one that died may have lost some, too.
+    // The viewer that died may have lost some messages, too.
     ensure!(dropped >= reported as f64, "{dropped} of {reported}");
     drop((kept, slow));
     scene.wait_for("no viewer", "ros2probe_foxglove_clients", 0.0)?;
@@ -283,14 +284,14 @@ fn a_viewer_that_is_slow_or_dies_costs_only_itself() -> Result<()> {
     Ok(())
 }
 
-/// The number in a point cloud.
+/// Returns the number in a point cloud.
 fn number(payload: &[u8]) -> Result<u64> {
     let (_, data) = payload.split_at_checked(52).context("no data")?;
     let (number, _) = data.split_first_chunk().context("no number")?;
     Ok(u64::from_le_bytes(*number))
 }
 
-/// What the hosts send: announcements and messages by host, writer and number, and the ports.
+/// Packets of the hosts: announcements and messages by host, writer and number, and the ports.
 #[derive(Debug, PartialEq, Eq)]
 struct Sent {
     announcements: BTreeSet<(String, String, u64)>,
@@ -302,7 +303,7 @@ struct Sent {
 /// Discovery and user packets of the robot are the same with and without a viewer that shows
 /// everything.
 #[test]
-fn a_viewer_of_everything_adds_no_packet_of_the_robot() -> Result<()> {
+fn a_viewer_of_all_topics_causes_no_packet_of_the_robot() -> Result<()> {
     let mut sent = Vec::new();
     for is_viewed in [false, true] {
         let link = Link::new()?;
@@ -313,7 +314,7 @@ fn a_viewer_of_everything_adds_no_packet_of_the_robot() -> Result<()> {
         if let Some(viewer) = &mut viewer {
             viewer.send(&serde_json::json!({"op": "subscribeConnectionGraph"}))?;
         }
-        // Best effort, so that no repair depends on the load of the machine.
+        // The stream is best effort, so that no repair depends on the load of the machine.
         let stream = Stream {
             rate: 50.0,
             linger: 8.0,
@@ -331,7 +332,8 @@ fn a_viewer_of_everything_adds_no_packet_of_the_robot() -> Result<()> {
         let mut ports = publisher.process.udp_ports()?;
         ports.extend(subscriber.process.udp_ports()?);
         publisher.go()?;
-        // Received while it sends: the recording of both runs ends equally late.
+        // The viewer receives while the publisher sends, so that the recordings of both runs end
+        // equally late.
         if let Some(viewer) = &mut viewer {
             let mut count = 0;
             viewer.wait_for("messages", |viewer, news| {
@@ -394,7 +396,8 @@ fn what_was_sent(recording: &Path, ports: &BTreeSet<u16>) -> Result<Sent> {
         }
     }
     sent.endpoints = endpoints.len();
-    // ros_discovery_info is repeated as nodes come; the stream is the writer with most messages.
+    // ros_discovery_info is repeated when nodes appear. The stream is the writer with most
+    // messages.
     let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
     for (writer, _) in sent.messages.keys() {
         *counts.entry(writer).or_default() += 1;
@@ -407,10 +410,10 @@ fn what_was_sent(recording: &Path, ports: &BTreeSet<u16>) -> Result<Sent> {
 }
 
 /// Measures the table of `docs/benchmarks-parts.md`: `cargo test --release --test live foxglove::
-/// -- --ignored --nocapture`. One publisher; what watches it takes turns.
+/// -- --ignored --nocapture`. The observers of one publisher alternate.
 #[test]
 #[ignore = "takes three minutes and a quiet machine to mean anything"]
-fn cost_of_a_viewer_beside_the_subscriber_of_a_bridge() -> Result<()> {
+fn the_cost_of_a_viewer_is_measured_beside_the_subscriber_of_a_bridge() -> Result<()> {
     const WINDOW: Duration = Duration::from_secs(10);
     const ROUNDS: usize = 3;
     let link = Link::new()?;
@@ -474,7 +477,7 @@ fn cost_of_a_viewer_beside_the_subscriber_of_a_bridge() -> Result<()> {
     Ok(())
 }
 
-/// Reads for this long; returns messages and bytes.
+/// Reads for this long, and returns the number of messages and of bytes.
 fn count(mut viewer: Viewer, span: Duration) -> Result<(u64, u64)> {
     let deadline = Instant::now() + span;
     let (mut messages, mut bytes) = (0, 0);

@@ -1,5 +1,5 @@
-//! `rp run` at the sockets of a host: real participants are seen whole, the source is chosen as
-//! documented, containers that start later are seen, and nothing stays behind. Needs root.
+//! `rp run` at the sockets of a host. Real participants and containers that start later are seen
+//! completely, the source is chosen as documented, and nothing stays behind. Needs root.
 
 use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt as _;
@@ -19,7 +19,7 @@ use tempfile::TempDir;
 const PATIENCE: Duration = Duration::from_secs(60);
 
 #[test]
-fn the_demo_robot_is_seen_whole_at_its_sockets() -> Result<()> {
+fn the_demo_robot_is_seen_completely_at_its_sockets() -> Result<()> {
     let link = Link::new()?;
     let observed = Observed::start(&link.robot, &at_the_sockets_of(&link.robot))?;
     let mut roles = Vec::new();
@@ -30,7 +30,8 @@ fn the_demo_robot_is_seen_whole_at_its_sockets() -> Result<()> {
     ] {
         roles.push(Process::start(&host.inside(), robot()?, ["--role", role])?);
     }
-    // What the monitor subscribes is sent to it; what it says of itself is received.
+    // The robot sends the topics that the monitor subscribes to, and receives the monitor's
+    // announcements.
     let page = observed.wait(|page| {
         page.sum("ros2_participants", &[]) == 3.0
             && ["/points", "/imu", "/scan", "/cmd_vel"]
@@ -49,17 +50,17 @@ fn the_demo_robot_is_seen_whole_at_its_sockets() -> Result<()> {
 }
 
 #[test]
-fn fast_dds_is_counted_as_its_logs_say_at_either_end() -> Result<()> {
+fn counts_of_fast_dds_equal_its_logs_at_either_end() -> Result<()> {
     counted_as_logged(Stack::Fast)
 }
 
 #[test]
-fn cyclone_dds_is_counted_as_its_logs_say_at_either_end() -> Result<()> {
+fn counts_of_cyclone_dds_equal_its_logs_at_either_end() -> Result<()> {
     counted_as_logged(Stack::Cyclone)
 }
 
 #[test]
-fn rust_dds_is_counted_as_its_logs_say_at_either_end() -> Result<()> {
+fn counts_of_rust_dds_equal_its_logs_at_either_end() -> Result<()> {
     counted_as_logged(Stack::Rust)
 }
 
@@ -75,14 +76,14 @@ fn counted_as_logged(stack: Stack) -> Result<()> {
         let robot = Observed::start(&link.robot, &at_the_sockets_of(&link.robot))?;
         let monitor = Observed::start(&link.monitor, &at_the_sockets_of(&link.monitor))?;
         let (mut publisher, mut subscriber) = pair(&link.robot, &link.monitor, stack, &stream)?;
-        // The agent reads less than a point cloud of an unknown writer.
+        // Of an unknown writer, the agent reads less than a point cloud.
         for observed in [&robot, &monitor] {
             observed.wait(|page| publishers(page, &stream.topic) == Some(1.0))?;
         }
         publisher.go()?;
         publisher.wait_sent(PATIENCE)?;
         for observed in [&robot, &monitor] {
-            // RustDDS on a busy machine may go without saying so.
+            // On a busy machine, RustDDS may leave without a goodbye.
             match stack {
                 Stack::Rust => observed.agent.settled_scrape(&stream.topic, stream.count)?,
                 _ => observed.wait(|page| gone(page, &stream.topic))?,
@@ -141,7 +142,7 @@ fn a_receiver_is_named_by_process_and_control_group() -> Result<()> {
     the_doctor_finds_them(&host, &socket, subscriber.process.pid())
 }
 
-/// The report of `rp doctor` for a host with an agent and two nodes.
+/// Checks the report of `rp doctor` for a host with an agent and two nodes.
 fn the_doctor_finds_them(host: &Namespace, socket: &Path, subscriber: u32) -> Result<()> {
     let [program, arguments @ ..] = &host.outside();
     let output = Command::new(program)
@@ -165,10 +166,10 @@ fn the_doctor_finds_them(host: &Namespace, socket: &Path, subscriber: u32) -> Re
         assert_eq!(find(area, check)?["verdict"], "ok", "{report:#}");
     }
     let participants = find("graph", "participants")?["sentence"].as_str();
-    // Others of this machine may be heard in shared memory.
+    // Other participants of this machine may be seen in shared memory.
     let seen = participants.is_some_and(|said| said.contains("domain 0: 2 Eclipse Cyclone DDS"));
     assert!(seen, "{participants:?}");
-    // Others of this machine may be among them.
+    // Other processes of this machine may be among them.
     let processes = find("processes", "processes")?.to_string();
     assert!(
         processes.contains(&format!("({subscriber}): domain 0, Cyclone DDS")),
@@ -178,13 +179,13 @@ fn the_doctor_finds_them(host: &Namespace, socket: &Path, subscriber: u32) -> Re
 }
 
 #[test]
-fn a_mirrored_interface_shows_what_no_socket_receives_and_counts_nothing_twice() -> Result<()> {
+fn a_mirrored_interface_shows_forwarded_messages_and_counts_nothing_twice() -> Result<()> {
     let link = Link::new()?;
     let cgroup = link.monitor.cgroup().display();
     let configuration =
         format!("capture: {{source: host, cgroup: {cgroup}, mirror_interfaces: [eth*]}}\n");
     let observed = Observed::start(&link.monitor, &configuration)?;
-    // A port without a socket, as for forwarded or mirrored traffic.
+    // The port has no socket, as for forwarded or mirrored traffic.
     let mut sender = Sender::between(&link.robot, &link.monitor)?;
     let mut talker = Talker::new(1, "/forwarded");
     introduce(&talker, &mut sender)?;
@@ -220,7 +221,7 @@ fn a_mirrored_interface_shows_what_no_socket_receives_and_counts_nothing_twice()
 }
 
 #[test]
-fn by_default_the_agent_reads_at_the_sockets_and_reports_it() -> Result<()> {
+fn by_default_the_agent_captures_at_the_sockets_and_reports_it() -> Result<()> {
     let host = Namespace::alone()?;
     let cgroup = host.cgroup().display();
     let observed = Observed::start(&host, &format!("capture: {{cgroup: {cgroup}}}\n"))?;
@@ -275,7 +276,7 @@ fn without_the_capability_to_attach_the_wire_is_selected_and_the_log_has_the_rea
 }
 
 #[test]
-fn three_capabilities_are_enough_at_the_sockets_and_all_are_given_up() -> Result<()> {
+fn three_capabilities_suffice_at_the_sockets_and_all_are_dropped_later() -> Result<()> {
     let link = Link::new()?;
     let only = "net_admin,bpf,perfmon";
     let configuration = at_the_sockets_of(&link.monitor);
@@ -316,7 +317,7 @@ fn a_configured_source_that_is_unavailable_is_an_error() -> Result<()> {
 }
 
 #[test]
-fn a_container_that_starts_later_is_seen_by_an_agent_as_it_is_by_default() -> Result<()> {
+fn a_container_that_starts_later_is_seen_with_the_default_configuration() -> Result<()> {
     let host = Namespace::alone()?;
     let topic = format!("/container_{}", std::process::id());
     let observed = Observed::start(&host, &format!("watch: [{topic}]\n"))?;
@@ -325,7 +326,7 @@ fn a_container_that_starts_later_is_seen_by_an_agent_as_it_is_by_default() -> Re
         reliable: true,
         ..Stream::small(200)
     };
-    // Another network namespace and another control group.
+    // The container has another network namespace and another control group.
     let container = Namespace::alone()?;
     let (mut publisher, _subscriber) = pair(&container, &container, Stack::Cyclone, &stream)?;
     publisher.go()?;
@@ -342,11 +343,11 @@ fn a_container_that_starts_later_is_seen_by_an_agent_as_it_is_by_default() -> Re
 }
 
 #[test]
-fn two_agents_at_once_see_the_same_and_one_that_is_killed_takes_its_programs_along() -> Result<()> {
+fn two_agents_count_the_same_and_a_killed_one_leaves_no_programs_behind() -> Result<()> {
     let link = Link::new()?;
     let configuration = at_the_sockets_of(&link.robot);
     let first = Observed::start(&link.robot, &configuration)?;
-    // The metrics listener's address is taken on the first one's network.
+    // On the network of the first agent, the address of the metrics listener is in use.
     let mut second = Observed::start(&link.monitor, &configuration)?;
     assert_eq!(cgroup::attached(link.robot.cgroup())?, [4, 4]);
     let stream = Stream::small(400);
@@ -360,7 +361,7 @@ fn two_agents_at_once_see_the_same_and_one_that_is_killed_takes_its_programs_alo
     }
     second.agent.process.signal("KILL")?;
     second.agent.process.wait(PATIENCE)?;
-    // The kernel lets go of a dead process's descriptors in its own time.
+    // The kernel releases the descriptors of a killed process asynchronously.
     let deadline = Instant::now() + PATIENCE;
     while cgroup::attached(link.robot.cgroup())? != [2, 2] {
         ensure!(Instant::now() < deadline, "a program stays");
@@ -372,7 +373,7 @@ fn two_agents_at_once_see_the_same_and_one_that_is_killed_takes_its_programs_alo
     Ok(())
 }
 
-/// A host with the agent on it.
+/// A host with an agent on it.
 struct Observed<'a> {
     agent: Agent<'a>,
     log: PathBuf,
@@ -380,12 +381,12 @@ struct Observed<'a> {
 }
 
 impl<'a> Observed<'a> {
-    /// Watches everything unless the configuration lists watches.
+    /// Starts an agent that watches everything unless the configuration lists watches.
     fn start(host: &'a Namespace, configuration: &str) -> Result<Observed<'a>> {
         Self::start_with(host, configuration, None)
     }
 
-    /// Runs as a user with these capabilities only.
+    /// Starts an agent as a user with only these capabilities.
     fn start_with(
         host: &'a Namespace,
         configuration: &str,
@@ -417,7 +418,7 @@ impl<'a> Observed<'a> {
     }
 
     fn log(&self) -> Result<String> {
-        // Without the colours.
+        // Removes the colours.
         let log = std::fs::read_to_string(&self.log)?;
         Ok(log
             .replace("\u{1b}[0m", "")
@@ -440,7 +441,7 @@ impl<'a> Observed<'a> {
     }
 }
 
-/// A program that starts `rp` with these capabilities only.
+/// Writes a program that starts `rp` with only these capabilities.
 fn write_start(directory: &TempDir, capabilities: &str) -> Result<()> {
     let file = |name: &str| directory.path().join(name);
     // The unprivileged user may be unable to read the build directory.

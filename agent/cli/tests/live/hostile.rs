@@ -1,5 +1,5 @@
-//! Forged traffic, and an agent with few privileges. Memory stays bounded, real messages are counted
-//! exactly, and the agent reports what is wrong.
+//! Forged traffic, and an agent with few privileges. Memory stays bounded, real messages are
+//! counted exactly, and the agent reports what is wrong.
 
 use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt as _;
@@ -22,15 +22,16 @@ use tempfile::TempDir;
 /// A port without a socket on the robot: only the agent observes the storm.
 const NOBODY: u16 = 7399;
 const STORM: Duration = Duration::from_secs(6);
-/// Most bytes that a storm may add to the agent's memory. With every table full, and several
-/// snapshots and pages in flight, the agent stays within the unit's `MemoryMax`.
+/// Maximum number of bytes that a storm may add to the agent's memory. With every table full, and
+/// several snapshots and pages in flight, the agent stays within the unit's `MemoryMax`.
 const GROWTH: u64 = 72 << 20;
 /// Forged participants are removed after 5 s of silence, or when their lease ends if they sent for
 /// longer than that.
 const SILENCE: Duration = Duration::from_secs(6);
 /// User and group of an agent, and of a file system that never answers.
 const STUCK: u32 = 65_533;
-/// Mounts that file system at `/dev/shm` of its own namespace, until its input ends.
+/// Mounts a file system that never answers at `/dev/shm` of its own namespace, until its input
+/// ends.
 const STUCK_MOUNT: &str = r#"
 import ctypes, os, sys
 device = os.open("/dev/fuse", os.O_RDWR)
@@ -41,12 +42,11 @@ if libc.mount(b"stuck", b"/dev/shm", b"fuse", 0, options.encode()) != 0:
 print("ready", flush=True)
 sys.stdin.read()
 "#;
-/// Cyclone DDS repeats itself every 8 s.
+/// Maximum time of recovery. Cyclone DDS repeats its announcement every 8 s.
 const RECOVERY: Duration = Duration::from_secs(30);
 
 #[test]
-fn a_storm_of_forged_rtps_leaves_memory_bounded_the_page_whole_and_a_real_topic_counted()
--> Result<()> {
+fn a_storm_of_forged_rtps_leaves_memory_bounded_and_a_real_topic_exact() -> Result<()> {
     let link = Link::new()?;
     let target = format!("{}:{NOBODY}", link.robot.address());
     let sender = Sender::new(
@@ -58,13 +58,12 @@ fn a_storm_of_forged_rtps_leaves_memory_bounded_the_page_whole_and_a_real_topic_
 }
 
 #[test]
-fn a_storm_of_torn_ip_fragments_leaves_memory_bounded_the_page_whole_and_a_real_topic_counted()
--> Result<()> {
+fn a_storm_of_torn_ip_fragments_leaves_memory_bounded_and_a_real_topic_exact() -> Result<()> {
     let link = Link::new()?;
     let mut wire = Wire::new(&link.monitor, &link.robot, "eth0")?;
     wire.port = NOBODY;
     wire.shuffle = |packets| {
-        // Other fragments are missing each time; some overlap or are out of order.
+        // Different fragments are missing each time; some overlap or are out of order.
         let lot = packets
             .iter()
             .fold(0, |sum, packet| sum ^ packet[5] ^ packet[7]) as usize;
@@ -86,7 +85,7 @@ fn a_storm_of_torn_ip_fragments_leaves_memory_bounded_the_page_whole_and_a_real_
 }
 
 #[test]
-fn a_flood_of_samples_of_a_watched_topic_takes_nothing_from_the_others() -> Result<()> {
+fn a_flood_of_samples_of_a_watched_topic_does_not_affect_other_topics() -> Result<()> {
     let link = Link::new()?;
     let target = format!("{}:{NOBODY}", link.robot.address());
     let source = format!("{}:0", link.monitor.address());
@@ -108,14 +107,12 @@ fn forgeries_that_fill_every_table_leave_memory_bounded_and_expire_with_their_le
 }
 
 #[test]
-fn a_robot_that_starts_behind_a_flood_of_forged_participants_is_counted_exactly_if_watched_by_name()
--> Result<()> {
+fn a_robot_watched_by_name_that_starts_during_a_flood_is_counted_exactly() -> Result<()> {
     behind_a_flood(|_| ON_THE_WIRE.to_owned())
 }
 
 #[test]
-fn a_robot_that_starts_behind_a_flood_of_forged_participants_is_counted_exactly_at_the_sockets()
--> Result<()> {
+fn a_robot_at_the_sockets_that_starts_during_a_flood_is_counted_exactly() -> Result<()> {
     behind_a_flood(|link| at_the_sockets_of(&link.robot))
 }
 
@@ -139,7 +136,8 @@ fn three_capabilities_suffice_for_an_unprivileged_user() -> Result<()> {
     let page = agent.settled_scrape("/unprivileged", 500)?;
     let counted = page.sum("ros2_topic_messages_total", &[("topic", "/unprivileged")]);
     assert_eq!(counted, 500.0, "{}", page.0);
-    // The filter meters a classified writer: the agent updates its map without further privileges.
+    // The filter meters a classified writer, so the agent updates its map without further
+    // privileges.
     let metered = page.sum("ros2probe_filter_events_total", &[("event", "metered")]);
     assert!(metered > 400.0, "{metered} of 500 metered");
     assert_eq!(page.sum("ros2probe_filter_refused_updates_total", &[]), 0.0);
@@ -147,13 +145,12 @@ fn three_capabilities_suffice_for_an_unprivileged_user() -> Result<()> {
 }
 
 #[test]
-fn shared_memory_that_never_answers_is_named_and_delays_neither_the_rest_nor_the_end() -> Result<()>
-{
+fn shared_memory_that_never_answers_is_reported_and_delays_nothing_else() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("ros2probe.yaml");
     std::fs::write(&file, format!("watch: [/**]\n{ON_THE_WIRE}"))?;
-    // The file system below admits one user, so that it stops the agent of no other test.
+    // The mounted file system admits one user, so that it blocks the agent of no other test.
     let start = start_as(STUCK, "-all,+net_raw,+bpf,+perfmon,+sys_ptrace", &directory)?;
     let mut agent = Agent::start(&link.robot, start, &file)?;
     let is_able = |page: &Scrape| {
@@ -178,7 +175,7 @@ fn shared_memory_that_never_answers_is_named_and_delays_neither_the_rest_nor_the
     let said = "capture.shm: its thread has made no progress for ";
     assert!(reason.contains(said), "{reason}");
 
-    // The rest goes on.
+    // Everything else continues.
     let mut sender = Sender::between(&link.monitor, &link.robot)?;
     let mut talker = Talker::new(1, "/beside");
     introduce(&talker, &mut sender)?;
@@ -201,8 +198,8 @@ fn shared_memory_that_never_answers_is_named_and_delays_neither_the_rest_nor_the
     Ok(())
 }
 
-/// Writes a program that starts `rp` as a user and group with these capabilities alone. The user may
-/// be unable to read the build directory, so the program starts a copy.
+/// Writes a program that starts `rp` as a user and group with these capabilities alone. The user
+/// may be unable to read the build directory, so the program starts a copy.
 pub fn start_as(user: u32, capabilities: &str, directory: &TempDir) -> Result<PathBuf> {
     let file = |name: &str| directory.path().join(name);
     std::fs::copy(env!("CARGO_BIN_EXE_rp"), file("rp"))?;
@@ -277,7 +274,7 @@ fn behind_a_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
     Ok(())
 }
 
-/// Some 2000 datagrams a second.
+/// A sender of some 2000 datagrams per second.
 struct Paced(Sender);
 
 impl Carrier for Paced {
@@ -315,7 +312,7 @@ fn matched_pair(link: &Link, stream: &Stream, nodes: [&str; 2]) -> Result<[Peer;
     Ok([subscriber, publisher])
 }
 
-/// Runs the storm beside a real topic: memory stays bounded, the page whole and the count exact.
+/// Runs the storm beside a real topic: memory stays bounded, the page complete and the count exact.
 /// Returns when the storm ended, and the topic's endpoints.
 fn a_real_topic_survives(
     agent: &Agent<'_>,
@@ -372,7 +369,7 @@ fn a_real_topic_survives(
     Ok((ended, [subscriber, publisher]))
 }
 
-/// Nodes that start after the storm are discovered, and their messages are counted exactly.
+/// Checks that nodes that start after the storm are discovered, and their messages counted exactly.
 fn newcomers_are_counted(agent: &Agent<'_>, link: &Link) -> Result<()> {
     let stream = Stream {
         topic: "/after".to_owned(),

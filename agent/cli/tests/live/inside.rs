@@ -1,4 +1,4 @@
-//! Chains by causality: two processes that pass messages on within their callbacks, observed from
+//! Chains by causality: two processes that pass on messages within their callbacks, observed from
 //! inside by a running agent.
 
 use std::path::Path;
@@ -24,11 +24,11 @@ const NODES: [(&str, [&str; 2], u64); 2] = [
     ("controller", ["/filtered", "/cmd"], 3_000),
 ];
 const MESSAGES: usize = 20;
-/// Largest difference between the agent's and a process's time of a callback, in seconds.
+/// Maximum difference between the agent's and a process's time of a callback, in seconds.
 const CLOSE: f64 = 0.000_2;
 
 #[test]
-fn a_chain_by_causality_takes_as_long_as_its_processes_say() -> Result<()> {
+fn the_times_of_a_chain_by_causality_are_those_of_its_processes() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
@@ -104,14 +104,14 @@ fn a_chain_by_causality_takes_as_long_as_its_processes_say() -> Result<()> {
     Ok(())
 }
 
-/// Images of containers: each has a library of its own, which is in no usual place.
+/// Number of images of containers. Each has a library of its own, in no usual directory.
 const IMAGES: usize = 4;
 /// CPU time from the start of a process to its first call. rclcpp takes longer, and a busy machine
-/// delays it as it delays the agent.
+/// delays the process and the agent alike.
 const LOADING: Duration = Duration::from_millis(150);
 
 #[test]
-fn a_library_of_another_inode_is_observed_from_the_first_call_on() -> Result<()> {
+fn a_library_of_another_inode_is_observed_from_the_first_call() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let agent = agent(&host, directory.path())?;
@@ -156,7 +156,7 @@ const CALL: &str = "ros_trace_rcl_publish";
 const CREATION: &str = "ros_trace_rcl_publisher_init";
 
 #[test]
-fn calls_are_observed_while_a_client_asks_and_names_from_the_start() -> Result<()> {
+fn calls_are_observed_while_a_client_requests_them_and_names_always() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
@@ -174,7 +174,7 @@ fn calls_are_observed_while_a_client_asks_and_names_from_the_start() -> Result<(
         let inside: Inside<'_> = serde_json::from_str(&text)?;
         ensure!(inside.mode == "auto", "{text}");
         if inside.reason.is_some() {
-            // On a busy machine the first answer comes before the breakpoints are there.
+            // On a busy machine, the first answer comes before the breakpoints exist.
             return Ok(None);
         }
         let name = format!("/robot1/{node}");
@@ -193,7 +193,7 @@ fn calls_are_observed_while_a_client_asks_and_names_from_the_start() -> Result<(
 
     // Before any request the process publishes unobserved, but its names are known.
     let mut first = start("first")?;
-    // It maps the library while it starts.
+    // The process maps the library while it starts.
     wait_until("the creation is observed", || {
         Ok(has(&first, CREATION).unwrap_or(false))
     })?;
@@ -205,7 +205,7 @@ fn calls_are_observed_while_a_client_asks_and_names_from_the_start() -> Result<(
     let info = resting.sum("ros2probe_inside_info", &[("mode", "auto")]);
     ensure!(info == 1.0, "{info}");
 
-    // A process that starts in the meantime is observed from its first call.
+    // A process that starts during the requests is observed from its first call.
     let is_observed_from_zero = |process: &Process| -> Result<bool> {
         Ok(published("first")? == Some(0) && has(process, CALL)?)
     };
@@ -224,8 +224,8 @@ fn calls_are_observed_while_a_client_asks_and_names_from_the_start() -> Result<(
         })?;
     }
 
-    // Ten seconds after the last request the breakpoints of calls are gone, and what follows is not
-    // counted later.
+    // Ten seconds after the last request, the breakpoints of calls are gone, and later calls are
+    // not counted afterwards.
     wait_until("calls are no longer observed", || {
         Ok(!has(&first, CALL)? && !has(&second, CALL)?)
     })?;
@@ -256,8 +256,8 @@ fn agent_with<'n>(host: &'n Namespace, directory: &Path, inside: &str) -> Result
     Agent::start(host, RP, &configuration)
 }
 
-/// As many as are attached to at most. With perf events their end would take longer than the unit
-/// allows: more than a robot has.
+/// Returns the maximum number of attached libraries. With perf events, detaching 64 would take
+/// longer than the unit allows; 8 are still more than a robot has.
 fn libraries() -> usize {
     match Means::of_this_kernel() {
         Means::Links => 64,
@@ -265,7 +265,7 @@ fn libraries() -> usize {
     }
 }
 
-/// Maps each of its arguments as code, and waits.
+/// A script that maps each of its arguments as code, and waits.
 const MAP: &str = "
 import mmap, sys
 code = [open(path, 'rb') for path in sys.argv[1:]]
@@ -275,7 +275,7 @@ sys.stdin.readline()
 ";
 
 #[test]
-fn the_end_with_many_libraries_attached_is_within_the_time_that_the_unit_allows() -> Result<()> {
+fn an_agent_attached_to_many_libraries_ends_within_the_time_of_the_unit() -> Result<()> {
     let unit = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../systemd/ros2probe.service");
     let text = std::fs::read_to_string(unit)?;
     let allowed = text.lines().find_map(|line| {

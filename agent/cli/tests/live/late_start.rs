@@ -1,5 +1,5 @@
-//! A robot that started before the agent. The agent restores what participants announced before its
-//! own restart, and `rp discover` requests the rest. Until then writers appear without names.
+//! A robot that started before the agent. The agent restores the announcements from before its own
+//! restart, and `rp discover` requests the others. Until then, writers appear without names.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -17,9 +17,9 @@ use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use tempfile::TempDir;
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Endpoints are announced once: a restarted agent has a name by then, or never.
+/// Time until a restarted agent has all names. Endpoints are announced only once.
 const AT_ONCE: Duration = Duration::from_secs(5);
-/// Two announcements of each participant.
+/// Time for two announcements of each participant.
 const AFTERWARDS: Duration = Duration::from_secs(7);
 /// Seconds in which each participant announces itself at least once.
 const LISTEN: &str = "5";
@@ -48,7 +48,7 @@ fn a_running_cyclone_dds_robot_repeats_all_names_on_request() -> Result<()> {
 }
 
 #[test]
-fn a_full_disk_costs_one_line_in_the_log_and_the_state_alone() -> Result<()> {
+fn a_full_disk_costs_only_the_state_and_one_line_in_the_log() -> Result<()> {
     let scene = Scene::new()?;
     let state = scene.file("state");
     let _disk = Disk::mount(&state)?;
@@ -176,7 +176,7 @@ fn asked(stack: Stack) -> Result<()> {
     Ok(())
 }
 
-/// Waits for the writer's rate and process, and returns that page. It holds no name yet.
+/// Waits for the writer's rate and process, and returns that page, which has no name yet.
 fn shows_an_unknown_writer(agent: &Agent<'_>, robot: &Robot) -> Result<Scrape> {
     let unknown = |page: &Scrape| {
         let rate = page.value("ros2_unknown_writer_rate_hertz", &[]);
@@ -201,7 +201,7 @@ fn shows_an_unknown_writer(agent: &Agent<'_>, robot: &Robot) -> Result<Scrape> {
     Ok(page)
 }
 
-/// `rp discover --dry-run`, for all participants and for one.
+/// Checks `rp discover --dry-run` for all participants and for one.
 fn a_dry_run_sends_nothing(scene: &Scene, page: &Scrape) -> Result<()> {
     let recording = Capture::start(&scene.link.monitor, &scene.file("dry.pcap"))?;
     let output = scene.discover(&["--all", "--dry-run", "--interface", INTERFACE])?;
@@ -228,7 +228,7 @@ fn a_dry_run_sends_nothing(scene: &Scene, page: &Scrape) -> Result<()> {
     Ok(())
 }
 
-/// `rp discover --all`: returns what it prints.
+/// Runs `rp discover --all`, and returns its output.
 fn discovers_all_names(scene: &Scene, agent: &Agent<'_>) -> Result<String> {
     let output = scene.discover(&["--all"])?;
     let said = String::from_utf8(output.stdout)?;
@@ -247,8 +247,8 @@ fn discovers_all_names(scene: &Scene, agent: &Agent<'_>) -> Result<String> {
     Ok(said)
 }
 
-/// Only the robot receives packets, as many as `rp discover` printed. Each conversation begins with
-/// the introduction and ends with the goodbye.
+/// Checks that only the robot receives packets, as many as `rp discover` printed. Each conversation
+/// begins with the introduction and ends with the goodbye.
 fn packets_are_those_printed(scene: &Scene, recording: &Path, printed: &str) -> Result<()> {
     let monitor = scene.link.monitor.address();
     let ours = scene.packets_of_discover();
@@ -277,7 +277,7 @@ fn packets_are_those_printed(scene: &Scene, recording: &Path, printed: &str) -> 
         let own = format!("{ours} and src port {port}");
         let packets = payloads(recording, &own)?;
         let is = |packet: &str, mark: &str| packet.contains(mark);
-        // PID_BUILTIN_ENDPOINT_SET; PID_STATUS_INFO of a goodbye.
+        // The patterns are PID_BUILTIN_ENDPOINT_SET, and PID_STATUS_INFO of a goodbye.
         assert!(is(&packets[0], "5800040039000000"), "{packets:?}");
         let last = packets.last().context("no packet")?;
         assert!(is(last, "7100040000000003"), "{packets:?}");
@@ -289,7 +289,7 @@ fn packets_are_those_printed(scene: &Scene, recording: &Path, printed: &str) -> 
     Ok(())
 }
 
-/// Its logs show no other endpoints, and no sample is missing.
+/// Checks that the robot's logs show no other endpoints and no missing sample.
 fn the_robot_is_undisturbed(robot: &Robot, log_before: &[EventLog; 2]) -> Result<()> {
     let log_after = robot.log()?;
     assert_eq!(endpoints(log_before), endpoints(&log_after));
@@ -302,7 +302,7 @@ fn the_robot_is_undisturbed(robot: &Robot, log_before: &[EventLog; 2]) -> Result
     Ok(())
 }
 
-/// A link with a robot on one end, and a place for the agent that is on neither.
+/// A link with a robot on one end, and a host for the agent that is on neither end.
 struct Scene {
     link: Link,
     place: Namespace,
@@ -346,7 +346,7 @@ impl Scene {
         Agent::start(&self.place, program, &self.configuration()?)
     }
 
-    /// A publisher with two nodes and its subscriber, on one host.
+    /// Starts a publisher with two nodes and its subscriber, on one host.
     fn robot(&self, stack: Stack) -> Result<Robot> {
         let stream = Stream {
             rate: 100.0,
@@ -371,7 +371,7 @@ impl Scene {
         })
     }
 
-    /// Filter for the packets that `rp discover` sends.
+    /// Returns the filter for the packets that `rp discover` sends.
     fn packets_of_discover(&self) -> String {
         format!("udp and src host {}", self.link.monitor.address())
     }
@@ -457,7 +457,7 @@ fn times(recording: &Path, filter: &str) -> Result<Vec<f64>> {
     times.map(|time| time.parse().context("no time")).collect()
 }
 
-/// Source ports.
+/// Returns the source ports.
 fn ports(recording: &Path, filter: &str) -> Result<BTreeSet<u16>> {
     let text = read(recording, "", filter)?;
     // 1795143000.123 IP 10.99.0.2.40123 > 10.99.0.1.7412: UDP, length 208
@@ -466,7 +466,7 @@ fn ports(recording: &Path, filter: &str) -> Result<BTreeSet<u16>> {
     ports.map(|port| port.parse().context("no port")).collect()
 }
 
-/// Hexadecimal digits of each packet.
+/// Returns the hexadecimal digits of each packet.
 fn payloads(recording: &Path, filter: &str) -> Result<Vec<String>> {
     let text = read(recording, "-x", filter)?;
     let mut packets: Vec<String> = Vec::new();

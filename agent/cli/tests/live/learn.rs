@@ -1,5 +1,5 @@
-//! `rp learn` beside a live agent: it measures topics that no watch covers, leaves nothing behind,
-//! and what it writes finds the faults of the same robot.
+//! `rp learn` with a live agent. It measures topics that no watch covers, and leaves nothing
+//! behind. Its file detects the faults of the same robot.
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -12,7 +12,7 @@ use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::wait_until;
 
-/// Longer than 20 s with a publisher, which the numbers of endpoints need.
+/// Time to learn: more than the 20 s with a publisher that the numbers of endpoints need.
 const LEARNS: Duration = Duration::from_secs(30);
 const VIOLATED: &str = "ros2_watch_expectation_violated";
 
@@ -64,7 +64,7 @@ impl<'a> Place<'a> {
         self.agent.process.signal("HUP")
     }
 
-    /// Whether the topic violates this expectation now. `None` without the expectation.
+    /// Returns whether the topic violates this expectation now; `None` without the expectation.
     fn violates(&self, topic: &str, expectation: &str) -> Result<Option<bool>> {
         let labels = [("topic", topic), ("expectation", expectation)];
         let value = self.agent.scrape()?.value(VIOLATED, &labels);
@@ -116,7 +116,7 @@ fn a_live_robot_is_learnt_without_a_watch_and_its_faults_are_found() -> Result<(
     );
     is_complete(&place.watchlist)?;
 
-    // Nothing stays watched or measured.
+    // No topic stays watched or measured.
     wait_until("the stream is closed", || {
         let page = place.agent.scrape()?;
         Ok(page.value("ros2probe_subscriptions", &[]) == Some(0.0))
@@ -154,7 +154,7 @@ fn a_live_robot_is_learnt_without_a_watch_and_its_faults_are_found() -> Result<(
     Ok(())
 }
 
-/// The file is valid, and each topic has a rate, a loss, a silence and endpoints.
+/// Checks that the file is valid and that each topic has a rate, a loss, a silence and endpoints.
 fn is_complete(watchlist: &Path) -> Result<()> {
     let text = std::fs::read_to_string(watchlist)?;
     let checked = Command::new(env!("CARGO_BIN_EXE_rp"))
@@ -180,7 +180,7 @@ fn is_complete(watchlist: &Path) -> Result<()> {
 }
 
 #[test]
-fn an_agent_that_ends_leaves_no_watchlist() -> Result<()> {
+fn an_agent_that_ends_during_rp_learn_leaves_no_watchlist() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let mut place = Place::new(&host, directory.path())?;

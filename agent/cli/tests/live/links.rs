@@ -1,5 +1,5 @@
-//! Every kind of link a robot talks over, against the agent's counts: each sample once, whatever
-//! carries it, and nothing of what the configuration leaves out.
+//! Every kind of link of a robot. The agent counts each sample once, whatever carries it, and no
+//! sample that the configuration excludes.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -16,12 +16,12 @@ use ros2probe_testing::harness::{run, wait_until};
 use tempfile::TempDir;
 
 const WATCH_ALL: &str = "watch: [/**]\ncapture:\n  source: wire\n";
-/// Whole frames, frames near the MTU, few and many IP fragments.
+/// Sizes of samples: whole frames, frames near the MTU, few and many IP fragments.
 const SIZES: [usize; 6] = [320, 1300, 1440, 4000, 20_000, 60_000];
 const ROUNDS: usize = 20;
 
 #[test]
-fn samples_over_ipv6_count_once_in_fragments_of_1500_and_1280() -> Result<()> {
+fn samples_over_ipv6_count_once_in_fragments_for_an_mtu_of_1500_and_1280() -> Result<()> {
     for mtu in [1500, 1280] {
         let link = Link::new()?;
         for (host, address) in [(&link.robot, "fd99::1/64"), (&link.monitor, "fd99::2/64")] {
@@ -41,7 +41,7 @@ fn samples_over_ipv6_count_once_in_fragments_of_1500_and_1280() -> Result<()> {
 }
 
 #[test]
-fn cyclone_dds_over_ipv6_is_seen_as_over_ipv4() -> Result<()> {
+fn cyclone_dds_over_ipv6_is_counted_as_over_ipv4() -> Result<()> {
     let link = Link::new()?;
     for (host, address) in [(&link.robot, "fd99::1/64"), (&link.monitor, "fd99::2/64")] {
         ip(host, &format!("addr add {address} dev eth0 nodad"))?;
@@ -77,7 +77,7 @@ fn cyclone_dds_over_ipv6_is_seen_as_over_ipv4() -> Result<()> {
 }
 
 #[test]
-fn vlan_tags_are_looked_behind_one_and_two() -> Result<()> {
+fn samples_behind_one_and_two_vlan_tags_count_once() -> Result<()> {
     let link = Link::new()?;
     let observed = Observed::start(&link.monitor, WATCH_ALL)?;
     let tags = [[0x88, 0xa8, 0, 7], [0x81, 0, 0, 100]];
@@ -127,14 +127,13 @@ fn a_tunnel_without_a_link_layer_is_seen() -> Result<()> {
     ip(&host, "addr add 10.88.0.1/24 dev tun0")?;
     ip(&host, "link set tun0 up")?;
     observed.counts_each_sample_once("/tunnelled", &mut tun)?;
-    // And what the host sends into it.
+    // The host also sends into the tunnel.
     let mut sender = Sender::new(&host, "10.88.0.1:0", "10.88.0.2:7400")?;
     observed.counts_each_sample_once("/into_the_tunnel", &mut sender)
 }
 
 #[test]
-fn an_interface_that_appears_later_is_seen_and_one_set_down_does_not_make_the_agent_spin()
--> Result<()> {
+fn a_new_interface_is_seen_and_one_set_down_causes_no_busy_loop() -> Result<()> {
     let link = Link::new()?;
     let observed = Observed::start(&link.monitor, WATCH_ALL)?;
     add_cable(&link, "eth1", "10.102.0")?;
@@ -161,7 +160,7 @@ fn an_interface_that_appears_later_is_seen_and_one_set_down_does_not_make_the_ag
 }
 
 #[test]
-fn nothing_of_an_excluded_interface_is_seen_also_when_it_appears_later() -> Result<()> {
+fn an_excluded_interface_is_not_seen_even_if_it_appears_later() -> Result<()> {
     let link = Link::new()?;
     add_cable(&link, "wlan0", "10.104.0")?;
     let all_but_wlan =
@@ -201,13 +200,13 @@ fn nothing_of_an_excluded_interface_is_seen_also_when_it_appears_later() -> Resu
 }
 
 #[test]
-fn an_interface_is_judged_by_its_new_name_after_it_was_renamed() -> Result<()> {
+fn a_renamed_interface_is_selected_by_its_new_name() -> Result<()> {
     let link = Link::new()?;
     let observed = Observed::start(
         &link.monitor,
         "watch: [/**]\ncapture:\n  source: wire\n  interfaces:\n    include: [eth*]\n",
     )?;
-    // As udev does with what it finds.
+    // The interface is renamed as udev does it.
     add_cable(&link, "wlan0", "10.106.0")?;
     let rename = |from: &str, to: &str| -> Result<()> {
         ip(&link.monitor, &format!("link set {from} down"))?;
@@ -230,13 +229,13 @@ fn an_interface_is_judged_by_its_new_name_after_it_was_renamed() -> Result<()> {
 }
 
 #[test]
-fn interfaces_that_came_and_went_do_not_use_up_the_filters_table() -> Result<()> {
+fn removed_interfaces_do_not_use_up_the_table_of_the_filter() -> Result<()> {
     let link = Link::new()?;
     let observed = Observed::start(
         &link.monitor,
         "watch: [/**]\ncapture:\n  source: wire\n  interfaces:\n    exclude: [veth*]\n",
     )?;
-    // The table has room for 1024.
+    // The table holds 1024 interfaces.
     for _ in 0..3 {
         let pair =
             |number| format!("link add veth{number} group 7 type veth peer name vethx{number}");
@@ -249,7 +248,7 @@ fn interfaces_that_came_and_went_do_not_use_up_the_filters_table() -> Result<()>
 }
 
 #[test]
-fn a_container_is_looked_into_by_the_path_of_its_network() -> Result<()> {
+fn a_container_is_observed_by_the_path_of_its_network_namespace() -> Result<()> {
     let link = Link::new()?;
     let path = link.robot.network();
     let observed = Observed::start(
@@ -259,10 +258,10 @@ fn a_container_is_looked_into_by_the_path_of_its_network() -> Result<()> {
             path.display()
         ),
     )?;
-    // Inside it, where nothing of it can be seen from outside.
+    // These samples stay in the container's network, which is invisible from outside.
     let mut sender = Sender::new(&link.robot, "127.0.0.1:0", "127.0.0.1:7400")?;
     observed.counts_each_sample_once("/inside", &mut sender)?;
-    // From it, seen in both networks.
+    // These samples leave the container and are seen in both networks.
     let mut sender = Sender::between(&link.robot, &link.monitor)?;
     observed.counts_each_sample_once("/across", &mut sender)?;
     let scrape = observed.agent.scrape()?;
@@ -297,7 +296,7 @@ fn a_network_namespace_is_reported_while_its_path_is_missing() -> Result<()> {
         wait_until("missed", || Ok(!is_ready()))?;
         let page = observed.agent.scrape()?;
         assert_eq!(page.value("ros2probe_ready", &[]), Some(0.0));
-        // The agent checks for events once a second: it does not report a shorter blindness.
+        // The agent checks for events once a second, so it does not report a shorter interruption.
         reported("ros2probe.capture.blind", round)?;
         run(&format!(
             "mount --bind /proc/{}/ns/net {place}",
@@ -363,7 +362,7 @@ fn a_sample_with_a_missing_fragment_never_counts() -> Result<()> {
 #[test]
 fn a_bridge_and_its_port_show_a_sample_once() -> Result<()> {
     let link = Link::new()?;
-    // The monitor's end of the cable becomes a port of its bridge, as a container's would.
+    // The monitor's end of the cable becomes a port of its bridge, like that of a container.
     ip(&link.monitor, "link add br0 type bridge")?;
     let address = link.monitor.address();
     ip(&link.monitor, &format!("addr del {address}/24 dev eth0"))?;
@@ -376,7 +375,7 @@ fn a_bridge_and_its_port_show_a_sample_once() -> Result<()> {
     observed.counts_each_sample_once("/bridged", &mut sender)?;
     let scrape = observed.agent.scrape()?;
     assert!(value(&scrape, "ros2_topic_duplicate_messages_total", "/bridged") > 0);
-    // And out through both.
+    // The monitor also sends through the bridge and its port.
     let mut sender = Sender::between(&link.monitor, &link.robot)?;
     observed.counts_each_sample_once("/bridged_out", &mut sender)
 }
@@ -439,7 +438,7 @@ fn ip(host: &Namespace, arguments: &str) -> Result<String> {
     run(&format!("ip -n {} {arguments}", host.name()))
 }
 
-/// Runs many `ip` commands at once.
+/// Runs many `ip` commands in one process.
 fn batch(host: &Namespace, commands: impl Iterator<Item = String>) -> Result<()> {
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("batch");
@@ -451,7 +450,7 @@ fn batch(host: &Namespace, commands: impl Iterator<Item = String>) -> Result<()>
     Ok(())
 }
 
-/// Joins the hosts by another veth pair; the robot is `.1` and the monitor `.2` on it.
+/// Connects the hosts by another veth pair, on which the robot is `.1` and the monitor `.2`.
 fn add_cable(link: &Link, name: &str, network: &str) -> Result<()> {
     let (robot, monitor) = (link.robot.name(), link.monitor.name());
     run(&format!(
@@ -464,7 +463,8 @@ fn add_cable(link: &Link, name: &str, network: &str) -> Result<()> {
     wait_carrying(link, name)
 }
 
-/// Waits until both ends of a cable carry frames: the kernel drops them silently for up to a second.
+/// Waits until both ends of a cable carry frames: the kernel drops them silently for up to a
+/// second.
 fn wait_carrying(link: &Link, name: &str) -> Result<()> {
     wait_carrying_at(&link.robot, name)?;
     wait_carrying_at(&link.monitor, name)
@@ -479,7 +479,7 @@ fn wait_carrying_at(host: &Namespace, name: &str) -> Result<()> {
     Ok(())
 }
 
-/// Address and interface index of the host's link-local address, once it may be used.
+/// Returns the address and interface index of the host's link-local address, once it is usable.
 fn link_local(host: &Namespace) -> Result<(String, String)> {
     let deadline = Instant::now() + Duration::from_secs(30);
     loop {

@@ -44,7 +44,7 @@ mod unnoticed;
 
 use std::process::Command;
 
-/// `rp` of this build, with an environment that does not leak into it.
+/// Returns `rp` of this build, with an environment that is independent of the tests' own.
 fn rp() -> Command {
     ros2probe_testing::local_agent::rp(env!("CARGO_BIN_EXE_rp"))
 }

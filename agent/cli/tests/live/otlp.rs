@@ -1,5 +1,5 @@
-//! Two hosts of the demo robot, an agent and a real OpenTelemetry receiver on each: both report the
-//! same traces, and a receiver that stops and returns costs no capture.
+//! Two hosts of the demo robot, each with an agent and a real OpenTelemetry receiver. Both agents
+//! report the same traces, and a receiver that stops and returns does not disturb the capture.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -114,7 +114,8 @@ fn two_hosts_report_the_same_traces_and_a_stopped_receiver_costs_no_capture() ->
     both_ends_report_the_same_traces(writer, &mut at_robot, &mut at_monitor)
 }
 
-/// The demo robot's own topics are traced on both hosts, a cloud with its fragments and times.
+/// Checks that the demo robot's own topics are traced on both hosts, a cloud with its fragments and
+/// times.
 fn spans_of_all_kinds_come(at_robot: &mut Rotel, at_monitor: &mut Rotel) -> Result<()> {
     for (receiver, names) in [
         (&mut *at_robot, &["send /points", "receive /cmd_vel"][..]),
@@ -144,7 +145,7 @@ fn spans_of_all_kinds_come(at_robot: &mut Rotel, at_monitor: &mut Rotel) -> Resu
     Ok(())
 }
 
-/// Every message is counted and no span is dropped while the receiver is away.
+/// Checks that every message is counted and no span is dropped while the receiver is stopped.
 fn nothing_was_lost(page: &Scrape) -> Result<()> {
     let truth = [("topic", "/truth")];
     let counted = page.sum("ros2_topic_messages_total", &truth);
@@ -156,7 +157,7 @@ fn nothing_was_lost(page: &Scrape) -> Result<()> {
     Ok(())
 }
 
-/// The sampled messages of `/truth`, and no others, have a span on each host, parent and child.
+/// Checks that exactly the sampled messages of `/truth` have a span on each host, parent and child.
 fn both_ends_report_the_same_traces(
     writer: Guid,
     at_robot: &mut Rotel,

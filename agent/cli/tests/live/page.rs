@@ -39,7 +39,7 @@ fn lines(host: &Namespace, path: &str, seconds: u32) -> Result<Vec<Value>> {
 }
 
 #[test]
-fn the_stream_shows_a_robot_as_it_runs() -> Result<()> {
+fn the_stream_shows_a_running_robot() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let configuration = directory.path().join("ros2probe.yaml");
@@ -63,7 +63,7 @@ fn the_stream_shows_a_robot_as_it_runs() -> Result<()> {
     messages_are_decoded(&host, &name)
 }
 
-/// Returns the name of the topic with messages of type Imu.
+/// Checks the stream, and returns the name of the topic with messages of type Imu.
 fn the_stream_separates_structure_and_figures(reported: &[Value]) -> Result<String> {
     let first = reported.first().context("no line")?;
     ensure!(first["open"]["source"] == "host", "{first}");
@@ -140,7 +140,7 @@ fn processes_are_listed(host: &Namespace, robots: &[Process]) -> Result<()> {
     Ok(())
 }
 
-/// The stream of a topic's messages begins with its type, and each message has its header's stamp.
+/// Checks that a topic's stream begins with its type, and that each message has its header's stamp.
 fn messages_are_decoded(host: &Namespace, topic: &str) -> Result<()> {
     let path = format!("/topics/{}/messages", topic.replace('/', "%2F"));
     // On a busy machine the robot itself may send nothing for seconds.
@@ -173,7 +173,7 @@ fn messages_are_decoded(host: &Namespace, topic: &str) -> Result<()> {
     Ok(())
 }
 
-/// `make demo`, until its value is dropped.
+/// A running `make demo`, which ends when this value is dropped.
 struct Demo {
     child: std::process::Child,
     lines: std::sync::mpsc::Receiver<String>,
@@ -222,7 +222,7 @@ impl Demo {
 
 impl Drop for Demo {
     fn drop(&mut self) {
-        // SIGTERM, so that the demo removes its namespaces.
+        // The demo removes its namespaces on SIGTERM.
         let id = self.child.id().to_string();
         let _ = Command::new("kill").args(["-TERM", &id]).status();
         let _ = self.child.wait();

@@ -26,17 +26,17 @@ fn rust_dds_delivers_every_sample() -> Result<()> {
 }
 
 #[test]
-fn fast_dds_loses_what_the_link_drops() -> Result<()> {
+fn fast_dds_loses_exactly_the_samples_that_the_link_drops() -> Result<()> {
     loses_what_the_link_drops(Stack::Fast)
 }
 
 #[test]
-fn cyclone_dds_loses_what_the_link_drops() -> Result<()> {
+fn cyclone_dds_loses_exactly_the_samples_that_the_link_drops() -> Result<()> {
     loses_what_the_link_drops(Stack::Cyclone)
 }
 
 #[test]
-fn rust_dds_loses_what_the_link_drops() -> Result<()> {
+fn rust_dds_loses_exactly_the_samples_that_the_link_drops() -> Result<()> {
     loses_what_the_link_drops(Stack::Rust)
 }
 
@@ -59,7 +59,8 @@ fn loses_what_the_link_drops(stack: Stack) -> Result<()> {
     Ok(())
 }
 
-/// What a best-effort publisher sent, its subscriber received and the link dropped.
+/// Samples that a best-effort publisher sent, that its subscriber received, and that the link
+/// dropped.
 struct Exchange {
     sent: Vec<u64>,
     received: Vec<u64>,
@@ -87,7 +88,7 @@ impl Exchange {
         publisher.wait_sent(Duration::from_secs(60))?;
         std::thread::sleep(Duration::from_millis(300));
         let counts = loss.counts()?;
-        // A busy RustDDS writer packs several samples into a datagram; those are never dropped.
+        // A busy RustDDS writer packs several samples into a datagram, which is never dropped.
         assert!(
             counts.matched > SAMPLES / 2,
             "{counts:?} of {SAMPLES} samples"

@@ -1,6 +1,6 @@
-//! An agent that is a user with the few capabilities of its source and nothing else: it sees all
-//! that this source can see, keeps only the privileges that it needs, and reports which ones it
-//! lacks. An agent that root starts changes its user, and serves nothing before.
+//! An agent that runs as a user with only the capabilities of its source. It sees all that this
+//! source can see, keeps only the privileges that it needs, and reports missing ones. An agent that
+//! root starts changes its user before it serves anything.
 
 mod ros2_daemon;
 
@@ -26,17 +26,17 @@ use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use seccompiler::{BpfProgram, SeccompAction, SeccompFilter};
 
 const SAMPLES: u64 = 400;
-/// No capability, and `CAP_BPF` alone, as /proc shows them.
+/// The empty capability set and `CAP_BPF` alone, as /proc shows them.
 const NOTHING: &str = "0000000000000000";
 const BPF_ALONE: &str = "0000008000000000";
 /// `CAP_NET_ADMIN` alone, and with `CAP_BPF`.
 const NET_ADMIN_ALONE: &str = "0000000000001000";
 const NET_ADMIN_AND_BPF: &str = "0000008000001000";
-/// Stands for the package's user and group.
+/// Id that represents the package's user and group.
 const USER: u32 = 64_123;
 
 #[test]
-fn three_capabilities_are_enough_at_the_sockets() -> Result<()> {
+fn three_capabilities_suffice_at_the_sockets() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let capture = at_the_sockets_of(&link.monitor);
@@ -68,7 +68,7 @@ fn three_capabilities_are_enough_at_the_sockets() -> Result<()> {
             "{ability:?}"
         );
     }
-    // Read after everything was given up.
+    // The control group is read after all capabilities were dropped.
     let cgroup = page.labels_of("ros2_subscriber_info", "cgroup");
     let own = link.monitor.cgroup().file_name().context("no name")?;
     let own = own.to_string_lossy();
@@ -85,7 +85,7 @@ fn three_capabilities_are_enough_at_the_sockets() -> Result<()> {
 }
 
 #[test]
-fn an_agent_permitted_only_on_the_wire_reports_it() -> Result<()> {
+fn an_agent_with_capabilities_for_the_wire_only_reports_it() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let agent = start(
@@ -109,7 +109,7 @@ fn an_agent_permitted_only_on_the_wire_reports_it() -> Result<()> {
     Ok(())
 }
 
-/// A host with the package's user and the files that package and service manager create.
+/// Prepares a host with the package's user and the files that package and service manager create.
 fn installed(host: &Namespace, file: &impl Fn(&str) -> PathBuf) -> Result<()> {
     std::fs::copy(env!("CARGO_BIN_EXE_rp"), file("rp"))?;
     for (name, line) in [
@@ -122,7 +122,7 @@ fn installed(host: &Namespace, file: &impl Fn(&str) -> PathBuf) -> Result<()> {
         let text = std::fs::read_to_string(Path::new("/etc").join(name))?;
         std::fs::write(file(name), format!("{text}{line}"))?;
     }
-    // As the package and the service manager make them.
+    // The package and the service manager create these directories.
     for name in ["state", "run"] {
         std::fs::create_dir(file(name))?;
         chown(file(name), Some(USER), Some(USER))?;
@@ -150,7 +150,7 @@ fn installed(host: &Namespace, file: &impl Fn(&str) -> PathBuf) -> Result<()> {
 }
 
 #[test]
-fn started_by_root_the_agent_becomes_the_packages_user_and_writes_no_file_of_roots() -> Result<()> {
+fn an_agent_started_by_root_changes_its_user_and_writes_no_file_of_root() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let file = |name: &str| -> PathBuf { directory.path().join(name) };
@@ -158,7 +158,7 @@ fn started_by_root_the_agent_becomes_the_packages_user_and_writes_no_file_of_roo
     installed(&host, &file)?;
     let log = file("log");
     let mut agent = Agent::start_logging(&host, file("start"), &file("ros2probe.yaml"), &log)?;
-    // The shared-memory thread keeps capabilities that depend on root's own here; other threads
+    // The thread for shared memory keeps capabilities that depend on root's own here. Other threads
     // keep none.
     let main = std::fs::read_to_string(format!("/proc/{}/status", agent.process.pid()))?;
     for line in [
@@ -201,8 +201,9 @@ fn started_by_root_the_agent_becomes_the_packages_user_and_writes_no_file_of_roo
 }
 
 #[test]
-fn an_agent_that_cannot_get_rid_of_its_capabilities_serves_nothing() -> Result<()> {
-    // A kernel that reports success and does nothing: only reading back shows it.
+fn an_agent_that_cannot_drop_its_capabilities_serves_nothing() -> Result<()> {
+    // This filter simulates a kernel that reports success and does nothing, which only reading back
+    // shows.
     let capset = BTreeMap::from([(libc::SYS_capset, Vec::new())]);
     let lie = SeccompFilter::new(
         capset,
@@ -236,7 +237,7 @@ fn an_agent_that_cannot_get_rid_of_its_capabilities_serves_nothing() -> Result<(
 }
 
 #[test]
-fn a_collector_is_found_by_its_name_and_connected_to() -> Result<()> {
+fn an_agent_resolves_the_name_of_a_collector_and_connects_to_it() -> Result<()> {
     let host = Namespace::alone()?;
     let network = host.network();
     let (names, collector) = netns::within(&network, || -> Result<_> {
@@ -292,7 +293,7 @@ fn a_collector_is_found_by_its_name_and_connected_to() -> Result<()> {
     })
 }
 
-/// A name server's answer: every name has the address 127.0.0.1, and no other.
+/// Returns a name server's answer: every name has the address 127.0.0.1, and no other.
 fn answer(question: &[u8]) -> Option<Vec<u8>> {
     let (header, rest) = question.split_first_chunk::<12>()?;
     let name = rest.iter().position(|byte| *byte == 0)? + 1;
@@ -302,7 +303,7 @@ fn answer(question: &[u8]) -> Option<Vec<u8>> {
     answer.extend([0x81, 0x80, 0, 1, 0, u8::from(is_address), 0, 0, 0, 0]);
     answer.extend(asked);
     if is_address {
-        // The name above, a record of 4 octets that is good for a minute.
+        // A pointer to the name above, and a record of 4 octets that is valid for a minute.
         answer.extend([0xc0, 12, 0, 1, 0, 1, 0, 0, 0, 60, 0, 4, 127, 0, 0, 1]);
     }
     Some(answer)
@@ -321,12 +322,12 @@ fn start<'a>(
     let watch = "watch: [{topic: /imu, per_subscriber: true}]\n";
     std::fs::write(file("ros2probe.yaml"), format!("{watch}{capture}"))?;
     let only = format!("-all,{capabilities}");
-    // As StateDirectory=ros2probe of the unit would have it.
+    // `StateDirectory=ros2probe` of the unit creates this directory.
     std::fs::create_dir(file("state"))?;
     chown(file("state"), Some(65534), Some(65534))?;
     let groups = harness::cgroup::hierarchy()?;
     let groups = groups.display();
-    // As ProtectControlGroups=yes and ProtectProc=invisible of the unit would have it.
+    // `ProtectControlGroups=yes` and `ProtectProc=invisible` of the unit have this effect.
     let sandbox = format!(
         "mount --bind {groups} {groups} && mount -o remount,bind,ro {groups} && \
          mount -t proc -o hidepid=invisible proc /proc"
@@ -350,12 +351,12 @@ fn start<'a>(
     Ok(agent)
 }
 
-/// The names of a process's threads, none of which has a capability, can gain one, or may make
-/// every system call.
+/// Returns the names of a process's threads. Fails if a thread has a capability, can gain one, or
+/// may make every system call.
 fn confined(process: u32, user: u32) -> Result<BTreeSet<String>> {
     let mut names = BTreeSet::new();
     for task in std::fs::read_dir(format!("/proc/{process}/task"))? {
-        // A thread that is looking up a name may end.
+        // A thread that resolves a name may end.
         let Ok(status) = std::fs::read_to_string(task?.path().join("status")) else {
             continue;
         };
@@ -376,9 +377,9 @@ fn confined(process: u32, user: u32) -> Result<BTreeSet<String>> {
             let left = value(set)?;
             let may_keep = matches!(set, "CapPrm" | "CapEff");
             let kept: &[&str] = match name {
-                // Before Linux 5.19 that is what changing maps takes.
+                // Before Linux 5.19, changing maps needs this capability.
                 "capture" if may_keep => &[NOTHING, BPF_ALONE],
-                // It attaches to a control group that is created again.
+                // The thread attaches to a control group that is created again.
                 "cgroup" if may_keep => &[NET_ADMIN_ALONE, NET_ADMIN_AND_BPF],
                 _ => &[NOTHING],
             };
@@ -389,7 +390,7 @@ fn confined(process: u32, user: u32) -> Result<BTreeSet<String>> {
     Ok(names)
 }
 
-/// The page after a stream to the monitor of which nothing was lost.
+/// Sends a stream to the monitor, and returns the page after it. Fails if a sample was lost.
 fn watch_a_stream(link: &Link, agent: &Agent<'_>) -> Result<Scrape> {
     let stream = Stream {
         linger: 30.0,

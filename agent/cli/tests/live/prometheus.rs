@@ -1,5 +1,5 @@
-//! A real Prometheus scrapes the agent beside the demo robot, and PromQL answers what the robot's
-//! publishers really did; `promtool` finds nothing wrong with the page.
+//! A real Prometheus scrapes the agent beside the demo robot. PromQL returns the rates of the
+//! robot's publishers, and `promtool` accepts the page.
 
 use std::io::Write as _;
 use std::process::{Command, Stdio};
@@ -13,12 +13,12 @@ use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, robot};
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::prometheus::{INSTALL, Prometheus};
 
-/// The window of rates.
+/// Window of the rates.
 const WINDOW: Duration = Duration::from_secs(6);
 const PATIENCE: Duration = Duration::from_secs(40);
 
 #[test]
-fn prometheus_answers_the_rates_at_which_the_demo_robot_publishes() -> Result<()> {
+fn prometheus_returns_the_rates_at_which_the_demo_robot_publishes() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let configuration = directory.path().join("ros2probe.yaml");
@@ -33,8 +33,8 @@ fn prometheus_answers_the_rates_at_which_the_demo_robot_publishes() -> Result<()
     ] {
         roles.push(Process::start(&host.inside(), robot()?, ["--role", role])?);
     }
-    // A publisher that logs every sample: the truth to compare with. On a busy machine RustDDS would
-    // drop some that it has logged.
+    // The reference is a publisher that logs every sample. On a busy machine, RustDDS would drop
+    // some samples that it has logged.
     let stream = Stream {
         topic: "/truth".to_owned(),
         domain: 1,
@@ -64,8 +64,8 @@ fn prometheus_answers_the_rates_at_which_the_demo_robot_publishes() -> Result<()
         let sent = log.0.iter().filter(|event| event.ev == "pub");
         Ok(sent.map(|event| event.t).collect())
     };
-    // The window lies in the stream. On a busy machine a scrape may be late, and the demo, which keeps
-    // no log, behind.
+    // The window is within the stream. On a busy machine, a scrape may be late, and the demo, which
+    // keeps no log, may fall behind.
     std::thread::sleep(WINDOW + Duration::from_secs(2));
     let began = Instant::now();
     loop {
@@ -75,7 +75,7 @@ fn prometheus_answers_the_rates_at_which_the_demo_robot_publishes() -> Result<()
             prometheus.query(&format!("rate({counter}[{}s])", WINDOW.as_secs()))
         };
         let rates = [rate("/truth")?, rate("/imu")?, rate("/points")?];
-        // The latest scrape is up to a second older than the question.
+        // The latest scrape is up to a second older than the query.
         let end = asked.saturating_sub(Duration::from_millis(500));
         let window = end.saturating_sub(WINDOW).as_nanos()..end.as_nanos();
         let sent = sent()?.into_iter();

@@ -1,5 +1,5 @@
-//! `rp topic hz`, `bw`, `delay` and `echo` on a robot whose machine is busy: right where subscribers
-//! are not, and gone without a trace, however they end.
+//! `rp topic hz`, `bw`, `delay` and `echo` on a busy machine. They are correct where subscribers
+//! are not, and they leave no trace, however they end.
 
 use std::hint::spin_loop;
 use std::io::{BufRead as _, BufReader};
@@ -20,14 +20,14 @@ use ros2probe_testing::harness::wait_until;
 
 const PATIENCE: Duration = Duration::from_secs(60);
 const RATE: f64 = 200.0;
-/// Between the printed rate and the true one.
+/// Maximum difference between the printed rate and the true one, in hertz.
 const TOLERANCE: f64 = 0.1;
 
-/// One after the other: both keep the machine busy.
+/// Runs one test at a time, because both keep the machine busy.
 static TURN: Mutex<()> = Mutex::new(());
 
 #[test]
-fn ten_clients_are_right_on_a_busy_machine_and_leave_nothing_behind() -> Result<()> {
+fn ten_clients_print_correct_rates_on_a_busy_machine_and_leave_no_trace() -> Result<()> {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
@@ -41,7 +41,7 @@ fn ten_clients_are_right_on_a_busy_machine_and_leave_nothing_behind() -> Result<
     })?;
     let _load = Load::on_every_core();
 
-    // As many as there are kinds of ends, and some that only stay.
+    // There is a client for each kind of end, and some that continue.
     let start = |arguments: &str| Client::start(&socket, arguments);
     let hz = start("hz /imu")?;
     let mut killed = start("hz /imu /nobody")?;
@@ -70,14 +70,14 @@ fn ten_clients_are_right_on_a_busy_machine_and_leave_nothing_behind() -> Result<
     piped_into_head(&socket)?;
     open(&agent, 4)?;
 
-    // The busier the machine, the longer until single delays no longer show.
+    // The busier the machine, the longer single delays affect the rate.
     wait_until("the rate is printed", || {
         Ok((hz.last("average rate: ") - RATE).abs() <= TOLERANCE)
     })
     .with_context(|| hz.printed().join("\n"))?;
     all.prints("average rate: ")?;
     let sent = is_the_rate_sent(&hz, &publisher, &subscriber)?;
-    // 320 bytes in DDS's encoding, 200 times a second, over the span until now.
+    // 320 bytes in DDS's encoding are sent 200 times a second, over the interval until now.
     wait_until("the bandwidth is printed", || {
         Ok((60.0..=70.0).contains(&bandwidth.last("")))
     })
@@ -93,7 +93,7 @@ fn ten_clients_are_right_on_a_busy_machine_and_leave_nothing_behind() -> Result<
     Ok(())
 }
 
-/// Compares the printed rate with the publisher's log. Returns how many messages the log holds.
+/// Compares the printed rate with the publisher's log. Returns the number of messages in the log.
 fn is_the_rate_sent(hz: &Client, publisher: &Peer, subscriber: &Peer) -> Result<usize> {
     let log = publisher.log()?.0;
     let sent: Vec<u64> = log
@@ -119,7 +119,7 @@ fn is_the_rate_sent(hz: &Client, publisher: &Peer, subscriber: &Peer) -> Result<
     Ok(sent.len())
 }
 
-/// An agent that watches nothing by itself, and its socket.
+/// Starts an agent that watches nothing by itself, and returns it with its socket.
 fn agent<'a>(host: &'a Namespace, directory: &Path) -> Result<(Agent<'a>, PathBuf)> {
     let configuration = directory.join("ros2probe.yaml");
     let socket = directory.join("api.sock");
@@ -207,8 +207,8 @@ fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()
     let_go(&agent, "/points", 50.0)
 }
 
-/// Checks that the topic continues and its count stays: an interest that a client left behind would
-/// increase it.
+/// Checks that the topic continues and its count stays: a subscription that a client left behind
+/// would increase it.
 fn let_go(agent: &Agent<'_>, topic: &str, least: f64) -> Result<()> {
     wait_until("the topic is let go", || {
         let counted = || -> Result<f64> {
@@ -222,7 +222,7 @@ fn let_go(agent: &Agent<'_>, topic: &str, least: f64) -> Result<()> {
     })
 }
 
-/// So many subscriptions are open.
+/// Waits until this many subscriptions are open.
 fn open(agent: &Agent<'_>, wanted: u32) -> Result<()> {
     let what = format!("{wanted} subscriptions open");
     let page = agent.scrape_until(&what, |page| {
@@ -231,7 +231,7 @@ fn open(agent: &Agent<'_>, wanted: u32) -> Result<()> {
     page.map(drop)
 }
 
-/// Ends silently once its reader is gone, as any program does.
+/// Checks that `rp` ends silently once its reader is gone, as any program does.
 fn piped_into_head(socket: &Path) -> Result<()> {
     let rp = env!("CARGO_BIN_EXE_rp");
     let script = format!(
@@ -255,7 +255,7 @@ fn piped_into_head(socket: &Path) -> Result<()> {
     Ok(())
 }
 
-/// One `rp`, and what it has printed.
+/// One `rp`, and its output.
 struct Client {
     name: String,
     child: Child,
@@ -303,14 +303,14 @@ impl Client {
         })
     }
 
-    /// This many more lines than now.
+    /// Waits for this many more lines.
     fn reports(&self, more: usize) -> Result<()> {
         let now = self.printed().len();
         let what = format!("{} goes on", self.name);
         wait_until(&what, || Ok(self.printed().len() >= now + more))
     }
 
-    /// Returns the last printed number behind these words; `None` before the first.
+    /// Returns the last printed number after these words; NaN before the first.
     fn last(&self, words: &str) -> f64 {
         let printed = self.printed();
         let mut numbers = printed.iter().rev().filter_map(|line| {
@@ -320,7 +320,7 @@ impl Client {
         numbers.next().unwrap_or(f64::NAN)
     }
 
-    /// Ctrl-C.
+    /// Sends Ctrl-C, and returns the exit code.
     fn interrupt(&mut self) -> Result<Option<i32>> {
         harness::run(&format!("kill -INT {}", self.child.id()))?;
         let deadline = Instant::now() + PATIENCE;

@@ -1,6 +1,5 @@
-//! Recordings of a robot at work, by the agent and by `rp bag record`: every message that was sent is
-//! in the bag or counted as missing, however the recording, its reader or its storage ends. Needs
-//! root.
+//! Recordings of a running robot, by the agent and by `rp bag record`. Every sent message is in the
+//! bag or counted as missing, however the recording, its reader or its storage ends. Needs root.
 
 mod robot;
 
@@ -25,16 +24,17 @@ use tempfile::TempDir;
 
 const RP: &str = env!("CARGO_BIN_EXE_rp");
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Two lidars of 13 MB/s each, and small topics.
+/// Size and number of the messages of two lidars with 13 MB/s each.
 const CLOUD: usize = 644_000;
 const CLOUDS: u64 = 40;
-/// Bytes of a message of the stream that fills a small disk.
+/// Size of a message of the stream that fills a small disk, in bytes.
 const SCAN: usize = 64_000;
 const SMALL: u64 = 600;
-/// Between a message and its way into the file: a second, and what a busy machine needs besides.
+/// Maximum time from a message to its write into the file: a second, and a margin for a busy
+/// machine.
 const UNFLUSHED: Duration = Duration::from_secs(5);
 
-/// Point clouds take the machine for themselves.
+/// Point clouds run alone on the machine.
 static MACHINE: RwLock<()> = RwLock::new(());
 
 #[test]
@@ -54,7 +54,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
         streams.iter().all(|(_, topic, ..)| is_known(topic))
     })?;
 
-    // Both at once, and all the watches count besides.
+    // The agent and a client record simultaneously, and the watches count in addition.
     let (status, _) = robot.ask("POST", "/recordings", &json!({"name": "all"}))?;
     ensure!(status == 201, "{status}");
     let mut client = Recorder::start(&robot, "client", &["-a"])?;
@@ -93,7 +93,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
     a_slow_reader_loses_the_largest(&robot, &mut pairs)
 }
 
-/// Topic, messages of each stretch, publisher and subscriber.
+/// Topic, number of messages of each stretch, publisher and subscriber.
 type Pair = (&'static str, u64, Peer, Peer);
 
 fn start_pairs(
@@ -125,7 +125,8 @@ fn start_pairs(
     Ok(pairs)
 }
 
-/// Each message of the first stretch is in the bag, or its report counts it as missing.
+/// Checks that each message of the first stretch is in the bag, or counted as missing in the
+/// report.
 fn all_or_counted(bag: &Path, report: &Value, pairs: &[Pair], page: &Scrape) -> Result<()> {
     let numbers = numbers(bag)?;
     let mut messages = 0;
@@ -157,7 +158,7 @@ fn all_or_counted(bag: &Path, report: &Value, pairs: &[Pair], page: &Scrape) -> 
     Ok(())
 }
 
-/// A reader that does nothing for a while, with room for four clouds.
+/// Checks a reader that does nothing for a while, with memory for four clouds.
 fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Result<()> {
     let arguments = ["/front", "/imu", "--max-cache-size", "3000000"];
     let mut slow = Recorder::start(robot, "slow", &arguments)?;
@@ -197,7 +198,7 @@ fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Res
             let all = recorded.len() as u64 + missing;
             ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubts());
         }
-        // The largest is dropped first, so small messages stay complete.
+        // The largest messages are dropped first, so small messages stay complete.
         let is_large = *topic == "/front";
         ensure!((dropped > 10) == is_large, "{topic}: {report:#}");
         ensure!(is_large || dropped == 0, "{topic}: {report:#}");
@@ -246,7 +247,7 @@ fn a_recording_is_controlled_by_its_client_and_outlives_it() -> Result<()> {
     repaired(&last, &imu, end)
 }
 
-/// Each message of that time is in the bag, counted as paused, or counted as missing.
+/// Checks that each message of that time is in the bag, counted as paused, or counted as missing.
 fn a_client_pauses_resumes_splits_and_ends_a_recording(robot: &Robot<'_>) -> Result<()> {
     let wanted = json!({"name": "led", "topics": {"topics": ["/imu"]}});
     let (status, begun) = robot.ask("POST", "/recordings", &wanted)?;
@@ -312,7 +313,8 @@ fn names_that_lead_elsewhere_are_refused(robot: &Robot<'_>) -> Result<()> {
     Ok(())
 }
 
-/// A silence writes a bag of the messages before it; a request and a signal write one each.
+/// Checks that a silence writes a bag of the messages before it, and that a request and a signal
+/// write one each.
 fn snapshots_are_taken_of_silence_and_on_request(robot: &Robot<'_>, imu: &mut Peer) -> Result<()> {
     imu.process.signal("STOP")?;
     let written = |page: &Scrape| page.sum("ros2probe_snapshots_written_total", &[]);
@@ -325,7 +327,7 @@ fn snapshots_are_taken_of_silence_and_on_request(robot: &Robot<'_>, imu: &mut Pe
     };
     let name = taken["attributes"]["recording"].as_str();
     let before = numbers_of_imu(&robot.bags().join(name.context("no name")?))?;
-    // It may have been stopped between sending and saying so.
+    // The publisher may have been stopped between sending and logging a message.
     let last = sent(imu)?.last().copied().context("nothing sent")?;
     let is_last = before.last().is_some_and(|it| it.abs_diff(last) <= 1);
     ensure!(is_last, "{last} of {before:?}");
@@ -351,10 +353,10 @@ fn numbers_of_imu(bag: &Path) -> Result<BTreeSet<u64>> {
 }
 
 #[test]
-fn a_storage_that_takes_no_more_ends_a_recording_in_order() -> Result<()> {
+fn a_full_storage_ends_a_recording_in_order() -> Result<()> {
     let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
     let host = Namespace::alone()?;
-    // A disk of 4 MB that only the agent has.
+    // Only the agent has this disk of 4 MB.
     let mut enter = host.on_network();
     let script = r#"mount -t tmpfs -o size=4m none "$0" && exec "$@""#;
     enter.extend(["unshare", "--mount", "sh", "-c", script].map(str::to_owned));
@@ -428,13 +430,13 @@ if test -e "$1/bag"; then cp -r "$1/bag" "$5"; fi; exit $code"#
     Ok(())
 }
 
-/// From the first to the last.
+/// Returns the distance from the first number to the last, including both.
 fn span(numbers: &BTreeSet<u64>) -> Result<u64> {
     let (first, last) = (numbers.first(), numbers.last());
     Ok(last.context("nothing")? - first.context("nothing")? + 1)
 }
 
-/// The report in a bag's metadata.
+/// Returns the report in a bag's metadata.
 fn report_of(bag: &Path) -> Result<Value> {
     let text = fs::read_to_string(bag.join("metadata.yaml"))?;
     let metadata = ros2probe_bag::metadata::Metadata::read(&text)?;
@@ -442,7 +444,7 @@ fn report_of(bag: &Path) -> Result<Value> {
     Ok(serde_json::from_str(report.context("no report")?)?)
 }
 
-/// Messages of a topic that are not in the bag although they were sent.
+/// Returns the number of messages of a topic that were sent and are not in the bag.
 fn missing(report: &Value, topic: &str) -> u64 {
     let reasons = ["incomplete", "not_captured", "dropped", "unwritten"];
     let topic = report.pointer("/topics").and_then(|all| all.get(topic));
@@ -450,7 +452,7 @@ fn missing(report: &Value, topic: &str) -> u64 {
     counts.map(Option::unwrap_or_default).sum()
 }
 
-/// A bag whose disk became full: read by others to its end, and its report is right.
+/// Checks that a bag whose disk became full can be read to its end, and that its report is correct.
 fn whole(bag: &Path, report: &Value) -> Result<()> {
     let recorded = numbers(bag)?.remove("/points").context("no /points")?;
     ensure!(recorded.len() > 10, "{recorded:?}");
@@ -460,7 +462,7 @@ fn whole(bag: &Path, report: &Value) -> Result<()> {
         recorded.len()
     );
     ensure!(report["bytes"] == recorded.len() * SCAN, "{report:#}");
-    // Without a gap, except for messages reported as missing.
+    // The numbers have no gap, except for messages reported as missing.
     ensure!(
         span(&recorded)? <= recorded.len() as u64 + missing(report, "/points"),
         "{recorded:?} {report:#}"
@@ -470,7 +472,7 @@ fn whole(bag: &Path, report: &Value) -> Result<()> {
     Ok(())
 }
 
-/// A bag whose recorder was killed has, once it is indexed, all messages until shortly before.
+/// Checks that the bag of a killed recorder has, once indexed, all messages until shortly before.
 fn repaired(bag: &Path, publisher: &Peer, killed: Duration) -> Result<()> {
     let (code, stderr) = rp(&["bag", "reindex", &bag.display().to_string()])?;
     ensure!(code == Some(0), "{stderr}");
@@ -495,7 +497,7 @@ fn repaired(bag: &Path, publisher: &Peer, killed: Duration) -> Result<()> {
     Ok(())
 }
 
-/// Bytes of a bag's files.
+/// Returns the size of a bag's files, in bytes.
 fn bytes(bag: &Path) -> u64 {
     let files = fs::read_dir(bag).into_iter().flatten().flatten();
     let sizes = files.filter_map(|file| Some(file.metadata().ok()?.len()));

@@ -24,41 +24,42 @@ use ros2probe_testing::harness::usage::Usage;
 use ros2probe_testing::harness::wait_until;
 use tempfile::TempDir;
 
-/// Of point clouds.
+/// Sizes of point clouds, in bytes.
 const SIZES: [usize; 2] = [644_000, 2_720_000];
 const PATIENCE: Duration = Duration::from_secs(60);
-/// After this time no more of a publisher's samples arrive, even if the agent lost some of them.
+/// Time after which no more of a publisher's samples arrive, even if the agent lost some of them.
 const QUIET: Duration = Duration::from_secs(6);
-/// As the peers announce it, ROS style.
+/// Type as the peers announce it, in the style of ROS.
 const CLOUD: &str = "sensor_msgs/msg/PointCloud2";
-/// Offset of the points, behind encapsulation, header, fields and sizes.
+/// Offset of the points, after encapsulation, header, fields and sizes.
 const DATA: usize = 52;
 
 #[test]
-fn payloads_of_fast_dds_are_what_was_sent() -> Result<()> {
+fn payloads_of_fast_dds_equal_those_that_were_sent() -> Result<()> {
     payloads_are_what_was_sent(Stack::Fast, &SIZES, at_the_sockets_of)
 }
 
 #[test]
-fn payloads_of_cyclone_dds_are_what_was_sent() -> Result<()> {
+fn payloads_of_cyclone_dds_equal_those_that_were_sent() -> Result<()> {
     payloads_are_what_was_sent(Stack::Cyclone, &SIZES, at_the_sockets_of)
 }
 
 #[test]
-fn payloads_of_rust_dds_are_what_was_sent() -> Result<()> {
+fn payloads_of_rust_dds_equal_those_that_were_sent() -> Result<()> {
     payloads_are_what_was_sent(Stack::Rust, &SIZES, at_the_sockets_of)
 }
 
 #[test]
-fn payloads_on_the_wire_are_what_was_sent() -> Result<()> {
-    // In IP fragments, and larger ones in frames of 1.4 KB; more than that a busy machine loses.
+fn payloads_on_the_wire_equal_those_that_were_sent() -> Result<()> {
+    // Samples are in IP fragments, and larger ones in frames of 1.4 KB. A busy machine loses parts
+    // of more.
     let on_the_wire = |_: &Namespace| ON_THE_WIRE.to_owned();
     payloads_are_what_was_sent(Stack::Fast, &[60_000, 644_000], on_the_wire)?;
     payloads_are_what_was_sent(Stack::Cyclone, &[644_000], on_the_wire)
 }
 
 #[test]
-fn the_last_message_of_a_transient_local_publisher_comes_first_without_a_watch() -> Result<()> {
+fn the_last_message_of_a_transient_local_publisher_is_delivered_first() -> Result<()> {
     let on_the_wire = |_: &Namespace| ON_THE_WIRE.to_owned();
     comes_first(Stack::Fast, at_the_sockets_of)?;
     comes_first(Stack::Cyclone, at_the_sockets_of)?;
@@ -72,12 +73,12 @@ fn comes_first(stack: Stack, source: impl Fn(&Namespace) -> String) -> Result<()
     let stream = Stream {
         reliable: true,
         transient_local: true,
-        // Its message lives as long as the publisher.
+        // The last message is kept as long as the publisher exists.
         linger: 90.0,
         ..Stream::point_cloud(size, 3)
     };
     let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, stack, &stream)?;
-    // The kernel knows the publisher by now. No client requests its topic.
+    // The kernel already knows the publisher. No client requests its topic.
     publisher.go()?;
     let bytes = f64::from(u32::try_from(size)?);
     let kept = |page: &Scrape| page.sum("ros2probe_retained_bytes", &[]) == bytes;
@@ -105,7 +106,7 @@ fn comes_first(stack: Stack, source: impl Fn(&Namespace) -> String) -> Result<()
     Ok(())
 }
 
-/// No watch is configured: the interest of one stream of samples suffices.
+/// Checks the payloads without a configured watch: one stream of samples suffices.
 fn payloads_are_what_was_sent(
     stack: Stack,
     sizes: &[usize],
@@ -114,7 +115,7 @@ fn payloads_are_what_was_sent(
     for size in sizes.iter().copied() {
         let link = Link::new()?;
         let source = source(&link.robot);
-        // Frames that find no room in a packet ring are not seen.
+        // Frames that do not fit into a packet ring are not seen.
         let lossless_metering = source != ON_THE_WIRE;
         let observed = Observed::start(&link.robot, &source)?;
         let stream = Stream {
@@ -131,7 +132,7 @@ fn payloads_are_what_was_sent(
         let mut heard = Instant::now();
         while received.len() as u64 + missed < stream.count {
             let next = match next_within(&mut lines, QUIET) {
-                // Of the last samples nothing may have been seen, and no HEARTBEAT behind them.
+                // The agent may have seen neither the last samples nor a HEARTBEAT after them.
                 Ok(Some(News::Nothing)) | Err(_)
                     if !lossless_metering
                         && publisher.log()?.sequences("pub").len() as u64 == stream.count
@@ -217,23 +218,23 @@ const LOSSLESS: [&str; 5] = [
     "ros2probe_incomplete_datagrams_total",
 ];
 
-/// Messages that the agent reports as missing.
+/// Returns the number of messages that the agent reports as missing.
 fn dropped(page: &Scrape) -> f64 {
     LOSSLESS.iter().map(|name| page.sum(name, &[])).sum()
 }
 
-/// The byte that the peers write at this position of the points.
+/// Returns the byte that the peers write at this position of the points.
 pub(crate) fn pattern(place: usize) -> u8 {
     let [low, ..] = (place * 7 + (place >> 8) * 13 + (place >> 16)).to_le_bytes();
     low
 }
 
-/// The number in a point cloud, every byte of which is as it was sent.
+/// Returns the number in a point cloud. Fails if any byte differs from the sent one.
 pub(crate) fn check(payload: &[u8], pattern: &[u8]) -> Result<u64> {
     ensure!(payload.starts_with(&[0, 1, 0, 0]), "{:?}", payload.get(..4));
     let (_, data) = payload.split_at(DATA);
     let (number, rest) = data.split_first_chunk().context("no data")?;
-    // Behind the data: `is_dense`, and padding.
+    // The field `is_dense` and padding follow the data.
     let len = rest.len() - 1 - rest.len() % 4;
     let is_as_sent = rest.get(..len) == pattern.get(..len);
     ensure!(is_as_sent, "sample {number:?} has other bytes");
@@ -294,7 +295,7 @@ fn next_within(lines: &mut Lines<'_>, patience: Duration) -> Result<Option<News>
     }
 }
 
-/// The binary under test, or another build of it.
+/// Returns the binary under test, or another build of it.
 fn program() -> OsString {
     std::env::var_os("ROS2PROBE_TESTED").unwrap_or_else(|| env!("CARGO_BIN_EXE_rp").into())
 }
@@ -328,7 +329,7 @@ impl<'a> Observed<'a> {
         Ok(serde_json::from_slice(&answer.stdout)?)
     }
 
-    /// Waits until shared memory is seen in this way.
+    /// Waits until the agent has this view of shared memory.
     fn wait_for_view(&self, view: &str) -> Result<()> {
         wait_until(view, || {
             let topic = self.topic("/points")?;
@@ -345,10 +346,10 @@ impl<'a> Observed<'a> {
     }
 }
 
-/// Ten clients at once: one never reads, one is killed. The others receive everything, the interest
-/// of closed clients ends, and memory stays bounded.
+/// One of ten simultaneous clients never reads, and one is killed. The others receive everything,
+/// the subscriptions of closed clients end, and memory stays bounded.
 #[test]
-fn readers_that_stop_or_die_delay_no_other() -> Result<()> {
+fn stopped_and_killed_readers_delay_no_other_reader() -> Result<()> {
     let host = Namespace::alone()?;
     let limits = "limits: {payload_bytes: 8388608, subscriptions: 12}\n";
     let observed = Observed::start(&host, &format!("{limits}{}", at_the_sockets_of(&host)))?;
@@ -407,7 +408,7 @@ fn readers_that_stop_or_die_delay_no_other() -> Result<()> {
     Ok(())
 }
 
-/// A client that reads as fast as it can; killed with its value.
+/// A client that reads as fast as it can, and is killed when its value is dropped.
 struct Reader(Child);
 
 impl Reader {
@@ -436,7 +437,7 @@ impl Drop for Reader {
 /// -- --ignored --nocapture`.
 #[test]
 #[ignore = "takes two minutes and a quiet machine to mean anything"]
-fn cost_of_a_stream_of_point_clouds() -> Result<()> {
+fn the_cost_of_a_stream_of_point_clouds_is_measured() -> Result<()> {
     const WINDOW: Duration = Duration::from_secs(20);
     for (stack, rate) in [
         (Stack::Cyclone, 20.0),

@@ -1,5 +1,6 @@
-//! Fast DDS with its default transports on one host: user data, endpoints and node names go through
-//! shared memory, and only participants show on the network. The agent reads it without a trace.
+//! Fast DDS with its default transports on one host. User data, endpoints and node names go through
+//! shared memory, and only participants are announced on the network. The agent reads shared memory
+//! without a trace.
 //!
 //! Each host has its own `/dev/shm`, in a mount namespace as a container has it, which the
 //! agent reaches through `/proc`. The references are the peers' logs, and the agent's system calls
@@ -20,9 +21,9 @@ use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_until;
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Share of samples seen that a test requires, on a machine with other load.
+/// Minimum share of samples seen that a test requires, on a machine with other load.
 const COVERAGE: f64 = 0.1;
-/// Most attempts to start a pair before the agent has its names.
+/// Maximum number of attempts to start a pair before the agent has its names.
 const MEETINGS: u32 = 12;
 
 #[test]
@@ -88,7 +89,7 @@ fn four_streams_in_shared_memory_are_counted_as_they_were_sent() -> Result<()> {
     Ok(())
 }
 
-/// Between the two pages a stream sent its second stretch.
+/// Checks the counts of a stream that sent its second stretch between the two pages.
 fn assert_counted(stream: &Stream, half: &Scrape, page: &Scrape) {
     let count = |page: &Scrape| page.sum("ros2_topic_messages_total", &[("topic", &stream.topic)]);
     let topic = [("topic", stream.topic.as_str())];
@@ -110,7 +111,7 @@ fn assert_counted(stream: &Stream, half: &Scrape, page: &Scrape) {
         "{}",
         shared_memory_metrics(page)
     );
-    // A DATA is padded to four bytes where another submessage follows it.
+    // A DATA is padded to four bytes if another submessage follows it.
     let bytes = count(page) * stream.size as f64;
     assert!((sum("ros2_topic_bytes_total") - bytes).abs() <= 4.0 * stream.count as f64);
     assert_eq!(sum("ros2_topic_lost_messages_total"), 0.0);
@@ -125,8 +126,7 @@ fn assert_counted(stream: &Stream, half: &Scrape, page: &Scrape) {
 }
 
 #[test]
-fn one_topic_has_its_sources_on_a_host_of_two_middlewares_and_with_a_remote_subscriber()
--> Result<()> {
+fn a_topic_of_two_middlewares_with_a_remote_subscriber_has_all_its_sources() -> Result<()> {
     let link = Link::new()?;
     let host = Host::new(&link.robot)?;
     let directory = tempfile::tempdir()?;
@@ -166,11 +166,11 @@ fn one_topic_has_its_sources_on_a_host_of_two_middlewares_and_with_a_remote_subs
 
 /// Streams of a host of two middlewares with a remote subscriber.
 struct Streams {
-    /// Fast DDS to two subscribers, through shared memory and the network.
+    /// Stream of Fast DDS to two subscribers, through shared memory and the network.
     both: Stream,
-    /// The same for each of its subscribers.
+    /// The same stream with one peer, for the local subscriber.
     one: Stream,
-    /// The remote subscriber's end.
+    /// The same stream for the remote subscriber.
     far: Stream,
     cyclone: Stream,
 }
@@ -205,7 +205,7 @@ impl Streams {
         }
     }
 
-    /// Starts the peers, publishers first, again until the agent has heard all endpoints.
+    /// Starts the peers, publishers first, and repeats this until the agent has all endpoints.
     fn meet(&self, host: &Host<'_>, remote: &Namespace, agent: &Agent<'_>) -> Result<[Peer; 5]> {
         for _ in 0..MEETINGS {
             let mut peers = [
@@ -248,7 +248,7 @@ fn shows_all_pairs(page: &Scrape) -> bool {
 }
 
 #[test]
-fn with_shared_histories_nothing_is_seen_and_the_agent_reports_it() -> Result<()> {
+fn messages_in_shared_histories_are_not_seen_and_the_agent_reports_it() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
@@ -267,7 +267,7 @@ fn with_shared_histories_nothing_is_seen_and_the_agent_reports_it() -> Result<()
 }
 
 #[test]
-fn an_agent_with_nothing_to_see_costs_next_to_nothing() -> Result<()> {
+fn an_agent_without_shared_memory_to_read_takes_almost_no_cpu() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
@@ -292,7 +292,7 @@ fn an_agent_with_nothing_to_see_costs_next_to_nothing() -> Result<()> {
 /// --nocapture`.
 #[test]
 #[ignore = "takes two minutes and prints a figure"]
-fn how_often_both_nodes_and_both_endpoints_are_known() -> Result<()> {
+fn the_ratio_of_starts_after_which_all_names_are_known_is_measured() -> Result<()> {
     const STARTS: usize = 20;
     let network = Namespace::alone()?;
     let host = Host::new(&network)?;
@@ -318,7 +318,7 @@ fn how_often_both_nodes_and_both_endpoints_are_known() -> Result<()> {
 /// --nocapture`.
 #[test]
 #[ignore = "takes two minutes and a quiet machine to mean anything"]
-fn whether_peers_lose_or_wait_more_with_an_agent_beside_them() -> Result<()> {
+fn losses_and_delays_of_peers_are_measured_with_and_without_an_agent() -> Result<()> {
     const PAIRS: usize = 10;
     let network = Namespace::alone()?;
     let host = Host::new(&network)?;
@@ -331,7 +331,7 @@ fn whether_peers_lose_or_wait_more_with_an_agent_beside_them() -> Result<()> {
     };
     let mut runs = [Vec::new(), Vec::new()];
     for pair in 0..2 * PAIRS {
-        // Without, with, with, without, ...: what drifts touches both.
+        // The order is without, with, with, without, and so on, so that a drift affects both.
         let with = usize::from(matches!(pair % 4, 1 | 2));
         let agent = match with {
             1 => Some(start_agent(&network, directory.path())?),
@@ -379,7 +379,7 @@ fn whether_peers_lose_or_wait_more_with_an_agent_beside_them() -> Result<()> {
 /// A host with its own `/dev/shm`.
 struct Host<'n> {
     network: &'n Namespace,
-    /// Keeps the mount namespace.
+    /// The process that keeps the mount namespace.
     keeper: Process,
 }
 
@@ -403,7 +403,7 @@ impl<'n> Host<'n> {
         Peer::launch_behind(&enter, stack, role, stream, &[&node_of(role, stream)])
     }
 
-    /// A publisher and a matched subscriber.
+    /// Starts a publisher and a matched subscriber.
     fn pair(&self, stream: &Stream) -> Result<(Peer, Peer)> {
         let mut subscriber = self.launch(Role::Subscriber, stream)?;
         subscriber.wait_ready()?;
@@ -414,15 +414,15 @@ impl<'n> Host<'n> {
         Ok((publisher, subscriber))
     }
 
-    /// As [`Self::known_pairs`] of one stream.
+    /// Starts one pair as [`Self::known_pairs`] does.
     fn known_pair(&self, agent: &Agent<'_>, stream: &Stream) -> Result<(Peer, Peer)> {
         let mut pairs = self.known_pairs(agent, std::slice::from_ref(stream))?;
         pairs.pop().context("no pair")
     }
 
-    /// As [`Self::pair`] for each stream, until the agent has all names. Names are announced
-    /// once, and their memory is reused within a moment: a tap without CPU time in that moment
-    /// misses them.
+    /// Starts a pair for each stream as [`Self::pair`] does, until the agent has all names. Names
+    /// are announced once, and their memory is reused within a moment. A tap without CPU time in
+    /// that moment misses them.
     fn known_pairs(&self, agent: &Agent<'_>, streams: &[Stream]) -> Result<Vec<(Peer, Peer)>> {
         for attempt in 1..=MEETINGS {
             let pairs: Result<Vec<_>> = streams.iter().map(|stream| self.pair(stream)).collect();
@@ -445,7 +445,7 @@ impl<'n> Host<'n> {
         bail!("their names did not become known in {MEETINGS} attempts")
     }
 
-    /// Files of this host's shared memory that the agent has open.
+    /// Returns the files of this host's shared memory that the agent has open.
     fn files_open_in(&self, agent: &Agent<'_>) -> Result<Vec<String>> {
         let open = fs::read_dir(format!("/proc/{}/fd", agent.process.pid()))?;
         let links = open
@@ -455,12 +455,12 @@ impl<'n> Host<'n> {
         Ok(names.filter(|name| name.contains("fastrtps_")).collect())
     }
 
-    /// Returns its path from outside.
+    /// Returns the path of the shared memory from outside.
     fn shared_memory(&self) -> PathBuf {
         PathBuf::from(format!("/proc/{}/root/dev/shm", self.keeper.pid()))
     }
 
-    /// As `fastdds shm clean` would.
+    /// Removes the files as `fastdds shm clean` would.
     fn remove_shared_memory(&self) -> Result<()> {
         for entry in fs::read_dir(self.shared_memory())? {
             fs::remove_file(entry?.path())?;
@@ -469,7 +469,7 @@ impl<'n> Host<'n> {
     }
 }
 
-/// A reliable stream as `rmw_fastrtps_cpp` publishes it by default.
+/// Returns a reliable stream as `rmw_fastrtps_cpp` publishes it by default.
 fn shared() -> Stream {
     Stream {
         reliable: true,
@@ -499,7 +499,7 @@ fn is_known(page: &Scrape, stream: &Stream) -> bool {
             .all(|name| page.sum(name, &[("topic", &stream.topic)]) == 1.0)
 }
 
-/// Names of ports and of segments.
+/// Returns the names of ports and of segments.
 fn files_of(memory: &Path) -> Result<(Vec<String>, Vec<String>)> {
     let mut names: Vec<_> = fs::read_dir(memory)?
         .map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()))
@@ -510,7 +510,7 @@ fn files_of(memory: &Path) -> Result<(Vec<String>, Vec<String>)> {
 
 fn start_agent<'a>(host: &'a Namespace, directory: &Path) -> Result<Agent<'a>> {
     let configuration = directory.join("ros2probe.yaml");
-    // These tests are about polling.
+    // These tests cover polling only.
     let cgroup = host.cgroup().display();
     let capture = format!("capture: {{source: host, cgroup: {cgroup}, shm: {{exact: off}}}}");
     fs::write(&configuration, format!("watch: [/**]\n{capture}\n"))?;
@@ -519,7 +519,7 @@ fn start_agent<'a>(host: &'a Namespace, directory: &Path) -> Result<Agent<'a>> {
 
 /// Lets the publisher send everything, and returns the page.
 fn run(agent: &Agent<'_>, mut publisher: Peer, stream: &Stream) -> Result<Scrape> {
-    // Names and endpoints have settled.
+    // Waits until names and endpoints have settled.
     std::thread::sleep(Duration::from_secs(1));
     publisher.go()?;
     publisher.wait_sent(PATIENCE)?;

@@ -1,7 +1,7 @@
 //! Exact mode: every message that Fast DDS puts into shared memory, seen in the process that sends
 //! it. Needs root and a kernel with uprobes.
 //!
-//! The judges are the peers' logs, and the code in their memory: a breakpoint shows there.
+//! The references are the peers' logs, and the code in their memory, which shows a breakpoint.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -23,8 +23,8 @@ use crate::hostile::start_as;
 const UNPRIVILEGED: u32 = 65_534;
 const PATIENCE: Duration = Duration::from_secs(60);
 const SAMPLES: u64 = 600;
-/// Samples at full speed. The ring has room for all of them: the agent may get no CPU during the
-/// burst.
+/// Size of the ring, and number of samples at full speed. The ring holds all of them, since the
+/// agent may get no CPU during the burst.
 const RING: u64 = 4 << 20;
 const BURST: u64 = 50_000;
 const FASTER_THAN_IT_GOES: f64 = 1e6;
@@ -98,9 +98,9 @@ fn every_message_is_seen_and_breakpoints_end_with_a_killed_agent() -> Result<()>
     Ok(())
 }
 
-/// As packaged: the agent has no right over other processes.
+/// The agent has no right over other processes, as packaged.
 #[test]
-fn by_the_broker_an_agent_without_rights_sees_every_message_in_every_start_order() -> Result<()> {
+fn with_a_broker_an_agent_without_rights_sees_every_message_in_every_start_order() -> Result<()> {
     for is_broker_first in [true, false] {
         let host = Host::new()?;
         let directory = tempfile::tempdir()?;
@@ -138,7 +138,7 @@ fn by_the_broker_an_agent_without_rights_sees_every_message_in_every_start_order
         publisher.go()?;
         counted(&agent, "/imu", SAMPLES / 2)?;
 
-        // The breakpoints belong to the agent, and a new broker goes on.
+        // The breakpoints belong to the agent, and a new broker continues.
         let library = library_of(&publisher)?;
         let is_attached = |peer: &Peer| -> Result<bool> {
             let Code { in_memory, in_file } = code::at_function(&peer.process, &library)?;
@@ -164,7 +164,7 @@ fn by_the_broker_an_agent_without_rights_sees_every_message_in_every_start_order
         );
 
         for thread in threads(agent.process.pid())? {
-            // It attaches to a recreated control group.
+            // The thread attaches to a recreated control group.
             let is_allowed = thread.capabilities == 0 || thread.name == "cgroup";
             ensure!(is_allowed, "{thread:?}");
         }
@@ -201,7 +201,7 @@ fn threads(process: u32) -> Result<Vec<Thread>> {
 }
 
 #[test]
-fn without_the_means_for_uprobes_shared_memory_is_sampled_and_the_reason_reported() -> Result<()> {
+fn without_uprobes_shared_memory_is_sampled_and_the_reason_is_reported() -> Result<()> {
     let host = Host::new()?;
     let directory = tempfile::tempdir()?;
     let lacking = ["setpriv", "--bounding-set", "-sys_ptrace"].map(str::to_owned);
@@ -217,7 +217,7 @@ fn without_the_means_for_uprobes_shared_memory_is_sampled_and_the_reason_reporte
     assert_eq!(able("shared_memory"), 1.0);
     drop(agent);
 
-    // A process with a library that has no such function, and a pair that has.
+    // A process has a library without the function, and a pair has one with it.
     let fake = directory.path().join("libfastdds.so.3.9");
     fs::copy(any_library()?, &fake)?;
     let agent = start_agent(&host.network, directory.path(), &[])?;
@@ -232,7 +232,7 @@ fn without_the_means_for_uprobes_shared_memory_is_sampled_and_the_reason_reporte
     enter.extend(["env".to_owned(), preload]);
     let mut stranger = Process::start(&enter, "sleep", ["60"])?;
     wait_until("it is not covered", || Ok(!is_able()?))?;
-    // A process may be met while it executes another program; the agent then tries again.
+    // The agent may find a process that executes another program, and then tries again.
     wait_until("the reason is that the library lacks the function", || {
         let reasons = (agent.scrape()?).labels_of("ros2probe_shm_exact_info", "reason");
         Ok(reasons.iter().all(|reason| reason.contains("no symbol")))
@@ -248,7 +248,7 @@ fn without_the_means_for_uprobes_shared_memory_is_sampled_and_the_reason_reporte
 }
 
 #[test]
-fn a_recreated_cgroup_is_sampled_and_the_reason_reported() -> Result<()> {
+fn a_recreated_cgroup_is_sampled_and_the_reason_is_reported() -> Result<()> {
     let mut host = Host::new()?;
     let observed = host.network.cgroup().join("observed");
     fs::create_dir(&observed)?;
@@ -270,7 +270,7 @@ fn a_recreated_cgroup_is_sampled_and_the_reason_reported() -> Result<()> {
     let health = get(&host.network, "http://127.0.0.1:17401/health")?;
     assert!(health.contains("the cgroup was recreated"), "{health}");
 
-    // Polling finds the participants of the new one, and no loss is reported.
+    // Polling finds the participants of the new control group, and no loss is reported.
     let stream = Stream {
         count: SAMPLES,
         linger: 60.0,
@@ -280,7 +280,7 @@ fn a_recreated_cgroup_is_sampled_and_the_reason_reported() -> Result<()> {
         let page = agent.scrape()?;
         Ok(page.sum("ros2_topic_publishers", &[("topic", "/imu")]) == 1.0)
     };
-    // Polling may miss an announcement: other nodes of the same names repeat it.
+    // Polling may miss an announcement, which other nodes of the same names repeat.
     let (mut publisher, mut subscriber) = host.pair(&stream)?;
     let began = Instant::now();
     while !is_there()? {
@@ -298,7 +298,7 @@ fn a_recreated_cgroup_is_sampled_and_the_reason_reported() -> Result<()> {
     let topic = [("topic", "/imu")];
     let counted = page.sum("ros2_topic_messages_total", &topic);
     let lost = page.sum("ros2_topic_lost_messages_total", &topic);
-    // The last ones may have been overwritten before they were read.
+    // The last samples may have been overwritten before they were read.
     ensure!(
         (0.9..=1.0).contains(&(counted / SAMPLES as f64)) && lost == 0.0,
         "{counted} of {SAMPLES}, {lost} lost: {}",
@@ -313,11 +313,12 @@ fn a_recreated_cgroup_is_sampled_and_the_reason_reported() -> Result<()> {
 /// A host with its own `/dev/shm`.
 struct Host {
     network: Namespace,
-    /// That its nodes are in.
+    /// Control group of the host's nodes.
     cgroup: PathBuf,
-    /// Keeps the mount namespace.
+    /// The process that keeps the mount namespace.
     keeper: Process,
-    /// A copy of Fast DDS: agents of other tests may have breakpoints in the installed one.
+    /// Directory with a copy of Fast DDS, since agents of other tests may have breakpoints in the
+    /// installed one.
     libraries: TempDir,
 }
 
@@ -340,7 +341,8 @@ impl Host {
         })
     }
 
-    /// A process whose library has breakpoints, so that later ones have them from the beginning.
+    /// Starts a process whose library gets breakpoints, so that later processes have them from the
+    /// beginning.
     fn attached(&self, agent: &Agent<'_>) -> Result<Peer> {
         let peer = self.launch(Role::Subscriber, &shared("/first"))?;
         let place = self.libraries.path().display().to_string();
@@ -351,7 +353,7 @@ impl Host {
         Ok(peer)
     }
 
-    /// A publisher and a matched subscriber.
+    /// Starts a publisher and a matched subscriber.
     fn pair(&self, stream: &Stream) -> Result<(Peer, Peer)> {
         let mut subscriber = self.launch(Role::Subscriber, stream)?;
         subscriber.wait_ready()?;
@@ -378,7 +380,7 @@ impl Host {
     }
 }
 
-/// A reliable stream as `rmw_fastrtps_cpp` publishes it by default.
+/// Returns a reliable stream as `rmw_fastrtps_cpp` publishes it by default.
 fn shared(topic: &str) -> Stream {
     Stream {
         topic: topic.to_owned(),
@@ -393,7 +395,7 @@ fn start_agent<'a>(host: &'a Namespace, directory: &Path, words: &[String]) -> R
     start_agent_at(host, host.cgroup(), directory, words)
 }
 
-/// As [`start_agent`], for what is in a cgroup.
+/// Starts an agent as [`start_agent`] does, for the processes in a cgroup.
 fn start_agent_at<'a>(
     host: &'a Namespace,
     cgroup: &Path,
@@ -426,7 +428,7 @@ fn configured(cgroup: &Path, directory: &Path) -> Result<PathBuf> {
     Ok(configuration)
 }
 
-/// Socket of the broker, if one is started.
+/// Returns the socket of the broker, if one is started.
 fn socket_of(directory: &Path) -> PathBuf {
     directory.join("attach.sock")
 }
@@ -448,7 +450,7 @@ fn is_known(agent: &Agent<'_>, topic: &str) -> Result<bool> {
         && endpoints.map(|name| page.sum(name, &[("topic", topic)])) == [1.0; 2])
 }
 
-/// Waits until it is.
+/// Waits until the topic is known.
 fn known(agent: &Agent<'_>, topic: &str) -> Result<()> {
     let result = wait_until(topic, || is_known(agent, topic));
     result.with_context(|| {
@@ -459,7 +461,7 @@ fn known(agent: &Agent<'_>, topic: &str) -> Result<()> {
     })
 }
 
-/// The page that counts so many messages of a topic, and later no more.
+/// Returns the page that counts this many messages of a topic, after which no more are counted.
 fn counted(agent: &Agent<'_>, topic: &str, count: u64) -> Result<Scrape> {
     let page = agent.settled_scrape(topic, count)?;
     println!("{}", shared_memory_metrics(&page));
@@ -468,7 +470,7 @@ fn counted(agent: &Agent<'_>, topic: &str, count: u64) -> Result<Scrape> {
     Ok(page)
 }
 
-/// Waits for this many samples from this one on at a subscriber, and returns their number.
+/// Waits for `count` samples since `first` at a subscriber, and returns their number.
 fn received(subscriber: &mut Peer, first: u64, count: u64) -> Result<u64> {
     let deadline = Instant::now() + PATIENCE;
     loop {
@@ -482,12 +484,12 @@ fn received(subscriber: &mut Peer, first: u64, count: u64) -> Result<u64> {
     }
 }
 
-/// The file of a peer's Fast DDS.
+/// Returns the file of a peer's Fast DDS.
 fn library_of(peer: &Peer) -> Result<PathBuf> {
     mapped(peer.process.pid(), "/libfastrtps.so")
 }
 
-/// Some library that is not Fast DDS.
+/// Returns a library that is not Fast DDS.
 fn any_library() -> Result<PathBuf> {
     mapped(std::process::id(), "/libgcc_s.so")
 }

@@ -1,9 +1,10 @@
-//! The sources agree: a capture gives the same counts whether it is replayed from the file or sent
-//! again between sockets. There the host source sees whole datagrams, and the wire source frames.
+//! The sources agree: a capture leads to the same counts whether it is replayed from the file or
+//! sent again between sockets. There, the host source sees whole datagrams, and the wire source
+//! frames.
 //!
-//! Counted are messages, bytes and losses of each topic and of each writer that was never
-//! announced, and the lost sequence numbers of each writer. Times are not: they are those of the
-//! second sending, and of duplicates the host sees a copy on each side.
+//! The compared counts are messages, bytes and losses of each topic and of each unknown writer, and
+//! the lost sequence numbers of each writer. Times and duplicates are not compared. Times are those
+//! of the second sending, and the host sees a copy of duplicates on each side.
 
 mod injection;
 
@@ -28,17 +29,17 @@ use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::witness::{Testimony, Witness};
 use ros2probe_wire::Expansion;
 
-/// Every topic, hidden ones too.
+/// Configuration that watches every topic, including hidden ones.
 const EVERYTHING: &str = "watch: ['/**', '/**/_action/*', '/**/_service_event']\n";
 /// Longer captures run only if `ROS2PROBE_FIXTURES` names them.
 const LONGEST: Duration = Duration::from_secs(60);
-/// Captures are sent in half their time: windows in which gaps may still be filled are long enough.
+/// Captures are sent in half their time. Windows in which gaps may still be filled are long enough.
 const SPEED: u32 = 2;
-/// Both sources have taken in everything.
+/// Time after which both sources have processed everything.
 const SETTLE: Duration = Duration::from_millis(800);
 
 #[test]
-fn host_wire_and_file_give_the_same_counts() -> Result<()> {
+fn host_wire_and_file_lead_to_the_same_counts() -> Result<()> {
     let asked = std::env::var_os("ROS2PROBE_FIXTURES").map(PathBuf::from);
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let corpus = asked
@@ -46,14 +47,15 @@ fn host_wire_and_file_give_the_same_counts() -> Result<()> {
         .unwrap_or(here.join("../../../shared/fixtures"));
     let own = captures(&here.join("../testing/data"));
     ensure!(own.len() >= 8, "{own:?}");
-    // The corpus holds those of the repository too.
+    // The corpus also contains the captures of the repository.
     let more = captures(&corpus).into_iter().filter(|path| {
         let end: PathBuf = path.iter().rev().take(3).collect();
         !own.iter()
             .any(|own| own.iter().rev().take(3).collect::<PathBuf>() == end)
     });
     let all: Vec<PathBuf> = own.iter().cloned().chain(more).collect();
-    // One after the other: what is started while sockets are made would belong to their cgroup.
+    // The captures are prepared one after the other, because what starts while sockets are created
+    // would belong to their cgroup.
     let prepared = (0..)
         .zip(&all)
         .map(|(number, path)| Sending::prepare(number, path));
@@ -90,7 +92,7 @@ struct Sending<'a> {
 }
 
 impl<'a> Sending<'a> {
-    /// `None` for a capture that cannot be sent again, or takes too long.
+    /// Prepares a capture; `None` if it cannot be sent again, or takes too long.
     fn prepare(number: usize, capture: &'a Path) -> Result<Option<Self>> {
         let host = Namespace::alone()?;
         let cgroup = Cgroup::create(&format!("{PREFIX}-{}-source{number}", std::process::id()))?;
@@ -205,7 +207,7 @@ impl std::fmt::Display for Counts {
     }
 }
 
-/// Two levels below `root`; none if it does not exist.
+/// Returns the captures two levels below `root`; none if it does not exist.
 fn captures(root: &Path) -> Vec<PathBuf> {
     let children = |directory: &Path| {
         let entries = std::fs::read_dir(directory).into_iter().flatten().flatten();
@@ -213,7 +215,7 @@ fn captures(root: &Path) -> Vec<PathBuf> {
         paths.sort();
         paths
     };
-    // Zenoh does not send RTPS, and RTPS over TCP is not read.
+    // Zenoh does not send RTPS, and the agent does not read RTPS over TCP.
     let directories = children(root)
         .into_iter()
         .filter(|label| !label.ends_with("zenoh") && !label.ends_with("fastrtps-tcp"))

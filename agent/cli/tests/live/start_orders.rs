@@ -1,8 +1,8 @@
 //! Agent, publisher, subscriber and router of Zenoh start in every order. Once the agent knows the
 //! names, the same messages give the same figures, also after a restart of the agent and a router.
 //!
-//! A robot that is older than the agent sends before the agent starts, and is requested to repeat its
-//! announcements.
+//! A robot that is older than the agent sends before the agent starts, and repeats its
+//! announcements on request.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -21,12 +21,12 @@ use tempfile::TempDir;
 
 const RP: &str = env!("CARGO_BIN_EXE_rp");
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Longer than the second after which a gap is a loss.
+/// Time to settle: longer than the second after which a gap is a loss.
 const SETTLE: Duration = Duration::from_secs(2);
-/// Messages that the publisher sends in one go.
+/// Number of messages that the publisher sends without a pause.
 const STRETCH: u64 = 100;
 const TOPIC: [(&str, &str); 1] = [("topic", "/imu")];
-/// Orders that run at the same time.
+/// Number of orders that run at the same time.
 const AT_ONCE: usize = 3;
 
 /// A program that starts.
@@ -51,22 +51,22 @@ fn cyclone_dds_and_the_agent_start_in_every_order() -> Result<()> {
 }
 
 #[test]
-fn zenoh_and_the_agent_start_in_every_order_behind_the_router() -> Result<()> {
+fn zenoh_and_the_agent_start_in_every_order_after_the_router() -> Result<()> {
     every_order_from(Stack::Zenoh, &[R], &[A, P, S])
 }
 
 #[test]
-fn zenoh_and_the_router_start_in_every_order_behind_the_agent() -> Result<()> {
+fn zenoh_and_the_router_start_in_every_order_after_the_agent() -> Result<()> {
     every_order_from(Stack::Zenoh, &[A], &[R, P, S])
 }
 
 #[test]
-fn zenoh_router_and_agent_start_in_every_order_behind_the_publisher() -> Result<()> {
+fn zenoh_router_and_agent_start_in_every_order_after_the_publisher() -> Result<()> {
     every_order_from(Stack::Zenoh, &[P], &[R, A, S])
 }
 
 #[test]
-fn zenoh_router_and_agent_start_in_every_order_behind_the_subscriber() -> Result<()> {
+fn zenoh_router_and_agent_start_in_every_order_after_the_subscriber() -> Result<()> {
     every_order_from(Stack::Zenoh, &[S], &[R, A, P])
 }
 
@@ -74,7 +74,7 @@ fn every_order(stack: Stack, parts: &[Part]) -> Result<()> {
     every_order_from(stack, &[], parts)
 }
 
-/// Tries each order of `parts` behind `first`.
+/// Tries each order of `parts` after `first`.
 fn every_order_from(stack: Stack, first: &[Part], parts: &[Part]) -> Result<()> {
     let orders: Vec<Vec<Part>> = permutations(parts)
         .into_iter()
@@ -98,7 +98,7 @@ fn every_order_from(stack: Stack, first: &[Part], parts: &[Part]) -> Result<()> 
     Ok(())
 }
 
-/// What the agent reports of a stretch of messages.
+/// The agent's report of a stretch of messages.
 #[derive(Debug, PartialEq, Eq)]
 struct Figures {
     nodes: BTreeSet<String>,
@@ -142,7 +142,7 @@ fn one_order(stack: Stack, order: &[Part]) -> Result<()> {
     };
     for part in order {
         if *part == Part::Agent && robot.is_whole() {
-            // It has sent messages that the agent cannot know.
+            // The robot sends messages that the agent cannot know.
             robot.matched()?;
             robot.send()?;
         }
@@ -253,7 +253,7 @@ impl<'n> Robot<'n> {
         Ok(())
     }
 
-    /// Requests the announcements that precede the agent, as its hints recommend.
+    /// Requests the announcements from before the agent's start, as its hints recommend.
     fn discover(&self) -> Result<()> {
         let enter = self.host.on_network();
         let (program, arguments) = enter.split_first().context("no host")?;
@@ -287,7 +287,7 @@ impl<'n> Robot<'n> {
         })
     }
 
-    /// Sends a stretch and waits until the agent reports the expected figures. They stay.
+    /// Sends a stretch, and waits until the agent reports the expected figures, which then stay.
     fn figures_of_a_stretch(&mut self, expected: &Figures) -> Result<()> {
         let none = Figures {
             messages: 0,
@@ -335,7 +335,7 @@ impl<'n> Robot<'n> {
         }
     }
 
-    /// Returns the figures since a page.
+    /// Returns the figures since `before`.
     fn figures(&self, before: &Scrape) -> Result<Figures> {
         let agent = self.agent()?;
         let page = agent.scrape()?;

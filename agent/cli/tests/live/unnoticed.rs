@@ -1,5 +1,6 @@
-//! Observing leaves the robot exactly as it was: no participant, no endpoint, no packet, no socket
-//! of the network but the listeners, no multicast group, no promiscuous interface.
+//! Observing leaves the robot unchanged. The agent has no participant and no endpoint, and sends no
+//! packet. Its listeners are its only sockets of the network, it joins no multicast group, and no
+//! interface is promiscuous.
 //!
 //! The references are recordings of the link that tshark reads, the kernel's own counters, and the
 //! sockets of every process in `/proc`.
@@ -17,14 +18,14 @@ use ros2probe_testing::harness::dissection::{Content, Dissection, Frame};
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 
-/// The kernels' own traffic: address resolution, multicast membership, IPv6 neighbours.
+/// Traffic of the kernels themselves: address resolution, multicast membership, IPv6 neighbours.
 const KERNEL_PROTOCOLS: [&str; 3] = ["arp", "igmp", "icmpv6"];
 const PHASE: Duration = Duration::from_secs(2);
-/// LISTEN in `/proc/net/tcp`.
+/// State LISTEN in `/proc/net/tcp`.
 const LISTENING: &str = "0A";
 
 #[test]
-fn running_nodes_send_the_same_before_beside_and_after_the_agent() -> Result<()> {
+fn running_nodes_send_the_same_before_during_and_after_an_agent() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let mut nodes = Nodes::start(&link)?;
@@ -36,7 +37,7 @@ fn running_nodes_send_the_same_before_beside_and_after_the_agent() -> Result<()>
     phases.push(unix_seconds());
     let mut agent = start_agent(&link.robot, directory.path())?;
     std::thread::sleep(PHASE);
-    // It started after most announcements, but sees the traffic.
+    // The agent started after most announcements, but sees the traffic.
     let messages = |page: &Scrape| {
         page.sum("ros2_topic_messages_total", &[])
             + page.sum("ros2_unknown_writer_messages_total", &[])
@@ -75,13 +76,13 @@ fn running_nodes_send_the_same_before_beside_and_after_the_agent() -> Result<()>
         assert!(silent.is_empty(), "{phase} the agent {silent:?} are silent");
         others.extend(talking.difference(&known).cloned());
     }
-    // ros_discovery_info is each participant's writer and reader beside those of the streams.
+    // Besides the streams, each participant has a writer and a reader of ros_discovery_info.
     assert!(others.len() <= 2 * prefixes.len(), "{others:?}");
     Ok(())
 }
 
 #[test]
-fn nodes_that_start_beside_the_agent_announce_what_they_announce_without_it() -> Result<()> {
+fn nodes_that_start_beside_an_agent_announce_the_same_as_without_it() -> Result<()> {
     let mut announced = Vec::new();
     for observed in [false, true] {
         let link = Link::new()?;
@@ -103,9 +104,9 @@ fn nodes_that_start_beside_the_agent_announce_what_they_announce_without_it() ->
         let talking = talking(frames.iter());
         let silent: Vec<_> = known.difference(&talking).collect();
         assert!(silent.is_empty(), "{silent:?}");
-        // ros_discovery_info is each participant's writer and reader beside those of the streams.
+        // Besides the streams, each participant has a writer and a reader of ros_discovery_info.
         assert_eq!(talking.len(), 3 * known.len(), "{talking:?}");
-        // Sequence numbers of the announcements' writers: how many endpoints each host announces.
+        // The sequence numbers of the announcements show how many endpoints each host announces.
         let announcements = frames.iter().flat_map(|frame| {
             let address = frame.ip_source.rsplit('.').next().unwrap_or_default();
             let writers = frame.submessages.iter().filter_map(move |submessage| {
@@ -128,7 +129,7 @@ fn nodes_that_start_beside_the_agent_announce_what_they_announce_without_it() ->
 fn a_host_that_runs_only_the_agent_sends_nothing() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
-    // The kernel would search for IPv6 routers and neighbours.
+    // With IPv6, the kernel would search for routers and neighbours.
     inside(
         &link.robot,
         &format!("sysctl -qw net.ipv6.conf.{INTERFACE}.disable_ipv6=1"),
@@ -170,7 +171,7 @@ fn a_host_that_runs_only_the_agent_sends_nothing() -> Result<()> {
 }
 
 #[test]
-fn the_agent_has_no_socket_of_the_network_but_its_listeners() -> Result<()> {
+fn the_listeners_are_the_only_network_sockets_of_the_agent() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let before = memberships(&link.robot)?;
@@ -196,7 +197,7 @@ fn the_agent_has_no_socket_of_the_network_but_its_listeners() -> Result<()> {
     let listeners = of_table("tcp")?;
     let addresses = listeners.iter().map(|row| (&*row[1], &*row[3]));
     let addresses: BTreeSet<_> = addresses.collect();
-    // 127.0.0.1:17400 for metrics, 17401 for control, and 8765 for viewers.
+    // The listeners are 127.0.0.1:17400 for metrics, 17401 for control, and 8765 for viewers.
     let expected = ["0100007F:43F8", "0100007F:43F9", "0100007F:223D"];
     assert_eq!(addresses, expected.map(|each| (each, LISTENING)).into());
     for table in ["tcp6", "udp", "udp6", "udplite", "raw", "raw6", "icmp"] {
@@ -250,7 +251,7 @@ impl Nodes {
         self.publishers.iter().chain(&self.subscribers)
     }
 
-    /// The UDP ports that these processes have bound.
+    /// Returns the UDP ports that these processes have bound.
     fn ports(&self) -> Result<BTreeSet<u16>> {
         let mut ports = BTreeSet::new();
         for peer in self.all() {
@@ -269,7 +270,7 @@ impl Nodes {
     }
 }
 
-/// The endpoints of the streams, as the peers log them.
+/// Returns the endpoints of the streams, as the peers log them.
 fn guids<'a>(peers: impl Iterator<Item = &'a Peer>) -> Result<BTreeSet<String>> {
     let mut guids = BTreeSet::new();
     for peer in peers {
@@ -279,7 +280,8 @@ fn guids<'a>(peers: impl Iterator<Item = &'a Peer>) -> Result<BTreeSet<String>> 
     Ok(guids)
 }
 
-/// Fast DDS 2.9 aborts beside the others in one domain.
+/// Returns a stack's stream in a separate domain, since Fast DDS 2.9 aborts in one with other
+/// stacks.
 fn stream_of(stack: Stack) -> Stream {
     Stream {
         domain: stack as u16,
@@ -294,7 +296,7 @@ fn topic_of(stack: Stack) -> String {
     format!("/{stack:?}").to_lowercase()
 }
 
-/// Every frame comes from a socket of a node, or is a kernel's own.
+/// Checks that a frame comes from a node's socket, or from a kernel itself.
 fn assert_is_of_a_node(frame: &Frame, ports: &BTreeSet<u16>, phase: &str) {
     let is_of_a_kernel = frame
         .protocols
@@ -310,7 +312,7 @@ fn assert_is_of_a_node(frame: &Frame, ports: &BTreeSet<u16>, phase: &str) {
     );
 }
 
-/// The endpoints of streams that send: writers samples, readers answers.
+/// Returns the endpoints of streams that send: writers send samples, and readers answers.
 fn talking<'a>(frames: impl Iterator<Item = &'a Frame>) -> BTreeSet<String> {
     let mut guids = BTreeSet::new();
     for frame in frames {
@@ -335,7 +337,7 @@ fn start_agent<'a>(host: &'a Namespace, directory: &Path) -> Result<Agent<'a>> {
     Agent::start(host, env!("CARGO_BIN_EXE_rp"), &configuration)
 }
 
-/// Inodes of a process's sockets.
+/// Returns the inodes of a process's sockets.
 fn sockets_of(pid: u32) -> Result<BTreeSet<String>> {
     let mut sockets = BTreeSet::new();
     for entry in fs::read_dir(format!("/proc/{pid}/fd"))? {
@@ -353,7 +355,7 @@ fn sockets_of(pid: u32) -> Result<BTreeSet<String>> {
     Ok(sockets)
 }
 
-/// The rows of a table of `/proc/<pid>/net`, in words.
+/// Returns the rows of a table of `/proc/<pid>/net`, in words.
 fn table_rows(pid: u32, table: &str) -> Result<Vec<Vec<String>>> {
     let path = format!("/proc/{pid}/net/{table}");
     let text = fs::read_to_string(&path).with_context(|| format!("cannot read {path}"))?;
@@ -363,7 +365,7 @@ fn table_rows(pid: u32, table: &str) -> Result<Vec<Vec<String>>> {
         .collect())
 }
 
-/// Multicast groups that the host has joined, of IPv4, IPv6 and the link.
+/// Returns the multicast groups that the host has joined, of IPv4, IPv6 and the link.
 fn memberships(host: &Namespace) -> Result<Vec<String>> {
     let shown = inside(host, "ip maddress show")?;
     let mut lines: Vec<_> = shown.lines().map(|line| line.trim().to_owned()).collect();

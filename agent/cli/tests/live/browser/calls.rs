@@ -42,7 +42,7 @@ impl Filter {
         self.run("publish 10 100")?;
         self.run("both 30")?;
         self.run("timer 20 100")?;
-        // Prints figures before its name.
+        // The process prints figures before the name of this command.
         self.process.write_line("receive 4 1000")?;
         self.process.write_line("take 20 2000")?;
         self.run("miss 3")

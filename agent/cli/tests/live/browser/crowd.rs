@@ -1,4 +1,4 @@
-//! A capture of a large robot whose names mean harm, or none: topics, types, nodes and messages.
+//! A capture of a large robot with hostile or harmless names: topics, types, nodes and messages.
 
 use std::time::Duration;
 
@@ -6,15 +6,16 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 use ros2probe_testing::model::forge::{self, Message};
 
-/// When the capture begins: 2026-11-21, Unix seconds.
+/// Start of the capture: 2026-11-21, in Unix seconds.
 pub(super) const START: u64 = 1_795_219_200;
-/// Topics of one participant, each with its own node.
+/// Number of topics of one participant, each with its own node.
 const TOPICS: usize = 20;
-/// Longest name in DDS.
+/// Maximum length of a name in DDS.
 const LONGEST: usize = 255;
 
-/// Names that harm a page which takes text for markup, for code, or for a file's path, and that the
-/// agent shows: it takes no quotation marks, control characters, nor what turns text around.
+/// Hostile names that the agent shows. They harm a page that treats text as markup, code or a
+/// file's path. The agent refuses quotation marks, control characters and changes of the text's
+/// direction.
 pub(super) const HARM: [&str; 16] = [
     "<img src=x onerror=harmed=1>",
     "><script>globalThis.harmed=1</script>",
@@ -44,7 +45,7 @@ const REFUSED: [&str; 6] = [
     "refused\\u{41}",
 ];
 
-/// A capture (pcap) of so many topics, measured for some seconds.
+/// Returns a capture (pcap) of this many topics that send for some seconds.
 pub(crate) fn capture(topics: usize, hostile: bool, seconds: u64) -> Vec<u8> {
     let mut file = vec![0xd4, 0xc3, 0xb2, 0xa1, 2, 0, 4, 0, 0, 0, 0, 0, 0, 0, 0, 0];
     file.extend_from_slice(&[0xff, 0xff, 0, 0, 1, 0, 0, 0]);
@@ -82,7 +83,7 @@ pub(crate) fn capture(topics: usize, hostile: bool, seconds: u64) -> Vec<u8> {
         for robot in &robots {
             let prefix = prefix(*robot);
             for (number, topic) in (1..).zip(own(*robot)) {
-                // One in fifty loses every fifth message.
+                // One topic in fifty loses every fifth message.
                 if topic % 50 == 3 && second % 5 == 4 {
                     continue;
                 }
@@ -113,7 +114,7 @@ fn name(topic: usize, hostile: bool) -> String {
     let harm = HARM[topic % HARM.len()];
     match (hostile, topic % 20) {
         (false, _) => format!("robot_{:02}/sensor_{topic:03}/data", topic / TOPICS),
-        // As long as DDS allows, of what no keyboard has.
+        // This name has the maximum length of DDS, and characters that no keyboard has.
         (true, 19) => {
             let mut junk = format!("{topic:03}");
             let mut next = (topic as u32).wrapping_mul(2_654_435_761);
@@ -154,7 +155,7 @@ fn node_name(topic: usize, hostile: bool) -> String {
     }
 }
 
-/// Adds a UDP payload to the discovery multicast address of domain 0.
+/// Adds a UDP payload that is sent to the discovery multicast address of domain 0.
 pub(super) fn put(file: &mut Vec<u8>, after: Duration, payload: &[u8]) {
     let length = u16::try_from(payload.len()).unwrap();
     let mut frame = vec![1, 0, 0x5e, 0x7f, 0, 1, 2, 0, 0, 0, 0, 1, 8, 0, 0x45, 0];

@@ -1,4 +1,4 @@
-//! A capture of chains of nodes whose topics and nodes have names that mean harm.
+//! A capture of chains of nodes with hostile names of topics and nodes.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 use super::crowd::{HARM, START, put};
 
-/// Messages through each chain; a chain is shown from five on.
+/// Number of messages through each chain. Five are enough for a chain to be shown.
 const MESSAGES: u64 = 20;
 /// Time from the publication of a hop's input to that of its output.
 const HOP: Duration = Duration::from_millis(3);
@@ -15,8 +15,8 @@ const WRITER: EntityId = EntityId([0, 0, 1, 3]);
 const READER: EntityId = EntityId([0, 0, 2, 4]);
 const NODES: EntityId = EntityId([0, 2, 0, 3]);
 
-/// Returns a capture (pcap) of chains with so many hops each. Their nodes publish what they read
-/// with its stamp.
+/// Returns a capture (pcap) of chains with these numbers of hops. Their nodes publish each message
+/// that they read with its stamp.
 pub(crate) fn capture(lengths: &[usize]) -> Vec<u8> {
     let mut file = vec![0xd4, 0xc3, 0xb2, 0xa1, 2, 0, 4, 0, 0, 0, 0, 0, 0, 0, 0, 0];
     file.extend_from_slice(&[0xff, 0xff, 0, 0, 1, 0, 0, 0]);
@@ -30,7 +30,7 @@ pub(crate) fn capture(lengths: &[usize]) -> Vec<u8> {
             // Chains follow each other, so that their messages do not mix.
             let begin = Duration::from_secs(2 + number * 10)
                 + Duration::from_millis(100 * u64::try_from(chain).unwrap());
-            // Not a multiple of 100 us, which could be a coincidence.
+            // The stamp is not a multiple of 100 us, which could be a coincidence.
             let stamp = after(begin) - 1_234_567;
             for stage in 0..=*hops {
                 let at = begin + HOP * u32::try_from(stage).unwrap();
@@ -43,7 +43,7 @@ pub(crate) fn capture(lengths: &[usize]) -> Vec<u8> {
             }
         }
     }
-    // Time in which the last messages are evaluated.
+    // Leaves time to evaluate the last messages.
     let end = Duration::from_secs(2 + MESSAGES * 10 + 20);
     let payload = forge::participant(prefix(0, 0), 600, None);
     put(
@@ -56,7 +56,7 @@ pub(crate) fn capture(lengths: &[usize]) -> Vec<u8> {
     file
 }
 
-/// Announces a participant with one node: it publishes its topic and reads that of the stage
+/// Announces a participant with one node, which publishes its topic and reads that of the stage
 /// before. Each topic has a subscription.
 fn announce(file: &mut Vec<u8>, chain: usize, stage: usize) {
     let prefix = prefix(chain, stage);
@@ -95,12 +95,12 @@ fn name(chain: usize, stage: usize) -> String {
     format!("{visible}{harm}{chain}_{stage}")
 }
 
-/// Nanoseconds of the calendar.
+/// Returns the nanoseconds since the epoch.
 fn after(time: Duration) -> u64 {
     START * 1_000_000_000 + u64::try_from(time.as_nanos()).unwrap()
 }
 
-/// A message that begins with a `std_msgs/Header`.
+/// Returns a message that begins with a `std_msgs/Header`.
 fn stamped(stamp: u64) -> Vec<u8> {
     let mut payload = vec![0, 1, 0, 0];
     payload.extend_from_slice(&u32::try_from(stamp / 1_000_000_000).unwrap().to_le_bytes());

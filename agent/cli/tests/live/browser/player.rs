@@ -1,6 +1,6 @@
-//! Plays a scenario of `agent/cli/tests/page`: Node drives a real Chromium that shows the page of an
-//! agent which the test has started. A scenario may ask the test for something, such as to restart
-//! the agent: a line that begins with `@`, answered with a line of JSON.
+//! Plays a scenario of `agent/cli/tests/page`: Node drives a real Chromium that shows the page of
+//! an agent which the test has started. A scenario may send requests to the test, such as to
+//! restart the agent. A request is a line that begins with `@`, and its answer is a line of JSON.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::path::{Path, PathBuf};
@@ -11,16 +11,17 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, bail, ensure};
 use serde_json::Value;
 
-/// Longest time for a scenario.
+/// Maximum time for a scenario.
 const PATIENCE: Duration = Duration::from_secs(280);
 
 /// Actions that a scenario can request.
 pub(crate) type Answers<'a> = &'a mut dyn FnMut(&str) -> Result<Value>;
 
-/// Plays a scenario behind the words of a host; without words on this machine's network.
+/// Plays a scenario after the words `enter`, which enter a host; without words in this network.
 ///
 /// # Errors
-/// The scenario does not hold: its output is the error's text. A tool is missing, or an answer fails.
+/// Fails with the scenario's output if the scenario fails, or if a tool is missing or an answer
+/// fails.
 pub(crate) fn play(
     enter: &[String],
     name: &str,
@@ -30,7 +31,7 @@ pub(crate) fn play(
     play_for(PATIENCE, enter, name, arguments, answers)
 }
 
-/// As [`play`], with another limit of its time.
+/// Plays a scenario as [`play`] does, with another time limit.
 pub(crate) fn play_for(
     patience: Duration,
     enter: &[String],
@@ -95,13 +96,13 @@ pub(crate) fn play_for(
     Ok(())
 }
 
-/// Plays a scenario without questions.
+/// Plays a scenario without requests.
 pub(crate) fn watch(enter: &[String], name: &str, arguments: &[&str]) -> Result<()> {
     let mut nothing = |question: &str| bail!("no answer to {question}");
     play(enter, name, arguments, &mut nothing)
 }
 
-/// Ends with its value.
+/// A process that ends when this value is dropped.
 struct Ended(Child);
 
 impl Drop for Ended {
@@ -115,7 +116,7 @@ fn scenarios() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/page")
 }
 
-/// The system's Node, or the one that `.ci/prerequisites.sh page` unpacked where it is too old.
+/// Returns the Node that `.ci/prerequisites.sh page` unpacked, or else the system's.
 fn node() -> Result<PathBuf> {
     let own = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../target/tools/node/bin/node");
     if own.exists() {

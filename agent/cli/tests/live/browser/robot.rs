@@ -1,4 +1,4 @@
-//! A host with an agent and the demo's robot, and questions about what the agent does.
+//! A host with an agent and the demo's robot, and queries of the agent's state.
 
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::net::TcpStream;
@@ -15,7 +15,7 @@ use ros2probe_testing::harness::peer;
 use ros2probe_testing::harness::process::Process;
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Streams of clients without a token.
+/// Number of streams that clients without a token may open.
 const STREAMS: usize = 12;
 
 /// A host without a link to any other.
@@ -41,7 +41,7 @@ impl Place {
         })
     }
 
-    /// An agent at the sockets of the host, with this configuration besides.
+    /// Starts an agent at the sockets of the host, with additional configuration.
     pub(crate) fn agent(&self, more: &str) -> Result<Agent<'_>> {
         self.configured(at_the_sockets_of(&self.host) + more)
     }
@@ -61,19 +61,19 @@ impl Place {
         agent.with_context(|| std::fs::read_to_string(&log).unwrap_or_default())
     }
 
-    /// Returns a configuration with which the agent records on a full disk too.
+    /// Returns a configuration with which the agent records even on a full disk.
     pub(crate) fn recordings(&self) -> String {
         let bags = self.directory.path().join("bags");
         let bags = bags.display();
         format!("recordings:\n  directory: {bags}\n  reserve_percent: 0\n  reserve_bytes: 0\n")
     }
 
-    /// The words that run the browser on this host.
+    /// Returns the words that run the browser on this host.
     pub(crate) fn inside(&self) -> Vec<String> {
         self.host.outside().to_vec()
     }
 
-    /// A node that publishes its own topic until its value is dropped.
+    /// Starts a node that publishes its own topic until the returned value is dropped.
     pub(crate) fn publisher(&self, topic: &str, node: &str) -> Result<Process> {
         let words = ["--role", "pub", "--topic", topic, "--node", node];
         let stream = [
@@ -102,8 +102,8 @@ impl Place {
         super::number(&self.ask("/health")?["limits"], "limit", limit, "used")
     }
 
-    /// Returns the number of open streams of the page: the limit minus those that it can still
-    /// open.
+    /// Returns the number of open streams of the page: the limit minus the streams that can still
+    /// be opened.
     pub(crate) fn streams(&self) -> Result<usize> {
         let mut held = Vec::new();
         for _ in 0..STREAMS {
@@ -122,7 +122,7 @@ impl Place {
         }
         let open = STREAMS - held.len();
         drop(held);
-        // The agent notices within a second that they are gone.
+        // The agent notices within a second that the streams are closed.
         std::thread::sleep(Duration::from_millis(1500));
         Ok(open)
     }

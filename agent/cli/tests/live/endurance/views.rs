@@ -1,11 +1,11 @@
-//! The graph in the agent's answers, held against the robot's.
+//! The graph in the agent's answers, compared with the robot's.
 
 use super::*;
 
 /// Answers of each agent, and the differences that dropped frames explain.
 pub(super) struct Views<'a> {
     pub(super) agents: Vec<&'a Agent<'a>>,
-    /// Dropped frames and the differences of counts that they explain, by the last checkpoint.
+    /// Dropped frames and the differences of counts that they explain, at the last checkpoint.
     pub(super) excused: Vec<(f64, Tally, Vec<f64>)>,
     pub(super) since: Instant,
     pub(super) wrong: Vec<String>,
@@ -21,7 +21,7 @@ impl<'a> Views<'a> {
         }
     }
 
-    /// Notes where an agent's graph is another one than the crowd's, or its counts are.
+    /// Records where an agent's graph or counts differ from the crowd's.
     pub(super) fn compare<C: Carrier>(&mut self, crowd: &mut Crowd<C>) -> Result<()> {
         for index in 0..self.agents.len() {
             let began = Instant::now();
@@ -44,7 +44,7 @@ impl<'a> Views<'a> {
                 if crowd.graph() != before && !is_late {
                     continue;
                 }
-                // The content of dropped frames is unknown: endpoints are announced again, and
+                // The content of dropped frames is unknown, so endpoints are announced again and
                 // counts differ.
                 let blind = dropped(&answer.page) > self.excused[index].0;
                 let difference = self.difference(index, crowd, &answer, blind || is_late);
@@ -75,7 +75,7 @@ impl<'a> Views<'a> {
         Ok(())
     }
 
-    /// What is wrong in an answer; `excused` takes the counts as they are from now on.
+    /// Returns what is wrong in an answer. With `excused`, the present counts become the reference.
     fn difference<C: Carrier>(
         &mut self,
         index: usize,
@@ -124,11 +124,11 @@ impl<'a> Views<'a> {
     }
 }
 
-/// All that is compared.
+/// All parts of an answer that are compared.
 struct Answer {
     pub(super) graph: Graph,
     pub(super) page: Scrape,
-    /// Of each measured topic, less 1e9 for one that is lost.
+    /// Messages of each measured topic, minus 1e9 for each lost one.
     pub(super) messages: BTreeMap<String, f64>,
 }
 

@@ -1,4 +1,4 @@
-//! Clients that mean harm: each kind does what it does until it is ended.
+//! Hostile clients. Each kind repeats its action until it is ended.
 
 use std::io::{Read as _, Write as _};
 use std::net::{Ipv4Addr, TcpStream};
@@ -15,7 +15,7 @@ use ros2probe_capture::netns;
 use super::{API_PORT, METRICS_PORT};
 use ros2probe_testing::harness::network::Namespace;
 
-/// Neither takes longer to answer or to be refused.
+/// Maximum time of an answer or of a refusal.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 /// The agent's addresses, and the token.
@@ -49,7 +49,7 @@ pub(super) struct Answers {
 }
 
 impl Doors {
-    /// Those of an agent on a host, which `socket` and `token` open; connected to on that host.
+    /// Returns the doors of an agent on a host. Clients connect on that host.
     pub(super) fn new(host: &Namespace, socket: &Path, token: &'static str) -> Doors {
         Doors {
             network: host.network(),
@@ -74,7 +74,7 @@ impl Doors {
         Ok(stream)
     }
 
-    /// A request to the API with the token.
+    /// Returns a request to the API with the token.
     pub(super) fn request(&self, path: &str) -> String {
         let Doors { address, token, .. } = self;
         format!(
@@ -84,7 +84,7 @@ impl Doors {
 }
 
 impl Clients {
-    /// Some of every kind.
+    /// Starts some clients of every kind.
     pub(super) fn start(doors: &Doors) -> Clients {
         let mut clients = Clients {
             stop: Arc::default(),
@@ -102,7 +102,7 @@ impl Clients {
         clients
     }
 
-    /// Ends them; how often each kind did what it does.
+    /// Ends the clients, and returns how often each kind repeated its action.
     pub(super) fn end(self) -> Result<String> {
         self.stop.store(true, Ordering::Relaxed);
         let mut done = Vec::new();
@@ -124,7 +124,7 @@ impl Clients {
         let counter = Arc::clone(&count);
         let thread = std::thread::spawn(move || {
             while !stop.load(Ordering::Relaxed) {
-                // A refused or closed connection ends no client.
+                // A client continues after a refused or closed connection.
                 if act(&doors).is_ok() {
                     counter.fetch_add(1, Ordering::Relaxed);
                 }
@@ -136,7 +136,7 @@ impl Clients {
 }
 
 impl Asker {
-    /// Sends `request` once per `period`, each time on a new connection.
+    /// Sends a request once per `period`, each time on a new connection.
     pub(super) fn start(
         what: &'static str,
         period: Duration,
@@ -184,7 +184,7 @@ pub(super) fn answer(
     Ok(String::from_utf8_lossy(&answer).into_owned())
 }
 
-/// Heads of 38 KB that never end, on as many connections as both listeners take.
+/// Sends heads of 38 KB that never end, on as many connections as both listeners accept.
 fn unfinished() -> impl FnMut(&Doors) -> Result<()> {
     let field = format!("x: {}\r\n", "x".repeat(9_500));
     let (mut open, mut number) = (Vec::new(), 0_usize);
@@ -208,7 +208,7 @@ fn unfinished() -> impl FnMut(&Doors) -> Result<()> {
     }
 }
 
-/// Ask once and keep the connection.
+/// Sends one request per connection, and keeps the connection open.
 fn idle() -> impl FnMut(&Doors) -> Result<()> {
     let mut open = Vec::new();
     move |doors| {
@@ -224,7 +224,7 @@ fn idle() -> impl FnMut(&Doors) -> Result<()> {
     }
 }
 
-/// Take 5 KB of a page in a second.
+/// Reads 5 KB of a page per second.
 fn slow() -> impl FnMut(&Doors) -> Result<()> {
     let mut open = Vec::new();
     move |doors| {
@@ -246,7 +246,7 @@ fn compressed(doors: &Doors) -> Result<()> {
     Ok(())
 }
 
-/// As many globs as fit, each with as many stars as it may have.
+/// Subscribes to as many globs as fit, each with the maximum number of stars.
 fn costly_subscription(doors: &Doors) -> Result<()> {
     let glob = format!("/{}*", "*a".repeat(15));
     let list = vec![glob; 250].join(",");
@@ -259,7 +259,7 @@ fn costly_subscription(doors: &Doors) -> Result<()> {
     Ok(())
 }
 
-/// One more costly glob each time, which stays.
+/// Adds a watch with a costly glob each time, and never removes it.
 fn costly_watch() -> impl FnMut(&Doors) -> Result<()> {
     let mut number = 0;
     move |doors| {

@@ -18,7 +18,7 @@ use ros2probe_testing::harness::{run, wait_until};
 const CLIENTS: usize = 24;
 
 #[test]
-fn without_descriptors_only_what_needs_one_fails_and_later_recovers() -> Result<()> {
+fn without_descriptors_only_operations_that_need_one_fail_and_later_recover() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let (state, bags) = (
@@ -109,7 +109,7 @@ fn a_recording_is_refused(api: &mut TcpStream, bags: &Path) -> Result<String> {
     Ok(detail)
 }
 
-/// A recording of 50 messages has all of them.
+/// Checks that a recording of 50 messages has all of them.
 fn a_recording_works(scene: &Scene<'_>, late: &mut Counted) -> Result<()> {
     let (status, begun) = scene.ask("POST", "/recordings", r#"{"name": "some"}"#)?;
     ensure!(status == 201, "{status} {begun}");

@@ -17,14 +17,14 @@ use ros2probe_testing::harness::{run, wait_until};
 /// The agent's disk, which only the agent has.
 struct Disk<'a, 'b> {
     scene: &'a Scene<'b>,
-    /// As the agent calls it.
+    /// Path of the disk for the agent.
     place: PathBuf,
-    /// As it is reached from here.
+    /// Path of the disk for this process.
     root: PathBuf,
 }
 
 impl Disk<'_, '_> {
-    /// Leaves no byte.
+    /// Fills the disk completely.
     fn fill(&self) -> Result<()> {
         let mut filler = fs::File::create(self.root.join("filler"))?;
         while filler.write_all(&[7; 4096]).is_ok() {}
@@ -73,7 +73,7 @@ impl Disk<'_, '_> {
         })
     }
 
-    /// A recording, a snapshot: both are refused, and leave nothing behind.
+    /// Checks that a recording and a snapshot are refused, and that they leave nothing behind.
     fn refuses(&self, reason: &str) -> Result<()> {
         let before = self.names("bags");
         for _ in 0..3 {
@@ -94,7 +94,7 @@ impl Disk<'_, '_> {
         Ok(())
     }
 
-    /// Both work, and what they write can be read.
+    /// Checks that a recording and a snapshot work, and that their bags can be read.
     fn accepts(&self, counted: &mut Counted, name: &str) -> Result<()> {
         let body = format!(r#"{{"name": "{name}"}}"#);
         let (status, begun) = self.scene.ask("POST", "/recordings", &body)?;
@@ -113,8 +113,7 @@ impl Disk<'_, '_> {
 }
 
 #[test]
-fn a_disk_that_is_full_read_only_or_gone_costs_what_should_lie_there_and_no_message() -> Result<()>
-{
+fn a_full_read_only_or_removed_disk_costs_only_the_files_on_it_and_no_message() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let place = directory.path().join("disk");
@@ -172,7 +171,7 @@ fn a_disk_that_is_full_read_only_or_gone_costs_what_should_lie_there_and_no_mess
     counted.check(&scene.agent)?;
     let written = disk.writes("written")?;
     disk.make_room()?;
-    // Although nothing changes.
+    // The state is written although nothing changes.
     disk.wait_for_write("written", written)?;
     disk.state(&["/first", "/second"])?;
     disk.accepts(&mut counted, "roomy")?;
@@ -196,7 +195,7 @@ fn a_disk_that_is_full_read_only_or_gone_costs_what_should_lie_there_and_no_mess
     )
 }
 
-/// A disk that is remounted read-only, and back.
+/// Remounts the disk read-only, and later writable again.
 fn a_disk_that_is_read_only(disk: &Disk<'_, '_>, link: &Link, counted: &mut Counted) -> Result<()> {
     disk.remount("ro")?;
     disk.refuses("Read-only file system")?;
@@ -214,7 +213,7 @@ fn a_disk_that_is_read_only(disk: &Disk<'_, '_>, link: &Link, counted: &mut Coun
     )
 }
 
-/// Directories that are removed while the agent runs.
+/// Removes the directories while the agent runs.
 fn directories_that_are_gone(
     disk: &Disk<'_, '_>,
     link: &Link,
@@ -225,7 +224,7 @@ fn directories_that_are_gone(
     let failed = disk.writes("failed")?;
     let _fourth = Counted::start(link, 4, "fourth")?;
     disk.wait_for_write("failed", failed)?;
-    // Bags make themselves a place.
+    // The directory for bags is created again.
     disk.accepts(counted, "again")?;
     fs::create_dir(disk.root.join("state"))?;
     let written = disk.writes("written")?;
@@ -237,7 +236,7 @@ fn directories_that_are_gone(
     )
 }
 
-/// Directories that belong to another user for a while.
+/// Gives the directories to another user for a while.
 fn directories_of_another_user(
     disk: &Disk<'_, '_>,
     link: &Link,
@@ -267,7 +266,7 @@ pub(super) fn writes(page: &Scrape, outcome: &'static str) -> f64 {
     page.sum("ros2probe_state_writes_total", &[("outcome", outcome)])
 }
 
-/// Others read so many messages in it, to its end.
+/// Checks that another reader reads this many messages in the bag, to its end.
 pub(super) fn readable(bag: &Path, messages: u64) -> Result<()> {
     let mut found = 0;
     for entry in fs::read_dir(bag)? {

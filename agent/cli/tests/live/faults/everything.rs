@@ -1,6 +1,6 @@
-//! All loads of the other tests at once, within two thirds of the unit's memory: forged announcements
-//! of every kind, full tables, recordings, and hostile clients. The long forms, which need an optimized
-//! agent, run within its CPU as well.
+//! All loads of the other tests together, within two thirds of the unit's memory: forged
+//! announcements of every kind, full tables, recordings, and hostile clients. The long variants,
+//! which need an optimized agent, also stay within the unit's CPU.
 
 use std::fs;
 use std::io::Write as _;
@@ -28,8 +28,8 @@ use ros2probe_testing::harness::usage::Usage;
 /// Variable with another length of the attack, in seconds.
 const SECONDS: &str = "ROS2PROBE_ATTACK_SECONDS";
 const TOKEN: &str = "0123456789abcdef0123456789abcdef";
-/// A scraper waits for 10 s unless configured otherwise; an unoptimized agent takes several times the
-/// CPU of the shipped one.
+/// Maximum time of an answer for an optimized and an unoptimized agent. A scraper waits for 10 s by
+/// default. An unoptimized agent takes several times the CPU of the shipped one.
 const LONGEST: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(60)];
 const SENT: Duration = Duration::from_secs(60);
 const RECORDINGS: [(&str, &str); 4] = [
@@ -40,12 +40,12 @@ const RECORDINGS: [(&str, &str); 4] = [
 ];
 
 #[test]
-fn everything_at_once_on_the_wire_stays_within_the_unit() -> Result<()> {
+fn all_loads_together_on_the_wire_stay_within_the_limits_of_the_unit() -> Result<()> {
     everything("on the wire", |_| ON_THE_WIRE.to_owned())
 }
 
 #[test]
-fn everything_at_once_at_the_sockets_stays_within_the_unit() -> Result<()> {
+fn all_loads_together_at_the_sockets_stay_within_the_limits_of_the_unit() -> Result<()> {
     everything("at the sockets", |link| at_the_sockets_of(&link.robot))
 }
 
@@ -140,8 +140,8 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     )
 }
 
-/// Makes the state directory and the token of a configuration with every kind of client, and returns
-/// its text.
+/// Makes the state directory and the token of a configuration with every kind of client, and
+/// returns its text.
 fn configuration(directory: &Path, capture: &str) -> Result<String> {
     fs::create_dir(directory.join("state"))?;
     fs::write(directory.join("token"), TOKEN)?;
@@ -156,9 +156,9 @@ fn configuration(directory: &Path, capture: &str) -> Result<String> {
 
 /// The highest values of a span.
 struct Highest {
-    /// Bytes that the group needed.
+    /// Memory that the group needed, in bytes.
     peak: u64,
-    /// Used share of these tables, of 1.
+    /// Used shares of these tables, from 0 to 1.
     participants: f64,
     endpoints: f64,
     zenoh_aliases: f64,
@@ -208,8 +208,8 @@ fn recordings_and_silent_readers(doors: &Doors) -> Result<Vec<std::net::TcpStrea
     Ok(silent)
 }
 
-/// Returns the number of answers of each client and its longest wait. Fails if an answer was refused
-/// or late.
+/// Returns the number of answers of each client and its longest wait. Fails if an answer was
+/// refused or late.
 fn answers(askers: Vec<Asker>) -> Result<Vec<String>> {
     let mut answered = Vec::new();
     for asker in askers {
@@ -241,9 +241,9 @@ fn refusals_have_names(page: &Scrape) -> Result<()> {
     Ok(())
 }
 
-/// Announcements of every kind with fields that are new each time, and messages with much in them.
+/// Starts storms of announcements of every kind with new fields each time, and of large messages.
 fn storms(link: &Link) -> Result<[Storm; 4]> {
-    // An unoptimized agent takes less.
+    // An unoptimized agent processes fewer messages.
     let (pace, rest) = if long().is_some() { (2, 50) } else { (1, 200) };
     let breathing = |count: u32| Breathing::resting(link, count * pace, Duration::from_millis(4));
     let slow = Breathing::resting(link, 1, Duration::from_millis(rest))?;
@@ -263,20 +263,20 @@ fn page(doors: &Doors) -> Result<Scrape> {
     Ok(Scrape(answer))
 }
 
-/// Returns the used share of a table, of 1.
+/// Returns the used share of a table, from 0 to 1.
 fn filled(page: &Scrape, table: &str) -> f64 {
     let label = [("table", table)];
     page.sum("ros2probe_table_entries", &label) / page.sum("ros2probe_table_limit", &label)
 }
 
-/// As [`filled`], of its cap in bytes.
+/// Returns the used share of a table's cap in bytes, from 0 to 1.
 fn filled_bytes(page: &Scrape, table: &str) -> f64 {
     let label = [("table", table)];
     page.sum("ros2probe_table_bytes", &label) / page.sum("ros2probe_table_bytes_limit", &label)
 }
 
-/// Ends a recording, and returns its number of messages of real topics. The report counts each other
-/// sent message with the reason, except those dropped before the agent knew their topic.
+/// Ends a recording, and returns its number of messages of real topics. The report counts each
+/// other sent message with the reason, except those dropped before the agent knew their topic.
 fn accounted(doors: &Doors, name: &str, real: &Real, is_all: bool) -> Result<u64> {
     let path = format!("/recordings/{name}");
     let (status, ended) = on_the_socket(doors, "DELETE", &path, "")?;
@@ -295,7 +295,7 @@ fn accounted(doors: &Doors, name: &str, real: &Real, is_all: bool) -> Result<u64
     Ok(recorded)
 }
 
-/// Two publishers on the robot and their subscribers beyond it.
+/// Two publishers on the robot, and their subscribers on the other host.
 struct Real {
     publishers: Vec<(Peer, &'static str)>,
     _subscribers: Vec<Peer>,
@@ -306,7 +306,7 @@ impl Real {
         let seconds = span.as_secs();
         let small = Stream {
             topic: "/real".to_owned(),
-            // A topic that vanished makes room for new ones.
+            // The publisher stays, because a vanished topic would leave its entry to new ones.
             linger: 600.0,
             ..Stream::small(200 * seconds)
         };
@@ -366,8 +366,8 @@ impl Real {
         page.context("no streams")
     }
 
-    /// Fails unless each message is counted or dropped by the agent with a count. The robot itself
-    /// loses no message.
+    /// Fails unless the agent has counted each message, or dropped it with a count. The robot
+    /// itself loses no message.
     fn check(&self, page: &Scrape) -> Result<String> {
         let dropped = dropped(page);
         let mut said = Vec::new();

@@ -1,5 +1,5 @@
-//! Processes and libraries that look like others: equal inodes in two containers, a library that was
-//! replaced while a process uses it, and a process id that is used again.
+//! Processes and libraries that look like others: equal inodes in two containers, a library that is
+//! replaced while in use, and a process id that is used again.
 
 use std::fs::{self, Permissions};
 use std::os::unix::fs::PermissionsExt as _;
@@ -19,7 +19,7 @@ use crate::hostile::start_as;
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Interval at which the agent reads the tables of calls.
 const ROUND: Duration = Duration::from_secs(1);
-/// Owns no process and no file of the test.
+/// User that owns no process and no file of the test.
 const UNPRIVILEGED: u32 = 65_534;
 /// Covers the directory `$0` of the program and its library with a copy in a separate file system,
 /// mounted at `$1` first, and runs it.
@@ -43,7 +43,7 @@ os.waitpid(child, 0)
 "#;
 
 #[test]
-fn each_library_and_process_is_taken_for_itself_whatever_it_looks_like() -> Result<()> {
+fn libraries_and_processes_with_equal_identities_are_distinguished() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
@@ -62,7 +62,7 @@ fn each_library_and_process_is_taken_for_itself_whatever_it_looks_like() -> Resu
         let process = Process::start(&enter, "sh", &arguments)?;
         running.push((topic, process));
     }
-    // The kernel numbers the files of each tmpfs from the same number on.
+    // The kernel numbers the files of each tmpfs from the same first number.
     let identities = running.iter().map(|(_, process)| identity(process.pid()));
     let identities = identities.collect::<Result<Vec<_>>>()?;
     let [(device, inode), (other_device, other_inode)] = &identities[..] else {
@@ -131,7 +131,7 @@ fn each_library_and_process_is_taken_for_itself_whatever_it_looks_like() -> Resu
 }
 
 #[test]
-fn without_root_a_library_is_attached_by_its_path_unless_another_file_is_there() -> Result<()> {
+fn without_root_a_library_is_attached_by_its_path_unless_it_was_replaced() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let programs = [

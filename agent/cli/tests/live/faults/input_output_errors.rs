@@ -1,4 +1,4 @@
-//! A disk whose reads, writes, syncs and names fail with EIO, as those of a dying one do.
+//! A disk whose reads, writes, syncs and changes of names fail with EIO, as on a failing disk.
 
 use std::fs;
 use std::path::Path;
@@ -15,7 +15,7 @@ use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::soak::outcome;
 use ros2probe_testing::harness::wait_until;
 
-/// Longest time of an answer, and until a recording ends.
+/// Maximum time of an answer, and until a recording ends.
 const PROMPT: Duration = Duration::from_secs(10);
 const EIO: &str = "Input/output error";
 
@@ -38,7 +38,7 @@ impl Robot<'_, '_> {
         Ok(())
     }
 
-    /// A recording that begins now is refused with the reason, soon and without a trace.
+    /// Checks that a new recording is refused with the reason, soon and without a trace.
     fn refuses(&self, name: &str) -> Result<()> {
         let began = Instant::now();
         let body = format!(r#"{{"name": "{name}"}}"#);
@@ -75,8 +75,8 @@ impl Robot<'_, '_> {
         Ok((error.to_owned(), kept.context("no count")?))
     }
 
-    /// Checks that the bag of a recording that failed has the messages that it counts: as it is,
-    /// and after it was completed.
+    /// Checks that the bag of a failed recording has the counted messages, both as it is and after
+    /// it was completed.
     fn has_kept(&self, name: &str, messages: u64) -> Result<()> {
         ensure!(messages >= 100, "{name}: {messages} messages");
         let bag = self.place.join("bags").join(name);
@@ -89,7 +89,7 @@ impl Robot<'_, '_> {
         readable(&bag, messages)
     }
 
-    /// Everything is written again: the state with this node, and a recording.
+    /// Checks that everything is written again: the state with this node, and a recording.
     fn recovers(&self, counted: &mut Counted, node: &str, name: &str) -> Result<()> {
         let written = self.writes("written")?;
         self.disk.fail(Failing::NOTHING);
@@ -111,7 +111,7 @@ impl Robot<'_, '_> {
 }
 
 #[test]
-fn a_disk_that_answers_eio_costs_what_should_lie_there_and_no_message() -> Result<()> {
+fn a_disk_that_fails_with_eio_costs_only_the_files_on_it_and_no_message() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let place = directory.path().join("disk");
@@ -153,7 +153,7 @@ fn a_disk_that_answers_eio_costs_what_should_lie_there_and_no_message() -> Resul
         let (error, kept) = robot.ended(name)?;
         let took = began.elapsed();
         ensure!(took < PROMPT, "{name}: ended after {took:?}");
-        // A file that cannot be synced is noticed when it is.
+        // A failed sync is noticed only when the file is synced.
         if failing != Failing::SYNCS {
             robot.refuses(&format!("{name}_refused"))?;
         }
@@ -172,7 +172,7 @@ fn a_disk_that_answers_eio_costs_what_should_lie_there_and_no_message() -> Resul
             ),
         )?;
     }
-    // A recording reads nothing.
+    // A recording reads nothing from the disk.
     robot.record("reads")?;
     disk.fail(Failing::READS);
     counted.talk(1400, 100)?;

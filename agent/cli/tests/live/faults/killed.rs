@@ -23,7 +23,7 @@ use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::soak::{long, outcome};
 use ros2probe_testing::harness::wait_until;
 
-/// Repeats what another run did.
+/// Variable with the seed of another run, to repeat it.
 const SEED: &str = "ROS2PROBE_SOAK_SEED";
 
 /// The agent's activity when it is killed.
@@ -82,9 +82,9 @@ impl Robot {
             while !stopped.load(Ordering::Relaxed) {
                 counted.talk(320, 20)?;
                 if round % 20 == 0 {
-                    // SPDP only: endpoints are announced once.
+                    // Only SPDP is repeated, because endpoints are announced once.
                     sender.carry(&counted.talker.participant())?;
-                    // So that there is always something to keep.
+                    // A new node gives the agent something to save each time.
                     let passer_by = Talker::new(1000 + round % 400, "/passing");
                     for message in passer_by.introduction("passer_by") {
                         sender.carry(&message)?;
@@ -125,7 +125,7 @@ impl Places {
         Ok(places)
     }
 
-    /// A configuration with everything that attaches to the kernel or writes to the disk.
+    /// Returns a configuration with everything that attaches to the kernel or writes to the disk.
     fn configuration_text(&self, link: &Link) -> String {
         format!(
             "capture: {{source: host, cgroup: {}, mirror_interfaces: [eth0], shm: {{exact: uprobe}}}}\n\
@@ -138,7 +138,7 @@ impl Places {
         )
     }
 
-    /// Returns the number of bags without metadata: a kill interrupted their begin or end.
+    /// Returns the number of bags without metadata, whose beginning or end a kill interrupted.
     fn bags_without_metadata(&self) -> usize {
         let bags = fs::read_dir(&self.bags).into_iter().flatten().flatten();
         bags.filter(|bag| !bag.path().join("metadata.yaml").exists())
@@ -147,7 +147,7 @@ impl Places {
 }
 
 #[test]
-fn killed_at_any_moment_it_leaves_nothing_and_starts_clean() -> Result<()> {
+fn an_agent_killed_at_any_moment_leaves_nothing_and_starts_clean() -> Result<()> {
     let seed = std::env::var(SEED).ok().and_then(|text| text.parse().ok());
     let random = || {
         std::time::UNIX_EPOCH
@@ -220,8 +220,8 @@ fn killed_at_any_moment_it_leaves_nothing_and_starts_clean() -> Result<()> {
     )
 }
 
-/// Starts an agent and kills it at this moment. Returns its number of objects in the kernel, all removed
-/// by then, and the time that its start took.
+/// Starts an agent and kills it at this moment. Returns the number of its objects in the kernel,
+/// all removed by then, and the duration of its start.
 fn until(
     link: &Link,
     places: &Places,
@@ -240,7 +240,7 @@ fn until(
     let mut agent = Agent { process, host };
     agent.wait_ready(PATIENCE)?;
     let ready = began.elapsed();
-    // Names come from the saved state at once.
+    // Names come immediately from the saved state.
     let page = agent.scrape()?;
     let nodes = page.labels_of("ros2_node_info", "ros_node");
     ensure!(nodes.contains("/robot"), "names are lost: {nodes:?}");

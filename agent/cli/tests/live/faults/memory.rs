@@ -1,4 +1,4 @@
-//! Everything at its cap at once, in the memory that the unit allows.
+//! All tables at their caps together, within the memory that the unit allows.
 
 use std::fs;
 use std::io::Write as _;
@@ -17,7 +17,7 @@ use ros2probe_testing::harness::soak::{long, outcome};
 /// A port without a socket on the robot.
 pub(super) const NOBODY: u16 = 7399;
 
-/// Leaves other tests some of the machine.
+/// A sender that pauses, so that other tests get a share of the machine.
 pub(super) struct Breathing {
     sender: Sender,
     carried: u32,
@@ -27,12 +27,12 @@ pub(super) struct Breathing {
 }
 
 impl Breathing {
-    /// So many a millisecond.
+    /// Sends `pace` messages per millisecond.
     pub(super) fn start(link: &Link, pace: u32) -> Result<Breathing> {
         Breathing::resting(link, pace, Duration::from_millis(1))
     }
 
-    /// So many between two rests.
+    /// Sends `pace` messages between two pauses.
     pub(super) fn resting(link: &Link, pace: u32, rest: Duration) -> Result<Breathing> {
         let source = format!("{}:0", link.monitor.address());
         let target = format!("{}:{NOBODY}", link.robot.address());
@@ -56,7 +56,7 @@ impl Carrier for Breathing {
 }
 
 #[test]
-fn every_cap_reached_at_once_stays_within_the_unit_s_memory() -> Result<()> {
+fn all_caps_reached_together_stay_within_the_memory_of_the_unit() -> Result<()> {
     let limit = Allowance::of_the_unit()?.memory;
     let group = Confined::to_memory(limit)?;
     let link = Link::new()?;
@@ -106,8 +106,8 @@ fn every_cap_reached_at_once_stays_within_the_unit_s_memory() -> Result<()> {
     )
 }
 
-/// Sends everything at once, for at least this time and until this part of the tables is used.
-/// Returns the datagrams sent and the most memory needed.
+/// Sends all messages concurrently, for at least this time and until this part of the tables is
+/// used. Returns the number of datagrams sent and the maximum memory needed.
 fn storm(
     scene: &Scene<'_>,
     group: &Confined,
@@ -115,7 +115,7 @@ fn storm(
     span: Duration,
     filled: f64,
 ) -> Result<(u64, u64)> {
-    // Clients that request all messages and never read them.
+    // These clients request all messages and never read them.
     let mut readers = Vec::new();
     for _ in 0..12 {
         let mut stream = scene.connect(API_PORT)?;
@@ -139,7 +139,7 @@ fn storm(
     while began.elapsed() < span || !is_full {
         ensure!(group.kills()? == 0, "killed after {:?}", began.elapsed());
         peak = peak.max(group.needed()?);
-        // A page of all of it is memory, too.
+        // A page of all entries needs memory, too.
         let page = scene.agent.scrape()?;
         is_full = ["participants", "endpoints"].into_iter().all(|table| {
             let label = [("table", table)];

@@ -1,4 +1,4 @@
-//! Receivers that are not there, hang, or talk nonsense; scrapers that do not read.
+//! Receivers that do not exist, hang, or send garbage; scrapers that do not read.
 
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -18,16 +18,16 @@ use ros2probe_testing::harness::soak::{long, outcome};
 use ros2probe_testing::harness::usage::Usage;
 use ros2probe_testing::harness::wait_until;
 
-/// Most bytes that all of them together may add to the agent's memory.
+/// Maximum number of bytes that all of them together may add to the agent's memory.
 const GROWTH: u64 = 24 << 20;
-/// Fewer than the listeners take.
+/// Number of slow scrapers, fewer than the listeners accept.
 const SLOW: usize = 20;
-/// More than they take; the kernel's queue has room for the others.
+/// Number of clients, more than the listeners accept. The kernel's queue has space for the others.
 const CROWD: usize = 140;
-/// Their descriptors, and some of the agent's own.
+/// Maximum number of additional descriptors: those of clients, and some of the agent's own.
 const PLACES: usize = 32 + 64 + 8;
 
-/// Listens where the agent exports to, and does what no receiver should.
+/// A receiver that listens where the agent exports to, and misbehaves.
 struct Receiver {
     address: SocketAddr,
     met: Arc<AtomicUsize>,
@@ -80,7 +80,7 @@ impl Receiver {
 }
 
 #[test]
-fn receivers_and_scrapers_that_misbehave_cost_counters_and_no_message() -> Result<()> {
+fn misbehaving_receivers_and_scrapers_are_counted_and_cost_no_message() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let hanging = Receiver::start(&link.robot, None)?;
@@ -93,7 +93,7 @@ fn receivers_and_scrapers_that_misbehave_cost_counters_and_no_message() -> Resul
     let variables = [
         variable("METRICS", hanging.address.to_string()),
         variable("LOGS", babbling.address.to_string()),
-        // No name server is reached from there.
+        // No name server is reachable from that host.
         variable("TRACES", "collector.example.com:4317".to_owned()),
     ];
     let mut words = vec!["env"];
@@ -181,7 +181,7 @@ fn a_crowd_of_scrapers_and_clients_is_bounded_and_leaves_nothing_behind() -> Res
         "{before:?} became {after:?}"
     );
 
-    // A second agent finds its port taken.
+    // A second agent finds its port in use.
     let [program, words @ ..] = &link.robot.outside();
     let second = Command::new(program)
         .args(words)
@@ -218,20 +218,20 @@ fn a_crowd_of_scrapers_and_clients_is_bounded_and_leaves_nothing_behind() -> Res
     )
 }
 
-/// Slow ones of every kind.
+/// Opens slow connections of every kind.
 fn scrapers(scene: &Scene<'_>) -> Result<Vec<TcpStream>> {
     let mut all = Vec::new();
     for number in 0..SLOW {
         for port in [METRICS_PORT, API_PORT] {
             let mut stream = scene.connect(port)?;
             let request = match number % 4 {
-                // Half a request, as after a cable was pulled.
+                // Sends half a request, as if a cable had been pulled.
                 0 => "GET /metrics HTTP/1.1\r\nHo".to_owned(),
                 // Sends nothing.
                 1 => String::new(),
-                // Many, and not one answer is read.
+                // Sends many requests and reads no answer.
                 2 => "GET /metrics HTTP/1.1\r\nHost: localhost\r\n\r\n".repeat(100),
-                // A stream that is not read.
+                // Opens a stream that is not read.
                 _ => "GET /events?after=0 HTTP/1.1\r\nHost: localhost\r\n\r\n".to_owned(),
             };
             stream.write_all(request.as_bytes())?;

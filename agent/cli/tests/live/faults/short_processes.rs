@@ -1,4 +1,4 @@
-//! Thousands of processes that call, and end at once, within the unit's memory and CPU.
+//! Thousands of processes that call and end immediately, within the unit's memory and CPU.
 
 use std::time::{Duration, Instant};
 
@@ -12,10 +12,10 @@ use super::Scene;
 use super::unit::{Allowance, Confined, mebibytes};
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Shells that start one process after the other.
+/// Number of shells that start one process after the other.
 const SHELLS: u32 = 4;
 const MESSAGES: u32 = 200;
-/// Calls of each short process, at least.
+/// Minimum number of calls of each short process.
 const CALLS: f64 = 10.0;
 /// Runs `$1` processes of `$0`, each with other names.
 const LOOP: &str = r#"i=0; while [ $i -lt $1 ]; do
@@ -23,7 +23,7 @@ const LOOP: &str = r#"i=0; while [ $i -lt $1 ]; do
 done"#;
 
 #[test]
-fn thousands_of_short_processes_cost_bounded_memory_and_no_message_of_another_one() -> Result<()> {
+fn thousands_of_short_processes_cost_bounded_memory_and_no_message_of_others() -> Result<()> {
     let all: u32 = if long().is_some() { 20_000 } else { 2_000 };
     let allowance = Allowance::of_the_unit()?;
     let group = Confined::to(&allowance)?;

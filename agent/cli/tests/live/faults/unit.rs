@@ -7,14 +7,14 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail};
 
-/// Of `CPUQuota`, as systemd has it by default.
+/// Period of `CPUQuota`, systemd's default.
 const PERIOD: Duration = Duration::from_millis(100);
 
-/// Read from the packaged unit.
+/// Limits of the packaged unit.
 pub(super) struct Allowance {
-    /// `MemoryMax`, bytes.
+    /// `MemoryMax`, in bytes.
     pub(super) memory: u64,
-    /// `CPUQuota`, percent of a CPU.
+    /// `CPUQuota`, in percent of a CPU.
     pub(super) cpu_percent: u64,
 }
 
@@ -37,7 +37,7 @@ impl Allowance {
     }
 }
 
-/// Control groups of a test's own: one of the second version, or one for each controller of the first.
+/// Control groups of a test: one of version 2, or one per controller of version 1.
 pub(super) struct Confined {
     memory: PathBuf,
     cpu: Option<PathBuf>,
@@ -45,12 +45,12 @@ pub(super) struct Confined {
 }
 
 impl Confined {
-    /// No more memory than this, and no swap.
+    /// Limits memory to this many bytes, without swap.
     pub(super) fn to_memory(limit: u64) -> Result<Confined> {
         Confined::create("memory", limit, None)
     }
 
-    /// No more memory and time on CPUs than the unit allows.
+    /// Limits memory and CPU time to those that the unit allows.
     pub(super) fn to(allowance: &Allowance) -> Result<Confined> {
         Confined::create("unit", allowance.memory, Some(allowance.cpu_percent))
     }
@@ -72,7 +72,7 @@ impl Confined {
                 is_second: false,
             };
             write(&group.memory, "memory.limit_in_bytes", &memory)?;
-            // Nothing of sockets is counted where no limit is set.
+            // The kernel counts the memory of sockets only if a limit is set.
             write(&group.memory, "memory.kmem.tcp.limit_in_bytes", &memory)?;
             if let Some(quota) = quota {
                 let first = mount("cgroup", "cpu")?.context("no CPU controller is mounted")?;
@@ -103,7 +103,7 @@ impl Confined {
             is_second: true,
         };
         write(&group.memory, "memory.max", &memory)?;
-        // Absent where the kernel has no swap.
+        // This file is absent if the kernel has no swap.
         let _ = write(&group.memory, "memory.swap.max", &0);
         if let Some(quota) = quota {
             write(&group.memory, "cpu.max", &format!("{quota} {period}"))?;
@@ -125,7 +125,7 @@ impl Confined {
             let used = number("memory.current")?;
             return Ok(used.saturating_sub(value(&self.memory, "memory.stat", "file")?));
         }
-        // Counted apart there, and with the rest in the second version.
+        // Version 1 counts the memory of TCP separately, version 2 with the rest.
         let used = number("memory.usage_in_bytes")? + number("memory.kmem.tcp.usage_in_bytes")?;
         Ok(used.saturating_sub(value(&self.memory, "memory.stat", "cache")?))
     }
@@ -137,7 +137,7 @@ impl Confined {
         }
     }
 
-    /// For how long its threads waited for their next share of a CPU, taken together.
+    /// Returns the total time for which threads waited for their next share of a CPU.
     pub(super) fn throttled(&self) -> Result<Duration> {
         let cpu = self.cpu.as_ref().context("time on CPUs is not confined")?;
         Ok(match self.is_second {
@@ -146,7 +146,7 @@ impl Confined {
         })
     }
 
-    /// Each once.
+    /// Iterates over the groups, each once.
     fn groups(&self) -> impl Iterator<Item = &Path> {
         let other = self.cpu.as_ref().filter(|cpu| **cpu != self.memory);
         std::iter::once(self.memory.as_path()).chain(other.map(PathBuf::as_path))
@@ -194,7 +194,7 @@ fn read(group: &Path, file: &str) -> Result<String> {
     fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))
 }
 
-/// A value of a file with a name and a number in each line.
+/// Returns a value of a file with a name and a number in each line.
 fn value(group: &Path, file: &str, name: &str) -> Result<u64> {
     let text = read(group, file)?;
     let value = text.lines().find_map(|line| {

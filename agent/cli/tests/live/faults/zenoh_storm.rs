@@ -13,19 +13,19 @@ use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::zenoh::{Role, declare_key, declare_token, frame, init, open, publisher};
 
 const CONNECTIONS: usize = 200;
-/// Declarations in one batch, which has at most 65,535 bytes.
+/// Number of declarations in one batch, which has at most 65,535 bytes.
 const IN_A_BATCH: u32 = 24;
 const KEY: usize = 2000;
 
-/// Declares until [`ZenohStorm::end`].
+/// Sends declarations until [`ZenohStorm::end`].
 pub(super) struct ZenohStorm {
     stop: Arc<AtomicBool>,
     thread: JoinHandle<Result<u64>>,
 }
 
 impl ZenohStorm {
-    /// Connects the robot, whose agent observes it, to the other host, and rests so long between two
-    /// batches.
+    /// Connects the robot, whose agent observes it, to the other host, and rests for this time
+    /// between two batches.
     pub(super) fn start(link: &Link, rest: Duration) -> Result<ZenohStorm> {
         let address = SocketAddr::from((link.monitor.address(), 0));
         let listener = netns::within(&link.monitor.network(), || TcpListener::bind(address))??;
@@ -89,7 +89,7 @@ fn accept(listener: &TcpListener) {
     }
 }
 
-/// Keys in even rounds, tokens in odd ones.
+/// Returns keys in even rounds, and tokens in odd ones.
 fn declarations(connection: u32, round: u32) -> Vec<u8> {
     let messages = (0..IN_A_BATCH).map(|place| {
         let id = round * IN_A_BATCH + place + 1;
@@ -110,7 +110,7 @@ fn session(number: u32) -> [u8; 16] {
     session
 }
 
-/// Returns a batch behind its length, as on TCP.
+/// Returns a batch after its length, as on TCP.
 fn batch(bytes: &[u8]) -> Vec<u8> {
     let length = u16::try_from(bytes.len()).unwrap_or(u16::MAX);
     [&length.to_le_bytes()[..], bytes].concat()

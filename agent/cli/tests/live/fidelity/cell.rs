@@ -5,17 +5,17 @@ use std::fmt;
 
 use ros2probe_model::facts::loss::LossCause;
 
-/// Writer's sequence numbers throughout.
+/// Sent, lost and reported samples of a stretch, by the writer's sequence numbers.
 #[derive(Debug)]
 pub(crate) struct Cell {
     /// Stack, size, trouble, subscriber.
     pub(crate) name: String,
     pub(crate) sent: BTreeSet<u64>,
-    /// Those of `sent` that the subscriber was not given.
+    /// Samples of `sent` that the subscriber did not receive.
     pub(crate) lost: BTreeSet<u64>,
-    /// Those that the agent calls lost, with the cause it gives.
+    /// Samples that the agent reports as lost, with the reported cause.
     pub(crate) reported: BTreeMap<u64, LossCause>,
-    /// Causes that the trouble can have had.
+    /// Causes that the trouble may have.
     pub(crate) possible: BTreeSet<LossCause>,
     /// Whether the trouble is certain to drop samples.
     pub(crate) must_lose: bool,
@@ -27,17 +27,17 @@ impl Cell {
         reported.filter(|number| self.lost.contains(number)).count()
     }
 
-    /// Share of the lost samples that the agent names.
+    /// Returns the share of the lost samples that the agent reports.
     fn recall(&self) -> f64 {
         share(self.found(), self.lost.len())
     }
 
-    /// Share of the samples that the agent names which were lost.
+    /// Returns the share of the reported samples that were lost.
     fn precision(&self) -> f64 {
         share(self.found(), self.reported.len())
     }
 
-    /// What is not as it must be.
+    /// Returns the deviations from a correct report.
     pub(crate) fn faults(&self) -> Vec<String> {
         let named: BTreeSet<u64> = self.reported.keys().copied().collect();
         let mut faults = Vec::new();
@@ -92,7 +92,7 @@ impl fmt::Display for Cell {
     }
 }
 
-/// Of nothing all were found.
+/// Returns the share of `whole`, which is 1 if `whole` is 0.
 fn share(part: usize, whole: usize) -> f64 {
     match whole {
         0 => 1.0,

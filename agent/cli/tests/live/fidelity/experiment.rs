@@ -1,4 +1,4 @@
-//! A stream under one trouble after the other, observed by its subscribers and by the agent.
+//! A stream with one fault after the other, observed by its subscribers and by the agent.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -19,16 +19,17 @@ use ros2probe_testing::harness::run;
 use ros2probe_testing::harness::snmp::Snmp;
 use ros2probe_testing::harness::witness::Witness;
 
-/// Of the whole stream, with all pauses.
+/// Maximum duration of the whole stream, with all pauses.
 const PATIENCE: Duration = Duration::from_secs(90);
 /// Ports of the first participants of domain 0 that carry no samples.
 pub(crate) const DISCOVERY: &str = "7400, 7410, 7412, 7414, 7416";
-/// RustDDS sends 2125 datagrams a sample, to its own socket too: a smaller ring overflows on a busy
-/// machine.
+/// Size of the ring. RustDDS sends 2125 datagrams per sample, also to its own socket, and a smaller
+/// ring overflows on a busy machine.
 const RECORD_RING: u32 = 16 << 20;
-/// Gaps of best-effort streams are settled sooner.
+/// Time until gaps are settled. Gaps of best-effort streams are settled sooner.
 const SETTLED: Duration = Duration::from_secs(60);
-/// RustDDS sends somewhat later than it logs, and announcements never cease.
+/// Interval of checks for silence. RustDDS sends somewhat later than it logs, and announcements
+/// never cease.
 const QUIET: Duration = Duration::from_millis(400);
 const PAUSE: Duration = Duration::from_millis(20);
 const ANNOUNCEMENTS: u64 = 10;
@@ -39,17 +40,17 @@ const REASSEMBLY: Duration = Duration::from_millis(1500);
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Trouble {
     Nothing,
-    /// So many of a hundred samples miss a datagram.
+    /// This percentage of the samples loses a datagram.
     Datagrams(u64),
-    /// So many of a hundred samples miss a datagram on their way to the last subscriber only.
+    /// This percentage of the samples loses a datagram only on the path to the last subscriber.
     DatagramsToTheLast(u64),
-    /// So many of a hundred samples miss all IP fragments of a datagram but the first.
+    /// This percentage of the samples loses all IP fragments of a datagram except the first.
     Fragments(u64),
-    /// The first subscriber is stopped and continued.
+    /// The first subscriber is stopped and continued repeatedly.
     Stops,
 }
 
-/// Sizes that the paper measures.
+/// Sizes of the measured samples.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Size {
     B320,
@@ -64,7 +65,7 @@ pub(crate) struct Experiment {
     pub(crate) troubles: Vec<Trouble>,
 }
 
-/// One stretch with its trouble, as it was observed.
+/// One stretch with its fault, as it was observed.
 struct Span {
     trouble: Trouble,
     overflown: bool,
@@ -73,13 +74,13 @@ struct Span {
 impl Size {
     fn stream(self) -> Stream {
         let stream = match self {
-            // The buffer holds a third of a second.
+            // The receive buffer holds a third of a second of samples.
             Size::B320 => Stream {
                 rate: 400.0,
                 receive_buffer: 64 << 10,
                 ..Stream::small(0)
             },
-            // Two samples.
+            // The receive buffer holds two samples.
             Size::KB644 => Stream {
                 receive_buffer: 1 << 20,
                 ..Stream::point_cloud(644_000, 0)
@@ -103,7 +104,7 @@ impl Size {
         }
     }
 
-    /// Datagrams that make a sample. Zenoh sends over TCP.
+    /// Returns the number of datagrams per sample; 0 for Zenoh, which sends over TCP.
     const fn datagrams(self, stack: Stack) -> u64 {
         match (self, stack) {
             (_, Stack::Zenoh) => 0,
@@ -117,7 +118,7 @@ impl Size {
         }
     }
 
-    /// Returns for how long a subscriber is stopped, and then runs.
+    /// Returns for how long a subscriber is stopped, and for how long it then runs.
     const fn stop(self) -> (Duration, Duration) {
         match self {
             Size::B320 => (Duration::from_millis(800), Duration::from_millis(300)),
@@ -127,7 +128,7 @@ impl Size {
 }
 
 impl Trouble {
-    /// Returns whether it affects this one of so many subscribers.
+    /// Returns whether the fault affects this one of so many subscribers.
     fn strikes(self, subscriber: usize, subscribers: usize) -> bool {
         match self {
             Trouble::Nothing => false,
@@ -147,7 +148,7 @@ impl Trouble {
 }
 
 impl Experiment {
-    /// Cells by subscriber and trouble.
+    /// Runs the experiment, and returns cells by subscriber and fault.
     pub(crate) fn run(&self) -> Result<Vec<Cell>> {
         let link = Link::new()?;
         run(&format!(
@@ -182,7 +183,7 @@ impl Experiment {
             sent.numbers.len() as u64 == self.samples(),
             "not all was sent"
         );
-        // The sums settle while the peers run, the lists once they have ended.
+        // The sums settle while the peers run, and the lists once the peers have ended.
         let doubts = sums_that_differ(&mut witness, &sent, &received)?;
         let seen = witness.latest().context("no snapshot")?;
         let topic = self.size.stream().topic;
@@ -217,7 +218,8 @@ impl Experiment {
         Ok(cells)
     }
 
-    /// The losses of a subscriber in the stretch that ends with `due` times the samples of one.
+    /// Returns the losses of a subscriber in the stretch that ends with `due` times the samples of
+    /// one stretch.
     fn cell(
         &self,
         subscriber: usize,
@@ -244,7 +246,7 @@ impl Experiment {
         }
     }
 
-    /// Starts the agent itself beside the witness; its page must show the same losses.
+    /// Starts the agent itself beside the witness. The agent's page must show the same losses.
     fn agent<'a>(&self, link: &'a Link, directory: &Path) -> Result<Option<Agent<'a>>> {
         if self.subscribers < 2 {
             return Ok(None);
@@ -274,7 +276,7 @@ impl Experiment {
             Peer::start(host, self.stack, Role::Subscriber, &stream, &[name])
         });
         let mut subscribers: Vec<Peer> = subscribers.collect::<Result<_>>()?;
-        // Cyclone DDS sends to a multicast address as soon as there are two.
+        // Cyclone DDS sends to a multicast address as soon as there are two subscribers.
         let unicast = "CYCLONEDDS_URI=<General><AllowMulticast>spdp</AllowMulticast></General>";
         let mut enter = link.robot.inside();
         enter.extend(["env", unicast].map(str::to_owned));
@@ -294,7 +296,7 @@ impl Experiment {
         })
     }
 
-    /// One trouble while the next stretch is sent, until there are so many samples in all.
+    /// Applies one fault while the next stretch is sent, until `due` samples are sent in total.
     fn span(&self, trouble: Trouble, due: u64, link: &Link, peers: &mut Peers) -> Result<Span> {
         let subscriber = peers.subscribers.first().context("no subscriber")?;
         let host = subscriber.process.pid();
@@ -303,7 +305,7 @@ impl Experiment {
         let _loss = self.loss(trouble, link, peers)?;
         peers.publisher.go()?;
         if trouble == Trouble::Stops {
-            // A busy publisher may send little while its subscriber stands for a short time.
+            // A busy publisher may send little while its subscriber is stopped for a short time.
             self.stop(peers, || Ok(overflows()? > before))?;
         }
         while (peers.publisher.log()?.sequences("pub").len() as u64) < due {
@@ -319,7 +321,7 @@ impl Experiment {
         })
     }
 
-    /// Stops the first subscriber for a while, and until `is_enough`.
+    /// Stops the first subscriber for a while, and until `is_enough` is true.
     fn stop(&self, peers: &Peers, is_enough: impl Fn() -> Result<bool>) -> Result<()> {
         let (stands, runs) = self.size.stop();
         let slow = &peers.subscribers.first().context("no subscriber")?.process;
@@ -356,7 +358,7 @@ impl Experiment {
             format!("udp dport {{ {} }}", ports.join(", "))
         });
         let datagrams = format!("udp length {length} udp dport != {{ {DISCOVERY} }} {to}");
-        // Each time another datagram of a sample.
+        // Another datagram of a sample is dropped each time.
         let nth = match self.size.datagrams(self.stack) {
             1 => 100 / per_cent,
             several => 100 * several / per_cent - 1,
@@ -365,9 +367,9 @@ impl Experiment {
     }
 }
 
-/// Waits until the agent has counted what each subscriber logged, and returns where it differs. A
-/// loss behind the last sample that a subscriber received may be open until the writer ends: a
-/// stopped subscriber may miss the last one.
+/// Waits until the agent has counted what each subscriber logged, and returns where the counts
+/// differ. A loss after the last received sample may be open until the writer ends, because a
+/// stopped subscriber may miss the last sample.
 fn sums_that_differ(
     witness: &mut Witness,
     sent: &Truth,
@@ -385,7 +387,7 @@ fn sums_that_differ(
         let (mut counted, mut rows) = (None, String::new());
         let agreed = witness.wait_for("the counts of the log", SETTLED, |seen| {
             let sums = sums(seen, &sent.guid, &truth.guid);
-            // Peers that have left take their deliveries with them.
+            // The deliveries of peers vanish when the peers leave.
             if sums.messages > 0 {
                 counted = Some(sums);
                 let all = seen.topics.iter().flat_map(|topic| &topic.deliveries);
@@ -414,7 +416,7 @@ struct Peers {
 }
 
 impl Peers {
-    /// Ports that only the last subscriber has.
+    /// Returns the ports that only the last subscriber has.
     fn ports_of_the_last(&self) -> Result<Vec<String>> {
         let mut sockets = self
             .subscribers
@@ -429,7 +431,7 @@ impl Peers {
         Ok(ports.iter().map(u16::to_string).collect())
     }
 
-    /// Waits until all that was sent is on its way, and received what can be.
+    /// Waits until all samples have left, and have arrived if they can.
     fn wait_quiet(&self) -> Result<()> {
         let state = || {
             let logs = self.subscribers.iter().map(|peer| Ok(peer.log()?.0.len()));
@@ -500,7 +502,7 @@ impl Truth {
         Ok(())
     }
 
-    /// Returns the numbers sent after the first one received that were not received.
+    /// Returns the numbers after the first received one that were sent and not received.
     pub(crate) fn missing(&self, sent: &BTreeSet<u64>) -> BTreeSet<u64> {
         let first = self.numbers.first().copied().unwrap_or(u64::MAX);
         sent.range(first..)
@@ -510,7 +512,8 @@ impl Truth {
     }
 }
 
-/// Of one reader. Samples that arrived before it was known whose socket it is are his.
+/// Returns the sums of one reader. They include samples that arrived before the socket's owner was
+/// known.
 pub(crate) fn sums(seen: &Snapshot, writer: &str, reader: &str) -> Delivered {
     let sockets = sockets_of(seen, reader);
     let mut sums = Delivered::default();
@@ -528,15 +531,15 @@ pub(crate) fn sums(seen: &Snapshot, writer: &str, reader: &str) -> Delivered {
     sums
 }
 
-/// Sockets at which a reader is known to receive.
+/// Returns the sockets at which a reader is known to receive.
 fn sockets_of(seen: &Snapshot, reader: &str) -> BTreeSet<u64> {
     let deliveries = seen.topics.iter().flat_map(|topic| &topic.deliveries);
     let of_reader = deliveries.filter(|each| each.readers.iter().any(|guid| is(*guid, reader)));
     of_reader.flat_map(|each| each.sockets.clone()).collect()
 }
 
-/// Lost numbers of one reader with their cause, each named once. A loss that was settled before it
-/// was known whose socket it was is his whose it turned out to be.
+/// Returns the lost numbers of one reader with their cause, each once. A loss that was settled
+/// before the socket's owner was known belongs to the reader that owns the socket.
 pub(crate) fn reported(
     losses: &[DeliveryLoss],
     seen: &Snapshot,
@@ -561,7 +564,7 @@ pub(crate) fn reported(
     Ok(reported)
 }
 
-/// A log writes GUIDs without the point.
+/// Compares a GUID with one of a log, which has no point.
 pub(crate) fn is(guid: Guid, logged: &str) -> bool {
     guid.to_string().replace('.', "") == logged
 }

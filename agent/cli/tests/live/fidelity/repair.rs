@@ -1,5 +1,5 @@
-//! A reliable stream that the agent sees on the receiving host only: lost datagrams are sent again,
-//! and a tail without successors is still counted as lost.
+//! A reliable stream that the agent sees only on the receiving host. Lost datagrams are sent again,
+//! and lost last samples, which no sample follows, are still counted as lost.
 
 use ros2probe_wire::SequenceNumber;
 use std::time::Duration;
@@ -15,13 +15,13 @@ use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::witness::Witness;
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Number of first samples of which some are dropped, in a stream of seven seconds.
+/// Number of first samples, some of which are dropped, in a stream of seven seconds.
 const WOUNDED: u64 = 100;
 const SAMPLES: u64 = 220;
 /// One of this many datagrams with samples is dropped.
 const NTH: u64 = 5;
 
-/// What the agent on the receiving host counted.
+/// Counts of the agent on the receiving host.
 pub(crate) struct Repair {
     sent: Truth,
     received: Truth,
@@ -42,14 +42,15 @@ impl Repair {
             link.monitor.cgroup().display()
         ))?;
         let (mut publisher, subscriber) = delivered_pair(&link, stack, &mut witness)?;
-        // Repaired samples match as well, alone or several at once. A HEARTBEAT is shorter.
+        // The rule also matches repaired samples, alone or several in one datagram. A HEARTBEAT is
+        // shorter.
         let samples = format!("udp length 380-65535 udp dport != {{ {DISCOVERY} }}");
         let loss = Loss::of_datagrams(&link.robot, &samples, NTH, Part::Whole)?;
         wait_until(|| Ok(publisher.log()?.sequences("pub").len() as u64 >= WOUNDED))?;
         let dropped = loss.counts()?.dropped;
         drop(loss);
-        // Fast DDS repeats its request within three seconds. A reader delivers samples in order, so it
-        // has all of them with the latest.
+        // Fast DDS repeats its request within three seconds. A reader delivers samples in order, so
+        // the latest sample comes after all others.
         wait_until(|| {
             let received = subscriber.log()?.sequences("sub").len();
             Ok(received + 2 > publisher.log()?.sequences("pub").len())
@@ -65,8 +66,9 @@ impl Repair {
             ..sent
         };
         let newest = *sent.numbers.last().context("nothing was sent")?;
-        // The agent sees the HEARTBEAT for the tail some milliseconds before the ACKNACK that answers
-        // it. Until then the previous request stands, although the reader has received all of it.
+        // The agent sees the HEARTBEAT for the tail some milliseconds before the ACKNACK that
+        // answers it. Until then, the previous request is current, although the reader has received
+        // all its samples.
         let waiting = witness.wait_for("what is missing", PATIENCE, |seen| {
             let facts = acknowledgement(seen, &sent.guid, &reader)?;
             let received = Truth::of(&subscriber, "sub").ok()?;
@@ -125,7 +127,7 @@ impl Repair {
             "{repaired:?}"
         );
         ensure!(repaired.recovery_seconds > 0.0, "{repaired:?}");
-        // The reader acknowledges all before the first that it misses.
+        // The reader acknowledges all samples before the first that it misses.
         let first = *missing.first().context("nothing is missing")?;
         ensure!(
             waiting.acknowledged == SequenceNumber(first - 1),
@@ -140,7 +142,8 @@ impl Repair {
     }
 }
 
-/// Starts a reliable stream, and waits until the agent has identified the socket that receives its samples.
+/// Starts a reliable stream, and waits until the agent has identified the socket that receives its
+/// samples.
 fn delivered_pair(link: &Link, stack: Stack, witness: &mut Witness) -> Result<(Peer, Peer)> {
     let stream = Stream {
         reliable: true,
@@ -163,7 +166,8 @@ fn delivered_pair(link: &Link, stack: Stack, witness: &mut Witness) -> Result<(P
     })?;
 
     publisher.go()?;
-    // RustDDS sends to a multicast address: the agent learns a while later which socket receives it.
+    // RustDDS sends to a multicast address, so the agent learns only later which socket receives
+    // it.
     witness.wait_for("the socket that receives samples", PATIENCE, |seen| {
         let mut deliveries = seen.topics.iter().flat_map(|topic| &topic.deliveries);
         let known = deliveries.any(|each| !each.readers.is_empty() && each.delivered.messages > 0);

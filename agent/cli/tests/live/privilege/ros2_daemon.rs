@@ -1,4 +1,4 @@
-//! The thread that answers the `ros2` command line, as the unit confines it.
+//! The thread that answers the `ros2` command line, confined by the unit.
 
 use std::io::{Read as _, Write as _};
 use std::net::{TcpListener, TcpStream};
@@ -9,10 +9,10 @@ const ADDRESS: &str = "127.0.0.1:11511";
 const LIST: &str = "<methodCall><methodName>system.listMethods</methodName></methodCall>";
 
 #[test]
-fn without_any_privilege_it_takes_over_a_port_and_answers() -> Result<()> {
+fn without_any_privilege_the_thread_takes_over_the_port_and_answers() -> Result<()> {
     let host = Namespace::alone()?;
     let network = host.network();
-    // A real daemon comes first.
+    // A real daemon has the port first.
     let other = netns::within(&network, || TcpListener::bind(ADDRESS))??;
     let directory = tempfile::tempdir()?;
     let settings = format!("{}ros2_daemon: on\n", at_the_sockets_of(&host));

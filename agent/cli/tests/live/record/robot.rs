@@ -3,7 +3,7 @@
 use super::*;
 use ros2probe_testing::bag_messages::for_each_message;
 
-/// An agent with a place for bags.
+/// An agent with a directory for bags.
 pub(super) struct Robot<'a> {
     pub(super) host: &'a Namespace,
     pub(super) directory: TempDir,
@@ -20,7 +20,7 @@ impl<'a> Robot<'a> {
         Robot::start_in(host, settings, enter, tempfile::tempdir()?)
     }
 
-    /// `enter` mounts over the place for bags, which it is given as its next word.
+    /// Starts the agent. `enter` mounts over the directory for bags, which is its next argument.
     pub(super) fn start_on_disk(
         host: &'a Namespace,
         settings: &str,
@@ -70,7 +70,7 @@ impl<'a> Robot<'a> {
         self.directory.path().join("bags")
     }
 
-    /// A publisher that is known to the agent, held, and its subscriber.
+    /// Starts a publisher that the agent knows and that waits, and its subscriber.
     pub(super) fn pair(&self, stream: &Stream) -> Result<(Peer, Peer)> {
         let start = |role, node| Peer::start(self.host, Stack::Cyclone, role, stream, &[node]);
         let subscriber = start(Role::Subscriber, "/map")?;
@@ -91,7 +91,7 @@ impl<'a> Robot<'a> {
         Ok((status.parse()?, value))
     }
 
-    /// All events of these names so far.
+    /// Returns all events of these names so far.
     pub(super) fn events(&self, names: &str) -> Result<Vec<Value>> {
         let path = format!("/events?after=0&follow=false&name={names}");
         let text = self.curl("GET", &path, &Value::Null)?;
@@ -118,7 +118,7 @@ impl<'a> Robot<'a> {
             .context("cannot run curl")?;
         let mut input = child.stdin.take().context("no input")?;
         if !body.is_null() {
-            // An answer may come before all of it was taken.
+            // The answer may arrive before the whole body was read.
             let _ = input.write_all(body.to_string().as_bytes());
         }
         drop(input);
@@ -157,14 +157,14 @@ impl Recorder {
         fs::read_to_string(&self.stderr).unwrap_or_default()
     }
 
-    /// Ctrl-C.
+    /// Sends Ctrl-C, and waits for the end.
     pub(super) fn interrupt(&mut self) -> Result<ExitStatus> {
         self.process.signal("INT")?;
         self.process.wait(PATIENCE)
     }
 }
 
-/// Publishers have sent so many stretches, and the agent has counted what it will.
+/// Waits until publishers have sent so many stretches, and the agent has counted all that it can.
 pub(super) fn settled(
     robot: &Robot<'_>,
     pairs: &[(&str, u64, Peer, Peer)],
@@ -179,7 +179,7 @@ pub(super) fn settled(
     Ok(page)
 }
 
-/// Returns whether no record was dropped: messages of dropped records are unknown.
+/// Returns whether no record was dropped. The messages of dropped records are unknown.
 pub(super) fn is_exact(page: &Scrape) -> bool {
     let lost = page.sum("ros2probe_records_dropped_total", &[]);
     if lost > 0.0 {
@@ -188,12 +188,12 @@ pub(super) fn is_exact(page: &Scrape) -> bool {
     lost == 0.0
 }
 
-/// Numbers of the messages that a publisher has sent, as its writer counts them.
+/// Returns the numbers of the messages that a publisher has sent, as its writer counts them.
 pub(super) fn sent(publisher: &Peer) -> Result<BTreeSet<u64>> {
     publisher.log()?.writer_numbers("pub")
 }
 
-/// Numbers in a bag by topic, each once, as another reader finds them.
+/// Returns the numbers in a bag by topic, as another reader finds them. Fails if one occurs twice.
 pub(super) fn numbers(bag: &Path) -> Result<BTreeMap<String, BTreeSet<u64>>> {
     let mut numbers: BTreeMap<String, BTreeSet<u64>> = BTreeMap::new();
     for_each_message(bag, |message| {

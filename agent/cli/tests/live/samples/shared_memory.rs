@@ -1,10 +1,10 @@
-//! Samples in shared memory, by looking and on demand.
+//! Samples in shared memory, by polling and on demand.
 
 use super::*;
 
 /// Messages in shared memory are read whole in the process that sends them.
 #[test]
-fn payloads_in_shared_memory_are_what_was_sent() -> Result<()> {
+fn payloads_in_shared_memory_equal_those_that_were_sent() -> Result<()> {
     let host = Host::new()?;
     let observed = host.observe("exact: uprobe")?;
     let stream = in_shared_memory(60_000, 40);
@@ -17,10 +17,10 @@ fn payloads_in_shared_memory_are_what_was_sent() -> Result<()> {
     Ok(())
 }
 
-/// Fast DDS sends more than 64 KiB in several messages. Read by looking, a sample is whole when all
-/// of them were seen.
+/// Fast DDS sends more than 64 KiB in several messages. With polling, a sample is complete if all
+/// its messages were seen.
 #[test]
-fn samples_above_64_kib_are_read_from_shared_memory_by_looking() -> Result<()> {
+fn samples_above_64_kib_are_read_from_shared_memory_by_polling() -> Result<()> {
     let host = Host::new()?;
     let observed = host.observe("exact: off")?;
     let stream = Stream {
@@ -76,10 +76,10 @@ fn on_demand_every_sample_is_seen_and_the_last_reader_removes_the_breakpoint() -
     observed.wait_for_view("sampled")
 }
 
-/// A best-effort writer has no reader that waits for a lower number. While it sends, polling ends
-/// and breakpoints begin.
+/// No reader of a best-effort writer waits for a lower number. Breakpoints replace polling while
+/// the writer sends.
 #[test]
-fn while_breakpoints_attach_samples_keep_their_order_and_none_is_missing_unnamed() -> Result<()> {
+fn while_breakpoints_attach_samples_keep_their_order_and_losses_are_reported() -> Result<()> {
     let host = Host::with_its_own_fast_dds()?;
     let observed = host.observe("exact: auto")?;
     let stream = Stream {
@@ -118,7 +118,7 @@ fn while_breakpoints_attach_samples_keep_their_order_and_none_is_missing_unnamed
         numbers.len(),
         numbers[0]
     );
-    // Samples that arrived and missing ones that are named are together those that were sent.
+    // Samples that arrived and samples reported as missing are together all that were sent.
     let first = numbers[0];
     numbers.extend(missed);
     numbers.sort_unstable();
@@ -134,7 +134,7 @@ struct Host {
     network: Namespace,
     enter: Vec<String>,
     _shared_memory: SharedMemory,
-    /// With a copy of Fast DDS, if it has one.
+    /// Directory with a copy of Fast DDS, if the host has its own.
     _libraries: Option<TempDir>,
 }
 
@@ -150,8 +150,8 @@ impl Host {
         })
     }
 
-    /// Breakpoints are in a file's pages, for all processes that map it: this copy has none of
-    /// other tests.
+    /// Breakpoints are in a file's pages, for all processes that map the file. This copy has none
+    /// from other tests.
     fn with_its_own_fast_dds() -> Result<Self> {
         let mut host = Self::new()?;
         let library = Stack::Fast.library("libfastrtps.so")?;
@@ -164,15 +164,15 @@ impl Host {
         Ok(host)
     }
 
-    /// An agent at its sockets, with this of `capture.shm`.
+    /// Starts an agent at the host's sockets, with these settings of `capture.shm`.
     fn observe(&self, shm: &str) -> Result<Observed<'_>> {
         let cgroup = self.network.cgroup().display();
         let capture = format!("capture: {{source: host, cgroup: {cgroup}, shm: {{{shm}}}}}\n");
         Observed::start(&self.network, &capture)
     }
 
-    /// As [`Self::pair`], until the agent has their topic: it is announced once in shared memory,
-    /// and a busy machine may poll too late.
+    /// Starts a pair as [`Self::pair`] does, until the agent has its topic. The topic is announced
+    /// once in shared memory, and a busy machine may poll too late.
     fn known_pair(&self, observed: &Observed<'_>, stream: &Stream) -> Result<(Peer, Peer)> {
         for _ in 0..12 {
             let (mut publisher, mut subscriber) = self.pair(stream)?;
@@ -191,7 +191,7 @@ impl Host {
         bail!("{} never became known", stream.topic)
     }
 
-    /// A publisher and a matched subscriber.
+    /// Starts a publisher and a matched subscriber.
     fn pair(&self, stream: &Stream) -> Result<(Peer, Peer)> {
         let launch =
             |role, node| Peer::launch_behind(&self.enter, Stack::Fast, role, stream, &[node]);
@@ -205,7 +205,7 @@ impl Host {
     }
 }
 
-/// Point clouds as `rmw_fastrtps_cpp` publishes them by default.
+/// Returns a stream of point clouds as `rmw_fastrtps_cpp` publishes them by default.
 fn in_shared_memory(size: usize, count: u64) -> Stream {
     Stream {
         reliable: true,
@@ -215,8 +215,8 @@ fn in_shared_memory(size: usize, count: u64) -> Stream {
     }
 }
 
-/// Returns how many samples of a stream arrived as they were sent, and how many are missing. Ends
-/// at the last number, or after a silence.
+/// Returns how many samples of a stream arrived unchanged, and how many are missing. Ends at the
+/// last number, or after a silence.
 fn given(lines: &mut Lines<'_>, stream: &Stream) -> Result<(u64, u64)> {
     let pattern: Vec<u8> = (8..stream.size).map(pattern).collect();
     let (mut whole, mut missed, mut last) = (0, 0, 0);

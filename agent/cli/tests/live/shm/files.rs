@@ -2,11 +2,11 @@
 
 use super::*;
 
-/// Attempts after which a peer that survived the other is replaced, too.
+/// Number of attempts after which the surviving peer is replaced, too.
 const DEAF: u32 = 3;
 
 #[test]
-fn files_that_are_idle_garbage_truncated_or_of_another_user_do_no_harm() -> Result<()> {
+fn idle_garbage_truncated_and_foreign_files_do_no_harm() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
@@ -50,7 +50,7 @@ fn messages(page: &Scrape) -> f64 {
     page.sum("ros2_topic_messages_total", &[("topic", "/imu")])
 }
 
-/// Writes 128 ports that no process uses, copies of this one, and files that are no ports.
+/// Writes 128 ports that no process uses, copies of this one, and files that are not ports.
 fn write_idle_and_broken_files(memory: &Path, port_name: &str) -> Result<()> {
     let port = fs::read(memory.join(port_name))?;
     let number: u32 = port_name.trim_start_matches("fastrtps_port").parse()?;
@@ -125,7 +125,7 @@ fn a_new_pair_is_counted(host: &Host<'_>, agent: &Agent<'_>, stream: &Stream) ->
 }
 
 #[test]
-fn after_either_side_was_killed_everything_is_right_again_and_nothing_is_left_open() -> Result<()> {
+fn after_a_kill_of_either_peer_counts_recover_and_no_file_stays_open() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
@@ -149,8 +149,9 @@ fn after_either_side_was_killed_everything_is_right_again_and_nothing_is_left_op
             0 => Role::Subscriber,
             _ => Role::Publisher,
         };
-        // Endpoints are announced in shared memory, too: a new publisher may go unnoticed. A peer
-        // that was killed while it held the lock of the other's port leaves that one deaf.
+        // Endpoints are announced in shared memory, so a new publisher may go unnoticed. A peer
+        // that is killed while it holds the lock of the other's port leaves the other unable to
+        // receive.
         let mut is_right_again = |attempt: u32| -> Result<bool> {
             println!("{role:?} killed, attempt {attempt}");
             for (each, peer) in [
@@ -183,7 +184,7 @@ fn after_either_side_was_killed_everything_is_right_again_and_nothing_is_left_op
             }
         }
     }
-    // A port and a segment of each of two peers, and of some that were killed and are not tidied up.
+    // Each of two peers has a port and a segment, and killed peers have left some.
     assert!((4..=64).contains(&most), "{most} files");
     for peer in [&mut publisher, &mut subscriber] {
         peer.process.terminate()?;
@@ -198,10 +199,10 @@ fn after_either_side_was_killed_everything_is_right_again_and_nothing_is_left_op
     Ok(())
 }
 
-/// The files of killed processes stay, with their last messages. An agent that starts later counts
-/// none of them.
+/// The files of killed processes remain, with their last messages. An agent that starts later
+/// counts none of these messages.
 #[test]
-fn files_of_killed_processes_make_no_node_and_no_unknown_writer() -> Result<()> {
+fn files_of_killed_processes_lead_to_no_node_and_no_unknown_writer() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network)?;
     let stream = Stream {
@@ -222,7 +223,7 @@ fn files_of_killed_processes_make_no_node_and_no_unknown_writer() -> Result<()> 
     let agent = start_agent(&network, directory.path())?;
     let looked = |page: &Scrape| page.sum("ros2probe_shm_open", &[("kind", "directory")]) > 0.0;
     agent.scrape_until("shared memory is found", looked)?;
-    // Strangers are shown after 3 s.
+    // Unknown writers are shown after 3 s.
     std::thread::sleep(Duration::from_secs(5));
     let page = agent.scrape()?;
     assert_eq!(page.sum("ros2_unknown_writers", &[]), 0.0, "{}", page.0);
@@ -233,7 +234,7 @@ fn files_of_killed_processes_make_no_node_and_no_unknown_writer() -> Result<()> 
 }
 
 #[test]
-fn nothing_below_dev_shm_is_opened_but_for_reading_and_nothing_is_mapped() -> Result<()> {
+fn files_below_dev_shm_are_opened_only_for_reading_and_never_mapped() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
@@ -255,7 +256,8 @@ fn nothing_below_dev_shm_is_opened_but_for_reading_and_nothing_is_mapped() -> Re
         let status = fs::read_to_string(format!("/proc/{pid}/status"))?;
         Ok(!status.contains("TracerPid:\t0\n"))
     })?;
-    // Files of newcomers are opened before its eyes; it makes the agent too slow to hear names.
+    // strace sees the agent open the files of new peers. It makes the agent too slow to read their
+    // names.
     let _newcomers = host.pair(&Stream {
         topic: "/late".to_owned(),
         ..shared()
@@ -290,11 +292,12 @@ fn nothing_below_dev_shm_is_opened_but_for_reading_and_nothing_is_mapped() -> Re
                 let writes = ["O_WRONLY", "O_RDWR", "O_CREAT", "O_TRUNC"];
                 line.contains("O_RDONLY") && !writes.iter().any(|flag| line.contains(flag))
             }
-            // The standard library's own check of a descriptor that it closes.
+            // The standard library checks a descriptor that it closes.
             "fcntl" => line.contains("F_GETFD"),
             "pread64" | "inotify_add_watch" | "statx" | "fstat" | "newfstatat" | "getdents64"
             | "close" | "lseek" | "readlink" => true,
-            // The second half of a call that strace cut in two; the first half is checked.
+            // This is the second half of a call that strace split in two; the first half is
+            // checked.
             _ => call.starts_with("<...") || call.trim().starts_with("<..."),
         };
         assert!(is_harmless, "{line}");

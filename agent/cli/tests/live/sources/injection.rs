@@ -1,5 +1,5 @@
-//! A capture sent again: each of its datagrams whole, from the address and port it came from to
-//! those it went to, between sockets of one host. Every one is seen to arrive.
+//! Sends a capture again: each datagram whole, from its source to its destination, between sockets
+//! of one host. The arrival of every datagram is checked.
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
@@ -18,14 +18,14 @@ use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::run;
 
-/// Fragments as on a cable.
+/// MTU of a cable, so that datagrams are fragmented as on one.
 const MTU: u32 = 1500;
 const LOOPBACK: &str = "lo";
 const PATIENCE: Duration = Duration::from_secs(5);
 
 /// One datagram of a capture.
 struct Datagram {
-    /// Since the capture's beginning.
+    /// Time since the capture's beginning.
     at: Duration,
     source: SocketAddr,
     destination: SocketAddr,
@@ -39,7 +39,7 @@ pub(crate) struct Injection {
 }
 
 impl Injection {
-    /// `None` for a capture that holds less than what was on the wire.
+    /// Prepares a capture; `None` if it holds less than what was on the wire.
     pub(crate) fn of(capture: &Path, host: &Namespace, cgroup: &Cgroup) -> Result<Option<Self>> {
         let Some(datagrams) = datagrams(capture)? else {
             return Ok(None);
@@ -77,7 +77,7 @@ impl Injection {
         self.datagrams.last().map_or(Duration::ZERO, |last| last.at)
     }
 
-    /// Sends all packets, this many times as fast as captured. Returns their number.
+    /// Sends all packets at this multiple of the captured speed. Returns their number.
     pub(crate) fn run(&self, speed: u32) -> Result<usize> {
         let began = Instant::now();
         let mut received = vec![0; usize::from(u16::MAX)];
@@ -107,7 +107,7 @@ impl Injection {
     }
 }
 
-/// Of an end of a datagram; a member of the group if that is one.
+/// Opens the socket of a datagram's source or destination, as a member of a multicast group.
 fn socket(end: SocketAddr) -> Result<UdpSocket> {
     let socket = UdpSocket::bind(end)?;
     socket.set_read_timeout(Some(PATIENCE))?;
@@ -124,7 +124,7 @@ fn send_multicasts_to_loopback(socket: &UdpSocket) -> Result<()> {
     let interface = libc::in_addr {
         s_addr: u32::from_ne_bytes(Ipv4Addr::LOCALHOST.octets()),
     };
-    // SAFETY: the value has the size given.
+    // SAFETY: the value has the given size.
     let result = unsafe {
         libc::setsockopt(
             socket.as_raw_fd(),
@@ -138,7 +138,7 @@ fn send_multicasts_to_loopback(socket: &UdpSocket) -> Result<()> {
     Ok(())
 }
 
-/// All whole datagrams in the order in which they were complete.
+/// Returns all whole datagrams in the order of their completion.
 fn datagrams(capture: &Path) -> Result<Option<Vec<Datagram>>> {
     let mut reader = PcapReader::open(capture, Expansion::Limited)?;
     let mut reassembly = Reassembly::new(Limits::default());
