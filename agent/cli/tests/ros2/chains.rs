@@ -1,6 +1,5 @@
-//! A pipeline of real nodes of ROS 2: a sensor, a filter that sleeps, a controller, and a
-//! node that stamps again. The hops agree with the nodes' logs, live and in a capture of the same
-//! run.
+//! A pipeline of real nodes of ROS 2: a sensor, a filter that sleeps, a controller, and a node that
+//! re-stamps. The hops agree with the nodes' logs, live and in a capture of the same run.
 //!
 //! Needs root and ROS 2: `make test-ros2`.
 
@@ -19,12 +18,12 @@ use serde::Deserialize;
 use crate::host::{Host, Middleware, RP};
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Largest difference between the agent's and the nodes' median of a hop, in seconds.
+/// Maximum difference between the agent's and the nodes' median of a hop, in seconds.
 const CLOSE: f64 = 0.000_2;
-/// Messages that the pipeline has to pass.
+/// Number of messages that have to pass the pipeline.
 const MESSAGES: u64 = 200;
-/// Name of a node, its input and output, its milliseconds, and its stamps. The last two only read:
-/// a message without a subscription is not sent.
+/// Name of a node, its input and output, its duration in milliseconds, and its stamps. The last two
+/// nodes only subscribe, because a message without a subscription is not sent.
 const STAGES: [[&str; 5]; 5] = [
     ["filter", "/points", "/filtered", "12", "keep"],
     ["controller", "/filtered", "/cmd", "3", "keep"],
@@ -37,10 +36,10 @@ const STAGES: [[&str; 5]; 5] = [
 #[derive(Deserialize)]
 struct Logged {
     stamp: [i64; 2],
-    /// Begin of the callback.
+    /// Beginning of the callback.
     #[serde(default)]
     started: i64,
-    /// Time before the call that publishes, and after it: a message leaves in between.
+    /// Times before and after the call that publishes, between which a message leaves.
     published: i64,
     after: i64,
 }
@@ -49,19 +48,19 @@ type Log = HashMap<[i64; 2], Logged>;
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_cyclonedds_cpp: make test-ros2"]
-fn hops_over_cyclone_dds_take_as_long_as_the_nodes_log() -> Result<()> {
+fn hops_over_cyclone_dds_have_the_durations_that_the_nodes_log() -> Result<()> {
     agrees_with_the_nodes(Middleware::Cyclone)
 }
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
-fn hops_over_fast_dds_and_udp_take_as_long_as_the_nodes_log() -> Result<()> {
+fn hops_over_fast_dds_and_udp_have_the_durations_that_the_nodes_log() -> Result<()> {
     agrees_with_the_nodes(Middleware::FastUdp)
 }
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
-fn hops_over_shared_memory_with_the_uprobe_take_as_long_as_the_nodes_log() -> Result<()> {
+fn hops_over_shared_memory_with_the_uprobe_have_the_durations_that_the_nodes_log() -> Result<()> {
     agrees_with_the_nodes(Middleware::FastExact("uprobe"))
 }
 
@@ -123,7 +122,7 @@ fn agrees_with_the_nodes(middleware: Middleware) -> Result<()> {
     Ok(())
 }
 
-/// Copies the capture and the logs, to become test data.
+/// Copies the capture and the logs, to use them as test data.
 fn keep_run(host: &Host<'_>, capture: &Path, to: &Path) -> Result<()> {
     fs::create_dir_all(to)?;
     fs::copy(capture, to.join("capture.pcap"))?;
@@ -186,7 +185,7 @@ fn compare(host: &Host<'_>, list: &ChainList<'_>, what: &str) -> Result<()> {
         println!(
             "{what}, {name}: agent {agent:.6} s, nodes {logged:.6} s ({least:.6} to {most:.6} s)"
         );
-        // On a busy machine the calls that publish take long.
+        // On a busy machine, the calls that publish take long.
         let close = CLOSE.max((most - least) / 4.0);
         ensure!(
             (least..most).contains(&agent) && (agent - logged).abs() < close,
@@ -199,7 +198,7 @@ fn compare(host: &Host<'_>, list: &ChainList<'_>, what: &str) -> Result<()> {
     Ok(())
 }
 
-/// The node's part contains its callback, and the wait before it.
+/// Checks that the node's part contains its callback, and the wait before the callback.
 fn parts(chain: &Chain<'_>, place: usize, callback: f64, what: &str) -> Result<()> {
     let hop = &chain.hops[place];
     let (Some(transit), Some(node)) = (hop.transit, hop.processing) else {

@@ -1,5 +1,5 @@
-//! The cost of observing real nodes of rmw_zenoh: no observer, the agent and `ros2 topic hz` in
-//! turns (`make bench-ros2`). Needs root and ROS 2.
+//! The cost of observing real nodes of rmw_zenoh, alternately without an observer, with the agent
+//! and with `ros2 topic hz` (`make bench-ros2`). Needs root and ROS 2.
 
 use std::fs::File;
 use std::time::Duration;
@@ -45,7 +45,7 @@ enum Observer {
 /// CPU seconds in [`SECONDS`] of publishing.
 #[derive(Clone, Copy, Debug)]
 struct Cost {
-    /// Of publisher and subscription.
+    /// CPU seconds of publisher and subscription.
     nodes: f64,
     observer: f64,
 }
@@ -80,7 +80,7 @@ fn measure(workload: &Workload, observer: Observer) -> Result<Cost> {
         Observer::None | Observer::Agent => None,
     };
     sensor.wait_for("matched", Duration::from_secs(60))?;
-    // Until `ros2 topic hz` has begun.
+    // Waits until `ros2 topic hz` has begun.
     std::thread::sleep(Duration::from_secs(3));
     let warm_up = workload.messages_per_second;
     publish(&mut sensor, warm_up, warm_up)?;
@@ -107,7 +107,7 @@ fn measure(workload: &Workload, observer: Observer) -> Result<Cost> {
 
 #[test]
 #[ignore = "a benchmark: make bench-ros2"]
-fn of_the_agent_and_of_a_subscriber_beside_zenoh() -> Result<()> {
+fn the_cpu_of_the_agent_and_of_a_subscriber_beside_zenoh_is_measured() -> Result<()> {
     let rounds = std::env::var("ROUNDS").map_or(Ok(3), |rounds| rounds.parse())?;
     println!(
         "CPU seconds in {SECONDS} s, medians of {rounds}: nodes, observer, nodes against none"

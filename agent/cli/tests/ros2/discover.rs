@@ -1,5 +1,5 @@
-//! `rp discover --router` with a real router and real nodes of rmw_zenoh: it prints what `ros2`
-//! prints, sends what its dry run says, and leaves no trace.
+//! `rp discover --router` with a real router and real nodes of rmw_zenoh. It prints the same as
+//! `ros2`, sends the packets of its dry run, and leaves no trace.
 //!
 //! Needs root and ROS 2: `make test-ros2`.
 
@@ -27,15 +27,16 @@ const NODES: &[&str] = &[
     "/robot1/server",
     "/talker",
 ];
-/// What the router knows of a talker.
+/// Output for the router's knowledge of a talker.
 const OF_TALKER: &str =
     "domain 0: learned 1 node, 3 publishers, 1 subscription, 6 services and 0 clients";
-/// Topics of each node. The node of the `ros2` command has them too, so their counts differ.
+/// Topics of each node. The node of the `ros2` command has these topics too, so their counts
+/// differ.
 const OF_ALL: [&str; 2] = ["/rosout", "/parameter_events"];
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn a_router_lists_what_ros2_prints_and_no_node_appears() -> Result<()> {
+fn a_router_lists_the_graph_that_ros2_prints_and_no_node_appears() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let refused = rp(&host, &[])?;
@@ -71,10 +72,10 @@ fn a_router_lists_what_ros2_prints_and_no_node_appears() -> Result<()> {
         ros2(&host, "service list -t --include-hidden-services")
     })?;
     ensure!(Announced::of(&answer, "7")?.nodes == lines(&["/robot2/listener"]));
-    // Of one domain only.
+    // The command prints only one domain.
     let other = printed(&rp(&host, &["--domain", "7"])?)?;
     ensure!(Announced::of(&other, "0").is_err() && Announced::of(&other, "7")?.nodes.len() == 1);
-    // No node has come, and none has gone.
+    // No node has appeared or vanished.
     agrees("nodes", &lines(NODES), || {
         let mut named = ros2(&host, "node list -a")?;
         named.retain(|it| !it.starts_with("/_ros2cli"));
@@ -87,7 +88,7 @@ fn a_router_lists_what_ros2_prints_and_no_node_appears() -> Result<()> {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn routers_of_other_configurations_answer_or_are_named() -> Result<()> {
+fn routers_of_other_configurations_answer_or_are_refused_by_name() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let users = host.path("users.txt");
@@ -138,7 +139,7 @@ fn routers_of_other_configurations_answer_or_are_named() -> Result<()> {
     Ok(())
 }
 
-/// Returns the line of the shell that becomes a demo.
+/// Returns the shell line that executes a demo.
 fn program(name: &str) -> String {
     let prefix = installed::prefix();
     format!("exec {}/lib/demo_nodes_cpp/{name}", prefix.display())
@@ -179,7 +180,7 @@ fn printed(output: &Output) -> Result<String> {
     Ok(String::from_utf8(output.stdout.clone())?)
 }
 
-/// Returns the lines that `ros2` prints with these words, asking the graph itself.
+/// Returns the lines that `ros2` prints with these words, by its own discovery.
 fn ros2(host: &Host<'_>, words: &str) -> Result<BTreeSet<String>> {
     let enter = host.enter();
     let (program, arguments) = enter.split_first().context("no prefix")?;
@@ -193,7 +194,8 @@ fn ros2(host: &Host<'_>, words: &str) -> Result<BTreeSet<String>> {
     Ok(text.lines().map(str::to_owned).collect())
 }
 
-/// Waits until `ros2` prints these lines: a command that does not wait for all nodes prints a part.
+/// Waits until `ros2` prints these lines, since a command that does not wait for all nodes prints a
+/// part.
 fn agrees(
     what: &str,
     announced: &BTreeSet<String>,
@@ -218,7 +220,7 @@ fn counted(lines: &BTreeSet<String>) -> BTreeSet<String> {
     lines.iter().map(without_count).collect()
 }
 
-/// What `rp` printed of one domain.
+/// The output of `rp` about one domain.
 #[derive(Debug)]
 struct Announced {
     nodes: BTreeSet<String>,
@@ -293,7 +295,7 @@ impl Announced {
     }
 }
 
-/// A segment with payload, or the first of a connection.
+/// A segment with payload, or the first segment of a connection.
 #[derive(Debug)]
 struct Segment {
     source: String,
@@ -302,8 +304,8 @@ struct Segment {
     length: usize,
 }
 
-/// The client sends the planned messages and nothing else, and while it does, the router sends
-/// nothing to others.
+/// Checks that the client sends the planned messages and nothing else. While it sends, the router
+/// sends nothing to others.
 fn sends_only_this(planned: &str, segments: &[Segment]) -> Result<()> {
     let first = segments
         .iter()
@@ -321,7 +323,7 @@ fn sends_only_this(planned: &str, segments: &[Segment]) -> Result<()> {
         number.context("no number of bytes")
     });
     let mut numbers = numbers.collect::<Result<Vec<_>>>()?;
-    // The cookie, which the router's first answer has, with 49 bytes in Zenoh 1.8.
+    // The router's first answer has the cookie, of 49 bytes in Zenoh 1.8.
     *numbers.get_mut(1).context("no opening")? += 49;
     ensure!(sent == numbers, "{sent:?} of {planned}");
     let is_own = |it: &Segment| it.source == *client || it.destination == *client;
@@ -334,7 +336,7 @@ fn sends_only_this(planned: &str, segments: &[Segment]) -> Result<()> {
     Ok(())
 }
 
-/// tcpdump of the router's connections.
+/// A tcpdump of the router's connections.
 struct Sniffer<'h> {
     process: Process,
     host: &'h Host<'h>,

@@ -14,20 +14,20 @@ use ros2probe_message::yaml::Style;
 use ros2probe_message::{Library, Sources};
 use serde::Deserialize;
 
-/// Processes of the oracle at a time.
+/// Number of processes of the oracle at a time.
 const PARTS: usize = 2;
-/// Differences that are shown in full.
+/// Maximum number of differences that are shown in full.
 const SHOWN: usize = 12;
 
 #[test]
 #[ignore = "needs ROS 2: make test-ros2"]
-fn every_installed_message_type_prints_as_ros2_prints_it() {
+fn every_installed_message_type_prints_as_in_ros2() {
     assert_prints_equal("rmw_fastrtps_cpp");
 }
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_cyclonedds_cpp: make test-ros2"]
-fn samples_of_cyclone_dds_print_as_by_ros2() {
+fn samples_of_cyclone_dds_print_as_in_ros2() {
     assert_prints_equal("rmw_cyclonedds_cpp");
 }
 
@@ -63,21 +63,21 @@ struct Compared {
     types: BTreeSet<String>,
     prints: usize,
     differing: usize,
-    /// Of each type that differs.
+    /// One example of each type that differs.
     examples: BTreeMap<String, String>,
 }
 
-/// One message and what the original prints of it.
+/// One message, and the output of `ros2 topic echo` for it.
 #[derive(Deserialize)]
 struct Line {
     r#type: String,
     case: usize,
     payload: String,
-    /// Options, and what they print.
+    /// Options, and their output.
     prints: Vec<(Vec<String>, String)>,
 }
 
-/// Every `PARTS`-th type.
+/// Compares every `PARTS`-th type.
 fn compare(middleware: &str, part: usize) -> Compared {
     let oracle = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/ros2/oracle.py");
     let mut child = installed::shell(&format!("exec {} \"$0\" \"$@\"", installed::python()))
@@ -103,7 +103,7 @@ fn compare(middleware: &str, part: usize) -> Compared {
             let mut echo = Echo::new(parse(options));
             let printed = echo.message(&sample(&line.r#type), Some(&message_type), &payload);
             let printed = printed.unwrap();
-            // Fast DDS estimates the length where it serializes into a buffer, not where it sends.
+            // Fast DDS estimates the length if it serializes into a buffer, but not if it sends.
             let is_estimated = printed.err.contains("bytes after its last field");
             let is_plain = printed.err.is_empty();
             assert!(
@@ -132,7 +132,7 @@ fn compare(middleware: &str, part: usize) -> Compared {
     compared
 }
 
-/// The options of `ros2 topic echo`, as `rp topic echo` understands them.
+/// Converts the options of `ros2 topic echo` to those of `rp topic echo`.
 fn parse(words: &[String]) -> Options {
     let mut options = Options {
         dialect: installed::dialect(),
@@ -173,7 +173,7 @@ fn sample(message_type: &str) -> Sample {
     }
 }
 
-/// Both texts from the line in which they first differ.
+/// Returns both texts since the line in which they first differ.
 fn first_difference<'a>(expected: &'a str, printed: &'a str) -> (&'a str, &'a str) {
     let same = expected.bytes().zip(printed.bytes());
     let same = same.take_while(|(one, other)| one == other).count();
@@ -204,7 +204,8 @@ fn bytes(hex: &str) -> Vec<u8> {
         .collect()
 }
 
-/// The names of all messages below the prefix. Code was generated of a file with an `.idl` beside it.
+/// Returns the names of all messages below the prefix. Code was generated from files with an `.idl`
+/// beside them.
 fn installed_types() -> BTreeSet<String> {
     let share = installed::prefix().join("share");
     let entries = |directory: PathBuf| {

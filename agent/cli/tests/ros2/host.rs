@@ -1,4 +1,4 @@
-//! A host of real ROS 2 nodes with one middleware, and of the agent that observes them.
+//! A host of real ROS 2 nodes with one middleware, and of the agent that observes the nodes.
 
 use std::fs;
 use std::path::PathBuf;
@@ -128,7 +128,7 @@ impl<'n> Host<'n> {
         enter
     }
 
-    /// Runs a line of the shell in ROS's environment, with these arguments from `$1` on.
+    /// Runs a shell line in ROS's environment, with these arguments as `$1` and following.
     pub fn run(&self, line: &str, arguments: &[&str], errors: Stdio) -> Result<Process> {
         let line = installed::in_environment(line);
         let words = ["-c", &line, "bash"]
@@ -143,7 +143,7 @@ impl<'n> Host<'n> {
         has_router.then(|| self.router("")).transpose()
     }
 
-    /// Starts the router of rmw_zenoh, with these settings besides the default ones.
+    /// Starts the router of rmw_zenoh, with these settings in addition to the default ones.
     pub fn router(&self, settings: &str) -> Result<Process> {
         let program = installed::prefix().join("lib/rmw_zenoh_cpp/rmw_zenohd");
         let log = self.file("router.log");
@@ -160,7 +160,7 @@ impl<'n> Host<'n> {
         Ok(router)
     }
 
-    /// Returns what `rp` prints with these arguments, of the host's agent.
+    /// Returns the output of `rp` with these arguments and the host's agent.
     pub fn rp(&self, arguments: &[&str]) -> Result<String> {
         let output = Command::new(RP)
             .args(arguments)

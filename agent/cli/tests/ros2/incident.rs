@@ -1,5 +1,5 @@
-//! A snapshot of real nodes: a subscriber with incompatible QoS writes a bag, and `ros2 bag play`
-//! publishes what is in it.
+//! A snapshot of real nodes: a subscriber with incompatible QoS causes a bag, and `ros2 bag play`
+//! publishes its messages.
 
 use std::fs::{self, File};
 use std::path::Path;
@@ -19,7 +19,7 @@ const SECOND: i64 = 1_000_000_000;
 /// Interval of the publisher's messages.
 const INTERVAL: i64 = SECOND / 20;
 
-/// Runs `ros2` with these arguments. Its output goes to a file of that name.
+/// Runs `ros2` with these arguments. Its output goes to the file `name`.
 fn ros2(host: &Host<'_>, name: &str, arguments: &[&str]) -> Result<Process> {
     let line = format!("exec ros2 \"$@\" >{}", host.path(name));
     let errors = File::create(host.file(&format!("{name}.err")))?;
@@ -36,7 +36,7 @@ fn echo(host: &Host<'_>, name: &str, reliability: &str) -> Result<Process> {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, ros2bag, rosbag2_storage_mcap: make test-ros2"]
-fn a_finding_writes_a_bag_of_the_seconds_around_it_that_ros2_plays() -> Result<()> {
+fn a_finding_causes_a_bag_of_the_seconds_around_it_that_ros2_plays() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Cyclone)?;
     let bags = host.file("bags");
@@ -66,7 +66,7 @@ fn a_finding_writes_a_bag_of_the_seconds_around_it_that_ros2_plays() -> Result<(
     plays(&host, &bag, count)
 }
 
-/// Returns the number of messages.
+/// Checks that the bag covers the time of the finding. Returns the number of messages.
 fn spans_the_finding(bag: &Path) -> Result<usize> {
     let metadata = fs::read_to_string(bag.join("metadata.yaml"))?;
     let metadata = ros2probe_bag::metadata::Metadata::read(&metadata)?;

@@ -1,5 +1,5 @@
-//! Real processes of ROS 2, counted from inside: as many messages as the nodes themselves
-//! count, over each middleware, and within a process.
+//! Real processes of ROS 2, counted from inside: as many messages as the nodes count themselves,
+//! over each middleware and within a process.
 //!
 //! Needs root and ROS 2: `make test-ros2`.
 
@@ -21,29 +21,30 @@ const TAKEN: &str = "ros2_topic_inside_taken_messages_total";
 const TOPIC: [(&str, &str); 1] = [("topic", "/counted")];
 /// Callbacks of the demo, by node and trigger.
 const CALLBACKS: [(&str, &str); 2] = [("/talker", "timer"), ("/listener", "/chatter")];
-/// Messages at 1 kHz before and after a change.
+/// Number of messages at 1 kHz before and after a change.
 const MESSAGES: u64 = 3000;
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
-fn messages_over_fast_dds_are_as_many_as_the_nodes_count() -> Result<()> {
+fn messages_over_fast_dds_equal_the_counts_of_the_nodes() -> Result<()> {
     agrees_with_the_nodes(Middleware::FastSampled)
 }
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_cyclonedds_cpp: make test-ros2"]
-fn messages_over_cyclone_dds_are_as_many_as_the_nodes_count() -> Result<()> {
+fn messages_over_cyclone_dds_equal_the_counts_of_the_nodes() -> Result<()> {
     agrees_with_the_nodes(Middleware::Cyclone)
 }
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn messages_over_zenoh_are_as_many_as_the_nodes_count() -> Result<()> {
+fn messages_over_zenoh_equal_the_counts_of_the_nodes() -> Result<()> {
     agrees_with_the_nodes(Middleware::Zenoh)
 }
 
-/// The subscription runs before the agent, the publisher starts after it; then the publisher is
-/// killed, and another one follows; at last the agent is killed.
+/// Compares the counts with those of the nodes. The subscription runs before the agent, and the
+/// publisher starts after it. Then the publisher is killed and replaced, and finally the agent is
+/// killed.
 fn agrees_with_the_nodes(middleware: Middleware) -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, middleware)?;
@@ -86,7 +87,7 @@ fn agrees_with_the_nodes(middleware: Middleware) -> Result<()> {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, intra_process_demo: make test-ros2"]
-fn receptions_within_a_process_are_as_many_as_the_demo_prints() -> Result<()> {
+fn receptions_within_a_process_equal_the_number_that_the_demo_prints() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::FastSampled)?;
     let agent = agent(&host)?;
@@ -106,7 +107,7 @@ fn receptions_within_a_process_are_as_many_as_the_demo_prints() -> Result<()> {
         page.sum(name, &number) == printed as f64,
         "{printed} printed"
     );
-    // Nothing of it is on the network. A reception counts as a message one report later.
+    // None of it is on the network. A reception counts as a message one report later.
     let messages = "ros2_topic_messages_total";
     let page = agent.scrape_until("the messages are counted", |page| {
         page.sum(messages, &number) >= printed as f64
@@ -117,7 +118,7 @@ fn receptions_within_a_process_are_as_many_as_the_demo_prints() -> Result<()> {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, demo_nodes_cpp: make test-ros2"]
-fn callbacks_have_their_timer_s_period_and_their_node() -> Result<()> {
+fn callbacks_have_the_period_of_their_timer_and_the_name_of_their_node() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Cyclone)?;
     // The talker runs before the agent, the listener starts after it.
@@ -158,7 +159,7 @@ fn callbacks_have_their_timer_s_period_and_their_node() -> Result<()> {
             .find(|(of, what, _)| of == node && what.contains(trigger));
         let (_, what, wait) = callback.with_context(|| format!("{node}: {found:?}"))?;
         ensure!(node != "/talker" || what.contains("1"), "{what}");
-        // The clocks of kernel and process are compared: a wrong one shows as a long wait.
+        // The clocks of kernel and process are compared, since a wrong one leads to a long wait.
         ensure!(*wait < 0.05, "{node}: {wait}");
     }
     drop(agent);
@@ -181,7 +182,7 @@ fn publish(publisher: &mut Process, messages: u64) -> Result<()> {
     publisher.wait_for(&format!("published {messages}"), PATIENCE)
 }
 
-/// Waits until the subscription has as many messages.
+/// Waits until the subscription has this many messages.
 fn received(subscription: &mut Process, messages: u64) -> Result<()> {
     for _ in 0..100 {
         subscription.write_line("count")?;

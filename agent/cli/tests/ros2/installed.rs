@@ -7,7 +7,7 @@ use std::sync::LazyLock;
 use ros2probe::ros2::Dialect;
 
 /// Returns the directory of the distribution: `ROS2PROBE_ROS2`, or the last one below `/opt/ros`.
-/// Panics if it is missing: a test that needs it must not pass without it.
+/// Panics if it is missing, because a test that needs it must not pass without it.
 pub fn prefix() -> PathBuf {
     let named = std::env::var_os("ROS2PROBE_ROS2").filter(|named| !named.is_empty());
     let prefix = named.map(PathBuf::from).or_else(last_installed);
@@ -44,7 +44,8 @@ pub fn dialect() -> Dialect {
     Dialect::of_distro(distro()).unwrap_or_else(|| panic!("{} is no known distro", distro()))
 }
 
-/// Returns the Python that runs this distribution's command line: others may lack its modules.
+/// Returns the Python that runs this distribution's command line, since others may lack its
+/// modules.
 pub fn python() -> String {
     let program = prefix().join("bin/ros2");
     let script = std::fs::read_to_string(&program).unwrap();
@@ -55,7 +56,7 @@ pub fn python() -> String {
         .to_owned()
 }
 
-/// Returns a line of the shell behind the one that sets ROS's environment.
+/// Returns a shell line after the one that sets ROS's environment.
 pub fn in_environment(line: &str) -> String {
     format!(". {}/setup.bash && {line}", prefix().display())
 }

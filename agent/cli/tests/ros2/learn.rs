@@ -1,5 +1,5 @@
-//! `rp learn` beside the talker and the listener of ROS 2: they meet the watchlist, and
-//! without the listener they lack its endpoints and nothing else.
+//! `rp learn` beside the talker and the listener of ROS 2. They meet the watchlist, and without the
+//! listener, they only lack its endpoints.
 //!
 //! Needs root and ROS 2: `make test-ros2`.
 
@@ -16,18 +16,18 @@ use crate::host::{Host, Middleware, RP};
 use crate::installed;
 
 const VIOLATED: &str = "ros2_watch_expectation_violated";
-/// Longer than the 20 s with a publisher that the numbers of endpoints need.
+/// Time to learn: more than the 20 s with a publisher that the numbers of endpoints need.
 const LEARNS: Duration = Duration::from_secs(40);
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, demo_nodes_cpp: make test-ros2"]
-fn fast_dds_with_shared_memory_meets_what_was_learnt_from_it() -> Result<()> {
+fn fast_dds_with_shared_memory_meets_the_expectations_learnt_from_it() -> Result<()> {
     meets_what_was_learnt(Middleware::FastSampled)
 }
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_cyclonedds_cpp, demo_nodes_cpp: make test-ros2"]
-fn cyclone_dds_meets_what_was_learnt_from_it() -> Result<()> {
+fn cyclone_dds_meets_the_expectations_learnt_from_it() -> Result<()> {
     meets_what_was_learnt(Middleware::Cyclone)
 }
 

@@ -1,4 +1,5 @@
-//! A healthy robot of seven topics raises no alarm, also when the agent is killed and restarted twice.
+//! A healthy robot of seven topics raises no alarm, also when the agent is killed and restarted
+//! twice.
 //!
 //! Needs root and ROS 2: `make test-ros2`. `QUIET_SECONDS=600` makes it as long as a soak.
 
@@ -12,12 +13,12 @@ use ros2probe_testing::harness::network::Namespace;
 use crate::host::{Host, Middleware};
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Longer than two intervals of the slowest topic.
+/// Duration of the test: longer than two intervals of the slowest topic.
 const SECONDS: u64 = 120;
-/// Interval at which the agent saves its state, with room for a busy machine.
+/// Interval at which the agent saves its state, with a margin for a busy machine.
 const SAVED: Duration = Duration::from_secs(8);
-/// Topics of `ros2/robot.py` with least rate and longest silence: 0.8 of the rate, and two seconds or
-/// one and a half intervals.
+/// Topics of `ros2/robot.py` with minimum rate and maximum silence: 0.8 of the rate, and two
+/// seconds or one and a half intervals.
 const EXPECTED: [(&str, Option<u32>, u32); 7] = [
     ("/beat", None, 2),
     ("/cam", Some(8), 2),
@@ -43,7 +44,7 @@ fn fast_dds_with_a_uprobe_on_demand_raises_no_alarm() -> Result<()> {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
-fn fast_dds_whose_every_message_is_seen_raises_no_alarm() -> Result<()> {
+fn fast_dds_with_a_uprobe_for_every_message_raises_no_alarm() -> Result<()> {
     raises_no_alarm(Middleware::FastExact("uprobe"))
 }
 
@@ -93,12 +94,12 @@ fn raises_no_alarm(middleware: Middleware) -> Result<()> {
     };
     let start = Instant::now();
     agent.scrape_until("all topics are measured", all_measured)?;
-    // Its publishers exist before the first message, which is a silence.
+    // The publishers exist before their first message, and this time is a silence.
     let page = agent.scrape_until("no expectation is violated", |page| {
         page.sum("ros2_watch_expectation_violated", &[]) == 0.0
     })?;
     let mut before = alarms(&page);
-    // The last second is left out, as topics end one after the other.
+    // The last second is omitted, because topics end one after the other.
     let third = Duration::from_secs(seconds.saturating_sub(1)) / 3;
     for restarts in 0..3 {
         if restarts > 0 {

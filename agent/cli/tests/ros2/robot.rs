@@ -1,5 +1,5 @@
-//! A robot of seven topics made of real ROS 2 nodes, 8 B to 2.7 MB and 0.02 to 250 Hz: the bag, `echo`
-//! and `hz` hold the messages of its publisher's log, and name each message that they lack.
+//! A robot of seven topics made of real ROS 2 nodes, 8 B to 2.7 MB and 0.02 to 250 Hz. The bag,
+//! `echo` and `hz` have the messages of its publisher's log, and name each missing message.
 //!
 //! Needs root and ROS 2: `make test-ros2`.
 
@@ -22,7 +22,7 @@ use crate::host::{Host, Middleware, RP};
 use crate::installed;
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Topics of `ros2/robot.py` with the number of messages that it publishes on each.
+/// Topics of `ros2/robot.py`, and the number of messages that it publishes on each.
 const TOPICS: [(&str, u64); 7] = [
     ("/beat", 10),
     ("/cam", 100),
@@ -34,8 +34,9 @@ const TOPICS: [(&str, u64); 7] = [
 ];
 /// `echo` prints the messages of this topic by their numbers, which are in the header's frame.
 const ECHOED: [&str; 3] = ["/imu", "/cam", "/odom"];
-/// Polling of shared memory captures at least this share of small messages, also on a busy machine.
-/// Large messages are seldom captured: their pieces reuse the same memory. The rest is always counted.
+/// Minimum share of small messages that polling of shared memory captures, also on a busy machine.
+/// Large messages are seldom captured, because their pieces reuse the same memory. All others are
+/// counted.
 const CAPTURED: f64 = 0.7;
 const LARGE: [&str; 2] = ["/cam", "/points"];
 #[test]
@@ -140,7 +141,7 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
     let rates = hz.rates()?;
     println!("hz /imu: {rates:?}");
     let last = rates.last().context("hz printed nothing")?;
-    // Repaired messages arrive late: the subscriber's own rate is lower then.
+    // Repaired messages arrive late, and the subscriber's own rate is then lower.
     let received = robot.rate("subscribe", "/imu")?;
     let expected = received.min(250.0) - 5.0..255.0;
     ensure!(expected.contains(last), "{rates:?}, received {received}");
@@ -148,7 +149,7 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
 }
 
 /// Compares the deliveries at sockets with the log of the only subscriber, which has all messages.
-/// The last ones count when the agent has read their records.
+/// The last messages count once the agent has read their records.
 fn delivers_what_was_received(agent: &Agent<'_>, received: &Numbers) -> Result<()> {
     let agrees = |page: &Scrape| {
         received.iter().all(|(topic, numbers)| {
@@ -163,7 +164,7 @@ fn delivers_what_was_received(agent: &Agent<'_>, received: &Numbers) -> Result<(
 }
 
 /// Compares a bag, its report and the page with the publisher's log. Returns by topic the number of
-/// messages that could not be known to be missing.
+/// messages whose absence could not be detected.
 fn bag_holds_or_names_each_message(
     bag: &Path,
     published: &Numbers,
@@ -182,13 +183,14 @@ fn bag_holds_or_names_each_message(
             "{topic}: {} of {count} recorded, {missing} named as missing",
             in_bag.len()
         );
-        // Messages before the first one seen of a writer cannot be counted, nor the last ones without
-        // an observed HEARTBEAT or ACKNACK for them.
+        // Messages before the first one seen of a writer cannot be counted, nor the last ones
+        // without an observed HEARTBEAT or ACKNACK for them.
         let (before, after) = match is_looked_at {
             true => unknown(&in_bag, &report, topic, count)?,
             false => (0, 0),
         };
-        // Where the report counts further runs without naming them, the last numbers may be among them.
+        // If the report counts further runs without naming them, the last numbers may be among
+        // them.
         let counted_only = count.saturating_sub(in_bag.len() as u64 + missing + before);
         let after = match report.get("missing_runs_unnamed").and_then(Value::as_u64) {
             Some(0) => after,
@@ -243,7 +245,7 @@ struct Robot<'n> {
     host: Host<'n>,
 }
 
-/// An `rp` command with what it printed.
+/// An `rp` command and its output.
 struct Rp {
     process: Process,
     output: PathBuf,
@@ -254,12 +256,12 @@ struct Rp {
 struct Event {
     topic: String,
     seq: u64,
-    /// Nanoseconds.
+    /// Time in nanoseconds.
     t: u64,
 }
 
 impl Robot<'_> {
-    /// A node of `ros2/robot.py` in a separate process.
+    /// Starts a node of `ros2/robot.py` in a separate process.
     fn node(&self, role: &str) -> Result<Process> {
         self.host.python("robot.py", &[role, &self.log_of(role)])
     }
@@ -294,13 +296,13 @@ impl Robot<'_> {
     fn events(&self, role: &str) -> Result<Vec<Event>> {
         let mut events = Vec::new();
         for line in BufReader::new(File::open(self.log_of(role))?).lines() {
-            // The last one may be half written.
+            // The last line may be incomplete.
             events.extend(serde_json::from_str::<Event>(&line?));
         }
         Ok(events)
     }
 
-    /// Numbers by topic.
+    /// Returns the numbers by topic.
     fn log(&self, role: &str) -> Result<Numbers> {
         let mut numbers: Numbers = BTreeMap::new();
         for event in self.events(role)? {
@@ -309,7 +311,7 @@ impl Robot<'_> {
         Ok(numbers)
     }
 
-    /// Messages of a topic in a second, over the whole log.
+    /// Returns the messages of a topic per second, over the whole log.
     fn rate(&self, role: &str, topic: &str) -> Result<f64> {
         let events = self.events(role)?;
         let times = events.iter().filter(|event| event.topic == topic);
@@ -352,7 +354,7 @@ impl Robot<'_> {
         })
     }
 
-    /// Waits until the agent serves so many streams of samples.
+    /// Waits until the agent serves this many streams of samples.
     fn wait_for_subscriptions(&self, agent: &Agent<'_>, count: usize) -> Result<()> {
         let open = |page: &Scrape| page.sum("ros2probe_subscriptions", &[]);
         agent.scrape_until("subscriptions", |page| open(page) >= count as f64)?;
@@ -397,7 +399,7 @@ impl Rp {
         self.process.wait(PATIENCE)
     }
 
-    /// The numbers of the messages that `echo` printed, in the order printed.
+    /// Returns the numbers of the messages that `echo` printed, in the printed order.
     fn numbers(&self) -> Result<Vec<u64>> {
         let text = fs::read_to_string(&self.output)?;
         let lines = text.lines().map(|line| line.trim_matches('\''));
@@ -407,7 +409,7 @@ impl Rp {
             .collect()
     }
 
-    /// Returns how many messages `echo` names as missing.
+    /// Returns how many messages `echo` reports as missing.
     fn missed(&self) -> u64 {
         let errors = self.errors();
         let counts = errors
@@ -429,7 +431,7 @@ impl Rp {
     }
 }
 
-/// Application numbers in a bag by topic: one below the writer's sequence number.
+/// Returns the application's numbers in a bag by topic: one below the writer's sequence number.
 fn numbers(bag: &Path) -> Result<Numbers> {
     let mut numbers: Numbers = BTreeMap::new();
     let mut last = BTreeMap::new();
@@ -453,7 +455,7 @@ fn numbers(bag: &Path) -> Result<Numbers> {
     Ok(numbers)
 }
 
-/// The report in a bag's metadata.
+/// Returns the report in a bag's metadata.
 fn report_of(bag: &Path) -> Result<Value> {
     let text = fs::read_to_string(bag.join("metadata.yaml"))?;
     let metadata = ros2probe_bag::metadata::Metadata::read(&text)?;
@@ -461,8 +463,8 @@ fn report_of(bag: &Path) -> Result<Value> {
     Ok(serde_json::from_str(report.context("no report")?)?)
 }
 
-/// How many lie before the lowest number that is in the bag or named as missing, and behind the
-/// highest.
+/// Returns how many numbers are below the lowest one that is in the bag or reported as missing, and
+/// how many are above the highest.
 fn unknown(in_bag: &BTreeSet<u64>, report: &Value, topic: &str, count: u64) -> Result<(u64, u64)> {
     let runs = report["missing_runs"].as_array().context("no runs")?;
     let runs = runs.iter().filter(|run| run["topic"] == topic);
@@ -474,7 +476,7 @@ fn unknown(in_bag: &BTreeSet<u64>, report: &Value, topic: &str, count: u64) -> R
     Ok((*first, count - 1 - last))
 }
 
-/// The numbers that are neither in the bag nor named as missing.
+/// Returns the numbers that are neither in the bag nor reported as missing.
 fn unnamed(in_bag: &BTreeSet<u64>, report: &Value, topic: &str, count: u64) -> Vec<u64> {
     let runs = report["missing_runs"]
         .as_array()
@@ -490,7 +492,8 @@ fn unnamed(in_bag: &BTreeSet<u64>, report: &Value, topic: &str, count: u64) -> V
     lacking.filter(|number| !is_named(number)).collect()
 }
 
-/// Messages of a topic that the report names as missing, for whatever reason.
+/// Returns the number of messages of a topic that the report counts as missing, for whatever
+/// reason.
 fn missing(report: &Value, topic: &str) -> u64 {
     let reasons = ["incomplete", "not_captured", "dropped", "unwritten"];
     let topic = report.pointer("/topics").and_then(|all| all.get(topic));

@@ -1,5 +1,5 @@
-//! The `ros2` command line of ROS 2 with the agent as its daemon, beside real nodes: it prints
-//! what it prints with its own daemon, and sends nothing on the network.
+//! The `ros2` command line of ROS 2 with the agent as its daemon, beside real nodes. It prints the
+//! same as with its own daemon, and sends nothing on the network.
 //!
 //! Needs root and ROS 2: `make test-ros2`.
 
@@ -18,10 +18,10 @@ use crate::host::{Host, Middleware};
 use crate::installed::{self, in_environment};
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// The kernel keeps the address of a closed connection of the real daemon for a minute at most. The
-/// daemon does not let others reuse it.
+/// Maximum wait for the port. The kernel keeps the address of a closed connection of the real
+/// daemon for at most a minute. The daemon does not permit its reuse.
 const TIME_WAIT: Duration = Duration::from_secs(75);
-/// Nodes of the robot, without those of tools.
+/// Number of nodes of the robot, without those of tools.
 const NODES: f64 = 6.0;
 const LISTENING: [(&str, &str); 1] = [("state", "listening")];
 /// Every command that needs no participant, in each of its forms.
@@ -109,7 +109,7 @@ fn answers_as_the_real_daemon(middleware: Middleware) -> Result<()> {
     let sniffer = Sniffer::start(&robot)?;
     let with_agent = robot.all()?;
     let senders = sniffer.finish()?;
-    // Nodes of Zenoh have their session with the router since they started.
+    // Nodes of Zenoh have had their session with the router since they started.
     let is_zenoh = middleware == Middleware::Zenoh;
     let own = if is_zenoh {
         BTreeSet::new()
@@ -120,7 +120,7 @@ fn answers_as_the_real_daemon(middleware: Middleware) -> Result<()> {
     ensure!(is_zenoh || !senders.is_empty(), "the nodes sent nothing");
     let participants = agent.scrape()?.sum("ros2_participants", &[]);
     ensure!(participants == nodes.len() as f64, "{participants}");
-    // A command that uses no daemon is seen.
+    // A command that uses no daemon is seen on the network.
     let sniffer = Sniffer::start(&robot)?;
     robot.ros2("topic list --no-daemon")?;
     let senders = sniffer.finish()?;
@@ -136,7 +136,7 @@ fn answers_as_the_real_daemon(middleware: Middleware) -> Result<()> {
         let count = nodes.stdout.iter().filter(|byte| **byte == b'\n').count();
         Ok(text.contains("Node name: listener") && count == NODES as usize)
     })?;
-    // Discovery of the last endpoints.
+    // Waits for the discovery of the last endpoints.
     std::thread::sleep(Duration::from_secs(2));
     let with_daemon = robot.all()?;
     for ((command, real), ours) in robot.free().iter().zip(&with_daemon).zip(&with_agent) {
@@ -150,7 +150,7 @@ fn answers_as_the_real_daemon(middleware: Middleware) -> Result<()> {
             let text = robot.host.rp(&words)?;
             let mut lines: Vec<_> = text.lines().filter_map(without_daemon).collect();
             lines.sort_unstable();
-            // The name of a node in a namespace, as Humble prints it.
+            // Humble prints the name of a node in a namespace in this way.
             let whole = |line: &String| line.replace("//r/o/b/o/t/1server", "/robot1/server");
             let mut real: Vec<_> = real.output.iter().map(whole).collect();
             real.sort_unstable();
@@ -158,13 +158,14 @@ fn answers_as_the_real_daemon(middleware: Middleware) -> Result<()> {
         }
     }
     match is_zenoh {
-        // The port has nothing to do with the middleware.
+        // The port is independent of the middleware.
         true => Ok(()),
         false => takes_over(&robot, &agent),
     }
 }
 
-/// The agent waits while a real daemon has the port, and answers when it has ended.
+/// Checks that the agent waits while a real daemon has the port, and answers once the daemon has
+/// ended.
 fn takes_over(robot: &Robot<'_>, agent: &Agent<'_>) -> Result<()> {
     agent.process.signal("HUP")?;
     agent.scrape_until("the port is occupied", |page| {
@@ -188,7 +189,7 @@ struct Robot<'n> {
     host: Host<'n>,
 }
 
-/// What a command printed, without the order of lines and without the real daemon's own node.
+/// The output of a command, without the order of lines and without the real daemon's own node.
 #[derive(Debug, PartialEq, Eq)]
 struct Printed {
     status: Option<i32>,
@@ -196,7 +197,7 @@ struct Printed {
     errors: Vec<String>,
 }
 
-/// tcpdump on every interface of the namespace.
+/// A tcpdump on every interface of the namespace.
 struct Sniffer<'r> {
     process: Process,
     robot: &'r Robot<'r>,
@@ -242,7 +243,7 @@ impl Robot<'_> {
         }
     }
 
-    /// Returns what each command of [`Self::free`] prints.
+    /// Returns the output of each command of [`Self::free`].
     fn all(&self) -> Result<Vec<Output>> {
         self.free().iter().map(|words| self.ros2(words)).collect()
     }
@@ -272,8 +273,8 @@ impl Printed {
     }
 }
 
-/// Returns a line without the real daemon's node, which publishes `/rosout` and `/parameter_events`.
-/// The numbers of their publishers differ by one, and are left out.
+/// Returns a line without the real daemon's node, which publishes `/rosout` and
+/// `/parameter_events`. The numbers of publishers of these topics differ by one, and are omitted.
 fn without_daemon(line: &str) -> Option<String> {
     if line.starts_with("/_ros2cli_daemon_") {
         return None;

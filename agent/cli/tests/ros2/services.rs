@@ -1,5 +1,5 @@
-//! Real services and an action of ROS 2: the agent's times agree with the logs of both ends, a
-//! hanging call is found, and a lost reply is no answer.
+//! Real services and an action of ROS 2. The agent's times agree with the logs of both ends, a
+//! hanging call is found, and a lost reply does not count as an answer.
 //!
 //! Needs root and ROS 2: `make test-ros2`.
 
@@ -19,13 +19,13 @@ use crate::host::{Host, Middleware};
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Log of the client, in the directory of the host.
 const LOG: &str = "calls.jsonl";
-/// Log of the server, likewise.
+/// Log of the server, in the same directory.
 const ANSWERS: &str = "answers.jsonl";
 const EXACT: Middleware = Middleware::FastExact("uprobe");
 const CALLS: usize = 1000;
-/// How far the agent's median and mean may be outside of what server and client log.
+/// Maximum distance of the agent's median and mean from the range that server and client log.
 const CLOSE: f64 = 0.000_1;
-/// Likewise the 99th percentile, which a delay of ten calls changes.
+/// Maximum distance of the 99th percentile, which a delay of ten calls changes.
 const TAIL: f64 = 0.000_2;
 
 /// One call or goal of the client's log, in nanoseconds.
@@ -50,25 +50,25 @@ struct Answered {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_cyclonedds_cpp: make test-ros2"]
-fn calls_over_cyclone_dds_take_as_long_as_the_client_logs() -> Result<()> {
+fn calls_over_cyclone_dds_have_the_durations_that_the_client_logs() -> Result<()> {
     agrees_with_the_client(Middleware::Cyclone)
 }
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
-fn calls_over_fast_dds_and_udp_take_as_long_as_the_client_logs() -> Result<()> {
+fn calls_over_fast_dds_and_udp_have_the_durations_that_the_client_logs() -> Result<()> {
     agrees_with_the_client(Middleware::FastUdp)
 }
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
-fn calls_over_shared_memory_with_the_uprobe_take_as_long_as_the_client_logs() -> Result<()> {
+fn calls_over_shared_memory_with_the_uprobe_have_the_durations_in_the_log() -> Result<()> {
     agrees_with_the_client(EXACT)
 }
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn calls_over_zenoh_take_as_long_as_the_client_logs() -> Result<()> {
+fn calls_over_zenoh_have_the_durations_that_the_client_logs() -> Result<()> {
     agrees_with_the_client(Middleware::Zenoh)
 }
 
@@ -101,7 +101,7 @@ fn agrees_with_the_client(middleware: Middleware) -> Result<()> {
     })?;
     robot.compare(&page)?;
     hang(&robot, &agent, &mut client)?;
-    // A segment that TCP repeats arrives in its place: no reply is lost on its way.
+    // TCP delivers a repeated segment in its order, so no reply is lost.
     if !matches!(middleware, EXACT | Middleware::Zenoh) {
         lose(&network, &agent, &mut client)?;
     }
@@ -111,7 +111,7 @@ fn agrees_with_the_client(middleware: Middleware) -> Result<()> {
     Ok(())
 }
 
-/// A call that the server never answers becomes a finding.
+/// Checks that a call that the server never answers becomes a finding.
 fn hang(robot: &Robot<'_>, agent: &Agent<'_>, client: &mut Process) -> Result<()> {
     robot.obey(client, "hang")?;
     let page = agent.scrape_until("the call hangs", |page| {
@@ -122,14 +122,14 @@ fn hang(robot: &Robot<'_>, agent: &Agent<'_>, client: &mut Process) -> Result<()
     Ok(())
 }
 
-/// A reply that is lost between server and client is no answer until it is repaired.
+/// Checks that a reply lost between server and client does not count until it is repaired.
 fn lose(network: &Namespace, agent: &Agent<'_>, client: &mut Process) -> Result<()> {
     let nft = |rule: &str| run(&format!("ip netns exec {} nft {rule}", network.name()));
     nft("add table ip lost")?;
     nft("add chain ip lost input { type filter hook input priority 0 ; }")?;
     client.write_line("lose")?;
     client.wait_for("done", PATIENCE)?;
-    // The server has the request by now, and takes 1.5 s.
+    // The server already has the request, and takes 1.5 s.
     std::thread::sleep(Duration::from_millis(500));
     nft("add rule ip lost input meta l4proto udp drop")?;
     let answered = |page: &Scrape| count(page, "ros2_service_answered_requests_total", "/add");
@@ -194,8 +194,8 @@ impl<'n> Robot<'n> {
         let (goals, calls): (Vec<Logged>, Vec<Logged>) =
             logged.into_iter().partition(|each: &Logged| each.goal);
         ensure!(calls.len() == CALLS, "{}", calls.len());
-        // A request is on its way for longer than the server takes, and for less than the client
-        // waits, whatever delays the threads of both.
+        // A request takes longer than the server's work, and less than the client's wait, whatever
+        // delays the threads of both.
         let answers: Vec<Answered> = self.logged(ANSWERS, CALLS)?;
         let least = sorted(answers.iter().map(|each| each.sent - each.received));
         let most = sorted(calls.iter().map(|each| each.received - each.began));
@@ -226,7 +226,7 @@ impl<'n> Robot<'n> {
         let labels = [("ros_action", "/fib")];
         let seen = page.sum("ros2_action_goal_duration_p50_seconds", &labels);
         println!("goal: agent {seen:.6} s, client {goal:.6} s");
-        // The client is written in Python, and spins.
+        // The client is written in Python, and polls.
         ensure!((goal - seen).abs() < 0.02, "{seen} {goal}");
         Ok(())
     }

@@ -1,5 +1,5 @@
-//! Real nodes of rmw_zenoh under the agent's eyes: counts for each receiver equal the log of each
-//! subscription.
+//! Real nodes of rmw_zenoh that the agent observes. The counts of each receiver equal the log of
+//! each subscription.
 //!
 //! Needs root and ROS 2: `make test-ros2`.
 
@@ -27,11 +27,11 @@ use crate::host::{Host, Middleware, RP};
 const PATIENCE: Duration = Duration::from_secs(60);
 const WATCH: &str = "watch:\n- {topic: '/**', per_subscriber: true}\n";
 
-/// What a subscription logged.
+/// Counts in the log of a subscription.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Log {
     pub received: u64,
-    /// Numbers between the first and the last that it did not receive.
+    /// Number of messages between the first and the last that the subscription did not receive.
     missing: u64,
 }
 
@@ -69,7 +69,7 @@ pub fn log(subscription: &mut Process) -> Result<Log> {
     })
 }
 
-/// Returns what the log says once it has stayed the same for a second.
+/// Returns the log once it has not changed for a second.
 fn settled_log(subscription: &mut Process) -> Result<Log> {
     let mut before = log(subscription)?;
     loop {
@@ -82,7 +82,7 @@ fn settled_log(subscription: &mut Process) -> Result<Log> {
     }
 }
 
-/// Returns what arrived at the node, and what was lost on the way, by the agent.
+/// Returns what arrived at the node and what was lost, as the agent counts it.
 fn delivered(agent: &Agent<'_>, topic: &str, node: &str) -> Result<Log> {
     let mut log = Log {
         received: 0,
@@ -95,7 +95,7 @@ fn delivered(agent: &Agent<'_>, topic: &str, node: &str) -> Result<Log> {
     Ok(log)
 }
 
-/// Returns the receiving process of each delivery to the node, and the fate of the messages.
+/// Returns the receiving process of each delivery to the node, and the counts of its messages.
 fn deliveries(agent: &Agent<'_>, topic: &str, node: &str) -> Result<Vec<(Option<u32>, Delivered)>> {
     let text = get(agent.host, &format!("http://127.0.0.1:17401/topics{topic}"))?;
     let details: TopicDetails<'_> = serde_json::from_str(&text).with_context(|| text.clone())?;
@@ -175,7 +175,7 @@ fn runs_in(agent: &Agent<'_>, node: &str, process: &Process) -> Result<()> {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn small_messages_at_1_khz_and_point_clouds_count_as_each_subscription_logs() -> Result<()> {
+fn counts_of_small_messages_and_point_clouds_equal_the_log_of_each_subscription() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent(WATCH)?;
@@ -201,7 +201,7 @@ fn small_messages_at_1_khz_and_point_clouds_count_as_each_subscription_logs() ->
     for (process, node) in [(&sensor, "/sensor"), (&two, "/two"), (&map, "/map")] {
         runs_in(&agent, node, process)?;
     }
-    // Both subscriptions of the topic are matched.
+    // Waits until both subscriptions of the topic are matched.
     std::thread::sleep(Duration::from_secs(2));
     publish(&mut sensor, 5000, 5000)?;
     publish(&mut lidar, 60, 60)?;
@@ -218,7 +218,7 @@ fn small_messages_at_1_khz_and_point_clouds_count_as_each_subscription_logs() ->
         ensure!(named == Some(process.pid()), "{node}: {named:?}");
         received.push(log.received as f64);
     }
-    // On a busy machine Zenoh drops messages, which are on no connection then.
+    // On a busy machine, Zenoh drops messages before they are on any connection.
     let any = received[0].max(received[1])..=5000.0;
     ensure!(any.contains(&messages(&agent, "/imu")?), "{any:?}");
     ensure!(messages(&agent, "/points")? == received[2]);
@@ -234,7 +234,7 @@ fn small_messages_at_1_khz_and_point_clouds_count_as_each_subscription_logs() ->
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn messages_that_zenoh_drops_for_a_stopped_subscription_are_its_losses() -> Result<()> {
+fn messages_that_zenoh_drops_for_a_stopped_subscription_count_as_its_losses() -> Result<()> {
     let logs = beside_a_stopped_subscription("20", "2720000", [10, 60, 20])?;
     ensure!(logs[0].missing > 0, "nothing was dropped: {logs:?}");
     Ok(())
@@ -249,7 +249,7 @@ fn small_messages_that_wait_for_a_stopped_subscription_arrive_in_large_packets()
 }
 
 /// Publishes some messages, further ones while one of two subscriptions is stopped, and some more.
-/// Checks that the agent agrees with both, and returns what the stopped one logged, and the other.
+/// Checks that the agent agrees with both, and returns the logs of the stopped one and the other.
 fn beside_a_stopped_subscription(rate: &str, bytes: &str, counts: [u64; 3]) -> Result<[Log; 2]> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
@@ -280,7 +280,7 @@ fn beside_a_stopped_subscription(rate: &str, bytes: &str, counts: [u64; 3]) -> R
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn a_router_that_is_restarted_takes_no_node_with_it() -> Result<()> {
+fn a_restarted_router_removes_no_node_from_the_graph() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent(WATCH)?;

@@ -1,5 +1,5 @@
-//! A bag of small messages at 1 kHz and of point clouds has each message byte for byte, and `ros2
-//! bag play` publishes them again.
+//! A bag of small messages at 1 kHz and of point clouds has each message byte for byte. `ros2 bag
+//! play` publishes the messages again.
 
 use std::fs::{self, File};
 use std::process::Stdio;
@@ -14,17 +14,18 @@ use super::{PATIENCE, publisher, subscription};
 use crate::host::{Host, Middleware, RP};
 use crate::installed;
 
-/// Name of the publisher, topic, messages in a second, bytes, messages.
+/// Name of the publisher, topic, messages per second, bytes, and number of messages.
 const STREAMS: [(&str, &str, &str, &str, usize); 2] = [
     ("sensor", "/imu", "1000", "300", 5000),
     ("lidar", "/points", "20", "2720000", 100),
 ];
-/// Keeps all: the publisher waits while a connection is congested, instead of dropping messages.
+/// QoS that keeps all messages: the publisher waits while a connection is congested, instead of
+/// dropping messages.
 const RELIABLE: [&str; 2] = ["0", "RELIABLE"];
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp, ros2bag, rosbag2_storage_mcap: make test-ros2"]
-fn a_bag_has_each_message_byte_for_byte_and_ros2_plays_them() -> Result<()> {
+fn a_bag_has_each_message_byte_for_byte_and_ros2_plays_it() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent("watch: []\n")?;
@@ -68,7 +69,7 @@ fn a_bag_has_each_message_byte_for_byte_and_ros2_plays_them() -> Result<()> {
     plays(&host, &bag)
 }
 
-/// Plays the bag to two subscriptions.
+/// Plays the bag to two subscriptions, and checks their logs.
 fn plays(host: &Host<'_>, bag: &str) -> Result<()> {
     let mut listeners = Vec::new();
     for (name, topic, ..) in STREAMS {
@@ -79,7 +80,7 @@ fn plays(host: &Host<'_>, bag: &str) -> Result<()> {
         listener.wait_for("ready", PATIENCE)?;
         listeners.push(listener);
     }
-    // The player keeps ten messages otherwise, and Zenoh drops those of a congested connection.
+    // By default, the player keeps ten messages, and Zenoh drops those of a congested connection.
     let qos = "{history: keep_all, depth: 0, reliability: reliable, durability: volatile}";
     let overrides = STREAMS.map(|(_, topic, ..)| format!("{topic}: {qos}\n"));
     fs::write(host.file("qos.yaml"), overrides.concat())?;
@@ -99,7 +100,7 @@ fn plays(host: &Host<'_>, bag: &str) -> Result<()> {
     Ok(())
 }
 
-/// Fails if the hashes differ or are in another order.
+/// Fails if the hashes differ or have another order.
 fn same(topic: &str, sent: &[String], other: &[String]) -> Result<()> {
     let differs = sent.iter().zip(other).position(|(one, other)| one != other);
     ensure!(

@@ -1,4 +1,5 @@
-//! Sessions over TLS and QUIC: the agent names what it cannot read, and counts inside the processes.
+//! Sessions over TLS and QUIC: the agent reports unreadable connections, and counts inside the
+//! processes.
 
 use std::process::{Command, Stdio};
 
@@ -64,12 +65,12 @@ impl Robot {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn connections_over_tls_are_named_and_their_messages_counted_inside() -> Result<()> {
+fn connections_over_tls_are_reported_and_their_messages_counted_inside() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent_inside(WATCH)?;
     let mut robot = Robot::start(&host, "tls")?;
-    // Of the connections, those to port 7447 are recognized.
+    // Only the connections to port 7447 are recognized.
     agent.scrape_until("both connections to the router", |page| {
         page.sum(UNSEEN, &[("reason", "tls")]) == 2.0
     })?;
@@ -96,14 +97,14 @@ fn connections_over_tls_are_named_and_their_messages_counted_inside() -> Result<
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn connections_over_quic_are_named() -> Result<()> {
+fn connections_over_quic_are_reported() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let agent = host.agent(WATCH)?;
     let mut robot = Robot::start(&host, "quic")?;
     publish(&mut robot.sensor, 100, 100)?;
     ensure!(settled_log(&mut robot.one)?.received == 100);
-    // Connections between two addresses are one, as their end is not visible.
+    // Connections between two addresses count as one, because their ends are not visible.
     let page = agent.scrape_until("the connections", |page| {
         page.sum(UNSEEN, &[("reason", "quic")]) == 1.0
     })?;

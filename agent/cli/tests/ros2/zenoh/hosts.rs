@@ -1,4 +1,4 @@
-//! Two hosts joined by their routers, with an agent on each.
+//! Two hosts that their routers connect, with an agent on each.
 
 use anyhow::{Result, ensure};
 use ros2probe_testing::harness::agent::Agent;
@@ -13,7 +13,7 @@ const QOS: [&str; 2] = ["2000", "RELIABLE"];
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn the_agent_of_each_host_counts_what_its_subscriptions_log() -> Result<()> {
+fn the_counts_of_each_host_equal_the_logs_of_its_subscriptions() -> Result<()> {
     let link = Link::new()?;
     let robot = Host::new(&link.robot, Middleware::Zenoh)?;
     let base = Host::new(&link.monitor, Middleware::Zenoh)?;
@@ -49,7 +49,7 @@ fn the_agent_of_each_host_counts_what_its_subscriptions_log() -> Result<()> {
     nodes(&of_robot, 2.0)?;
     nodes(&of_base, 2.0)?;
 
-    // An agent that starts last, and requests the names.
+    // This agent starts last, and requests the names.
     drop(of_base);
     std::fs::remove_file(base.file("discovery.json"))?;
     let of_base = base.agent(WATCH)?;

@@ -55,7 +55,7 @@ fn an_agent_that_starts_last_counts_and_learns_the_names_from_the_router() -> Re
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn a_ros2_command_shows_who_receives_on_connections_older_than_the_agent() -> Result<()> {
+fn a_ros2_command_reveals_the_receivers_of_connections_older_than_the_agent() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let [_router, mut sensor, mut one] = robot(&host)?;
@@ -63,7 +63,7 @@ fn a_ros2_command_shows_who_receives_on_connections_older_than_the_agent() -> Re
     let mut command = host.run("exec ros2 node list --no-daemon", &[], Stdio::inherit())?;
     command.wait_for("/sensor", PATIENCE)?;
     runs_in(&agent, "/one", &one)?;
-    // The subscription sends nothing but KEEP_ALIVEs, each 30 s.
+    // The subscription sends only KEEP_ALIVEs, every 30 s.
     let (mut published, mut before) = (0, 0);
     wait_until("deliveries have a node", || {
         published += 10;

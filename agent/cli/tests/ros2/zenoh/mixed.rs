@@ -1,5 +1,5 @@
-//! A robot with nodes of DDS and of Zenoh on one topic: both are in one graph, and nothing is mixed
-//! up.
+//! A robot with nodes of DDS and of Zenoh on one topic: both are in one graph, and their messages
+//! are counted separately.
 
 use std::collections::BTreeMap;
 
@@ -16,7 +16,7 @@ const RATE: [&str; 4] = ["200", "300", "2000", "BEST_EFFORT"];
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp, rmw_cyclonedds_cpp: make test-ros2"]
-fn nodes_of_dds_and_zenoh_are_in_one_graph_and_nothing_is_mixed_up() -> Result<()> {
+fn nodes_of_dds_and_zenoh_are_in_one_graph_and_counted_separately() -> Result<()> {
     let network = Namespace::alone()?;
     let zenoh = Host::new(&network, Middleware::Zenoh)?;
     let dds = Host::new(&network, Middleware::Cyclone)?;
@@ -24,7 +24,7 @@ fn nodes_of_dds_and_zenoh_are_in_one_graph_and_nothing_is_mixed_up() -> Result<(
     let _router = zenoh.router("")?;
     let mut robots = Vec::new();
     for (host, name, reliability, count) in [
-        // Zenoh delivers to a reliable subscription, too.
+        // Zenoh also delivers to a reliable subscription.
         (&zenoh, "zenoh", "RELIABLE", 700),
         (&dds, "dds", "BEST_EFFORT", 400),
     ] {

@@ -12,7 +12,7 @@ const QOS: [&str; 2] = ["2000", "RELIABLE"];
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
-fn an_agent_that_restarts_knows_names_and_counts_for_each_node() -> Result<()> {
+fn a_restarted_agent_has_the_names_and_counts_of_each_node() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
     let mut agent = host.agent(WATCH)?;
@@ -41,7 +41,7 @@ fn an_agent_that_restarts_knows_names_and_counts_for_each_node() -> Result<()> {
 
     let agent = host.agent(WATCH)?;
     ensure!(all()? == before, "{:#?}", all()?);
-    // A connection that is older than the agent is recognized by some batches.
+    // The agent recognizes a connection that is older than itself after some batches.
     publish(&mut sensor, 50, 250)?;
     let logged = settled_log(&mut one)?.received;
     let delivered_before = delivered(&agent, "/imu", "/one")?.received;

@@ -15,7 +15,7 @@ use crate::host::{Host, Middleware};
 
 const TOPIC: &str = "/points";
 const COUNT: usize = 20;
-/// Keeps all: the publisher waits while a connection is congested.
+/// QoS that keeps all messages: the publisher waits while a connection is congested.
 const QOS: [&str; 2] = ["0", "RELIABLE"];
 
 #[test]
