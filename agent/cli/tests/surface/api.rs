@@ -16,7 +16,7 @@ use ros2probe_daemon::config::watch::ExpectationValues;
 use ros2probe_testing::local_agent::{self, Answer, LocalAgent, PATIENCE, capture, exchange};
 use serde_json::Value;
 
-/// A request with headers (each line ended) and a body.
+/// Sends a request with these headers (each line ended) and this body.
 fn ask(agent: &LocalAgent, method: &str, path: &str, headers: &str, body: &str) -> Answer {
     let stream = TcpStream::connect(agent.api).unwrap();
     let host = agent.api;
@@ -27,7 +27,7 @@ fn ask(agent: &LocalAgent, method: &str, path: &str, headers: &str, body: &str) 
     exchange(stream, &head, body)
 }
 
-/// The status and the end of the problem's type, or nothing.
+/// Returns the status and the last part of the problem's type, which is empty without a problem.
 fn problem(answer: &Answer) -> (u16, String) {
     let body: Value = serde_json::from_str(&answer.body).unwrap_or_default();
     let code = body["type"].as_str().unwrap_or_default().to_owned();
@@ -42,7 +42,7 @@ fn problem(answer: &Answer) -> (u16, String) {
     (answer.status, code.replace("urn:ros2probe:problem:", ""))
 }
 
-/// Repeats the request until the answer is as wanted.
+/// Repeats the request until the answer has the wanted content.
 fn wait_for(agent: &LocalAgent, path: &str, wanted: impl Fn(&Value) -> bool) -> Value {
     let deadline = Instant::now() + PATIENCE;
     loop {
@@ -59,7 +59,7 @@ fn wait_for(agent: &LocalAgent, path: &str, wanted: impl Fn(&Value) -> bool) -> 
 const JSON: &str = "Content-Type: application/json\r\n";
 const FORM: &str = "Content-Type: application/x-www-form-urlencoded\r\n";
 
-/// Method, path, headers and body of a request; status, code and words of its answer.
+/// Method, path, headers and body of a request; then the status, the code and words of its answer.
 type Refused = (
     &'static str,
     &'static str,
@@ -207,7 +207,7 @@ fn impossible_requests_are_answered_with_a_problem_and_its_reason() {
     }
     let refused = ask(&agent, "PATCH", "/watch/a", "", "");
     assert!(refused.headers.contains("allow: "), "{}", refused.headers);
-    // Without a body its content type is irrelevant; a name may contain slashes.
+    // A request without a body may have any content type. A name may contain slashes.
     assert_eq!(ask(&agent, "POST", "/watch/%2Fa", FORM, "").status, 201);
     assert_eq!(ask(&agent, "GET", "/watch/a", "", "").status, 200);
     let document: Value =
@@ -239,7 +239,7 @@ fn refused(section: &str) -> String {
 }
 
 #[test]
-fn the_agent_does_not_start_where_the_api_would_be_open_to_everybody_or_cannot_be() {
+fn an_open_api_without_a_token_or_an_api_that_cannot_be_served_prevents_the_start() {
     let open = refused("{listen: '0.0.0.0:17401'}");
     assert!(
         open.contains("config.yaml:1:15: api.listen: is 0.0.0.0:17401"),
@@ -256,7 +256,7 @@ fn the_agent_does_not_start_where_the_api_would_be_open_to_everybody_or_cannot_b
 }
 
 #[test]
-fn the_service_managers_directory_has_the_socket_of_one_agent_and_no_other_takes_it() {
+fn a_second_agent_does_not_take_the_socket_in_the_directory_of_the_service_manager() {
     let directory = tempfile::tempdir().unwrap();
     let socket = directory.path().join("api.sock");
     let start = || {
@@ -277,7 +277,7 @@ fn the_service_managers_directory_has_the_socket_of_one_agent_and_no_other_takes
     assert_eq!(ask(&second, "GET", "/watch/a", "", "").status, 200);
     drop(second);
     assert_eq!(asked(), 200);
-    // Killed, it leaves the file; the next one takes its place.
+    // A killed agent leaves its socket file. The next agent replaces it.
     first.signal("-KILL");
     first.wait();
     assert!(socket.exists());
@@ -287,7 +287,7 @@ fn the_service_managers_directory_has_the_socket_of_one_agent_and_no_other_takes
 }
 
 #[test]
-fn a_token_a_foreign_name_and_a_foreign_page_have_separate_answers() {
+fn a_wrong_token_a_foreign_host_and_a_foreign_origin_are_refused_with_separate_codes() {
     let directory = tempfile::tempdir().unwrap();
     let (config, token) = (
         directory.path().join("config.yaml"),
@@ -343,14 +343,14 @@ fn a_token_a_foreign_name_and_a_foreign_page_have_separate_answers() {
     let answer = agent.request("POST", "/watch/b", right);
     assert_eq!(answer.status, 404);
 
-    // A connection without a request does not delay the end.
+    // An idle connection does not delay the end.
     let _idle = TcpStream::connect(agent.api).unwrap();
     agent.signal("-TERM");
     assert!(agent.wait().success());
     assert!(!socket.exists());
 }
 
-/// The commands of a section of `docs/api.md` and what they print.
+/// Returns the commands of a section of `docs/api.md` with the output that the section shows.
 fn commands(section: &str) -> Vec<(String, String)> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/api.md");
     let page = std::fs::read_to_string(path).unwrap();
@@ -364,7 +364,7 @@ fn commands(section: &str) -> Vec<(String, String)> {
     commands.collect()
 }
 
-/// Without values that differ each time.
+/// Replaces values that differ each time.
 fn masked(text: &str) -> String {
     let mut masked = text.to_owned();
     for key in ["\"messages\":", "\"rate_hertz\":", "topic=\"/chatter\"} "] {
@@ -391,8 +391,8 @@ fn output_in_the_book_is_current() {
             if counts && masked(said.trim_end()) == masked(&expected) {
                 break;
             }
-            // Only a request without side effects can be repeated until the replay has reached that
-            // point.
+            // Only a request without side effects can be repeated until the replay has gone far
+            // enough.
             let may_repeat = !command.contains("-X") && Instant::now() < deadline;
             assert!(
                 may_repeat,

@@ -1,5 +1,5 @@
-//! Each answer of the API reads as its type of `ros2probe_api`, which writes the same JSON again.
-//! Bodies of requests are written by their types.
+//! Each answer of the API can be read as its type of `ros2probe_api`, which serializes to the same
+//! JSON. Bodies of requests are serialized from their types.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -22,7 +22,7 @@ use serde_json::Value;
 
 const CONFIGURATION: &str = "watch: [{topic: '/**', retain: last}]\n";
 
-/// Sends a typed body, and returns a typed answer of this status.
+/// Sends a typed body, and returns the typed answer, which must have this status.
 fn asked<T: DeserializeOwned + Serialize>(
     agent: &LocalAgent,
     method: &str,
@@ -40,7 +40,7 @@ fn get<T: DeserializeOwned + Serialize>(agent: &LocalAgent, path: &str) -> T {
     asked(agent, "GET", path, (), 200)
 }
 
-/// A replay that outlasts the test, with a directory for bags.
+/// Starts a replay that outlasts the test, with a directory for bags.
 fn agent(capture: &str, configuration: &Path) -> LocalAgent {
     let configuration = configuration.to_str().unwrap();
     let arguments = ["--speed", "0.5", "--config", configuration];
@@ -50,7 +50,7 @@ fn agent(capture: &str, configuration: &Path) -> LocalAgent {
 }
 
 #[test]
-fn answers_of_a_running_robot_read_as_their_types_and_write_the_same_again() {
+fn answers_of_a_running_robot_are_read_as_their_types_and_serialize_to_the_same_json() {
     for capture in ["cyclonedds/lifecycle-2ns", "fastrtps-udp/lifecycle-2ns"] {
         let directory = tempfile::tempdir().unwrap();
         let file = directory.path().join("ros2probe.yaml");
@@ -103,7 +103,7 @@ fn recordings(agent: &LocalAgent) {
     assert_eq!(list.snapshots.len(), 1);
 }
 
-/// The topic with the most messages.
+/// Returns the topic with the most messages.
 fn published(agent: &LocalAgent) -> String {
     let list: RecordingList = get(agent, "/recordings");
     let topics = &list.recordings[0].report.topics;

@@ -1,5 +1,5 @@
-//! The control API on real robots. The real binary replays captures of ROS 2 up to a time at which
-//! the graph of a real node is known.
+//! The control API for captures of real robots. The binary replays each capture up to a time at
+//! which the graph of a real node is known.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -29,10 +29,10 @@ use ros2probe_testing::truth::{self, GraphLine, Scenario};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 use serde_json::Value;
 
-/// Nodes have processed announcements after half a second.
+/// After this time, in nanoseconds, nodes have processed an announcement.
 const SETTLED: u64 = 500_000_000;
 
-/// A capture of which the agent has seen all up to a moment.
+/// An agent that has replayed a capture up to a point in time.
 struct Robot {
     agent: LocalAgent,
     _capture: tempfile::TempPath,
@@ -65,7 +65,7 @@ impl Robot {
         serde_json::from_str(&answer.body).unwrap()
     }
 
-    /// Status, code and detail of a refusal.
+    /// Returns status, code and detail of a refusal.
     fn problem(&self, path: &str) -> (u16, String, String) {
         let answer = self.ask(path);
         let body: Value = serde_json::from_str(&answer.body).unwrap();
@@ -86,7 +86,8 @@ fn capture_of(scenario: &str) -> PathBuf {
     data(scenario).pop().unwrap().capture
 }
 
-/// The packets of a capture file (classic, little-endian, microseconds) before a time.
+/// Returns the packets of a capture file (classic, little-endian, microseconds) before a point in
+/// time.
 fn beginning(capture: &Path, until: u64) -> Vec<u8> {
     let mut all = Vec::new();
     let file = File::open(capture).unwrap();
@@ -129,7 +130,7 @@ fn named<'a>(list: &'a Value, name: &str) -> &'a Value {
     found.unwrap_or_else(|| panic!("no {name} in {list}"))
 }
 
-/// The moments after which nothing changed for a while.
+/// Returns the lines after which the graph did not change for at least 1 s.
 fn settled(lines: &[GraphLine]) -> impl Iterator<Item = &GraphLine> {
     let pairs = lines.iter().zip(lines.iter().skip(1));
     let settled = pairs.filter(|(line, next)| next.t - line.t >= 2 * SETTLED);
@@ -137,11 +138,11 @@ fn settled(lines: &[GraphLine]) -> impl Iterator<Item = &GraphLine> {
 }
 
 #[test]
-fn topics_services_and_nodes_are_those_that_a_real_node_believed_in() {
+fn topics_services_and_nodes_equal_the_graph_of_a_real_node() {
     let mut compared = 0;
     for scenario in data("lifecycle-2ns") {
         for (witness, lines) in scenario.graphs() {
-            // The first: the whole robot. The last: its remainder.
+            // The first line describes the whole robot, the last line what remains of it.
             let all: Vec<_> = settled(&lines).collect();
             let (Some(first), Some(last)) = (all.first(), all.last()) else {
                 continue;
@@ -194,7 +195,7 @@ fn believed(name: &str, capture: &Path, line: &GraphLine) {
     drawn(&robot);
 }
 
-/// The graph holds together: every edge has its ends, and every listed node exists.
+/// Checks that both ends of every edge exist, and that every listed node is in the graph.
 fn drawn(robot: &Robot) {
     let graph = robot.get("/graph?hidden=true");
     let vertices = graph["nodes"].as_array().unwrap();
@@ -216,7 +217,7 @@ fn drawn(robot: &Robot) {
 }
 
 #[test]
-fn one_robot_is_described_as_ros2_would() {
+fn one_robot_is_described_as_ros2_describes_it() {
     let scenario = data("jazzy-cyclonedds/lifecycle-2ns").pop().unwrap();
     let (_, lines) = scenario.graphs().pop().unwrap();
     let line = settled(&lines).next().unwrap();
@@ -371,11 +372,11 @@ fn wrong_queries_are_refused_with_a_hint(robot: &Robot) {
     }
 }
 
-/// Cyclone DDS really did not match the two: the subscriber logged no message.
+/// Cyclone DDS did not match the two endpoints: the subscriber logged no message.
 #[test]
-fn a_mismatch_of_real_participants_is_named_in_the_topic_and_as_a_metric() {
+fn incompatible_qos_of_real_participants_is_reported_in_the_topic_and_as_a_metric() {
     let capture = capture_of("qos-mismatch-2ns");
-    // Before the participants leave.
+    // A point in time before the participants leave.
     let goodbye = 1_795_142_070_000_000_000;
     let robot = Robot::at(&capture, goodbye, "/chatter_be");
     let topic = robot.get("/topics/chatter_be");
@@ -401,8 +402,8 @@ fn a_mismatch_of_real_participants_is_named_in_the_topic_and_as_a_metric() {
 }
 
 #[test]
-fn each_answer_reads_as_its_type_and_writes_the_same_again() {
-    // Before the participants leave.
+fn each_answer_is_read_as_its_type_and_serializes_to_the_same_json() {
+    // A point in time before the participants leave.
     let goodbye = 1_795_142_070_000_000_000;
     let robot = Robot::at(&capture_of("qos-mismatch-2ns"), goodbye, "/**");
     let topics: TopicList<'_> = read_as(&robot.get("/topics"));
@@ -485,19 +486,19 @@ fn read_all(robot: &Robot) {
 #[test]
 fn a_topic_in_shared_memory_is_not_reported_as_silent() {
     let capture = capture_of("fastrtps-default/samehost-any");
-    // The time before the first goodbye.
+    // A point in time before the first participant leaves.
     let goodbye = 1_795_142_305_000_000_000;
     let robot = Robot::at(&capture, goodbye, "/**");
     let topic = robot.get("/topics/chatter");
     let passages = topic["passages"].as_array().unwrap();
     assert_eq!(passages[0]["passage"], "shared_memory", "{topic}");
-    // A capture has nothing of it.
+    // A capture contains no traffic of shared memory.
     assert_eq!(passages[0]["view"], "none", "{topic}");
     assert_eq!(topic["reasons"][0]["code"], "shared_memory", "{topic}");
 }
 
 #[test]
-fn a_thousand_topics_are_listed_at_once() {
+fn a_thousand_topics_are_listed_within_seconds() {
     let mut file = tempfile::NamedTempFile::with_suffix(".pcap").unwrap();
     std::io::Write::write_all(&mut file, &large_robot(1000)).unwrap();
     let robot = Robot::of(file.into_temp_path(), "/**");
@@ -507,7 +508,7 @@ fn a_thousand_topics_are_listed_at_once() {
         let took = began.elapsed();
         println!("{path}: {took:?} for {} bytes", answer.body.len());
         assert_eq!(answer.status, 200);
-        // Without optimizations, on a machine that is busy with other tests.
+        // The limit allows for a build without optimizations and for other tests on the machine.
         assert!(took < Duration::from_secs(5), "{path}: {took:?}");
     }
     let topics = robot.get("/topics");
@@ -520,7 +521,7 @@ fn a_thousand_topics_are_listed_at_once() {
     assert!(detail.contains("did you mean /topic_0999"), "{detail}");
 }
 
-/// A capture in which a participant announces a writer and a reader for each of so many topics.
+/// Returns a capture in which a participant announces a writer and a reader for each topic.
 fn large_robot(topics: u32) -> Vec<u8> {
     const START: u64 = 1_795_143_000;
     let prefix = GuidPrefix(*b"\x01\x10large-host");

@@ -1,4 +1,4 @@
-//! The broker under hostile clients, and with processes that never answer.
+//! The broker with hostile clients, and with processes whose memory cannot be read.
 
 use std::fs::{self, File};
 use std::io::{BufRead as _, BufReader, IoSlice};
@@ -21,8 +21,8 @@ use tempfile::TempDir;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// Maps the file that is named first, as its library. The second argument `stuck` lets reads of its
-/// environment wait without end (userfaultfd(2)).
+/// Maps the file of the first argument as a library. With the second argument `stuck`, reads of its
+/// environment block forever (userfaultfd(2)).
 const PROCESS: &str = r#"
 import ctypes, mmap, platform, struct, sys
 libc = ctypes.CDLL(None, use_errno=True)
@@ -46,7 +46,7 @@ print("ready", flush=True)
 sys.stdin.read()
 "#;
 
-/// A broker at a socket of its own.
+/// A broker with its own socket.
 struct Running {
     child: Child,
     socket: PathBuf,
@@ -109,7 +109,7 @@ impl Running {
         }
     }
 
-    /// Returns the resident kilobytes of the broker and of its connections.
+    /// Returns the resident memory of the broker and of the processes of its connections, in kB.
     fn memory(&self) -> u64 {
         let own = self.child.id();
         let children = fs::read_to_string(format!("/proc/{own}/task/{own}/children")).unwrap();
@@ -198,7 +198,7 @@ fn send(socket: &OwnedFd, bytes: &[u8], descriptors: &[BorrowedFd<'_>]) -> rusti
     .map(drop)
 }
 
-/// Returns the next answer; `None` if the broker closed the connection.
+/// Returns the next answer, or `None` if the broker has closed the connection.
 fn receive(socket: &OwnedFd) -> Option<Value> {
     let mut bytes = vec![0; MAX_PACKET];
     let (length, _) = recv(socket, &mut bytes[..], RecvFlags::empty()).ok()?;
@@ -212,9 +212,10 @@ fn refusal<T: std::fmt::Debug>(answer: Result<T, BrokerError>) -> String {
     }
 }
 
-/// The kernel reads an environment only as far as nothing must answer (CVE-2018-1120).
+/// The kernel reads an environment only up to a page that a process would have to supply
+/// (CVE-2018-1120).
 #[test]
-fn an_environment_that_never_answers_delays_nothing() {
+fn an_environment_whose_read_blocks_delays_no_request() {
     let running = Running::start();
     let library = running.library("libtracetools.so");
     fs::write(&library, vec![0; 4096]).unwrap();
@@ -255,7 +256,7 @@ fn processes_with_a_library_are_listed_with_name_and_domain_and_others_are_not_r
     assert_eq!(state.len(), 1);
     assert!(state[0].name.starts_with("python3"), "{state:?}");
     assert_eq!(broker.domain(process.id()).unwrap(), Some(42));
-    // The environment of other processes is none of the agent's business.
+    // The agent must not read the environment of other processes.
     assert_eq!(broker.domain(own).unwrap(), None);
 }
 
@@ -269,13 +270,13 @@ fn only_the_agents_user_and_root_may_connect() {
         .unwrap();
     let agent: u32 = line.split(':').nth(2).unwrap().parse().unwrap();
     let socket = &running.socket;
-    // The files of the socket must not decide.
+    // File permissions must not decide who may connect.
     let open = std::os::unix::fs::PermissionsExt::from_mode(0o755);
     fs::set_permissions(running.directory.path(), open).unwrap();
     let asks = |user: u32| {
         std::thread::scope(|scope| {
             let asking = scope.spawn(move || {
-                // SAFETY: changes the user of this thread alone.
+                // SAFETY: changes the user of this thread only.
                 let changed = unsafe { libc::syscall(libc::SYS_setresuid, user, user, user) };
                 assert_eq!(changed, 0);
                 Broker::at(socket).processes().is_ok()
@@ -290,7 +291,7 @@ fn only_the_agents_user_and_root_may_connect() {
 }
 
 #[test]
-fn a_hostile_client_gets_nothing_beyond_the_closed_list() {
+fn requests_of_a_hostile_client_outside_the_closed_list_are_refused() {
     let mut running = Running::start();
     let (elf, tracing) = (running.library("huge"), running.library("libtracetools.so"));
     fs::write(&tracing, vec![0; 4096]).unwrap();
@@ -337,7 +338,7 @@ fn a_hostile_client_gets_nothing_beyond_the_closed_list() {
             "{reason}"
         );
     }
-    // The library of one kind is none of the other, and a descriptor is not a program.
+    // A library of one kind is refused as the other kind, and a descriptor is not a program.
     let reason = attach(
         &mut broker,
         Calls::SharedMemory,
@@ -363,7 +364,7 @@ fn a_hostile_client_gets_nothing_beyond_the_closed_list() {
     ));
     assert!(reason.contains("BPF programs"), "{reason}");
 
-    // Packets that are no requests end their connection alone.
+    // A packet that is not a request ends only its own connection.
     for bytes in [
         &b"x"[..],
         b"{}",
@@ -387,7 +388,7 @@ fn a_hostile_client_gets_nothing_beyond_the_closed_list() {
 }
 
 #[test]
-fn ten_thousand_requests_and_clients_that_never_read_leave_the_broker_as_it_was() {
+fn ten_thousand_requests_and_clients_that_never_read_leave_the_memory_unchanged() {
     let running = Running::start();
     let before = running.memory();
     let mut broker = running.client();
@@ -410,7 +411,7 @@ fn ten_thousand_requests_and_clients_that_never_read_leave_the_broker_as_it_was(
         sending.join().unwrap();
     });
     println!("{requests} requests took {:.1?}", began.elapsed());
-    // A client that never reads is given up, while another one is answered.
+    // The broker gives up clients that never read, and another client is still answered.
     let deaf: Vec<_> = (0..3).map(|_| running.raw()).collect();
     for socket in &deaf {
         set_socket_timeout(socket, Timeout::Send, Some(Duration::from_millis(500))).unwrap();
@@ -425,7 +426,7 @@ fn ten_thousand_requests_and_clients_that_never_read_leave_the_broker_as_it_was(
         began.elapsed()
     );
     drop(deaf);
-    // More connections than there is room for wait, and none is lost.
+    // Connections beyond the maximum number wait, and none is lost.
     drop((broker, socket));
     let many: Vec<_> = (0..16).map(|_| running.raw()).collect();
     for socket in many {
@@ -442,7 +443,7 @@ fn ten_thousand_requests_and_clients_that_never_read_leave_the_broker_as_it_was(
 }
 
 #[test]
-fn without_a_socket_or_beside_another_broker_it_ends_with_one_clear_line() {
+fn without_a_socket_or_beside_another_broker_the_broker_ends_with_a_clear_error() {
     let running = Running::start();
     let run = |command: &mut Command| {
         let output = command.stdin(Stdio::null()).output().unwrap();

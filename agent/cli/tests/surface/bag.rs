@@ -1,4 +1,4 @@
-//! `rp bag`: captures made into bags, and what it prints of real ones.
+//! `rp bag`: captures that are converted to bags, and the output for real bags.
 
 mod captures;
 mod real;

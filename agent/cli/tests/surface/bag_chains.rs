@@ -1,4 +1,4 @@
-//! `rp chain` over bags made of a capture, in both storages, and over damaged ones.
+//! `rp chain` over bags that are made of a capture, in both storage formats, and over damaged bags.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -26,7 +26,7 @@ struct Recorded {
     data: Vec<u8>,
 }
 
-/// Makes a bag of the capture.
+/// Converts the capture to a bag.
 fn converted(directory: &Path) -> PathBuf {
     let bag = directory.join("drive");
     let capture = repository(CAPTURE);
@@ -51,7 +51,7 @@ fn recorded(bag: &Path) -> Vec<Recorded> {
     all
 }
 
-/// Writes an MCAP file of these messages.
+/// Writes an MCAP file with these messages.
 fn mcap(path: &Path, messages: &[Recorded]) {
     let file = fs::File::create(path).unwrap();
     let mut writer = mcap::Writer::new(std::io::BufWriter::new(file)).unwrap();
@@ -78,7 +78,7 @@ fn mcap(path: &Path, messages: &[Recorded]) {
     writer.finish().unwrap();
 }
 
-/// Writes a bag in the sqlite3 storage of these messages.
+/// Writes a bag in sqlite3 storage with these messages.
 fn sqlite3(directory: &Path, messages: &[Recorded]) -> PathBuf {
     let bag = directory.join("lite");
     let mut python = Command::new(repository("target/tools/bags/bin/python"))
@@ -147,26 +147,26 @@ fn temporary() -> TempDir {
 }
 
 #[test]
-fn a_bag_has_the_hops_of_the_capture_it_was_made_of() {
+fn a_bag_has_the_same_hops_as_its_capture() {
     let directory = temporary();
     let bag = converted(directory.path());
     let (of_bag, of_capture) = (answer(&bag, &[]), answer(&repository(CAPTURE), &[]));
-    // Both use the source timestamps.
+    // Both use source timestamps.
     assert_eq!(of_bag["times"], "publish");
     assert_near(&of_bag, &of_capture, 20e-6);
     let count = |answer: &Value| answer["chains"][0]["messages"].as_u64().unwrap();
-    // The first matches of a capture are evidence only.
+    // The first matches in a capture are only evidence of a chain, and are not measured.
     assert!((0..=5).contains(&(count(&of_bag) - count(&of_capture))));
     assert_eq!(of_bag["chains"][0]["domain_id"], Value::Null);
     assert_eq!(of_bag["faults"], json!([]));
-    // One file, and a part of the chain.
+    // A single file, and a part of the chain.
     let file = bag.join("drive_0.mcap");
     let part = answer(&file, &["/filtered", "/cmd"]);
     assert_eq!(hops(&part)[0], hops(&of_bag)[1]);
 }
 
 #[test]
-fn the_text_names_topics_without_nodes_and_the_times() {
+fn the_text_has_topics_and_the_kind_of_times_but_no_nodes() {
     let directory = temporary();
     let output = ask(&converted(directory.path()), &[]);
     let text = stdout(&output);
@@ -183,14 +183,14 @@ fn the_text_names_topics_without_nodes_and_the_times() {
 }
 
 #[test]
-fn bags_without_times_of_publication_use_those_of_the_recorder() {
+fn bags_without_publish_times_are_measured_by_log_times() {
     let directory = temporary();
     let bag = converted(directory.path());
     let of_bag = answer(&bag, &[]);
     let mut messages = recorded(&bag);
     let lite = answer(&sqlite3(directory.path(), &messages), &[]);
     for message in &mut messages {
-        // As rosbag2 of Humble does.
+        // rosbag2 of Humble does the same.
         message.publish_time = message.log_time;
     }
     let file = directory.path().join("humble.mcap");
@@ -198,7 +198,7 @@ fn bags_without_times_of_publication_use_those_of_the_recorder() {
     let humble = answer(&file, &[]);
     for found in [&lite, &humble] {
         assert_eq!(found["times"], "log");
-        // The difference is the transport of a message.
+        // The difference is the transport time of a message.
         assert_near(found, &of_bag, 500e-6);
     }
     assert_eq!(hops(&lite), hops(&humble));
@@ -231,7 +231,7 @@ fn a_topic_with_new_stamps_ends_the_chain() {
 }
 
 #[test]
-fn a_step_of_the_clock_leaves_the_medians() {
+fn a_step_of_the_clock_does_not_change_the_medians() {
     let directory = temporary();
     let bag = converted(directory.path());
     let of_bag = answer(&bag, &[]);
@@ -247,7 +247,7 @@ fn a_step_of_the_clock_leaves_the_medians() {
 }
 
 #[test]
-fn a_truncated_bag_shows_what_precedes_the_cut() {
+fn a_truncated_bag_is_read_up_to_the_cut() {
     let directory = temporary();
     let bag = converted(directory.path());
     let lite = sqlite3(directory.path(), &recorded(&bag));

@@ -1,4 +1,5 @@
-//! Fixed caps of docs/limits-*.md, driven over from outside; others have a test beside the constant.
+//! Fixed caps of docs/limits-*.md that can be exceeded from outside. Tests of the other caps are
+//! beside their constants.
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -84,7 +85,7 @@ impl World {
         self.put(Message::from(guid.prefix).data(by, number, &payload));
     }
 
-    /// A participant announces this many nodes.
+    /// Announces this number of nodes of a participant.
     fn nodes(&mut self, prefix: GuidPrefix, count: u32) {
         let names: Vec<_> = (0..count).map(|number| format!("n{number:0200}")).collect();
         let guid = Guid::new(prefix, entity(1, 3));
@@ -101,7 +102,7 @@ impl World {
         self.observer.input(Input::Time(Timestamp(self.now)));
     }
 
-    /// Entries and what was refused or given up of a table.
+    /// Returns the number of entries of a table, and the number of evictions.
     fn table(&self, name: &str) -> (usize, u64) {
         let tables = self.observer.snapshot(Timestamp(self.now)).tables;
         let table = tables.iter().find(|table| table.table == name).unwrap();
@@ -136,7 +137,7 @@ fn nodes_beyond_the_cap_are_left_out() {
 }
 
 #[test]
-fn nodes_of_unknown_participants_keep_within_their_bytes() {
+fn nodes_of_unknown_participants_do_not_exceed_the_cap_in_bytes() {
     let mut world = World::new();
     for number in 0..100 {
         world.nodes(prefix(number), 200);
@@ -164,7 +165,7 @@ fn findings_of_one_kind_beyond_the_cap_are_left_out() {
 }
 
 #[test]
-fn acknowledging_readers_beyond_the_page_s_cap_are_counted_as_not_shown() {
+fn acknowledging_readers_beyond_the_cap_of_the_metrics_page_are_counted_as_not_shown() {
     let mut world = World::new();
     world.participant(prefix(1));
     let writers = [1, 2, 3].map(|number| Guid::new(prefix(1), entity(number, 3)));
@@ -198,7 +199,7 @@ fn acknowledging_readers_beyond_the_page_s_cap_are_counted_as_not_shown() {
 }
 
 #[test]
-fn unknown_writers_beyond_the_page_s_cap_are_in_the_sum_alone() {
+fn unknown_writers_beyond_the_cap_of_the_metrics_page_are_only_in_the_sum() {
     let mut world = World::new();
     for number in 0..60 {
         for sample in 1..=50 {
@@ -219,14 +220,14 @@ fn unknown_writers_beyond_the_page_s_cap_are_in_the_sum_alone() {
     assert_eq!((all, shown), (60.0, 32));
 }
 
-/// A file of so many zeros, which take no room.
+/// Creates a file of zeros with this length, which takes no space on the disk.
 fn zeros(path: &Path, length: u64) -> String {
     File::create(path).unwrap().set_len(length).unwrap();
     path.to_str().unwrap().to_owned()
 }
 
 #[test]
-fn files_of_more_bytes_than_are_read_are_refused() {
+fn files_above_the_maximum_size_are_refused() {
     let directory = tempfile::tempdir().unwrap();
     let configuration = zeros(&directory.path().join("ros2probe.yaml"), (1 << 20) + 1);
     let bag = directory.path().join("bag");
@@ -247,7 +248,7 @@ fn files_of_more_bytes_than_are_read_are_refused() {
 }
 
 #[test]
-fn more_snapshots_than_may_be_configured_are_refused() {
+fn snapshots_beyond_the_cap_of_the_configuration_are_refused() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("ros2probe.yaml");
     let check = |count: usize| {
@@ -268,7 +269,7 @@ fn more_snapshots_than_may_be_configured_are_refused() {
 }
 
 #[test]
-fn more_chains_than_may_be_configured_are_refused() {
+fn chains_beyond_the_cap_of_the_configuration_are_refused() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("ros2probe.yaml");
     let check = |count: usize| {
@@ -287,7 +288,7 @@ fn more_chains_than_may_be_configured_are_refused() {
 }
 
 #[test]
-fn an_api_request_beyond_its_caps_is_refused_with_the_status_of_each() {
+fn an_api_request_beyond_a_cap_is_refused_with_the_status_of_that_cap() {
     let agent = LocalAgent::start(&mut rp(), &["--speed", "0.2"]);
     let list = "a".repeat(16_385);
     let (status, problem) = ask(agent.api, "GET", &format!("/samples?topic={list}"), "");
@@ -299,7 +300,7 @@ fn an_api_request_beyond_its_caps_is_refused_with_the_status_of_each() {
     );
     let mut stream = TcpStream::connect(agent.api).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    // The agent may close before it has read all.
+    // The agent may close the connection before it has read everything.
     let _ = stream.write_all(request.as_bytes());
     let mut answer = String::new();
     let _ = stream.read_to_string(&mut answer);
@@ -318,7 +319,7 @@ fn streams_of_events_beyond_the_cap_are_refused_until_one_ends() {
         stream.read_exact(&mut answer).unwrap();
         (String::from_utf8_lossy(&answer).into_owned(), stream)
     };
-    // A quarter of the 16 places is for clients with a token.
+    // A quarter of the 16 streams is reserved for clients with a token.
     let mut open: Vec<_> = (0..12).map(|_| stream()).collect();
     assert!(open.iter().all(|(answer, _)| answer == "HTTP/1.1 200"));
     assert_eq!(stream().0, "HTTP/1.1 503");
@@ -330,7 +331,7 @@ fn streams_of_events_beyond_the_cap_are_refused_until_one_ends() {
 }
 
 #[test]
-fn of_recordings_that_ended_the_latest_are_listed() {
+fn only_the_latest_ended_recordings_are_listed() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("ros2probe.yaml");
     let bags = directory.path().join("bags");
@@ -343,7 +344,8 @@ fn of_recordings_that_ended_the_latest_are_listed() {
         &mut rp(),
         &["--speed", "0.2", "--config", file.to_str().unwrap()],
     );
-    // One that ends waits for what was sent before: four of them do so at once.
+    // A recording that ends waits for packets that were sent before. Four recordings end
+    // simultaneously.
     for first in (0..20).step_by(4) {
         let numbers = first..first + 4;
         for number in numbers.clone() {
@@ -369,7 +371,7 @@ fn of_recordings_that_ended_the_latest_are_listed() {
 }
 
 #[test]
-fn a_snapshot_is_not_written_while_its_bags_take_what_they_may() {
+fn a_snapshot_is_not_written_while_its_bags_have_their_maximum_size() {
     let directory = tempfile::tempdir().unwrap();
     let bags = directory.path().join("bags");
     let old = bags.join("last_rosbag2_2020_01_01");

@@ -49,7 +49,7 @@ fn a_part_of_a_chain_has_its_own_latency() {
 }
 
 #[test]
-fn a_chain_that_is_not_there_is_refused_in_one_line() {
+fn a_missing_chain_is_reported_in_one_line() {
     let output = ask(&["/cmd", "/points"]);
     assert_eq!(output.status.code(), Some(1));
     let reason = "no chain from /cmd to /points: ";
@@ -58,7 +58,7 @@ fn a_chain_that_is_not_there_is_refused_in_one_line() {
 }
 
 #[test]
-fn a_name_without_a_slash_is_absolute_and_no_name_is_refused() {
+fn a_name_without_a_slash_is_absolute_and_an_invalid_name_is_refused() {
     let named = stdout(&ask(&["points", "cmd"]));
     assert_eq!(named, stdout(&ask(&["/points", "/cmd"])));
     for (name, reason) in [

@@ -1,4 +1,4 @@
-//! The command line: what it answers, how it fails, how it ends.
+//! The command line: its output, its errors, and its end.
 
 use std::fs::Permissions;
 use std::net::TcpListener;
@@ -25,7 +25,8 @@ fn file(directory: &tempfile::TempDir, name: &str, text: &str) -> PathBuf {
     path
 }
 
-/// One line, no backtrace, and this exit code.
+/// Asserts that a command fails with one line that has these parts, without a backtrace, and with
+/// this exit code.
 fn fails_with(output: &Output, code: i32, parts: &[&str]) {
     let said = stderr(output);
     assert_eq!(output.status.code(), Some(code), "{said}");
@@ -87,7 +88,7 @@ fn missing_files_are_named() {
 }
 
 #[test]
-fn a_busy_port_is_named_with_the_key_that_moves_it() {
+fn a_busy_port_is_reported_with_the_key_that_changes_it() {
     let busy = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = busy.local_addr().unwrap().to_string();
     let capture = capture();
@@ -116,8 +117,8 @@ fn a_busy_port_is_named_with_the_key_that_moves_it() {
 }
 
 #[test]
-fn without_privilege_the_missing_capabilities_and_the_command_are_named() {
-    // The build directory may be closed to others.
+fn without_privileges_the_error_has_the_missing_capabilities_and_the_command() {
+    // The build directory may not be readable for other users.
     let directory = tempfile::tempdir().unwrap();
     let program = directory.path().join("rp");
     std::fs::copy(env!("CARGO_BIN_EXE_rp"), &program).unwrap();
@@ -142,7 +143,7 @@ fn without_privilege_the_missing_capabilities_and_the_command_are_named() {
 }
 
 #[test]
-fn a_report_is_the_metrics_page_and_nothing_else() {
+fn a_report_consists_of_the_metrics_page() {
     let capture = capture();
     let output = run(&[
         "run",
@@ -200,7 +201,7 @@ fn a_cut_capture_is_reported_up_to_the_cut_and_fails() {
 }
 
 #[test]
-fn options_that_make_no_sense_are_refused() {
+fn invalid_options_are_refused_with_a_reason() {
     for (arguments, message) in [
         (&["run", "--report"][..], "--replay"),
         (&["run", "--watch", "points"], "must begin with a slash"),
@@ -220,7 +221,7 @@ fn options_that_make_no_sense_are_refused() {
 }
 
 #[test]
-fn the_version_is_the_package_s() {
+fn the_printed_version_equals_the_version_of_the_package() {
     let output = run(&["--version"]);
     let version = concat!("rp ", env!("CARGO_PKG_VERSION"), "\n");
     assert_eq!(String::from_utf8(output.stdout).unwrap(), version);
@@ -240,7 +241,7 @@ fn a_signal_ends_the_agent_in_order_and_is_logged() {
 }
 
 #[test]
-fn the_service_manager_hears_of_start_progress_reload_and_stop() {
+fn the_service_manager_is_notified_of_start_progress_reload_and_stop() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("notify");
     let socket = UnixDatagram::bind(&path).unwrap();
@@ -270,7 +271,7 @@ fn the_service_manager_hears_of_start_progress_reload_and_stop() {
 }
 
 #[test]
-fn a_pipe_in_place_of_a_file_is_refused_at_once() {
+fn a_pipe_in_place_of_a_file_is_refused_without_waiting() {
     let directory = tempfile::tempdir().unwrap();
     let pipe = |name: &str| {
         let path = directory.path().join(name);
@@ -314,7 +315,7 @@ fn a_pipe_in_place_of_a_file_is_refused_at_once() {
     }
 }
 
-/// Runs it; kills it when it takes longer.
+/// Runs a command, and kills it if it takes longer.
 fn within(mut command: Command, most: Duration) -> (Output, Duration) {
     let begin = Instant::now();
     command.stdout(Stdio::piped()).stderr(Stdio::piped());

@@ -12,8 +12,8 @@ fn shipped(name: &str) -> String {
     std::fs::read_to_string(path).unwrap()
 }
 
-/// The shipped file with every commented default switched on: a comment mark that is followed by
-/// a key, at the indentation of its section.
+/// Returns the shipped file with every commented default active. A default is a comment that begins
+/// with a key, at the indentation of its section.
 fn uncommented(yaml: &str) -> String {
     let line = |line: &str| match line.split_once("# ") {
         Some((indentation, rest))
@@ -34,7 +34,7 @@ fn uncommented(yaml: &str) -> String {
 }
 
 #[test]
-fn the_checked_in_schema_is_the_generated_one() {
+fn the_schema_in_the_repository_equals_the_generated_one() {
     let generated = serde_json::to_string_pretty(&Config::schema()).unwrap() + "\n";
     if std::env::var_os("UPDATE_SCHEMA").is_some() {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/ros2probe.schema.json");
@@ -66,7 +66,7 @@ fn the_shipped_file_measures_everything_and_changes_nothing_else() {
 }
 
 #[test]
-fn the_defaults_in_the_comments_are_the_defaults() {
+fn the_defaults_in_the_comments_equal_those_of_the_code() {
     let yaml = uncommented(&shipped("ros2probe.yaml"));
     for key in [
         "source",
@@ -144,7 +144,8 @@ fn the_schema_accepts_what_the_agent_accepts_and_refuses_what_it_refuses() {
     }
 }
 
-/// Each number of the schema with a bound: its path, and the bound.
+/// Finds each number of the schema with a bound. An entry has its path, the bound, and the step
+/// beyond the bound.
 fn bounds(schema: &Value, root: &Value, path: &str, found: &mut Vec<(String, f64, f64)>) {
     if let Some(name) = schema["$ref"].as_str() {
         let name = name.trim_start_matches("#/$defs/");
@@ -168,7 +169,7 @@ fn bounds(schema: &Value, root: &Value, path: &str, found: &mut Vec<(String, f64
     }
 }
 
-/// A file that sets this one key, with what the places around it need.
+/// Returns a file that sets only this key, with the keys that the enclosing objects require.
 fn with_key(path: &str, value: f64) -> String {
     let mut text = value.to_string();
     for part in path.rsplit('.') {
@@ -202,7 +203,7 @@ fn with_key(path: &str, value: f64) -> String {
 }
 
 #[test]
-fn every_bound_of_the_schema_is_the_agents_and_the_next_value_is_refused() {
+fn the_agent_accepts_every_bound_of_the_schema_and_refuses_the_next_value() {
     let schema: Value = serde_json::from_str(&shipped("ros2probe.schema.json")).unwrap();
     let mut found = Vec::new();
     bounds(&schema, &schema, "", &mut found);
@@ -210,7 +211,7 @@ fn every_bound_of_the_schema_is_the_agents_and_the_next_value_is_refused() {
     for (path, bound, step) in found {
         let read = |value: f64| Config::parse(with_key(&path, value).as_bytes());
         if let Err(error) = read(bound) {
-            // Several keys may not fit together at their bounds.
+            // Several keys may not be valid together at their bounds.
             panic!("{}: {}", with_key(&path, bound), error.report("file"));
         }
         let beyond = bound + step;
@@ -219,7 +220,7 @@ fn every_bound_of_the_schema_is_the_agents_and_the_next_value_is_refused() {
 }
 
 #[test]
-fn limits_are_generous_for_a_robot_and_small_for_a_storm() {
+fn default_limits_suffice_for_a_large_robot() {
     let Limits {
         participants,
         endpoints,

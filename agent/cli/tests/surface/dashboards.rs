@@ -1,6 +1,6 @@
 //! The shipped Grafana dashboards: Grafana's own types accept the files, and every panel has a unit
-//! and a description. No data source is fixed, and queries use existing metrics as their type
-//! requires.
+//! and a description. No data source is fixed, and each query uses existing metrics according to
+//! their type.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -11,7 +11,7 @@ use ros2probe_metrics::catalogue::{CATALOGUE, Kind};
 use ros2probe_testing::dashboard::{self, DATA_SOURCE, Dashboard, Panel, list, resolved, text};
 use serde_json::{Value, json};
 
-/// A separate window, because the sentence beneath the panel names it.
+/// Windows of panels whose description names the window.
 const OTHER_WINDOWS: [(&str, &str); 1] = [("Matched but without messages", "[5m]")];
 
 #[test]
@@ -40,7 +40,7 @@ fn every_panel_has_a_title_a_unit_and_a_description_in_sentences() -> Result<()>
 }
 
 #[test]
-fn the_data_source_is_a_variable_everywhere() -> Result<()> {
+fn every_data_source_is_a_variable() -> Result<()> {
     let wanted = json!({"type": "prometheus", "uid": DATA_SOURCE});
     for dashboard in dashboard::all()? {
         let first = dashboard.json.pointer("/templating/list/0");
@@ -63,7 +63,7 @@ fn the_data_source_is_a_variable_everywhere() -> Result<()> {
 }
 
 #[test]
-fn dashboards_are_not_edited_in_grafana_and_their_panels_do_not_overlap() -> Result<()> {
+fn dashboards_are_not_editable_in_grafana_and_their_panels_do_not_overlap() -> Result<()> {
     for dashboard in dashboard::all()? {
         let Dashboard { file, json, .. } = &dashboard;
         ensure!(json["editable"] == false, "{file} is editable");
@@ -155,7 +155,7 @@ fn every_metric_and_recorded_series_in_a_panel_exists() -> Result<()> {
 }
 
 #[test]
-fn every_variable_in_an_expression_is_one_of_the_dashboard_or_of_grafana() -> Result<()> {
+fn every_variable_in_an_expression_belongs_to_the_dashboard_or_to_grafana() -> Result<()> {
     for dashboard in dashboard::all()? {
         let own = list(&dashboard.json, "/templating/list").iter();
         let names = own.map(|variable| text(variable, "/name"));
@@ -178,14 +178,14 @@ fn every_variable_in_an_expression_is_one_of_the_dashboard_or_of_grafana() -> Re
 }
 
 #[test]
-fn grafana_s_types_accept_the_dashboards_and_nothing_that_is_wrong() -> Result<()> {
+fn grafana_s_types_accept_the_dashboards_and_reject_mistakes() -> Result<()> {
     let dashboards = dashboard::all()?;
     let mut files: Vec<(String, String)> = Vec::new();
     for Dashboard { file, text, .. } in &dashboards {
         files.push((file.clone(), text.clone()));
     }
-    // The types reject an unknown key, an unknown word of an enumeration, an option of another
-    // panel type, and a target without an expression.
+    // The types reject an unknown key, an unknown enumeration value, an option of another panel
+    // type, and a target without an expression.
     let text = &dashboards.first().context("no dashboards")?.text;
     let mistakes = [
         ("\"editable\"", "\"editible\""),
@@ -261,7 +261,7 @@ fn type_check(files: &[(String, String)]) -> Result<String> {
     let compiler = tools.join("node_modules/typescript/bin/tsc");
     ensure!(compiler.exists(), MISSING);
     let compiler = compiler.canonicalize()?;
-    // A directory below npm's, where the compiler finds Grafana's types.
+    // The directory is below npm's directory, so that the compiler finds Grafana's types.
     let directory = tempfile::tempdir_in(&tools)?;
     let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/dashboard/types");
     for file in ["dashboard.ts", "tsconfig.json"] {
@@ -285,7 +285,7 @@ fn type_check(files: &[(String, String)]) -> Result<String> {
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// Every series name of the catalogue, those of histograms being counters.
+/// Returns every series name of the catalogue with its kind. Series of histograms are counters.
 fn kinds() -> BTreeMap<String, Kind> {
     let mut kinds = BTreeMap::new();
     for metric in CATALOGUE {
@@ -300,7 +300,7 @@ fn kinds() -> BTreeMap<String, Kind> {
     kinds
 }
 
-/// The names in an expression, each with the text before and after it.
+/// Returns the names in an expression, each with the text before and after it.
 fn words(expression: &str) -> Vec<(&str, &str, &str)> {
     let named = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | ':');
     let mut words = Vec::new();

@@ -1,5 +1,5 @@
-//! The conversation of `rp discover`, without a network: against what real participants answered,
-//! and against answers that are lost, late, doubled, cut or forged.
+//! The conversation of `rp discover`, without a network. The answers are those of real
+//! participants, or answers that are lost, late, duplicated, truncated or forged.
 
 use std::collections::BTreeSet;
 use std::net::{Ipv4Addr, SocketAddrV4};
@@ -20,9 +20,9 @@ use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 
 const START: u64 = 5_000 * MILLISECOND;
-/// A conversation takes no longer, and a tick.
+/// Maximum duration of a conversation, and one tick, in nanoseconds.
 const LIMIT: u64 = 3_100 * MILLISECOND;
-/// Addresses of discovery and of the participant's other endpoints in these tests.
+/// Addresses of the participant for discovery and for its other endpoints in these tests.
 const METATRAFFIC: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 99, 0, 1), 7410);
 const DEFAULT: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 99, 0, 1), 7411);
 
@@ -30,7 +30,7 @@ const DEFAULT: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 99, 0, 1), 741
 struct Recording {
     speaker: LocalParticipant,
     target: Target,
-    /// Nanoseconds since the first packet, and the datagram.
+    /// Time since the first packet, in nanoseconds, and the datagram.
     sent: Vec<(u64, Vec<u8>)>,
     received: Vec<(u64, Vec<u8>)>,
 }
@@ -53,7 +53,8 @@ impl Recording {
                 _ => received.push((time, bytes)),
             }
         }
-        // Its GUID prefix, and the address in its PID_METATRAFFIC_UNICAST_LOCATOR.
+        // The introduction has the GUID prefix of the sender, and its address in
+        // PID_METATRAFFIC_UNICAST_LOCATOR.
         let introduction = &sent[0].1;
         let locator = [0x32, 0, 24, 0, 1, 0, 0, 0];
         let place = introduction
@@ -88,7 +89,7 @@ impl Recording {
         Session::new(self.speaker, self.target, true)
     }
 
-    /// Plays these answers to a session, each at its time; what it sent and when.
+    /// Delivers each answer to a session at its time. Returns the sent packets with their times.
     fn play(&self, session: &mut Session, answers: &[(u64, Vec<u8>)]) -> Vec<(u64, Outgoing)> {
         let mut answers = answers.to_vec();
         answers.sort_by_key(|(time, _)| *time);
@@ -130,7 +131,7 @@ fn assert_is_polite(session: &Session, recording: &Recording, outgoing: &[(u64, 
             vec![METATRAFFIC, DEFAULT]
         };
         assert!(to.contains(&packet.to));
-        // INFO_DST: other participants at that address ignore the message.
+        // INFO_DST makes other participants at that address ignore the message.
         assert_eq!(packet.bytes[24..36], recording.target.prefix.0);
     }
 }
@@ -141,7 +142,7 @@ fn names(session: &Session) -> BTreeSet<String> {
 }
 
 #[test]
-fn real_participants_are_asked_with_the_packets_that_worked_and_tell_everything() {
+fn real_participants_get_the_recorded_packets_and_announce_all_endpoints() {
     for recording in Recording::both() {
         let mut session = recording.session();
         let outgoing = recording.play(&mut session, &recording.received);
@@ -165,7 +166,7 @@ fn real_participants_are_asked_with_the_packets_that_worked_and_tell_everything(
 }
 
 #[test]
-fn without_nodes_one_packet_less_is_sent_and_no_reader_introduced() {
+fn without_nodes_one_packet_less_is_sent_and_no_reader_is_announced() {
     for recording in Recording::both() {
         let mut session = Session::new(recording.speaker, recording.target, false);
         let outgoing = recording.play(&mut session, &recording.received);
@@ -183,7 +184,7 @@ fn without_nodes_one_packet_less_is_sent_and_no_reader_introduced() {
 }
 
 #[test]
-fn silence_is_answered_with_one_more_introduction_and_a_goodbye() {
+fn silence_leads_to_one_more_introduction_and_a_goodbye() {
     let [recording, _] = Recording::both();
     let mut session = recording.session();
     let outgoing = recording.play(&mut session, &[]);
@@ -196,9 +197,9 @@ fn silence_is_answered_with_one_more_introduction_and_a_goodbye() {
 }
 
 #[test]
-fn a_participant_that_announces_without_end_costs_no_more_packets() {
+fn a_participant_with_endless_announcements_gets_no_more_packets() {
     for recording in Recording::both() {
-        // HEARTBEATs for ever more samples, without the samples.
+        // HEARTBEATs announce more and more samples, but no sample follows.
         let heartbeat = |last: u32| {
             let mut bytes = [b"RTPS\x02\x03\x01\x10", &recording.target.prefix.0[..]].concat();
             for writer in [
@@ -224,7 +225,7 @@ fn a_participant_that_announces_without_end_costs_no_more_packets() {
 }
 
 #[test]
-fn announcements_without_end_fill_no_table_beyond_its_cap() {
+fn endless_announcements_fill_no_table_beyond_its_cap() {
     let recording = Recording::read("fastdds.txt");
     let mut session = recording.session();
     let now = Timestamp(START);
@@ -251,7 +252,7 @@ fn announcements_without_end_fill_no_table_beyond_its_cap() {
 }
 
 #[test]
-fn packets_of_other_participants_are_not_trusted() {
+fn packets_of_other_participants_are_ignored() {
     for recording in Recording::both() {
         let mut forged = recording.received.clone();
         for (_, bytes) in &mut forged {
@@ -329,9 +330,9 @@ fn participants_with_dds_security_or_without_an_address_are_not_contacted() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Answers are lost, doubled, late, cut and changed.
+    /// Answers are lost, duplicated, delayed, truncated and changed.
     #[test]
-    fn whatever_is_answered_few_packets_are_sent_and_the_participant_leaves(
+    fn any_answers_lead_to_few_packets_and_one_goodbye(
         which in 0usize..2,
         fates in prop::collection::vec(
             (0u8..6, 0u64..1_500, any::<prop::sample::Index>(), any::<u8>()), 15),

@@ -1,6 +1,6 @@
-//! The conversation of `rp discover --router`: its messages, against Zenoh's own codec; its session,
-//! against what a real router answered and against hostile answers; the command, against a scripted
-//! server.
+//! The conversation of `rp discover --router`. Its messages are compared with those of Zenoh's own
+//! codec. Its session gets the answers of a real router and hostile answers. The command runs with
+//! a scripted server.
 
 mod answers;
 mod command;
@@ -28,7 +28,7 @@ use answers::{alias, aliased, final_, fragments, frame, init, open, token};
 
 const ID: [u8; 16] = [0x81, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 0x96];
 
-/// Both sides of the recorded conversation, as segments in their order.
+/// Returns both directions of the recorded conversation, as segments in their order.
 fn recorded() -> Vec<(bool, Vec<u8>)> {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/discover/zenoh.txt");
     let text = std::fs::read_to_string(file).unwrap();
@@ -41,7 +41,7 @@ fn recorded() -> Vec<(bool, Vec<u8>)> {
     text.lines().map(segment).collect()
 }
 
-/// Batches that the recorded router sent, without their lengths.
+/// Returns the batches that the recorded router sent, without their lengths.
 fn recorded_answers() -> Vec<Vec<u8>> {
     let answers = recorded().into_iter().filter(|(is_sent, _)| !is_sent);
     let stream = answers.flat_map(|(_, bytes)| bytes).collect::<Vec<_>>();
@@ -55,7 +55,7 @@ fn recorded_answers() -> Vec<Vec<u8>> {
     batches
 }
 
-/// A session that has sent its request.
+/// Returns a session that has sent its request.
 fn asked() -> Session {
     let mut session = Session::new(None);
     session.receive(&init(&[7; 49], 9, &[])).unwrap();
@@ -64,7 +64,7 @@ fn asked() -> Session {
     session
 }
 
-/// A token of a publisher in domain 0.
+/// Returns the token of a publisher in domain 0.
 fn publisher(number: usize) -> String {
     format!(
         "@ros2_lv/0/a1/0/{number}/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/\
@@ -80,7 +80,7 @@ fn publishers(session: &Session) -> usize {
         .sum()
 }
 
-/// What Zenoh's codec reads from a batch and writes again.
+/// Decodes a batch with Zenoh's codec, and returns the message with its encoding by the same codec.
 fn through_their_codec(batch: &[u8]) -> (TransportBody, Vec<u8>) {
     let mut reader = batch.reader();
     let read: TransportMessage = Zenoh080::new().read(&mut reader).unwrap();
@@ -91,7 +91,7 @@ fn through_their_codec(batch: &[u8]) -> (TransportBody, Vec<u8>) {
 }
 
 #[test]
-fn the_messages_are_those_that_zenoh_writes() {
+fn the_messages_equal_those_that_zenoh_encodes() {
     let cookie = [5; 200];
     let all = [
         message::introduction(ID),
@@ -128,7 +128,7 @@ fn the_messages_are_those_that_zenoh_writes() {
     let NetworkBody::Interest(interest) = body else {
         panic!("{body:?}");
     };
-    // It requests current declarations only.
+    // The message requests only current declarations.
     assert_eq!(interest.mode, InterestMode::Current);
     assert!(interest.options.keyexprs() && interest.options.tokens());
     assert!(!interest.options.subscribers() && !interest.options.queryables());
@@ -142,7 +142,7 @@ fn the_messages_are_those_that_zenoh_writes() {
 }
 
 #[test]
-fn a_router_without_priorities_is_asked_on_its_only_lane() {
+fn a_router_without_priorities_gets_the_request_with_the_default_priority() {
     for (extensions, priority) in [(&[1][..], Priority::Control), (&[], Priority::DEFAULT)] {
         let mut session = Session::new(None);
         session.receive(&init(&[], 9, extensions)).unwrap();
@@ -160,7 +160,7 @@ fn a_router_without_priorities_is_asked_on_its_only_lane() {
 }
 
 #[test]
-fn the_agent_s_decoder_reads_the_messages() {
+fn the_decoder_of_the_agent_reads_the_messages() {
     let all = [
         message::introduction(ID),
         message::opening(&[]),
@@ -191,10 +191,10 @@ fn the_agent_s_decoder_reads_the_messages() {
 }
 
 #[test]
-fn a_recorded_router_is_asked_and_understood() {
+fn the_session_with_a_recorded_router_sends_the_recorded_messages_and_is_complete() {
     let mut session = Session::new(None);
     let mut sent = vec![message::introduction(
-        // Behind the length, header, version and role.
+        // The identifier follows the length, header, version and role.
         recorded()[0].1[5..21].try_into().unwrap(),
     )];
     for batch in recorded_answers() {
@@ -229,7 +229,7 @@ fn aliases_and_fragments_lead_to_the_same_tokens() {
     let (long, short) = (publisher(1), publisher(2));
     let (prefix, suffix) = long.split_at(20);
     let mut session = asked();
-    // One FRAME with an alias, an alias of it, both tokens, one of them twice.
+    // One FRAME has an alias, an alias of that alias, and both tokens, one of them twice.
     let messages = [
         alias(1, 0, prefix),
         alias(2, 1, &suffix[..30]),
@@ -239,14 +239,14 @@ fn aliases_and_fragments_lead_to_the_same_tokens() {
     ];
     session.receive(&frame(&messages.concat())).unwrap();
     assert_eq!(publishers(&session), 2);
-    // In parts of 50 bytes, with and without the mark of the first.
+    // Fragments of 50 bytes, with and without the mark of the first fragment.
     for (number, is_marked) in [(3, true), (4, false)] {
         for fragment in fragments(&token(&publisher(number)), 50, is_marked) {
             session.receive(&fragment).unwrap();
         }
     }
     assert_eq!(publishers(&session), 4);
-    // A chain that the router gave up is forgotten.
+    // Fragments of a message that the router dropped are discarded.
     let [first, ..] = &fragments(&token(&publisher(5)), 50, true)[..] else {
         panic!("no fragment");
     };
@@ -256,7 +256,7 @@ fn aliases_and_fragments_lead_to_the_same_tokens() {
         session.receive(&fragment).unwrap();
     }
     assert_eq!((publishers(&session), session.unreadable()), (5, 0));
-    // An unknown alias hides one token only.
+    // An unknown alias makes only one token unreadable.
     session.receive(&frame(&aliased(9, "x"))).unwrap();
     session.receive(&frame(&final_())).unwrap();
     assert_eq!((session.step(), session.unreadable()), (Step::Complete, 1));
@@ -284,7 +284,7 @@ fn tokens_beyond_the_cap_end_the_conversation() {
         (session.step(), publishers(&session)),
         (Step::Request, RouterTokens::CAP)
     );
-    // One that is known needs no room.
+    // A known token needs no additional entry.
     session.receive(&frame(&token(&publisher(5)))).unwrap();
     assert_eq!(session.step(), Step::Request);
     session
@@ -297,7 +297,7 @@ fn tokens_beyond_the_cap_end_the_conversation() {
 }
 
 #[test]
-fn bytes_beyond_the_cap_end_the_conversation_even_if_aliases_hide_them() {
+fn bytes_beyond_the_cap_end_the_conversation_even_if_aliases_contain_them() {
     let mut session = asked();
     let batch = [0x04; 60_000];
     for _ in 0..MOST_BYTES / batch.len() {
@@ -307,7 +307,7 @@ fn bytes_beyond_the_cap_end_the_conversation_even_if_aliases_hide_them() {
     session.receive(&batch).unwrap();
     assert_eq!(session.step(), Step::Full);
 
-    // An alias of an alias: each token of ten bytes has 30,000.
+    // Each token of ten bytes uses an alias of 30,000 bytes.
     let mut session = asked();
     session
         .receive(&frame(&alias(1, 0, &"x".repeat(30_000))))

@@ -1,5 +1,5 @@
-//! `rp doctor`: the real binary as root and as an unprivileged user, without an agent and with one
-//! on a replay.
+//! `rp doctor`: the real binary as root and as an unprivileged user, without an agent and with an
+//! agent that replays a capture.
 
 use std::fs::Permissions;
 use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
@@ -64,9 +64,9 @@ fn without_an_agent_doctor_examines_the_host_and_tries_permitted_sources() {
 }
 
 #[test]
-fn an_unprivileged_user_gets_the_checks_that_need_root() {
+fn an_unprivileged_user_sees_which_checks_need_root() {
     let directory = tempfile::tempdir().unwrap();
-    // The build directory may be closed to others.
+    // The build directory may not be readable for other users.
     let program = directory.path().join("rp");
     std::fs::copy(env!("CARGO_BIN_EXE_rp"), &program).unwrap();
     for path in [directory.path(), &program] {
@@ -92,7 +92,8 @@ fn an_unprivileged_user_gets_the_checks_that_need_root() {
     assert!(text.contains(unknown), "{text}");
     assert!(text.contains("\n           > sudo rp doctor\n"), "{text}");
     assert!(text.contains("> sudo setcap cap_net_admin,"), "{text}");
-    // No terminal, no colours; and nothing but commands and paths is wider than a terminal.
+    // Without a terminal, the text has no colours. Only commands and paths are wider than a
+    // terminal.
     assert!(!text.contains('\x1b'), "{text}");
     let wide = |line: &&str| line.chars().count() > 80 && !line.trim_start().starts_with("> ");
     assert_eq!(text.lines().find(wide), None, "{text}");
@@ -144,7 +145,7 @@ fn doctor_reports_only_the_graph_of_a_capture() {
     );
 }
 
-/// A report in which the graph is known.
+/// Repeats the command until the graph is known, and returns the report.
 fn asked(arguments: &[&str]) -> Value {
     let deadline = Instant::now() + PATIENCE;
     loop {
@@ -162,7 +163,7 @@ fn asked(arguments: &[&str]) -> Value {
 }
 
 #[test]
-fn a_missing_named_agent_or_configuration_is_one_line() {
+fn a_missing_agent_or_configuration_is_reported_in_one_line() {
     for arguments in [
         &["--host", "127.0.0.1:1"][..],
         &["--config", "/nowhere.yaml"],

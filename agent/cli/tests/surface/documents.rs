@@ -1,10 +1,12 @@
-//! Commands that the documents show on captures of this repository print what the documents show.
+//! Commands that the documentation shows on captures of this repository print the documented
+//! output.
 
 use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-/// Commands and their outputs in the `console` blocks of a document, without their indentation.
+/// Returns the commands and their outputs in the `console` blocks of a document, without their
+/// indentation.
 fn commands(text: &str) -> Vec<(String, String)> {
     let mut found = Vec::new();
     for block in text.split("```console\n").skip(1) {
@@ -25,7 +27,7 @@ fn commands(text: &str) -> Vec<(String, String)> {
 }
 
 #[test]
-fn commands_on_captures_print_what_the_documents_show() {
+fn commands_on_captures_print_the_documented_output() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
     let rp = Path::new(env!("CARGO_BIN_EXE_rp")).parent().unwrap();
     let path = format!("{}:{}", rp.display(), std::env::var("PATH").unwrap());

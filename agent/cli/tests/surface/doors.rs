@@ -1,5 +1,5 @@
-//! Clients that mean no good, and what each way in gives: how much memory, how many places and how
-//! much of the robot they get.
+//! Hostile clients, and the access through each listener and the socket: memory, connections and
+//! parts of the API that a client gets.
 
 use std::collections::BTreeMap;
 use std::io::{Read as _, Write as _};
@@ -17,7 +17,7 @@ use ros2probe_testing::local_agent::{
 use seccompiler::{BpfProgram, SeccompAction, SeccompFilter};
 use serde_json::Value;
 
-/// KiB of a line of `/proc/PID/status`.
+/// Returns the value of a line of `/proc/PID/status`, in KiB.
 fn kibibytes(agent: &LocalAgent, key: &str) -> u64 {
     let status = std::fs::read_to_string(format!("/proc/{}/status", agent.pid())).unwrap();
     let line = status.lines().find_map(|line| line.strip_prefix(key));
@@ -25,7 +25,7 @@ fn kibibytes(agent: &LocalAgent, key: &str) -> u64 {
     number.split(' ').next().unwrap().parse().unwrap()
 }
 
-/// An HTTP answer whose body is not text.
+/// Returns the headers and the body of an HTTP answer whose body is not text.
 fn bytes_of(address: SocketAddr, path: &str, headers: &str) -> (String, Vec<u8>) {
     let mut stream = TcpStream::connect(address).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
@@ -40,7 +40,7 @@ fn bytes_of(address: SocketAddr, path: &str, headers: &str) -> (String, Vec<u8>)
 }
 
 #[test]
-fn unfinished_requests_with_long_heads_take_little_memory_and_no_place() {
+fn unfinished_requests_with_long_heads_take_little_memory_and_block_no_client() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     agent.wait_for_log("ready");
     assert_eq!(ask(agent.api, "GET", "/health", "").0, 200);
@@ -55,7 +55,8 @@ fn unfinished_requests_with_long_heads_take_little_memory_and_no_place() {
             .set_write_timeout(Some(Duration::from_millis(50)))
             .unwrap();
         let _ = write!(client, "GET /topics HTTP/1.1\r\nHost: {address}\r\n");
-        // Every other pair stays within what a head may have: 38 KB are held, 380 KB refused.
+        // Every other pair of connections stays below the maximum size of a head. The agent keeps
+        // their 38 KB, and refuses the 380 KB of the others.
         let fields = if number % 4 < 2 { 4 } else { 40 };
         for _ in 0..fields {
             if client.write_all(field.as_bytes()).is_err() {
@@ -77,7 +78,7 @@ fn unfinished_requests_with_long_heads_take_little_memory_and_no_place() {
 }
 
 #[test]
-fn idle_connections_and_unfinished_requests_make_room_for_the_next_client() {
+fn idle_connections_and_unfinished_requests_are_closed_for_the_next_client() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     agent.wait_for_log("ready");
     let mut clients = Vec::new();
@@ -96,12 +97,12 @@ fn idle_connections_and_unfinished_requests_make_room_for_the_next_client() {
     for _ in 0..20 {
         assert_eq!(agent.get("/metrics").status, 200);
     }
-    // The first one was closed without an answer.
+    // The agent closed the first connection without an answer.
     assert_eq!(clients[0].read(&mut [0; 16]).unwrap(), 0);
 }
 
 #[test]
-fn a_body_that_does_not_arrive_ends_its_connection_after_ten_seconds() {
+fn a_body_that_does_not_arrive_leads_to_a_closed_connection_after_ten_seconds() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     agent.wait_for_log("ready");
     let mut client = TcpStream::connect(agent.api).unwrap();
@@ -120,7 +121,7 @@ fn a_body_that_does_not_arrive_ends_its_connection_after_ten_seconds() {
 }
 
 #[test]
-fn a_flood_without_the_token_takes_no_answer_from_the_client_with_it() {
+fn a_flood_without_the_token_does_not_reduce_the_answers_to_a_client_with_it() {
     let directory = tempfile::tempdir().unwrap();
     let (config, token) = (
         directory.path().join("config.yaml"),
@@ -153,7 +154,7 @@ fn a_flood_without_the_token_takes_no_answer_from_the_client_with_it() {
             scope.spawn(flood);
         }
         let deadline = Instant::now() + PATIENCE;
-        // Their burst is used up.
+        // The burst of requests without a token is used up.
         while answers.load(Ordering::Relaxed) < 2_000 && Instant::now() < deadline {
             std::thread::sleep(Duration::from_millis(10));
         }
@@ -171,8 +172,8 @@ fn a_flood_without_the_token_takes_no_answer_from_the_client_with_it() {
 }
 
 #[test]
-fn an_agent_without_system_call_filters_reports_it_everywhere() {
-    // A kernel without them.
+fn missing_system_call_filters_are_reported_everywhere() {
+    // Simulates a kernel without system call filters.
     let refused = BTreeMap::from([(libc::SYS_seccomp, Vec::new())]);
     let filter = SeccompFilter::new(
         refused,
@@ -212,7 +213,8 @@ fn a_page_is_compressed_for_a_scraper_that_accepts_it() {
             .collect::<Vec<_>>()
     };
     let accepts = "Accept-Encoding: gzip\r\n";
-    // A page that is the same before and after is of the same series in between.
+    // If the page has the same series before and after, the compressed page in between has them
+    // too.
     let (mut headers, mut page) = bytes_of(agent.address, "/metrics", "");
     let (compressed_headers, compressed) = loop {
         assert!(!headers.contains("content-encoding"), "{headers}");
@@ -244,7 +246,7 @@ fn a_page_is_compressed_for_a_scraper_that_accepts_it() {
 }
 
 #[test]
-fn the_metrics_listener_answers_on_loopback_to_its_own_names_alone() {
+fn the_metrics_listener_on_loopback_answers_only_requests_to_its_own_names() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     agent.wait_for_log("ready");
     let port = agent.address.port();
@@ -262,7 +264,7 @@ fn the_metrics_listener_answers_on_loopback_to_its_own_names_alone() {
     assert_eq!(status("Host: localhost\r\nHost: evil.example\r\n"), 403);
 }
 
-/// The code of a refusal, and its detail; `None` for any other answer.
+/// Returns the code and the detail of a refusal, or `None` for any other answer.
 fn refusal(answer: &Answer) -> Option<(String, String)> {
     let problem: Value = serde_json::from_str(&answer.body).ok()?;
     let code = problem["type"].as_str()?;
@@ -270,7 +272,7 @@ fn refusal(answer: &Answer) -> Option<(String, String)> {
     Some((code.to_owned(), problem["detail"].as_str()?.to_owned()))
 }
 
-/// Requests and the level that they need.
+/// Requests and the level of access that they need.
 const REQUESTS: [(&str, &str, &str); 25] = [
     ("GET", "/health", "read"),
     ("GET", "/topics", "read"),
@@ -304,7 +306,7 @@ const REQUESTS: [(&str, &str, &str); 25] = [
 ];
 
 #[test]
-fn loopback_gives_what_is_configured_and_the_socket_everything() {
+fn loopback_grants_the_configured_access_and_the_socket_grants_all() {
     for level in ["read", "watch", "all"] {
         let directory = tempfile::tempdir().unwrap();
         let socket = directory.path().join("api.sock");
@@ -325,7 +327,7 @@ fn loopback_gives_what_is_configured_and_the_socket_everything() {
                 |answer: &Answer| refusal(answer).filter(|(code, _)| code == "needs-socket");
             let over_loopback = request(agent.api, method, path, "");
             let refused = needs_socket(&over_loopback);
-            // Another spelling of a path is not found.
+            // A path in another spelling is not found.
             let is_granted = rank(needed) <= rank(level) || over_loopback.status == 404;
             assert_eq!(refused.is_none(), is_granted, "{level}: {method} {path}");
             if let Some((_, detail)) = refused {
@@ -345,7 +347,7 @@ fn loopback_gives_what_is_configured_and_the_socket_everything() {
 }
 
 #[test]
-fn loopback_gives_watches_and_no_payloads_unless_something_else_is_configured() {
+fn by_default_loopback_grants_watches_but_no_payloads() {
     use ros2probe_daemon::config::{Access, Config};
     assert_eq!(Config::default().api.loopback, Access::Watch);
     let mut agent = LocalAgent::start(&mut rp(), &["--api-loopback", "watch"]);
@@ -374,7 +376,7 @@ fn loopback_gives_watches_and_no_payloads_unless_something_else_is_configured() 
 fn a_client_of_a_silent_server_gives_up_after_five_seconds() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap().to_string();
-    // Servers that send nothing, half an answer, and a stream without a line.
+    // Servers that send nothing, half of an answer, and a stream without a line.
     let beginnings = [
         "",
         "HTTP/1.1 200 OK\r\ncontent-length: 100\r\n\r\n{",
@@ -407,7 +409,7 @@ fn a_client_of_a_silent_server_gives_up_after_five_seconds() {
 }
 
 #[test]
-fn no_text_of_a_file_reaches_the_terminal_unescaped() {
+fn text_of_a_file_is_escaped_before_it_reaches_the_terminal() {
     let directory = tempfile::tempdir().unwrap();
     let steers = |text: &[u8]| {
         let text = String::from_utf8_lossy(text).into_owned();

@@ -1,5 +1,6 @@
-//! `GET /events` of the real binary: the events of a replay are in order, with names and
-//! attributes, resumable, filtered, and without delaying the end.
+//! `GET /events` of the real binary. The events of a replay are in order, with names and
+//! attributes. A client can resume and filter the stream, and the stream does not delay the end of
+//! the agent.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
@@ -12,7 +13,7 @@ use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, request};
 use ros2probe_testing::model::capture;
 use serde_json::Value;
 
-/// Ends a message of a stream.
+/// The end of a message of a stream.
 const END: &str = "\n\n";
 
 /// A message of a stream.
@@ -49,13 +50,13 @@ impl Message {
     }
 }
 
-/// Everything that is kept, without the greeting.
+/// Returns all events that the agent keeps, without the greeting.
 fn kept(agent: &LocalAgent, query: &str) -> Vec<Message> {
     let path = format!("/events?after=0&follow=false{query}");
     messages(&request(agent.api, "GET", &path, "").body)
 }
 
-/// The messages of an answer in chunks, whose boundaries lie between messages.
+/// Returns the messages of a chunked answer. Chunk boundaries are between messages.
 fn messages(body: &str) -> Vec<Message> {
     let body: String = body
         .split("\r\n")
@@ -67,7 +68,7 @@ fn messages(body: &str) -> Vec<Message> {
         .collect()
 }
 
-/// Runs a capture to its end.
+/// Replays a capture to its end.
 fn replayed(capture: &Path, arguments: &[&str]) -> LocalAgent {
     let mut agent = LocalAgent::replay(
         &mut rp(),
@@ -105,7 +106,7 @@ impl Stream {
         (count > 0).then(|| line.trim_end().to_owned())
     }
 
-    /// The next message that is an event; the greeting has an id alone.
+    /// Returns the next message that is an event. The greeting has only an id.
     fn next(&mut self) -> Message {
         let mut text = String::new();
         loop {
@@ -191,14 +192,14 @@ fn events_of_a_robot_are_in_order_and_filtered_by_name_and_topic() {
 }
 
 #[test]
-fn a_client_that_reconnects_continues_or_gets_the_number_it_missed() {
+fn a_client_that_reconnects_continues_or_gets_the_number_of_missed_events() {
     let agent = replayed(&local_agent::capture(), &[]);
     let all = kept(&agent, "");
     let again = |path: &str, header: &str| {
         let headers = format!("Last-Event-ID: {header}\r\n");
         messages(&request(agent.api, "GET", path, &headers).body)
     };
-    // The header is newer than the address, which a browser never changes.
+    // The header takes precedence over the address, which a browser never changes.
     assert_eq!(again("/events?after=0&follow=false", &all[4].id), all[5..]);
     let end = all.last().unwrap();
     assert_eq!(again("/events?follow=false", &end.id), []);
@@ -234,13 +235,13 @@ fn lost_messages_and_incompatible_readers_are_events_with_node_and_topic() {
     let capture = directory.path().join("lossy.pcap");
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../wire/tests/data");
     let source = data.join("cyclonedds-qos-mismatch.pcap.gz");
-    // A best-effort writer; 30 samples at 10 Hz.
+    // A best-effort writer with 30 samples at 10 Hz.
     let writer = [0x00, 0x00, 0x14, 0x03];
     let left_out = without_samples(&source, &capture, writer, 10..=12);
     assert!(left_out >= 3, "{left_out} packets left out");
     let agent = replayed(&capture, &["--watch", "/chatter_be"]);
     let lost = kept(&agent, "&name=ros2.message.lost&topic=/chatter_*");
-    // Three samples in a row are one event unless a second ended between them.
+    // Three consecutive samples are one event, unless a second ends between them.
     let sum = |name: &str| -> u64 {
         let counts = lost.iter().map(|message| message.attribute(name));
         counts.map(|count| count.as_u64().unwrap()).sum()
@@ -262,7 +263,7 @@ fn lost_messages_and_incompatible_readers_are_events_with_node_and_topic() {
     );
     assert!(lost[0].attribute("ros_node").is_string(), "{lost:?}");
 
-    // Its other reader requests more than it offers.
+    // The other reader requests more than the writer offers.
     let unfit = kept(&agent, "&name=ros2.qos.*");
     assert_eq!(unfit[0].event, "ros2.qos.incompatible");
     assert_eq!(unfit[0].attribute("topic"), "/chatter_be");
@@ -275,8 +276,8 @@ fn lost_messages_and_incompatible_readers_are_events_with_node_and_topic() {
 }
 
 #[test]
-fn a_stream_follows_what_happens_and_the_end_of_the_agent_does_not_wait_for_it() {
-    // 3 s of traffic in 10 s.
+fn a_stream_reports_events_as_they_occur_and_does_not_delay_the_end_of_the_agent() {
+    // 3 s of traffic are replayed in 10 s.
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "0.3"]);
     let mut stream = Stream::open(agent.api, "/events?name=ros2.node.*,ros2probe.watch.*", "");
     let node = stream.wait_for("ros2.node.discovered");
@@ -295,7 +296,8 @@ fn a_stream_follows_what_happens_and_the_end_of_the_agent_does_not_wait_for_it()
         assert_eq!(stream.wait_for(event).attribute("watch"), "/imu/data");
     }
 
-    // As many as permitted without a token; a further one is refused until one has left.
+    // With the first stream, these are as many as are permitted without a token. The next one is
+    // refused until a stream is closed.
     let others: Vec<_> = (0..11)
         .map(|_| Stream::open(agent.api, "/events", ""))
         .collect();
@@ -315,7 +317,8 @@ fn a_stream_follows_what_happens_and_the_end_of_the_agent_does_not_wait_for_it()
     assert!(agent.log().contains("drained=true"), "{}", agent.log());
 }
 
-/// Copies a capture without the packets that hold samples of these numbers; how many were left out.
+/// Copies a capture without the packets that have samples of these numbers. Returns the number of
+/// omitted packets.
 fn without_samples(
     from: &Path,
     to: &Path,
@@ -333,7 +336,7 @@ fn without_samples(
     while let Some(length) = rest.get(8..12) {
         let length = u32::from_le_bytes(length.try_into().unwrap()) as usize;
         let (packet, following) = rest.split_at(16 + length);
-        // Writer and sequence number of DATA, low word last, little-endian.
+        // The writer and the sequence number of DATA, low word last, little-endian.
         let holds = |number: u32| {
             let wanted = [writer, [0; 4], number.to_le_bytes()].concat();
             packet.windows(wanted.len()).any(|window| window == wanted)
@@ -350,7 +353,7 @@ fn without_samples(
 }
 
 #[test]
-fn a_replay_reports_every_endpoint_in_the_captures_time() {
+fn a_replay_reports_every_endpoint_at_any_speed() {
     use ros2probe_wire::time::SECOND;
     const START: u64 = 1_795_143_000 * SECOND;
     let alice = ros2probe_wire::GuidPrefix(*b"\x01\x10alice-host");
@@ -358,7 +361,7 @@ fn a_replay_reports_every_endpoint_in_the_captures_time() {
     let path = directory.path().join("announced.pcap");
     let mut capture = capture::Capture::new(capture::ETHERNET);
     capture.participant(START, 0, alice);
-    // 422 in 4 s: 200 a second are a storm, 106 are not.
+    // 422 endpoints in 4 s: 200 per second are a storm, and 106 per second are not.
     for number in 0..422 {
         let time = START + number as u64 * SECOND / 106;
         let topic = format!("rt/topic{number}");

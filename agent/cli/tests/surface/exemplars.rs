@@ -1,5 +1,5 @@
-//! Exemplars of chains as two other programs read them: a real Prometheus, from a scrape in
-//! OpenMetrics, and a receiver of OTLP. Both get the trace, the duration and its time.
+//! Exemplars of chains as two other programs read them: a real Prometheus from a scrape in
+//! OpenMetrics, and an OTLP receiver. Both get the trace, the duration and its time.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
@@ -72,7 +72,7 @@ fn exported(point: &HistogramDataPoint) -> impl Iterator<Item = Exemplar> {
     })
 }
 
-/// Returns what a Prometheus has stored of a family.
+/// Returns the exemplars that Prometheus has stored for a family.
 fn stored(prometheus: &Prometheus, family: &str) -> BTreeSet<Exemplar> {
     let query = format!("query={family}_seconds_bucket&start=0&end=9999999999");
     let answer = prometheus.get(&format!("/api/v1/query_exemplars?{query}"));
@@ -94,7 +94,7 @@ fn stored(prometheus: &Prometheus, family: &str) -> BTreeSet<Exemplar> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
-async fn prometheus_and_a_receiver_of_otlp_get_the_same_exemplars_of_a_chain() {
+async fn prometheus_and_an_otlp_receiver_get_the_same_exemplars_of_a_chain() {
     let receiver = Receiver::default();
     let address = receiver.clone().listen().await;
     let directory = tempfile::tempdir().unwrap();
@@ -113,7 +113,7 @@ async fn prometheus_and_a_receiver_of_otlp_get_the_same_exemplars_of_a_chain() {
     let capture = repository("agent/testing/data/fastrtps-udp/chain-1ns/capture.pcap.gz");
     let mut agent = LocalAgent::replay(&mut rp(), &capture, &arguments);
     agent.wait_for_log("the capture has ended");
-    // From now on, the exemplars do not change.
+    // The exemplars do not change after this point.
     let prometheus = Prometheus::start(directory.path(), agent.address);
     let deadline = Instant::now() + PATIENCE;
     for family in FAMILIES {

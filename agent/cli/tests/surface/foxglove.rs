@@ -1,5 +1,6 @@
-//! The listener for viewers: a strict client of the Foxglove protocol beside an agent that replays a
-//! capture. It checks messages, rights and refusals, and that hostile clients leave nothing behind.
+//! The listener for viewers: a strict client of the Foxglove protocol with an agent that replays a
+//! capture. It checks messages, rights and refusals. Hostile clients must not leave connections or
+//! subscriptions.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -20,11 +21,11 @@ use ros2probe_testing::viewer::{
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::Message;
 
-/// Log line of the listener.
+/// Text of the log line that has the address of the listener.
 const SERVING: &str = "serving viewers";
 const WATCHED: [&str; 4] = ["--foxglove", "127.0.0.1:0", "--watch", "/**"];
 
-/// An agent on a capture, and the address for viewers.
+/// Starts an agent that replays a capture. Returns the agent and the address for viewers.
 fn agent(arguments: &[&str]) -> (LocalAgent, SocketAddr) {
     let arguments: Vec<_> = WATCHED.iter().chain(arguments).copied().collect();
     let mut agent = LocalAgent::start(&mut rp(), &arguments);
@@ -43,7 +44,7 @@ fn connect(address: SocketAddr, path: &str, headers: &[(&str, &str)]) -> Result<
     .unwrap()
 }
 
-/// Waits until the page shows these numbers of viewers and of their subscriptions.
+/// Waits until the metrics page shows these numbers of viewers and subscriptions.
 fn wait_for_viewers(agent: &LocalAgent, viewers: f64, subscriptions: f64) {
     agent.wait_for_metric("ros2probe_foxglove_clients", |count| count == viewers);
     agent.wait_for_metric("ros2probe_foxglove_subscriptions", |count| {
@@ -127,7 +128,7 @@ fn a_viewer_gets_the_messages_of_a_capture_as_they_were_sent() {
                 clock = time;
             }
             News::Status(status) if status.id == "end" => break,
-            // `/rosout` and the like have no subscriber.
+            // Topics such as `/rosout` have no subscriber.
             News::Status(status) if status.id == "no_subscriber" => {}
             News::Graph => is_published |= viewer.graph.published.contains_key("/chatter"),
             news => panic!("{news:?}"),
@@ -159,7 +160,8 @@ fn a_viewer_gets_the_messages_of_a_capture_as_they_were_sent() {
     wait_for_viewers(&agent, 0.0, 0.0);
 }
 
-/// The definitions are those of the bags: another reader parses each, as the type that it names.
+/// The definitions equal those of bags. Another parser reads each definition as the type that it
+/// names.
 fn check_schemas(viewer: &Viewer) {
     let channels = viewer.channels.values();
     let messages: Vec<_> = channels
@@ -193,7 +195,7 @@ for name, text in json.loads(sys.argv[1]):
     assert name in get_types_from_msg(text, name), name
 ";
 
-/// The figures are those of the API, and their schema describes each.
+/// The figures agree with those of the API, and each matches its schema.
 fn check_figures(agent: &LocalAgent, figures: &BTreeMap<String, Value>, viewer: &Viewer) {
     let (_, topic) = ask(agent.api, "GET", "/topics/chatter", "");
     let chatter = &figures["/chatter"];
@@ -227,7 +229,7 @@ fn check_figures(agent: &LocalAgent, figures: &BTreeMap<String, Value>, viewer: 
 }
 
 #[test]
-fn a_request_without_a_viewers_handshake_is_refused_with_the_reason() {
+fn a_request_without_the_handshake_of_a_viewer_is_refused_with_a_reason() {
     let (agent, address) = agent(&["--speed", "max"]);
     let refused = |subprotocols: &[&str]| {
         let stream = TcpStream::connect(address).unwrap();
@@ -254,7 +256,7 @@ fn a_request_without_a_viewers_handshake_is_refused_with_the_reason() {
 }
 
 #[test]
-fn pages_elsewhere_need_a_token_and_those_of_viewers_and_of_this_host_do_not() {
+fn foreign_pages_need_a_token_but_pages_of_viewers_and_of_this_host_do_not() {
     let (agent, address) = agent(&["--speed", "max"]);
     let with = |name: &str, value: &str| connect(address, "/", &[(name, value)]);
     for origin in [
@@ -292,7 +294,8 @@ fn pages_elsewhere_need_a_token_and_those_of_viewers_and_of_this_host_do_not() {
         .err()
         .unwrap();
     assert_eq!(wrong.status, 401, "{wrong:?}");
-    // Not even a token lets a name lead here that a page elsewhere may have rebound.
+    // A valid token does not permit a foreign host name, which may belong to a page with DNS
+    // rebinding.
     let rebound = connect(address, &path, &[("host", "evil.example")]).err();
     assert_eq!(rebound.unwrap().status, 403);
 }
@@ -352,7 +355,7 @@ fn without_a_token_a_viewer_has_the_rights_of_loopback() {
     assert_eq!(agent.get("/metrics").status, 200);
 }
 
-/// A frame of a client: masked with zeroes, or not at all.
+/// Returns a frame of a client, masked with zeros or not masked.
 fn frame(first: u8, payload: &[u8], is_masked: bool) -> Vec<u8> {
     let mut frame = vec![first, if is_masked { 0x80 | 127 } else { 127 }];
     frame.extend((payload.len() as u64).to_be_bytes());
@@ -364,7 +367,7 @@ fn frame(first: u8, payload: &[u8], is_masked: bool) -> Vec<u8> {
 }
 
 #[test]
-fn clients_that_break_the_protocol_are_closed_with_a_code_and_leave_nothing() {
+fn clients_that_violate_the_protocol_are_closed_with_a_code_and_use_no_resources() {
     let (mut agent, address) = agent(&["--speed", "max"]);
     agent.wait_for_log("ready");
     let mut first = Viewer::connect(address).unwrap();
@@ -433,13 +436,13 @@ fn clients_that_break_the_protocol_are_closed_with_a_code_and_leave_nothing() {
             .unwrap_or_else(|error| panic!("{name}: {error:#}"));
         assert_eq!(closed, code, "{name}: {reason}");
         assert!(!reason.is_empty(), "{name}");
-        // Nothing follows the close but the end of the stream.
+        // After the close frame, the stream ends without further data.
         let mut rest = Vec::new();
         viewer.stream().set_read_timeout(Some(PATIENCE)).unwrap();
         let _ = viewer.stream().read_to_end(&mut rest);
         assert!(rest.is_empty(), "{name}: {} bytes", rest.len());
     }
-    // Subscriptions to channels that do not exist are ignored, however many come.
+    // Subscriptions to channels that do not exist are ignored, whatever their number.
     let mut viewer = Viewer::connect(address).unwrap();
     for part in 0..10_u32 {
         let ids = part * 1_000..(part + 1) * 1_000;
@@ -492,7 +495,7 @@ fn clients_that_break_the_protocol_are_closed_with_a_code_and_leave_nothing() {
 }
 
 #[test]
-fn a_busy_port_is_one_warning_and_the_agent_goes_on() {
+fn a_busy_port_leads_to_one_warning_and_the_agent_continues() {
     let other = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = other.local_addr().unwrap().to_string();
     let mut agent = LocalAgent::start(&mut rp(), &["--foxglove", &address, "--speed", "max"]);

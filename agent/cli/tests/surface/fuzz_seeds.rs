@@ -1,16 +1,17 @@
-//! Runs the fuzz targets' entry functions over their seeds and all truncations, so their checks run
-//! without a fuzzer too. Fuzzing found the seeds `found-*`: they are kept for their coverage,
-//! unchanged.
+//! Runs the entry functions of the fuzz targets over their seeds, so that their checks also run
+//! without a fuzzer. Fuzzing found the seeds `found-*`. They are kept for their coverage and are
+//! not changed.
 
 #[path = "../../../fuzz/src/lib.rs"]
 mod entry;
 
 use std::fs;
 
-/// Seeds longer than this are cut and changed only up to here.
+/// Maximum number of bytes of a seed that are truncated and changed.
 const LENGTH: usize = 2_000;
 
-/// Every seed in a directory, every truncation of it, and every byte of it changed.
+/// Runs the entry function over every seed in a directory, every truncation, and with every byte
+/// changed.
 fn run(directory: &str, entry: fn(&[u8])) {
     run_up_to(LENGTH, directory, entry);
 }
@@ -43,62 +44,62 @@ fn run_up_to(length: usize, directory: &str, entry: fn(&[u8])) {
 }
 
 #[test]
-fn captures_survive() {
+fn seeds_of_captures_cause_no_panic() {
     run("fuzz/seeds/capture", entry::capture);
 }
 
 #[test]
-fn ring_blocks_survive() {
+fn seeds_of_ring_blocks_cause_no_panic() {
     run("fuzz/seeds/ring_block", entry::ring_block);
 }
 
 #[test]
-fn shared_memory_survives() {
+fn seeds_of_shared_memory_cause_no_panic() {
     run("fuzz/seeds/shared_memory", entry::shared_memory);
 }
 
 #[test]
-fn configurations_survive() {
+fn seeds_of_configurations_cause_no_panic() {
     run("fuzz/seeds/configuration", entry::configuration);
 }
 
 #[test]
-fn definitions_survive() {
+fn seeds_of_definitions_cause_no_panic() {
     run("fuzz/seeds/definition", entry::definition);
 }
 
 #[test]
-fn messages_survive() {
+fn seeds_of_messages_cause_no_panic() {
     run("fuzz/seeds/message", entry::message);
 }
 
 #[test]
-fn filters_survive() {
+fn seeds_of_filters_cause_no_panic() {
     run("fuzz/seeds/filter", entry::filter);
 }
 
 #[test]
-fn bags_survive() {
-    // Each is written, read, made whole and read again.
+fn seeds_of_bags_cause_no_panic() {
+    // Each bag is written, read, repaired and read again.
     run_up_to(120, "fuzz/seeds/bag_file", entry::bag_file);
 }
 
 #[test]
-fn messages_of_viewers_survive() {
+fn seeds_of_messages_of_viewers_cause_no_panic() {
     run("fuzz/seeds/viewer", entry::viewer);
 }
 
 #[test]
-fn requests_of_ros2_survive() {
+fn seeds_of_requests_of_ros2_cause_no_panic() {
     run("fuzz/seeds/ros2_daemon", entry::ros2_daemon);
 }
 
 #[test]
-fn libraries_survive_hostile_trees() {
+fn seeds_of_library_trees_cause_no_panic() {
     run("fuzz/seeds/library", entry::library);
 }
 
 #[test]
-fn the_model_survives_any_input() {
+fn seeds_of_the_model_cause_no_panic() {
     run_up_to(400, "fuzz/seeds/model", entry::model);
 }

@@ -1,4 +1,4 @@
-//! The listener: both formats, health, reload, and a real Prometheus that scrapes it.
+//! The listener: both formats, health, reload, and scrapes by a real Prometheus.
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -12,7 +12,7 @@ const PROMETHEUS_ACCEPTS: &str = "Accept: application/openmetrics-text;version=1
     application/openmetrics-text;version=0.0.1;q=0.75,text/plain;version=0.0.4;q=0.5,*/*;q=0.1\r\n";
 
 #[test]
-fn the_program_is_mapped_as_it_was_loaded_and_its_memory_is_reported() {
+fn the_program_has_one_mapping_for_each_segment_and_its_memory_is_reported() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     agent.wait_for_log("ready");
     let page = agent.get("/metrics").body;
@@ -22,7 +22,7 @@ fn the_program_is_mapped_as_it_was_loaded_and_its_memory_is_reported() {
     let of_program = maps
         .lines()
         .filter(|line| line.ends_with(program.to_str().unwrap()));
-    // One for each segment of the file.
+    // Each segment of the file has one mapping.
     let mappings = of_program.count();
     assert!((2..10).contains(&mappings), "{mappings}");
     let own = metric(&page, "process_unreclaimable_memory_bytes").unwrap();
@@ -31,7 +31,7 @@ fn the_program_is_mapped_as_it_was_loaded_and_its_memory_is_reported() {
 }
 
 #[test]
-fn each_page_answers_as_it_should() {
+fn each_path_of_the_listener_gets_the_expected_answer() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     agent.wait_for_log("ready");
 
@@ -83,7 +83,7 @@ fn each_page_answers_as_it_should() {
 }
 
 #[test]
-fn a_reload_takes_over_what_is_right_and_keeps_what_was_when_it_is_wrong() {
+fn a_reload_applies_a_valid_configuration_and_keeps_the_old_one_otherwise() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("config.yaml");
     let write = |text: &str| std::fs::write(&path, text).unwrap();
@@ -131,11 +131,11 @@ fn a_reload_takes_over_what_is_right_and_keeps_what_was_when_it_is_wrong() {
 }
 
 #[test]
-fn series_of_deliveries_come_with_a_reload_that_asks_for_them() {
+fn series_of_deliveries_appear_after_a_reload_that_enables_them() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("config.yaml");
     std::fs::write(&path, "watch: [/chatter]\n").unwrap();
-    // 10 Hz for 3 s, at a third of the pace.
+    // 10 Hz for 3 s, replayed at 0.3 times the speed.
     let mut agent = LocalAgent::start(
         &mut rp(),
         &["--config", path.to_str().unwrap(), "--speed", "0.3"],
@@ -163,7 +163,7 @@ fn series_of_deliveries_come_with_a_reload_that_asks_for_them() {
     assert_eq!(promtool(&page), "");
 }
 
-/// A Prometheus, killed when its value is dropped.
+/// A Prometheus, which is killed when its value is dropped.
 pub(crate) struct Prometheus {
     child: Child,
     address: std::net::SocketAddr,
@@ -193,7 +193,7 @@ impl Prometheus {
         Self { child, address }
     }
 
-    /// Returns the answer of the API; null until the server has started.
+    /// Returns the answer of the API, or null before the server has started.
     pub(crate) fn get(&self, path: &str) -> serde_json::Value {
         if std::net::TcpStream::connect(self.address).is_err() {
             return serde_json::Value::Null;
@@ -202,7 +202,7 @@ impl Prometheus {
         serde_json::from_str(&body).unwrap_or_default()
     }
 
-    /// Repeats the query until the first sample of the answer is as wanted.
+    /// Repeats the query until the first sample of the answer has the wanted value.
     fn wait_for(&self, query: &str, wanted: impl Fn(f64) -> bool) -> f64 {
         let deadline = Instant::now() + PATIENCE;
         let encoded: String = query.bytes().map(|byte| format!("%{byte:02X}")).collect();
@@ -229,8 +229,8 @@ impl Drop for Prometheus {
 }
 
 #[test]
-fn a_real_prometheus_sees_the_rate_at_which_a_replayed_publisher_sent() {
-    // 10 Hz for 3 s, at a third of the pace.
+fn a_real_prometheus_computes_the_rate_of_a_replayed_publisher() {
+    // 10 Hz for 3 s, replayed at 0.3 times the speed.
     let mut agent = LocalAgent::start(&mut rp(), &["--watch", "/chatter", "--speed", "0.3"]);
     agent.wait_for_log("ready");
     let directory = tempfile::tempdir().unwrap();

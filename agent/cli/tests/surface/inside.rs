@@ -1,4 +1,4 @@
-//! From reports about calls inside processes to the metrics page, and `rp inside` without them.
+//! The metrics page after reports about calls inside processes, and `rp inside` without reports.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,8 +20,8 @@ use ros2probe_wire::{DomainId, Timestamp};
 
 const START: u64 = 1_795_143_000 * SECOND;
 
-/// Returns an observer that has taken a report in each of ten seconds: `/scan` at 20 Hz, published
-/// by a managed node whose timer takes 4 ms.
+/// Returns an observer that has received a report in each of ten seconds. A managed node, whose
+/// timer takes 4 ms, publishes `/scan` at 20 Hz.
 fn observed() -> Observer {
     let mut observer = Observer::new(observer::Settings::default());
     observer.input(Input::Time(Timestamp(START)));
@@ -113,7 +113,7 @@ fn page(observer: &Observer, source: Option<InsideSourceFacts>) -> String {
 }
 
 #[test]
-fn reports_become_series() {
+fn reports_of_calls_become_series() {
     let source = InsideSourceFacts {
         mode: "full",
         counters: vec![("hits", 777)],
@@ -157,13 +157,13 @@ fn reports_become_series() {
     assert!((rate - 20.0).abs() < 0.1, "{rate}");
     let busy = value(&format!("ros2_node_callback_busy_ratio{{{node}}}"));
     assert!((busy - 0.08).abs() < 0.001, "{busy}");
-    // Calls show no sizes.
+    // Reports of calls contain no sizes.
     assert!(!page.contains(&format!("ros2_topic_bytes_total{{{topic}}}")));
     assert!(!page.contains(&format!("ros2_topic_bandwidth_bytes_per_second{{{topic}}}")));
 }
 
 #[test]
-fn hours_and_days_become_series_of_their_length() {
+fn long_durations_become_series_with_their_length() {
     let mut observer = Observer::new(observer::Settings::default());
     observer.input(Input::Time(Timestamp(START)));
     let watches = Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap();
@@ -217,7 +217,7 @@ fn hours_and_days_become_series_of_their_length() {
 }
 
 #[test]
-fn without_reports_there_are_no_series() {
+fn without_reports_the_page_has_no_series_of_calls() {
     let observer = Observer::new(observer::Settings::default());
     let page = page(&observer, None);
     for name in [
@@ -233,7 +233,7 @@ fn without_reports_there_are_no_series() {
 }
 
 #[test]
-fn without_the_source_the_command_prints_how_to_switch_it_on() {
+fn without_the_source_the_command_prints_how_to_enable_it() {
     let capture = local_agent::capture();
     let run = |arguments: &[&str]| {
         let mut command = rp();

@@ -1,5 +1,5 @@
-//! `rp learn` on captures in virtual time. The file is a configuration, and the robot that it was
-//! learnt from meets it. Each fault of another robot violates its topic and no other.
+//! `rp learn` on captures in virtual time. Its output is a valid configuration, and the learnt
+//! robot meets it. Each fault of another robot violates only the expectations of its topic.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -28,20 +28,20 @@ const TOPICS: [(&str, u64); 6] = [
     ("rt/map", 5000),
 ];
 
-/// What is wrong with a topic.
+/// A fault of a topic.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Fault {
-    /// Every second message is sent.
+    /// Only every second message is sent.
     HalfRate,
-    /// No message after 30 s.
+    /// No message is sent after 30 s.
     Silent,
     /// Every fifth message is lost.
     Lossy,
-    /// No subscriber, so the writer sends nothing.
+    /// The topic has no subscriber, so the writer sends nothing.
     NoSubscriber,
 }
 
-/// A packet of a capture, to be sorted by time.
+/// The time of a packet, and a function that adds the packet to a capture.
 type Packet = (u64, Box<dyn Fn(&mut Capture)>);
 
 /// Writes a capture of the robot, with these faults by topic.
@@ -120,7 +120,7 @@ fn stderr(output: &Output) -> String {
     String::from_utf8(output.stderr.clone()).unwrap()
 }
 
-/// Learns from a capture into a file beside it.
+/// Learns from a capture, and writes the result to a file beside it.
 fn learn(capture: &Path) -> PathBuf {
     let file = capture.with_extension("yaml");
     let words = ["learn", "--replay", capture.to_str().unwrap(), "-o"];
@@ -133,7 +133,7 @@ fn learn(capture: &Path) -> PathBuf {
 }
 
 /// Replays a capture with this configuration. Returns the topics that were violated or silent at
-/// any time, with the expectations that they violated.
+/// any time, with the violated expectations.
 fn violations(capture: &Path, configuration: &Path) -> BTreeMap<String, BTreeSet<String>> {
     let configuration = configuration.to_str().unwrap();
     let arguments = ["--speed", "max", "--config", configuration];
@@ -157,7 +157,7 @@ fn violations(capture: &Path, configuration: &Path) -> BTreeMap<String, BTreeSet
 }
 
 #[test]
-fn a_healthy_robot_meets_what_was_learnt_from_it_and_each_fault_violates_its_topic() {
+fn a_healthy_robot_meets_its_learnt_expectations_and_each_fault_violates_its_topic() {
     let directory = tempfile::tempdir().unwrap();
     let healthy = directory.path().join("healthy.pcap");
     robot(&healthy, &[]);
@@ -203,7 +203,7 @@ fn a_healthy_robot_meets_what_was_learnt_from_it_and_each_fault_violates_its_top
 }
 
 #[test]
-fn real_robots_meet_what_was_learnt_from_them() {
+fn real_robots_meet_their_learnt_expectations() {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
     let directory = tempfile::tempdir().unwrap();
     for capture in [
@@ -224,7 +224,7 @@ fn real_robots_meet_what_was_learnt_from_them() {
 }
 
 #[test]
-fn a_file_is_replaced_only_by_force_and_nothing_is_left_of_a_failure() {
+fn a_file_is_replaced_only_with_force_and_a_failure_leaves_no_file() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("robot.pcap");
     robot(&capture, &[]);
@@ -285,7 +285,7 @@ fn a_file_is_replaced_only_by_force_and_nothing_is_left_of_a_failure() {
 }
 
 #[test]
-fn a_terminal_shows_the_progress_in_one_line() {
+fn the_progress_takes_one_line_of_a_terminal() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("robot.pcap");
     robot(&capture, &[]);
@@ -308,7 +308,7 @@ fn a_terminal_shows_the_progress_in_one_line() {
 }
 
 #[test]
-fn minutes_bound_what_is_learnt_of_a_capture() {
+fn an_end_time_limits_what_is_learnt_from_a_capture_and_wrong_minutes_are_refused() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("robot.pcap");
     robot(&capture, &[]);

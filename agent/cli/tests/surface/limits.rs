@@ -1,5 +1,6 @@
-//! Every cap of the configuration, reached. Existing entries work as before; the next one is
-//! refused or evicts another as the table states, with a count. Afterwards there is room again.
+//! Tests that reach every cap of the configuration. Existing entries work as before. The next entry
+//! is refused or evicts another one, as the table states, and is counted. Later entries are
+//! accepted again.
 
 mod driven;
 mod table;
@@ -34,7 +35,7 @@ use tokio_util::sync::CancellationToken;
 /// Lease of each participant, in seconds.
 const LEASE: u32 = 10_000;
 
-/// State of a cap: how much of it is used, and how often it was reached.
+/// Returns how much of a cap is used, and how often the cap was reached.
 fn standing(limits: Limits, snapshot: Snapshot, limit: Limit) -> (u64, u64) {
     let settings = ros2probe_daemon::settings_cell::Settings {
         limits,
@@ -54,7 +55,7 @@ fn standing(limits: Limits, snapshot: Snapshot, limit: Limit) -> (u64, u64) {
     (facts.used, facts.reached)
 }
 
-/// A domain in virtual time, all of it watched by a model with some caps.
+/// A domain in virtual time. A model with some caps observes all its traffic.
 struct World {
     limits: Limits,
     domain: VirtualDomain,
@@ -97,7 +98,7 @@ fn writer(participant: u8, number: u8) -> Guid {
 }
 
 #[test]
-fn participants_beyond_the_cap_are_left_out_until_one_goes() {
+fn participants_beyond_the_cap_are_left_out_until_one_leaves() {
     let mut world = World::new(Limits {
         participants: 2,
         ..Limits::default()
@@ -108,7 +109,7 @@ fn participants_beyond_the_cap_are_left_out_until_one_goes() {
     }
     world.participant(prefix(3), LEASE);
     assert_eq!(world.standing(Limit::Participants), (2, 1));
-    // Existing writers are counted as before.
+    // Samples of existing writers are still counted.
     world.endpoint(writer(1, 1), 1, "rt/a");
     world.sample(writer(1, 1), 1);
     assert_eq!(world.snapshot().topics[0].publishers.len(), 1);
@@ -121,7 +122,7 @@ fn participants_beyond_the_cap_are_left_out_until_one_goes() {
 }
 
 #[test]
-fn endpoints_beyond_the_cap_are_left_out_until_one_goes() {
+fn endpoints_beyond_the_cap_are_left_out_until_one_is_removed() {
     let mut world = World::new(Limits {
         endpoints: 2,
         ..Limits::default()
@@ -150,7 +151,7 @@ fn endpoints_beyond_the_cap_are_left_out_until_one_goes() {
 }
 
 #[test]
-fn topics_beyond_the_cap_are_listed_and_measured_once_there_is_room() {
+fn topics_beyond_the_cap_are_listed_but_not_measured_until_one_is_removed() {
     let mut world = World::new(Limits {
         topics: 2,
         ..Limits::default()
@@ -278,7 +279,7 @@ fn numbers(subscription: &mut Subscription) -> Vec<u64> {
 }
 
 #[test]
-fn messages_beyond_the_bytes_of_all_queues_evict_the_oldest_until_one_is_read() {
+fn messages_beyond_the_bytes_of_all_queues_evict_the_oldest_until_the_queue_is_read() {
     let sources = MetricSources::new(SourceKind::Wire, Default::default());
     let caps = Caps {
         subscriptions: 1,
@@ -316,7 +317,7 @@ fn messages_beyond_the_bytes_of_all_queues_evict_the_oldest_until_one_is_read() 
     assert!(all.open(request()).is_ok());
 }
 
-/// An agent with these limits that replays slowly and may write bags.
+/// Starts an agent with these limits that replays slowly and may write bags.
 fn agent(directory: &Path, limits: &str) -> LocalAgent {
     agent_on(&local_agent::capture(), directory, "0.2", limits)
 }
@@ -338,7 +339,7 @@ fn agent_on(capture: &Path, directory: &Path, speed: &str, limits: &str) -> Loca
     )
 }
 
-/// Waits until a cap has this value.
+/// Waits until this number of entries is used and the cap was reached this number of times.
 fn wait_for(agent: &LocalAgent, limit: &str, used: f64, reached: f64) {
     let series = |name: &str| format!("{name}{{limit=\"{limit}\"}}");
     agent.wait_for_metric(&series("ros2probe_limit_used"), |value| value == used);
@@ -348,7 +349,7 @@ fn wait_for(agent: &LocalAgent, limit: &str, used: f64, reached: f64) {
 }
 
 #[test]
-fn watches_beyond_the_cap_are_refused_to_clients_and_to_a_reload() {
+fn watches_beyond_the_cap_are_refused_for_clients_and_for_a_reload() {
     let directory = tempfile::tempdir().unwrap();
     let mut agent = agent(directory.path(), "watches: 3");
     assert_eq!(ask(agent.api, "POST", "/watch/c", "").0, 201);
@@ -402,7 +403,7 @@ fn recordings_beyond_the_cap_are_refused_until_one_ends() {
 }
 
 #[test]
-fn clients_beyond_the_cap_are_refused_at_once_and_served_after_one_leaves() {
+fn clients_beyond_the_cap_are_refused_until_one_leaves() {
     let directory = tempfile::tempdir().unwrap();
     let limits = "api_clients: 2, metrics_clients: 2";
     let agent = agent(directory.path(), limits);
@@ -410,7 +411,7 @@ fn clients_beyond_the_cap_are_refused_at_once_and_served_after_one_leaves() {
         let address = agent.api;
         let mut stream = TcpStream::connect(address).unwrap();
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
-        // Begun to be answered, so it surely keeps its place.
+        // The agent has begun its answer, so it does not close this client for another one.
         let request = format!("GET /events HTTP/1.1\r\nHost: {address}\r\n\r\n");
         stream.write_all(request.as_bytes()).unwrap();
         assert!(stream.read(&mut [0; 4096]).unwrap() > 0);
@@ -435,7 +436,7 @@ fn clients_beyond_the_cap_are_refused_at_once_and_served_after_one_leaves() {
     while status().status != 200 {
         assert!(Instant::now() < deadline, "no place was given back");
     }
-    // Connections without a request make room.
+    // Connections without a request are closed for the next client.
     let idle: Vec<_> = (0..8)
         .map(|_| TcpStream::connect(agent.address).unwrap())
         .collect();
@@ -454,7 +455,7 @@ fn clients_beyond_the_cap_are_refused_at_once_and_served_after_one_leaves() {
 }
 
 #[test]
-fn viewers_beyond_the_cap_are_refused_until_one_has_gone() {
+fn viewers_beyond_the_cap_are_refused_until_one_leaves() {
     let directory = tempfile::tempdir().unwrap();
     let configuration = directory.path().join("ros2probe.yaml");
     std::fs::write(&configuration, "limits: {foxglove_clients: 2}\n").unwrap();
@@ -483,7 +484,7 @@ fn viewers_beyond_the_cap_are_refused_until_one_has_gone() {
     assert!(metric(&page, series).unwrap() >= 1.0);
 }
 
-/// A capture of this many UDP datagrams, with only the first IP fragment of each.
+/// Returns a capture of this number of UDP datagrams, with only the first IP fragment of each.
 fn torn(count: u16) -> Vec<u8> {
     let mut capture = Vec::new();
     capture.extend_from_slice(&0xa1b2_c3d4_u32.to_le_bytes());
@@ -493,7 +494,7 @@ fn torn(count: u16) -> Vec<u8> {
         frame.extend_from_slice(&[8, 0, 0x45, 0]);
         frame.extend_from_slice(&1_500_u16.to_be_bytes());
         frame.extend_from_slice(&number.to_be_bytes());
-        // More fragments follow; UDP; no checksum.
+        // More fragments follow. The protocol is UDP, without a checksum.
         frame.extend_from_slice(&[0x20, 0, 64, 17, 0, 0, 10, 0, 0, 1, 10, 0, 0, 2]);
         frame.extend_from_slice(&7_400_u16.to_be_bytes());
         frame.extend_from_slice(&7_400_u16.to_be_bytes());
@@ -512,7 +513,7 @@ fn torn(count: u16) -> Vec<u8> {
 }
 
 #[test]
-fn fragments_beyond_the_bytes_push_out_the_oldest() {
+fn fragments_beyond_the_cap_in_bytes_evict_the_oldest() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("torn.pcap");
     std::fs::write(&capture, torn(100)).unwrap();
@@ -528,7 +529,7 @@ fn fragments_beyond_the_bytes_push_out_the_oldest() {
 }
 
 #[test]
-fn an_agent_at_a_limit_reports_it_on_readyz_on_the_page_in_health_and_in_rp_doctor() {
+fn a_reached_limit_is_reported_by_readyz_metrics_health_and_rp_doctor() {
     let directory = tempfile::tempdir().unwrap();
     let limits = "participants: 1, recordings: 1";
     let mut agent = agent_on(&local_agent::capture(), directory.path(), "max", limits);
@@ -558,7 +559,7 @@ fn an_agent_at_a_limit_reports_it_on_readyz_on_the_page_in_health_and_in_rp_doct
     assert_eq!(found.unwrap()["verdict"], "problem", "{report:#}");
 }
 
-/// Returns the output of `rp` and its exit code.
+/// Returns the exit code and the standard error of `rp`.
 fn run_failing(arguments: &[&str]) -> (Option<i32>, String) {
     let output = rp().args(arguments).output().unwrap();
     let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -566,7 +567,7 @@ fn run_failing(arguments: &[&str]) -> (Option<i32>, String) {
 }
 
 #[test]
-fn a_configuration_for_a_newer_rp_is_refused_in_one_line_by_check_start_and_reload() {
+fn a_configuration_for_a_newer_rp_is_refused_with_one_line() {
     let directory = tempfile::tempdir().unwrap();
     let mut agent = agent(directory.path(), "");
     let file = directory.path().join("ros2probe.yaml");
@@ -593,7 +594,7 @@ fn a_configuration_for_a_newer_rp_is_refused_in_one_line_by_check_start_and_relo
     let line = agent.wait_for_log("the configuration was not reloaded");
     assert!(line.contains("version: is 2"), "{line}");
     assert_eq!(ask(agent.api, "GET", "/watch/a", "").0, 200);
-    // One state with a version, and one without.
+    // The same configuration with a version, and without one.
     for same in [format!("version: 1\n{before}"), before] {
         std::fs::write(&file, same).unwrap();
         assert_eq!(run_failing(&["check-config", path]).0, Some(0));

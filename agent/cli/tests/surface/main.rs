@@ -1,5 +1,5 @@
 //! The agent's interfaces: API, metrics, configuration, command line, recordings and bags. `rp`
-//! replays captures on free ports of this host: no namespaces, no DDS participants.
+//! replays captures on free ports of this host, without network namespaces or DDS participants.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,
@@ -51,12 +51,12 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
-/// `rp` of this build, with an environment that does not leak into it.
+/// Returns a command that runs `rp` of this build in a clean environment.
 fn rp() -> Command {
     ros2probe_testing::local_agent::rp(env!("CARGO_BIN_EXE_rp"))
 }
 
-/// Asserts that an answer of the API reads as `T`, which writes the same again.
+/// Asserts that an answer of the API can be read as `T`, which serializes to the same JSON.
 fn read_as<T: DeserializeOwned + Serialize>(answer: &Value) -> T {
     let typed: T = serde_json::from_value(answer.clone()).unwrap();
     assert_eq!(serde_json::to_value(&typed).unwrap(), *answer);

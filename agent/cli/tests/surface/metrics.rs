@@ -1,4 +1,5 @@
-//! The metrics page: complete, well-formed in both formats whatever the network sends, bounded.
+//! The metrics page is complete, bounded, and well-formed in both formats, whatever the network
+//! sends.
 
 mod markdown;
 
@@ -61,7 +62,7 @@ fn sample<'a>(page: &'a str, series: &str) -> Option<&'a str> {
 }
 
 #[test]
-fn the_page_shows_the_whole_catalogue_and_nothing_else() {
+fn the_page_has_exactly_the_metrics_of_the_catalogue() {
     let page = page(
         sample_robot::snapshot(["/points"]),
         settings(),
@@ -94,7 +95,7 @@ fn the_page_shows_the_whole_catalogue_and_nothing_else() {
     }
 }
 
-/// The page of `docs/` that lists a metric.
+/// Returns the page of `docs/` that lists a metric.
 fn page_of(metric: &str) -> &'static str {
     let begins = |prefixes: &[&str]| prefixes.iter().any(|prefix| metric.starts_with(prefix));
     if begins(&["ros2probe_zenoh_"]) {
@@ -115,7 +116,7 @@ fn page_of(metric: &str) -> &'static str {
     }
 }
 
-/// The rows of the catalogue that a page lists, below the head of the table.
+/// Returns the rows of the catalogue that a page lists, with the head of the table.
 fn metrics_on(page: &str) -> String {
     let table = markdown::metrics();
     let is_shown = |(number, line): &(usize, &str)| match line.split('`').nth(1) {
@@ -127,7 +128,7 @@ fn metrics_on(page: &str) -> String {
 }
 
 #[test]
-fn the_book_s_tables_are_those_of_the_sources() {
+fn the_tables_in_the_book_equal_those_of_the_sources() {
     let docs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs");
     let hint = "run `UPDATE_DOCS=1 cargo test -p ros2probe --test surface metrics::` and commit";
     let metrics = |page| {
@@ -210,7 +211,7 @@ fn metric_values_equal_the_snapshot() {
         ("ros2_topic_rate_hertz", "19.98"),
         (
             "ros2_topic_last_message_timestamp_seconds",
-            // The encoder's shortest form of 1700000000.1234567.
+            // The shortest form of 1700000000.1234567 as the encoder writes it.
             "1700000000.1234568",
         ),
         ("ros2_topic_interarrival_seconds_count", "1000"),
@@ -282,7 +283,7 @@ const SUMS: [(&str, &str, &str); 13] = [
 ];
 
 #[test]
-fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
+fn deliveries_are_summed_by_topic_and_shown_separately_if_a_watch_enables_it() {
     let snapshot = sample_robot::snapshot(["/points"]);
     let asked = page(snapshot.clone(), settings(), Format::Classic);
     let topic = "domain_id=\"0\",topic=\"/points\"";
@@ -368,10 +369,10 @@ fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
 }
 
 #[test]
-fn series_of_deliveries_are_capped_and_never_twice() {
+fn series_of_deliveries_are_capped_and_unique() {
     let mut snapshot = sample_robot::snapshot(["/points"]);
     let topic = &mut snapshot.topics[0];
-    // A reader whose oldest unacknowledged message is older than is remembered.
+    // The oldest unacknowledged message of this reader is older than the remembered messages.
     topic.acknowledgements[0].lag_seconds = None;
     let one = sample_robot::delivery(Direction::Received);
     topic.deliveries = (0..2_000_u16)
@@ -417,7 +418,7 @@ fn promtool_accepts_the_page() {
 }
 
 #[test]
-fn hostile_names_stay_inside_their_label() {
+fn hostile_names_are_escaped_in_their_label() {
     let long = format!("/{}", "\u{e9}".repeat(10_000));
     let longer = format!("{long}x");
     let names = [
@@ -518,7 +519,7 @@ fn measured_topics_come_first_when_the_cap_is_reached() {
 }
 
 #[test]
-fn the_source_its_abilities_and_the_reason_for_it_are_exported() {
+fn the_source_with_its_abilities_and_its_reason_is_exported() {
     let facts = AgentFacts {
         source_reason: Some("no cgroup v2 hierarchy".to_owned()),
         ..sample_robot::agent()
@@ -542,7 +543,7 @@ fn the_source_its_abilities_and_the_reason_for_it_are_exported() {
 }
 
 #[test]
-fn both_formats_hold_the_same_samples() {
+fn both_formats_have_the_same_samples() {
     let sources = MetricSources::new(SourceKind::Wire, settings());
     let state = sources.latest.publish(
         sample_robot::snapshot(["/points", "/imu"]),
@@ -559,7 +560,7 @@ fn both_formats_hold_the_same_samples() {
     assert!(open.contains("# TYPE ros2_topic info\n"));
     assert!(open.contains("# UNIT ros2_topic_interarrival_seconds seconds\n"));
     assert!(open.contains("_bucket{le=\"0.00001\",") && classic.contains(",le=\"1e-05\"}"));
-    // Values that change from scrape to scrape are left out.
+    // Values that change between scrapes are omitted.
     let samples = |page: &str| -> BTreeSet<String> {
         let steady = |line: &&str| {
             ![
@@ -576,8 +577,8 @@ fn both_formats_hold_the_same_samples() {
     assert_eq!(samples(&open), samples(&classic));
 }
 
-/// Returns the sample with the bound of its bucket at the end, and with numbers as Rust writes them:
-/// the formats differ in both.
+/// Returns the sample with the bound of its bucket at the end, and with numbers as Rust writes
+/// them. The formats differ in both respects.
 fn normalised(sample: &str) -> String {
     let number = |text: &str| text.parse::<f64>().unwrap();
     let (series, value) = sample.rsplit_once(' ').unwrap();
@@ -642,7 +643,7 @@ fn buckets_of_chains_have_exemplars_while_traces_are_exported() {
     let [line] = lines[..] else {
         panic!("{lines:#?}")
     };
-    // The newest of 100 durations of 16 ms, of which each has its own trace.
+    // The exemplar is the newest of 100 durations of 16 ms, each of which has its own trace.
     assert!(line.starts_with("ros2_chain_latency_seconds_bucket{le=\"0.02\","));
     let wanted = " 100 # {trace_id=\"00000000000000000000000000000064\"} 0.016";
     assert!(line.contains(wanted), "{line}");
@@ -655,12 +656,12 @@ fn a_page_of_a_thousand_measured_topics_stays_below_16_kb_a_topic() {
         .map(|index| format!("/robot/sensor_{index:04}"))
         .collect();
     let mut snapshot = sample_robot::snapshot(names.iter().map(String::as_str));
-    // As without `capture.inside`, which is the default.
+    // The page is rendered without `capture.inside`, as by default.
     snapshot.inside = None;
     for topic in &mut snapshot.topics {
         topic.inside = None;
     }
-    // The series of chains and of Zenoh do not grow with the topics.
+    // The number of series of chains and of Zenoh does not depend on the number of topics.
     snapshot.chains = ChainsFacts::default();
     snapshot.zenoh = None;
     let mut settings = Settings {

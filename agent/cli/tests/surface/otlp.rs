@@ -1,4 +1,5 @@
-//! A real OpenTelemetry receiver gets the values of the page, and the agent continues when it stops.
+//! A real OpenTelemetry receiver gets the values of the metrics page, and the agent continues when
+//! the receiver stops.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -18,7 +19,7 @@ use ros2probe_testing::ports::free_address;
 use ros2probe_testing::repository;
 use ros2probe_testing::rotel::{Export, Item, Rotel, exports};
 
-/// Values that change from one reading to the next.
+/// Returns whether the value of a metric changes between two readings.
 pub(crate) fn changes(name: &str) -> bool {
     name.starts_with("process_")
         || name.starts_with("ros2probe_otlp_")
@@ -26,12 +27,12 @@ pub(crate) fn changes(name: &str) -> bool {
             name,
             "ros2probe_snapshot_age_seconds"
                 | "ros2probe_scrape_duration_seconds"
-                // A scrape is a client itself.
+                // A scrape counts as a client.
                 | "ros2probe_limit_used"
         )
 }
 
-/// The page's series, without histograms' buckets and what changes.
+/// Returns the series of the page, without buckets of histograms and without changing values.
 fn page_series(page: &str) -> BTreeMap<String, f64> {
     let lines = page.lines().filter(|line| !line.starts_with('#'));
     let series = lines.filter_map(|line| {
@@ -44,7 +45,7 @@ fn page_series(page: &str) -> BTreeMap<String, f64> {
         .collect()
 }
 
-/// The same of what was exported.
+/// Returns the same series of an export.
 fn exported_series(export: &[Export]) -> BTreeMap<String, f64> {
     let names: BTreeMap<String, _> = CATALOGUE
         .iter()
@@ -96,7 +97,7 @@ fn exported_series(export: &[Export]) -> BTreeMap<String, f64> {
 }
 
 #[test]
-fn a_real_receiver_gets_what_the_page_shows_and_may_go_and_come_back() {
+fn a_real_receiver_gets_the_series_of_the_page_also_after_a_restart() {
     let directory = tempfile::tempdir().unwrap();
     let mut receiver = Rotel::start(&mut Command::new(Rotel::binary()), directory.path(), None);
     let configuration = directory.path().join("ros2probe.yaml");
@@ -119,7 +120,7 @@ fn a_real_receiver_gets_what_the_page_shows_and_may_go_and_come_back() {
     let page = page_series(&agent.get("/metrics").body);
     assert!(page.len() > 200, "{}", page.len());
 
-    // The requests of one second hold the final state.
+    // An export that begins after this point has the final state.
     let complete = |text: &str| text.matches("-> Name: process.start_time").count();
     let seen = complete(&receiver.text());
     let text = receiver.wait_for("another export is complete", |text| {
@@ -165,14 +166,14 @@ fn a_real_receiver_gets_what_the_page_shows_and_may_go_and_come_back() {
     );
 }
 
-/// The last export that is complete has each series of the page, and names the robot.
+/// Asserts that the last complete export has each series of the page, and the name of the robot.
 fn assert_exported(text: &str, page: &BTreeMap<String, f64>) {
-    // Records and spans have a trace ID, and come when they happen.
+    // Log records and spans have a trace ID, and are sent as they occur.
     let is_metric = |item: &Item| !item.fields.contains_key("Trace ID");
     let metrics = exports(text).into_iter();
     let metrics = metrics.filter(|export| export.items.iter().all(is_metric));
     let all: Vec<_> = metrics.collect();
-    // Counters are the first request.
+    // The first request of an export has the counters.
     let first = |export: &Export| {
         let mut items = export.items.iter();
         items.any(|item| item.fields["Name"] == "process.cpu")
@@ -212,7 +213,7 @@ fn assert_exported(text: &str, page: &BTreeMap<String, f64>) {
 }
 
 #[test]
-fn over_http_a_real_receiver_gets_the_same() {
+fn a_real_receiver_gets_the_series_of_the_page_over_http() {
     let directory = tempfile::tempdir().unwrap();
     let mut receiver = Rotel::start(&mut Command::new(Rotel::binary()), directory.path(), None);
     let configuration = directory.path().join("ros2probe.yaml");
@@ -239,7 +240,7 @@ fn over_http_a_real_receiver_gets_the_same() {
 }
 
 #[test]
-fn the_agent_s_own_log_comes_on_request_and_exports_add_nothing_to_it() {
+fn the_log_of_the_agent_is_exported_if_enabled_and_exports_add_no_lines_to_it() {
     let directory = tempfile::tempdir().unwrap();
     let mut receiver = Rotel::start(&mut Command::new(Rotel::binary()), directory.path(), None);
     let configuration = directory.path().join("ros2probe.yaml");
@@ -258,7 +259,7 @@ fn the_agent_s_own_log_comes_on_request_and_exports_add_nothing_to_it() {
     };
     let requests = |signal: &str| metric(&agent.get("/metrics").body, &delivered(signal)).unwrap();
     let (lines, metrics) = (requests("log"), requests("metrics"));
-    // The first success of each signal is a line of the export thread.
+    // The export thread logs the first success of each signal.
     agent.wait_for_metric(&delivered("metrics"), |count| count > metrics + 5.0);
     assert!(
         requests("log") <= lines + 1.0,
@@ -290,7 +291,7 @@ impl MetricsService for HeaderReceiver {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
-async fn headers_of_the_environment_join_those_of_the_file_which_win() {
+async fn headers_of_the_file_take_precedence_over_those_of_the_environment() {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let service = MetricsServiceServer::new(HeaderReceiver)
@@ -316,15 +317,15 @@ async fn headers_of_the_environment_join_those_of_the_file_which_win() {
     let requests = |outcome: &str| {
         format!("ros2probe_otlp_exports_total{{signal=\"metrics\",outcome=\"{outcome}\"}}")
     };
-    // Each export has three requests; the last one holds histograms.
+    // Each export has three requests. The last request has the histograms.
     agent.wait_for_metric(&requests("delivered"), |count| count > 8.0);
     agent.wait_for_metric(&requests("failed"), |count| count < 0.5);
 }
 
-/// An event: its name and attributes.
+/// Name and attributes of an event.
 type LoggedEvent = (String, BTreeMap<String, String>);
 
-/// The events of the log.
+/// Returns the events of the agent's event log.
 fn logged_events(agent: &LocalAgent) -> Vec<LoggedEvent> {
     let kept = "/events?after=0&follow=false";
     let body = local_agent::request(agent.api, "GET", kept, "").body;
@@ -383,7 +384,7 @@ fn a_late_receiver_gets_all_events_as_log_records_in_order() {
     assert_eq!(exports[0].resource["robot.name"], "marvin");
     assert_eq!(exports[0].resource["service.name"], "ros2probe");
 
-    // Later events follow, and the last ones are sent before the end.
+    // Later events follow, and the last events are sent before the agent ends.
     let added = local_agent::request(agent.api, "POST", "/watch/imu", "");
     assert_eq!(added.status, 201);
     receiver.wait_for("it has one more", |text| text.contains("watch: Str(/imu)"));
@@ -400,8 +401,8 @@ fn a_late_receiver_gets_all_events_as_log_records_in_order() {
     );
 }
 
-/// An agent with these watches that replays a capture, and the spans that the receiver prints until
-/// `is_whole` accepts its output.
+/// Replays a capture with these watches, and waits until `is_whole` accepts the output of the
+/// receiver. Returns the spans that the receiver printed, and the metrics page.
 fn traced(
     directory: &Path,
     capture: &Path,
@@ -438,7 +439,7 @@ fn traced(
 }
 
 #[test]
-fn a_replay_gives_the_same_traces_every_time_and_they_equal_the_capture() {
+fn each_replay_exports_the_same_traces_and_they_agree_with_the_capture() {
     let directory = tempfile::tempdir().unwrap();
     let watch = "{topic: /chatter, trace: 1}";
     let capture = local_agent::capture();
@@ -489,9 +490,9 @@ fn a_replay_gives_the_same_traces_every_time_and_they_equal_the_capture() {
     assert!(attributes.contains_key("source_timestamp_unix_nano"));
 }
 
-/// Accepts OpenMetrics only.
+/// A header that accepts only OpenMetrics.
 const OPENMETRICS: &str = "Accept: application/openmetrics-text\r\n";
-/// Commands of the capture whose whole way is in `GET /chains`.
+/// Number of commands in the capture whose whole chain is in `GET /chains`.
 const COMMANDS: usize = 259;
 
 #[test]
@@ -499,7 +500,7 @@ fn a_chain_is_one_trace_with_the_spans_of_its_messages_and_nodes() {
     let directory = tempfile::tempdir().unwrap();
     let capture = repository("agent/testing/data/fastrtps-udp/chain-1ns/capture.pcap.gz");
     let watches = "{topic: /points, trace: 1}, {topic: /filtered}, {topic: /cmd}";
-    // The last span is the publication of the last command, and its last attribute is the stamp.
+    // The last span is the publication of the last command. Its last attribute is the stamp.
     let is_whole = |text: &str| {
         let published: Vec<_> = text.split(" : publish /cmd\n").skip(1).collect();
         let last = published.last().copied().unwrap_or_default();
@@ -556,7 +557,7 @@ fn a_chain_is_one_trace_with_the_spans_of_its_messages_and_nodes() {
         assert!(took > 12_000_000, "the filter sleeps 12 ms: {took}");
     }
 
-    // Each exemplar is the id of such a trace.
+    // Each exemplar is the id of one of these traces.
     for family in ["ros2_chain_latency", "ros2_chain_hop_latency"] {
         let bucket = format!("{family}_seconds_bucket{{");
         let lines = page.lines().filter(|line| line.starts_with(&bucket));
@@ -569,7 +570,7 @@ fn a_chain_is_one_trace_with_the_spans_of_its_messages_and_nodes() {
         assert!(ids.iter().all(|id| traces.contains_key(*id)), "{ids:?}");
     }
 
-    // The messages' own traces are apart. A publication on the traced topic links to its message.
+    // Messages have their own traces. A publication on the traced topic links to its message.
     let sent = spans
         .iter()
         .filter(|span| span.fields["Name"] == "send /points");

@@ -1,5 +1,5 @@
-//! OTLP carries each series of the page, for each capture: name, labels, type, unit, help and value.
-//! The page is read as OpenMetrics, and the exports as the receiver decodes them.
+//! For each capture, OTLP exports each series of the metrics page: name, labels, type, unit, help
+//! and value. The page is read as OpenMetrics, and the exports as the receiver decodes them.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
@@ -27,9 +27,9 @@ use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 use tonic::transport::server::{Server, TcpIncoming};
 
-/// Agents at the same time.
+/// Number of simultaneous agents.
 const AGENTS: usize = 3;
-/// Accepts OpenMetrics only.
+/// A header that accepts only OpenMetrics.
 const OPENMETRICS: &str = "Accept: application/openmetrics-text\r\n";
 
 /// The family of a series, and its labels that are not empty.
@@ -43,12 +43,12 @@ struct Series {
     kind: &'static str,
     unit: String,
     help: String,
-    /// The value; of a histogram its buckets from `le`, its sum and its count.
+    /// The value. For a histogram, the buckets by `le`, the sum and the count.
     numbers: BTreeMap<String, String>,
 }
 
 #[test]
-fn each_series_of_the_project_s_captures_is_exported_as_the_page_shows_it() {
+fn exported_series_of_captures_in_the_repository_equal_those_of_the_page() {
     let mut captures = Vec::new();
     for folder in [
         "agent/testing/data",
@@ -63,7 +63,7 @@ fn each_series_of_the_project_s_captures_is_exported_as_the_page_shows_it() {
 
 #[test]
 #[ignore = "needs the corpus of captures: make test-corpus"]
-fn each_series_of_the_corpus_is_exported_as_the_page_shows_it() {
+fn exported_series_of_the_corpus_equal_those_of_the_page() {
     let mut captures = Vec::new();
     find(&ros2probe_testing::corpus(), &mut captures);
     assert_exported(captures);
@@ -104,7 +104,7 @@ fn assert_exported(captures: Vec<PathBuf>) {
     assert!(kinds.keys().copied().eq(all), "{kinds:?}");
 }
 
-/// Compares the page of a finished replay with an export after it, and returns the page's series.
+/// Compares the page of a finished replay with a later export, and returns the series of the page.
 fn compare(runtime: &Runtime, capture: &Path) -> AllSeries {
     let receiver = Receiver::default();
     let address = runtime.block_on(receiver.clone().listen());
@@ -136,7 +136,7 @@ fn compare(runtime: &Runtime, capture: &Path) -> AllSeries {
     page
 }
 
-/// A receiver that gathers series until one comes again, which begins the next collection.
+/// A receiver that collects series. A repeated series begins the next collection.
 #[derive(Clone, Default)]
 struct Receiver(Arc<Mutex<Received>>);
 
@@ -166,9 +166,9 @@ impl Receiver {
         address
     }
 
-    /// Waits for a whole collection that begins from now on.
+    /// Waits for a complete collection that begins after this call.
     fn next_collection(&self) -> AllSeries {
-        // The present one may have begun before, and another one may be on its way.
+        // The current collection may have begun before, and the next one may already be on its way.
         let wanted = self.0.lock().unwrap().seen + 2;
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -198,7 +198,7 @@ impl Received {
         if last.is_none_or(|last| batch.keys().any(|key| last.contains_key(key))) {
             self.collections.push_back(AllSeries::new());
             self.seen += 1;
-            // The last one and the whole one before it.
+            // Keeps the last collection, and the complete collection before it.
             while self.collections.len() > 2 {
                 self.collections.pop_front();
             }
@@ -275,7 +275,7 @@ fn value(point: &NumberDataPoint) -> f64 {
     }
 }
 
-/// Returns the parts of a histogram as a page has them: each bucket includes the smaller ones.
+/// Returns the parts of a histogram as on a page, where each bucket includes the smaller ones.
 #[expect(
     clippy::cast_precision_loss,
     reason = "the page's numbers are read as such, too"
@@ -297,7 +297,7 @@ fn buckets(point: &HistogramDataPoint) -> Vec<(String, f64)> {
 }
 
 impl Series {
-    /// Adds a number; one that changes from reading to reading only shows that it exists.
+    /// Adds a number. A number that changes between readings is replaced by a fixed text.
     fn add(&mut self, metric: &str, part: String, number: f64) {
         let number = if changes(metric) {
             "changes".to_owned()
@@ -358,7 +358,7 @@ fn page_series(page: &str) -> AllSeries {
     panic!("the page is not complete")
 }
 
-/// Returns labels without the empty ones, which are equal to missing ones in Prometheus.
+/// Returns the labels without empty ones, which are equal to missing ones in Prometheus.
 fn parsed(mut labels: &str) -> BTreeMap<String, String> {
     let mut all = BTreeMap::new();
     while let Some((name, rest)) = labels.split_once("=\"") {

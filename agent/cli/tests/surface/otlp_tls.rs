@@ -1,4 +1,4 @@
-//! Exporting over TLS: only to a receiver whose certificate a known authority has signed.
+//! Exports over TLS only to a receiver whose certificate is signed by a known authority.
 
 use std::convert::Infallible;
 use std::path::Path;
@@ -28,7 +28,7 @@ use tonic::transport::server::{Server, TcpIncoming};
 use tonic::transport::{Identity, ServerTlsConfig};
 use tonic::{Request, Response, Status};
 
-/// Makes a private authority and a certificate for `localhost` that it signs, in the files
+/// Creates a private authority and a certificate for `localhost` that it signs, in the files
 /// `authority`, `certificate` and `key`.
 fn make_certificate(directory: &Path) {
     let make = |name: &str, key: &str, out: &str, more: &[&str]| {
@@ -57,7 +57,7 @@ fn make_certificate(directory: &Path) {
     make("/CN=collector", "key", "certificate", &signed);
 }
 
-/// Exports to the receiver at this port, with and without its authority.
+/// Asserts that exports to the receiver at this port succeed only with its authority.
 fn assert_believed_if_known(directory: &Path, port: u16, protocol: &str) {
     let path = |name: &str| directory.join(name).to_str().unwrap().to_owned();
     let configuration = path("ros2probe.yaml");
@@ -78,7 +78,7 @@ fn assert_believed_if_known(directory: &Path, port: u16, protocol: &str) {
             command.env("SSL_CERT_FILE", known);
         }
         let agent = LocalAgent::start(&mut command, &arguments);
-        // Counters, gauges and histograms are requests of their own.
+        // Counters, gauges and histograms are separate requests.
         let wanted = if outcome == "delivered" { 3.0 } else { 1.0 };
         agent.wait_for_metric(&count(outcome), |count| count >= wanted);
         agent.wait_for_metric(&count(never), |count| count < 0.5);
@@ -99,7 +99,7 @@ impl MetricsService for Receiver {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
-async fn a_receiver_is_believed_whose_authority_is_known_and_no_other() {
+async fn only_a_receiver_with_a_known_authority_gets_exports() {
     let directory = tempfile::tempdir().unwrap();
     make_certificate(directory.path());
     let read = |name: &str| std::fs::read(directory.path().join(name)).unwrap();
@@ -115,7 +115,7 @@ async fn a_receiver_is_believed_whose_authority_is_known_and_no_other() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
-async fn over_http_a_receiver_is_believed_whose_authority_is_known_and_no_other() {
+async fn only_a_receiver_with_a_known_authority_gets_exports_over_http() {
     let directory = tempfile::tempdir().unwrap();
     make_certificate(directory.path());
     let certificate = CertificateDer::from_pem_file(directory.path().join("certificate")).unwrap();

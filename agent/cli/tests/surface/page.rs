@@ -1,5 +1,5 @@
-//! The answers of the real binary to the page, on replays of real robots: files, the stream of
-//! changes, history, decoded messages, tokens, downloads.
+//! Answers to the web page for replays of real robots: files, the stream of changes, history,
+//! decoded messages, tokens and downloads.
 
 mod history;
 mod messages;
@@ -15,13 +15,13 @@ use crate::rp;
 use ros2probe_testing::local_agent::{Answer, LocalAgent, PATIENCE, ask, exchange, request};
 use serde_json::{Value, json};
 
-/// A capture of `agent/testing/data`.
+/// Returns the path of a capture of `agent/testing/data`.
 pub(crate) fn data(name: &str) -> PathBuf {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
     data.join(name).join("capture.pcap.gz")
 }
 
-/// An agent that has replayed a capture to its end and measured every topic.
+/// Returns an agent that has replayed a capture to its end and measured every topic.
 fn ended(name: &str, arguments: &[&str]) -> LocalAgent {
     let mut all = vec!["--speed", "max", "--watch", "/**"];
     all.extend(arguments);
@@ -36,14 +36,14 @@ fn get(agent: &LocalAgent, path: &str) -> Value {
     body
 }
 
-/// The end of the problem's type.
+/// Returns the last part of the problem's type.
 fn code(answer: &Answer) -> String {
     let body: Value = serde_json::from_str(&answer.body).unwrap_or_default();
     let code = body["type"].as_str().unwrap_or_default();
     code.replace("urn:ros2probe:problem:", "")
 }
 
-/// A stream of lines. HTTP/1.0: nothing separates them.
+/// A stream of lines over HTTP/1.0, which has no chunks.
 pub(crate) struct Lines {
     reader: BufReader<TcpStream>,
 }
@@ -77,7 +77,7 @@ impl Lines {
         })
     }
 
-    /// The next line: its one member's name and value; `None` at the end.
+    /// Returns the name and the value of the only member of the next line, or `None` at the end.
     pub(crate) fn next(&mut self) -> Option<(String, Value)> {
         let mut line = String::new();
         if self.reader.read_line(&mut line).unwrap() == 0 {
@@ -90,7 +90,7 @@ impl Lines {
         Some((name.clone(), value.clone()))
     }
 
-    /// Lines up to the next one of figures.
+    /// Returns all lines up to the next line with figures, which is the last.
     pub(crate) fn batch(&mut self) -> Vec<(String, Value)> {
         let mut lines = Vec::new();
         loop {
@@ -182,7 +182,7 @@ fn the_page_is_served_with_a_strict_policy_and_revalidated() {
 }
 
 #[test]
-fn the_page_of_this_listener_may_ask_and_others_may_not() {
+fn requests_of_the_own_page_are_permitted_and_those_of_foreign_pages_are_refused() {
     let agent = ended("cyclonedds/points-besteffort-lossy-2ns", &[]);
     let own = format!(
         "Origin: http://{}\r\nSec-Fetch-Site: same-origin\r\n",
@@ -204,14 +204,14 @@ fn the_page_of_this_listener_may_ask_and_others_may_not() {
             (403, "foreign-origin".to_owned())
         );
     }
-    // A link may lead to the page; a foreign page may not load its parts.
+    // A link may lead to the page, but a foreign page may not load parts of the page.
     let link =
         "Sec-Fetch-Site: cross-site\r\nSec-Fetch-Mode: navigate\r\nSec-Fetch-Dest: document\r\n";
     assert_eq!(request(agent.api, "GET", "/", link).status, 200);
     let part = "Sec-Fetch-Site: cross-site\r\nSec-Fetch-Mode: no-cors\r\n";
     let answer = request(agent.api, "GET", "/page/icon.svg", part);
     assert_eq!(code(&answer), "foreign-origin");
-    // A link reaches no route of the API.
+    // A link may not lead to a route of the API.
     assert_eq!(
         code(&request(agent.api, "GET", "/topics", link)),
         "foreign-origin"
@@ -247,7 +247,7 @@ fn the_page_can_be_switched_off() {
 }
 
 #[test]
-fn a_token_of_the_socket_lets_the_page_do_what_loopback_may_not() {
+fn a_token_from_the_socket_grants_the_page_more_access_than_loopback() {
     let directory = tempfile::tempdir().unwrap();
     let socket = directory.path().join("api.sock");
     let config = directory.path().join("config.yaml");
@@ -331,7 +331,7 @@ fn a_listener_that_requires_a_token_serves_files_without_one() {
 }
 
 #[test]
-fn another_robot_s_page_comes_by_a_tunnel() {
+fn the_page_of_another_robot_is_reached_through_a_tunnel() {
     let printed = rp().args(["page", "--host", "robot1"]).output().unwrap();
     let text = String::from_utf8(printed.stdout).unwrap();
     assert!(printed.status.success());
@@ -342,7 +342,7 @@ fn another_robot_s_page_comes_by_a_tunnel() {
 }
 
 #[test]
-fn an_agent_of_this_host_is_reached_by_its_address() {
+fn the_page_of_an_agent_on_this_host_is_reached_at_its_address() {
     let agent = ended("cyclonedds/points-besteffort-lossy-2ns", &[]);
     let host = agent.api.to_string();
     let printed = rp().args(["page", "--host", &host]).output().unwrap();
@@ -354,7 +354,7 @@ fn an_agent_of_this_host_is_reached_by_its_address() {
     assert_eq!(line(&live.batch(), "open")["access"], "all");
 }
 
-/// The same, with the bytes of the body.
+/// Sends a GET request. Returns the status, the head, and the body as bytes.
 fn bytes_of(api: SocketAddr, path: &str, headers: &str) -> (u16, String, Vec<u8>) {
     let mut stream = TcpStream::connect(api).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();

@@ -1,5 +1,5 @@
-//! Bags that the agent writes on request of the API: begun, paused, split and ended; and the last
-//! seconds before an expectation was violated.
+//! Bags that the agent writes on request of the API: start, pause, split and end. Also bags of the
+//! last seconds before the violation of an expectation.
 
 mod begin_and_end;
 mod captures;
@@ -24,10 +24,10 @@ use serde_json::Value;
 
 const START: u64 = 1_795_143_000 * SECOND;
 const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
-/// Topics of a robot with navigation and two cameras.
+/// Number of topics of a robot with navigation and two cameras.
 const MANY: usize = 171;
 
-/// An agent that may write bags, and replays slowly.
+/// Starts an agent that may write bags and replays slowly.
 fn agent(directory: &Path, more: &str) -> LocalAgent {
     agent_on(&local_agent::capture(), directory, "0.5", more)
 }
@@ -35,7 +35,7 @@ fn agent(directory: &Path, more: &str) -> LocalAgent {
 fn agent_on(capture: &Path, directory: &Path, speed: &str, more: &str) -> LocalAgent {
     let configuration = directory.join("ros2probe.yaml");
     let bags = directory.join("bags");
-    // The fill of the disk matters only in the tests that set it.
+    // The free space of the disk is relevant only in tests that set a reserve.
     let reserve = match more.contains("reserve_") {
         true => "",
         false => "  reserve_percent: 0\n  reserve_bytes: 0\n",
@@ -53,7 +53,7 @@ fn agent_on(capture: &Path, directory: &Path, speed: &str, more: &str) -> LocalA
     )
 }
 
-/// Reads the recording until it is as wanted.
+/// Repeats the request for a recording until the recording has the wanted content.
 fn wait_for(api: SocketAddr, name: &str, wanted: impl Fn(&Value) -> bool) -> Value {
     let deadline = Instant::now() + PATIENCE;
     loop {
@@ -66,7 +66,7 @@ fn wait_for(api: SocketAddr, name: &str, wanted: impl Fn(&Value) -> bool) -> Val
     }
 }
 
-/// Sequence numbers in a bag, by topic.
+/// Returns the sequence numbers in a bag, by topic.
 fn messages(directory: &Path) -> BTreeMap<String, Vec<u32>> {
     let mut found = BTreeMap::<_, Vec<_>>::new();
     for_each_message(directory, |message| {
@@ -138,12 +138,12 @@ fn a_headless_robot_records_on_request_and_lists_its_recordings() {
     agent.wait_for_metric("ros2probe_recorded_messages_total", recorded);
     let events = local_agent::request(api, "GET", "/events?after=0&follow=false", "").body;
     assert!(events.contains("ros2probe.recording.started") && events.contains(r#""missing":0"#));
-    // Asked again, nothing more happens.
+    // A repeated request has no effect.
     assert_eq!(ask(api, "DELETE", "/recordings/drive", "").0, 200);
 }
 
 #[test]
-fn a_recording_that_meets_a_limit_ends_in_order_with_the_reason_and_none_begins_then() {
+fn a_recording_that_reaches_a_limit_ends_with_the_reason_and_the_next_is_refused() {
     use std::os::unix::fs::PermissionsExt as _;
     let directory = tempfile::tempdir().unwrap();
     let agent = agent(
@@ -198,7 +198,7 @@ fn a_recording_that_would_use_the_reserve_is_refused() {
 }
 
 #[test]
-fn a_recording_that_cannot_be_is_refused_and_leaves_nothing() {
+fn an_invalid_recording_is_refused_and_leaves_no_files() {
     let directory = tempfile::tempdir().unwrap();
     let agent = agent(directory.path(), "");
     let long = "x".repeat(129);
@@ -249,7 +249,7 @@ fn a_recording_that_cannot_be_is_refused_and_leaves_nothing() {
 }
 
 #[test]
-fn the_seconds_before_an_expectation_was_violated_are_in_a_bag() {
+fn the_seconds_before_the_violation_of_an_expectation_are_written_to_a_bag() {
     let directory = tempfile::tempdir().unwrap();
     let more = "  snapshots:\n    - {name: incident, topics: ['/**'], seconds: 5}\n\
                 watch: [{topic: '/**', min_rate_hz: 1000000}]\n";
@@ -281,9 +281,10 @@ fn the_seconds_before_an_expectation_was_violated_are_in_a_bag() {
     assert_eq!(list["snapshots"][0]["failed"], 0, "{list}");
 }
 
-/// The capture is replayed as fast as it can be read: the time of the event decides, not its delay.
+/// The capture is replayed as fast as possible. The time of the event determines the messages, not
+/// the time of its arrival.
 #[test]
-fn the_seconds_around_an_event_are_in_a_bag_that_names_it() {
+fn the_seconds_around_an_event_are_written_to_a_bag_with_the_name_of_the_event() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("gap.pcap");
     let mut capture = Capture::new(ETHERNET);
@@ -316,7 +317,7 @@ fn the_seconds_around_an_event_are_in_a_bag_that_names_it() {
     assert_eq!(trigger["attributes"]["count"], 5, "{trigger}");
     let event: jiff::Timestamp = trigger["time"].as_str().unwrap().parse().unwrap();
     let event = u64::try_from(event.as_nanosecond()).unwrap() - START;
-    // Message n was sent after n tenths of a second.
+    // Message n was sent n tenths of a second after the start.
     let tenths = |nanoseconds: u64| u32::try_from(nanoseconds * 10 / SECOND).unwrap();
     let first = tenths((event - 3 * SECOND).next_multiple_of(SECOND / 10));
     let numbers = first..=tenths(event + 2 * SECOND);
@@ -329,12 +330,12 @@ fn the_seconds_around_an_event_are_in_a_bag_that_names_it() {
 }
 
 #[test]
-fn a_late_recording_and_a_late_echo_have_what_was_sent_once_before_them() {
+fn a_late_recording_and_a_late_echo_have_the_latched_message_sent_before_them() {
     for more in ["", "watch: [{topic: /tf_static, retain: last}]\n"] {
         let directory = tempfile::tempdir().unwrap();
         let agent = agent_on(&sent_once(), directory.path(), "10", more);
         agent.wait_for_metric("ros2probe_retained_bytes", |bytes| bytes > 50.0);
-        // The capture sends it once: a recording that begins now is too late for it.
+        // The capture contains one message of the topic, which precedes this recording.
         let ended = record_late(&agent, 1);
         assert_eq!(ended["report"]["sent_before"], serde_json::json!([]));
         let messages = messages(&directory.path().join("bags/late"));
@@ -350,7 +351,7 @@ fn a_late_recording_and_a_late_echo_have_what_was_sent_once_before_them() {
 }
 
 #[test]
-fn without_retention_a_late_recording_and_a_late_echo_name_what_they_miss() {
+fn without_retention_a_late_echo_reports_the_missing_latched_message() {
     let directory = tempfile::tempdir().unwrap();
     let mut agent = agent_on(&sent_once(), directory.path(), "10", "retain: off\n");
     agent.wait_for_log("the capture has ended");
@@ -375,7 +376,7 @@ fn sent_once() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/echo/capture.pcap.gz")
 }
 
-/// Records until this many messages of `/tf_static` are there.
+/// Records until the recording has this number of messages of `/tf_static`.
 fn record_late(agent: &LocalAgent, messages: u64) -> Value {
     let body = r#"{"name": "late", "topics": {"topics": ["/tf_static", "/chatter"]}}"#;
     let (status, begun) = ask(agent.api, "POST", "/recordings", body);
@@ -389,7 +390,7 @@ fn record_late(agent: &LocalAgent, messages: u64) -> Value {
 }
 
 #[test]
-fn snapshots_without_a_directory_are_a_mistake_only_if_the_directory_is_off() {
+fn snapshots_without_a_directory_are_an_error_only_if_the_directory_is_off() {
     let directory = tempfile::tempdir().unwrap();
     let configuration = directory.path().join("ros2probe.yaml");
     let run = |state: &str| {
@@ -405,7 +406,7 @@ fn snapshots_without_a_directory_are_a_mistake_only_if_the_directory_is_off() {
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         (output.status.code(), output.stdout.len(), said)
     };
-    // A replay has no state directory, as an agent whose disk is not there.
+    // A replay has no state directory, like an agent whose disk is missing.
     let (code, length, said) = run("");
     assert_eq!(code, Some(0), "{said}");
     assert!(length > 1000 && said.contains("snapshots are disabled"));
@@ -414,7 +415,8 @@ fn snapshots_without_a_directory_are_a_mistake_only_if_the_directory_is_off() {
     assert!(said.contains("the agent has no directory for recordings"));
 }
 
-/// Returns the output of `rp bag convert` for a capture, its exit code and the report in the bag.
+/// Converts a capture. Returns the exit code of `rp bag convert`, its standard error, and the
+/// report in the bag.
 fn converted(capture: &Path, bag: &Path, options: &[&str]) -> (Option<i32>, String, Value) {
     let mut command = rp();
     command
@@ -432,7 +434,7 @@ fn converted(capture: &Path, bag: &Path, options: &[&str]) -> (Option<i32>, Stri
     (output.status.code(), said, report.unwrap_or_default())
 }
 
-/// A minute of so many topics, one message of each a second.
+/// Writes a capture of one minute with `MANY` topics, each with one message per second.
 fn many_topics(path: &Path) {
     let mut capture = Capture::new(ETHERNET);
     capture.participant(START, 0, ALICE);
@@ -455,7 +457,7 @@ fn many_topics(path: &Path) {
     capture.write(path);
 }
 
-/// An `rp bag record` and what it prints on stderr.
+/// A process of `rp bag record`, and its lines on stderr.
 struct Recording {
     child: Child,
     lines: Receiver<String>,
@@ -487,7 +489,7 @@ impl Recording {
         }
     }
 
-    /// Waits for a line with `text`, and returns how long that took.
+    /// Waits for a line with `text`, and returns the waiting time.
     fn wait_for(&mut self, text: &str) -> Duration {
         let begun = Instant::now();
         loop {
@@ -508,7 +510,7 @@ impl Recording {
         assert!(sent.success());
     }
 
-    /// Returns its exit status and the time until its end.
+    /// Waits for the end, and returns the exit status and the waiting time.
     fn end(&mut self) -> (ExitStatus, Duration) {
         let begun = Instant::now();
         let status = loop {

@@ -1,5 +1,5 @@
-//! `rp topic`, `rp node`, `rp service` and `rp action`: the text of the original, from an agent and
-//! from a capture, and how they behave among other tools.
+//! `rp topic`, `rp node`, `rp service` and `rp action` print the output of ros2cli, from an agent
+//! and from a capture. They work together with other tools.
 
 mod echo;
 mod graph;
@@ -29,7 +29,7 @@ pub fn stderr(output: &Output) -> String {
     String::from_utf8(output.stderr.clone()).unwrap()
 }
 
-/// Checks for one line with the remedy, and exit code 1.
+/// Asserts that the command fails with exit code 1 and with one line that has this part.
 fn fails_with(output: &Output, part: &str) {
     let said = stderr(output);
     assert_eq!(output.status.code(), Some(1), "{said}");
@@ -38,7 +38,7 @@ fn fails_with(output: &Output, part: &str) {
 }
 
 #[test]
-fn a_running_agent_answers_what_its_capture_answers() {
+fn an_agent_and_its_capture_lead_to_the_same_output() {
     let capture = graph::own().join("graph.pcap.gz");
     let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--speed", "max"]);
     agent.wait_for_log("the capture has ended");
@@ -74,7 +74,7 @@ fn a_running_agent_answers_what_its_capture_answers() {
 }
 
 #[test]
-fn a_token_or_the_socket_opens_an_agent() {
+fn a_token_or_the_socket_gives_access_to_an_agent() {
     let directory = tempfile::tempdir().unwrap();
     let file = |name: &str, text: &str| {
         let path = directory.path().join(name);
@@ -109,7 +109,7 @@ fn a_token_or_the_socket_opens_an_agent() {
     assert_eq!(listed.status.code(), Some(0), "{}", stderr(&listed));
 }
 
-/// Answers every connection with these bytes.
+/// Starts a server that answers every connection with these bytes, and returns its address.
 fn answering(answer: &'static [u8]) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap().to_string();
@@ -152,7 +152,7 @@ fn an_unreachable_agent_is_reported_in_one_line() {
 }
 
 #[test]
-fn the_command_line_takes_precedence_over_the_environments_domain_and_distribution() {
+fn options_take_precedence_over_ros_distro_and_ros_domain_id() {
     let capture = graph::own().join("graph.pcap.gz");
     let info = |distro: &str, domain: &str, further: &[&str]| {
         let mut rp = rp();
@@ -187,7 +187,7 @@ fn a_command_without_a_verb_prints_its_help() {
 }
 
 #[test]
-fn a_capture_answers_as_an_agent_does_up_to_the_requested_time() {
+fn a_capture_is_listed_up_to_the_requested_time() {
     let capture = local_agent::capture();
     let capture = capture.to_str().unwrap();
     let list = |further: &[&str]| {
@@ -215,7 +215,7 @@ fn a_capture_answers_as_an_agent_does_up_to_the_requested_time() {
 }
 
 #[test]
-fn a_truncated_capture_shows_what_precedes_the_cut() {
+fn a_truncated_capture_is_listed_up_to_the_cut_with_a_warning() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("cut.pcap.gz");
     let whole = std::fs::read(local_agent::capture()).unwrap();

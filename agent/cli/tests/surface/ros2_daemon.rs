@@ -1,7 +1,8 @@
-//! The agent as the daemon of the `ros2` command line, beside a replayed capture of ROS 2 Humble:
-//! Python's own XML-RPC client, the life of the port, and requests that are refused.
+//! The agent as the daemon of the `ros2` command line, with a replayed capture of ROS 2 Humble. The
+//! tests use Python's own XML-RPC client, and check the states of the port and refused requests.
 //!
-//! The port of domain 0 exists once on a host, so these tests run one at a time (nextest's group).
+//! The port of domain 0 exists once on a host, so these tests run one after the other (nextest's
+//! group).
 
 use std::fs;
 use std::io::{ErrorKind, Read as _, Write as _};
@@ -19,9 +20,9 @@ use crate::rp;
 /// Port of domain 0, which the capture uses.
 const DAEMON: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), 11_511);
 const LISTENING: &str = "ros2probe_ros2_daemon_ports{state=\"listening\"}";
-/// The nodes end after 8 s of the capture, and all are known after a second.
+/// Replay speed. In the capture, all nodes are known after 1 s and end after 8 s.
 const SPEED: &str = "0.25";
-/// Most connections at once (`MAX_CLIENTS`).
+/// Maximum number of simultaneous connections (`MAX_CLIENTS`).
 const MAX_CLIENTS: usize = 16;
 
 /// An agent with a configuration file, which a test may change.
@@ -66,7 +67,7 @@ impl Daemon {
     }
 }
 
-/// The body of a call with texts.
+/// Returns the body of a call with text arguments.
 fn body(method: &str, arguments: &[&str]) -> String {
     let arguments: String = arguments
         .iter()
@@ -78,7 +79,7 @@ fn body(method: &str, arguments: &[&str]) -> String {
     )
 }
 
-/// Sends a request as Python's client does, on a kept connection.
+/// Sends a request on a persistent connection, as Python's client does.
 fn send(stream: &mut TcpStream, head: &str, body: &str) -> Answer {
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
     let length = body.len();
@@ -118,7 +119,7 @@ fn call(method: &str, arguments: &[&str]) -> Answer {
 }
 
 #[test]
-fn python_of_each_distribution_reads_every_answer_and_writes_the_same_bytes() {
+fn python_clients_of_each_distribution_read_every_answer_and_encode_the_same_bytes() {
     let script = repository("agent/cli/tests/surface/ros2_daemon/client.py");
     for distro in ["humble", "jazzy", "kilted", "lyrical"] {
         let _daemon = Daemon::listening(&format!("{{distro: {distro}}}"));
@@ -161,7 +162,7 @@ fn the_python_release_in_the_user_agent_selects_the_classes_of_endpoints() {
         ("3.10", 24, "rclpy.topic_endpoint_info.TopicEndpointInfo"),
         ("3.12", 16, "rclpy.topic_endpoint_info.TopicEndpointInfo"),
         ("3.14", 16, "rclpy.endpoint_info.TopicEndpointInfo"),
-        // Unknown: the robot announces no type hashes, as Humble.
+        // For an unknown release, the robot decides. It announces no type hashes, as in Humble.
         ("3.11", 24, "rclpy.topic_endpoint_info.TopicEndpointInfo"),
     ] {
         let head = HEAD.replace("3.10", release);
@@ -219,7 +220,7 @@ fn the_agent_waits_for_a_port_in_use_and_leaves_it_free_after_a_shutdown() {
     idle.set_read_timeout(Some(PATIENCE)).unwrap();
     let ended = idle.read(&mut [0]);
     assert!(!matches!(ended, Ok(1..)), "{ended:?}");
-    // Neither connection keeps the port: a daemon that does not reuse addresses can bind it.
+    // No connection keeps the port in use, so a daemon that does not reuse addresses can bind it.
     let bind = "import socket; s = socket.socket(); s.bind(('127.0.0.1', 11511)); s.listen()";
     let status = Command::new("python3").args(["-c", bind]).status().unwrap();
     assert!(status.success());
@@ -231,7 +232,7 @@ fn the_agent_waits_for_a_port_in_use_and_leaves_it_free_after_a_shutdown() {
 }
 
 #[test]
-fn web_pages_and_what_is_no_call_are_refused() {
+fn web_pages_and_requests_that_are_not_calls_are_refused() {
     let daemon = Daemon::listening("on");
     let list = body("system.listMethods", &[]);
     let ask = |head: &str, body: &str| {
@@ -308,7 +309,7 @@ fn connections_beyond_the_cap_replace_the_longest_idle_one() {
 }
 
 #[test]
-fn nothing_listens_without_the_setting() {
+fn without_the_setting_the_port_is_closed() {
     let daemon = Daemon::start("off");
     daemon
         .agent

@@ -1,5 +1,5 @@
-//! The shipped Prometheus rules: promtool accepts them, their tests pass, and every metric they
-//! read exists. Every alert names the remedy, and is tested to fire and not to.
+//! The shipped Prometheus rules: promtool accepts them, their tests pass, and every metric in them
+//! exists. Every alert names the remedy, and has tests in which it fires and in which it does not.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ use serde_yaml::Value;
 const INSTALL: &str =
     "promtool is missing: run `make prerequisites` or `apt-get install prometheus`";
 
-/// Groups of rules, which look like metrics.
+/// Names of rule groups, which look like names of metrics.
 const GROUPS: [&str; 6] = [
     "ros2probe_agent",
     "ros2probe_topics",
@@ -39,7 +39,7 @@ fn promtool(arguments: &[&str]) -> Result<()> {
 }
 
 #[test]
-fn promtool_understands_every_rule() -> Result<()> {
+fn promtool_accepts_every_rule() -> Result<()> {
     promtool(&[
         "check",
         "rules",
@@ -51,12 +51,12 @@ fn promtool_understands_every_rule() -> Result<()> {
 }
 
 #[test]
-fn the_rules_find_the_losses_of_invented_robots() -> Result<()> {
+fn the_rules_compute_the_losses_of_simulated_robots() -> Result<()> {
     promtool(&["test", "rules", "ros2probe.test.yaml"])
 }
 
 #[test]
-fn alerts_fire_on_symptoms_and_only_on_them() -> Result<()> {
+fn alerts_fire_only_on_their_symptoms() -> Result<()> {
     promtool(&["test", "rules", "ros2probe.alerts.test.yaml"])
 }
 
@@ -84,7 +84,7 @@ fn every_alert_has_a_severity_a_summary_and_a_remedy() -> Result<()> {
 }
 
 #[test]
-fn every_alert_is_tested_to_fire_and_not_to_fire() -> Result<()> {
+fn every_alert_has_tests_in_which_it_fires_and_does_not_fire() -> Result<()> {
     let tests = yaml("ros2probe.alerts.test.yaml")?;
     let tests = tests["tests"].as_sequence().context("no tests")?;
     for alert in alerts()? {
@@ -106,7 +106,7 @@ fn every_alert_is_tested_to_fire_and_not_to_fire() -> Result<()> {
 }
 
 #[test]
-fn the_readme_names_every_rule() -> Result<()> {
+fn the_readme_lists_every_alert() -> Result<()> {
     let readme = std::fs::read_to_string(rules().join("../README.md"))?;
     for alert in alerts()? {
         let name = alert["alert"].as_str().context("no name")?;
@@ -158,7 +158,7 @@ fn every_metric_in_the_rules_and_their_tests_is_in_the_catalogue() -> Result<()>
             .filter(|line| !line.trim_start().starts_with('#'))
             .flat_map(|line| [line, "\n"])
             .collect();
-        // A rule records each name with a colon, and promtool's tests cover it.
+        // A name with a colon belongs to a recording rule, which the tests of promtool cover.
         let word = |c: char| !(c.is_ascii_alphanumeric() || matches!(c, '_' | ':'));
         for name in text.split(word) {
             let of_ours = ["ros2_", "ros2probe_"]

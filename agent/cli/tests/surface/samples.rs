@@ -1,5 +1,5 @@
-//! Samples one by one: from the model over replayed captures, and from the real binary by
-//! `GET /samples`.
+//! Single samples: from the model over replayed captures, and from the real binary through `GET
+//! /samples`.
 
 mod shared_memory;
 
@@ -31,7 +31,7 @@ const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
 const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
 const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10bobby-host");
 
-/// The captures of the repository, and those of large messages where there are more.
+/// Returns the captures of the repository, and further captures of large messages if they exist.
 fn captures() -> Vec<PathBuf> {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut captures = Vec::new();
@@ -66,7 +66,7 @@ fn request(id: u64, depth: Depth) -> SampleRequest {
     }
 }
 
-/// Replays a capture with a watch for all topics and, with a depth, an interest in all samples.
+/// Replays a capture with a watch for all topics and, with a depth, a request for all samples.
 pub(crate) fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<SampleOutcome>) {
     let mut observer = Observer::new(Settings::default());
     let everything = vec![Watch::named("/**").unwrap()];
@@ -93,14 +93,15 @@ pub(crate) fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<S
     take(&mut observer);
     let mut snapshot = observer.snapshot(feed.last());
     snapshot.tables.retain(|table| table.table != "payloads");
-    // It marks that samples are wanted, and is not a number.
+    // This flag shows that samples are requested, and is not a count.
     for topic in &mut snapshot.topics {
         topic.is_read = false;
     }
     (snapshot, news)
 }
 
-/// Samples and their bytes by topic, each sample checked to be the next and the only one.
+/// Returns the numbers of samples and bytes by topic. Each sample must be unique, and the times
+/// must not decrease.
 fn counts(news: &[SampleOutcome], depth: Depth) -> BTreeMap<(DomainId, String), (u64, u64)> {
     let mut counts: BTreeMap<_, (u64, u64)> = BTreeMap::new();
     let mut seen = BTreeSet::new();
@@ -157,7 +158,7 @@ fn a_sample_request_changes_no_count_and_gets_each_counted_sample_once() {
                 };
                 let key = (topic.domain_id, topic.dds_name.to_string());
                 let given = counts.remove(&key).unwrap_or_default();
-                // Samples of an unknown writer count for its topic once it is announced.
+                // Earlier samples of an unknown writer count for its topic after its announcement.
                 let unannounced = unannounced(&news, &key.1);
                 assert_eq!(given.0 + unannounced, measured.messages, "{name}: {key:?}");
                 if unannounced == 0 {
@@ -192,7 +193,7 @@ fn a_sample_request_changes_no_count_and_gets_each_counted_sample_once() {
 #[derive(serde::Deserialize)]
 struct Logged {
     lost_between: Vec<u64>,
-    /// When each message reached its callback.
+    /// The times at which the messages reached their callback.
     t: Vec<u64>,
 }
 
@@ -202,7 +203,7 @@ struct GroundTruth {
 }
 
 #[test]
-fn a_subscription_gets_what_a_reliable_subscriber_got_in_its_order_and_at_its_times() {
+fn a_subscription_gets_the_messages_of_a_reliable_subscriber_in_order_and_on_time() {
     for (label, unannounced) in [
         ("fastrtps-udp/keep-last-lossy-2ns", 0),
         ("cyclonedds/keep-last-lossy-2ns", 0),
@@ -239,7 +240,8 @@ fn a_subscription_gets_what_a_reliable_subscriber_got_in_its_order_and_at_its_ti
             let numbers = given.iter().map(|(number, _)| *number);
             assert!(numbers.is_sorted(), "{label}");
             assert_eq!(given.len(), logged.t.len(), "{label}");
-            // A callback runs some time after the datagram that it was waiting for.
+            // A callback runs some time after the arrival of the datagram that completed its
+            // message.
             let late = given.iter().zip(&logged.t);
             let late = late.filter(|((_, at), t)| !(0..20_000_000).contains(&t.wrapping_sub(*at)));
             let late: Vec<_> = late.collect();
@@ -248,7 +250,7 @@ fn a_subscription_gets_what_a_reliable_subscriber_got_in_its_order_and_at_its_ti
     }
 }
 
-/// A domain in which two participants announce a writer of a topic each.
+/// A domain in which two participants each announce a writer of a topic.
 struct Robot {
     observer: Observer,
     at: u64,
@@ -281,7 +283,7 @@ impl Robot {
         });
     }
 
-    /// Read in shared memory, where others may have been missed.
+    /// Adds a message that was read from shared memory, where others may have been missed.
     fn receive(&mut self, message: Message) {
         self.at += 1_000_000;
         let envelope = forge::multicast(self.at, 0);
@@ -305,7 +307,7 @@ impl Robot {
             .input(Input::SampleRequests(Arc::new(sample_requests)));
     }
 
-    /// Writer, number and payload, or the reason of a miss.
+    /// Returns writer, number and payload of each sample, or the reason for a missed sample.
     fn given(&mut self) -> Vec<(GuidPrefix, u64, Result<Vec<u8>, MissedReason>)> {
         let given = self.observer.drain().samples.into_iter();
         given
@@ -323,13 +325,13 @@ impl Robot {
     }
 }
 
-/// A payload whose bytes differ by position.
+/// Returns a payload whose bytes differ by position.
 fn payload(size: usize) -> Vec<u8> {
     (0..size).map(|place| (place * 7 % 251) as u8).collect()
 }
 
 #[test]
-fn fragments_make_the_payload_that_was_sent_in_the_order_of_counting() {
+fn fragments_are_assembled_and_samples_are_delivered_in_the_order_of_completion() {
     let mut robot = Robot::new(Settings::default());
     robot.subscribe(&["/points", "/add/_service_event"], Depth::Payloads);
     let (large, small) = (payload(4321), payload(1234));
@@ -406,7 +408,7 @@ fn each_subscription_gets_the_losses_since_it_began() {
 }
 
 #[test]
-fn interest_measures_unwatched_topics_and_ends_with_the_last_request() {
+fn sample_requests_measure_unwatched_topics_until_the_last_request_ends() {
     let mut robot = Robot::new(Settings::default());
     let guid = Guid::new(ALICE, WRITER);
     let verdict = |robot: &mut Robot| {
@@ -435,7 +437,7 @@ fn interest_measures_unwatched_topics_and_ends_with_the_last_request() {
 }
 
 #[test]
-fn samples_without_room_are_reported_and_memory_stays_bounded() {
+fn samples_beyond_the_cap_in_bytes_are_reported_and_memory_is_bounded() {
     let mut robot = Robot::new(Settings {
         payload_bytes: 100_000,
         ..Settings::default()
@@ -450,7 +452,7 @@ fn samples_without_room_are_reported_and_memory_stays_bounded() {
             .find(|table| table.table == "payloads");
         table.unwrap().size
     };
-    // No client takes the samples.
+    // No client reads the samples.
     for number in 1..=20 {
         robot.put(Message::from(ALICE).data(WRITER, number, &payload(10_000)));
         assert!(held(&robot) <= 100_000);
@@ -469,7 +471,7 @@ fn samples_without_room_are_reported_and_memory_stays_bounded() {
             .iter()
             .all(|given| given.2 == Err(MissedReason::NotCaptured))
     );
-    // Samples that never become complete make room for one that does.
+    // Samples that never become complete are evicted for one that does.
     for number in 30..60 {
         robot.fragment(ALICE, number, 1, &payload(50_000));
         assert!(held(&robot) <= 100_000);
@@ -482,7 +484,7 @@ fn samples_without_room_are_reported_and_memory_stays_bounded() {
 }
 
 #[test]
-fn a_stream_reports_what_was_missed_and_where_it_is_complete() {
+fn a_stream_has_the_samples_and_the_time_up_to_which_it_is_complete() {
     let agent = LocalAgent::start(&mut rp(), &["--speed", "4"]);
     let answer = local_agent::request(agent.api, "GET", "/samples?all=true", "");
     assert_eq!(answer.status, 200, "{}", answer.body);
@@ -518,7 +520,7 @@ fn a_stream_reports_what_was_missed_and_where_it_is_complete() {
 }
 
 #[test]
-fn an_invalid_topic_name_is_refused() {
+fn an_invalid_query_is_refused() {
     let agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     for query in [
         "",

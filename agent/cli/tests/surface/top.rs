@@ -1,5 +1,5 @@
-//! `rp top` on a pseudo-terminal, against a real agent: the screen, the effect of keys, and
-//! that the terminal is given back clean however it ends.
+//! `rp top` on a pseudo-terminal with a real agent: the screen, the effect of keys, and the
+//! terminal after every kind of end.
 
 use std::time::{Duration, Instant};
 
@@ -9,7 +9,7 @@ use ros2probe_testing::pseudo_terminal::Terminal;
 
 const TOPIC: &str = "/chatter";
 
-/// An agent that has seen all of a capture in which everything is measured.
+/// Returns an agent that has replayed a whole capture and measured everything.
 fn agent() -> LocalAgent {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max", "--watch", "/**"]);
     agent.wait_for_log("the capture has ended");
@@ -35,7 +35,7 @@ fn wait_until(holds: impl Fn() -> bool) {
 }
 
 #[test]
-fn top_draws_reacts_to_keys_and_restores_the_terminal() {
+fn rp_top_reacts_to_keys_and_restores_the_terminal() {
     let agent = agent();
     let mut top = top(&agent, &[]);
     top.wait_for(TOPIC);
@@ -60,7 +60,7 @@ fn top_draws_reacts_to_keys_and_restores_the_terminal() {
 }
 
 #[test]
-fn a_signal_ends_it_cleanly_and_so_does_control_c_when_the_agent_is_gone() {
+fn a_signal_and_control_c_without_an_agent_restore_the_terminal() {
     let agent = agent();
     for (signal, code) in [("-TERM", 143), ("-INT", 130)] {
         let mut top = top(&agent, &[]);
@@ -86,7 +86,7 @@ fn a_signal_ends_it_cleanly_and_so_does_control_c_when_the_agent_is_gone() {
 }
 
 #[test]
-fn a_signal_ends_it_also_when_the_terminal_takes_nothing() {
+fn a_signal_ends_rp_top_while_the_terminal_accepts_no_output() {
     let agent = agent();
     let mut top = top(&agent, &["--interval", "0.1"]);
     top.wait_for(TOPIC);
@@ -99,7 +99,7 @@ fn a_signal_ends_it_also_when_the_terminal_takes_nothing() {
 }
 
 #[test]
-fn an_agent_that_comes_back_is_found_again() {
+fn rp_top_reconnects_to_a_restarted_agent() {
     let directory = tempfile::tempdir().unwrap();
     let socket = directory.path().join("api.sock");
     let config = directory.path().join("config.yaml");
@@ -129,8 +129,8 @@ fn an_agent_that_comes_back_is_found_again() {
 }
 
 #[test]
-fn a_topic_is_measured_on_request_until_the_program_ends() {
-    // Eight seconds, long enough for a loaded machine.
+fn a_topic_is_measured_on_request_until_rp_top_ends() {
+    // The capture takes 8 s at this speed, which is long enough for a loaded machine.
     let agent = LocalAgent::start(&mut rp(), &["--speed", "0.2"]);
     let is_measured = || {
         let topic = request(agent.api, "GET", &format!("/topics{TOPIC}"), "").body;
@@ -158,7 +158,7 @@ fn a_topic_is_measured_on_request_until_the_program_ends() {
 }
 
 #[test]
-fn once_it_prints_a_table_that_needs_no_terminal() {
+fn with_once_rp_top_prints_a_table_without_a_terminal() {
     let output = |agent: &[&str], arguments: &[&str]| {
         let mut command = rp();
         command.arg("top").args(arguments).args(agent);
@@ -195,7 +195,7 @@ fn once_it_prints_a_table_that_needs_no_terminal() {
         "{filtered}"
     );
 
-    // A capture gives the same table without an agent.
+    // A capture leads to the same table without an agent.
     let capture = capture();
     let replayed = ["--replay", capture.to_str().unwrap()];
     let (code, from_capture, said) = output(&replayed, &["--once", "--sort", "rate"]);
@@ -215,7 +215,7 @@ fn once_it_prints_a_table_that_needs_no_terminal() {
 }
 
 #[test]
-fn a_capture_is_shown_as_it_goes_on() {
+fn a_capture_is_shown_during_its_replay() {
     let mut command = rp();
     command
         .args(["top", "--speed", "4", "--replay"])

@@ -1,4 +1,4 @@
-//! The metrics listener behind a `web.yml`: passwords and encryption.
+//! The metrics listener with a `web.yml`: passwords and encryption.
 
 use std::process::{Command, Output};
 
@@ -7,7 +7,7 @@ use ros2probe_testing::local_agent;
 use ros2probe_testing::local_agent::LocalAgent;
 use tempfile::TempDir;
 
-/// Writes a configuration and a `web.yml` with this content.
+/// A directory with a configuration and with a `web.yml` of this content.
 struct Web {
     directory: TempDir,
 }
@@ -51,7 +51,7 @@ fn curl(arguments: &[&str]) -> Output {
     curl.args(arguments).output().unwrap()
 }
 
-/// The status that curl was answered with.
+/// Returns the HTTP status of the answer to curl.
 fn status(arguments: &[&str]) -> String {
     let output = curl(arguments);
     let said = String::from_utf8(output.stdout).unwrap();
@@ -59,7 +59,7 @@ fn status(arguments: &[&str]) -> String {
 }
 
 #[test]
-fn a_client_without_a_password_reads_nothing() {
+fn a_client_without_the_password_is_refused() {
     let hash = bcrypt::hash("open sesame", 4).unwrap();
     let web = Web::new(&format!("basic_auth_users:\n  alice: {hash}\n"));
     let agent = web.agent();
@@ -101,7 +101,7 @@ fn refused(web: &Web) -> String {
 }
 
 #[test]
-fn a_file_that_would_leave_the_listener_open_does_not_start_the_agent() {
+fn an_invalid_web_config_prevents_the_start_of_the_agent() {
     let said = refused(&Web::new("basic_auth_users:\n  alice: secret\n"));
     assert!(
         said.contains("the hash of `alice` is not a bcrypt hash"),

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use super::*;
 
 #[test]
-fn the_checked_in_document_is_the_generated_one() {
+fn the_document_in_the_repository_equals_the_generated_one() {
     let generated = ros2probe_daemon::surface::api::document()
         .to_pretty_json()
         .unwrap()
@@ -29,9 +29,9 @@ for error in OPENAPI_31_VALIDATOR.iter_errors(json.load(open(sys.argv[1]))):
     print(list(error.instance_path), error.message)
 ";
 
-/// `list` was the id of twelve operations, and `show` that of seven.
+/// Earlier, `list` was the id of twelve operations, and `show` the id of seven.
 #[test]
-fn the_document_is_valid_and_every_operation_has_an_id_of_its_own() {
+fn the_document_is_valid_and_every_operation_has_a_unique_id() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/openapi.json");
     let python = schemathesis("python")
         .args(["-c", VALIDATE])
@@ -58,7 +58,8 @@ fn the_document_is_valid_and_every_operation_has_an_id_of_its_own() {
             );
             let is_plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
             assert!(id.chars().all(is_plain), "{id} is no name of a function");
-            // OpenAPI 3.1.1, 4.8.9: each name in the path is a parameter, and the reverse.
+            // OpenAPI 3.1.1, 4.8.9: each name in the path is a parameter, and each path parameter
+            // is in the path.
             let named: BTreeSet<&str> = path
                 .split('/')
                 .filter_map(|segment| segment.strip_prefix('{')?.strip_suffix('}'))
@@ -138,7 +139,8 @@ fn the_document_has_the_topics_and_limits_that_the_agent_accepts() {
     assert_expectations_are_documented(&document);
 }
 
-/// Limits of an expectation are those of the configuration, and the agent refuses what is beyond.
+/// The limits of an expectation are the same as in the configuration, and the agent refuses values
+/// beyond them.
 fn assert_expectations_are_documented(document: &Value) {
     let schema = ros2probe_daemon::config::Config::schema();
     let configured = &schema["$defs"]["WatchShape"]["anyOf"][1]["properties"];
@@ -202,14 +204,14 @@ fn assert_expectations_are_documented(document: &Value) {
     ));
 }
 
-/// Text of so many characters that the parameter may have.
+/// Returns a valid value of the parameter with this number of characters.
 fn filler(parameter: &str, length: usize) -> String {
     let mut text = String::new();
     match parameter {
         "topic" | "exclude" => {
             while text.len() < length {
                 let left = length - text.len();
-                // The last name has two characters at least.
+                // The last name has at least two characters.
                 let part = if left <= 202 { left } else { 200 };
                 text += &format!("/{}", "a".repeat(part - 1));
                 if text.len() < length {
@@ -220,14 +222,14 @@ fn filler(parameter: &str, length: usize) -> String {
             text
         }
         "name" if length <= 1025 => {
-            // Blanks around a name do not count.
+            // Blanks around a name are ignored.
             format!("{}ros2.message.lost", "+".repeat(length - 17))
         }
         _ => "a".repeat(length),
     }
 }
 
-/// The status of an answer that may have no end.
+/// Returns the status of an answer whose body may be endless.
 fn status(agent: &LocalAgent, method: &str, path: &str, body: &str) -> u16 {
     use std::io::{Read as _, Write as _};
     let mut stream = TcpStream::connect(agent.api).unwrap();
@@ -247,7 +249,7 @@ fn status(agent: &LocalAgent, method: &str, path: &str, body: &str) -> u16 {
 }
 
 #[test]
-fn every_bound_of_the_document_is_the_agents_and_the_next_value_is_refused() {
+fn the_agent_accepts_every_bound_of_the_document_and_refuses_the_next_value() {
     let directory = tempfile::tempdir().unwrap();
     let config = directory.path().join("config.yaml");
     let bags = directory.path().join("bags");
@@ -277,7 +279,7 @@ fn every_bound_of_the_document_is_the_agents_and_the_next_value_is_refused() {
     assert!(checked >= 30, "{checked}");
 }
 
-/// The checked value, the status at the bound, and the status beyond it.
+/// Takes the checked value, the status at the bound, and the status beyond it.
 type Check<'a> = &'a mut dyn FnMut(&str, u16, u16);
 
 fn bounds_of_queries(agent: &LocalAgent, document: &Value, check: Check<'_>) {
@@ -294,7 +296,7 @@ fn bounds_of_queries(agent: &LocalAgent, document: &Value, check: Check<'_>) {
         {
             let (name, schema) = (parameter["name"].as_str().unwrap(), &parameter["schema"]);
             let ask = |value: &str| {
-                // Without a topic nothing is wanted.
+                // These parameters need a topic.
                 let topic = match (path.as_str(), name) {
                     ("/samples", "exclude" | "exclude_regex" | "domain_id" | "queue_bytes") => {
                         "topic=/a&"
@@ -340,7 +342,7 @@ fn bounds_of_bodies(agent: &LocalAgent, document: &Value, check: Check<'_>) {
             let ask = |value: Value| {
                 let mut body = serde_json::json!({ name.as_str(): value });
                 if name == "window_s" {
-                    // A window needs a rate.
+                    // A window requires a rate.
                     body["min_rate_hz"] = 1.into();
                 }
                 status(agent, method, path, &body.to_string())
@@ -348,7 +350,7 @@ fn bounds_of_bodies(agent: &LocalAgent, document: &Value, check: Check<'_>) {
             let what = format!("{path} {name}");
             for (bound, step) in [("maximum", 1.0), ("minimum", -1.0)] {
                 if let Some(value) = schema[bound].as_f64() {
-                    // Whole numbers stay whole.
+                    // Integers stay integers.
                     let beyond = schema[bound].as_i64().map_or_else(
                         || Value::from(value + step),
                         |value| Value::from(value + if step > 0.0 { 1 } else { -1 }),
@@ -365,7 +367,7 @@ fn bounds_of_bodies(agent: &LocalAgent, document: &Value, check: Check<'_>) {
     }
 }
 
-/// A program in the separate directory of a Python package.
+/// Runs a program from the directory in which schemathesis is installed.
 fn schemathesis(program: &str) -> Command {
     let target = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap();
     let program = target.join("tools/schemathesis/bin").join(program);
@@ -388,7 +390,7 @@ fn no_request_gets_an_undocumented_answer() {
     );
     agent.wait_for_log("ready");
     let document = format!("http://{}/openapi.json", agent.api);
-    // Streams do not end: how they are answered is tested elsewhere.
+    // Streams do not end. Other tests check their answers.
     let output = schemathesis("st")
         .arg("--config-file")
         .arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/schemathesis.toml"))

@@ -1,4 +1,4 @@
-//! Watches of clients beside those of the configuration.
+//! Watches of clients, together with those of the configuration.
 
 use super::*;
 
@@ -35,7 +35,7 @@ fn a_watch_is_added_shown_replaced_and_removed() {
     assert_eq!(shown["origin"], "api");
     assert_eq!(shown["max_silence_s"], 2.0);
 
-    // Of a topic that is not there, in one domain.
+    // A watch of a topic that does not exist yet, in one domain.
     let later = ask(
         &agent,
         "POST",
@@ -62,7 +62,7 @@ fn a_watch_is_added_shown_replaced_and_removed() {
     assert_eq!(problem(&gone), (404, "no-such-watch".to_owned()));
 }
 
-/// Topics and origins of the watches.
+/// Returns the topics and origins of the watches.
 fn listed(agent: &LocalAgent) -> Vec<(String, String)> {
     let list: Value = serde_json::from_str(&ask(agent, "GET", "/watch", "", "").body).unwrap();
     let watches = list["watches"].as_array().unwrap().iter();
@@ -72,7 +72,7 @@ fn listed(agent: &LocalAgent) -> Vec<(String, String)> {
 }
 
 #[test]
-fn a_client_does_not_overrule_the_configuration_and_reloads_do_not_undo_what_it_added() {
+fn a_client_cannot_change_configured_watches_and_a_reload_keeps_watches_of_clients() {
     let directory = tempfile::tempdir().unwrap();
     let config = directory.path().join("config.yaml");
     let write = |text: &str| std::fs::write(&config, text).unwrap();
@@ -105,7 +105,8 @@ fn a_client_does_not_overrule_the_configuration_and_reloads_do_not_undo_what_it_
     );
     assert_eq!(problem(&other), (409, "watch-given".to_owned()));
 
-    // A watch that the configuration lists later belongs to it as long as it is listed.
+    // A watch that the configuration lists later belongs to the configuration as long as it is
+    // listed.
     write("watch: [/a, /c]");
     let reloaded = ask(&agent, "POST", "/-/reload", "", "");
     assert_eq!(reloaded.status, 200, "{}", reloaded.body);
@@ -137,7 +138,7 @@ fn a_client_does_not_overrule_the_configuration_and_reloads_do_not_undo_what_it_
     assert!(agent.wait().success());
 }
 
-/// Of a replay with four watches.
+/// Checks the health of a replay with four watches.
 fn assert_health(health: &Value) {
     assert_eq!(health["ready"], true);
     assert_eq!(health["watches"], 4);

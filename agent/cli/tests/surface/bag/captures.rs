@@ -1,4 +1,5 @@
-//! Captures of real ROS 2 made into bags: exactly what was complete on the wire, byte for byte.
+//! Captures of real ROS 2 that are converted to bags: a bag contains exactly the samples that were
+//! complete on the wire, byte for byte.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -31,7 +32,7 @@ fn data() -> PathBuf {
 }
 
 #[test]
-fn captures_in_the_repository_become_what_was_complete_on_the_wire() {
+fn bags_of_captures_in_the_repository_have_exactly_the_complete_samples() {
     let scenarios = truth::scenarios(&data());
     assert!(scenarios.len() >= 8, "{scenarios:?}");
     check(&scenarios);
@@ -39,7 +40,7 @@ fn captures_in_the_repository_become_what_was_complete_on_the_wire() {
 
 #[test]
 #[ignore = "needs the corpus of captures: make test-corpus"]
-fn the_whole_corpus_becomes_what_was_complete_on_the_wire() {
+fn bags_of_the_whole_corpus_have_exactly_the_complete_samples() {
     let scenarios = truth::scenarios(&ros2probe_testing::corpus());
     assert!(!scenarios.is_empty());
     check(&scenarios);
@@ -60,8 +61,8 @@ fn check(scenarios: &[Scenario]) {
         let (complete, incomplete, gaps) = on_the_wire(scenario);
         let found = in_the_bag(&name, &bag);
         if name.contains("cli-observed") || name.contains("fastrtps-default/lifecycle") {
-            // They begin late, or announcements went through shared memory: samples before the
-            // writer's announcement have no topic.
+            // In some captures, samples precede the writer's announcement, or announcements went
+            // through shared memory. Such samples have no topic.
             let within = |(topic, count): (&String, &u64)| complete.get(topic) >= Some(count);
             assert!(found.iter().all(within), "{name}: {found:?} {complete:?}");
             continue;
@@ -117,7 +118,8 @@ fn samples(run: &Value) -> u64 {
     run["samples"].as_u64().unwrap()
 }
 
-/// Complete samples of each topic by the independent decoder, and all that were incomplete.
+/// Returns the complete samples of each topic by the independent decoder, and the numbers of
+/// incomplete and of missing samples.
 fn on_the_wire(scenario: &Scenario) -> (BTreeMap<String, u64>, u64, u64) {
     let (mut complete, mut incomplete, mut gaps) = (BTreeMap::new(), 0, 0);
     for writer in scenario.facts().writers.values() {
@@ -150,7 +152,7 @@ fn in_the_bag(name: &str, bag: &Path) -> BTreeMap<String, u64> {
         read::scan(&bag.join(file), Expansion::Limited, each).unwrap();
     }
     for (topic, sequences) in sequences {
-        // One writer each, but for these; in its order, none twice.
+        // All topics but these have one writer. Its samples are in order and without duplicates.
         if !matches!(
             topic.as_str(),
             "/rosout" | "/parameter_events" | "/chatter" | "/tf"
@@ -163,14 +165,14 @@ fn in_the_bag(name: &str, bag: &Path) -> BTreeMap<String, u64> {
     counts
 }
 
-/// The published payload: the byte at `i` of `data` is `i + n` in message n, which is the writer's
-/// n + 1.
+/// Checks the published payload. The byte at `i` of `data` is `i + n` in message n, which has the
+/// sequence number n + 1.
 fn assert_cloud(name: &str, sequence: u32, payload: &[u8]) {
     let length_of = |at: usize| {
         let length = payload.get(at..at + 4).unwrap().try_into().unwrap();
         u32::from_le_bytes(length) as usize
     };
-    // `data` ends before `is_dense` and up to three bytes of padding.
+    // `is_dense` and up to three bytes of padding follow `data`.
     let fits = |at: &usize| {
         let rest = payload.len().checked_sub(length_of(*at));
         rest.is_some_and(|rest| (at + 5..=at + 8).contains(&rest))
@@ -193,7 +195,7 @@ fn report(bag: &Path) -> Value {
 }
 
 #[test]
-fn topics_are_chosen_and_an_existing_directory_is_refused() {
+fn only_chosen_topics_are_converted_and_an_existing_directory_is_refused() {
     let directory = tempfile::tempdir().unwrap();
     let capture = data().join("cyclonedds/samehost-any/capture.pcap.gz");
     let bag = directory.path().join("bag");

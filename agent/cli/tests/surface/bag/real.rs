@@ -29,7 +29,7 @@ fn rp(arguments: &[&str]) -> Output {
         .unwrap()
 }
 
-/// Copies of all real bags, with files of zeros where only the size matters.
+/// Copies all real bags, with files of zeros where only the size is relevant.
 fn copies(into: &Path) -> Vec<PathBuf> {
     let mut bags = Vec::new();
     for entry in fs::read_dir(real()).unwrap() {
@@ -58,7 +58,7 @@ fn copies(into: &Path) -> Vec<PathBuf> {
 }
 
 #[test]
-fn info_of_every_real_bag_is_printed_as_the_original_prints_it() {
+fn info_of_every_real_bag_equals_that_of_ros2_bag_info() {
     let directory = tempfile::tempdir().unwrap();
     let bags = copies(directory.path());
     assert_eq!(bags.len(), 7);
@@ -72,7 +72,7 @@ fn info_of_every_real_bag_is_printed_as_the_original_prints_it() {
 }
 
 #[test]
-fn later_distributions_add_services_and_sort_topics() {
+fn info_of_later_distributions_has_services_and_sorted_topics() {
     let bag = real().join("bag_zstd_fast");
     let bag = bag.to_str().unwrap();
     let printed = |arguments: &[&str]| {
@@ -95,7 +95,7 @@ Service:           0\nService information: \n";
     assert!(kilted.ends_with(end), "{kilted}");
     assert_eq!(printed(&["-t"]), "/chatter\n/robot1/imu/data\n/tf_static\n");
     let verbose = printed(&["-v"]);
-    // 1152 messages of 324 bytes.
+    // The topic has 1152 messages of 324 bytes.
     let imu = "Count: 1152 | Size Contribution: 364.5 KiB | Serialization Format: cdr\n";
     assert!(verbose.contains(imu), "{verbose}");
 }
@@ -122,7 +122,7 @@ fn info_of_a_single_file_is_printed() {
 }
 
 #[test]
-fn a_path_without_a_bag_is_refused_as_the_original_does() {
+fn a_path_without_a_bag_is_refused_with_the_message_of_ros2_bag_info() {
     let directory = tempfile::tempdir().unwrap();
     let nothing = directory.path().join("nothing");
     let refused = |path: &Path, code: i32, text: &str| {

@@ -1,6 +1,6 @@
 //! Batches of a router, without their lengths.
 
-/// Returns the acknowledgement of INIT with a cookie, a version, and extensions without value.
+/// Returns an INIT acknowledgement with a cookie, a version, and extensions without a value.
 pub fn init(cookie: &[u8], version: u8, extensions: &[u8]) -> Vec<u8> {
     let more = if extensions.is_empty() { 0 } else { 0x80 };
     let mut batch = vec![0x61 | more, version, 0x10, 0xa1, 0xb2, 0x0a, 0x00, 0xc0];
@@ -10,7 +10,7 @@ pub fn init(cookie: &[u8], version: u8, extensions: &[u8]) -> Vec<u8> {
     batch
 }
 
-/// Returns the acknowledgement of OPEN.
+/// Returns an OPEN acknowledgement.
 pub fn open() -> Vec<u8> {
     vec![0x62, 60, 0]
 }
@@ -20,27 +20,27 @@ pub fn frame(messages: &[u8]) -> Vec<u8> {
     [&[0x25, 0], messages].concat()
 }
 
-/// Returns the declaration of a token in full.
+/// Returns the declaration of a token whose key is not shortened.
 pub fn token(key: &str) -> Vec<u8> {
     declare(&[0x26, 0, 0], key)
 }
 
-/// Returns the declaration of a token behind an alias of the router.
+/// Returns the declaration of a token whose key begins with an alias of the router.
 pub fn aliased(scope: u8, suffix: &str) -> Vec<u8> {
     declare(&[0x66, 0, scope], suffix)
 }
 
-/// Returns the declaration of an alias behind another one, or behind none.
+/// Returns the declaration of an alias whose key begins with another alias, or with none (0).
 pub fn alias(id: u8, scope: u8, suffix: &str) -> Vec<u8> {
     declare(&[0x60, id, scope], suffix)
 }
 
-/// Returns the end of the answer.
+/// Returns the message that ends the answer.
 pub fn final_() -> Vec<u8> {
     vec![0x3e, 1, 0x1a]
 }
 
-/// Returns FRAGMENTs of the lane of declarations with parts of a message.
+/// Returns the FRAGMENTs of a message, with the priority of declarations.
 pub fn fragments(message: &[u8], length: usize, is_marked: bool) -> Vec<Vec<u8>> {
     let count = message.len().div_ceil(length);
     let part = |(index, part): (usize, &[u8])| {

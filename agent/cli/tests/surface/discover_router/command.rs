@@ -12,7 +12,8 @@ use super::answers::{final_, frame, init, open, token};
 use super::{publisher, recorded_answers};
 use crate::rp;
 
-/// What a server does after each batch that it receives; at the end it closes the connection.
+/// An action of the server after each batch that it receives. The server closes the connection
+/// after the last action.
 enum Then {
     /// Sends these batches, with their lengths.
     Batches(Vec<Vec<u8>>),
@@ -24,7 +25,7 @@ enum Then {
 
 struct Server {
     address: SocketAddr,
-    /// What it received.
+    /// The bytes that the server received.
     received: JoinHandle<Vec<u8>>,
 }
 
@@ -54,7 +55,7 @@ impl Server {
         Self { address, received }
     }
 
-    /// Runs the command and returns its output with what the server received.
+    /// Runs the command, and returns its output and the bytes that the server received.
     fn ask(self, more: &[&str]) -> (Output, Vec<u8>) {
         let output = ask(self.address, more);
         (output, self.received.join().unwrap())
@@ -122,7 +123,8 @@ fn a_recorded_answer_is_printed_with_its_counts() {
     ] {
         assert!(printed.lines().any(|it| it == line), "{line}: {printed}");
     }
-    // It sent what it said: the sizes without the cookie, which has 49 bytes here.
+    // The command sent what it printed. The printed sizes are without the cookie, which has 49
+    // bytes here.
     let planned: Vec<usize> = printed
         .lines()
         .filter(|line| line.contains("), "))
@@ -161,7 +163,7 @@ fn a_dry_run_prints_the_messages_and_does_not_connect() {
 }
 
 #[test]
-fn a_closed_port_is_no_router() {
+fn a_closed_port_is_reported_as_no_router() {
     says(
         &ask(free_address(), &[]),
         &[
@@ -174,7 +176,7 @@ fn a_closed_port_is_no_router() {
 
 #[test]
 fn other_programs_are_recognized_by_their_first_bytes() {
-    // The alerts of OpenSSL, and of a router with a `tls/` endpoint (Zenoh 1.8, recorded).
+    // TLS alerts of OpenSSL, and of a router with a `tls/` endpoint (Zenoh 1.8, recorded).
     for alert in [
         b"\x15\x03\x01\x00\x02\x02\x46",
         b"\x15\x03\x03\x00\x02\x02\x32",
@@ -183,16 +185,17 @@ fn other_programs_are_recognized_by_their_first_bytes() {
     }
     let http = b"HTTP/1.1 400 Bad Request\r\nConnection: close\r\n\r\n";
     fails(vec![Then::Bytes(http)], &["does not speak Zenoh", "7447"]);
-    // Without the end of the connection, as well.
+    // The same without the end of the connection.
     let script = vec![Then::Bytes(b"SSH-2.0-OpenSSH_9.2\r\n"), Then::Wait];
     fails(script, &["does not speak Zenoh"]);
 }
 
 #[test]
-fn another_version_and_a_refusal_are_named() {
+fn another_version_and_a_refusal_are_reported_as_such() {
     let old = Then::Batches(vec![init(&[], 8, &[])]);
     fails(vec![old], &["version 8", "Zenoh 1.x"]);
-    // CLOSE of a link as a router sends it that has no room, and one that rejects the introduction.
+    // CLOSE of a link from a router without a free session, and CLOSE from a router that rejects
+    // the introduction.
     let full = Then::Batches(vec![vec![0x03, 3]]);
     fails(vec![full], &["too many sessions", "max_sessions"]);
     let invalid = Then::Batches(vec![vec![0x03, 2]]);
@@ -203,7 +206,7 @@ fn another_version_and_a_refusal_are_named() {
 }
 
 #[test]
-fn an_end_at_each_step_is_named_with_the_last_message() {
+fn an_end_at_each_step_is_reported_with_the_last_message() {
     let nothing = || Then::Bytes(b"");
     fails(
         vec![nothing()],
@@ -220,7 +223,7 @@ fn an_end_at_each_step_is_named_with_the_last_message() {
 }
 
 #[test]
-fn a_silent_router_is_given_up_and_gets_a_goodbye_once_it_is_known() {
+fn a_silent_router_leads_to_a_timeout_and_to_a_goodbye_in_an_open_session() {
     let silent = Server::start(vec![Then::Wait]);
     let (output, received) = silent.ask(&[]);
     says(&output, &["no answer", "introduction (INIT)", "within 3 s"]);
@@ -232,7 +235,7 @@ fn a_silent_router_is_given_up_and_gets_a_goodbye_once_it_is_known() {
 }
 
 #[test]
-fn a_malformed_answer_is_refused_with_its_place() {
+fn a_malformed_answer_is_refused_with_the_name_of_its_message() {
     let opened = Then::Batches(vec![open(), frame(&[0x3e, 1, 0x1f])]);
     fails(
         vec![introduced(), opened],

@@ -1,9 +1,9 @@
-//! The test that exceeds each cap of docs/limits-*.md.
+//! The tests that exceed each cap of docs/limits-*.md.
 
-/// A line for each fixed cap: constant or table, its file, the test's file, and the test.
+/// A line for each fixed cap: the constant or table, its file, the file of the test, and the test.
 const FIXED: &str = include_str!("driven.txt");
 
-/// Returns constant or table, its file, the test's file, and the test.
+/// Returns the constant or table of each fixed cap, its file, the file of the test, and the test.
 pub fn fixed() -> Vec<[&'static str; 4]> {
     let words = |line: &'static str| line.split(' ').collect::<Vec<_>>().try_into();
     FIXED
@@ -13,19 +13,19 @@ pub fn fixed() -> Vec<[&'static str; 4]> {
         .expect("four words")
 }
 
-/// Key of `limits:`, and the test of tests/surface/limits.rs.
+/// Each key of `limits:`, and its test in tests/surface/limits.rs.
 pub const KEYS: &[[&str; 2]] = &[
     [
         "participants",
-        "participants_beyond_the_cap_are_left_out_until_one_goes",
+        "participants_beyond_the_cap_are_left_out_until_one_leaves",
     ],
     [
         "endpoints",
-        "endpoints_beyond_the_cap_are_left_out_until_one_goes",
+        "endpoints_beyond_the_cap_are_left_out_until_one_is_removed",
     ],
     [
         "topics",
-        "topics_beyond_the_cap_are_listed_and_measured_once_there_is_room",
+        "topics_beyond_the_cap_are_listed_but_not_measured_until_one_is_removed",
     ],
     [
         "unknown_writers",
@@ -37,19 +37,19 @@ pub const KEYS: &[[&str; 2]] = &[
     ],
     [
         "watches",
-        "watches_beyond_the_cap_are_refused_to_clients_and_to_a_reload",
+        "watches_beyond_the_cap_are_refused_for_clients_and_for_a_reload",
     ],
     [
         "reassembly_bytes",
-        "fragments_beyond_the_bytes_push_out_the_oldest",
+        "fragments_beyond_the_cap_in_bytes_evict_the_oldest",
     ],
     [
         "payload_bytes",
-        "messages_beyond_the_bytes_of_all_queues_evict_the_oldest_until_one_is_read",
+        "messages_beyond_the_bytes_of_all_queues_evict_the_oldest_until_the_queue_is_read",
     ],
     [
         "subscriptions",
-        "messages_beyond_the_bytes_of_all_queues_evict_the_oldest_until_one_is_read",
+        "messages_beyond_the_bytes_of_all_queues_evict_the_oldest_until_the_queue_is_read",
     ],
     [
         "recordings",
@@ -57,14 +57,14 @@ pub const KEYS: &[[&str; 2]] = &[
     ],
     [
         "api_clients",
-        "clients_beyond_the_cap_are_refused_at_once_and_served_after_one_leaves",
+        "clients_beyond_the_cap_are_refused_until_one_leaves",
     ],
     [
         "metrics_clients",
-        "clients_beyond_the_cap_are_refused_at_once_and_served_after_one_leaves",
+        "clients_beyond_the_cap_are_refused_until_one_leaves",
     ],
     [
         "foxglove_clients",
-        "viewers_beyond_the_cap_are_refused_until_one_has_gone",
+        "viewers_beyond_the_cap_are_refused_until_one_leaves",
     ],
 ];

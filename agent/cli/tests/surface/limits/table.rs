@@ -1,4 +1,4 @@
-//! The table of limits: the page, /health and docs/limits-*.md agree about each cap.
+//! The table of limits: the metrics page, /health and docs/limits-*.md agree about each cap.
 
 use super::*;
 use ros2probe::tables as commands;
@@ -9,7 +9,7 @@ use ros2probe_model::facts::bounded::Table;
 use ros2probe_model::facts::tables as model;
 
 #[test]
-fn every_limit_of_the_configuration_is_on_the_page_and_in_the_answer_on_health() {
+fn every_limit_of_the_configuration_is_on_the_metrics_page_and_in_health() {
     let directory = tempfile::tempdir().unwrap();
     let mut caps = String::new();
     for limit in Limit::ALL {
@@ -30,7 +30,7 @@ fn every_limit_of_the_configuration_is_on_the_page_and_in_the_answer_on_health()
     assert_eq!(shown.len(), Limit::ALL.len());
 }
 
-/// The pages of the book that list constants, one behind the other.
+/// Returns the text of the pages of the book that list constants.
 fn pages_of_fixed_caps(root: &Path) -> String {
     let pages = ["capture", "model", "agent"].map(|page| format!("docs/limits-{page}.md"));
     let text = |page: &String| std::fs::read_to_string(root.join(page)).unwrap();
@@ -83,7 +83,7 @@ fn assert_test(path: &str, name: &str) {
 }
 
 #[test]
-fn every_cap_names_the_test_that_drives_it_over() {
+fn every_cap_has_a_test_that_exceeds_it() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
     let page = pages_of_fixed_caps(&root);
     let rows = page.lines().filter(|line| line.starts_with("| "));

@@ -1,4 +1,4 @@
-//! The tables of `docs/` in Markdown, from the declarations of the sources.
+//! The tables of `docs/` in Markdown, generated from the declarations of the sources.
 
 use std::fmt::Write as _;
 

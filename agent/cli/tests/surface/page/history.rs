@@ -1,9 +1,9 @@
-//! A topic's figures of the last minutes.
+//! The history of a topic over the last minutes.
 
 use super::*;
 
 #[test]
-fn the_history_of_a_topic_adds_up_to_what_was_counted() {
+fn the_sum_of_the_history_of_a_topic_agrees_with_its_counters() {
     let agent = ended("cyclonedds/points-besteffort-lossy-2ns", &[]);
     let mut lost = 0;
     let mut seen = 0;
@@ -30,7 +30,7 @@ fn the_history_of_a_topic_adds_up_to_what_was_counted() {
             let column = rows(&history[key]).iter();
             column.filter_map(Value::as_u64).sum()
         };
-        // The last, unfinished second is in no row.
+        // No row contains the last, unfinished second.
         let counted = measured["messages"].as_u64().unwrap();
         let rate = measured["rate_hertz"].as_f64().unwrap().max(1.0);
         let reported = sum("messages");
@@ -47,7 +47,7 @@ fn the_history_of_a_topic_adds_up_to_what_was_counted() {
 }
 
 #[test]
-fn the_history_of_a_topic_is_found_by_every_way_to_write_its_name() {
+fn the_history_of_a_topic_is_found_by_every_spelling_of_its_name() {
     let agent = ended("cyclonedds/points-besteffort-lossy-2ns", &[]);
     let topics = get(&agent, "/topics");
     let mut topics = rows(&topics["topics"]).iter();

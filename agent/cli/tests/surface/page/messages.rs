@@ -1,13 +1,13 @@
-//! Decoded messages, and bags that are taken away.
+//! Decoded messages, and downloads of bags.
 
 use super::*;
 
 #[test]
-fn messages_are_decoded_five_a_second_at_most() {
+fn at_most_five_messages_per_second_are_decoded() {
     let capture = data("cyclonedds/lifecycle-2ns");
     let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "0.5"]);
     agent.wait_for_log("ready");
-    // The robot of the capture publishes it from some moment on.
+    // The robot of the capture begins to publish this topic some time after the start.
     let deadline = Instant::now() + PATIENCE;
     let topic = loop {
         let topics = get(&agent, "/topics");
@@ -58,7 +58,7 @@ fn messages_are_decoded_five_a_second_at_most() {
         assert!(message["error"].is_null() && message["bytes"].as_u64().unwrap() > 4);
         assert!(message["time"].as_f64().unwrap() > 1e9);
     }
-    // However late this program reads them.
+    // The maximum rate holds even if this test reads the messages late.
     let most = 1.0 + 5.0 * opened.elapsed().as_secs_f64();
     assert!(reported.len() as f64 <= most, "{reported:?}");
     for pair in reported.windows(2) {
@@ -85,8 +85,8 @@ fn messages_are_decoded_five_a_second_at_most() {
 }
 
 #[test]
-fn topics_whose_messages_are_decoded_are_limited() {
-    // Slow enough that no stream ends by itself during the test.
+fn the_number_of_topics_with_decoded_messages_is_limited() {
+    // The replay is slow enough that no stream ends during the test.
     let capture = data("cyclonedds/lifecycle-2ns");
     let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "0.2"]);
     agent.wait_for_log("ready");
@@ -104,7 +104,7 @@ fn topics_whose_messages_are_decoded_are_limited() {
     let mut all: Vec<_> = (0..8)
         .map(|_| open().unwrap_or_else(|answer| panic!("{}", answer.body)))
         .collect();
-    // Streams take no turn of other answers.
+    // Open streams do not block other answers.
     assert!(!rows(&get(&agent, "/topics")["topics"]).is_empty());
     let refused = open().err().unwrap();
     assert_eq!(
@@ -120,7 +120,7 @@ fn topics_whose_messages_are_decoded_are_limited() {
 }
 
 #[test]
-fn a_bag_can_be_taken_away_whole() {
+fn all_files_of_a_bag_can_be_downloaded() {
     let directory = tempfile::tempdir().unwrap();
     let config = directory.path().join("config.yaml");
     let bags = directory.path().join("bags");

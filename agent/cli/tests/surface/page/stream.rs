@@ -1,4 +1,4 @@
-//! The stream of figures that the page follows.
+//! The stream of figures for the web page.
 
 use super::*;
 
@@ -42,7 +42,7 @@ fn a_stream_begins_with_the_whole_state_and_continues_with_changes() {
         "{loss}"
     );
 
-    // The capture has ended: nothing changes, and the stream continues.
+    // After the end of the capture nothing changes, and the stream continues.
     let began = Instant::now();
     for _ in 0..2 {
         let batch = live.batch();
@@ -54,7 +54,7 @@ fn a_stream_begins_with_the_whole_state_and_continues_with_changes() {
         (1.0..6.0).contains(&began.elapsed().as_secs_f64()),
         "{began:?}"
     );
-    // A watch changes the structure; the figures stay.
+    // A watch changes the structure, but not the figures.
     assert_eq!(ask(agent.api, "POST", "/watch/another", "").0, 201);
     let batch = live.batch();
     assert!(
@@ -63,7 +63,7 @@ fn a_stream_begins_with_the_whole_state_and_continues_with_changes() {
     );
 }
 
-/// The graph and its figures are those of the other answers.
+/// Asserts that the graph and its figures agree with the other answers of the API.
 fn assert_graph(agent: &LocalAgent, first: &[(String, Value)], open: &Value) {
     let graph = line(first, "graph");
     let topics = get(agent, "/topics?hidden=true");
@@ -98,7 +98,7 @@ fn assert_graph(agent: &LocalAgent, first: &[(String, Value)], open: &Value) {
                 assert_eq!(node.map_or(&Value::Null, |node| &node[2]), &known["node"]);
             }
         }
-        // Its figures, too.
+        // The figures of the topic agree, too.
         let values = line(first, "values");
         let mut figures = rows(&values["topics"]).iter();
         let figures = figures.find(|figures| figures[0] == row[0]);
@@ -119,7 +119,7 @@ fn assert_graph(agent: &LocalAgent, first: &[(String, Value)], open: &Value) {
 }
 
 #[test]
-fn a_replay_sends_figures_in_the_time_of_its_capture() {
+fn the_figures_of_a_replay_have_the_times_of_its_capture() {
     let capture = data("cyclonedds/points-besteffort-lossy-2ns");
     let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "0.5"]);
     agent.wait_for_log("ready");
@@ -152,10 +152,10 @@ fn a_replay_sends_figures_in_the_time_of_its_capture() {
 }
 
 #[test]
-fn streams_are_limited_and_a_closed_one_is_noticed() {
+fn streams_beyond_the_cap_are_refused_until_one_is_closed() {
     let agent = ended("cyclonedds/points-besteffort-lossy-2ns", &[]);
     let open = || Lines::open(agent.api, "/live", "");
-    // A quarter of the 16 places is for clients with a token.
+    // A quarter of the 16 streams is reserved for clients with a token.
     let mut all: Vec<_> = (0..12)
         .map(|_| open().unwrap_or_else(|_| panic!()))
         .collect();
@@ -176,13 +176,14 @@ fn streams_are_limited_and_a_closed_one_is_noticed() {
 }
 
 #[test]
-fn a_client_that_does_not_read_costs_nothing_and_misses_no_change() {
+fn a_client_that_reads_late_gets_all_changes() {
     let capture = data("cyclonedds/points-besteffort-lossy-2ns");
     let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "4"]);
     agent.wait_for_log("ready");
     let mut slow = Lines::open(agent.api, "/live", "").unwrap_or_else(|_| panic!());
     agent.wait_for_log("the capture has ended");
-    // A client that has applied all changes holds what a new client receives at once.
+    // A client that has applied all changes has the same state as a new client after its first
+    // batch.
     let mut state = std::collections::BTreeMap::new();
     let mut graph = Value::Null;
     let until = Instant::now() + Duration::from_secs(3);

@@ -1,9 +1,9 @@
-//! The begin and the interruption of a recording of many topics.
+//! The start and the interruption of a recording of many topics.
 
 use super::*;
 
 #[test]
-fn a_recording_of_many_topics_begins_and_ends_without_a_question_for_each() {
+fn a_recording_of_many_topics_begins_and_ends_without_a_request_for_each_topic() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("many.pcap");
     many_topics(&capture);
@@ -20,15 +20,16 @@ fn a_recording_of_many_topics_begins_and_ends_without_a_question_for_each() {
     eprintln!("{MANY} topics: began after {began:?}, ended after {ended:?}");
     assert_eq!(status.code(), Some(0), "{:#?}", recording.said);
     assert!(began < Duration::from_secs(3), "began after {began:?}");
-    // It waits up to two seconds for messages on their way: a replay's clock is not that of now.
+    // The end waits up to two seconds for messages in transit, because the clock of a replay
+    // differs from the current time.
     assert!(ended < Duration::from_secs(5), "ended after {ended:?}");
     assert_eq!(messages(&bag).len(), MANY);
 }
 
 #[test]
-fn a_recording_that_is_interrupted_while_it_begins_leaves_nothing() {
+fn a_recording_that_is_interrupted_at_its_start_leaves_no_bag() {
     let directory = tempfile::tempdir().unwrap();
-    // An agent that takes the request and never answers.
+    // An agent that accepts the request and never answers.
     let socket = directory.path().join("api.sock");
     let listener = UnixListener::bind(&socket).unwrap();
     let bag = directory.path().join("bag");
@@ -52,7 +53,7 @@ fn a_recording_that_is_interrupted_while_it_begins_leaves_nothing() {
 }
 
 #[test]
-fn a_second_interrupt_ends_a_recording_at_once_with_its_report() {
+fn a_second_interrupt_ends_a_recording_without_waiting_but_with_its_report() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("many.pcap");
     many_topics(&capture);
@@ -61,7 +62,7 @@ fn a_second_interrupt_ends_a_recording_at_once_with_its_report() {
     let mut recording = Recording::start(agent.api, &bag, &[]);
     recording.wait_for("Recording...");
     std::thread::sleep(Duration::from_secs(2));
-    // The first one waits for messages on their way until a time that a replay never reaches.
+    // The first signal waits for messages in transit until a time that a replay never reaches.
     recording.signal("-INT");
     recording.wait_for("Completing the bag");
     recording.signal("-INT");

@@ -1,4 +1,4 @@
-//! Captures that are late, cut or silent, as `rp` converts and echoes them.
+//! Captures that begin late, are truncated or have silent topics, as `rp` converts and echoes them.
 
 use super::*;
 
@@ -6,7 +6,7 @@ const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10bobby-host");
 
 const ONE: GuidPrefix = GuidPrefix(*b"\x01\x10oneproc-ss");
 
-/// One that begins late and holds more than one domain.
+/// Writes a capture that begins late and has more than one domain.
 fn with_omissions(path: &Path) {
     let mut capture = Capture::new(ETHERNET);
     let at = |milliseconds: u64| START + milliseconds * 1_000_000;
@@ -22,7 +22,7 @@ fn with_omissions(path: &Path) {
     for number in 11..=15 {
         capture.sample(at(500 + 10 * number), 0, late, number);
     }
-    // Between these nothing passes the network.
+    // The writer and the reader of this process exchange nothing over the network.
     capture.participant(at(700), 0, ONE);
     capture.writer(at(710), 0, writer(ONE, 0), "rt/inside", 1);
     capture.reader(at(711), 0, reader(ONE, 0), "rt/inside", 1);
@@ -36,7 +36,7 @@ fn with_omissions(path: &Path) {
 }
 
 #[test]
-fn messages_missing_in_a_late_capture_are_counted_by_topic_and_reason_and_change_the_exit_code() {
+fn missing_messages_of_a_late_capture_are_counted_and_change_the_exit_code() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("late.pcap");
     with_omissions(&capture);
@@ -77,7 +77,7 @@ fn messages_missing_in_a_late_capture_are_counted_by_topic_and_reason_and_change
 }
 
 #[test]
-fn a_capture_that_is_whole_converts_with_exit_code_0() {
+fn the_conversion_of_a_complete_capture_ends_with_exit_code_0() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("many.pcap");
     many_topics(&capture);
@@ -95,7 +95,7 @@ fn a_capture_that_is_whole_converts_with_exit_code_0() {
 }
 
 #[test]
-fn a_cut_capture_becomes_a_bag_up_to_the_cut_and_changes_the_exit_code() {
+fn a_truncated_capture_is_converted_up_to_the_cut_and_changes_the_exit_code() {
     let directory = tempfile::tempdir().unwrap();
     let (whole, cut) = (
         directory.path().join("many.pcap"),
@@ -111,7 +111,7 @@ fn a_cut_capture_becomes_a_bag_up_to_the_cut_and_changes_the_exit_code() {
 }
 
 #[test]
-fn a_link_type_that_cannot_be_read_is_no_empty_robot() {
+fn an_unsupported_link_type_is_an_error_and_not_an_empty_graph() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("wifi.pcap");
     let mut capture = Capture::new(127);
@@ -139,7 +139,8 @@ fn a_link_type_that_cannot_be_read_is_no_empty_robot() {
     assert!(!bag.exists());
 }
 
-/// A topic within one participant, one without a subscriber, and a writer that is never announced.
+/// Writes a capture with a topic within one participant, a topic without a subscriber, and a writer
+/// that is never announced.
 fn with_silence(path: &Path) {
     let mut capture = Capture::new(ETHERNET);
     let at = |milliseconds: u64| START + milliseconds * 1_000_000;
@@ -187,7 +188,7 @@ fn a_silent_topic_is_explained_once_on_stderr() {
         assert!(!out.contains("subscriber"), "{verb}: {out}");
     }
 
-    // As long as it runs: after some seconds, once.
+    // Commands that keep running print the reason once, after some seconds.
     let agent = LocalAgent::replay(&mut rp(), &capture, &["--speed", "1"]);
     agent.wait_for_metric("ros2_topics{domain_id=\"0\",kind=\"topic\"}", |topics| {
         topics == 2.0
@@ -216,7 +217,7 @@ fn a_silent_topic_is_explained_once_on_stderr() {
 }
 
 #[test]
-fn a_late_start_is_no_empty_robot() {
+fn a_capture_without_announcements_leads_to_a_hint_beside_the_known_topics() {
     let directory = tempfile::tempdir().unwrap();
     let (silent, lonely) = (
         directory.path().join("a.pcap"),
@@ -255,7 +256,7 @@ fn a_late_start_is_no_empty_robot() {
 }
 
 #[test]
-fn a_cut_capture_is_echoed_up_to_the_cut_and_no_agent_has_ended() {
+fn a_truncated_capture_is_echoed_up_to_the_cut_with_an_error_about_the_capture() {
     let directory = tempfile::tempdir().unwrap();
     let (whole, cut) = (
         directory.path().join("a.pcap"),

@@ -1,8 +1,8 @@
-//! Agents that started after the robot: who sends is known, but not on which topic.
+//! Agents that started after the robot. The writers are known, but not their topics.
 
 use super::*;
 
-/// Ten minutes of a writer that is announced and one that is not, at 10 Hz.
+/// Writes a capture of ten minutes with an announced and an unannounced writer, each at 10 Hz.
 fn late_robot(path: &Path) {
     let (known, unknown) = (writer(ALICE, 0), writer(ALICE, 1));
     let mut capture = Capture::new(ETHERNET);
@@ -27,9 +27,9 @@ fn late_agent(directory: &Path) -> LocalAgent {
 const MISSED: &str = "1 writer is active whose announcement was missed; its topic is unknown";
 const REMEDY: &str = "`sudo rp discover --all` requests their announcements";
 
-/// It printed `Recording...`, and the reason for an empty bag only at Ctrl-C.
+/// Earlier, a recording printed the reason for an empty bag only at Ctrl-C.
 #[test]
-fn a_recording_warns_at_once_and_repeatedly_of_writers_without_a_topic() {
+fn a_recording_warns_early_and_repeatedly_of_writers_without_a_topic() {
     let directory = tempfile::tempdir().unwrap();
     let agent = late_agent(directory.path());
     let mut recording = Recording::start(agent.api, &directory.path().join("bag"), &[]);
@@ -44,7 +44,7 @@ fn a_recording_warns_at_once_and_repeatedly_of_writers_without_a_topic() {
     let (status, _) = recording.end();
     assert_eq!(status.code(), Some(0), "{:#?}", recording.said);
 
-    // A recording of known topics lacks nothing.
+    // In a recording of known topics, nothing is missing.
     let mut command = rp();
     command.args(["bag", "record", "--host", &agent.api.to_string(), "-o"]);
     command.arg(directory.path().join("whole")).arg("/whole");
@@ -60,9 +60,9 @@ fn a_recording_warns_at_once_and_repeatedly_of_writers_without_a_topic() {
     );
 }
 
-/// Every question about a known topic printed the hint about missed announcements.
+/// Earlier, every request about a known topic printed the hint about missed announcements.
 #[test]
-fn the_hint_about_missed_announcements_comes_only_without_an_answer() {
+fn the_hint_about_missed_announcements_is_printed_only_without_an_answer() {
     let directory = tempfile::tempdir().unwrap();
     let agent = late_agent(directory.path());
     let ask = |arguments: &[&str]| {
@@ -104,7 +104,7 @@ fn the_hint_about_missed_announcements_comes_only_without_an_answer() {
         assert!(stderr.contains(&hint), "{arguments:?}: {stderr}");
         assert_eq!(stderr.matches(MISSED).count(), 1, "{arguments:?}: {stderr}");
     }
-    // The agent names the command; its clients repeat it.
+    // The agent names the command, and its clients repeat it.
     for path in ["/names", "/health"] {
         let (_, answer) = ask_api(&agent, path);
         assert!(

@@ -1,4 +1,4 @@
-//! `rp topic echo` on a capture: what the original printed of the same messages.
+//! `rp topic echo` on a capture: the output equals that of ros2cli for the same messages.
 
 use std::path::{Path, PathBuf};
 
@@ -21,7 +21,7 @@ fn own() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/echo")
 }
 
-/// Runs with the capture; messages between `from` and `until` are echoed.
+/// Runs a command with the capture. Messages between `from` and `until` are echoed.
 fn echo(arguments: &[&str], from: &str, until: &str) -> std::process::Output {
     let capture = own().join("capture.pcap.gz");
     let capture = ["--replay", capture.to_str().unwrap()];
@@ -29,10 +29,10 @@ fn echo(arguments: &[&str], from: &str, until: &str) -> std::process::Output {
     run(&[arguments, &["--distro", "humble"], &capture, &times].concat())
 }
 
-/// When the original's subscription was there is not known, only that it was between the command's
-/// start and its end: what it printed is a part of all that is printed of that time.
+/// The recorded subscription began at an unknown time between the start and the end of its command.
+/// Its output is therefore a part of the whole output for this time.
 #[test]
-fn echo_prints_as_the_original_does() {
+fn echo_prints_the_output_of_ros2cli() {
     let text = std::fs::read_to_string(own().join("recorded.jsonl")).unwrap();
     let differences =
         Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/ros2cli-differences.md");
@@ -66,7 +66,7 @@ fn echo_prints_as_the_original_does() {
         assert!(is_part, "{name}: {said}{}", stderr(&output));
         if recorded.code == 1 {
             assert_eq!(said, recorded.stdout, "{name}");
-            // The reason for missing messages follows the original's output.
+            // The reason for missing messages follows the output of ros2cli.
             let why = |line: &&str| !line.starts_with("rp: no message on ");
             let err = stderr(&output);
             let err: String = err.split_inclusive('\n').filter(why).collect();
@@ -85,7 +85,7 @@ const END: &str = "1795142522.806041638";
 const IMU: &str = "/robot1/imu/data";
 
 #[test]
-fn options_choose_what_is_echoed_and_when_it_ends() {
+fn options_select_the_echoed_messages_and_the_end() {
     let lines = |further: &[&str]| {
         let output = echo(&[&["topic", "echo", IMU], further].concat(), START, END);
         assert_eq!(
@@ -160,7 +160,7 @@ fn a_topic_that_cannot_be_echoed_is_reported_in_one_line() {
     );
     assert_eq!(ask(&["--timeout", "0"]).status.code(), Some(2));
     assert_eq!(ask(&["-l", "-1"]).status.code(), Some(2));
-    // Another type than the writer's: no message is printed, and stderr names the reason.
+    // With a type other than the writer's, no message is printed, and stderr has the reason.
     let other = ask(&["std_msgs/msg/String"]);
     assert_eq!(
         (stdout(&other).as_str(), other.status.code()),
@@ -174,7 +174,7 @@ fn a_topic_that_cannot_be_echoed_is_reported_in_one_line() {
 }
 
 #[test]
-fn only_messages_that_pass_the_filter_are_timed() {
+fn only_messages_that_match_the_filter_are_measured() {
     let hz = |further: &[&str]| {
         let output = echo(&[&["topic", "hz", IMU], further].concat(), START, END);
         assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
@@ -190,9 +190,9 @@ fn only_messages_that_pass_the_filter_are_timed() {
     );
 }
 
-/// Goals of order 4 in three recordings; Jazzy announces type hashes.
+/// The recordings have goals of order 4. Jazzy announces type hashes.
 #[test]
-fn an_action_prints_feedback_and_states_with_every_middleware() {
+fn action_echo_prints_feedback_and_states_with_every_middleware() {
     let directory = tempfile::tempdir().unwrap();
     let place = directory.path().join("example_interfaces/action");
     std::fs::create_dir_all(&place).unwrap();
@@ -227,7 +227,7 @@ fn an_action_prints_feedback_and_states_with_every_middleware() {
             .map(|line| line.rsplit(',').next().unwrap().to_owned())
             .collect();
         assert_eq!(states, ["2", "4"], "executing, succeeded");
-        // Another definition of the name is not used where the announced hash is not its own.
+        // A definition of the same name is not used if its hash differs from the announced hash.
         if software == "jazzy-cyclonedds" {
             let again = run(&[&arguments[..], &definitions].concat());
             assert_eq!((stdout(&again), stderr(&again).as_str()), (said, ""));

@@ -1,5 +1,5 @@
-//! The verbs of the graph against what the original printed about the same robot, byte for byte,
-//! and the list of differences.
+//! The verbs of the graph: the output equals that of ros2cli for the same robot, byte for byte,
+//! except for listed differences.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,8 @@ pub fn own() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/cli")
 }
 
-/// Names of recorded commands in the table of `docs/ros2cli-differences.md` below this heading.
+/// Returns the names of recorded commands in the table of `docs/ros2cli-differences.md` below this
+/// heading.
 fn listed(heading: &str) -> BTreeSet<String> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/ros2cli-differences.md");
     let text = std::fs::read_to_string(path).unwrap();
@@ -24,7 +25,7 @@ fn listed(heading: &str) -> BTreeSet<String> {
     names.map(|(name, _)| name.to_owned()).collect()
 }
 
-/// GIDs of another run are others.
+/// Replaces GIDs by their lengths, because they differ between runs.
 fn without_gids(text: &str) -> String {
     let line = |line: &str| match line.split_once("GID: ") {
         Some((head, gid)) => format!("{head}GID: {} bytes\n", gid.split('.').count()),
@@ -34,7 +35,7 @@ fn without_gids(text: &str) -> String {
 }
 
 #[test]
-fn a_graph_prints_as_by_ros2() {
+fn verbs_of_the_graph_print_the_output_of_ros2cli() {
     let capture = own().join("graph.pcap.gz");
     let recorded = std::fs::read_to_string(own().join("recorded.jsonl")).unwrap();
     let differing = listed("Recorded commands");
@@ -65,9 +66,10 @@ fn a_graph_prints_as_by_ros2() {
     assert_eq!((same, different), (56, differing));
 }
 
-/// Nodes of one name, and a topic and a service of two types (`fixtures/cli/mixed.py`).
+/// The capture has nodes with the same name, and a topic and a service with two types each
+/// (`fixtures/cli/mixed.py`).
 #[test]
-fn a_node_has_its_endpoints_types_if_a_topic_has_several() {
+fn node_info_has_the_types_of_the_endpoints_if_a_topic_has_several() {
     let capture = own().join("mixed.pcap.gz");
     let recorded = std::fs::read_to_string(own().join("mixed.jsonl")).unwrap();
     let mut count = 0;
@@ -81,7 +83,8 @@ fn a_node_has_its_endpoints_types_if_a_topic_has_several() {
         let code = line["code"].as_i64().map(|code| code as i32);
         assert_eq!(output.status.code(), code, "{}", text("name"));
         assert_eq!(stdout(&output), text("stdout"), "{}", text("name"));
-        // The warning of later releases, and both nodes instead of one (`ros2cli-differences.md`).
+        // The expected text has the warning of later releases, and names both nodes instead of one
+        // (`ros2cli-differences.md`).
         let expected = text("stderr")
             .replace("aware that are nodes", "aware that there are nodes")
             .replace("exact name, this can", "exact name, which can")
@@ -92,7 +95,7 @@ fn a_node_has_its_endpoints_types_if_a_topic_has_several() {
     assert_eq!(count, 12);
 }
 
-/// As for a topic known at the start: a replay has it once it was read.
+/// A capture is read completely first, so the topic is treated as one that is known at the start.
 #[test]
 fn a_topic_of_two_types_is_not_echoed_from_a_capture() {
     let capture = own().join("mixed.pcap.gz");
@@ -112,9 +115,9 @@ fn a_topic_of_two_types_is_not_echoed_from_a_capture() {
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
 }
 
-/// The original prints `/robot1/sensor_node` as `//r/o/b/o/t/1sensor_node`.
+/// ros2cli prints `/robot1/sensor_node` as `//r/o/b/o/t/1sensor_node`.
 #[test]
-fn the_nodes_of_an_action_bear_their_names() {
+fn the_nodes_of_an_action_have_their_full_names() {
     let capture = own().join("graph.pcap.gz");
     let words = ["action", "info", "-t", "/robot1/fibonacci"];
     let output = run(&[&words[..], &["--replay", capture.to_str().unwrap()]].concat());
@@ -127,7 +130,7 @@ fn the_nodes_of_an_action_bear_their_names() {
 }
 
 #[test]
-fn output_absent_in_humble_is_that_of_jazzy() {
+fn commands_that_humble_lacks_print_the_output_of_jazzy() {
     let capture = own().join("graph.pcap.gz");
     let ask = |words: &str| {
         let mut words: Vec<&str> = words.split(' ').collect();
@@ -151,7 +154,7 @@ fn output_absent_in_humble_is_that_of_jazzy() {
     );
     let found = said("/robot1/fibonacci\n");
     assert_eq!(ask(&format!("action find {}", fibonacci.trim())), found);
-    // Hidden services are listed with the command's option as well as with the verb's.
+    // Hidden services are listed with the option of the command, and also with that of the verb.
     let hidden = "/robot1/fibonacci/_action/send_goal";
     assert_eq!(ask(&format!("service type {hidden}")).2, Some(1));
     let shown = ask(&format!("service --include-hidden-services type {hidden}"));

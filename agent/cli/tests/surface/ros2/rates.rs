@@ -1,5 +1,6 @@
-//! `rp topic hz`, `bw` and `delay` on captures: what the original printed on the same capture, within
-//! the tolerances that docs/ros2cli-differences.md lists, and what was really sent and received.
+//! `rp topic hz`, `bw` and `delay` on captures. The output agrees with that of ros2cli on the same
+//! capture, within the tolerances of docs/ros2cli-differences.md, and with the messages that were
+//! sent and received.
 
 use std::collections::BTreeMap;
 use std::io::Read as _;
@@ -10,10 +11,10 @@ use serde_json::Value;
 
 use super::{run, stderr, stdout};
 
-/// Seconds after which the original was ended.
+/// Time in seconds after which the recorded command of ros2cli was stopped.
 const LASTED: f64 = 7.0;
 
-/// A row of the list.
+/// A row of the list of tolerances.
 #[derive(Debug)]
 struct Tolerance {
     start_up: f64,
@@ -22,7 +23,7 @@ struct Tolerance {
     messages: f64,
 }
 
-/// A command of the original, and its output.
+/// A recorded command of ros2cli, and its output.
 struct Recorded {
     name: String,
     arguments: Vec<String>,
@@ -35,13 +36,13 @@ fn own() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/rates")
 }
 
-/// Recordings of the corpus.
+/// Returns the directory of recordings in the corpus.
 fn corpus() -> PathBuf {
     ros2probe_testing::corpus().join("cyclonedds/cli-observed-2ns")
 }
 
 #[test]
-fn rates_are_printed_as_the_original_prints_them() {
+fn printed_rates_agree_with_those_of_ros2cli() {
     let list = tolerances();
     let mut compared = 0;
     for recorded in recorded(&own()) {
@@ -53,7 +54,7 @@ fn rates_are_printed_as_the_original_prints_them() {
 
 #[test]
 #[ignore = "needs the corpus of captures: make test-corpus"]
-fn rates_in_the_corpus_are_printed_as_the_original_prints_them() {
+fn printed_rates_of_the_corpus_agree_with_those_of_ros2cli() {
     let (list, corpus) = (tolerances(), corpus());
     let mut compared = 0;
     for recorded in recorded(&corpus.join("cli")) {
@@ -86,7 +87,7 @@ fn received_messages_of_a_lossy_topic_are_counted() {
         .iter()
         .find(|one| one["topic"] == "/robot1/imu/data")
         .unwrap();
-    // 902 of 1000 were received: 901 intervals.
+    // 902 of 1000 messages were received, so there are 901 intervals.
     let said = on(small, "hz /robot1/imu/data --distro kilted");
     let window = imu["count"].as_u64().unwrap() - 1;
     assert!(said.ends_with(&format!(" window: {window}\n")), "{said}");
@@ -95,7 +96,7 @@ fn received_messages_of_a_lossy_topic_are_counted() {
         imu["rate_hz"].as_f64().unwrap(),
     );
     assert!((rate - truth).abs() <= truth / 1000.0, "{rate} of {truth}");
-    // All repairs of a reliable topic, each once; in a table with the other topic.
+    // Each repair of a reliable topic is counted once. The table also has the other topic.
     let said = on(small, "hz /chatter robot1/imu/data --distro kilted");
     assert!(
         said.contains("\n/chatter          ") && said.contains("   249   \n"),
@@ -108,7 +109,8 @@ fn received_messages_of_a_lossy_topic_are_counted() {
         "{said}"
     );
 
-    // 4 of 10 point clouds were complete; 9 intervals of a reliable topic, fragments repeated.
+    // 4 of 10 point clouds were complete. The reliable topic has 9 intervals, although fragments
+    // were repeated.
     let lossy = "cyclonedds/points-besteffort-lossy-2ns/capture.pcap.gz";
     let said = on(lossy, "hz /robot1/points --distro kilted");
     assert!(
@@ -153,10 +155,10 @@ fn topics_that_cannot_be_measured_are_refused() {
     );
 }
 
-/// The nodes' own logs: rates agree with them to a thousandth; the original is off by thirty.
+/// Rates agree with the logs of the nodes to 0.1 %. Those of `ros2 topic hz` differ by 3 %.
 #[test]
 #[ignore = "needs the corpus of captures: make test-corpus"]
-fn rates_of_the_corpus_are_those_that_were_sent() {
+fn rates_of_the_corpus_agree_with_the_logs_of_the_nodes() {
     let (list, corpus) = (tolerances(), corpus());
     let sent = sent(&corpus.join("sensor.jsonl.gz"));
     for recorded in recorded(&corpus.join("cli")) {
@@ -190,7 +192,7 @@ impl Recorded {
     fn compare(&self, capture: &Path, tolerance: &Tolerance) {
         let (out, err) = self.replayed(capture, tolerance);
         let name = &self.name;
-        // The reason for missing messages follows the original's output.
+        // The reason for missing messages follows the output of ros2cli.
         let why = |line: &&str| {
             let reasons = ["rp: no message on ", "whose announcement was missed"];
             !reasons.iter().any(|reason| line.contains(reason))
@@ -211,7 +213,7 @@ impl Recorded {
         }
     }
 
-    /// Both outputs of the same command on a capture.
+    /// Returns standard output and standard error of the same command on a capture.
     fn replayed(&self, capture: &Path, tolerance: &Tolerance) -> (String, String) {
         let from = format!("{:.9}", self.start + tolerance.start_up);
         let until = format!("{:.9}", self.start + LASTED);
@@ -230,7 +232,7 @@ impl Tolerance {
         };
         match before {
             "rate:" => (value - wanted).abs() <= wanted * self.rate,
-            // Bandwidths begin their line.
+            // A bandwidth is the first word of its line.
             "" => (value - wanted).abs() <= wanted * self.rate,
             "window:" | "from" => (value - wanted).abs() <= self.messages,
             _ if word.ends_with('s') || before == "delay:" => (value - wanted).abs() <= self.time,
@@ -255,7 +257,7 @@ fn last(said: &str, words: &str) -> f64 {
     numbers.next().unwrap()
 }
 
-/// The commands of these verbs.
+/// Returns the recorded commands of these verbs.
 fn recorded(directory: &Path) -> Vec<Recorded> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(directory).unwrap() {
@@ -287,7 +289,7 @@ fn recorded(directory: &Path) -> Vec<Recorded> {
     found
 }
 
-/// The list of tolerances.
+/// Returns the list of tolerances by recorded command.
 fn tolerances() -> BTreeMap<String, Tolerance> {
     let list = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/ros2cli-differences.md");
     let list = std::fs::read_to_string(list).unwrap();
@@ -311,7 +313,7 @@ fn tolerances() -> BTreeMap<String, Tolerance> {
     tolerances
 }
 
-/// When messages were sent, by topic.
+/// Returns the times at which messages were sent, by topic.
 fn sent(log: &Path) -> BTreeMap<String, Vec<f64>> {
     let mut text = String::new();
     let file = std::fs::File::open(log).unwrap();

@@ -1,4 +1,4 @@
-//! `rp` among other tools: pipes, signals, shells and `man`.
+//! `rp` together with other tools: pipes, signals, shells and `man`.
 
 use std::io::Read as _;
 use std::net::TcpListener;
@@ -9,7 +9,7 @@ use super::{run, stderr, stdout};
 use crate::rp;
 use ros2probe_testing::local_agent::capture;
 
-/// Returns a tool's output, or `None` if it is not installed.
+/// Returns the output of a tool, or `None` if it is not installed.
 fn tool(name: &str, arguments: &[&str]) -> Option<Output> {
     let output = Command::new(name).args(arguments).output();
     match output {
@@ -19,7 +19,7 @@ fn tool(name: &str, arguments: &[&str]) -> Option<Output> {
 }
 
 #[test]
-fn a_reader_that_has_gone_is_no_error() {
+fn a_closed_pipe_ends_the_command_without_an_error_message() {
     let mut rp = rp();
     rp.args(["topic", "list", "--replay"]).arg(capture());
     let mut child = rp
@@ -36,8 +36,8 @@ fn a_reader_that_has_gone_is_no_error() {
 }
 
 #[test]
-fn an_interrupt_ends_it_with_the_code_of_the_original() {
-    // Accepts and never answers.
+fn an_interrupt_ends_the_command_with_the_exit_code_of_ros2cli() {
+    // This server accepts connections and never answers.
     let silent = TcpListener::bind("127.0.0.1:0").unwrap();
     let mut rp = rp();
     rp.args([
@@ -78,7 +78,7 @@ fn shells_can_read_their_completions() {
     assert_eq!(run(&["completions", "tcsh"]).status.code(), Some(2));
 }
 
-/// Commands and verbs below these words, as their help lists them.
+/// Returns the commands and verbs below these words, as their help lists them.
 fn below(words: &[&str]) -> Vec<String> {
     let help = stdout(&run(&[words, &["--help"]].concat()));
     let Some((_, commands)) = help.split_once("Commands:\n") else {

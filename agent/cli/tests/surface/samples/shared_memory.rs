@@ -1,9 +1,9 @@
-//! Samples that were read from shared memory.
+//! Samples that are read from shared memory.
 
 use super::*;
 
 #[test]
-fn a_sample_of_several_messages_in_shared_memory_is_given_whole() {
+fn a_sample_in_several_messages_of_shared_memory_is_delivered_complete() {
     let mut robot = Robot::new(Settings::default());
     robot.subscribe(&["/points"], Depth::Payloads);
     robot.at += SECOND;
@@ -11,14 +11,15 @@ fn a_sample_of_several_messages_in_shared_memory_is_given_whole() {
     for start in [1, 2, 3] {
         robot.receive(Message::from(ALICE).fragment(WRITER, 1, start, 1000, &large));
     }
-    // Polling two ports may find them in another order, and twice.
+    // Polling two ports may find the messages in another order, and twice.
     for (number, start) in [(3, 1), (2, 1), (2, 3), (3, 2), (2, 1), (2, 2), (3, 3)] {
         robot.receive(Message::from(ALICE).fragment(WRITER, number, start, 1000, &large));
     }
     let expected = [1, 2, 3].map(|number| (ALICE, number, Ok(large.clone())));
     let given = robot.given();
     let (whole, missed): (Vec<_>, Vec<_>) = given.into_iter().partition(|each| each.2.is_ok());
-    // The last fragment of 2 was seen while one was missing: it was given up then.
+    // The last fragment of sample 2 was read while another one was missing, so the sample was given
+    // up.
     assert_eq!(whole, [expected[0].clone(), expected[2].clone()]);
     assert_eq!(missed, [(ALICE, 2, Err(MissedReason::NotCaptured))]);
     robot.receive(Message::from(ALICE).data(WRITER, 4, &payload(24)));
@@ -34,7 +35,7 @@ fn a_sample_of_several_messages_in_shared_memory_is_given_whole() {
 }
 
 #[test]
-fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_for_them() {
+fn missing_samples_of_shared_memory_delay_the_clock_and_are_then_reported() {
     let mut robot = Robot::new(Settings::default());
     robot.subscribe(&["/points"], Depth::Payloads);
     let small = payload(24);
@@ -50,7 +51,7 @@ fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_f
     let now = Timestamp(sent + SECOND / 20);
     robot.observer.input(Input::Time(now));
     assert!(robot.observer.dispatched_until(now).0 < sent);
-    // One of them is late.
+    // One of the missing samples arrives late.
     look(&mut robot, 3);
     assert_eq!(robot.given(), [given(3)]);
     let now = Timestamp(sent + SECOND);
@@ -58,7 +59,7 @@ fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_f
     assert_eq!(robot.observer.dispatched_until(now), now);
     let not_captured = (ALICE, 4, Err(MissedReason::NotCaptured));
     assert_eq!(robot.given(), [not_captured]);
-    // The end of a capture waits for nothing.
+    // At the end of a capture, the agent does not wait for missing samples.
     look(&mut robot, 8);
     robot.observer.input(Input::End);
     assert_eq!(
@@ -68,7 +69,7 @@ fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_f
 }
 
 #[test]
-fn a_repair_in_shared_memory_is_given_before_what_its_reader_held_back() {
+fn a_repair_in_shared_memory_is_delivered_before_the_samples_that_waited_for_it() {
     let mut robot = Robot::new(Settings::default());
     let reader = Guid::new(BOB, EntityId([0, 0, 0x12, 0x04]));
     let subscription = forge::endpoint(reader, "rt/points", "a::msg::dds_::B_", true);
@@ -76,7 +77,7 @@ fn a_repair_in_shared_memory_is_given_before_what_its_reader_held_back() {
     robot.subscribe(&["/points"], Depth::Payloads);
     let small = payload(24);
     let mut times = BTreeMap::new();
-    // 3 is sent again, 5 was not seen.
+    // Sample 3 is sent again, and sample 5 was not read.
     for number in [1, 2, 4, 6, 3, 7] {
         robot.receive(Message::from(ALICE).data(WRITER, number, &small));
         times.insert(number, robot.at);
@@ -96,7 +97,7 @@ fn a_repair_in_shared_memory_is_given_before_what_its_reader_held_back() {
             }
         }
     }
-    // A reader gets 4 with 3, and 6 when it came: it may have had 5.
+    // A reader delivers 4 after 3, and 6 on its arrival, because it may have received 5.
     let repaired = times[&3];
     let expected = [
         (1, Some(times[&1])),
@@ -111,12 +112,12 @@ fn a_repair_in_shared_memory_is_given_before_what_its_reader_held_back() {
 }
 
 #[test]
-fn the_last_samples_in_shared_memory_are_known_by_the_acknowledgement_of_their_reader() {
+fn missing_last_samples_of_shared_memory_are_detected_by_an_acknowledgement() {
     let mut robot = Robot::new(Settings::default());
     robot.subscribe(&["/points"], Depth::Payloads);
     let small = payload(24);
     robot.receive(Message::from(ALICE).data(WRITER, 1, &small));
-    // INFO_DST and ACKNACK: all below 4.
+    // INFO_DST, and an ACKNACK of all sequence numbers below 4.
     let body = [
         &[0, 0, 0x12, 0x04][..],
         &WRITER.0,
