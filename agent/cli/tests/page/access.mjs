@@ -1,10 +1,10 @@
-// Accessibility of every view: axe finds nothing in either theme, nothing scrolls sideways at 360
-// px and at 400 % zoom, and everything is reached by keys. The second argument is one of these.
+// Accessibility of every view. axe finds nothing in either theme, no view scrolls sideways at 360
+// px and at 400 % zoom, and every control is reached by keys. The second argument selects a test.
 
 import assert from 'node:assert/strict';
 import { scenario, until } from './tab.mjs';
 
-/** Address, and what is there once the view is drawn. */
+/** Fragment of each view, and an element that is present when the view is drawn. */
 const VIEWS = [
   ['', '.figures'],
   ['#/topics', 'main tbody tr[data-row]'],
@@ -21,7 +21,7 @@ const VIEWS = [
   ['#/nowhere', 'main p'],
 ];
 
-/** Opens what a view unfolds on request, so that it is looked at as well. */
+/** Opens the details of a view, so that they are checked as well. */
 async function unfold(tab) {
   for (const summary of await tab.page.locator('details:not([open]) > summary').all()) {
     await summary.click();
@@ -56,7 +56,7 @@ async function dialogs(tab, what) {
   await tab.escape();
 }
 
-/** From the begin of the page by the Tab key alone, to the first row of the table of topics. */
+/** Moves from the start of the page to the first row of the topics with the Tab key only. */
 async function byKeyboard(tab) {
   await tab.go('#/topics');
   await tab.page.locator('main tbody tr[data-row]').first().waitFor();
@@ -102,7 +102,7 @@ async function themes(open) {
     await dialogs(tab, theme);
     await tab.page.close();
   }
-  // The choice of a theme stays, whatever the system prefers.
+  // The chosen theme persists, whatever the system prefers.
   const tab = await open({ theme: 'light' });
   await tab.live();
   await tab.page.getByRole('button', { name: /^Theme: auto/ }).click();
@@ -116,7 +116,7 @@ async function themes(open) {
 async function small(open, width, height, scale) {
   const tab = await open({ width, height, scale });
   await tab.go('#/topics');
-  // The longest word of a topic's state.
+  // The longest state of a topic.
   await tab.page.locator('.badge', { hasText: 'unmatched pub' }).first().waitFor();
   for (const [fragment, ready] of VIEWS) {
     await tab.go(fragment);

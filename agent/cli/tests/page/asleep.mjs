@@ -1,12 +1,12 @@
-// A tab in the background: frozen for a minute by the browser, and hidden. It costs the agent
-// nothing while hidden, and shows the current state when it is visible again.
+// A tab in the background, which the browser freezes for a minute, and a hidden tab. A hidden tab
+// needs no work of the agent, and shows the current state when it is visible again.
 
 import assert from 'node:assert/strict';
 import { ask, scenario, until } from './tab.mjs';
 
 const MINUTE_MS = 60_000;
 
-/** Lets the test hide the tab: the browser without a window has no tabs to change between. */
+/** Lets the test hide the tab, because a browser without a window cannot change between tabs. */
 function hideable() {
   let state = 'visible';
   Object.defineProperty(Document.prototype, 'visibilityState', { get: () => state });
@@ -31,7 +31,7 @@ await scenario(async (open) => {
   await session.send('Page.setWebLifecycleState', { state: 'active' });
   await row('/while_asleep').waitFor();
   await tab.live();
-  // The figures are of now: the time of the last message moves on with the clock.
+  // The figures are current: the time of the last message advances with the clock.
   await tab.page.getByRole('link', { name: '/imu', exact: true }).click();
   await until('a message of now', async () => {
     const text = await tab.page.locator('.figure', { hasText: 'last message' })
@@ -51,7 +51,7 @@ await scenario(async (open) => {
   await tab.page.evaluate(() => globalThis.becomeVisible(true));
   await tab.live();
   await until('the stream is open', async () => (await ask('streams')).live === 1);
-  // A short look elsewhere keeps it.
+  // The stream stays open while the tab is hidden only briefly.
   const opened = () => tab.requests.filter((request) => request.url().endsWith('/live')).length;
   const before = opened();
   await tab.page.evaluate(() => globalThis.becomeVisible(false));

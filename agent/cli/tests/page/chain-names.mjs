@@ -1,6 +1,6 @@
-// Chains of topics and nodes with names that mean harm: they stay text, each chain is found by its
-// own address, and its way is in the graph. Arguments: address, number of chains, hops of the
-// longest.
+// Chains of topics and nodes with hostile names. The names stay text, each chain is found by its
+// own address, and its path is in the graph. Arguments: address, number of chains, hops of the
+// longest chain.
 
 import assert from 'node:assert/strict';
 import { scenario, there, until } from './tab.mjs';
@@ -32,7 +32,7 @@ await scenario(async (open) => {
     await tab.harmless(text);
     await tab.narrow(text);
   }
-  // The longest: all hops, and all of them in the graph.
+  // The longest chain shows all its hops, also in the graph.
   await tab.go('#/chains?sort=-hops');
   await until('the longest first', async () =>
     (await rows.first().innerText()).includes(`\t${LONGEST}\t`));
@@ -46,7 +46,7 @@ await scenario(async (open) => {
     .getAttribute('aria-rowcount'), String(LONGEST + 2));
   await tab.accessible('a long chain of hostile names');
   await tab.page.getByRole('link', { name: 'In the graph' }).click();
-  // Above 60 nodes the boxes are closed, and stand for what is in them.
+  // With more than 60 nodes the boxes are closed, and represent their content.
   await tab.page.getByRole('combobox', { name: 'Boxes' }).selectOption('none');
   const passed = tab.page.locator('.vertex.passed');
   await until('its way', async () => (await passed.count()) === 2 * (LONGEST + 1), 60_000);

@@ -1,5 +1,5 @@
-// Chains of real nodes in a capture: the list with configured ones first, the waterfall whose bars
-// agree with GET /chains, and the way through the graph. Then none, thousands, and no agent.
+// Chains of real nodes in a capture: the list with configured chains first, the waterfall whose
+// bars agree with GET /chains, and the path in the graph. Then no chain, thousands, and no agent.
 // Argument: address. Configured: /points to /cmd with 20 ms, /points to /filtered with 50 ms, and
 // /camera to /steering, which does not exist.
 
@@ -10,7 +10,7 @@ const CHAIN = '#/chains/%2Fpoints?to=%2Fcmd';
 const WAY = ['/sensor', '/points', '/filter', '/filtered', '/controller', '/cmd'];
 
 const UNITS = { 's': 1, 'ms': 1e-3, 'µs': 1e-6 };
-/** Seconds of a text such as "13.0 ms". */
+/** Returns the seconds of a text such as "13.0 ms". */
 const seconds = (text) => {
   const [, number, unit] = /([\d.]+) (s|ms|µs)/.exec(text);
   return Number(number) * UNITS[unit];
@@ -23,7 +23,7 @@ function close(found, wanted, what, part = 0.006) {
 
 const rows = (tab) => tab.page.locator('main tbody tr[data-row]');
 
-/** The shares of the axis that a row's bar takes. */
+/** Returns the positions of the bar of a row, as ratios of the axis. */
 const bar = (row) => row.evaluate((element) => {
   const share = (each, name) => Number(each.getAttribute(name).replace('%', '')) / 100;
   const svg = element.querySelector('svg.track');
@@ -53,7 +53,7 @@ async function list(tab) {
   close(limit, 0.02, 'limit');
   close(p50, expected[0].latency.p50_seconds, 'p50');
   close(p99, expected[0].latency.p99_seconds, 'p99');
-  // Sorted by p99, and filtered by a node in between; both are in the address.
+  // The address has the sort key p99 and the filter, which matches a node within the chains.
   await tab.page.getByRole('button', { name: 'p99' }).click();
   await until('the fastest first', async () =>
     (await rows(tab).first().innerText()).startsWith('/points → /filtered'));
@@ -64,7 +64,7 @@ async function list(tab) {
   await tab.shows('No chain matches.');
 }
 
-/** From the list to the second chain, by keys alone. */
+/** Moves from the list to the second chain with keys only. */
 async function keys(tab) {
   await tab.go('#/chains');
   await there(rows(tab));
@@ -74,7 +74,7 @@ async function keys(tab) {
     () => document.activeElement.textContent)) === '/points → /filtered');
   await tab.page.keyboard.press('Enter');
   await tab.heading('/points → /filtered');
-  // A part of a longer chain, with one hop, so that no hop is the slowest.
+  // A part of a longer chain, with a single hop, so that no hop is marked as the slowest.
   await until('one hop', async () => (await rows(tab).count()) === 2);
   assert.equal(await tab.page.locator('.waterfall .badge').count(), 0);
   await tab.page.keyboard.press('g');
@@ -156,7 +156,7 @@ async function graph(tab) {
     assert.notEqual(colour, faded);
     assert.ok(width > thin, `${width} and ${thin} wide`);
   }
-  // All of the way is in view, and keys walk along it.
+  // The whole path is visible, and keys move along it.
   const { x, width } = await tab.page.locator('.canvas').boundingBox();
   for (const vertex of await passed.all()) {
     const box = await vertex.boundingBox();
@@ -207,7 +207,7 @@ async function links(tab) {
   await tab.shows('no message has passed it so far');
   await tab.go('#/chains/%2Fcmd?to=%2Fpoints');
   await tab.shows('No such chain now.');
-  // The finding of the slow chain leads to it.
+  // The finding about the slow chain has a link to the chain.
   await tab.go('#/');
   const finding = tab.page.locator('.findings li', { hasText: 'chain from /points to /cmd' });
   await finding.getByRole('link', { name: 'Chains' }).click();
@@ -232,7 +232,7 @@ async function everywhere(open) {
   }
 }
 
-/** Answers that no agent gives today: few rows of them are in the document at a time. */
+/** Shows thousands of chains, of which only a few rows are in the document at the same time. */
 async function thousands(open) {
   const tab = await open();
   await tab.live();
@@ -283,7 +283,7 @@ await scenario(async (open) => {
   await everywhere(open);
   await thousands(open);
 
-  // The agent is gone: the figures stay, and the page says why they are old.
+  // The agent has ended: the figures stay, and the page shows why they are old.
   await tab.go(CHAIN);
   await until('hops', async () => (await rows(tab).count()) === 3);
   tab.expect(/^error: Failed to load resource: net::ERR_/);

@@ -1,5 +1,5 @@
-// 500 topics with names that mean harm: markup, quotes, marks that turn text around, 256 bytes of
-// junk. They stay text, every one is listed and found by its own address, and the page stays usable.
+// 500 topics with hostile names: markup, quotes, marks that reverse text, 256 bytes of junk. The
+// names stay text, every topic is listed and found by its own address, and the page stays usable.
 // Arguments: address, number of topics.
 
 import assert from 'node:assert/strict';
@@ -14,7 +14,7 @@ await scenario(async (open) => {
   await tab.page.locator('main tbody tr[data-row]').first().waitFor();
   await harmless('topics');
 
-  // All of them, row by row as one scrolls, though few are in the document at a time.
+  // All topics are found by scrolling, though only a few are in the document at the same time.
   const links = new Map();
   let most = 0;
   await until('every topic', async () => {
@@ -38,12 +38,12 @@ await scenario(async (open) => {
   await tab.page.evaluate(() => scrollTo(0, 0));
   await tab.narrow('topics');
 
-  // One of each kind, opened by its own link: the address leads to that very topic.
+  // One topic of each kind is opened by its link. The address leads to exactly that topic.
   const kinds = [...links].slice(0, 40);
   for (const [href, text] of kinds) {
     await tab.page.goto(`${tab.address}${href}`);
     await tab.live();
-    // A long name is cut in the middle of the table's cell and whole in the heading.
+    // A long name is shortened in the middle in the table, and complete in the heading.
     const [begin, end] = text.split('…');
     await until(`the view of ${text}`, async () => {
       const heading = await tab.page.locator('main h1').textContent();
@@ -71,7 +71,7 @@ await scenario(async (open) => {
   await tab.page.locator('main tbody tr').first().waitFor();
   await harmless('events');
 
-  // The graph of them all: laid out in the worker while the page answers.
+  // The worker computes the layout of the graph of all topics while the page stays responsive.
   await tab.go('#/graph?boxes=none&hidden=1');
   await until('the layout', async () => /laid out in \d+ ms/.test(await tab.text()), 60_000);
   await harmless('graph');

@@ -1,12 +1,12 @@
-// What a process shows from inside, on the views of its node and of its topics. The process calls
-// the functions that rclcpp calls. Argument: address.
+// Data from inside a process, on the views of its node and of its topics. The process calls the
+// functions that rclcpp calls. Argument: address.
 
 import assert from 'node:assert/strict';
 import { ask, reads, scenario, there, until } from './tab.mjs';
 
 const NODE = '#/nodes/%2Frobot1%2Ffilter?domain=0';
 
-/** Rows of a table as lists of texts. */
+/** Returns the rows of a table as lists of texts. */
 const cells = (table) => table.locator('tbody tr').evaluateAll((rows) => rows.map((row) =>
   [...row.children].map((cell) => cell.textContent.trim())));
 
@@ -14,7 +14,7 @@ await scenario(async (open) => {
   const tab = await open();
   await tab.live();
   const inside = tab.page.locator('section[aria-labelledby="inside"]');
-  // A node that has called nothing has no such section.
+  // A node without observed calls has no such section.
   await until('the node', async () => {
     await tab.go(NODE);
     return (await tab.page.locator('main ul.plain').count()) > 0;
@@ -38,7 +38,7 @@ await scenario(async (open) => {
     });
     return row;
   };
-  // The answers of the API, as the page prints them: 10 + 30 + 20 published, and 30 within.
+  // The page shows the figures of the API: 10 + 30 + 20 published messages, 30 within the process.
   await first('Publishers', ['/out', '/robot1/filter', '60', '30']);
   await first('Subscriptions', ['/in', '/robot1/filter', '20', '3']);
   const buffer = await first('Buffers', ['/in', '/robot1/filter', '30', '26']);
@@ -52,18 +52,18 @@ await scenario(async (open) => {
   });
   const calls = Object.fromEntries(callbacks.map(([name, , number]) => [name, number]));
   assert.equal(calls['timer 1.00 ms'], '20');
-  // Callbacks of messages take 2 ms, those of the process's own 1 ms, and longer on a busy machine.
+  // Callbacks of messages take 2 ms, those within the process 1 ms, and more on a busy machine.
   const [taken] = callbacks.filter(([name]) => name === '/in');
   assert.match(taken[5], /^[1-9][\d.]* ms$/, JSON.stringify(callbacks));
   await tab.accessible('a node from inside');
 
-  // While it works, rates and busy times appear.
+  // While the process works, rates and busy times appear.
   const working = (async () => { for (let at = 0; at < 4; at += 1) await ask('work'); })();
   await until('rates', async () => /Hz/.test((await cells(table('Publishers')))[0][4]));
   await reads(inside, /Its callbacks take [\d.]+ % of the\s+time/);
   await working;
 
-  // Its topics, of which the network shows nothing.
+  // The topics of the process, which do not use the network.
   await tab.go('#/topics/%2Fout?domain=0');
   await tab.shows('Rate and messages come from inside');
   const published = await first('Publishers', ['/out', '/robot1/filter', '300', '150']);
@@ -74,8 +74,8 @@ await scenario(async (open) => {
   await tab.go('#/topics/%2Fin?domain=0');
   await first('Subscriptions', ['/in', '/robot1/filter', '100', '15']);
 
-  // It publishes within the callback of its input: a chain by causality, with the wait and the
-  // callback of 2 ms or more as parts.
+  // The process publishes within the callback of its input. This is a chain by causality. Its parts
+  // are the wait and the callback of at least 2 ms.
   await tab.go('#/chains');
   const row = tab.page.locator('main tbody tr[data-row]', { hasText: '/in → /out' });
   await there(row);

@@ -1,4 +1,5 @@
-// A capture with losses, at the capture's own time: the page opened after the incident shows it.
+// A capture with losses, with the times of the capture. A page that is opened later shows the
+// incident.
 
 import assert from 'node:assert/strict';
 import { reads, scenario, there, until } from './tab.mjs';
@@ -6,7 +7,7 @@ import { reads, scenario, there, until } from './tab.mjs';
 await scenario(async (open) => {
   const tab = await open();
   await tab.live();
-  // The time bar: the time of all figures.
+  // The time bar shows the time of all figures.
   const bar = tab.page.locator('.timebar');
   await until('the end of the capture', async () => /finished/.test(await bar.innerText()));
   await reads(bar, /2026-\d\d-\d\d \d\d:\d\d:\d\d, .* after the begin/);
@@ -24,12 +25,12 @@ await scenario(async (open) => {
   const chart = tab.page.getByRole('img', { name: /^Lost messages/ });
   await until('the chart of what was lost', async () => Number(/maximum ([\d,]+)/.exec(
     await chart.getAttribute('aria-label'))?.[1]) > 0);
-  // When it happened: the table of the chart has the seconds.
+  // The table of the chart has the seconds of the incident.
   const figure = tab.page.locator('figure', { hasText: 'Lost messages' });
   await figure.getByRole('button', { name: 'Table' }).click();
   await there(figure.locator('tbody tr'));
 
-  // The badge in the table, and the sort that brings it up.
+  // The table has a badge, and can be sorted by it.
   await tab.go('#/topics?sort=state');
   const row = tab.page.locator('main tbody tr[data-row]').first();
   await reads(row, /loss/);
@@ -38,7 +39,7 @@ await scenario(async (open) => {
   await until('only what is wrong', async () => tab.fragment().includes('only=wrong'));
   await there(tab.page.locator('main tbody tr[data-row]'));
 
-  // In the graph it has a mark and a word, not only a colour.
+  // In the graph, the topic has a mark and a word, not only a colour.
   await tab.go('#/graph');
   await tab.page.getByRole('button', { name: /with a warning/ }).first().waitFor();
   await there(tab.page.locator('.vertex.warning .sign'));

@@ -1,7 +1,7 @@
 // Measures the page: first useful paint with 500 topics, layout of large graphs in the worker, and
-// memory of a tab over minutes of stream. Prints the figures; fails where one is over its budget.
-// What tabs cost the agent: make bench BENCH_OPTIONS="--only tabs".
-// MEASURE_MINUTES is how long the memory is watched (2).
+// memory of a tab over minutes of stream. Prints the figures, and fails if one exceeds its budget.
+// Cost of tabs for the agent: make bench BENCH_OPTIONS="--only tabs".
+// MEASURE_MINUTES is the duration of the measurement of memory (default: 2).
 
 import assert from 'node:assert/strict';
 import { robot } from '../../../page/test/robot.js';
@@ -11,17 +11,17 @@ const MINUTES = Number(process.env.MEASURE_MINUTES ?? 2);
 const PAINT_MS = 1000;
 /** Budgets of layouts: nodes, topics, milliseconds. */
 const LAYOUTS = [[100, 300, 1000], [200, 600, 3000]];
-/** A tab whose memory grows by less than this over the second half of its time is level. */
+/** Maximum growth of a tab's memory over the second half of its time, in bytes. */
 const GROWTH_BYTES = 3_000_000;
 
 const sleep = (ms) => new Promise((wake) => setTimeout(wake, ms));
 const median = (all) => all.toSorted((one, other) => one - other)[Math.floor(all.length / 2)];
 
-/** Notes when the first row of a table, or the first finding or figure, is in the document. */
+/** Stores the time at which the first row of a table, or the first figure, is painted. */
 function mark() {
   const seen = () => {
     if (globalThis.usefulAt || !document.querySelector('main tbody tr[data-row], main .figures')) return;
-    // Painted with the next frame.
+    // The element is painted with the next frame.
     requestAnimationFrame(() => setTimeout(() => { globalThis.usefulAt ??= performance.now(); }));
   };
   new MutationObserver(seen).observe(document, { childList: true, subtree: true });
@@ -80,10 +80,10 @@ async function memory(open) {
   };
   const samples = [];
   const steps = 12;
-  // Ten minutes of the page's own history fill within the first of them at most.
+  // The history of the page covers at most 10 min, and is filled in the first of them.
   for (let step = 0; step <= steps; step += 1) {
     samples.push(await heap());
-    // One looks around as well: every view is opened and left.
+    // Every view is opened and left, as by a user.
     for (const view of ['#/', '#/graph', '#/nodes', '#/events', '#/topics']) {
       await tab.page.evaluate((to) => { location.hash = to; }, view);
       await sleep(300);

@@ -1,5 +1,5 @@
-// The current message of a topic: a tree that is folded and unfolded, and a chart of a number
-// in it. The agent decodes only while the tree is open.
+// The current message of a topic: a tree that can be collapsed, and a chart of a number in it. The
+// agent decodes messages only while the tree is open.
 
 import assert from 'node:assert/strict';
 import { ask, gone, reads, scenario, until } from './tab.mjs';
@@ -20,12 +20,12 @@ await scenario(async (open) => {
   await until('the next message', async () => (await field('nanosec').innerText()) !== before);
   await reads(section, /by \/imu_driver/);
 
-  // Folded away, and back.
+  // A branch is collapsed and expanded again.
   await tree.getByRole('button', { name: /^header/ }).click();
   await gone(field('nanosec'));
   await tree.getByRole('button', { name: /^header/ }).click();
   await field('nanosec').waitFor();
-  // A covariance is an array of nine.
+  // A covariance is an array of nine numbers.
   await reads(tree, /orientation_covariance \(9\)/);
 
   await tree.getByRole('button', { name: 'Plot linear_acceleration.z' }).click();
@@ -38,10 +38,10 @@ await scenario(async (open) => {
   await until('its values', async () => (await values.locator('tbody tr').count()) >= 1);
   await tab.accessible('a message with a chart');
 
-  // At most five a second, whatever the topic's rate; how many were left out is shown.
+  // At most five messages per second are shown, and the number of omitted messages.
   await until('what was not shown', async () => /\d+ not shown before it/
     .test(await section.innerText()));
-  // While it is closed, the agent decodes nothing.
+  // While the tree is closed, the agent decodes nothing.
   assert.equal((await ask('streams')).messages, 1);
   await section.getByRole('button', { name: 'Close' }).click();
   await until('the agent is left alone', async () => (await ask('streams')).messages === 0);

@@ -1,5 +1,5 @@
-// A best-effort publisher and a reliable subscriber: the finding is first, and leads to the two
-// endpoints side by side with the policy that does not fit.
+// A best-effort publisher and a reliable subscriber: the finding is the first, and has a link to
+// the two endpoints with the incompatible policy.
 
 import assert from 'node:assert/strict';
 import { reads, scenario, there, until } from './tab.mjs';
@@ -27,7 +27,7 @@ await scenario(async (open) => {
   assert.equal(durability, 0, 'only the policy that does not fit');
   await tab.accessible('a mismatch');
 
-  // The topic carries the badge, the graph the mark, the node the finding.
+  // The topic has the badge, the graph has the mark, and the node has the finding.
   await tab.go('#/topics?sort=state');
   await reads(tab.page.locator('main tbody tr[data-row]').first(), /QoS/);
   await tab.go('#/graph');
@@ -35,6 +35,6 @@ await scenario(async (open) => {
   await there(tab.page.locator('.edge .sign.error'));
   await tab.page.getByRole('combobox', { name: 'Show' }).selectOption('nodes');
   await until('the pair', async () => (await tab.page.locator('.edge.pair, .edge').count()) > 0);
-  // A screen reader hears of new findings only: none since the page was opened.
+  // A screen reader announces only new findings. There was none since the page was opened.
   assert.equal(await tab.page.locator('[aria-live="polite"]').innerText(), '');
 });

@@ -1,4 +1,4 @@
-// A recording from its start to the downloaded file; and a snapshot.
+// A recording from its start to the downloaded file, and a snapshot.
 
 import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
@@ -7,13 +7,13 @@ import { ask, gone, scenario, until } from './tab.mjs';
 await scenario(async (open) => {
   const tab = await open({ fragment: '#/recordings' });
   await tab.live();
-  // A refusal is a line of the browser's own on the console.
+  // The browser itself writes a refusal to the console.
   tab.expect(/the server responded with a status of 422/);
   await tab.shows('No recording yet.');
   await tab.page.getByRole('combobox', { name: 'Topics' }).fill('/imu /scan');
   await tab.page.getByLabel('Name').fill('lap one');
   await tab.page.getByRole('button', { name: 'Start', exact: true }).click();
-  // A name that no file can have is refused in words, and the form stays as it was.
+  // An invalid file name is refused with a message, and the form keeps its values.
   await tab.page.locator('main [role="alert"]').waitFor();
   assert.equal(await tab.page.getByLabel('Name').inputValue(), 'lap one');
   await tab.page.getByLabel('Name').fill('lap-one');

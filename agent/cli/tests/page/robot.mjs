@@ -1,4 +1,4 @@
-// Every view of a robot that runs: what it shows, its address, the keys that lead to it.
+// Every view of a running robot: its content, its address, and the keys that open it.
 // Arguments: address, process id of the node /lidar.
 
 import assert from 'node:assert/strict';
@@ -7,7 +7,7 @@ import { ask, gone, reads, scenario, there, until } from './tab.mjs';
 
 const LIDAR = process.argv[3];
 
-/** The number at the begin of a text such as "20.0 Hz". */
+/** Returns the number at the start of a text such as "20.0 Hz". */
 const leading = (text) => Number(/-?[\d.]+/.exec(text)?.[0]);
 
 async function overview(tab) {
@@ -22,9 +22,9 @@ async function overview(tab) {
   const first = tab.page.locator('section[aria-labelledby="busiest"] tbody tr').first();
   await until('/points is the busiest', async () => (await first.innerText()).includes('/points'));
   await reads(first, /MB\/s/);
-  // The robot has no mistake in it that stops messages.
+  // The robot has no fault that stops messages.
   const errors = await tab.page.locator('.findings li.error').allInnerTexts();
-  // A machine that is busy with other tests loses messages, which is true and found.
+  // On a busy machine, messages may really be lost, which the page then reports.
   assert.deepEqual(errors.filter((text) => !text.includes('loses messages')), []);
 }
 
@@ -39,7 +39,7 @@ async function topics(tab) {
     return ['/cmd_vel', '/imu', '/points', '/scan'].every((name) => all.includes(name));
   });
   assert.ok(!(await names()).includes('/rosout') || (await names()).length > 4);
-  // Sorted by rate, the fastest first; an absent rate is last.
+  // The topics are sorted by rate, with the fastest first and absent rates last.
   await tab.page.getByRole('button', { name: /^Rate/ }).click();
   await tab.page.getByRole('button', { name: /^Rate/ }).click();
   await until('sorted by rate', async () => (await names())[0] === '/imu');
@@ -49,7 +49,7 @@ async function topics(tab) {
   const row = tab.page.locator('main tbody tr[data-row]');
   await reads(row, /sensor_msgs\/msg\/PointCloud2/);
   await reads(row, /[1-9][\d.]* Hz/);
-  // The address has it all: it survives a reload and can be passed on.
+  // The address has the sort key and the filter, so both survive a reload.
   assert.equal(tab.fragment(), '#/topics?sort=-rate&filter=point+cloud2');
   await tab.page.reload();
   await tab.live();
@@ -67,7 +67,7 @@ async function topic(tab) {
   await until('charts', async () => (await tab.page.locator('.plot canvas').count()) === 5);
   const chart = tab.page.getByRole('img', { name: /^Rate over the last ten minutes/ });
   await until('a rate', async () => /rate: last [1-9]/.test(await chart.getAttribute('aria-label')));
-  // The chart continues: a second later it has another second.
+  // The chart continues, with one more second after each second.
   const seconds = () => tab.page.evaluate(() =>
     document.querySelector('.plot .uplot') && performance.now());
   assert.ok(await seconds());
@@ -76,7 +76,7 @@ async function topic(tab) {
   await until('values as a table', async () => (await table.locator('tbody tr').count()) > 0);
   await reads(table.locator('tbody tr').first(), /\d\d:\d\d:\d\d\s+[\d.]+ MB\/s/);
   await table.getByRole('button', { name: 'Table' }).click();
-  // One cursor for all charts, moved by keys.
+  // Keys move one cursor in all charts.
   await chart.focus();
   await tab.page.keyboard.press('ArrowLeft');
   const shown = () => tab.page.locator('.u-legend .u-series:first-child .u-value').allInnerTexts();
@@ -120,7 +120,7 @@ async function graph(tab) {
   await tab.page.getByRole('button', { name: 'Show all' }).click();
   await vertex('/cmd_vel').waitFor();
   await gone(vertex('/rosout'));
-  // What flows: the edges of /points carry megabytes and are wide.
+  // The edges of /points transport megabytes and are wide.
   const widths = await until('edges', async () => {
     const all = await tab.page.locator('.edge .line').evaluateAll((lines) => lines.map((line) =>
       [line.parentNode.querySelector('title')?.textContent, Number(line.getAttribute('stroke-width'))]));
@@ -128,10 +128,10 @@ async function graph(tab) {
   });
   const wide = widths.filter(([, width]) => width > 4);
   assert.ok(wide.every(([title]) => /MB\/s/.test(title)), JSON.stringify(widths));
-  // From left to right: a publisher is left of its topic.
+  // The graph goes from left to right: a publisher is left of its topic.
   const [lidar, points] = [await vertex('/lidar').boundingBox(), await vertex('/points').boundingBox()];
   assert.ok(lidar.x + lidar.width <= points.x, 'left to right');
-  // Keys walk along the edges and choose.
+  // Keys move along the edges and select.
   await vertex('/lidar').focus();
   await tab.page.keyboard.press('ArrowRight');
   const focused = (name) => tab.page.evaluate((attribute) =>
@@ -168,7 +168,7 @@ async function graph(tab) {
   await tab.page.getByRole('combobox', { name: 'Boxes' }).selectOption('process');
   await until('boxes of processes', async () => (await tab.page.locator('.box').count()) >= 3);
   await reads(tab.page.locator('.canvas'), LIDAR);
-  // A box closes and opens.
+  // A box is closed and opened.
   const box = tab.page.locator('.box [role="button"]', { hasText: new RegExp(LIDAR) }).first();
   await box.focus();
   await tab.page.keyboard.press('Enter');

@@ -1,5 +1,5 @@
-// Takes the pictures of the documentation from the demo: `make screenshots`.
-// Arguments: the demo's program, the directory of the pictures, names of pictures (all of them).
+// Takes the screenshots of the documentation from the demo: `make screenshots`. Arguments: the
+// program of the demo, the directory of the pictures, and names of pictures (default: all).
 
 import { spawn } from 'node:child_process';
 import { mkdirSync, statSync } from 'node:fs';
@@ -7,10 +7,10 @@ import { createInterface } from 'node:readline';
 import { launch, Tab, until } from './tab.mjs';
 
 const [, , PROGRAM, DIRECTORY, ...WANTED] = process.argv;
-/** Seconds of figures before the pictures are taken, so that charts have a course. */
+/** Seconds before the pictures are taken, so that charts have enough points. */
 const WAIT_S = Number(process.env.SCREENSHOT_WAIT_S ?? 75);
 
-/** Name, fragment, theme, width, height, and what is there once the view is drawn. */
+/** Name, fragment, theme, width, height, and an element that is present when the view is drawn. */
 const PICTURES = [
   ['overview', '#/', 'light', 1280, 860, '.figures'],
   ['overview-dark', '#/', 'dark', 1280, 860, '.figures'],

@@ -1,8 +1,8 @@
-// A real browser that shows the agent's page, and what the page must never do: write to the console,
-// ask another origin, open a dialog of the browser, break a rule of accessibility.
+// A real browser that shows the agent's page. The page must never write to the console, send a
+// request to another origin, open a dialog of the browser, or violate a rule of accessibility.
 //
-// A scenario runs beside a Rust test (agent/cli/tests/live/browser.rs), which has started the agent. `ask`
-// puts a question to that test, such as to restart the agent.
+// A Rust test (agent/cli/tests/live/browser.rs) starts the agent and the scenario. `ask` sends that
+// test a command, such as to restart the agent.
 
 import assert from 'node:assert/strict';
 import { existsSync, mkdirSync, readFileSync } from 'node:fs';
@@ -11,11 +11,11 @@ import { basename } from 'node:path';
 import { createInterface } from 'node:readline';
 import { fileURLToPath } from 'node:url';
 
-/** What .ci/prerequisites.sh installs. */
+/** Directory of the packages that .ci/prerequisites.sh installs. */
 const TOOLS = fileURLToPath(new URL('../../../../target/tools/page/', import.meta.url));
 const FAILURES = fileURLToPath(new URL('../../../../target/page-failures/', import.meta.url));
 const CHROMIUM = '/usr/bin/chromium-headless-shell';
-/** Longest wait for anything; other tests keep the machine busy. */
+/** Maximum wait for an event. Other tests keep the machine busy. */
 const PATIENCE_MS = 30_000;
 
 if (!existsSync(`${TOOLS}node_modules/playwright-core`)) {
@@ -26,13 +26,13 @@ const load = createRequire(`${TOOLS}package.json`);
 const { chromium } = load('playwright-core');
 const AXE = readFileSync(load.resolve('axe-core/axe.min.js'), 'utf8');
 
-/** Files of this folder take the place of the agent's own, for those who work on the page. */
+/** Files of this folder replace the agent's own files during work on the page. */
 const EDITED = process.env.ROS2PROBE_PAGE_FROM;
 
-/** The address that the Rust test gave. */
+/** The address that the Rust test passed. */
 export const ADDRESS = process.argv[2] ?? 'http://127.0.0.1:17401/';
 
-/** Debian's browser, or the one playwright-core fetched where the system has no package. */
+/** Starts Debian's browser, or that of playwright-core if the system has no package. */
 export function launch() {
   if (!existsSync(CHROMIUM)) process.env.PLAYWRIGHT_BROWSERS_PATH ??= `${TOOLS}browsers`;
   return chromium.launch({
@@ -41,7 +41,7 @@ export function launch() {
   });
 }
 
-/** Waits until something holds, and returns it. */
+/** Waits until the function returns a true value, and returns that value. */
 export async function until(what, holds, patience = PATIENCE_MS) {
   const deadline = Date.now() + patience;
   let last;
@@ -57,16 +57,16 @@ export async function until(what, holds, patience = PATIENCE_MS) {
   }
 }
 
-/** Waits until a part of the page reads as it should: parts of a view arrive one after the other. */
+/** Waits until a part of the page has this text. Parts of a view arrive one after the other. */
 export const reads = (locator, pattern) => until(`${locator} reads ${pattern}`, async () => {
   const text = await locator.innerText();
   return pattern instanceof RegExp ? pattern.test(text) : text.includes(pattern);
 });
 
-/** Waits until there is at least one of these elements. */
+/** Waits until at least one of these elements exists. */
 export const there = (locator) => until(`there is ${locator}`, async () => (await locator.count()) > 0);
 
-/** Waits until there is none of these elements. */
+/** Waits until none of these elements exists. */
 export const gone = (locator) => until(`there is no ${locator}`, async () =>
   (await locator.count()) === 0);
 
@@ -79,7 +79,7 @@ async function edited(route) {
 
 let lines = null;
 
-/** Puts a question to the Rust test and returns its answer. */
+/** Sends a command to the Rust test and returns the answer. */
 export async function ask(question) {
   lines ??= createInterface({ input: process.stdin })[Symbol.asyncIterator]();
   process.stdout.write(`@${question}\n`);
@@ -88,10 +88,10 @@ export async function ask(question) {
   return JSON.parse(value);
 }
 
-/** Nothing that prints nothing or turns its neighbours around is in the document. */
+/** Characters that are invisible or reverse text, which the document must not contain. */
 const UNSEEN = /[\u0000-\u0008\u000b-\u001f\u007f-\u009f\u00ad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffc]/;
 
-/** What in the document is not as it must be. */
+/** Returns the parts of the document that violate its rules. */
 function looked(pattern) {
   const unseen = new RegExp(pattern);
   const wrong = [];
@@ -103,7 +103,7 @@ function looked(pattern) {
       if (/^on/i.test(name)) wrong.push(`attribute ${name} of ${each.tagName}`);
       if (/^(href|src|action|xlink:href)$/i.test(name) && !value.startsWith('#')
         && !value.startsWith('blob:')) wrong.push(`${name}=${value.slice(0, 100)}`);
-      // A key of the page's own is on no screen and read by no one.
+      // Keys of the page itself are never displayed.
       if (name !== 'data-key' && unseen.test(value)) wrong.push(`unseen in ${name} of ${each.tagName}: ${
         encodeURIComponent(value.slice(0, 60))}`);
     }
@@ -118,18 +118,18 @@ function looked(pattern) {
   return wrong.slice(0, 10);
 }
 
-/** One tab, and what has been seen of it. */
+/** One tab, with its messages and requests. */
 export class Tab {
   constructor(page, address) {
     this.page = page;
     this.address = address;
     this.origin = new URL(address).origin;
-    /** Everything the console showed, and every mistake no one caught. */
+    /** All messages on the console, and all uncaught errors. */
     this.messages = [];
     /** Requests of the tab and of its workers. */
     this.requests = [];
     this.dialogs = [];
-    /** Console messages that the browser itself writes about a request that fails. */
+    /** Patterns of messages that the browser itself writes about a failed request. */
     this.expected = [];
     page.on('console', (message) => this.messages.push(`${message.type()}: ${message.text()} (${
       message.location().url})`));
@@ -141,12 +141,12 @@ export class Tab {
     page.context().on('request', (request) => this.requests.push(request));
   }
 
-  /** Messages that match are of the browser's own making, not the page's. */
+  /** Permits messages that match, because the browser writes them and not the page. */
   expect(pattern) {
     this.expected.push(pattern);
   }
 
-  /** Fails where the tab did what it may not. */
+  /** Fails if the tab violated a rule. */
   verify() {
     const said = this.messages.filter((each) => !this.expected.some((known) => known.test(each)));
     assert.deepEqual(said, [], 'the console stays empty');
@@ -193,7 +193,7 @@ export class Tab {
     });
   }
 
-  /** Opens the search and types there. */
+  /** Opens the search and types a text. */
   async search(text) {
     await this.page.keyboard.press('/');
     await this.page.getByRole('dialog', { name: 'Search' }).waitFor();
@@ -201,13 +201,13 @@ export class Tab {
     await this.page.keyboard.type(text);
   }
 
-  /** Closes the dialog that is open. */
+  /** Closes the open dialog. */
   async escape() {
     await this.page.keyboard.press('Escape');
     await gone(this.page.locator('dialog'));
   }
 
-  /** Fails with what axe finds against WCAG 2.2 A and AA. */
+  /** Fails if axe finds violations of WCAG 2.2 A and AA. */
   async accessible(what) {
     await this.page.evaluate(AXE);
     const found = await this.page.evaluate(() => globalThis.axe.run(document, {
@@ -220,12 +220,12 @@ export class Tab {
     assert.equal(words.length, 0, `${what}:\n${words.join('\n')}`);
   }
 
-  /** Fails where a name of the network is more than text. */
+  /** Fails if a name from the network is more than text. */
   async harmless(what) {
     assert.deepEqual(await this.page.evaluate(looked, UNSEEN.source), [], what);
   }
 
-  /** Fails where the page scrolls sideways; names what is too wide. */
+  /** Fails if the page scrolls sideways, with the names of elements that are too wide. */
   async narrow(what) {
     const wide = await this.page.evaluate(() => {
       const { scrollWidth, clientWidth } = document.documentElement;
@@ -245,7 +245,7 @@ export class Tab {
 }
 
 /**
- * Runs a scenario in a browser of its own and ends the process: 0 where it holds.
+ * Runs a scenario in a separate browser and ends the process, with code 0 on success.
  * @param {(open: (options?: object) => Promise<Tab>, browser: any) => Promise<void>} story
  */
 export async function scenario(story) {

@@ -1,5 +1,5 @@
-// Where loopback lacks the rights, the page needs a token once: in the address that `rp page` prints,
-// or pasted. The page removes it from the address at once and keeps it in its tab only.
+// If loopback lacks the rights, the page needs a token once: in the address that `rp page` prints,
+// or pasted. The page removes the token from the address immediately and keeps it only in its tab.
 // Arguments: address of an agent whose loopback grants `read`, address of one that requires a token.
 
 import assert from 'node:assert/strict';
@@ -7,7 +7,7 @@ import { ADDRESS, ask, gone, scenario, until } from './tab.mjs';
 
 const STRICT = process.argv[3];
 
-/** A refusal is a line of the browser on the console, whatever the page does with it. */
+/** The browser writes each refusal to the console, whatever the page does with it. */
 const REFUSED = /Failed to load resource: the server responded with a status of (401|403)/;
 
 async function loopback(open, browser) {
@@ -22,7 +22,7 @@ async function loopback(open, browser) {
   await tab.page.getByRole('link', { name: 'Agent', exact: true }).click();
   await tab.shows(/Rights at this address\s+read/);
 
-  // A wrong one changes nothing and is reported.
+  // A wrong token changes nothing and is reported.
   await tab.page.getByRole('button', { name: 'Enter a token' }).click();
   await tab.page.getByLabel('Token', { exact: true }).last().fill('0'.repeat(64));
   await tab.page.getByRole('button', { name: 'Use this token' }).click();
@@ -32,7 +32,7 @@ async function loopback(open, browser) {
   await tab.page.getByRole('button', { name: 'Forget the token' }).click();
   await tab.live();
 
-  // The address of `rp page`.
+  // The page is opened at the address of `rp page`.
   const { printed } = await ask('rp page');
   const [, token] = printed.split('#token=');
   assert.match(token, /^[0-9a-f]{64}$/);
@@ -55,7 +55,7 @@ async function loopback(open, browser) {
   await tab.page.goForward();
   await tab.live();
 
-  // After a reload it is still there; in another tab it is not.
+  // The token is still there after a reload, but not in another tab.
   await tab.page.reload();
   await tab.page.getByRole('link', { name: 'Agent', exact: true }).click();
   await tab.shows(/Rights at this address\s+all/);

@@ -1,17 +1,17 @@
 // The public client of the Foxglove WebSocket protocol subscribes to every channel of the demo's
-// robot: it must understand each message. Argument: address of the agent's listener.
+// robot, and must understand each message. Argument: address of the agent's listener.
 
 import assert from 'node:assert/strict';
 import { createRequire } from 'node:module';
 import { fileURLToPath } from 'node:url';
 
-/** What .ci/prerequisites.sh installs. */
+/** Directory of the packages that .ci/prerequisites.sh installs. */
 const TOOLS = fileURLToPath(new URL('../../../../target/tools/page/', import.meta.url));
 const load = createRequire(`${TOOLS}package.json`);
 const { FoxgloveClient } = load('@foxglove/ws-protocol');
 const WebSocket = load('ws');
 
-/** Longest wait for everything; other tests keep the machine busy. */
+/** Maximum wait for all messages. Other tests keep the machine busy. */
 const PATIENCE_MS = 60_000;
 const POINTS_BYTES = 640_000;
 /** Topics of the robot with their types, and the messages to wait for. */
@@ -24,7 +24,7 @@ const TOPICS = {
 
 const socket = new WebSocket(process.argv[2], [FoxgloveClient.SUPPORTED_SUBPROTOCOL]);
 const client = new FoxgloveClient({ ws: socket });
-/** Channels by topic, with what was received on them. */
+/** Channels by topic, with their received messages. */
 const channels = new Map();
 const subscriptions = new Map();
 const problems = [];
@@ -32,7 +32,7 @@ let server;
 const graph = new Map();
 
 client.on('error', (error) => problems.push(String(error)));
-// The demo's robot does not subscribe to these. The agent says so if the viewer is there for long.
+// The demo's robot does not subscribe to these topics. The agent reports this after a while.
 const SILENT = '/parameter_events, /rosout: no subscriber exists, so nothing is sent';
 client.on('status', ({ message }) => { if (message !== SILENT) problems.push(message); });
 client.on('serverInfo', (info) => { server = info; });

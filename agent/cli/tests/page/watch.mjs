@@ -1,5 +1,5 @@
-// A topic is measured and no longer measured at a press: the agent's list of watches and the
-// kernel's map of writers follow, and so do the figures.
+// A button starts and stops the measurement of a topic. The agent's list of watches, the kernel's
+// map of writers, and the figures follow.
 
 import assert from 'node:assert/strict';
 import { ask, scenario, until } from './tab.mjs';
@@ -20,13 +20,13 @@ await scenario(async (open) => {
     return now.interest > before.interest && now;
   });
   assert.deepEqual(measured.topics, ['/scan']);
-  // However busy the machine is: a scan that is measured has a rate.
+  // A measured scan has a rate, however busy the machine is.
   await until('its rate', async () => /[1-9][\d.]* Hz/.test(await row.innerText()));
-  // The other topics stay as they were.
+  // The other topics are unchanged.
   const other = tab.page.locator('main tbody tr[data-row]', { hasText: '/points' });
   assert.ok(await other.getByRole('button', { name: 'off: measure /points' }).isVisible());
 
-  // In the view of the topic the same button, with the same effect.
+  // The view of the topic has the same button with the same effect.
   await tab.page.getByRole('link', { name: '/scan', exact: true }).click();
   await tab.page.locator('.plot canvas').first().waitFor();
   await tab.page.getByRole('button', { name: 'on: measure /scan' }).click();

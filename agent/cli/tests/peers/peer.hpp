@@ -25,13 +25,13 @@ namespace peer {
 constexpr const char* kPointCloudType = "sensor_msgs::msg::dds_::PointCloud2_";
 constexpr const char* kDiscoveryTopic = "ros_discovery_info";
 constexpr const char* kDiscoveryType = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
-// A serialized PointCloud2 with no fields and frame_id "lidar": 4 bytes of encapsulation and 48
-// before `data`, 1 after.
+// Overhead of a serialized PointCloud2 with no fields and frame_id "lidar": 4 bytes of
+// encapsulation, 48 bytes before `data` and 1 after it.
 constexpr size_t kPointCloudOverhead = 53;
 
 using Guid = std::array<uint8_t, 16>;
 
-// Returns the byte at an offset of a point cloud's data: adjacent bytes differ, and so do fragments.
+// Returns the byte at an offset of a point cloud's data. Adjacent bytes and fragments differ.
 inline uint8_t pattern(size_t place) {
   return static_cast<uint8_t>(place * 7 + (place >> 8) * 13 + (place >> 16));
 }
@@ -164,7 +164,7 @@ struct Options {
 
 inline std::string dds_topic(const std::string& ros_topic) { return "rt" + ros_topic; }
 
-// One JSON object per line, flushed at once: a killed process leaves a complete log.
+// One JSON object per line, flushed immediately, so that a killed process leaves a complete log.
 class Log {
  public:
   Log(const Options& options, const char* stack) {
@@ -252,7 +252,7 @@ inline void wait_for_line() {
   } while (byte != '\n');
 }
 
-// Waits until `matched` reports enough peers, then for the start.
+// Waits until `matched` reports enough peers, and then for the start.
 inline void wait_for_start(const Options& options, const std::function<int()>& matched) {
   while (!stopped && matched() < options.peers) usleep(10000);
   say("matched");

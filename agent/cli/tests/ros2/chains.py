@@ -1,4 +1,4 @@
-"""Nodes of a pipeline: a sensor, nodes that take a known time, and their logs.
+"""Nodes of a pipeline: a sensor, nodes with a known processing time, and their logs.
 
 chains.py sensor OUT HZ LOG
 chains.py node NAME IN OUT MILLISECONDS keep|now LOG

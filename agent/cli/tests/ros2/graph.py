@@ -1,4 +1,4 @@
-"""A node with an action server and client, and a service server in a namespace, of rclpy."""
+"""A node of rclpy with an action server and client, and a service server in a namespace."""
 
 import rclpy
 from example_interfaces.action import Fibonacci

@@ -1,9 +1,9 @@
-"""A publisher and a subscription at 1 kHz, in processes of their own.
+"""A publisher and a subscription at 1 kHz, in separate processes.
 
     inside.py publish      each line of standard input is a number of messages; prints `published N`
     inside.py subscribe    prints `received N` for each line of standard input
 
-Both print `ready` first, and the publisher `matched` once it has a subscription.
+Both print `ready` first. The publisher prints `matched` when it has a subscription.
 """
 
 import sys
@@ -14,7 +14,7 @@ import rclpy
 from std_msgs.msg import Int64
 
 PERIOD = 0.001
-# All messages of a test: what is overwritten before Fast DDS repairs it would be lost.
+# At least the messages of a test: Fast DDS cannot repair messages that are overwritten.
 DEPTH = 10_000
 
 

@@ -1,8 +1,8 @@
-"""Prints with the code of `ros2 topic echo` what messages of every installed type look like.
+"""Prints messages of every installed type with the code of `ros2 topic echo`.
 
 Needs the environment of an installed ROS 2 (Python of Debian 12 or Ubuntu 22.04). Values are
-random, but the same in every run. One JSON document a line: type, case, the payload as the
-middleware serializes it, and for each list of options what `echo` writes to its standard output.
+random, but equal in every run. Each line is one JSON document: type, case, the payload as the
+middleware serializes it, and the standard output of `echo` for each list of options.
 
     oracle.py PART PARTS    every PARTS-th type, beginning with PART
 """
@@ -28,7 +28,7 @@ from rosidl_parser.definition import (
 from rosidl_runtime_py.utilities import get_message
 
 CASES = 7
-# Of strings and arrays; above 128 `echo` cuts, above 1000 numpy does.
+# Lengths of strings and arrays. `echo` truncates above 128, and numpy above 1000.
 LENGTHS = [0, 1, 2, 3, 4, 7, 31]
 LONG = [127, 128, 129, 1000, 1001]
 
@@ -62,7 +62,8 @@ DOUBLES = [
     9007199254740993.0, 5e-324, 2.2250738585072014e-308, 1.7976931348623157e308, math.inf,
     -math.inf, math.nan, math.pi, 2.0 ** -44, 2.0 ** 53, 2.0 ** 89,
 ]
-# Of float32: ties of the shortest digits as a double, and limits. rclpy takes none above 3.402823466e38.
+# Values of float32: ties of the shortest digits as a double, and limits. rclpy accepts values up
+# to 3.402823466e38.
 SINGLES = [
     540.92608642578125, 0.0, -0.0, 1.0, 0.1, 16777216.0, 1e-7, 1e-45, 3.4028232635611926e38,
     1.1754943508222875e-38, math.inf, -math.inf, math.nan, 33554432.0, 8.5e9, 123456789.0,
@@ -82,7 +83,7 @@ def real(rng, is_single):
     elif kind == 1:
         value = round(rng.uniform(-100, 100), rng.randrange(5))
     elif kind == 2:
-        # Few bits behind the point: exact ties in decimal digits.
+        # Few bits after the binary point lead to exact ties in decimal digits.
         value = rng.randrange(-2 ** 24, 2 ** 24) / 2.0 ** rng.randrange(25)
     elif is_single:
         value = single(rng.getrandbits(32))
@@ -117,7 +118,7 @@ def text(rng, of):
         parts = [rng.choice(WORDS) for _ in range(rng.randrange(4))]
         value = rng.choice(["", " ", "\n", ": ", " #"]).join(parts)
     if isinstance(of, AbstractWString):
-        # One character is one code unit.
+        # Each character must be one code unit.
         value = "".join(one for one in value if ord(one) < 0x10000)
     return value if bound is None else value.encode()[:bound].decode(errors="ignore")
 
@@ -144,12 +145,12 @@ def value_of(rng, of, depth, is_long):
         if isinstance(of, BoundedSequence):
             length = min(length, of.maximum_size)
     if not is_plain and length > 4:
-        # Long, without taking long.
+        # A long sequence of few different values needs little time.
         few = [value_of(rng, element, depth + 2, False) for _ in range(3)]
         return [rng.choice(few) for _ in range(length)]
     typename = getattr(element, "typename", None)
     if typename in ("float", "double") and rng.random() < 0.5:
-        # Of one order of magnitude, which numpy shows without exponents.
+        # numpy prints values of one order of magnitude without exponents.
         values = [round(rng.uniform(-50, 50), rng.randrange(9)) for _ in range(length)]
         if values and rng.random() < 0.2:
             values[0] = rng.choice([math.nan, math.inf, -math.inf, -0.0, 0.0])
@@ -166,7 +167,7 @@ def message_of(rng, message_class, depth=0, is_long=False):
             value = numpy.array(value, dtype=present.dtype)
         elif isinstance(present, array.array):
             value = array.array(present.typecode, value)
-        # Some setters refuse what a node in another language may send.
+        # Some setters reject values that a node in another language may send.
         try:
             setattr(message, slot.lstrip("_"), value)
         except AssertionError:
@@ -185,7 +186,7 @@ def fields(message):
 
 
 class Verb(echo.EchoVerb):
-    """The verb itself, with messages that come from here instead of a subscription."""
+    """The verb of ros2cli, with messages of this script instead of a subscription."""
 
     def choose_qos(self, node, args):
         return None
@@ -211,7 +212,7 @@ def printed(type_name, payload, options):
 def types():
     for package, prefix in sorted(get_packages_with_prefixes().items()):
         for path in sorted(Path(prefix, "share", package, "msg").glob("*.msg")):
-            # Without it no code was generated.
+            # Without an .idl file, no code was generated.
             if path.with_suffix(".idl").exists():
                 yield f"{package}/msg/{path.stem}"
 

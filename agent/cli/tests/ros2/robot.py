@@ -1,11 +1,11 @@
-"""Two nodes of a robot with seven topics, each in a process of its own, and what they log.
+"""Two nodes of a robot with seven topics, each in a separate process, and their logs.
 
-    robot.py publish LOG [SECONDS]   announces its topics, publishes when a line comes on standard input
-    robot.py subscribe LOG           receives them
+    robot.py publish LOG [SECONDS]   announces topics, publishes after a line on standard input
+    robot.py subscribe LOG           receives the messages
 
-Both print `ready`, `matched` and, when all is published, `done`. A log has one line of JSON for each
-message: its topic, the number that its publisher gave it (from 0, one below the sequence number of
-its DDS writer), and the time.
+Both print `ready`, `matched` and, after the last message, `done`. A log has one line of JSON for
+each message: its topic, its number (from 0, one below the sequence number of the DDS writer), and
+the time.
 """
 
 import heapq
@@ -24,9 +24,9 @@ from sensor_msgs.msg import Image, Imu, PointCloud2
 from std_msgs.msg import Header, Int64
 from tf2_msgs.msg import TFMessage
 
-# All of the fastest topic: Fast DDS repairs after up to 3 s, and what is overwritten by then is lost.
+# Enough messages of the fastest topic for a repair of Fast DDS, which may happen after 3 s.
 DEPTH = 2500
-# Zenoh drops messages of a congested connection, unless the publisher keeps all.
+# Zenoh drops messages of a congested connection, unless the publisher keeps all messages.
 IS_ZENOH = os.environ["RMW_IMPLEMENTATION"] == "rmw_zenoh_cpp"
 HISTORY = HistoryPolicy.KEEP_ALL if IS_ZENOH else HistoryPolicy.KEEP_LAST
 QOS = QoSProfile(depth=DEPTH, history=HISTORY)
@@ -34,7 +34,7 @@ DIGITS = "%08d"
 
 
 def header():
-    """A header whose frame has room for a message's number."""
+    """Returns a header whose frame has space for the number of a message."""
     return Header(frame_id=DIGITS % 0)
 
 
@@ -66,7 +66,7 @@ class Template:
 
     def __init__(self, kind, message):
         self.bytes = bytearray(serialize_message(message))
-        # Behind the encapsulation, and in a TFMessage behind the number of transforms.
+        # The stamp follows the encapsulation, and in a TFMessage the number of transforms.
         self.stamp = 8 if kind is TFMessage else 4
         self.is_number = kind is Int64
 

@@ -2,18 +2,18 @@
 
     services.py serve LOG       answers /add after some milliseconds, never answers /hang,
                                 executes goals of /fib
-    services.py call LOG COUNT  waits for the server, then obeys lines on standard input:
+    services.py call LOG COUNT  waits for the server, then follows lines on standard input:
                                 `add` calls /add COUNT times, `hang` calls /hang once,
                                 `lose` calls /add, which takes 1.5 s, without waiting, `goal`
                                 sends a goal and waits for its result, `end` ends it
 
-Both print `ready`; the client prints `done` after each line. The client's log has one line of JSON
-for each call: the times at which the call that sends the request began (`began`), and at which the
-response was received by the middleware, or was taken where the middleware does not report that
-(`received`). The server's log has one line for each answer of /add: the times at which the request
-was received, or its callback began (`received`), and at which the call that sends the response
-began (`sent`). Both processes have real-time priority, so that other programs do not delay what
-they log.
+Both print `ready`, and the client prints `done` after each line. The client's log has one line of
+JSON for each call. `began` is the time at which the function that sends the request was called.
+`received` is the time at which the middleware received the response, or at which the response was
+taken, if the middleware does not report it. The server's log has one line for each answer of /add.
+`received` is the time at which the request was received, or at which its callback began. `sent` is
+the time at which the function that sends the response was called. Both processes have real-time
+priority, so that other programs do not delay the logged events.
 """
 
 import json
@@ -100,7 +100,7 @@ class Client:
         self.adder.wait_for_service()
         self.hanger.wait_for_service()
         self.action.wait_for_server()
-        # Some time for the agent, and for the endpoints at the other end.
+        # The agent and the endpoints at the other end need some time.
         time.sleep(1.0)
 
     def call(self, milliseconds):

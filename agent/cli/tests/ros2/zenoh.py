@@ -1,18 +1,18 @@
-"""Publishers and subscriptions that count, in processes of their own.
+"""Publishers and subscriptions that count, in separate processes.
 
     zenoh.py publish NAME TOPIC RATE BYTES DEPTH RELIABILITY [LOG]
     zenoh.py subscribe NAME TOPIC DEPTH RELIABILITY [PAUSE]
     zenoh.py log NAME TOPIC DEPTH RELIABILITY LOG
     zenoh.py bag PATH
 
-Publisher and subscription print `ready` first. For each line of standard input, a number of
-messages, the publisher sends them and prints `published N` with all it has sent so far. For each
+Publisher and subscription print `ready` first. Each line of standard input is a number of messages.
+The publisher sends them and prints `published N` with the total number of sent messages. For each
 line the subscription prints `received N first F last L`, with the numbers in the messages. PAUSE is
 the time that its callback takes, in seconds.
 
-A DEPTH of 0 keeps all. LOG is a file with a line for each message: the SHA-256 of its serialized
-bytes. `log` subscribes and only writes it. `bag` prints the topic and that hash of each message that
-rosbag2 reads.
+A DEPTH of 0 keeps all messages. LOG is a file with the SHA-256 of the serialized bytes of each
+message, one per line. `log` subscribes and only writes this file. `bag` prints the topic and the
+hash of each message that rosbag2 reads.
 """
 
 import hashlib

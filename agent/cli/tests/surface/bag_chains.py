@@ -1,4 +1,4 @@
-"""Writes a bag in the sqlite3 storage as rosbag2 does, from lines of JSON on stdin.
+"""Writes a bag in sqlite3 storage as rosbag2 does, from lines of JSON on stdin.
 
 Usage: bag_chains.py DIRECTORY
 """

@@ -1,7 +1,8 @@
-"""Reads payloads with PyPI `rosbags`: lines of JSON in (type, payload in hexadecimal), values out.
+"""Decodes payloads with PyPI `rosbags`. Input is lines of JSON (type, hexadecimal payload).
 
 usage: read.py DEFINITIONS, a directory with package/msg/Type.msg that rosbags does not have.
-Floats come as the hexadecimal digits of their 64 bits; a type without fields as an empty list.
+Floats are printed as the hexadecimal digits of their 64 bits, and a type without fields as an empty
+list.
 """
 
 import json

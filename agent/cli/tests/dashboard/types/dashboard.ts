@@ -1,5 +1,6 @@
-// What a dashboard file may say: Grafana's own types (@grafana/schema), closed where they take anything: a panel's
-// options and custom fields are those of its type, and a target is a Prometheus query.
+// The type of a dashboard file: Grafana's own types (@grafana/schema), restricted where they accept
+// any value. A panel has only the options and custom fields of its type, and a target is a
+// Prometheus query.
 import type { Dashboard, FieldConfig, Panel, RowPanel } from '@grafana/schema';
 import type * as bargauge from '@grafana/schema/dist/esm/raw/composable/bargauge/panelcfg/x/BarGaugePanelCfg_types.gen';
 import type * as heatmap from '@grafana/schema/dist/esm/raw/composable/heatmap/panelcfg/x/HeatmapPanelCfg_types.gen';
@@ -40,7 +41,7 @@ type Panels =
   | Of<'table', table.Options, table.FieldConfig>
   | Of<'timeseries', timeseries.Options, timeseries.FieldConfig>;
 
-// In JSON the member of an enumeration is its value.
+// In JSON, a member of an enumeration is written as its value.
 type Json<T> = T extends string ? `${T}` : T extends object ? { [Key in keyof T]: Json<T[Key]> } : T;
 
 export type Checked = Json<Omit<Dashboard, 'panels'> & { panels: Panels[] }>;

@@ -1,6 +1,7 @@
-// A ROS 2 publisher or subscriber on Cyclone DDS, announced as rmw_cyclonedds does: the enclave in
-// the participant's user data, no type information in discovery, ros_discovery_info republished
-// whole whenever an entity comes or goes. Command line and log: ../peer.hpp.
+// A ROS 2 publisher or subscriber on Cyclone DDS, announced as rmw_cyclonedds does. The enclave is
+// in the participant's user data, discovery has no type information, and the whole
+// ros_discovery_info is republished whenever an entity is created or deleted. Command line and
+// log: ../peer.hpp.
 #include <dds/dds.h>
 #include <dds/version.h>
 
@@ -25,7 +26,7 @@ peer::Guid guid_of(dds_entity_t entity) {
   return bytes;
 }
 
-// idlc's descriptor under the type name ROS uses on the wire.
+// Returns idlc's descriptor with the type name that ROS uses on the wire.
 dds_topic_descriptor_t named(const dds_topic_descriptor_t& layout, const char* name) {
   dds_topic_descriptor_t descriptor = layout;
   descriptor.m_typename = name;
@@ -40,7 +41,7 @@ struct Receiver {
   uint64_t received = 0;
 };
 
-// One participant with its nodes, keeping ros_discovery_info in step.
+// One participant with its nodes, which keeps ros_discovery_info up to date.
 class Context {
  public:
   explicit Context(const peer::Options& options)

@@ -56,7 +56,7 @@ class SerializedType : public TopicDataType {
     return [sample] { return static_cast<uint32_t>(static_cast<Payload*>(sample)->size()); };
   }
 
-  // Fast DDS shares histories of bounded types only.
+  // Fast DDS shares only histories of bounded types.
   bool is_bounded() const override { return true; }
 
   void* createData() override { return new Payload; }
@@ -141,7 +141,7 @@ class Receiver : public DataReaderListener {
   uint64_t received_ = 0;
 };
 
-// One participant with its nodes, keeping ros_discovery_info in step.
+// One participant with its nodes, which keeps ros_discovery_info up to date.
 class Context {
  public:
   Context(const peer::Options& options) : options_(options) {

@@ -1,8 +1,8 @@
 // Passes messages as Fast DDS passes them to its shared memory: to a function of the same name and
-// parameters. 2.x passes one piece; 3.x, with -DLIST, a list of buffers.
+// parameters. 2.x passes one buffer, and 3.x, with -DLIST, a list of buffers.
 //
-// An input line has the lengths of the buffers, a colon, and the message in hexadecimal digits; or
-// `nowhere`, for a message at an unmapped address. Prints `handed` after each.
+// An input line has the lengths of the buffers, a colon, and the message in hexadecimal digits. The
+// line `nowhere` stands for a message at an unmapped address. Prints `handed` after each line.
 #include <chrono>
 #include <cstdint>
 #include <iostream>
@@ -63,7 +63,7 @@ int main() {
     const uint32_t size = bytes.empty() ? 100 : bytes.size();
 #ifdef LIST
     std::vector<NetworkBuffer> buffers;
-    // Each in separate memory.
+    // Each buffer is in separate memory.
     std::vector<std::vector<unsigned char>> parts;
     size_t at = 0;
     for (uint32_t length : lengths) {

@@ -3,10 +3,10 @@
     peer.py --role router [--connect ENDPOINT]...
     peer.py --role pub|sub [--topic /t] [--size BYTES] [--rate HZ] [--count N] [--depth N] ...
 
-The command line and the log of `pub` and `sub` equal those of the peers of DDS (../peer.hpp). Options
-that only DDS has are accepted and ignored. A node is a session of its own, which connects to the
-router of its host, and directly to the other sessions there. `--linger` keeps a publisher after its
-last message.
+The command line and the log of `pub` and `sub` equal those of the DDS peers (../peer.hpp). Options
+that only DDS has are accepted and ignored. Each node is a separate session, which connects to the
+router of its host, and directly to the other sessions there. `--linger` keeps a publisher running
+after its last message.
 """
 
 import argparse
@@ -24,7 +24,7 @@ import xxhash
 import zenoh
 
 TYPE = "std_msgs::msg::dds_::UInt8MultiArray_/TypeHashNotSupported"
-# Encapsulation, layout without dimensions, and the length of the data.
+# Bytes of the encapsulation, the layout without dimensions, and the length of the data.
 OVERHEAD = 16
 ROUTER = "tcp/localhost:7447"
 
@@ -54,7 +54,7 @@ def options():
 
 
 def config(mode, listen, connect):
-    """The settings in which the default files of rmw_zenoh differ from Zenoh's own."""
+    """Returns the settings in which the default files of rmw_zenoh differ from Zenoh's own."""
     settings = {
         "mode": mode,
         "listen/endpoints": listen,
@@ -99,7 +99,7 @@ class Log:
 def wait_for_line():
     while not stopped.is_set():
         if select.select([sys.stdin], [], [], 0.05)[0]:
-            # A line at a time, unbuffered, so that `select` sees the next one.
+            # Reads one line without a buffer, so that `select` sees the next line.
             while (byte := os.read(0, 1)) != b"\n":
                 if not byte:
                     sys.exit("standard input ended before the start")
@@ -127,7 +127,7 @@ class Session:
         return key
 
     def announce(self, kind):
-        """Announces the nodes. The first one has the endpoint, whose GID is returned."""
+        """Announces the nodes. Returns the GID of the endpoint, which the first node has."""
         names = self.options.node or ["/publisher" if kind == "MP" else "/subscriber"]
         for number, name in enumerate(names):
             namespace, _, base = name.rpartition("/")

@@ -1,8 +1,9 @@
 """Calls every function of the ros2 daemon as a distribution's command line would.
 
-The classes stand in for rclpy's. As in ros2cli, a class is registered for its own element alone and
-its constructor knows its own fields alone, so that another distribution's answer raises. Each answer
-is written again from its objects and has to have the same bytes. Prints a JSON object.
+The classes replace those of rclpy. As in ros2cli, each class is registered only for its element,
+and its constructor accepts only its own fields, so an answer of another distribution raises an
+exception. Each answer is encoded again from its objects, and must have the same bytes. Prints a
+JSON object.
 
 Usage: client.py PORT DISTRIBUTION
 """
@@ -103,7 +104,7 @@ if is_lyrical:
 
 
 class Transport(xmlrpc.client.Transport):
-    """Keeps the bytes of each answer."""
+    """A transport that keeps the bytes of each answer."""
 
     def parse_response(self, response):
         body = response.read()
@@ -125,7 +126,7 @@ def call(name, *arguments):
     result = function(*arguments)
     again = xmlrpc.client.dumps(
         (result,), methodresponse=True, allow_none=True)
-    # Bytes are read as Binary, whose class writes the same text.
+    # Bytes are decoded as Binary, whose class encodes the same text.
     assert again == bodies[-1], f'{name}:\n{again}\n{bodies[-1]}'
     return shown(result)
 

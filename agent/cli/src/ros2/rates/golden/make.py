@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Writes reports.jsonl: numbers and texts as Python's own arithmetic and formatting give them.
 
-One case a line: what is measured, the window, messages as [time, size, stamp] in nanoseconds, the
-time of the report, and the text. Written from the formats and formulas alone, it shares no code
-with what is tested. Run it again with: python3 make.py > reports.jsonl
+Each line is one case: what is measured, the window, messages as [time, size, stamp] in
+nanoseconds, the time of the report, and the text. The script follows only the formats and formulas,
+and shares no code with the tested program. Run it again with: python3 make.py > reports.jsonl
 """
 import json
 import math
@@ -55,7 +55,7 @@ for case in range(90):
     count = random.randrange(3, 24)
     window = random.choice([2, 5, 10, 10000])
     period = random.choice([1, 1000, 250_000, 500_000, 5_000_000, 100_000_000, 3 * SECOND])
-    # Half milliseconds and half bytes sit on the edge of rounding.
+    # Half milliseconds and half bytes are limits of rounding.
     exact = random.random() < 0.4
     size = random.choice([1, 25, 324, 999, 10_005, 644_148, 2_720_000])
     time, messages = 0, []
