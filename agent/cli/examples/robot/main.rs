@@ -2,9 +2,9 @@
 //! ROS. The demo observes it, and the tests count its messages. It behaves like any node and does
 //! not communicate with the agent.
 //!
-//! `lidar`, `base` and `monitor` are the demo's processes. `pub` and `sub` are the test peers, which
-//! share their command line and log format with `agent/cli/tests/peers`. `talkers` and `listeners`
-//! have many small topics (`crowd`).
+//! `lidar`, `base` and `monitor` are the demo's processes. `pub` and `sub` are the test peers,
+//! which share their command line and log format with `agent/cli/tests/peers`. `talkers` and
+//! `listeners` have many small topics (`crowd`).
 
 use std::fs::File;
 use std::io::{BufRead, Write};

@@ -7,7 +7,7 @@ use std::ffi::c_int;
 /// Replaces the C library's function in this program. Waits again after an interruption.
 ///
 /// # Safety
-/// The same as for `epoll_wait(2)`: `events` has room for `max_events`.
+/// The same as for `epoll_wait(2)`: `events` has space for `max_events`.
 #[unsafe(no_mangle)]
 unsafe extern "C" fn epoll_wait(
     epoll: c_int,

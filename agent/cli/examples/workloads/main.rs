@@ -1,5 +1,5 @@
-//! `make bench`: the cost of observing. Each workload runs between two hosts. The observer is, in
-//! turn, none, the agent (host hook, then packet sockets), and a Cyclone DDS subscriber in C++. The
+//! `make bench`: the cost of observing. Each workload runs between two hosts, alternately without
+//! an observer, with the agent (host hook, packet sockets) and with a Cyclone DDS subscriber. The
 //! table shows CPU time and memory of the observer, and the total of all processes.
 //!
 //! Before that, it measures the agent's footprint (`footprint`) and the cost of open pages

@@ -9,13 +9,13 @@ const DIGITS: i32 = 3;
 /// Summary statistics of a set of values.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Summary {
-    /// Smallest value.
+    /// Minimum value.
     pub minimum: f64,
     /// Median.
     pub median: f64,
     /// 95th percentile.
     pub p95: f64,
-    /// Largest value.
+    /// Maximum value.
     pub maximum: f64,
     /// Median absolute deviation, scaled to the standard deviation of a normal distribution.
     pub deviation: f64,

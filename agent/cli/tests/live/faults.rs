@@ -41,8 +41,8 @@ const API_PORT: u16 = 17401;
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Interval of announcements, as of real participants.
 const REPEAT: Duration = Duration::from_secs(3);
-/// Maximum duration of a shutdown: 3 s for answers and the last round, 2 s for the last export, and
-/// 3 s for a busy machine.
+/// Maximum duration of a shutdown: 3 s for answers and the last round, 2 s for the last export, 3 s
+/// for a busy machine.
 const ENDING: Duration = Duration::from_secs(8);
 
 /// An agent on a separate host, with a directory for its files.

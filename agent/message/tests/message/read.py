@@ -1,4 +1,4 @@
-"""Decodes payloads with PyPI `rosbags`. Input is lines of JSON (type, hexadecimal payload).
+"""Decodes payloads with PyPI `rosbags`: lines of JSON (type, hexadecimal payload) to JSON values.
 
 usage: read.py DEFINITIONS, a directory with package/msg/Type.msg that rosbags does not have.
 Floats are printed as the hexadecimal digits of their 64 bits, and a type without fields as an empty

@@ -25,9 +25,9 @@ pub struct Bandwidth {
     pub window: String,
     /// Mean size.
     pub mean: String,
-    /// Smallest size.
+    /// Minimum size.
     pub min: String,
-    /// Largest size.
+    /// Maximum size.
     pub max: String,
 }
 

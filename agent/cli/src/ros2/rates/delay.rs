@@ -19,9 +19,9 @@ pub struct Ages {
 pub struct Age {
     /// Mean age in seconds.
     pub delay: String,
-    /// Smallest age, in seconds.
+    /// Minimum age, in seconds.
     pub min: String,
-    /// Largest age, in seconds.
+    /// Maximum age, in seconds.
     pub max: String,
     /// Standard deviation, in seconds.
     pub standard_deviation: String,

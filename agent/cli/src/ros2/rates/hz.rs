@@ -19,9 +19,9 @@ pub struct Intervals {
 pub struct Rate {
     /// Messages per second.
     pub rate: String,
-    /// Shortest interval, in seconds.
+    /// Minimum interval, in seconds.
     pub min: String,
-    /// Longest interval, in seconds.
+    /// Maximum interval, in seconds.
     pub max: String,
     /// Standard deviation of the intervals, in seconds.
     pub standard_deviation: String,

@@ -1,5 +1,5 @@
 //! Processes and libraries that look like others: equal inodes in two containers, a library that is
-//! replaced while in use, and a process id that is used again.
+//! replaced while in use, and a reused process id.
 
 use std::fs::{self, Permissions};
 use std::os::unix::fs::PermissionsExt as _;
