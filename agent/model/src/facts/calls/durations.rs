@@ -156,7 +156,9 @@ impl Durations {
         }
         if is_wrapped && let Some((least, largest)) = earlier.range {
             let range = self.range.unwrap_or((least, largest));
-            self.range = Some((range.0.min(least), range.1.max(largest)));
+            let range = (range.0.min(least), range.1.max(largest));
+            // An extreme of `earlier` may lie in a bucket that is empty now.
+            self.range = Self::of(self.counts.clone(), self.sum, range).range;
         }
     }
 
@@ -423,6 +425,21 @@ mod tests {
         let mut fresh = of(&[1_000_000]);
         fresh.continue_from(&of(&[1_000_000; 9]));
         assert_eq!(fresh.count(), 1);
+    }
+
+    #[test]
+    fn a_range_continued_from_a_wrapped_report_stays_within_the_buckets_in_use() {
+        let counts = |bucket: usize, count: u32| {
+            let mut counts = [0_u32; BUCKETS];
+            counts[bucket] = count;
+            counts
+        };
+        let mut wrapped = counts(5, u32::MAX);
+        wrapped[90] = 1;
+        let earlier = Durations::new(&wrapped, u64::MAX, 1, u64::MAX);
+        let mut now = Durations::new(&counts(5, 3), 1, 1, 1);
+        now.continue_from(&earlier);
+        check(&now);
     }
 
     proptest! {
