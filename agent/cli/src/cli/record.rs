@@ -248,14 +248,14 @@ impl Record {
             std::thread::scope(|scope| {
                 scope.spawn(|| ahead.read(&mut samples));
                 let next = |timeout: Duration| ahead.next(timeout);
-                let recorded = record(recorder, next, &commands, activity);
+                let recorded = record(recorder, next, || !ahead.is_empty(), &commands, activity);
                 ahead.close();
                 recorded
             })
         } else {
             // The replay waits for the storage.
             let next = |timeout: Duration| samples.next_within(timeout);
-            record(recorder, next, &commands, activity)
+            record(recorder, next, || false, &commands, activity)
         };
         drop(keys);
         output.finish();

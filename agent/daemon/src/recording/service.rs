@@ -479,12 +479,18 @@ impl Recording {
             );
             counted = now;
         };
-        let (ended, _) = session::record(recorder, next, commands, |going| {
-            if let Activity::Recording(recorder) = going {
-                count(recorder.report());
-                self.report_status(recorder);
-            }
-        });
+        let (ended, _) = session::record(
+            recorder,
+            next,
+            || false,
+            commands,
+            |going| {
+                if let Activity::Recording(recorder) = going {
+                    count(recorder.report());
+                    self.report_status(recorder);
+                }
+            },
+        );
         count(&ended.report);
         figures.active.fetch_sub(1, Ordering::Relaxed);
         drop((subscription, slot));

@@ -20,8 +20,8 @@ use ros2probe_bag::{Compressed, Error, FileCompression, Progress};
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Interval of status reports.
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
-/// Maximum time to wait for the next message that was sent before the end.
-const DRAIN: Duration = Duration::from_secs(2);
+/// Maximum time to wait for messages that were sent before the end.
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Command to a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -81,15 +81,16 @@ struct Completion<'a, T> {
 }
 
 /// Records until the end. The second value is the source's error, if it failed. `report_activity`
-/// is called regularly and after each command.
+/// is called regularly and after each command. `is_behind` returns whether items wait that `next` has
+/// already received: they are recorded before the end, however long it takes.
 pub fn record<E>(
     mut recorder: Recorder<'_>,
     mut next: impl FnMut(Duration) -> Result<NextItem, E>,
+    is_behind: impl Fn() -> bool,
     commands: &Receiver<Command>,
     mut report_activity: impl FnMut(Activity<'_>),
 ) -> (Finished, Option<E>) {
     let mut compressing = Compressing::default();
-    // Time at which the end was requested, and time of the last item since then.
     let mut stopping: Option<(Timestamp, Instant)> = None;
     let mut hurry = false;
     let mut reported = Instant::now();
@@ -100,7 +101,7 @@ pub fn record<E>(
             Ok(CommandOutcome::Out) => report_activity(Activity::Recording(&recorder)),
             Ok(CommandOutcome::Stop) => {
                 if stopping.is_none() {
-                    stopping = Some((now(), Instant::now()));
+                    stopping = Some((now(), Instant::now() + DRAIN_TIMEOUT));
                     report_activity(Activity::Completing);
                 }
             }
@@ -121,17 +122,14 @@ pub fn record<E>(
                 break (Some(error), None);
             }
         }
+        if stopping.is_some_and(|(_, deadline)| Instant::now() >= deadline && !is_behind()) {
+            break (None, None);
+        }
         let item = match got {
             NextItem::Item(item) => item,
-            NextItem::Pending if stopping.is_some_and(|(_, waited)| waited.elapsed() >= DRAIN) => {
-                break (None, None);
-            }
             NextItem::Pending => continue,
             NextItem::Closed => break (None, None),
         };
-        if let Some((_, waited)) = &mut stopping {
-            *waited = Instant::now();
-        }
         if let Err(error) = recorder.take(&item) {
             break (Some(error), None);
         }

@@ -95,6 +95,11 @@ impl ReadAhead {
         }
     }
 
+    /// Returns whether no item waits.
+    pub(super) fn is_empty(&self) -> bool {
+        self.lock().items.is_empty()
+    }
+
     /// Ends the reader.
     pub(super) fn close(&self) {
         self.lock().is_closed = true;
