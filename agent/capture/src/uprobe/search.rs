@@ -51,7 +51,7 @@ pub struct LibrarySearch {
 pub struct Facts {
     /// Libraries in use.
     pub libraries: Vec<LibraryFacts>,
-    /// Why messages of some process may not be seen; `None` = all processes are covered.
+    /// Why messages of some process may be missed; `None` = every process is covered.
     pub uncovered: Option<String>,
     /// Whether the running processes have been inspected, or need not be.
     pub has_inspected: bool,

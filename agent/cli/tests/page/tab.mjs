@@ -1,5 +1,5 @@
-// A real browser that shows the agent's page. The page must never write to the console, send a
-// request to another origin, open a dialog of the browser, or violate a rule of accessibility.
+// A real browser that shows the agent's page. The page must never write to the console, request
+// another origin, open a dialog of the browser, or violate a rule of accessibility.
 //
 // A Rust test (agent/cli/tests/live/browser.rs) starts the agent and the scenario. `ask` sends that
 // test a command, such as to restart the agent.

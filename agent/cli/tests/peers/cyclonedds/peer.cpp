@@ -1,5 +1,5 @@
 // A ROS 2 publisher or subscriber on Cyclone DDS, announced as rmw_cyclonedds does. The enclave is
-// in the participant's user data, discovery has no type information, and the whole
+// in the participant's user data, and discovery has no type information. The whole
 // ros_discovery_info is republished whenever an entity is created or deleted. Command line and
 // log: ../peer.hpp.
 #include <dds/dds.h>
