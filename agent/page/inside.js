@@ -26,12 +26,20 @@ export function tables(inside) {
       (inside.buffers ?? []).map((/** @type {any} */ it) => [it.topic ?? 'unknown', who(it),
         count(it.enqueued_messages), count(it.overwritten_messages), rate(it.rate_hertz),
         half(it.waiting), most(it.waiting)])],
-    ['Callbacks', ['Callback', 'Node', 'Calls', 'Busy', 'Rate', 'Duration p50', 'p99', 'Wait p99'],
+    ['Callbacks', ['Callback', 'Node', 'Calls', 'Busy', 'Rate', 'Duration p50', 'p99', 'Wait p99',
+      'Thread'],
       (inside.callbacks ?? []).map((/** @type {any} */ it) => [trigger(it.trigger), who(it),
         count(it.calls), percent(it.busy_ratio), rate(it.rate_hertz), half(it.duration),
-        most(it.duration), most(it.wait)])],
+        most(it.duration), most(it.wait), states(it.states_ratio)])],
   ]);
   return all.filter(([, , rows]) => rows.length > 0);
+}
+
+/** Names the states in which a callback's thread spent a percent of the time or more.
+ * @param {any} ratio null if the kernel does not show it */
+export function states(ratio) {
+  return ['cpu', 'throttled', 'runnable', 'blocked'].filter((state) => ratio?.[state] >= 0.01)
+    .map((state) => `${state} ${Math.round(100 * ratio[state])}%`).join(' ');
 }
 
 /** Says why nothing is shown yet. @param {any} answer null before the first one */

@@ -154,8 +154,48 @@ pub struct Figures {
     pub hops: u32,
     /// Unused.
     pub unused: u32,
+    /// Completed calls of the callback whose thread's states are known.
+    pub states_known: u64,
+    /// What these calls consisted of, by [`thread_state`], in nanoseconds.
+    pub states: [u64; thread_state::COUNT],
     /// Counts by [`distribution`] and [`bucket`].
     pub buckets: [[u32; BUCKETS]; 2],
+}
+
+/// What the thread of a callback did, by the accounting of the scheduler.
+pub mod thread_state {
+    /// It ran on a CPU.
+    pub const CPU: usize = 0;
+    /// It could run, but its control group had used up its CPU quota (`cpu.max`).
+    pub const THROTTLED: usize = 1;
+    /// It could run, and other threads ran instead.
+    pub const RUNNABLE: usize = 2;
+    /// It waited for something else: a lock, a file, the end of a sleep.
+    pub const BLOCKED: usize = 3;
+    /// Number of these states.
+    pub const COUNT: usize = 4;
+}
+
+/// Members of the kernel's structures from which the programs read the accounting of threads.
+pub mod accounting {
+    /// `task_struct.se.sum_exec_runtime`: CPU time, added up at each tick and context switch.
+    pub const RUNTIME: usize = 0;
+    /// `task_struct.sched_info.run_delay`: time in which the thread could run and did not.
+    pub const RUN_DELAY: usize = 1;
+    /// `task_struct.nvcsw`: voluntary context switches.
+    pub const VOLUNTARY_SWITCHES: usize = 2;
+    /// `task_struct.nivcsw`: involuntary context switches.
+    pub const INVOLUNTARY_SWITCHES: usize = 3;
+    /// `task_struct.sched_task_group`, the control group of the thread.
+    pub const GROUP: usize = 4;
+    /// `task_group.parent`.
+    pub const GROUP_PARENT: usize = 5;
+    /// `task_group.cfs_bandwidth.throttled_time`: summed over all CPUs.
+    pub const GROUP_THROTTLED: usize = 6;
+    /// Number of these members.
+    pub const COUNT: usize = 7;
+    /// A member that the running kernel does not have.
+    pub const ABSENT: u32 = u32::MAX;
 }
 
 /// State of one process.

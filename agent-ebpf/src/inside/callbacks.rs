@@ -3,10 +3,11 @@
 use core::ptr::{read_volatile, write_volatile};
 
 use ros2probe_wire::inside::{
-    Counter, Figures, HOPS_PER_SECOND, Handle, Hop, announced, distribution, kind,
+    Counter, Figures, HOPS_PER_SECOND, Handle, Hop, announced, distribution, kind, thread_state,
 };
 
 use crate::{
+    accounting::{self, Accounting},
     instructions::add,
     maps::{ANNOUNCEMENTS, Current, Thread, calendar, count, now, observe, read, steady},
 };
@@ -72,6 +73,11 @@ pub fn started(callback: u64, within: bool) {
         (*thread).callback = callback;
         (*thread).started = now;
         (*figures).thread = current.thread;
+        (*thread).is_accounted = 0;
+        if let Some(accounting) = accounting::read() {
+            (*thread).is_accounted = 1;
+            (*thread).accounting = accounting;
+        }
         let input = (*thread).input;
         if within {
             add(&raw mut (*figures).within, 1);
@@ -223,12 +229,47 @@ pub fn ended(callback: u64) {
         write_volatile(&raw mut (*figures).last, now);
         // A callback that runs an executor contains other callbacks, which overwrite its start.
         if (*thread).callback == callback && now > (*thread).started {
-            observe(figures, distribution::INTERVAL, now - (*thread).started);
+            let duration = now - (*thread).started;
+            observe(figures, distribution::INTERVAL, duration);
+            if (*thread).is_accounted != 0 {
+                account(figures, &(*thread).accounting, duration);
+            }
         }
         (*thread).callback = 0;
         (*thread).executed = 0;
         (*thread).input = current.handle(0, 0);
     }
+}
+
+/// Adds what a callback's thread did since `before`.
+#[inline(always)]
+unsafe fn account(figures: *mut Figures, before: &Accounting, duration: u64) {
+    let Some(after) = accounting::read() else {
+        return;
+    };
+    // Waiting is exact. The CPU time may lack a tick, and may have one from before the callback.
+    // No part can be larger than what the others leave: groups are throttled on several CPUs.
+    let waited = least(after.runnable.wrapping_sub(before.runnable), duration);
+    let cpu = if after.switches == before.switches {
+        duration - waited
+    } else {
+        least(after.cpu.wrapping_sub(before.cpu), duration - waited)
+    };
+    let throttled = least(after.throttled.wrapping_sub(before.throttled), waited);
+    // SAFETY: map values, by the caller, and indices within the array.
+    unsafe {
+        let states = (&raw mut (*figures).states).cast::<u64>();
+        add(states.add(thread_state::CPU), cpu);
+        add(states.add(thread_state::THROTTLED), throttled);
+        add(states.add(thread_state::RUNNABLE), waited - throttled);
+        add(states.add(thread_state::BLOCKED), duration - cpu - waited);
+        add(&raw mut (*figures).states_known, 1);
+    }
+}
+
+#[inline(always)]
+const fn least(one: u64, other: u64) -> u64 {
+    if one < other { one } else { other }
 }
 
 /// Reports a publication during a callback that handles a message.

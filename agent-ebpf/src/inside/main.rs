@@ -11,6 +11,7 @@
 #![no_main]
 #![feature(asm_experimental_arch)]
 
+mod accounting;
 mod callbacks;
 #[path = "../instructions.rs"]
 mod instructions;

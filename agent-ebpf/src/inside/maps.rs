@@ -13,6 +13,7 @@ use ros2probe_wire::inside::{
 };
 
 use crate::{
+    accounting::Accounting,
     instructions::{add, opaque},
     settings::is_within,
 };
@@ -74,6 +75,10 @@ pub struct Thread {
     pub started: u64,
     /// Publisher whose message was passed within the process and may also go to the middleware.
     pub publisher: u64,
+    /// Whether the accounting of the thread was read when the callback began.
+    pub is_accounted: u64,
+    /// The accounting at that time.
+    pub accounting: Accounting,
 }
 
 /// A position in a ring buffer.

@@ -275,6 +275,26 @@ pub struct Callback<'a> {
     pub duration: Option<Durations>,
     /// Time from when the callback is ready to when it starts; null without a value.
     pub wait: Option<Durations>,
+    /// What the time of its calls consisted of, in seconds; null if the kernel does not show it.
+    pub states_seconds: Option<ThreadStates>,
+    /// The same of the last window, as shares of the duration of its calls; null without any.
+    pub states_ratio: Option<ThreadStates>,
+}
+
+/// What threads did during calls, by the accounting of the kernel's scheduler. The parts add up to
+/// the duration of the calls.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct ThreadStates {
+    /// On a CPU.
+    pub cpu: f64,
+    /// Able to run, but the control group had used up its CPU quota (`cpu.max`).
+    pub throttled: f64,
+    /// Able to run, while other threads ran instead.
+    pub runnable: f64,
+    /// Waiting for something else: a lock, a file, the end of a sleep.
+    pub blocked: f64,
 }
 
 /// The last known lifecycle state of a managed node.

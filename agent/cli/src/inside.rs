@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use ros2probe_api::inside::{Durations, Inside, Owner};
+use ros2probe_api::inside::{Durations, Inside, Owner, ThreadStates};
 
 use crate::top::text::{safe, seconds};
 
@@ -123,6 +123,7 @@ pub fn text(inside: &Inside<'_>) -> String {
             it.rate_hertz.map(hertz).unwrap_or_default(),
             quantiles(it.duration.as_ref()),
             quantiles(it.wait.as_ref()),
+            it.states_ratio.as_ref().map(states).unwrap_or_default(),
         ])
     });
     let head = [
@@ -133,6 +134,7 @@ pub fn text(inside: &Inside<'_>) -> String {
         "HZ",
         "DURATION P50/P99",
         "WAIT P50/P99",
+        "THREAD",
     ];
     table(&mut out, head, callbacks);
     for state in &inside.lifecycle_states {
@@ -195,6 +197,21 @@ fn percent(ratio: f64) -> String {
     format!("{:.1}%", ratio * 100.0)
 }
 
+/// Returns the states in which the thread spent a percent of the time or more.
+fn states(ratio: &ThreadStates) -> String {
+    let all = [
+        ("cpu", ratio.cpu),
+        ("throttled", ratio.throttled),
+        ("runnable", ratio.runnable),
+        ("blocked", ratio.blocked),
+    ];
+    let shown = all.iter().filter(|(_, share)| *share >= 0.01);
+    let words: Vec<_> = shown
+        .map(|(state, share)| format!("{state} {:.0}%", 100.0 * share))
+        .collect();
+    words.join(" ")
+}
+
 fn quantiles(durations: Option<&Durations>) -> String {
     durations.map_or_else(String::new, |it| {
         format!("{} {}", seconds(it.p50_seconds), seconds(it.p99_seconds))
@@ -244,6 +261,11 @@ mod tests {
                     period_seconds: Some(0.05),
                 },
                 busy_ratio: Some(0.4),
+                states_ratio: Some(ThreadStates {
+                    cpu: 0.204,
+                    runnable: 0.796,
+                    ..ThreadStates::default()
+                }),
                 ..Callback::default()
             }],
             ..Inside::default()
@@ -262,7 +284,9 @@ mod tests {
         };
         let scan = columns(find("/scan").unwrap());
         assert_eq!(scan, ["/scan", "/lidar", "120", "0", "10.0", "-", "-"]);
-        assert!(find("timer 50 ms").unwrap().contains("40.0%"), "{text}");
+        let timer = find("timer 50 ms").unwrap();
+        assert!(timer.contains("40.0%"), "{text}");
+        assert!(timer.ends_with("cpu 20% runnable 80%"), "{text}");
         assert!(find("/points").unwrap().ends_with("3/5"), "{text}");
         assert!(
             text.contains("process 42") && !text.contains('\u{1b}'),

@@ -12,6 +12,7 @@ test('each kind of entity has a table, and empty ones are left out', () => {
     callbacks: [
       { ...owner, node: null, trigger: { kind: 'timer', name: null, period_seconds: 0.05 },
         calls: 7, busy_ratio: 0.4, rate_hertz: 20,
+        states_ratio: { cpu: 0.204, throttled: 0, runnable: 0.796, blocked: 0 },
         duration: { p50_seconds: 0.012, p99_seconds: 0.12 }, wait: null },
       { ...owner, trigger: { kind: 'service', name: '/plan' }, calls: 1 },
       { ...owner, trigger: { kind: 'intra_process', name: null }, calls: 1 },
@@ -26,6 +27,7 @@ test('each kind of entity has a table, and empty ones are left out', () => {
   assert.match(publishers[0][4], /^10/);
   assert.match(callbacks[0][0], /^timer 50/);
   assert.equal(callbacks[0][1], 'process 42');
+  assert.deepEqual(callbacks.map((row) => row[8]), ['cpu 20% runnable 80%', '', '']);
   assert.deepEqual(callbacks.map((row) => row[0]).slice(1), ['service /plan', 'intra_process']);
 });
 

@@ -143,6 +143,15 @@ int main(int argc, char **argv) {
                 ros_trace_callback_end(callback);
                 printf("%ld ", (long)(published - began));
             }
+        } else if (!strcmp(what, "sleep")) {
+            /* Callbacks that sleep for `us` microseconds. */
+            for (long i = 0; i < n; i++) {
+                ros_trace_rclcpp_executor_get_next_ready();
+                ros_trace_rclcpp_executor_execute(&in);
+                ros_trace_callback_start(callback, false);
+                usleep(us);
+                ros_trace_callback_end(callback);
+            }
         } else if (!strcmp(what, "relay")) {
             /* Takes a message with the source timestamp `n`. The callback publishes after `us`
                microseconds. Prints the source timestamp of its output, and the nanoseconds. */

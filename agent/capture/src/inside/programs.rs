@@ -13,11 +13,12 @@ use ros2probe_attach::attach::AttachError;
 use ros2probe_attach::client::Broker;
 use ros2probe_attach::functions::{Calls, ENQUEUE};
 use ros2probe_attach::request::Place;
-use ros2probe_wire::inside::{Counter, Figures, Handle, Process, clock};
+use ros2probe_wire::inside::{Counter, Figures, Handle, Process, accounting, clock};
 use zerocopy::FromZeros as _;
 
 use crate::breakpoints::{self, Breakpoints, Dispatcher, Means};
 use crate::filter::{Aligned, FilterError, absent_is_fine, failed, take};
+use crate::kernel_types::KernelTypes;
 use crate::system::{Clocks, raw_difference};
 use crate::uprobe::attachments::Refusal;
 
@@ -32,7 +33,7 @@ type FiguresWords = [u64; size_of::<Figures>() / 8];
 type ProcessWords = [u64; size_of::<Process>() / 8];
 type HandleWords = [u64; size_of::<Handle>() / 8];
 /// Words of `Thread` and `Entry` in the kernel programs.
-type ThreadWords = [u64; 9];
+type ThreadWords = [u64; 14];
 type EntryWords = [u64; 2];
 const _: () = assert!(size_of::<Figures>().is_multiple_of(8));
 
@@ -71,11 +72,13 @@ pub fn load(
     means: Means,
 ) -> Result<(Programs, Tables), FilterError> {
     let architecture = u32::from(cfg!(target_arch = "aarch64"));
+    let offsets = accounting_offsets();
     let (callbacks, within) = (u32::from(has_callbacks), within.unwrap_or(0));
     let ebpf = EbpfLoader::new()
         .override_global("ARCHITECTURE", &architecture, true)
         .override_global("CALLBACKS", &callbacks, true)
         .override_global("WITHIN", &within, true)
+        .override_global("ACCOUNTING", &offsets, true)
         .load(&OBJECT.0)
         .map_err(FilterError::load)?;
     let calls = match has_callbacks {
@@ -94,6 +97,27 @@ pub fn load(
         waiting: take(ebpf, "WAITING")?,
     };
     Ok((Programs(breakpoints), tables))
+}
+
+/// Returns where the running kernel keeps the accounting of threads, by [`accounting`]. Without its
+/// types (CONFIG_DEBUG_INFO_BTF), the states of threads stay unknown.
+fn accounting_offsets() -> [u32; accounting::COUNT] {
+    let members = [
+        ("task_struct", "se.sum_exec_runtime"),
+        ("task_struct", "sched_info.run_delay"),
+        ("task_struct", "nvcsw"),
+        ("task_struct", "nivcsw"),
+        ("task_struct", "sched_task_group"),
+        ("task_group", "parent"),
+        ("task_group", "cfs_bandwidth.throttled_time"),
+    ];
+    let types = KernelTypes::read().ok();
+    members.map(|(structure, member)| {
+        let types = types.as_ref();
+        types
+            .and_then(|types| types.offset(structure, member))
+            .unwrap_or(accounting::ABSENT)
+    })
 }
 
 impl Programs {

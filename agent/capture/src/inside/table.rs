@@ -9,11 +9,12 @@ use ros2probe_model::derive::chain::causality::CausalPublication;
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::calls::report::{
     BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report,
-    SubscriptionReport, Transition,
+    SubscriptionReport, ThreadStates, Transition,
 };
 use ros2probe_model::facts::names::{NodeName, TopicName};
 use ros2probe_wire::inside::{
     self, Announcement, Figures, Handle, Process, announced, distribution, kind, state,
+    thread_state,
 };
 use ros2probe_wire::{DomainId, Timestamp};
 use zerocopy::FromBytes as _;
@@ -480,6 +481,7 @@ impl ProcessTable {
                     durations: durations(figures, distribution::INTERVAL),
                     waits: durations(figures, distribution::DELAY),
                     skipped: figures.failed,
+                    states: states(figures),
                 });
                 Some(())
             }
@@ -529,6 +531,17 @@ impl Item {
         }
         let announcement = Announcement::read_from_bytes(bytes).ok()?;
         Some(Self::Announcement(Box::new(announcement)))
+    }
+}
+
+fn states(figures: &Figures) -> ThreadStates {
+    let of = |state: usize| figures.states.get(state).copied().unwrap_or_default();
+    ThreadStates {
+        calls: figures.states_known,
+        cpu: of(thread_state::CPU),
+        throttled: of(thread_state::THROTTLED),
+        runnable: of(thread_state::RUNNABLE),
+        blocked: of(thread_state::BLOCKED),
     }
 }
 

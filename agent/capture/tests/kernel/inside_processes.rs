@@ -1,5 +1,7 @@
 //! Programs at the functions of `libtracetools.so`, in processes that call them as rclcpp does.
 
+mod thread_states;
+
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};

@@ -9,8 +9,8 @@ use ros2probe_daemon::config::{Limits, Watch, Watchlist};
 use ros2probe_daemon::settings_cell::Settings;
 use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
 use ros2probe_model::facts::calls::report::{
-    BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report, Transition,
-    Trigger,
+    BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report, ThreadStates,
+    Transition, Trigger,
 };
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{self, Observer};
@@ -72,6 +72,7 @@ fn observed() -> Observer {
                 durations,
                 waits: Durations::default(),
                 skipped: 2,
+                states: ThreadStates::default(),
             }],
             ..ProcessReport::default()
         };
@@ -192,6 +193,7 @@ fn long_durations_become_series_with_their_length() {
                     durations: calls.clone(),
                     waits: waits.clone(),
                     skipped: 0,
+                    states: ThreadStates::default(),
                 }],
                 ..ProcessReport::default()
             }],

@@ -25,7 +25,8 @@ use opentelemetry_proto::tonic::metrics::v1::number_data_point;
 use ros2probe_metrics::catalogue::CATALOGUE;
 use ros2probe_metrics::otlp::{Exporter, Exports, Host, Inputs, Outcome, Reason, Settings, Signal};
 use ros2probe_model::facts::calls::report::{
-    CallbackReport, Durations, ProcessReport, PublisherReport, Report, Transition, Trigger,
+    CallbackReport, Durations, ProcessReport, PublisherReport, Report, ThreadStates, Transition,
+    Trigger,
 };
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{self, Observer};
@@ -165,6 +166,7 @@ fn seen_inside() -> Snapshot {
                 durations,
                 waits: Durations::default(),
                 skipped: 2,
+                states: ThreadStates::default(),
             }],
             ..ProcessReport::default()
         };

@@ -11,7 +11,7 @@ use crate::settings_cell::Settings;
 use ros2probe_metrics::catalogue::{self as metric, Metric};
 use ros2probe_metrics::metric_sink::{Label, MetricSink};
 use ros2probe_model::facts::calls::facts::{Callback, InsideFacts, TopicInside};
-use ros2probe_model::facts::calls::report::Trigger;
+use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
 use ros2probe_model::facts::histogram::Histogram;
 use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::DomainId;
@@ -45,6 +45,7 @@ struct CallbackSum {
     wait_p99: Option<Duration>,
     busy: Option<f64>,
     skipped: u64,
+    states: ThreadStates,
 }
 
 impl<'a> Callbacks<'a> {
@@ -158,6 +159,16 @@ pub(super) fn callbacks(
             known.try_for_each(|(key, value)| family.sample(&labels(key), value))
         })?;
     }
+    sink.family(&metric::CALLBACK_TIME, |family| {
+        for (key, sum) in sums.iter().filter(|(_, sum)| sum.states.calls > 0) {
+            let [domain_id, node, trigger, name] = labels(key);
+            for (state, time) in ThreadStates::LABELS.iter().zip(sum.states.nanoseconds()) {
+                let labels = [domain_id, node, trigger, name, Label::Text(state)];
+                family.sample(&labels, Duration::from_nanos(time).as_secs_f64())?;
+            }
+        }
+        Ok(())
+    })?;
     sink.family(&metric::TIMER_SKIPPED, |family| {
         let mut timers = sums
             .iter()
@@ -276,6 +287,7 @@ impl CallbackSum {
             *self.busy.get_or_insert_default() += busy;
         }
         self.skipped += callback.skipped;
+        self.states.add(callback.states);
     }
 }
 
@@ -299,6 +311,8 @@ mod tests {
             wait: Quantiles::default(),
             durations: std::sync::Arc::default(),
             waits: std::sync::Arc::default(),
+            states: ThreadStates::default(),
+            recent_states: ThreadStates::default(),
         }
     }
 

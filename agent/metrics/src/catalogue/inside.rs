@@ -3,6 +3,7 @@
 use super::{Metric, TOPIC};
 
 const CALLBACK: &[&str] = &["domain_id", "ros_node", "trigger", "name"];
+const CALLBACK_STATE: &[&str] = &["domain_id", "ros_node", "trigger", "name", "state"];
 
 pub const TOPIC_SOURCE: Metric = Metric::info(
     "ros2_topic_source_info",
@@ -116,6 +117,14 @@ pub const CALLBACK_BUSY: Metric = Metric::gauge(
     "Share of the last 5 to 10 s that calls took.",
 )
 .unit("ratio")
+.experimental();
+pub const CALLBACK_TIME: Metric = Metric::counter(
+    "ros2_callback_time_seconds_total",
+    CALLBACK_STATE,
+    "Time of completed calls by the state of their thread: on a CPU, able to run but throttled by the \
+     CPU quota of its control group, able to run while others ran, or blocked.",
+)
+.unit("seconds")
 .experimental();
 pub const TIMER_SKIPPED: Metric = Metric::counter(
     "ros2_timer_skipped_periods_total",

@@ -14,7 +14,7 @@ use std::time::Duration;
 use ros2probe_model::facts::calls::facts::TopicInside;
 use ros2probe_model::facts::calls::report::{
     BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report,
-    SubscriptionReport, Transition, Trigger,
+    SubscriptionReport, ThreadStates, Transition, Trigger,
 };
 use ros2probe_model::facts::names::NodeName;
 use ros2probe_model::facts::watch::{Watch, Watchlist};
@@ -192,6 +192,7 @@ fn callback(handle: u64, trigger: Trigger, thread: u32, calls: u64, at: u64) -> 
         durations: durations(calls, 1),
         waits: durations(calls, 1),
         skipped: 0,
+        states: ThreadStates::default(),
     }
 }
 

@@ -8,7 +8,7 @@ use ros2probe_model::facts::calls::facts::{
     Buffer, Callback, InsideFacts, LifecycleState, ObservedProcess, Owner, Publisher, Quantiles,
     ReaderQueue, Subscription, TopicCounts, TopicInside,
 };
-use ros2probe_model::facts::calls::report::{Durations, Trigger};
+use ros2probe_model::facts::calls::report::{Durations, ThreadStates, Trigger};
 use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::facts::names::TopicName;
@@ -200,6 +200,18 @@ fn callback(handle: u64, trigger: Trigger) -> Callback {
         wait: quantiles(),
         durations: durations(),
         waits: durations(),
+        states: states(),
+        recent_states: states(),
+    }
+}
+
+fn states() -> ThreadStates {
+    ThreadStates {
+        calls: 990,
+        cpu: 8_000_000_000,
+        throttled: 0,
+        runnable: 3_000_000_000,
+        blocked: 1_000_000_000,
     }
 }
 

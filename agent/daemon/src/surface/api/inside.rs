@@ -19,7 +19,7 @@ use crate::agent_facts::InsideSourceFacts;
 use crate::surface::inside_nodes::NodeActivity;
 use ros2probe_api::inside::{
     Buffer, Callback, Counter, Durations, Inside, Library, LifecycleState, NodeInside, Owner,
-    Process, Publisher, ReaderQueue, Subscription, TopicInside, Trigger,
+    Process, Publisher, ReaderQueue, Subscription, ThreadStates, TopicInside, Trigger,
 };
 use ros2probe_model::facts::calls::facts::{self, Quantiles};
 use ros2probe_model::facts::calls::report;
@@ -355,7 +355,27 @@ fn callback(facts: &facts::Callback, clock: WallClock) -> Callback<'_> {
         last_call_timestamp_seconds: clock.wall_time(facts.last).seconds(),
         duration: durations(&facts.duration),
         wait: durations(&facts.wait),
+        states_seconds: thread_states(&facts.states, 1e9),
+        states_ratio: {
+            let sum: u64 = facts.recent_states.nanoseconds().iter().sum();
+            thread_states(&facts.recent_states, sum.max(1) as f64)
+        },
     }
+}
+
+/// Returns times in units of `unit` nanoseconds; `None` if they cover no call.
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "nanoseconds of some months are below 2^53"
+)]
+fn thread_states(states: &report::ThreadStates, unit: f64) -> Option<ThreadStates> {
+    let [cpu, throttled, runnable, blocked] = states.nanoseconds().map(|time| time as f64 / unit);
+    (states.calls > 0).then_some(ThreadStates {
+        cpu,
+        throttled,
+        runnable,
+        blocked,
+    })
 }
 
 fn lifecycle_state(facts: &facts::LifecycleState, clock: WallClock) -> LifecycleState<'_> {
@@ -415,6 +435,12 @@ mod tests {
                     durations,
                     waits: report::Durations::default(),
                     skipped: 0,
+                    states: report::ThreadStates {
+                        calls: 10 * second,
+                        cpu: 3 * second * 1_000_000_000,
+                        blocked: second * 1_000_000_000,
+                        ..report::ThreadStates::default()
+                    },
                 }],
                 ..ProcessReport::default()
             };

@@ -12,7 +12,8 @@ use crate::facts::calls::facts::{
     Buffer, Callback, InsideFacts, Owner, Publisher, Quantiles, Subscription,
 };
 use crate::facts::calls::report::{
-    BufferReport, CallbackReport, Durations, PublisherReport, SubscriptionReport, Trigger,
+    BufferReport, CallbackReport, Durations, PublisherReport, SubscriptionReport, ThreadStates,
+    Trigger,
 };
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName};
@@ -69,6 +70,7 @@ pub(super) struct Counts {
     pub(super) count: u64,
     pub(super) failed: u64,
     pub(super) within: u64,
+    pub(super) states: ThreadStates,
 }
 
 /// A handle with the start of its window.
@@ -126,6 +128,7 @@ impl Counts {
             count: one(self.count, earlier.count),
             failed: one(self.failed, earlier.failed),
             within: one(self.within, earlier.within),
+            states: self.states.since(earlier.states),
         }
     }
 }
@@ -143,8 +146,8 @@ impl Figures {
             },
             counts: Counts {
                 count: report.published,
-                failed: 0,
                 within: report.within_process,
+                ..Counts::default()
             },
             last: clock.model_time(report.last),
             durations: [Some(report.intervals.into()), None],
@@ -164,7 +167,7 @@ impl Figures {
             counts: Counts {
                 count: report.taken,
                 failed: report.failed,
-                within: 0,
+                ..Counts::default()
             },
             last: clock.model_time(report.last),
             durations: [None, Some(report.latency.into())],
@@ -187,6 +190,7 @@ impl Figures {
                 count: report.enqueued,
                 failed: report.overwritten,
                 within: report.dequeued,
+                ..Counts::default()
             },
             last: clock.model_time(report.last),
             durations: [None, Some(report.waiting.into())],
@@ -213,7 +217,8 @@ impl Figures {
             counts: Counts {
                 count: report.calls,
                 failed: report.skipped,
-                within: 0,
+                states: report.states,
+                ..Counts::default()
             },
             last: clock.model_time(report.last),
             durations: [Some(report.durations.into()), Some(report.waits.into())],
@@ -402,6 +407,8 @@ impl Tracked {
                 wait: quantiles[DELAY],
                 durations: durations(INTERVAL),
                 waits: durations(DELAY),
+                states: counts.states,
+                recent_states: recent.states,
             }),
         }
     }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use ros2probe_wire::{DomainId, Guid};
 
-use super::report::{Durations, Trigger};
+use super::report::{Durations, ThreadStates, Trigger};
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName};
 
@@ -201,6 +201,10 @@ pub struct Callback {
     pub durations: Arc<Durations>,
     /// Waits of all calls.
     pub waits: Arc<Durations>,
+    /// What the time of all calls consisted of.
+    pub states: ThreadStates,
+    /// What the time of the calls that ended in the last window consisted of.
+    pub recent_states: ThreadStates,
 }
 
 /// The last lifecycle state of a managed node.

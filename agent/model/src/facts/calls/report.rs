@@ -151,6 +151,58 @@ pub struct CallbackReport {
     pub waits: Durations,
     /// Periods in which a timer was not called.
     pub skipped: u64,
+    /// What the time of its calls consisted of.
+    pub states: ThreadStates,
+}
+
+/// What the threads of calls did, in nanoseconds, by the accounting of the kernel's scheduler.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ThreadStates {
+    /// Calls that this covers; 0 if the kernel does not show its accounting.
+    pub calls: u64,
+    /// They ran on a CPU.
+    pub cpu: u64,
+    /// They could run, but their control group had used up its CPU quota (`cpu.max`).
+    pub throttled: u64,
+    /// They could run, and other threads ran instead.
+    pub runnable: u64,
+    /// They waited for something else: a lock, a file, the end of a sleep.
+    pub blocked: u64,
+}
+
+impl ThreadStates {
+    /// Labels of the states, in the order of [`Self::nanoseconds`].
+    pub const LABELS: [&str; 4] = ["cpu", "throttled", "runnable", "blocked"];
+
+    /// Returns the time in each state.
+    #[must_use]
+    pub const fn nanoseconds(&self) -> [u64; 4] {
+        [self.cpu, self.throttled, self.runnable, self.blocked]
+    }
+
+    /// Returns what was added since `earlier`; a smaller number of calls began anew.
+    #[must_use]
+    pub const fn since(self, earlier: Self) -> Self {
+        if self.calls < earlier.calls {
+            return self;
+        }
+        Self {
+            calls: self.calls - earlier.calls,
+            cpu: self.cpu.saturating_sub(earlier.cpu),
+            throttled: self.throttled.saturating_sub(earlier.throttled),
+            runnable: self.runnable.saturating_sub(earlier.runnable),
+            blocked: self.blocked.saturating_sub(earlier.blocked),
+        }
+    }
+
+    /// Adds the times of other calls.
+    pub const fn add(&mut self, other: Self) {
+        self.calls += other.calls;
+        self.cpu += other.cpu;
+        self.throttled += other.throttled;
+        self.runnable += other.runnable;
+        self.blocked += other.blocked;
+    }
 }
 
 /// Trigger of a callback.

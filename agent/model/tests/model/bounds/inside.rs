@@ -3,7 +3,7 @@
 use super::*;
 use ros2probe_model::facts::calls::report::{
     CallbackReport, Durations, ProcessReport, PublisherReport, Report, SubscriptionReport,
-    Transition, Trigger,
+    ThreadStates, Transition, Trigger,
 };
 use ros2probe_testing::model::host;
 
@@ -48,6 +48,7 @@ pub(super) fn reports(observer: &mut Observer, dice: &mut Dice, now: u64) {
         durations: Durations::default(),
         waits: Durations::default(),
         skipped: 0,
+        states: ThreadStates::default(),
     };
     let process = ProcessReport {
         id,

@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use ros2probe_daemon::agent_facts::InsideSourceFacts;
 use ros2probe_model::facts::calls::report::{
-    CallbackReport, Durations, ProcessReport, PublisherReport, Report, Transition, Trigger,
+    CallbackReport, Durations, ProcessReport, PublisherReport, Report, ThreadStates, Transition,
+    Trigger,
 };
 use ros2probe_wire::DomainId;
 use ros2probe_wire::time::SECOND;
@@ -32,6 +33,7 @@ fn process(id: u32, second: u64, now: u64) -> ProcessReport {
         durations: durations.clone(),
         waits: durations.clone(),
         skipped: 0,
+        states: ThreadStates::default(),
     };
     let publisher = |handle: u64| PublisherReport {
         handle,

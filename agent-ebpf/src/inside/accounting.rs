@@ -1,0 +1,95 @@
+//! What the scheduler has counted for the running thread.
+
+use core::mem::MaybeUninit;
+
+use aya_ebpf::helpers::{bpf_get_current_task, generated::bpf_probe_read_kernel};
+use ros2probe_wire::inside::accounting::{
+    ABSENT, COUNT, GROUP, GROUP_PARENT, GROUP_THROTTLED, INVOLUNTARY_SWITCHES, RUN_DELAY, RUNTIME,
+    VOLUNTARY_SWITCHES,
+};
+
+/// Control groups whose throttling is added up: that of the thread, and those around it.
+const LEVELS: u32 = 4;
+
+/// Offsets of members by `accounting`. Set by the loader.
+#[unsafe(no_mangle)]
+pub static ACCOUNTING: [u32; COUNT] = [ABSENT; COUNT];
+
+/// Accounting of a thread, in nanoseconds but for the switches. Only differences have a meaning.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct Accounting {
+    /// CPU time up to the last tick or context switch.
+    pub cpu: u64,
+    pub runnable: u64,
+    pub throttled: u64,
+    /// Context switches.
+    pub switches: u64,
+}
+
+/// Reads the accounting of the running thread; `None` if the kernel does not keep it, or does not
+/// allow the read.
+#[inline(always)]
+pub fn read() -> Option<Accounting> {
+    if offset(RUNTIME) == ABSENT
+        || offset(RUN_DELAY) == ABSENT
+        || offset(VOLUNTARY_SWITCHES) == ABSENT
+        || offset(INVOLUNTARY_SWITCHES) == ABSENT
+    {
+        return None;
+    }
+    // SAFETY: no preconditions.
+    let task = unsafe { bpf_get_current_task() };
+    let switches = word(task, VOLUNTARY_SWITCHES)?;
+    Some(Accounting {
+        cpu: word(task, RUNTIME)?,
+        runnable: word(task, RUN_DELAY)?,
+        throttled: throttled(task),
+        switches: switches.wrapping_add(word(task, INVOLUNTARY_SWITCHES)?),
+    })
+}
+
+/// Returns how long the quotas of the thread's control groups have stopped them.
+#[inline(always)]
+fn throttled(task: u64) -> u64 {
+    let has_quotas = offset(GROUP) != ABSENT && offset(GROUP_PARENT) != ABSENT;
+    if !has_quotas || offset(GROUP_THROTTLED) == ABSENT {
+        return 0;
+    }
+    let (mut sum, mut level) = (0_u64, 0);
+    let mut group = word(task, GROUP).unwrap_or(0);
+    while level < LEVELS {
+        if group == 0 {
+            break;
+        }
+        sum = sum.wrapping_add(word(group, GROUP_THROTTLED).unwrap_or(0));
+        group = word(group, GROUP_PARENT).unwrap_or(0);
+        level += 1;
+    }
+    sum
+}
+
+#[inline(always)]
+fn offset(of: usize) -> u32 {
+    // SAFETY: an index below the array's length.
+    let offset = unsafe { (&raw const ACCOUNTING).cast::<u32>().add(of) };
+    // SAFETY: a constant of the loaded object, never written while the program runs.
+    unsafe { core::ptr::read_volatile(offset) }
+}
+
+/// Reads a member of the structure at `address`.
+#[inline(always)]
+fn word(address: u64, of: usize) -> Option<u64> {
+    let mut value = MaybeUninit::<u64>::zeroed();
+    let address = address.wrapping_add(u64::from(offset(of)));
+    // SAFETY: the destination has the size given; the kernel checks the address.
+    let result = unsafe {
+        bpf_probe_read_kernel(
+            value.as_mut_ptr().cast(),
+            size_of::<u64>() as u32,
+            address as *const _,
+        )
+    };
+    // SAFETY: any bytes are a number.
+    (result == 0).then(|| unsafe { value.assume_init() })
+}

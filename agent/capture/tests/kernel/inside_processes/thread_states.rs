@@ -1,0 +1,170 @@
+//! What the time of callbacks consists of, compared with the kernel's own figures of the process.
+
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use ros2probe_model::facts::calls::report::ThreadStates;
+
+use super::{Process, Robot};
+
+/// Difference that a command besides its callbacks, and the time between the readings, may make.
+const TOLERANCE: Duration = Duration::from_millis(12);
+
+/// CPU time and waiting time of a process's only thread, from `/proc/PID/schedstat`.
+struct Schedstat {
+    cpu: Duration,
+    run_delay: Duration,
+}
+
+impl Schedstat {
+    fn of(process: &Process) -> Self {
+        let path = format!("/proc/{}/schedstat", process.child.id());
+        let text = std::fs::read_to_string(path).unwrap();
+        let mut fields = text.split_whitespace();
+        let mut next = || Duration::from_nanos(fields.next().unwrap().parse().unwrap());
+        Self {
+            cpu: next(),
+            run_delay: next(),
+        }
+    }
+}
+
+/// A process of the same CPU that never sleeps.
+struct Hog(Child);
+
+impl Hog {
+    fn on(cpu: &str) -> Self {
+        let child = Command::new("taskset")
+            .args(["-c", cpu, "sh", "-c", "while :; do :; done"])
+            .stdin(Stdio::null())
+            .spawn();
+        Self(child.expect("install taskset: apt-get install util-linux"))
+    }
+}
+
+impl Drop for Hog {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A control group with a quota of its CPU time, by either version of the hierarchy.
+struct Quota(PathBuf);
+
+impl Quota {
+    /// Lets the process run for a fifth of each 100 ms.
+    fn a_fifth_for(process: &Process) -> Self {
+        let name = format!("r2p-quota-{}", process.child.id());
+        let first = PathBuf::from("/sys/fs/cgroup/cpu");
+        let (group, limits): (_, &[_]) = if first.join("cpu.cfs_quota_us").exists() {
+            let limits = &[
+                ("cpu.cfs_period_us", "100000"),
+                ("cpu.cfs_quota_us", "20000"),
+            ];
+            (first.join(name), limits)
+        } else {
+            let root = PathBuf::from("/sys/fs/cgroup");
+            let _ = std::fs::write(root.join("cgroup.subtree_control"), "+cpu");
+            (root.join(name), &[("cpu.max", "20000 100000")])
+        };
+        std::fs::create_dir(&group).unwrap();
+        let quota = Self(group);
+        for (file, limit) in limits {
+            let written = std::fs::write(quota.0.join(file), limit);
+            written.expect("a kernel with CPU quotas (CONFIG_CFS_BANDWIDTH)");
+        }
+        let id = process.child.id().to_string();
+        std::fs::write(quota.0.join("cgroup.procs"), id).unwrap();
+        quota
+    }
+}
+
+impl Drop for Quota {
+    fn drop(&mut self) {
+        let id = std::fs::read_to_string(self.0.join("cgroup.procs")).unwrap_or_default();
+        for id in id.split_whitespace() {
+            let root = self.0.with_file_name("cgroup.procs");
+            let _ = std::fs::write(root, id);
+        }
+        let _ = std::fs::remove_dir(&self.0);
+    }
+}
+
+/// A process whose callbacks are observed, after it has created its entities.
+fn started() -> (Robot, Process) {
+    let mut robot = Robot::new(248, &[], true);
+    robot.attach();
+    let mut process = robot.start();
+    process.run("init");
+    (robot, process)
+}
+
+/// Runs a command of callbacks. Returns what they consisted of, and the kernel's figures of the
+/// process over the same time.
+fn run(robot: &mut Robot, process: &mut Process, command: &str) -> (ThreadStates, Schedstat) {
+    let before = Schedstat::of(process);
+    process.run(command);
+    let after = Schedstat::of(process);
+    let report = robot.report(process);
+    let callback = report.callbacks.first().unwrap();
+    let states = callback.states;
+    assert_eq!(states.calls, callback.calls, "{states:?}");
+    let sum: u64 = states.nanoseconds().iter().sum();
+    assert_eq!(
+        Duration::from_nanos(sum),
+        callback.durations.sum(),
+        "{states:?}"
+    );
+    let schedstat = Schedstat {
+        cpu: after.cpu - before.cpu,
+        run_delay: after.run_delay - before.run_delay,
+    };
+    (states, schedstat)
+}
+
+fn assert_close(nanoseconds: u64, expected: Duration, states: ThreadStates) {
+    let difference = Duration::from_nanos(nanoseconds).abs_diff(expected);
+    assert!(difference < TOLERANCE, "{states:?} {expected:?}");
+}
+
+#[test]
+fn a_callback_that_sleeps_is_blocked() {
+    let (mut robot, mut process) = started();
+    let (states, schedstat) = run(&mut robot, &mut process, "sleep 20 5000");
+    assert!(states.blocked >= 20 * 5_000_000, "{states:?}");
+    assert_close(states.cpu, schedstat.cpu, states);
+    assert_close(states.runnable, schedstat.run_delay, states);
+    assert_eq!(states.throttled, 0);
+}
+
+#[test]
+fn a_callback_beside_a_busy_thread_is_runnable_for_as_long_as_the_kernel_counts() {
+    let (mut robot, mut process) = started();
+    let id = process.child.id().to_string();
+    let pinned = Command::new("taskset").args(["-pc", "0", &id]).output();
+    assert!(pinned.unwrap().status.success());
+    let _hog = Hog::on("0");
+    let (states, schedstat) = run(&mut robot, &mut process, "take 10 60000");
+    let sum: u64 = states.nanoseconds().iter().sum();
+    assert!(states.runnable > sum / 5, "{states:?}");
+    assert_close(states.cpu, schedstat.cpu, states);
+    assert_close(states.runnable, schedstat.run_delay, states);
+    assert_eq!(states.throttled, 0);
+}
+
+#[test]
+fn a_callback_beyond_the_quota_of_its_control_group_is_throttled() {
+    let (mut robot, mut process) = started();
+    let _quota = Quota::a_fifth_for(&process);
+    let (states, schedstat) = run(&mut robot, &mut process, "take 3 300000");
+    let sum: u64 = states.nanoseconds().iter().sum();
+    assert!(states.throttled > sum / 2, "{states:?}");
+    assert_close(states.cpu, schedstat.cpu, states);
+    assert_close(
+        states.runnable + states.throttled,
+        schedstat.run_delay,
+        states,
+    );
+}
