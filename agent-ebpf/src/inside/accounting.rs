@@ -1,4 +1,4 @@
-//! What the scheduler has counted for the running thread.
+//! The scheduler's accounting of the running thread.
 
 use core::mem::MaybeUninit;
 
