@@ -32,7 +32,8 @@ pub enum Input<'a> {
     ClockSet(i64),
     /// The source sees the traffic since this time. Before, it saw none of it or only a part.
     ViewBegan(Timestamp),
-    /// A datagram that was captured in full.
+    /// A datagram that was captured in full and whose user data has no other source: one of a capture
+    /// file, or the rest that the kernel filter did not walk. Taps use [`Self::Submessage`].
     Datagram {
         /// Its addresses and time.
         envelope: &'a Envelope,

@@ -3,6 +3,16 @@
 //! All processing uses the source's time, which the caller passes in: the same input yields the
 //! same facts, live or replayed at any speed. The observer reads no clock, sends nothing and keeps
 //! no packets.
+//!
+//! Its parts, and when they run:
+//! - This module: leases, and a submessage's numbers at its writer and receivers; per observation.
+//! - `announcements`: SPDP, SEDP, `ros_discovery_info`; per captured sample.
+//! - `samples`, `calls`, `chains`: payloads, requests and replies, stamps; per sample.
+//! - `zenoh`: connections of Zenoh; per report.
+//! - `inside`, `arrivals`: calls inside processes, and their queues; per report.
+//! - `lists`, `settings`: which topics are measured; when a list changes.
+//! - `clock`: what time decides, such as leases, gaps that become losses, findings; per tick.
+//! - `report`: the snapshot; on request.
 
 mod announcements;
 mod arrivals;
@@ -23,7 +33,7 @@ use std::time::Duration;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::record::Handover;
 use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
-use ros2probe_wire::{DomainId, EntityId, Guid, Reason, Timestamp};
+use ros2probe_wire::{DomainId, Guid, Reason, Timestamp};
 
 use crate::derive::chain::Chains;
 use crate::derive::examiner::Examiner;
@@ -132,6 +142,15 @@ pub(crate) struct Counts {
     pub(crate) records: u64,
 }
 
+/// Where the observations of a captured datagram's user data come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum UserData {
+    /// The datagram is their only source.
+    Here,
+    /// The source sorts them among others, and passes them as [`Input::Observation`].
+    Separate,
+}
+
 impl Observer {
     /// Creates an observer without state or watches.
     #[must_use]
@@ -199,7 +218,7 @@ impl Observer {
                 length,
             } => self.cut_datagram(envelope, payload, length),
             Input::Submessage { captured, found } => {
-                self.submessage(captured, found, EntityId::is_builtin);
+                self.submessage(captured, found, UserData::Separate);
             }
             Input::DatagramEnd(outcome) => self.datagram_end(outcome),
             Input::SharedMemory { envelope, payload } => {
@@ -211,7 +230,7 @@ impl Observer {
                 .uncertain(self.graph.wall_clock.model_time(now)),
             Input::ProbesDetached => self.measure.profiler.end_exact_view(),
             Input::Zenoh(report) => self.zenoh_report(report),
-            Input::Observation(observation) => self.count(observation),
+            Input::Observation(observation) => self.observe(observation),
             Input::ParticipantAlive(prefix, at) => {
                 let at = self.graph.wall_clock.model_time(at);
                 self.graph.discovery.seen(prefix, at, Priority::NOTHING);
@@ -304,7 +323,7 @@ impl Observer {
         let mut padded = payload.to_vec();
         padded.resize(payload.len().max(length), 0);
         walk::datagram(&padded, envelope, None, |found| {
-            self.count(&Observation::of(&found.record, self.graph.wall_clock));
+            self.observe(&Observation::of(&found.record, self.graph.wall_clock));
         });
     }
 
@@ -379,15 +398,33 @@ impl Observer {
             .or_default() += 1;
     }
 
-    /// Counts an observation.
-    fn count(&mut self, observation: &Observation) {
+    /// Processes a submessage that a source saw: renews the lease of its sender, and measures user
+    /// data. Only the sequence numbers move here. [`Self::tick`] turns gaps into losses.
+    fn observe(&mut self, observation: &Observation) {
         self.counts.records += 1;
-        let head = observation.head();
-        let (writer, sender, at) = (head.writer, observation.sender(), head.at);
+        let writer = observation.head().writer;
         if matches!(observation, Observation::Presence(_)) {
+            let (sender, at) = (observation.sender(), observation.head().at);
             self.graph.discovery.seen(sender, at, Priority::NOTHING);
             return;
         }
+        self.renew_lease(observation);
+        if writer.entity.is_builtin() {
+            return;
+        }
+        if let Some(sample) = observation.sample() {
+            self.measure.latched.seen(sample);
+        }
+        if self.derive.tracer.is_wanted() {
+            self.trace(observation);
+        }
+        self.measure_user_data(observation);
+    }
+
+    /// Renews the lease of the participant that sent an observation, or admits it.
+    fn renew_lease(&mut self, observation: &Observation) {
+        let head = observation.head();
+        let (sender, at) = (observation.sender(), head.at);
         let sample = observation.sample();
         let evidence = Priority {
             watched: false,
@@ -401,7 +438,7 @@ impl Observer {
                 }
                 _ => self.graph.receivers.learn(observation),
             },
-            sends: sample.is_some_and(Sample::is_delivered) && !writer.entity.is_builtin(),
+            sends: sample.is_some_and(Sample::is_delivered) && !head.writer.entity.is_builtin(),
         };
         if self.graph.discovery.seen(sender, at, evidence) {
             let journal = &mut self.journal;
@@ -410,27 +447,24 @@ impl Observer {
             }
             self.follow_up(at);
         }
-        if writer.entity.is_builtin() {
-            return;
-        }
-        if let Some(sample) = sample {
-            self.measure.latched.seen(sample);
-        }
-        if self.derive.tracer.is_wanted() {
-            self.trace(observation);
-        }
-        // Requests and replies are seldom measured, so ordinary topics skip this lookup.
+    }
+
+    /// Measures user data of a measured topic, or of an unknown writer.
+    fn measure_user_data(&mut self, observation: &Observation) {
+        let (writer, sample) = (observation.head().writer, observation.sample());
+        // The profiler needs to know calls first. Requests and replies are seldom measured, so
+        // ordinary topics skip this lookup.
         let measures_calls = self.derive.services.has_measured();
         if let Some(sample) = sample.filter(|_| measures_calls) {
             self.call_seen(sample);
         }
-        let graph = &self.graph;
         let journal = &mut self.journal;
-        match self.measure.profiler.observe(observation, journal, graph) {
+        match (self.measure.profiler).observe(observation, journal, &self.graph) {
             ObservationOutcome::Unmeasured => {
                 if let Some(sample) = sample.filter(|_| !measures_calls) {
                     self.call_seen(sample);
                 }
+                self.measure_unknown_writer(observation);
             }
             ObservationOutcome::Measured => {
                 if let Some(sample) = sample {
@@ -440,9 +474,8 @@ impl Observer {
                     if let Some(sample) = sample {
                         self.came_again(sample);
                     }
-                    self.turn(writer, at);
+                    self.turn(writer, observation.head().at);
                 }
-                return;
             }
             ObservationOutcome::Counted(counted) => {
                 self.report_missing();
@@ -450,22 +483,24 @@ impl Observer {
                     self.chain_seen(sample, Some(&counted));
                 }
                 self.counted(writer, &counted);
-                return;
             }
         }
-        let is_strange = writer.entity.is_writer()
-            && !self.graph.discovery.endpoints().contains_key(&writer)
-            && !self.graph.discovery.was_disposed(writer, at);
-        if is_strange {
-            let graph = &self.graph;
-            let journal = &mut self.journal;
-            let outcome = self
-                .measure
-                .profiler
-                .unknown_writer(observation, journal, graph);
-            if let ObservationOutcome::Counted(counted) = outcome {
-                self.counted(writer, &counted);
-            }
+    }
+
+    /// Measures the writer of an observation if no announcement of it is known.
+    fn measure_unknown_writer(&mut self, observation: &Observation) {
+        let head = observation.head();
+        let (writer, discovery) = (head.writer, &self.graph.discovery);
+        if !writer.entity.is_writer()
+            || discovery.endpoints().contains_key(&writer)
+            || discovery.was_disposed(writer, head.at)
+        {
+            return;
+        }
+        let journal = &mut self.journal;
+        let outcome = (self.measure.profiler).unknown_writer(observation, journal, &self.graph);
+        if let ObservationOutcome::Counted(counted) = outcome {
+            self.counted(writer, &counted);
         }
     }
 
@@ -488,29 +523,23 @@ impl Observer {
         });
     }
 
-    /// Reads the announcements and payloads of a datagram, and counts every submessage.
+    /// Reads the announcements and payloads of a datagram, and observes every submessage.
     fn walk(&mut self, captured: Captured<'_>, payload: &[u8], handover: Option<&Handover>) {
         let outcome = walk::datagram(payload, captured.envelope, handover, |found| {
-            self.submessage(captured, &found, |_| true);
+            self.submessage(captured, &found, UserData::Here);
         });
         self.datagram_end(outcome);
     }
 
-    /// Reads the announcement or payload in a submessage, and counts it if `counts` is true for its
-    /// writer.
-    fn submessage(
-        &mut self,
-        captured: Captured<'_>,
-        found: &Found<'_>,
-        counts: impl Fn(EntityId) -> bool,
-    ) {
+    /// Reads the announcement or payload in a submessage, and observes it.
+    fn submessage(&mut self, captured: Captured<'_>, found: &Found<'_>, user_data: UserData) {
         let observation = match captured.is_polled {
             true => Observation::of_polled(&found.record, self.graph.wall_clock),
             false => Observation::of(&found.record, self.graph.wall_clock),
         };
         self.announced(captured, found, &observation);
-        if counts(observation.head().writer.entity) {
-            self.count(&observation);
+        if user_data == UserData::Here || observation.head().writer.entity.is_builtin() {
+            self.observe(&observation);
         }
     }
 

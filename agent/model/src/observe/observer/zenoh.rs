@@ -211,7 +211,7 @@ impl Observer {
         if let Some(payload) = sample.payload.whole() {
             self.keep_payload(&observed, payload);
         }
-        self.count(&Observation::Sample(observed));
+        self.observe(&Observation::Sample(observed));
         if stream.outgoing && stream.is_loopback() {
             // The receiver's socket is not read, because the sender's socket has shown the sample.
             let head = Head {
@@ -219,7 +219,7 @@ impl Observer {
                 socket: sample.receiving_socket,
                 ..observed.head
             };
-            self.count(&Observation::Sample(Sample { head, ..observed }));
+            self.observe(&Observation::Sample(Sample { head, ..observed }));
         }
     }
 }
