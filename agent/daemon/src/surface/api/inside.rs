@@ -476,7 +476,18 @@ mod tests {
 
         let node = node(DomainId(0), "/lidar", &snapshot).unwrap();
         assert_eq!((node.callbacks.len(), node.publishers.len()), (1, 1));
-        assert_eq!(node.callbacks[0].trigger.words(), "timer 100 ms");
+        let callback = &node.callbacks[0];
+        assert_eq!(callback.trigger.words(), "timer 100 ms");
+        let states = callback.states_seconds.unwrap();
+        assert_eq!(
+            [states.cpu, states.blocked, states.runnable],
+            [9.0, 3.0, 0.0]
+        );
+        let shares = callback.states_ratio.unwrap();
+        assert_eq!(
+            [shares.cpu, shares.blocked, shares.throttled],
+            [0.75, 0.25, 0.0]
+        );
         assert!(super::node(DomainId(0), "/camera", &snapshot).is_none());
     }
 

@@ -45,6 +45,7 @@ pub(super) enum Detail {
     Callback {
         trigger: Trigger,
         thread: u32,
+        states: ThreadStates,
     },
 }
 
@@ -70,7 +71,6 @@ pub(super) struct Counts {
     pub(super) count: u64,
     pub(super) failed: u64,
     pub(super) within: u64,
-    pub(super) states: ThreadStates,
 }
 
 /// A handle with the start of its window.
@@ -98,6 +98,7 @@ pub(super) struct Tracked {
 struct Mark {
     at: ModelTime,
     counts: Counts,
+    states: ThreadStates,
     durations: [Option<Arc<Durations>>; 2],
 }
 
@@ -128,7 +129,6 @@ impl Counts {
             count: one(self.count, earlier.count),
             failed: one(self.failed, earlier.failed),
             within: one(self.within, earlier.within),
-            states: self.states.since(earlier.states),
         }
     }
 }
@@ -213,11 +213,11 @@ impl Figures {
             detail: Detail::Callback {
                 trigger: report.trigger,
                 thread: report.thread,
+                states: report.states,
             },
             counts: Counts {
                 count: report.calls,
                 failed: report.skipped,
-                states: report.states,
                 ..Counts::default()
             },
             last: clock.model_time(report.last),
@@ -230,6 +230,20 @@ impl Figures {
         match &self.detail {
             Detail::Callback { trigger, .. } => Some(trigger),
             _ => None,
+        }
+    }
+
+    /// Returns what the time of a callback's calls consisted of.
+    const fn states(&self) -> ThreadStates {
+        match &self.detail {
+            Detail::Callback { states, .. } => *states,
+            Detail::Endpoint { .. } | Detail::Buffer { .. } => ThreadStates {
+                calls: 0,
+                cpu: 0,
+                throttled: 0,
+                runnable: 0,
+                blocked: 0,
+            },
         }
     }
 
@@ -250,6 +264,7 @@ impl Tracked {
             Some(began) => Mark {
                 at: began,
                 counts: Counts::default(),
+                states: ThreadStates::default(),
                 durations: [None, None],
             },
             None => Mark::of(&figures, at),
@@ -280,6 +295,7 @@ impl Tracked {
             let mark = Mark {
                 at,
                 counts: Counts::default(),
+                states: ThreadStates::default(),
                 durations: [None, None],
             };
             self.marks = [mark.clone(), mark];
@@ -294,8 +310,8 @@ impl Tracked {
         added
     }
 
-    /// Records the publication time of the oldest message that a report added. It is unknown
-    /// without the latency of each message.
+    /// Records the publication time of the oldest message that a report added. Does nothing unless
+    /// the report has the latency of each message.
     pub(super) fn took(&mut self, added: &Added) {
         let delay = added.delay.as_ref().filter(|delay| {
             self.figures.kind == Kind::Subscription && delay.count() == added.counts.count
@@ -394,7 +410,11 @@ impl Tracked {
                 last: *last,
                 waiting: quantiles[DELAY],
             }),
-            Detail::Callback { trigger, thread } => into.callbacks.push(Callback {
+            Detail::Callback {
+                trigger,
+                thread,
+                states,
+            } => into.callbacks.push(Callback {
                 owner,
                 trigger: trigger.clone(),
                 thread: *thread,
@@ -407,8 +427,8 @@ impl Tracked {
                 wait: quantiles[DELAY],
                 durations: durations(INTERVAL),
                 waits: durations(DELAY),
-                states: counts.states,
-                recent_states: recent.states,
+                states: *states,
+                recent_states: states.since(self.marks[0].states),
             }),
         }
     }
@@ -478,6 +498,7 @@ impl Mark {
         Self {
             at,
             counts: figures.counts,
+            states: figures.states(),
             durations: figures.durations.clone(),
         }
     }

@@ -33,7 +33,13 @@ fn process(id: u32, second: u64, now: u64) -> ProcessReport {
         durations: durations.clone(),
         waits: durations.clone(),
         skipped: 0,
-        states: ThreadStates::default(),
+        states: ThreadStates {
+            calls: 20 * second,
+            cpu: second << 24,
+            throttled: second << 20,
+            runnable: second << 22,
+            blocked: second << 26,
+        },
     };
     let publisher = |handle: u64| PublisherReport {
         handle,
