@@ -157,8 +157,8 @@ pub fn identify(skb: *mut __sk_buff, slot: u32, named: &mut u32) -> (u32, u64) {
     *named = named.wrapping_add(1);
     // SAFETY: no preconditions.
     let cpu = unsafe { bpf_get_smp_processor_id() } as u32;
-    // The token is unique among 2^20 datagrams of a CPU if at most 256 CPUs exist. Slots count from
-    // one, so the token is never 0.
+    // The token is unique among 2^20 datagrams of a CPU if at most 256 CPUs exist. It contains the
+    // slot's number plus one, so it is never 0.
     let token = *named << 12 | (slot + 1) << 8 | (cpu & 0xff);
     // SAFETY: `skb` is the program's context.
     (token, unsafe { bpf_get_socket_cookie(skb.cast()) })

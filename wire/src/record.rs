@@ -110,7 +110,8 @@ pub struct Record {
     pub datagram_len: u16,
     /// Index of the interface on which the frame was seen; 0 = unknown.
     pub interface: u32,
-    /// Token of a fragmented datagram, unique for some seconds; 0 if not fragmented.
+    /// Token of the datagram, unique for some seconds. On an interface, only a fragmented datagram has
+    /// one; 0 = none.
     pub datagram: u32,
     /// One of [`kind`].
     pub kind: u8,

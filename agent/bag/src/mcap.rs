@@ -110,7 +110,7 @@ pub struct Chunk<'a> {
     pub records: &'a [u8],
 }
 
-/// Position and content of a chunk.
+/// Position, time range and sizes of a chunk.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct ChunkIndex {
     /// Earliest log time.

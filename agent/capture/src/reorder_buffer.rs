@@ -7,8 +7,8 @@
 //!
 //! The kernel reports a full socket buffer after the datagram, but the model must count it before.
 //! Records of full socket buffers therefore precede all records of the same or a later time. For a
-//! captured datagram the kernel reports only the token. The datagram's records are then passed
-//! twice, first as not delivered.
+//! captured datagram the kernel reports only the token. The model then receives each sample record
+//! of the datagram twice: first with SOCKET_FULL, then without.
 //!
 //! Records from polling shared memory also wait here: a uprobe or a socket may see samples that
 //! polling misses. A message is polled after it was sent, so a record from its sender comes first.

@@ -175,7 +175,7 @@ impl Observation {
             self.suspended_at = None;
             tracing::info!("attached again inside processes");
         }
-        // The last round must not be left out.
+        // A late round is skipped, so the observation ends only when its last round can be reported.
         let ends = !shared.is_wanted() && !shared.is_late();
         let failed = self.find(now, !ends && self.suspended_at.is_none());
         if ends {

@@ -288,7 +288,7 @@ impl ProcessTable {
             .map(|(id, _)| *id)
             .collect();
         let mut figures: Vec<_> = tables.figures().collect();
-        // Buffers need the names of publishers, and callbacks need those of buffers.
+        // A buffer is named after its publisher, and a callback after its buffer.
         figures.sort_unstable_by_key(|(handle, _)| handle.kind);
         self.drain(tables, clocks, broker);
         for (handle, figures) in &figures {

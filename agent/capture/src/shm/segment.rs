@@ -77,8 +77,8 @@ impl Buffer {
         Ok(buffer)
     }
 
-    /// Returns whether the buffer is still in the announced use: then everything read so far is
-    /// valid.
+    /// Returns whether the buffer still has the descriptor's validity id. If so, everything read so
+    /// far is valid.
     #[must_use]
     pub fn is_valid<S: Source + ?Sized>(&self, source: &S) -> bool {
         let status = source.long(self.node);

@@ -480,7 +480,7 @@ impl Session {
         };
         let settled = match self.asked {
             Some(asked) => self.missing() == 0 || now - asked >= TIMEOUT,
-            // A participant without endpoints announces the empty range 1..0.
+            // A participant without endpoints sends HEARTBEATs with firstSN 1 and lastSN 0.
             None => now - heard >= GATHER && self.missing() == 0,
         };
         if !settled {

@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn several_types_print_as_a_list_of_python() {
+    fn several_types_are_printed_as_a_python_list() {
         let topic = topic(&["a/msg/X", "b/msg/Y"]);
         let printed = info("/chatter", Some(&topic), false, Dialect::Humble).unwrap();
         assert!(

@@ -178,7 +178,8 @@ impl TopicLoss {
         }
     }
 
-    /// Records the last share of a writer that left.
+    /// Records the last share of a writer that left, if it lost more than the others that left in this
+    /// second.
     pub(crate) const fn leave(&mut self, share: LossShare) {
         if share.lost > self.departed.lost {
             self.departed = share;

@@ -2,7 +2,7 @@
 //!
 //! The age of the oldest unacknowledged sample requires the times of samples. The latest times are
 //! exact; older ones are thinned out, so a reader that hangs for an hour needs bounded memory.
-//! Writers without acknowledgements keep no state.
+//! The tracker keeps no state for writers without acknowledgements.
 
 use std::collections::VecDeque;
 

@@ -470,8 +470,8 @@ impl Delivery {
         });
     }
 
-    /// Handles a sample that arrives after it was settled as lost. It changes the counters only if
-    /// its cause was still pending.
+    /// Handles a sample that arrives after it was settled as lost. A whole sample whose loss cause is
+    /// still pending counts as recovered. Any other sample counts as a duplicate.
     fn late(
         &mut self,
         sample: &Sample,

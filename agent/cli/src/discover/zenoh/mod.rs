@@ -1,7 +1,7 @@
 //! `rp discover --router`: requests the liveliness tokens of all nodes from a Zenoh router.
 //!
-//! A session as a client exists for a few milliseconds over one TCP connection. It declares
-//! nothing and subscribes to nothing, so no node appears and other sessions receive nothing.
+//! The command opens a client session over one TCP connection for a few milliseconds. The session
+//! declares nothing and subscribes to nothing, so no node appears and other sessions receive nothing.
 
 pub mod address;
 pub mod error;

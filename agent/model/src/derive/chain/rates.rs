@@ -24,7 +24,8 @@ impl<'a> Rates<'a> {
         }
     }
 
-    /// Returns whether the rates of both topics differ by at most 5 %, or one message.
+    /// Returns whether the rates of both topics differ by at most 5 %, or one message. Returns
+    /// `false` if either topic has fewer than [`FEWEST`] messages.
     pub(super) fn are_equal(&self, one: TopicId, other: TopicId) -> bool {
         let (one, other) = (self.messages(one), self.messages(other));
         one.min(other) >= FEWEST && one.abs_diff(other) <= (one.max(other) / 20).max(1)

@@ -21,8 +21,8 @@ use crate::facts::tables::{
 
 /// Time without a message after which the messages of a stamp are evaluated.
 pub(super) const QUIET: Duration = Duration::from_secs(2);
-/// Time after which the messages of a stamp are evaluated in any case; longer chains are not
-/// recognised.
+/// Time after which the messages of a stamp are evaluated even if more may follow. Longer chains are
+/// not recognized.
 pub(super) const LONGEST: Duration = Duration::from_secs(5);
 /// Time for which later messages of an evaluated stamp are ignored.
 const REMEMBERED: Duration = Duration::from_secs(10);
