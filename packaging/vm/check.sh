@@ -116,8 +116,8 @@ echoed() {
 ticks() { awk '/^cpu / { for (n = 2; n <= 9; n++) sum += $n; print sum, $5 + $6 }' /proc/stat; }
 # A default robot of Fast DDS with six topics, small and frequent to large and rare, in one recording: in
 # the bag is what each publisher sent. `six_topics PARTS`: at rates divided by that number. An emulated
-# machine has little CPU for this robot: then the robot has priority over the agent, which must name
-# each message that is missing.
+# machine may lack the CPU for the full rates. The robot then has priority over the agent, which must
+# name each missing message. At lower rates none may be missing.
 six_topics() {
     parts=$1
     rm -rf bag6 six_*.jsonl
@@ -164,7 +164,7 @@ six_topics() {
         figure="$figure, $size B: ${in_bag:-0} of $published"
     done
     [ $absent = "$missing" ] || status=1
-    [ $absent = 0 ] || [ "$busy" -ge 85 ] || status=1
+    [ $absent = 0 ] || { [ "$parts" = 1 ] && [ "$busy" -ge 85 ]; } || status=1
     # shellcheck disable=SC2086
     kill -INT $peers 2>/dev/null
     # shellcheck disable=SC2086
@@ -351,7 +351,6 @@ if [ "$source" = host ]; then
     check "Fast DDS, shared memory, 2.7 MB, recorded" recorded large_exact 2700000 5 50 --reliable
     check "Fast DDS by default, six topics, recorded" six_topics 1
     check "Fast DDS by default, six topics at a third of the rates, recorded" six_topics 3
-    [ $absent = 0 ] || check "complete at a third of the rates" false
     check "Fast DDS, shared memory, echoed" echoed printed 64 250 5000 --reliable
     check "Fast DDS, shared memory, 700 KB, echoed" echoed large_printed 700000 5 50 --reliable
     check "the broker rests" broker_rests

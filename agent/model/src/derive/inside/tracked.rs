@@ -146,8 +146,8 @@ impl Figures {
             },
             counts: Counts {
                 count: report.published,
+                failed: 0,
                 within: report.within_process,
-                ..Counts::default()
             },
             last: clock.model_time(report.last),
             durations: [Some(report.intervals.into()), None],
@@ -167,7 +167,7 @@ impl Figures {
             counts: Counts {
                 count: report.taken,
                 failed: report.failed,
-                ..Counts::default()
+                within: 0,
             },
             last: clock.model_time(report.last),
             durations: [None, Some(report.latency.into())],
@@ -190,7 +190,6 @@ impl Figures {
                 count: report.enqueued,
                 failed: report.overwritten,
                 within: report.dequeued,
-                ..Counts::default()
             },
             last: clock.model_time(report.last),
             durations: [None, Some(report.waiting.into())],
@@ -218,7 +217,7 @@ impl Figures {
             counts: Counts {
                 count: report.calls,
                 failed: report.skipped,
-                ..Counts::default()
+                within: 0,
             },
             last: clock.model_time(report.last),
             durations: [Some(report.durations.into()), Some(report.waits.into())],
@@ -234,16 +233,10 @@ impl Figures {
     }
 
     /// Returns what the time of a callback's calls consisted of.
-    const fn states(&self) -> ThreadStates {
+    fn states(&self) -> ThreadStates {
         match &self.detail {
             Detail::Callback { states, .. } => *states,
-            Detail::Endpoint { .. } | Detail::Buffer { .. } => ThreadStates {
-                calls: 0,
-                cpu: 0,
-                throttled: 0,
-                runnable: 0,
-                blocked: 0,
-            },
+            _ => ThreadStates::default(),
         }
     }
 
