@@ -26,7 +26,7 @@ pub struct Health {
     pub version: Cow<'static, str>,
     /// Where the agent captures: `host`, `wire` or `replay`.
     pub source: Cow<'static, str>,
-    /// The replay has reached the end of its capture, and no value changes any more.
+    /// The replay has reached the end of its capture, so its values are final.
     pub finished: bool,
     /// Age of the agent's state, in seconds; null before the first packet.
     pub age_seconds: Option<f64>,

@@ -42,7 +42,7 @@ pub enum Standing {
     Ok,
     /// No watch or subscription measures the topic.
     Unwatched,
-    /// The topic has no endpoints any more.
+    /// The last endpoint of the topic has left.
     Gone,
 }
 
