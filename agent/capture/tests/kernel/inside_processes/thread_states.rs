@@ -54,20 +54,20 @@ impl Drop for Hog {
 struct Quota(PathBuf);
 
 impl Quota {
-    /// Lets the process run for a fifth of each 100 ms.
-    fn a_fifth_for(process: &Process) -> Self {
+    /// Lets the process run for a twentieth of each 100 ms.
+    fn a_twentieth_for(process: &Process) -> Self {
         let name = format!("r2p-quota-{}", process.child.id());
         let first = PathBuf::from("/sys/fs/cgroup/cpu");
         let (group, limits): (_, &[_]) = if first.join("cpu.cfs_quota_us").exists() {
             let limits = &[
                 ("cpu.cfs_period_us", "100000"),
-                ("cpu.cfs_quota_us", "20000"),
+                ("cpu.cfs_quota_us", "5000"),
             ];
             (first.join(name), limits)
         } else {
             let root = PathBuf::from("/sys/fs/cgroup");
             let _ = std::fs::write(root.join("cgroup.subtree_control"), "+cpu");
-            (root.join(name), &[("cpu.max", "20000 100000")])
+            (root.join(name), &[("cpu.max", "5000 100000")])
         };
         std::fs::create_dir(&group).unwrap();
         let quota = Self(group);
@@ -78,6 +78,19 @@ impl Quota {
         let id = process.child.id().to_string();
         std::fs::write(quota.0.join("cgroup.procs"), id).unwrap();
         quota
+    }
+
+    /// Returns how long the kernel has throttled the group.
+    fn throttled(&self) -> Duration {
+        let text = std::fs::read_to_string(self.0.join("cpu.stat")).unwrap();
+        let of = |name| {
+            let mut lines = text.lines().filter_map(|line| line.split_once(' '));
+            let value = lines.find(|(field, _)| *field == name)?.1;
+            Some(value.parse::<u64>().unwrap())
+        };
+        let nanoseconds = of("throttled_time").map(Duration::from_nanos);
+        let microseconds = || of("throttled_usec").map(Duration::from_micros);
+        nanoseconds.or_else(microseconds).unwrap()
     }
 }
 
@@ -157,10 +170,12 @@ fn a_callback_beside_a_busy_thread_is_runnable_for_as_long_as_the_kernel_counts(
 #[test]
 fn a_callback_beyond_the_quota_of_its_control_group_is_throttled() {
     let (mut robot, mut process) = started();
-    let _quota = Quota::a_fifth_for(&process);
+    let quota = Quota::a_twentieth_for(&process);
+    let before = quota.throttled();
     let (states, schedstat) = run(&mut robot, &mut process, "take 3 300000");
-    let sum: u64 = states.nanoseconds().iter().sum();
-    assert!(states.throttled > sum / 2, "{states:?}");
+    let throttled = quota.throttled() - before;
+    assert!(throttled > Duration::from_millis(100), "{states:?}");
+    assert_close(states.throttled, throttled, states);
     assert_close(states.cpu, schedstat.cpu, states);
     assert_close(
         states.runnable + states.throttled,
