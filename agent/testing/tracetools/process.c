@@ -56,6 +56,16 @@ static void pass(int64_t microseconds) {
     while (clock_now(CLOCK_MONOTONIC) < end) {}
 }
 
+/* Adds the thread's CPU time and its waiting time, in nanoseconds, with a sign. */
+static void add_schedstat(long long sums[2], int sign) {
+    long long cpu = 0, run_delay = 0;
+    FILE *file = fopen("/proc/thread-self/schedstat", "r");
+    if (!file || fscanf(file, "%lld %lld", &cpu, &run_delay) != 2) abort();
+    fclose(file);
+    sums[0] += sign * cpu;
+    sums[1] += sign * run_delay;
+}
+
 static struct rmw out_rmw, in_rmw;
 static struct impl out_impl, in_impl;
 static struct handle out = { &out_impl }, in = { &in_impl };
@@ -143,15 +153,20 @@ int main(int argc, char **argv) {
                 ros_trace_callback_end(callback);
                 printf("%ld ", (long)(published - began));
             }
-        } else if (!strcmp(what, "sleep")) {
-            /* Callbacks that sleep for `us` microseconds. */
+        } else if (!strcmp(what, "sleep") || !strcmp(what, "compute")) {
+            /* Callbacks that sleep or compute for `us` microseconds. Prints the CPU time and the
+               waiting time of all, as the kernel counts them. */
+            long long sums[2] = { 0, 0 };
             for (long i = 0; i < n; i++) {
                 ros_trace_rclcpp_executor_get_next_ready();
                 ros_trace_rclcpp_executor_execute(&in);
+                add_schedstat(sums, -1);
                 ros_trace_callback_start(callback, false);
-                usleep(us);
+                if (*what == 's') usleep(us); else pass(us);
                 ros_trace_callback_end(callback);
+                add_schedstat(sums, 1);
             }
+            printf("%lld %lld ", sums[0], sums[1]);
         } else if (!strcmp(what, "relay")) {
             /* Takes a message with the source timestamp `n`. The callback publishes after `us`
                microseconds. Prints the source timestamp of its output, and the nanoseconds. */
