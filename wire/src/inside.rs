@@ -4,6 +4,8 @@
 //! CLOCK_MONOTONIC nanoseconds unless a field says otherwise. Handles are addresses in the observed
 //! process, which are not trusted.
 
+pub mod late;
+
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
 /// Maximum number of observed processes.
@@ -192,8 +194,12 @@ pub mod accounting {
     pub const GROUP_PARENT: usize = 5;
     /// `task_group.cfs_bandwidth.throttled_time`: summed over all CPUs.
     pub const GROUP_THROTTLED: usize = 6;
+    /// `task_struct.__state`, before Linux 5.14 `state`.
+    pub const STATE: usize = 7;
+    /// `task_struct.pid`, the id of the thread.
+    pub const THREAD: usize = 8;
     /// Number of these members.
-    pub const COUNT: usize = 7;
+    pub const COUNT: usize = 9;
     /// A member that the running kernel does not have.
     pub const ABSENT: u32 = u32::MAX;
 }
@@ -273,6 +279,8 @@ pub mod announced {
     pub const BUFFER_SUBSCRIPTION: u32 = 15;
     /// A causal publication: the item is a [`Hop`](super::Hop) instead.
     pub const HOP: u32 = 16;
+    /// A late call: the item is a [`LateCall`](super::late::LateCall) instead.
+    pub const LATE: u32 = 17;
 }
 
 /// The name or a relation of a handle, sent once for each handle.
@@ -349,11 +357,15 @@ pub enum Counter {
     HopsLost,
     /// Causal publications beyond [`HOPS_PER_SECOND`], not reported.
     HopsSkipped,
+    /// Late calls beyond [`late::PER_SECOND`], not reported.
+    LateSkipped,
+    /// Late calls lost because the ring was full.
+    LateLost,
 }
 
 impl Counter {
     /// Every counter, in index order.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 10] = [
         Self::Hits,
         Self::Suspended,
         Self::ProcessesFull,
@@ -362,6 +374,8 @@ impl Counter {
         Self::AnnouncementsLost,
         Self::HopsLost,
         Self::HopsSkipped,
+        Self::LateSkipped,
+        Self::LateLost,
     ];
 
     /// Returns the label value.
@@ -376,6 +390,8 @@ impl Counter {
             Self::AnnouncementsLost => "announcements_lost",
             Self::HopsLost => "hops_lost",
             Self::HopsSkipped => "hops_skipped",
+            Self::LateSkipped => "late_skipped",
+            Self::LateLost => "late_lost",
         }
     }
 }

@@ -3,9 +3,12 @@
 use core::mem::MaybeUninit;
 
 use aya_ebpf::helpers::{bpf_get_current_task, generated::bpf_probe_read_kernel};
-use ros2probe_wire::inside::accounting::{
-    ABSENT, COUNT, GROUP, GROUP_PARENT, GROUP_THROTTLED, INVOLUNTARY_SWITCHES, RUN_DELAY, RUNTIME,
-    VOLUNTARY_SWITCHES,
+use ros2probe_wire::inside::{
+    accounting::{
+        ABSENT, COUNT, GROUP, GROUP_PARENT, GROUP_THROTTLED, INVOLUNTARY_SWITCHES, RUN_DELAY,
+        RUNTIME, VOLUNTARY_SWITCHES,
+    },
+    thread_state,
 };
 
 /// Control groups whose throttling is added up: that of the thread, and those around it.
@@ -49,6 +52,37 @@ pub fn read() -> Option<Accounting> {
     })
 }
 
+/// Returns what the running thread did in the last `duration` nanoseconds, which began with
+/// `before`, by [`thread_state`].
+///
+/// # Safety
+/// `before` is in a map value.
+#[inline(always)]
+pub unsafe fn states(
+    before: *const Accounting,
+    after: &Accounting,
+    duration: u64,
+) -> [u64; thread_state::COUNT] {
+    // SAFETY: as required of the caller.
+    let before = unsafe { &*before };
+    // Waiting is exact. The CPU time may lack a tick, and may have one from before the span.
+    // No part can be larger than what the others leave: groups are throttled on several CPUs.
+    let waited = least(after.runnable.wrapping_sub(before.runnable), duration);
+    let cpu = if after.switches == before.switches {
+        duration - waited
+    } else {
+        least(after.cpu.wrapping_sub(before.cpu), duration - waited)
+    };
+    let throttled = least(after.throttled.wrapping_sub(before.throttled), waited);
+    // In the order of `thread_state`.
+    [cpu, throttled, waited - throttled, duration - cpu - waited]
+}
+
+#[inline(always)]
+pub const fn least(one: u64, other: u64) -> u64 {
+    if one < other { one } else { other }
+}
+
 /// Returns how long the quotas of the thread's control groups have stopped them.
 #[inline(always)]
 fn throttled(task: u64) -> u64 {
@@ -70,7 +104,7 @@ fn throttled(task: u64) -> u64 {
 }
 
 #[inline(always)]
-fn offset(of: usize) -> u32 {
+pub fn offset(of: usize) -> u32 {
     // SAFETY: an index below the array's length.
     let offset = unsafe { (&raw const ACCOUNTING).cast::<u32>().add(of) };
     // SAFETY: a constant of the loaded object, never written while the program runs.
@@ -79,7 +113,7 @@ fn offset(of: usize) -> u32 {
 
 /// Reads a member of the structure at `address`.
 #[inline(always)]
-fn word(address: u64, of: usize) -> Option<u64> {
+pub fn word(address: u64, of: usize) -> Option<u64> {
     let mut value = MaybeUninit::<u64>::zeroed();
     let address = address.wrapping_add(u64::from(offset(of)));
     // SAFETY: the destination has the size given; the kernel checks the address.

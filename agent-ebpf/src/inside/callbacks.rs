@@ -3,12 +3,13 @@
 use core::ptr::{read_volatile, write_volatile};
 
 use ros2probe_wire::inside::{
-    Counter, Figures, HOPS_PER_SECOND, Handle, Hop, announced, distribution, kind, thread_state,
+    Counter, Figures, HOPS_PER_SECOND, Handle, Hop, announced, distribution, kind,
 };
 
 use crate::{
-    accounting::{self, Accounting},
+    accounting,
     instructions::add,
+    late,
     maps::{ANNOUNCEMENTS, Current, Thread, calendar, count, now, observe, read, steady},
 };
 
@@ -74,78 +75,84 @@ pub fn started(callback: u64, within: bool) {
         (*thread).started = now;
         (*figures).thread = current.thread;
         (*thread).is_accounted = 0;
-        if let Some(accounting) = accounting::read() {
+        let accounting = accounting::read();
+        if let Some(accounting) = accounting {
             (*thread).is_accounted = 1;
             (*thread).accounting = accounting;
         }
         let input = (*thread).input;
+        let mut delay = 0;
         if within {
             add(&raw mut (*figures).within, 1);
             if input.kind == kind::BUFFER {
                 (*figures).trigger = input;
                 let entered = (*thread).entered;
                 if entered != 0 && now > entered {
-                    observe(figures, distribution::DELAY, now - entered);
+                    delay = now - entered;
+                    observe(figures, distribution::DELAY, delay);
                 }
             } else {
                 (*figures).trigger = current.handle(0, kind::BUFFER);
             }
         } else if input.kind == kind::SUBSCRIPTION {
             (*figures).trigger = input;
-            waited_since_source(&current, figures, thread, now);
+            delay = waited_since_source(&current, figures, thread, now);
         } else if (*thread).executed != 0 {
             (*figures).trigger = current.handle((*thread).executed, kind::TIMER);
-            waited_since_due(&current, figures, (*thread).executed, now);
+            delay = waited_since_due(&current, figures, (*thread).executed, now);
         } else {
             (*figures).trigger = current.handle(0, 0);
         }
+        late::began(&current, delay, now, accounting);
     }
 }
 
 /// Adds the time since the message's source timestamp, less the minimum delay of the subscription's
-/// takes.
+/// takes. Returns that time; 0 if it is unknown.
 #[inline(always)]
 unsafe fn waited_since_source(
     current: &Current,
     figures: *mut Figures,
     thread: *const Thread,
     now: u64,
-) {
+) -> u64 {
     // SAFETY: map values, by the caller.
     unsafe {
         let source = (*thread).source_timestamp;
         let calendar = calendar(now);
         if source == 0 || calendar <= source {
-            return;
+            return 0;
         }
         let input = (*thread).input;
         let Some(subscription) = current.known_figures(input.address, kind::SUBSCRIPTION) else {
-            return;
+            return 0;
         };
         let minima = (&raw const (*subscription).minima).cast::<u64>();
         let least = read_volatile(minima.add(distribution::DELAY));
         let delay = calendar - source;
-        if least != 0 && delay >= least - 1 {
-            observe(figures, distribution::DELAY, delay - (least - 1));
+        if least == 0 || delay < least - 1 {
+            return 0;
         }
+        observe(figures, distribution::DELAY, delay - (least - 1));
+        delay - (least - 1)
     }
 }
 
 /// Adds the time since the timer was due. The timer's structure already has the time of the next
-/// call.
+/// call. Returns that time; 0 if it is unknown.
 #[inline(always)]
-unsafe fn waited_since_due(current: &Current, figures: *mut Figures, timer: u64, now: u64) {
+unsafe fn waited_since_due(current: &Current, figures: *mut Figures, timer: u64, now: u64) -> u64 {
     let structure = read::<u64>(timer);
     let place = match current.timer_period_at() {
         0 => find_period(structure, now),
         place => place,
     };
     if place == 0 {
-        return;
+        return 0;
     }
     let [period, last, next] = read::<[u64; 3]>(structure + u64::from(place));
     if !is_schedule(period, last, next, now) {
-        return;
+        return 0;
     }
     current.found_timer_period(place);
     // SAFETY: a map value, by the caller.
@@ -164,9 +171,11 @@ unsafe fn waited_since_due(current: &Current, figures: *mut Figures, timer: u64,
             add(&raw mut (*figures).failed, skipped);
         }
         let clock = clock_of(last, now);
-        if clock > due {
-            observe(figures, distribution::DELAY, clock - due);
+        if clock <= due {
+            return 0;
         }
+        observe(figures, distribution::DELAY, clock - due);
+        clock - due
     }
 }
 
@@ -231,45 +240,29 @@ pub fn ended(callback: u64) {
         if (*thread).callback == callback && now > (*thread).started {
             let duration = now - (*thread).started;
             observe(figures, distribution::INTERVAL, duration);
-            if (*thread).is_accounted != 0 {
-                account(figures, &(*thread).accounting, duration);
+            let after = accounting::read();
+            let mut known = None;
+            if let Some(after) = &after
+                && (*thread).is_accounted != 0
+            {
+                let before = &raw const (*thread).accounting;
+                let states = accounting::states(before, after, duration);
+                let sums = (&raw mut (*figures).states).cast::<u64>();
+                let mut state = 0;
+                while state < states.len() {
+                    add(sums.add(state), states[state]);
+                    state += 1;
+                }
+                add(&raw mut (*figures).states_known, 1);
+                known = Some(states);
             }
+            let trigger = (*figures).trigger;
+            late::ended(&current, callback, trigger, thread, now, after, known);
         }
         (*thread).callback = 0;
         (*thread).executed = 0;
         (*thread).input = current.handle(0, 0);
     }
-}
-
-/// Adds what a callback's thread did since `before`.
-#[inline(always)]
-unsafe fn account(figures: *mut Figures, before: &Accounting, duration: u64) {
-    let Some(after) = accounting::read() else {
-        return;
-    };
-    // Waiting is exact. The CPU time may lack a tick, and may have one from before the callback.
-    // No part can be larger than what the others leave: groups are throttled on several CPUs.
-    let waited = least(after.runnable.wrapping_sub(before.runnable), duration);
-    let cpu = if after.switches == before.switches {
-        duration - waited
-    } else {
-        least(after.cpu.wrapping_sub(before.cpu), duration - waited)
-    };
-    let throttled = least(after.throttled.wrapping_sub(before.throttled), waited);
-    // SAFETY: map values, by the caller, and indices within the array.
-    unsafe {
-        let states = (&raw mut (*figures).states).cast::<u64>();
-        add(states.add(thread_state::CPU), cpu);
-        add(states.add(thread_state::THROTTLED), throttled);
-        add(states.add(thread_state::RUNNABLE), waited - throttled);
-        add(states.add(thread_state::BLOCKED), duration - cpu - waited);
-        add(&raw mut (*figures).states_known, 1);
-    }
-}
-
-#[inline(always)]
-const fn least(one: u64, other: u64) -> u64 {
-    if one < other { one } else { other }
 }
 
 /// Reports a publication during a callback that handles a message.

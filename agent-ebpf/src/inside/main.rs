@@ -15,20 +15,22 @@ mod accounting;
 mod callbacks;
 #[path = "../instructions.rs"]
 mod instructions;
+mod late;
 mod maps;
 mod messages;
 mod names;
 #[path = "../registers.rs"]
 mod registers;
+mod scheduler;
 #[path = "../settings.rs"]
 mod settings;
 
 use aya_ebpf::{
     EbpfContext as _,
     helpers::generated::bpf_get_attach_cookie,
-    macros::{map, uprobe},
+    macros::{map, raw_tracepoint, uprobe},
     maps::ProgramArray,
-    programs::ProbeContext,
+    programs::{ProbeContext, RawTracePointContext},
 };
 use ros2probe_wire::inside::announced;
 
@@ -85,6 +87,20 @@ pub fn called(context: ProbeContext) -> u32 {
     let cookie = unsafe { bpf_get_attach_cookie(context.as_ptr()) };
     // SAFETY: programs of the same type, which user space has set.
     unsafe { CALLS.tail_call(&context, cookie as u32) };
+    0
+}
+
+/// Runs whenever a CPU changes from one thread to another.
+#[raw_tracepoint]
+pub fn sched_switch(context: RawTracePointContext) -> u32 {
+    scheduler::switched(&context);
+    0
+}
+
+/// Runs whenever a thread is woken.
+#[raw_tracepoint]
+pub fn sched_waking(context: RawTracePointContext) -> u32 {
+    scheduler::woken(&context);
     0
 }
 

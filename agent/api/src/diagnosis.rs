@@ -92,6 +92,27 @@ pub enum Diagnosis<'a> {
         /// 99th percentile of the callback's wait when the problem appeared.
         wait_seconds: f64,
     },
+    /// Calls of a callback are late, at least three in a minute for the same cause.
+    LateCallback {
+        /// Node of the callback; null when unknown.
+        node: Option<Cow<'a, str>>,
+        /// Id of the process.
+        process_id: u32,
+        /// Trigger of the callback.
+        trigger: Trigger<'a>,
+        /// Late calls in a minute for this cause, when the problem appeared.
+        late_calls: u64,
+        /// Stage in which they became late: `wait` or `callback`.
+        stage: Cow<'a, str>,
+        /// What made them late, as in the answer of `/why`.
+        cause: Cow<'a, str>,
+        /// Name of the thread that ran instead or released the lock; null without one.
+        by: Option<Cow<'a, str>>,
+        /// The cause in words.
+        words: Cow<'a, str>,
+        /// Time from ready to the end of the longest of the last of these calls.
+        longest_seconds: f64,
+    },
     /// Messages within a process are overwritten before the subscription takes them.
     IntraProcessOverflow {
         /// Node of the subscription; null when unknown.
@@ -154,6 +175,7 @@ impl Diagnosis<'_> {
             Self::NodeInSeveralDomains { .. } => "node_in_several_domains",
             Self::SlowCallback { .. } => "slow_callback",
             Self::ExecutorWait { .. } => "executor_wait",
+            Self::LateCallback { .. } => "late_callback",
             Self::IntraProcessOverflow { .. } => "intra_process_overflow",
             Self::ReaderQueueOverflow { .. } => "reader_queue_overflow",
             Self::ObservationSuspended { .. } => "observation_suspended",

@@ -42,6 +42,7 @@ pub mod services;
 pub mod snapshots;
 pub mod topics;
 pub mod watches;
+pub mod why;
 
 pub use open::Open;
 

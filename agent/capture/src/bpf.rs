@@ -12,6 +12,7 @@ use ros2probe_attach::kernel::TRACE_UPROBE_MULTI;
 const MAP_LOOKUP_ELEM: c_int = 1;
 const MAP_UPDATE_ELEM: c_int = 2;
 const PROG_LOAD: c_int = 5;
+const RAW_TRACEPOINT_OPEN: c_int = 17;
 const BTF_LOAD: c_int = 18;
 const LINK_CREATE: c_int = 28;
 const ITER_CREATE: c_int = 33;
@@ -144,6 +145,16 @@ pub(crate) fn set_program(
 pub(crate) fn create_link(program: u32, target: u32, attach_type: u32) -> io::Result<OwnedFd> {
     // SAFETY: the attributes contain no pointer.
     unsafe { descriptor(LINK_CREATE, &[program, target, attach_type, 0]) }
+}
+
+/// Runs a program at a tracepoint, such as `sched_switch`. Closing the descriptor ends it.
+///
+/// # Errors
+/// Fails if the kernel has no such tracepoint, or refuses.
+pub(crate) fn open_tracepoint(name: &CStr, program: BorrowedFd<'_>) -> io::Result<OwnedFd> {
+    let attributes = [address(name.as_ptr()), u64::from(number(program))];
+    // SAFETY: the name outlives the call.
+    unsafe { descriptor(RAW_TRACEPOINT_OPEN, &attributes) }
 }
 
 /// Starts one run of a linked iterator.

@@ -33,6 +33,7 @@ use super::uprobe::Uprobe;
 use super::uprobe::search::Facts as UprobeFacts;
 use super::wire_tap::{self, WireTap, WireTapError};
 use super::zenoh::Streams;
+use crate::inside::late::LateDemand;
 use crate::inside::{Facts as InsideFacts, Inside};
 use crate::reassembly::Limits;
 use crate::settings::{CaptureSettings, ShmMode};
@@ -277,6 +278,13 @@ impl LiveSource {
     /// Sets whether a client needs calls inside processes, if they are observed on demand.
     pub fn want_inside(&self, wanted: bool) {
         self.inside.iter().for_each(|inside| inside.want(wanted));
+    }
+
+    /// Sets which calls clients regard as late, and whether one asks for their causes.
+    pub fn want_late(&self, demand: &LateDemand) {
+        self.inside
+            .iter()
+            .for_each(|inside| inside.want_late(demand));
     }
 
     /// Returns why processes are not observed from inside although that is configured.

@@ -28,6 +28,8 @@ pub struct CaptureSettings {
     pub shm: ShmSettings,
     /// Observation inside processes.
     pub inside: InsideChoice,
+    /// Causes of late callbacks.
+    pub late: LateChoice,
     /// Socket of the process that attaches breakpoints, if one listens there.
     pub broker: PathBuf,
     /// TCP ports of Zenoh, at most [`ros2probe_wire::filter::PORT_CAPACITY`].
@@ -46,6 +48,20 @@ pub enum InsideChoice {
     Full,
     /// Like `full`, but calls are observed only while a client needs them; otherwise only the
     /// creation of nodes, publishers, subscriptions, timers and services.
+    #[default]
+    Auto,
+}
+
+/// Whether the scheduler's events are observed, which name the causes of late callbacks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum LateChoice {
+    /// Late calls are not reported.
+    Off,
+    /// While calls are observed.
+    On,
+    /// While a client asks for causes. At other times, late calls are reported with the sums of the
+    /// scheduler's accounting.
     #[default]
     Auto,
 }

@@ -3,7 +3,7 @@
 use ros2probe_model::facts::bounded::CONFIGURED;
 use ros2probe_model::facts::bounded::Rule::Oldest;
 use ros2probe_wire::filter::UNKNOWN_CAPACITY;
-use ros2probe_wire::inside::HANDLE_CAPACITY;
+use ros2probe_wire::inside::{HANDLE_CAPACITY, late};
 
 ros2probe_model::tables! {
     /// Datagrams with missing IP fragments
@@ -130,6 +130,12 @@ ros2probe_model::tables! {
     InsideBuffers { name: "inside.buffers", entries: HANDLE_CAPACITY as usize, effect: "all are reported again" }
     /// Causal publications until the next report
     CausalHops { name: "inside.hops", entries: 16_384, effect: "further ones are in no chain" }
+    /// Callbacks whose usual durations are learnt
+    CallbackBounds {
+        name: "inside.bounds", entries: late::BOUND_CAPACITY as usize, effect: "further ones are never late",
+    }
+    /// Late calls until the next report
+    LateCalls { name: "inside.late", entries: 1024 }
     /// Changes of managed nodes' states until the next report
     Transitions { name: "inside.transitions", entries: 1024 }
     /// Reports of observed processes that wait for the model. Figures are cumulative

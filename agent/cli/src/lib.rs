@@ -26,3 +26,4 @@ pub mod learn;
 pub mod ros2;
 pub mod tables;
 pub mod top;
+pub mod why;

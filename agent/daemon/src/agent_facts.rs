@@ -102,6 +102,10 @@ pub struct InsideSourceFacts {
     pub libraries: Vec<InsideLibrary>,
     /// Counters of the kernel programs, all of them in a fixed order.
     pub counters: Vec<(&'static str, u64)>,
+    /// What is observed about late calls: `off`, `sums` or `events`.
+    pub late: &'static str,
+    /// Why the scheduler's events are not observed although they are needed.
+    pub without_events: Option<String>,
     /// Why nothing is observed although the source is switched on. `None` if it works.
     pub reason_off: Option<String>,
 }

@@ -1,11 +1,12 @@
 //! Latest snapshot, published by the capture thread and read by surfaces.
 //!
-//! Readers and the writer never wait for each other. A reader may request a newer state and wait
+//! Readers and the writer never wait for each other, except for the copy of a few questions about
+//! late calls. A reader may request a newer state and wait
 //! for it within its timeout.
 
 use std::os::fd::BorrowedFd;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
-use std::sync::{Arc, LazyLock};
+use std::sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use arc_swap::{ArcSwap, ArcSwapOption};
@@ -13,6 +14,7 @@ use tokio::sync::Notify;
 
 use super::agent_facts::{AgentFacts, SourceKind};
 use ros2probe_capture::bell::Bell;
+use ros2probe_capture::inside::late::{LateDemand, RequestedBound};
 use ros2probe_model::measure::history::Past;
 use ros2probe_model::report::snapshot::Snapshot;
 
@@ -23,6 +25,8 @@ const PAST_SECONDS: u8 = 5;
 
 /// Time for which calls inside processes are observed after the last request for them.
 const CALLS_HELD: Duration = Duration::from_secs(10);
+/// Maximum number of topics and nodes about whose late calls clients ask at once.
+const MAX_LATE_QUESTIONS: usize = 16;
 
 /// The latest state and the last seconds.
 #[derive(Debug)]
@@ -37,8 +41,19 @@ pub struct SnapshotCell {
     read: AtomicBool,
     /// Time at which a client last needed calls inside processes.
     calls_wanted: ArcSwapOption<Instant>,
+    /// Causes of late calls for which clients asked lately.
+    late_wanted: Mutex<Vec<LateQuestion>>,
     bell: Arc<CaptureBell>,
     publication: Notify,
+}
+
+/// A client's question for the causes of late calls.
+#[derive(Clone, Debug)]
+struct LateQuestion {
+    at: Instant,
+    /// Topic or node; `None` = all.
+    name: Option<Arc<str>>,
+    above: Option<Duration>,
 }
 
 /// Wakes the capture thread from its wait for packets. Without a socket pair, readers wait until
@@ -98,6 +113,7 @@ impl SnapshotCell {
             asked: AtomicBool::new(false),
             read: AtomicBool::new(false),
             calls_wanted: ArcSwapOption::empty(),
+            late_wanted: Mutex::default(),
             bell: Arc::new(CaptureBell::new()),
             publication: Notify::new(),
         }
@@ -143,6 +159,46 @@ impl SnapshotCell {
             .as_deref()
             .map(|at| now.saturating_duration_since(*at));
         age.is_some_and(|age| age <= CALLS_HELD)
+    }
+
+    /// Notes that a client asks for the causes of late calls. With `above`, calls of callbacks of
+    /// this topic or node, or of all, are late if they take longer.
+    pub fn want_late(&self, name: Option<&str>, above: Option<Duration>) {
+        self.want_calls();
+        let mut questions = self.late_questions();
+        questions.retain(|question| question.at.elapsed() <= CALLS_HELD);
+        let is_same = |question: &LateQuestion| question.name.as_deref() == name;
+        let question = LateQuestion {
+            at: Instant::now(),
+            name: name.map(Arc::from),
+            above,
+        };
+        questions.retain(|known| !is_same(known));
+        if questions.len() < MAX_LATE_QUESTIONS {
+            questions.push(question);
+        }
+    }
+
+    /// Returns what clients asked lately about late calls.
+    #[must_use]
+    pub fn late_demand(&self, now: Instant) -> LateDemand {
+        let mut questions = self.late_questions();
+        questions.retain(|question| now.saturating_duration_since(question.at) <= CALLS_HELD);
+        let bounds = questions.iter().filter_map(|question| {
+            Some(RequestedBound {
+                name: question.name.clone(),
+                above: question.above?,
+            })
+        });
+        LateDemand {
+            has_question: !questions.is_empty(),
+            bounds: bounds.collect(),
+        }
+    }
+
+    fn late_questions(&self) -> MutexGuard<'_, Vec<LateQuestion>> {
+        let questions = self.late_wanted.lock();
+        questions.unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Counts one second, and returns whether the last seconds were read lately.
@@ -418,6 +474,34 @@ mod tests {
         let rings = cell.bell().descriptor().unwrap();
         assert_eq!(wait(&[rings], Duration::ZERO).unwrap(), Some(0));
         assert!(after(0) && after(9) && !after(11));
+    }
+
+    #[test]
+    fn late_calls_are_wanted_until_ten_seconds_after_the_last_question() {
+        let cell = SnapshotCell::new(SourceKind::Host);
+        let after = |seconds| cell.late_demand(Instant::now() + Duration::from_secs(seconds));
+        assert_eq!(after(0), LateDemand::default());
+        let above = |milliseconds| Some(Duration::from_millis(milliseconds));
+        cell.want_late(Some("/scan"), above(5));
+        cell.want_late(Some("/scan"), above(7));
+        for _ in 0..100 {
+            cell.want_late(None, None);
+        }
+        let demand = after(9);
+        assert!(demand.has_question);
+        assert_eq!(demand.bounds.len(), 1);
+        assert_eq!(Some(demand.bounds[0].above), above(7));
+        assert_eq!(after(11), LateDemand::default());
+    }
+
+    #[test]
+    fn questions_about_many_names_are_bounded() {
+        let cell = SnapshotCell::new(SourceKind::Host);
+        for number in 0..1000 {
+            cell.want_late(Some(&format!("/topic_{number}")), Some(Duration::ZERO));
+        }
+        let bounds = cell.late_demand(Instant::now()).bounds;
+        assert_eq!(bounds.len(), MAX_LATE_QUESTIONS);
     }
 
     #[tokio::test]

@@ -1,11 +1,15 @@
 /* A program that calls libtracetools.so in the order of rclcpp (Iron), by commands on standard
  * input. It prints a line after each command. -DPLACE=240 or 248: offset of rmw_handle. */
+#define _GNU_SOURCE
+#include <fcntl.h>
+#include <pthread.h>
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/mman.h>
 #include <sys/wait.h>
 #include <time.h>
 #include <unistd.h>
@@ -75,6 +79,53 @@ static char node, object, machine, owner;
 static char callback[8], buffer[8], timer_callback, message;
 static uint64_t capacity = 4, filled, writes, reads;
 
+/* A thread that holds the lock for `us` microseconds of each period, and rests for as long. */
+static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
+static void *hold_lock(void *us) {
+    pthread_setname_np(pthread_self(), "lock-holder");
+    for (;;) {
+        pthread_mutex_lock(&lock);
+        usleep((long)us);
+        pthread_mutex_unlock(&lock);
+        usleep((long)us);
+    }
+    return 0;
+}
+
+/* Writes `us` KiB and waits for the disk. */
+static void write_to_disk(const char *path, long kilobytes) {
+    static char block[1024];
+    int file = open(path, O_CREAT | O_WRONLY | O_TRUNC, 0600);
+    for (long i = 0; i < kilobytes; i++) if (write(file, block, sizeof block) < 0) abort();
+    if (fsync(file)) abort();
+    close(file);
+}
+
+/* Reads a file that is not in memory, page by page. */
+static void read_from_disk(const char *path) {
+    int file = open(path, O_RDONLY);
+    off_t size = lseek(file, 0, SEEK_END);
+    if (posix_fadvise(file, 0, 0, POSIX_FADV_DONTNEED)) abort();
+    char *pages = mmap(0, size, PROT_READ, MAP_SHARED, file, 0);
+    if (madvise(pages, size, MADV_RANDOM)) abort();
+    volatile char sum = 0;
+    for (off_t at = 0; at < size; at += 4096) sum += pages[at];
+    munmap(pages, size);
+    close(file);
+}
+
+/* Does one of the things for which a callback can be late. */
+static void be_late(const char *what, long us, const char *path) {
+    if (!strcmp(what, "sleep")) usleep(us);
+    else if (!strcmp(what, "compute")) pass(us);
+    else if (!strcmp(what, "lock")) {
+        while (!pthread_mutex_trylock(&lock)) { pthread_mutex_unlock(&lock); usleep(100); }
+        pthread_mutex_lock(&lock);
+        pthread_mutex_unlock(&lock);
+    } else if (!strcmp(what, "disk")) write_to_disk(path, us);
+    else if (!strcmp(what, "fault")) read_from_disk(path);
+}
+
 /* Puts one message into the ring buffer, as rclcpp's RingBufferImplementation does. */
 static void enqueue(void) {
 #ifndef HUMBLE
@@ -94,7 +145,7 @@ static bool dequeue(void) {
 }
 
 int main(int argc, char **argv) {
-    char line[256], what[64];
+    char line[4096], what[64], path[3072];
     const char *input = argc > 1 ? argv[1] : "/in", *output = argc > 2 ? argv[2] : "/out";
     const char *name = argc > 3 ? argv[3] : "filter";
     out_rmw = made_rmw(output);
@@ -104,7 +155,8 @@ int main(int argc, char **argv) {
     memset(out_impl.before, 0x5a, sizeof out_impl.before);
     while (fgets(line, sizeof line, stdin)) {
         long n = 0, us = 0;
-        if (sscanf(line, "%63s %ld %ld", what, &n, &us) < 1) continue;
+        path[0] = 0;
+        if (sscanf(line, "%63s %ld %ld %3071s", what, &n, &us, path) < 1) continue;
         if (!strcmp(what, "init")) {
             ros_trace_rcl_node_init(&node, 0, name, "/robot1");
             ros_trace_rcl_publisher_init(&out, &node, &out_rmw, output, 10);
@@ -153,16 +205,21 @@ int main(int argc, char **argv) {
                 ros_trace_callback_end(callback);
                 printf("%ld ", (long)(published - began));
             }
-        } else if (!strcmp(what, "sleep") || !strcmp(what, "compute")) {
-            /* Callbacks that sleep or compute for `us` microseconds. Prints the CPU time and the
-               waiting time of all, as the kernel counts them. */
+        } else if (strstr("sleep compute lock disk fault", what)) {
+            /* Callbacks that need time for one of these, `us` microseconds or KiB. Prints the CPU
+               time and the waiting time of all, as the kernel counts them. */
+            static bool has_holder;
+            if (!strcmp(what, "lock") && !has_holder) {
+                pthread_t holder;
+                has_holder = !pthread_create(&holder, 0, hold_lock, (void *)us);
+            }
             long long sums[2] = { 0, 0 };
             for (long i = 0; i < n; i++) {
                 ros_trace_rclcpp_executor_get_next_ready();
                 ros_trace_rclcpp_executor_execute(&in);
                 add_schedstat(sums, -1);
                 ros_trace_callback_start(callback, false);
-                if (*what == 's') usleep(us); else pass(us);
+                be_late(what, us, path);
                 ros_trace_callback_end(callback);
                 add_schedstat(sums, 1);
             }

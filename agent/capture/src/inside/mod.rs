@@ -8,6 +8,7 @@
 //! the model. Apart from the breakpoints, it changes nothing in the processes, and it never waits
 //! for them.
 
+pub mod late;
 pub mod names;
 mod observation;
 pub mod process;
@@ -23,13 +24,14 @@ use std::time::{Duration, Instant};
 use ros2probe_attach::client::Broker;
 use ros2probe_model::facts::bounded::Bounded;
 
+use self::late::{LateDemand, LateObservation};
 use self::observation::Probes;
 use self::programs::Tables;
 use self::table::Round;
 use crate::bell::Bell;
 use crate::breakpoints::Means;
 use crate::filter::FilterError;
-use crate::settings::InsideChoice;
+use crate::settings::{InsideChoice, LateChoice};
 use crate::shm::directories::Scope;
 use crate::system::Clocks;
 use crate::tables::WaitingRounds;
@@ -64,6 +66,10 @@ pub struct Facts {
     pub is_resting: bool,
     /// Whether calls have been observed for long enough to show rates.
     pub shows_rates: bool,
+    /// What is observed about late calls: `off`, `sums` or `events`.
+    pub late: &'static str,
+    /// Why the scheduler's events are not observed although they are needed.
+    pub without_events: Option<String>,
     /// Counters of the programs.
     pub counters: Vec<(&'static str, u64)>,
 }
@@ -73,6 +79,8 @@ struct Shared {
     facts: Mutex<Facts>,
     /// Whether a client needs calls, if they are observed on demand.
     wanted: AtomicBool,
+    /// What clients want to know about late calls.
+    late: Mutex<LateDemand>,
     /// Rings when `wanted` changes. Without the bell, the thread notices a change within a second.
     bell: Option<Bell>,
     progress: Arc<Progress>,
@@ -84,6 +92,7 @@ struct Work {
     tables: Tables,
     scope: Scope,
     has_callbacks: bool,
+    late: LateObservation,
     broker: Broker,
 }
 
@@ -94,7 +103,7 @@ impl Inside {
     /// # Errors
     /// Fails if a capability is missing, or if the kernel has no uprobes.
     pub fn open(
-        choice: InsideChoice,
+        (choice, late): (InsideChoice, LateChoice),
         cgroup: Option<&Path>,
         broker: &Path,
     ) -> Result<Self, UprobeError> {
@@ -110,6 +119,8 @@ impl Inside {
         let _ = tables.set_clocks(&Clocks::read());
         let progress = Arc::new(Progress::default());
         let is_on_demand = choice == InsideChoice::Auto;
+        let programs = Arc::new(programs);
+        let late = LateObservation::new(Arc::clone(&programs), late);
         let mut probes = Probes::new(programs, is_on_demand, &progress);
         // A node announces its publishers only once, so the probes are attached to installed
         // libraries in advance.
@@ -129,6 +140,7 @@ impl Inside {
                 rounds: Mutex::default(),
                 facts: Mutex::new(facts),
                 wanted: AtomicBool::new(!is_on_demand),
+                late: Mutex::default(),
                 bell: Bell::new().ok(),
                 progress,
                 stop: AtomicBool::new(false),
@@ -138,6 +150,7 @@ impl Inside {
                 tables,
                 scope,
                 has_callbacks,
+                late,
                 broker,
             }),
         })
@@ -171,6 +184,18 @@ impl Inside {
         let is_on_demand = shared.facts().is_on_demand;
         if is_on_demand && shared.wanted.swap(wanted, Ordering::AcqRel) != wanted {
             shared.bell.iter().for_each(Bell::ring);
+        }
+    }
+
+    /// Sets what clients want to know about late calls.
+    pub fn want_late(&self, demand: &LateDemand) {
+        let mut known = self.shared.late();
+        if *known != *demand {
+            let is_first = demand.has_question && !known.has_question;
+            known.clone_from(demand);
+            if is_first {
+                self.shared.bell.iter().for_each(Bell::ring);
+            }
         }
     }
 
@@ -213,6 +238,10 @@ impl Shared {
         rounds.push(round);
     }
 
+    fn late(&self) -> MutexGuard<'_, LateDemand> {
+        self.late.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     fn facts(&self) -> MutexGuard<'_, Facts> {
         self.facts.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -235,6 +264,7 @@ mod tests {
             facts: Mutex::default(),
             progress: Arc::default(),
             wanted: AtomicBool::new(true),
+            late: Mutex::default(),
             bell: None,
             stop: AtomicBool::new(false),
         };

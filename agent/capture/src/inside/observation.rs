@@ -9,6 +9,7 @@ use ros2probe_attach::client::{Broker, BrokerError};
 use ros2probe_attach::functions::{Calls, Library};
 use ros2probe_wire::inside::{Counter, PROCESS_CAPACITY};
 
+use super::late::LateObservation;
 use super::programs::{Attached, Programs, Tables};
 use super::table::ProcessTable;
 use super::{Facts, MAX_HITS, Shared, Work};
@@ -45,8 +46,11 @@ pub(super) struct Probes {
 
 impl Probes {
     /// Creates probes that are attached to no library.
-    pub(super) fn new(programs: Programs, is_on_demand: bool, progress: &Arc<Progress>) -> Self {
-        let programs = Arc::new(programs);
+    pub(super) fn new(
+        programs: Arc<Programs>,
+        is_on_demand: bool,
+        progress: &Arc<Progress>,
+    ) -> Self {
         let at = |meaning, part| {
             let (programs, progress) = (Arc::clone(&programs), Arc::clone(progress));
             Attachments::new(
@@ -127,6 +131,7 @@ struct Observation {
     probes: Probes,
     tables: Tables,
     has_callbacks: bool,
+    late: LateObservation,
     broker: Broker,
     processes: Processes,
     table: ProcessTable,
@@ -150,6 +155,7 @@ impl Observation {
             probes: work.probes,
             tables: work.tables,
             has_callbacks: work.has_callbacks,
+            late: work.late,
             broker: work.broker,
             processes: Processes::new(work.scope, Library::Tracing),
             table: ProcessTable::new(work.has_callbacks),
@@ -181,6 +187,8 @@ impl Observation {
         if ends {
             self.probes.detach();
         }
+        let demand = shared.late().clone();
+        (self.late).follow(!ends && self.has_callbacks, &demand, &mut self.tables);
         let clocks = self.set_clocks();
         if !shared.is_late() {
             self.round(shared, &clocks, ends);
@@ -220,6 +228,7 @@ impl Observation {
         let (tables, broker) = (&mut self.tables, &mut self.broker);
         let is_showing = |process| showing.contains(&process);
         let mut round = (self.table).round(tables, clocks, elapsed, broker, is_showing);
+        self.late.set_bounds(&self.table, &mut self.tables);
         round.is_last = is_last;
         let hits = round.hits;
         shared.put(round);
@@ -380,6 +389,8 @@ impl Observation {
             detached,
             is_resting: self.is_resting,
             shows_rates: self.rounds >= ROUNDS_OF_RATES,
+            late: self.late.observed(),
+            without_events: self.late.without_events().map(str::to_owned),
             counters: labels.zip(values).collect(),
         });
     }

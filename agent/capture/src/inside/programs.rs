@@ -4,19 +4,25 @@
 //! as long as its descriptor: the kernel removes the breakpoint when this process ends, however it
 //! ends.
 
+use std::ffi::CStr;
 use std::fs::File;
-use std::os::fd::{AsFd as _, BorrowedFd};
+use std::io;
+use std::os::fd::{AsFd as _, BorrowedFd, OwnedFd};
 
 use aya::maps::{Array, HashMap, MapData, MapError, PerCpuArray, RingBuf};
-use aya::{EbpfLoader, Pod};
+use aya::programs::{ProgramError, RawTracePoint};
+use aya::{Ebpf, EbpfLoader, Pod};
 use ros2probe_attach::attach::AttachError;
 use ros2probe_attach::client::Broker;
 use ros2probe_attach::functions::{Calls, ENQUEUE};
 use ros2probe_attach::request::Place;
+use ros2probe_wire::inside::late::{self, Activity, Blocked, Bound};
 use ros2probe_wire::inside::{Counter, Figures, Handle, Process, accounting, clock};
 use zerocopy::FromZeros as _;
 
+use crate::bpf;
 use crate::breakpoints::{self, Breakpoints, Dispatcher, Means};
+use crate::error_chain::in_words;
 use crate::filter::{Aligned, FilterError, absent_is_fine, failed, take};
 use crate::kernel_types::KernelTypes;
 use crate::system::{Clocks, raw_difference};
@@ -35,10 +41,23 @@ type HandleWords = [u64; size_of::<Handle>() / 8];
 /// Words of `Thread` and `Entry` in the kernel programs.
 type ThreadWords = [u64; 14];
 type EntryWords = [u64; 2];
+type BoundWords = [u64; size_of::<Bound>() / 8];
+/// Words of `Followed` in the kernel programs.
+type FollowedWords = [u64; 5 + FOLLOWED_STATES + 15];
+const FOLLOWED_STATES: usize = (size_of::<Blocked>() + 2 * size_of::<Activity>()) / 8;
+/// Tracepoints of the scheduler. The programs have the same names.
+const EVENTS: [&CStr; 2] = [c"sched_switch", c"sched_waking"];
 const _: () = assert!(size_of::<Figures>().is_multiple_of(8));
 
 /// The loaded programs.
-pub struct Programs(Breakpoints);
+pub struct Programs {
+    breakpoints: Breakpoints,
+    /// Programs at the scheduler's [`EVENTS`].
+    scheduler: Result<[OwnedFd; 2], NoEvents>,
+}
+
+/// Programs that run at the events of the scheduler. They end with the value.
+pub struct Events(#[expect(dead_code, reason = "the drop matters")] [OwnedFd; 2]);
 
 /// Tables of the programs.
 pub struct Tables {
@@ -51,6 +70,12 @@ pub struct Tables {
     threads: HashMap<MapData, u32, ThreadWords>,
     /// Times at which messages entered ring buffers.
     waiting: HashMap<MapData, EntryWords, u64>,
+    late_mode: Array<MapData, u32>,
+    bounds: HashMap<MapData, HandleWords, BoundWords>,
+    /// Threads that call callbacks.
+    followed: HashMap<MapData, u32, FollowedWords>,
+    /// Number of these threads that can run and do not.
+    runnable: Array<MapData, i64>,
 }
 
 /// The probes in one library; dropping the value removes the breakpoints.
@@ -87,6 +112,7 @@ pub fn load(
     };
     let mut breakpoints = Breakpoints::load(ebpf, &OBJECT.0, calls, Some(DISPATCHER), means)?;
     let ebpf = &mut breakpoints.ebpf;
+    let scheduler = load_scheduler(ebpf, &offsets);
     let tables = Tables {
         processes: take(ebpf, "PROCESSES")?,
         handles: take(ebpf, "HANDLES")?,
@@ -95,8 +121,16 @@ pub fn load(
         announcements: take(ebpf, "ANNOUNCEMENTS")?,
         threads: take(ebpf, "THREADS")?,
         waiting: take(ebpf, "WAITING")?,
+        late_mode: take(ebpf, "LATE_MODE")?,
+        bounds: take(ebpf, "BOUNDS")?,
+        followed: take(ebpf, "FOLLOWED_THREADS")?,
+        runnable: take(ebpf, "RUNNABLE_THREADS")?,
     };
-    Ok((Programs(breakpoints), tables))
+    let programs = Programs {
+        breakpoints,
+        scheduler,
+    };
+    Ok((programs, tables))
 }
 
 /// Returns where the running kernel keeps the accounting of threads, by [`accounting`]. Without its
@@ -110,14 +144,50 @@ fn accounting_offsets() -> [u32; accounting::COUNT] {
         ("task_struct", "sched_task_group"),
         ("task_group", "parent"),
         ("task_group", "cfs_bandwidth.throttled_time"),
+        ("task_struct", "__state"),
+        ("task_struct", "pid"),
     ];
     let types = KernelTypes::read().ok();
-    members.map(|(structure, member)| {
-        let types = types.as_ref();
-        types
-            .and_then(|types| types.offset(structure, member))
-            .unwrap_or(accounting::ABSENT)
-    })
+    let find = |(structure, member)| types.as_ref()?.offset(structure, member);
+    let mut offsets = members.map(|member| find(member).unwrap_or(accounting::ABSENT));
+    if let Some(earlier) = find(("task_struct", "state")) {
+        offsets[accounting::STATE] = earlier;
+    }
+    offsets
+}
+
+/// Loads the programs at the scheduler's events.
+fn load_scheduler(ebpf: &mut Ebpf, offsets: &[u32]) -> Result<[OwnedFd; 2], NoEvents> {
+    if offsets.iter().any(|offset| *offset == accounting::ABSENT) {
+        return Err(NoEvents::Types);
+    }
+    let mut load = |name: &CStr| {
+        let name = name.to_str().unwrap_or_default();
+        let program = ebpf.program_mut(name).ok_or(NoEvents::Missing)?;
+        let program: &mut RawTracePoint = program.try_into()?;
+        program.load()?;
+        let descriptor = program.fd()?.as_fd().try_clone_to_owned();
+        descriptor.map_err(NoEvents::Kernel)
+    };
+    let [switch, waking] = EVENTS;
+    Ok([load(switch)?, load(waking)?])
+}
+
+/// Why the events of the scheduler are not observed.
+#[derive(Debug, thiserror::Error)]
+pub enum NoEvents {
+    /// The kernel does not describe its types, or has other ones.
+    #[error("the kernel does not describe its scheduler (needs CONFIG_DEBUG_INFO_BTF)")]
+    Types,
+    /// The object lacks a program.
+    #[error("a program is missing")]
+    Missing,
+    /// The kernel refuses a program.
+    #[error("the kernel refuses a program at the scheduler's events (needs Linux 5.15)")]
+    Program(#[from] ProgramError),
+    /// The kernel refuses to run a program.
+    #[error("the kernel refuses to observe the scheduler's events")]
+    Kernel(#[source] io::Error),
 }
 
 impl Programs {
@@ -131,8 +201,9 @@ impl Programs {
         part: Option<Calls>,
         place: Place,
     ) -> Result<Attached, Refusal> {
-        let calls = part.unwrap_or(self.0.calls);
-        Ok(Attached::new(self.0.attach(broker, calls, place)?))
+        let calls = part.unwrap_or(self.breakpoints.calls);
+        let attached = self.breakpoints.attach(broker, calls, place)?;
+        Ok(Attached::new(attached))
     }
 
     /// Attaches to a library's file with the rights of this process, for tests and examples.
@@ -140,7 +211,23 @@ impl Programs {
     /// # Errors
     /// Fails if the library has none of the functions, or if the kernel refuses.
     pub fn attach_here(&self, file: &File) -> Result<Attached, AttachError> {
-        Ok(Attached::new(self.0.attach_here(self.0.calls, file)?))
+        let calls = self.breakpoints.calls;
+        Ok(Attached::new(self.breakpoints.attach_here(calls, file)?))
+    }
+
+    /// Runs the programs at the scheduler's events.
+    ///
+    /// # Errors
+    /// Fails if the kernel has no such events, or refused the programs when they were loaded.
+    pub fn observe_scheduler(&self) -> Result<Events, String> {
+        let programs = self.scheduler.as_ref().map_err(|error| in_words(error))?;
+        let [switch, waking] = programs;
+        let open = |name, program: &OwnedFd| {
+            let opened = bpf::open_tracepoint(name, program.as_fd());
+            opened.map_err(|error| in_words(&NoEvents::Kernel(error)))
+        };
+        let [of_switch, of_waking] = EVENTS;
+        Ok(Events([open(of_switch, switch)?, open(of_waking, waking)?]))
     }
 }
 
@@ -251,6 +338,41 @@ impl Tables {
         }
         clear(&mut self.threads).map_err(failed("THREADS", "remove"))?;
         clear(&mut self.waiting).map_err(failed("WAITING", "remove"))
+    }
+
+    /// Sets what the programs observe about late calls, one of [`late::mode`]. Threads are followed
+    /// anew, because their states are unknown between two observations.
+    ///
+    /// # Errors
+    /// Fails if the kernel refuses an update.
+    pub fn set_late_mode(&mut self, mode: u32) -> Result<(), FilterError> {
+        let set = self.late_mode.set(0, late::mode::OFF, 0);
+        set.map_err(failed("LATE_MODE", "set"))?;
+        clear(&mut self.followed).map_err(failed("FOLLOWED_THREADS", "remove"))?;
+        let set = self.runnable.set(0, 0, 0);
+        set.map_err(failed("RUNNABLE_THREADS", "set"))?;
+        let set = self.late_mode.set(0, mode, 0);
+        set.map_err(failed("LATE_MODE", "set"))
+    }
+
+    /// Sets from when on calls of a callback are late.
+    ///
+    /// # Errors
+    /// Fails if the kernel refuses the update, for example because its table is full.
+    pub fn set_bound(&mut self, callback: Handle, bound: Bound) -> Result<(), FilterError> {
+        let key: HandleWords = zerocopy::transmute!(callback);
+        let words: BoundWords = zerocopy::transmute!(bound);
+        let set = self.bounds.insert(key, words, 0);
+        set.map_err(failed("BOUNDS", "update"))
+    }
+
+    /// Removes the bound of a callback.
+    ///
+    /// # Errors
+    /// Fails if the kernel refuses the update.
+    pub fn remove_bound(&mut self, callback: Handle) -> Result<(), FilterError> {
+        let key: HandleWords = zerocopy::transmute!(callback);
+        absent_is_fine(self.bounds.remove(&key)).map_err(failed("BOUNDS", "remove"))
     }
 
     /// Returns all counters, summed over CPUs.

@@ -7,11 +7,13 @@ use std::time::Duration;
 use ros2probe_attach::client::Broker;
 use ros2probe_model::derive::chain::causality::CausalPublication;
 use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::facts::calls::late::LateCall;
 use ros2probe_model::facts::calls::report::{
     BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report,
-    SubscriptionReport, ThreadStates, Transition,
+    SubscriptionReport, ThreadStates, Transition, Trigger,
 };
 use ros2probe_model::facts::names::{NodeName, TopicName};
+use ros2probe_wire::inside::late;
 use ros2probe_wire::inside::{
     self, Announcement, Figures, Handle, Process, announced, distribution, kind, state,
     thread_state,
@@ -19,11 +21,12 @@ use ros2probe_wire::inside::{
 use ros2probe_wire::{DomainId, Timestamp};
 use zerocopy::FromBytes as _;
 
+use super::late::convert;
 use super::names::{Endpoint, Names, text};
 use super::process::Stat;
 use super::programs::Tables;
 use crate::system::Clocks;
-use crate::tables::{CausalHops, InsideBuffers, NewNodes, ReportedHandles, Transitions};
+use crate::tables::{CausalHops, InsideBuffers, LateCalls, NewNodes, ReportedHandles, Transitions};
 
 /// Maximum calls per second of one process. Above it, its calls are no longer counted.
 pub const MAX_PROCESS_HITS: u64 = 50_000;
@@ -37,6 +40,7 @@ pub struct ProcessTable {
     known: HashMap<u32, Observed>,
     has_callbacks: bool,
     hops: Bounded<CausalHops, Vec<inside::Hop>>,
+    late: Bounded<LateCalls, Vec<Box<late::LateCall>>>,
     transitions: Bounded<Transitions, Vec<Transition>>,
     rounds: u32,
     /// Time since calls per second were last evaluated.
@@ -122,6 +126,7 @@ impl ProcessTable {
             known: HashMap::new(),
             has_callbacks,
             hops: Bounded::default(),
+            late: Bounded::default(),
             transitions: Bounded::default(),
             rounds: 0,
             unjudged: Duration::ZERO,
@@ -151,6 +156,9 @@ impl ProcessTable {
         match item {
             Some(Item::Hop(hop)) => {
                 self.hops.push(hop);
+            }
+            Some(Item::Late(call)) => {
+                self.late.push(call);
             }
             Some(Item::Announcement(announcement)) => self.announced(&announcement, clocks, broker),
             None => {}
@@ -198,6 +206,7 @@ impl ProcessTable {
     /// Makes the next round report everything again, after [`Tables::forget_calls`].
     pub fn forget_reports(&mut self) {
         self.hops.clear();
+        self.late.clear();
         for observed in self.known.values_mut() {
             observed.forget_reports();
         }
@@ -296,6 +305,11 @@ impl ProcessTable {
                 self.handle(report, *handle, figures, clocks);
             }
         }
+        let calls = self.late.take();
+        let late = calls
+            .iter()
+            .filter_map(|call| self.late_call(call, &figures, clocks));
+        let late = late.collect();
         let hops = self.hops.take();
         let hops = hops.iter().filter_map(|hop| self.hop(hop, clocks));
         let mut publications: Vec<_> = hops.collect();
@@ -320,6 +334,7 @@ impl ProcessTable {
             has_callbacks: self.has_callbacks,
             processes: reports.into_values().collect(),
             transitions: self.transitions.take(),
+            late,
         };
         Round {
             report,
@@ -493,6 +508,41 @@ impl ProcessTable {
         }
     }
 
+    /// Names the callbacks of a late call; `None` if its process has ended.
+    fn late_call(
+        &self,
+        call: &late::LateCall,
+        figures: &[(Handle, Figures)],
+        clocks: &Clocks,
+    ) -> Option<LateCall> {
+        self.known.get(&call.process)?;
+        Some(convert(call, clocks, |address| {
+            let key = Handle {
+                address,
+                process: call.process,
+                kind: kind::CALLBACK,
+            };
+            let found = figures.iter().find(|(handle, _)| *handle == key);
+            let unknown = (Trigger::Service(None), None);
+            found.map_or(unknown, |(handle, figures)| {
+                self.name_callback(*handle, figures)
+            })
+        }))
+    }
+
+    /// Returns the trigger of a callback, and its node.
+    pub(super) fn name_callback(
+        &self,
+        callback: Handle,
+        figures: &Figures,
+    ) -> (Trigger, Option<NodeName>) {
+        let Some(observed) = self.known.get(&callback.process) else {
+            return (Trigger::Service(None), None);
+        };
+        let buffer = |address| observed.buffer(address);
+        (observed.names).trigger(callback.address, figures, buffer)
+    }
+
     /// Names the topics of a causal publication; `None` if one is unknown.
     fn hop(&self, hop: &inside::Hop, clocks: &Clocks) -> Option<CausalPublication> {
         let observed = self.known.get(&hop.process)?;
@@ -521,6 +571,7 @@ impl ProcessTable {
 enum Item {
     Announcement(Box<Announcement>),
     Hop(inside::Hop),
+    Late(Box<late::LateCall>),
 }
 
 impl Item {
@@ -528,6 +579,10 @@ impl Item {
         let kind = u32::from_ne_bytes(*bytes.first_chunk()?);
         if kind == announced::HOP {
             return inside::Hop::read_from_bytes(bytes).ok().map(Self::Hop);
+        }
+        if kind == announced::LATE {
+            let call = late::LateCall::read_from_bytes(bytes).ok()?;
+            return Some(Self::Late(Box::new(call)));
         }
         let announcement = Announcement::read_from_bytes(bytes).ok()?;
         Some(Self::Announcement(Box::new(announcement)))

@@ -90,7 +90,7 @@ pub(super) fn open_inside(settings: &CaptureSettings) -> (Option<Inside>, Option
         return (None, None);
     }
     match Inside::open(
-        settings.inside,
+        (settings.inside, settings.late),
         settings.cgroup.as_deref(),
         &settings.broker,
     ) {

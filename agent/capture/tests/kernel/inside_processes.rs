@@ -1,5 +1,6 @@
 //! Programs at the functions of `libtracetools.so`, in processes that call them as rclcpp does.
 
+mod late;
 mod thread_states;
 
 use std::fs::File;
@@ -9,7 +10,7 @@ use std::time::Duration;
 
 use ros2probe_attach::client::Broker;
 use ros2probe_capture::breakpoints::Means;
-use ros2probe_capture::inside::programs::{self, Attached, Programs, Tables};
+use ros2probe_capture::inside::programs::{self, Attached, Events, Programs, Tables};
 use ros2probe_capture::inside::table::{MAX_PROCESS_HITS, ProcessTable, Round};
 use ros2probe_capture::system::Clocks;
 use ros2probe_model::facts::calls::report::{ProcessReport, Trigger};
@@ -23,6 +24,7 @@ struct Robot {
     tables: Tables,
     table: ProcessTable,
     attached: Option<Attached>,
+    events: Option<Events>,
 }
 
 /// A process that takes commands.
@@ -49,6 +51,7 @@ impl Robot {
             tables,
             table: ProcessTable::new(has_callbacks),
             attached: None,
+            events: None,
         }
     }
 

@@ -27,6 +27,7 @@ mod service;
 mod shared;
 mod top;
 mod topic;
+mod why;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -95,6 +96,8 @@ pub(crate) enum Question {
     Top(top::Top),
     /// Print what processes publish, take and call, and how long callbacks take
     Inside(inside::Inside),
+    /// Print which calls of callbacks were late, and what made them late
+    Why(why::Why),
     /// Write a watchlist with the expectations that a healthy robot meets
     Learn(learn::Learn),
     /// Print the address of the page that shows the robot in a browser
@@ -119,6 +122,7 @@ impl Question {
             Self::Doctor(doctor) => doctor.ask(),
             Self::Top(top) => top.ask(),
             Self::Inside(inside) => inside.ask(),
+            Self::Why(why) => why.ask(),
             Self::Learn(learn) => learn.ask(),
             Self::Page(page) => page.ask(),
             Self::Foxglove(foxglove) => foxglove.ask(),
@@ -136,6 +140,7 @@ impl Question {
             | Self::Chain(_)
             | Self::Doctor(_)
             | Self::Inside(_)
+            | Self::Why(_)
             | Self::Page(_)
             | Self::Foxglove(_) => Some(interrupt::INTERRUPTED),
             // `top` restores the terminal first, and `learn` writes what it has learnt.

@@ -43,6 +43,21 @@ pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
             who(node, process_id),
             seconds(*wait_seconds)
         ),
+        Diagnosis::LateCallback {
+            node,
+            process_id,
+            trigger,
+            late_calls,
+            words,
+            longest_seconds,
+            ..
+        } => format!(
+            "callback of {} in {} was late {late_calls} times in a minute, up to {}: {}",
+            safe(&trigger.words()),
+            who(node, process_id),
+            seconds(*longest_seconds),
+            safe(words)
+        ),
         Diagnosis::IntraProcessOverflow {
             node,
             process_id,

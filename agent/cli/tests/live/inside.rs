@@ -7,6 +7,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_api::chains::ChainList;
 use ros2probe_api::inside::Inside;
+use ros2probe_api::why::Why;
 use ros2probe_capture::breakpoints::Means;
 use ros2probe_testing::harness::agent::Agent;
 use ros2probe_testing::harness::code;
@@ -237,6 +238,66 @@ fn calls_are_observed_while_a_client_requests_them_and_names_always() -> Result<
         Ok(published("first")? == Some(MESSAGES as u64))
     })?;
     ensure!(published("second")? == Some(0));
+    Ok(())
+}
+
+#[test]
+fn a_call_that_sleeps_is_late_with_its_cause_from_the_first_question_on() -> Result<()> {
+    let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let program = TracedProgram::build(248, &[])?;
+    let _agent = agent_with(&host, directory.path(), "auto")?;
+    let arguments = ["/in", "/out", "filter"];
+    let mut process = Process::start(&host.inside(), program.program(), arguments)?;
+    let socket = directory.path().join("api.sock");
+    let ask = |options: &str| run(&format!("{RP} why {options} --socket {}", socket.display()));
+    let why = |options: &str| -> Result<Why<'static>> {
+        let text = ask(&format!("--json --wait 0 {options}"))?;
+        Ok(serde_json::from_str(&text)?)
+    };
+    // The first question begins the observation of calls, and later that of the scheduler.
+    wait_until("the scheduler is observed", || {
+        let answer = why("--above 5")?;
+        ensure!(answer.callbacks.is_empty(), "{answer:?}");
+        Ok(answer.observed == "events" && answer.reason.is_none())
+    })?;
+    process.write_line("init")?;
+    process.wait_for("init", PATIENCE)?;
+    let mut late = None;
+    wait_until("the late call is known", || {
+        // A bound is set after the first call of a callback.
+        process.write_line("sleep 1 20000")?;
+        process.wait_for("sleep", PATIENCE)?;
+        let mut answer = why("/robot1/filter --above 5")?;
+        late = answer.callbacks.pop();
+        Ok(late.is_some())
+    })?;
+    let late = late.context("late call")?;
+    ensure!(
+        late.owner.node.as_deref() == Some("/robot1/filter"),
+        "{late:?}"
+    );
+    let call = late.examples.first().context("example")?;
+    ensure!(call.cause.as_deref() == Some("sleep"), "{call:?}");
+    let parts: f64 = call.parts.iter().map(|part| part.seconds).sum();
+    let whole = call.duration_seconds + call.wait_seconds.unwrap_or_default();
+    ensure!((parts - whole).abs() < 1e-6, "{call:?}");
+    let blocked = call.blocked.as_ref().context("blocked")?;
+    ensure!(blocked.seconds >= 0.02, "{call:?}");
+    ensure!(
+        blocked.system_call.as_deref() == Some("clock_nanosleep"),
+        "{call:?}"
+    );
+    let text = ask("/robot1/filter --last 10m")?;
+    ensure!(
+        text.contains("it slept") && text.contains("sleep 20ms"),
+        "{text}"
+    );
+    let none = why("/another")?;
+    ensure!(
+        none.callbacks.is_empty() && none.causes.is_empty(),
+        "{none:?}"
+    );
     Ok(())
 }
 

@@ -88,6 +88,7 @@ fn observed() -> Observer {
             has_callbacks: true,
             processes: vec![process],
             transitions: vec![transition],
+            late: Vec::new(),
         }));
         observer.input(Input::Time(Timestamp(now)));
     }
@@ -198,6 +199,7 @@ fn long_durations_become_series_with_their_length() {
                 ..ProcessReport::default()
             }],
             transitions: Vec::new(),
+            late: Vec::new(),
         }));
         observer.input(Input::Time(Timestamp(now)));
     }
@@ -250,4 +252,29 @@ fn without_the_source_the_command_prints_how_to_enable_it() {
     let answer: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!(answer["mode"], "off");
     assert_eq!(answer["callbacks"], serde_json::json!([]));
+}
+
+#[test]
+fn without_the_source_no_call_is_late_and_the_command_says_why() {
+    let capture = local_agent::capture();
+    let run = |arguments: &[&str]| {
+        let mut command = rp();
+        command.arg("why").args(arguments).arg("--replay");
+        command.arg(&capture).output().unwrap()
+    };
+    let output = run(&[]);
+    assert_eq!(output.status.code(), Some(1));
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        error.contains("capture.inside or capture.late is off"),
+        "{error}"
+    );
+    let output = run(&["--json", "--above", "5", "--last", "10m"]);
+    let answer: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(answer["observed"], "off");
+    assert_eq!(answer["callbacks"], serde_json::json!([]));
+    for wrong in [["--above", "-1"], ["--above", "x"], ["--last", "soon"]] {
+        let output = run(&[&format!("{}={}", wrong[0], wrong[1])]);
+        assert_eq!(output.status.code(), Some(2), "{wrong:?}");
+    }
 }

@@ -203,6 +203,12 @@ fn metric_values_equal_the_snapshot() {
         Format::Classic,
     );
     let topic = "{domain_id=\"0\",topic=\"/points\"}";
+    let late = "{domain_id=\"0\",ros_node=\"/lidar\",trigger=\"subscription\",name=\"/points\",\
+                stage=\"callback\",cause=\"runnable\"}";
+    for (name, value) in [("calls", "1"), ("seconds", "0.07")] {
+        let series = format!("ros2_late_{name}_total{late}");
+        assert_eq!(sample(&page, &series), Some(value), "{series}");
+    }
     for (series, value) in [
         ("ros2_topic_messages_total", "123456"),
         ("ros2_topic_bytes_total", "79504384000"),

@@ -336,6 +336,7 @@ impl Reader {
                 reading_cpu_percent: shm.reading_cpu_percent,
             },
             inside: shape.inside,
+            late: shape.late,
             broker: PathBuf::from(shape.broker),
             zenoh_ports: shape.zenoh.unwrap_or_default().ports,
         };

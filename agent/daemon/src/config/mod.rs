@@ -21,7 +21,7 @@ use serde::Deserialize;
 use crate::events::Trigger;
 pub use mistake::{Mistake, Mistakes, Position};
 pub use ros2probe_capture::settings::{
-    CaptureSettings, ExactChoice, InsideChoice, ShmMode, ShmSettings, SourceChoice,
+    CaptureSettings, ExactChoice, InsideChoice, LateChoice, ShmMode, ShmSettings, SourceChoice,
 };
 use ros2probe_message::Dialect;
 pub use ros2probe_metrics::otlp::{Compression, Endpoint, OtlpProtocol, OtlpSettings};
@@ -404,6 +404,7 @@ impl Default for Config {
                     reading_cpu_percent: defaults::SHM_READING_CPU_PERCENT,
                 },
                 inside: InsideChoice::default(),
+                late: LateChoice::default(),
                 broker: PathBuf::from(defaults::BROKER),
                 zenoh_ports: vec![defaults::ZENOH_PORT],
             },

@@ -11,8 +11,8 @@ use serde::{Deserialize, Serialize};
 
 use super::limits::LimitsShape;
 use super::{
-    Access, Compression, ExactChoice, InsideChoice, Level, OtlpProtocol, PageChoice, Retain,
-    RetainChoice, ShmMode, SourceChoice, defaults,
+    Access, Compression, ExactChoice, InsideChoice, LateChoice, Level, OtlpProtocol, PageChoice,
+    Retain, RetainChoice, ShmMode, SourceChoice, defaults,
 };
 
 /// Configuration of the ros2probe agent. Every key is optional.
@@ -193,6 +193,10 @@ pub(super) struct CaptureShape {
     /// `full`: also callbacks, timers and lifecycle transitions; `auto`: as `full`, while a client
     /// needs calls. Each observed call costs the process some microseconds.
     pub(super) inside: InsideChoice,
+    /// Causes of late callbacks, where callbacks are observed: who ran instead, and for what a
+    /// callback waited. `on`: by the events of the kernel's scheduler, as long as calls are observed;
+    /// `auto`: only while a client asks for causes; `off`: late calls are not reported.
+    pub(super) late: LateChoice,
     /// Socket of the process that attaches breakpoints (`rp attach`). Without a socket there, an
     /// agent with the privileges starts one of its own.
     pub(super) broker: String,
@@ -556,6 +560,7 @@ impl Default for CaptureShape {
             record_ring_bytes: defaults::RECORD_RING_BYTES,
             shm: None,
             inside: InsideChoice::default(),
+            late: LateChoice::default(),
             broker: defaults::BROKER.to_owned(),
             zenoh: None,
         }

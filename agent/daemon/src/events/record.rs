@@ -409,6 +409,7 @@ fn finding(finding: &Diagnosis) -> Values {
         ],
         Diagnosis::SlowCallback { .. }
         | Diagnosis::ExecutorWait { .. }
+        | Diagnosis::LateCallback { .. }
         | Diagnosis::IntraProcessOverflow { .. }
         | Diagnosis::ReaderQueueOverflow { .. }
         | Diagnosis::ObservationSuspended { .. } => inside(finding),
@@ -453,6 +454,22 @@ fn inside(finding: &Diagnosis) -> Values {
         Diagnosis::ExecutorWait { trigger, wait, .. } => values.extend([
             ("trigger", Some(text(trigger.label()))),
             ("wait_seconds", seconds(wait)),
+        ]),
+        Diagnosis::LateCallback {
+            trigger,
+            calls,
+            stage,
+            cause,
+            by,
+            longest,
+            ..
+        } => values.extend([
+            ("trigger", Some(text(trigger.label()))),
+            ("late_calls", number(*calls)),
+            ("stage", Some(text(stage.label()))),
+            ("cause", Some(text(cause.label()))),
+            ("by", by.as_deref().map(text)),
+            ("longest_seconds", seconds(longest)),
         ]),
         Diagnosis::IntraProcessOverflow {
             overwritten_permille,

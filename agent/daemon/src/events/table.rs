@@ -159,7 +159,7 @@ pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
     FINDING,
     "Another fault of the graph, named by `diagnosis`: type_conflict, type_hash_conflict, \
      duplicate_node, node_in_several_domains, slow_callback, executor_wait, \
-     intra_process_overflow, reader_queue_overflow, observation_suspended, slow_chain, or (INFO) \
+     late_callback, intra_process_overflow, reader_queue_overflow, observation_suspended, slow_chain, or (INFO) \
      unmatched_publisher, unmatched_subscription, restamping_node.",
 )
 .relief(Severity::Info);

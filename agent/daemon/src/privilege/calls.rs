@@ -215,6 +215,7 @@ const NOTICE: &[c_long] = &[
 /// `bpf` commands of linux/bpf.h: lookup, update, delete and next key of maps.
 mod command {
     pub(super) const MAPS: [libc::c_int; 4] = [1, 2, 3, 4];
+    pub(super) const RAW_TRACEPOINT_OPEN: libc::c_int = 17;
     pub(super) const LINK_CREATE: libc::c_int = 28;
     pub(super) const ITERATOR_CREATE: libc::c_int = 33;
 }
@@ -276,9 +277,10 @@ impl Allowed {
                 allowed.always(NOTICE);
                 allowed.ask_broker()?;
             }
-            Role::Inside => {
+            Role::Inside { .. } => {
                 allowed.ask_broker()?;
-                allowed.bpf(command::MAPS.into_iter())?;
+                let commands = command::MAPS.into_iter();
+                allowed.bpf(commands.chain([command::RAW_TRACEPOINT_OPEN]))?;
             }
             Role::Broker => allowed.answer_agents()?,
         }

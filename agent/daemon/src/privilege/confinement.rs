@@ -64,8 +64,12 @@ pub enum Role {
     },
     /// Requests to the broker, which attaches programs to libraries. No capability.
     Exact,
-    /// Like [`Role::Exact`], but also reads the programs' maps.
-    Inside,
+    /// Like [`Role::Exact`], but also uses the programs' maps, and runs loaded programs at
+    /// tracepoints. `CAP_BPF` where the kernel requires it.
+    Inside {
+        /// Whether the kernel requires `CAP_BPF`, as [`Role::inside`] determines.
+        needs_bpf: bool,
+    },
     /// The broker, a process of its own with the capabilities that [`uprobe::useful`] returns. It
     /// forks, accepts connections, and opens files for reading, but creates no connection.
     Broker,
@@ -135,6 +139,13 @@ impl Role {
         Self::Reattach { needs_bpf }
     }
 
+    /// Returns the role of the thread that observes calls inside processes, on this kernel.
+    #[must_use]
+    pub fn inside() -> Self {
+        let needs_bpf = map_updates_need_bpf();
+        Self::Inside { needs_bpf }
+    }
+
     /// Returns the role of the thread that reads shared memory. Raises a limit of the process.
     #[must_use]
     pub fn shared_memory() -> Self {
@@ -152,13 +163,8 @@ impl Role {
             }
         };
         match self {
-            Self::Service
-            | Self::Serve
-            | Self::Export
-            | Self::Ros2Daemon
-            | Self::Exact
-            | Self::Inside => nothing,
-            Self::Capture { needs_bpf } => bpf(needs_bpf),
+            Self::Service | Self::Serve | Self::Export | Self::Ros2Daemon | Self::Exact => nothing,
+            Self::Capture { needs_bpf } | Self::Inside { needs_bpf } => bpf(needs_bpf),
             Self::Reattach { needs_bpf } => CapabilitySet::NET_ADMIN | bpf(needs_bpf),
             Self::SharedMemory { needs_nice: false } => CapabilitySet::SYS_PTRACE,
             Self::SharedMemory { needs_nice: true } => {
@@ -249,7 +255,7 @@ pub fn spawn_source(
         Task::SharedMemory => Role::shared_memory(),
         Task::Reattach => Role::reattach(),
         Task::Probes => Role::Exact,
-        Task::Inside => Role::Inside,
+        Task::Inside => Role::inside(),
     };
     spawn(role, thread, work).map_err(|error| match error {
         SpawnError::Thread(error) => error,

@@ -21,11 +21,13 @@ use crate::state::StateWriter;
 use crate::subscriptions::Subscriptions;
 use crate::watches::Watches;
 pub use capture_time::CaptureTime;
+use ros2probe_capture::inside::late::RequestedBound;
 use ros2probe_capture::live::{CaptureError, LiveSource};
 use ros2probe_capture::pcap::PcapError;
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_metrics::otlp::SpanSink;
 use ros2probe_model::facts::selection::SampleRequest;
+use ros2probe_model::facts::watch::Watch;
 use ros2probe_model::measure::history::History;
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Observer;
@@ -70,6 +72,8 @@ pub struct Run {
     observer: Observer,
     /// Participants for which the kernel filter records the time of the last message.
     followed: BTreeSet<GuidPrefix>,
+    /// Maximum latencies of watched topics: calls of callbacks beyond them are late.
+    expected_latencies: Vec<RequestedBound>,
     outputs: Outputs,
     drops: DropMonitor,
     watches: Arc<Watches>,
@@ -116,6 +120,7 @@ impl Run {
             source,
             observer,
             followed: BTreeSet::new(),
+            expected_latencies: Vec::new(),
             outputs,
             drops: DropMonitor::default(),
             watches,
@@ -278,7 +283,11 @@ impl Run {
         let output = self.observer.drain();
         if let Source::Live(live) = &mut self.source {
             live.apply(&output.interest);
-            live.want_inside(self.outputs.latest.are_calls_wanted(Instant::now()));
+            let now = Instant::now();
+            live.want_inside(self.outputs.latest.are_calls_wanted(now));
+            let mut demand = self.outputs.latest.late_demand(now);
+            demand.bounds.extend_from_slice(&self.expected_latencies);
+            live.want_late(&demand);
         }
         self.outputs.events.add(output.events, now);
         self.outputs.spans.add(output.spans, output.chain_spans);
@@ -302,6 +311,7 @@ impl Run {
                     // The expectations of the new list begin now, not at the last round.
                     self.observer.input(Input::Time(live.clock()));
                 }
+                self.expected_latencies = expected_latencies(watchlist.watches());
                 self.observer.input(Input::Watchlist(watchlist));
             }
             if let Some(sample_requests) = self.subscriptions.take_changed() {
@@ -420,6 +430,18 @@ impl Run {
 }
 
 /// Copies the model's list of participants to the kernel filter.
+/// Returns the maximum latencies of topics that watches name.
+fn expected_latencies(watches: &[Arc<Watch>]) -> Vec<RequestedBound> {
+    let named = watches.iter().filter(|watch| watch.is_literal());
+    let expected = named.filter_map(|watch| {
+        Some(RequestedBound {
+            name: Some(Arc::from(watch.pattern.as_str())),
+            above: watch.expectations.max_latency?,
+        })
+    });
+    expected.collect()
+}
+
 fn follow(live: &mut LiveSource, followed: &mut BTreeSet<GuidPrefix>, snapshot: &Snapshot) {
     let present: BTreeSet<_> = snapshot
         .participants

@@ -330,6 +330,8 @@ fn inside(live: &LiveSource) -> Option<InsideSourceFacts> {
         shows_rates: facts.shows_rates,
         libraries: libraries.collect(),
         counters: facts.counters,
+        late: facts.late,
+        without_events: facts.without_events,
         reason_off: reason_off.or_else(resting),
     })
 }

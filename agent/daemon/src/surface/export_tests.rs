@@ -182,6 +182,7 @@ fn seen_inside() -> Snapshot {
             has_callbacks: true,
             processes: vec![process],
             transitions: vec![transition],
+            late: Vec::new(),
         }));
         observer.input(Input::Time(Timestamp(start + second * SECOND)));
     }

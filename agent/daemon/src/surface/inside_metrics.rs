@@ -10,7 +10,8 @@ use crate::agent_facts::InsideSourceFacts;
 use crate::settings_cell::Settings;
 use ros2probe_metrics::catalogue::{self as metric, Metric};
 use ros2probe_metrics::metric_sink::{Label, MetricSink};
-use ros2probe_model::facts::calls::facts::{Callback, InsideFacts, TopicInside};
+use ros2probe_model::facts::calls::facts::{Callback, InsideFacts, Owner, TopicInside};
+use ros2probe_model::facts::calls::late::{Cause, Stage};
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
 use ros2probe_model::facts::histogram::Histogram;
 use ros2probe_model::report::snapshot::Snapshot;
@@ -175,7 +176,38 @@ pub(super) fn callbacks(
             .filter(|((_, _, trigger, _), _)| *trigger == "timer");
         timers.try_for_each(|(key, sum)| family.sample(&labels(key), sum.skipped))
     })?;
+    late(sink, known)?;
     nodes(sink, known)
+}
+
+/// Writes the metrics of late calls. Callbacks with the same labels share their series.
+fn late(sink: &mut MetricSink<'_>, known: Option<&InsideFacts>) -> fmt::Result {
+    let mut times: BTreeMap<(CallbackKey<'_>, Stage, Cause), Duration> = BTreeMap::new();
+    let mut calls: BTreeMap<(CallbackKey<'_>, Stage, Cause), u64> = BTreeMap::new();
+    for callback in known.into_iter().flat_map(|known| &known.late) {
+        let key = || key_of(&callback.owner, &callback.trigger);
+        for ((stage, cause), sum) in &callback.sums {
+            *times.entry((key(), *stage, *cause)).or_default() += *sum;
+        }
+        for ((stage, cause), count) in &callback.causes {
+            *calls.entry((key(), *stage, *cause)).or_default() += count;
+        }
+    }
+    sink.family(&metric::LATE_TIME, |family| {
+        let mut times = times.iter();
+        times.try_for_each(|(of, time)| family.sample(&late_labels(of), time.as_secs_f64()))
+    })?;
+    sink.family(&metric::LATE_CALLS, |family| {
+        let mut calls = calls.iter();
+        calls.try_for_each(|(of, count)| family.sample(&late_labels(of), *count))
+    })
+}
+
+fn late_labels<'a>(of: &'a (CallbackKey<'_>, Stage, Cause)) -> [Label<'a>; 6] {
+    let (key, stage, cause) = of;
+    let [domain_id, node, trigger, name] = labels(key);
+    let (stage, cause) = (Label::Text(stage.label()), Label::Text(cause.label()));
+    [domain_id, node, trigger, name, stage, cause]
 }
 
 fn nodes(sink: &mut MetricSink<'_>, known: Option<&InsideFacts>) -> fmt::Result {
@@ -250,15 +282,18 @@ pub(super) fn source(
 }
 
 fn key(callback: &Callback) -> CallbackKey<'_> {
-    let owner = &callback.owner;
-    let name = match &callback.trigger {
+    key_of(&callback.owner, &callback.trigger)
+}
+
+fn key_of<'a>(owner: &'a Owner, trigger: &Trigger) -> CallbackKey<'a> {
+    let name = match trigger {
         Trigger::Timer(period) => period.map(|period| format!("{period:?}")),
         other => other.name().map(str::to_owned),
     };
     (
         owner.domain_id,
         owner.node.as_deref().unwrap_or_default(),
-        callback.trigger.label(),
+        trigger.label(),
         name.unwrap_or_default(),
     )
 }
@@ -294,7 +329,7 @@ impl CallbackSum {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ros2probe_model::facts::calls::facts::{Owner, Quantiles};
+    use ros2probe_model::facts::calls::facts::Quantiles;
     use ros2probe_model::facts::model_time::ModelTime;
 
     fn callback(number: usize) -> Callback {

@@ -4,6 +4,7 @@ use super::{Metric, TOPIC};
 
 const CALLBACK: &[&str] = &["domain_id", "ros_node", "trigger", "name"];
 const CALLBACK_STATE: &[&str] = &["domain_id", "ros_node", "trigger", "name", "state"];
+const CALLBACK_CAUSE: &[&str] = &["domain_id", "ros_node", "trigger", "name", "stage", "cause"];
 
 pub const TOPIC_SOURCE: Metric = Metric::info(
     "ros2_topic_source_info",
@@ -125,6 +126,19 @@ pub const CALLBACK_TIME: Metric = Metric::counter(
      CPU quota of its control group, able to run while others ran, or blocked.",
 )
 .unit("seconds")
+.experimental();
+pub const LATE_TIME: Metric = Metric::counter(
+    "ros2_late_seconds_total",
+    CALLBACK_CAUSE,
+    "Time of late calls by stage (wait or callback) and cause: what their time consisted of.",
+)
+.unit("seconds")
+.experimental();
+pub const LATE_CALLS: Metric = Metric::counter(
+    "ros2_late_calls_total",
+    CALLBACK_CAUSE,
+    "Late calls by the stage and the cause that made them late.",
+)
 .experimental();
 pub const TIMER_SKIPPED: Metric = Metric::counter(
     "ros2_timer_skipped_periods_total",

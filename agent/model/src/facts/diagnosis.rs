@@ -16,6 +16,7 @@ use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{DomainId, Guid};
 
 use crate::facts::calls::facts::Owner;
+use crate::facts::calls::late::{Cause, Stage};
 use crate::facts::calls::report::Trigger;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
 use crate::facts::topic_kind::TopicKind;
@@ -135,6 +136,25 @@ pub enum Diagnosis {
         /// 99th percentile of its wait.
         wait: Duration,
     },
+    /// Calls of a callback are late, at least three in a minute for the same cause.
+    LateCallback {
+        /// Its topic, if messages trigger it.
+        topic: Option<TopicKey>,
+        /// The callback.
+        callback: Owner,
+        /// Trigger of the callback.
+        trigger: Trigger,
+        /// Late calls in a minute for this cause.
+        calls: u64,
+        /// Stage in which they became late.
+        stage: Stage,
+        /// What made them late.
+        cause: Cause,
+        /// Name of the thread that ran instead or held the lock, in the longest of the last calls.
+        by: Option<Arc<str>>,
+        /// Time from ready to the end of that call.
+        longest: Duration,
+    },
     /// Messages within a process are overwritten before the subscription takes them.
     IntraProcessOverflow {
         /// Topic.
@@ -235,7 +255,7 @@ pub enum Change<'a> {
 
 impl Diagnosis {
     /// All kinds, as label values.
-    pub const KINDS: [&'static str; 15] = [
+    pub const KINDS: [&'static str; 16] = [
         "qos_incompatible",
         "type_conflict",
         "type_hash_conflict",
@@ -246,6 +266,7 @@ impl Diagnosis {
         "node_in_several_domains",
         "slow_callback",
         "executor_wait",
+        "late_callback",
         "intra_process_overflow",
         "reader_queue_overflow",
         "observation_suspended",
@@ -267,6 +288,7 @@ impl Diagnosis {
             Self::NodeInSeveralDomains { .. } => "node_in_several_domains",
             Self::SlowCallback { .. } => "slow_callback",
             Self::ExecutorWait { .. } => "executor_wait",
+            Self::LateCallback { .. } => "late_callback",
             Self::IntraProcessOverflow { .. } => "intra_process_overflow",
             Self::ReaderQueueOverflow { .. } => "reader_queue_overflow",
             Self::ObservationSuspended { .. } => "observation_suspended",
@@ -289,7 +311,9 @@ impl Diagnosis {
             | Self::ReaderQueueOverflow { topic, .. }
             | Self::RestampingNode { topic, .. }
             | Self::SlowChain { topic, .. } => Some(topic),
-            Self::SlowCallback { topic, .. } | Self::ExecutorWait { topic, .. } => topic.as_ref(),
+            Self::SlowCallback { topic, .. }
+            | Self::ExecutorWait { topic, .. }
+            | Self::LateCallback { topic, .. } => topic.as_ref(),
             Self::DuplicateNode { .. }
             | Self::NodeInSeveralDomains { .. }
             | Self::ObservationSuspended { .. } => None,
@@ -316,9 +340,9 @@ impl Diagnosis {
     #[must_use]
     pub const fn owner(&self) -> Option<&Owner> {
         match self {
-            Self::SlowCallback { callback, .. } | Self::ExecutorWait { callback, .. } => {
-                Some(callback)
-            }
+            Self::SlowCallback { callback, .. }
+            | Self::ExecutorWait { callback, .. }
+            | Self::LateCallback { callback, .. } => Some(callback),
             Self::IntraProcessOverflow { queue, .. } | Self::ReaderQueueOverflow { queue, .. } => {
                 Some(queue)
             }
@@ -355,6 +379,7 @@ impl Diagnosis {
             Self::ObservationSuspended { domain_id, .. } => (*domain_id, "", None, None),
             Self::SlowCallback { .. }
             | Self::ExecutorWait { .. }
+            | Self::LateCallback { .. }
             | Self::IntraProcessOverflow { .. }
             | Self::ReaderQueueOverflow { .. } => (DomainId(0), "", None, None),
             Self::RestampingNode { node, .. } => (DomainId(0), node, None, None),

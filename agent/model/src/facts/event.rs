@@ -360,6 +360,7 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         | Diagnosis::HangingCall { .. }
         | Diagnosis::SlowCallback { .. }
         | Diagnosis::ExecutorWait { .. }
+        | Diagnosis::LateCallback { .. }
         | Diagnosis::IntraProcessOverflow { .. }
         | Diagnosis::ReaderQueueOverflow { .. }
         | Diagnosis::ObservationSuspended { .. }

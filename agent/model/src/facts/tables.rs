@@ -242,6 +242,19 @@ crate::tables! {
     LifecycleStates {
         name: "inside.states", entries: 1024, effect: "the newcomer has no state", reported: "table `inside`",
     }
+    /// Callbacks with late calls
+    LateCallbacks {
+        name: "inside.late", entries: 128, effect: "the one that was late the longest time ago is dropped",
+        reported: "table `inside`",
+    }
+    /// Late calls of one callback with time and cause
+    LateHistory { name: "inside.late.history", entries: 128, rule: Oldest }
+    /// The longest late calls of one callback, with all their parts
+    LongestLateCalls {
+        name: "inside.late.longest", entries: 8, effect: "the shortest is dropped, or one that is older than an hour",
+    }
+    /// The last late calls of one callback, with all their parts
+    LastLateCalls { name: "inside.late.last", entries: 8, rule: Oldest }
     /// Topics of observed processes
     InsideTopicSums {
         name: "inside.topics", entries: HANDLE_CAPACITY as usize,

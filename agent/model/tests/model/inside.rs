@@ -2,6 +2,7 @@
 //! findings, from reports built by hand in virtual time.
 
 mod findings;
+mod late;
 mod queues;
 mod slow;
 mod sources;
@@ -63,6 +64,7 @@ impl World {
             has_callbacks: true,
             processes,
             transitions: Vec::new(),
+            late: Vec::new(),
         }));
         self.now += SECOND / 2;
         self.observer.input(Input::Time(Timestamp(self.now)));
@@ -74,6 +76,7 @@ impl World {
             has_callbacks: true,
             processes: Vec::new(),
             transitions: vec![transition],
+            late: Vec::new(),
         }));
     }
 

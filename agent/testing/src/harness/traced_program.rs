@@ -31,7 +31,15 @@ impl TracedProgram {
         arguments.extend(defines);
         compile(&arguments)?;
         let place = format!("-DPLACE={place}");
-        let mut arguments = vec!["-O2", &place, "-o", &program, &of_program, &library];
+        let mut arguments = vec![
+            "-O2",
+            "-pthread",
+            &place,
+            "-o",
+            &program,
+            &of_program,
+            &library,
+        ];
         arguments.push("-Wl,-rpath,$ORIGIN");
         arguments.extend(defines);
         compile(&arguments)?;

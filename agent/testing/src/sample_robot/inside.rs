@@ -5,14 +5,18 @@ use std::time::Duration;
 
 use ros2probe_daemon::agent_facts::{InsideLibrary, InsideSourceFacts};
 use ros2probe_model::facts::calls::facts::{
-    Buffer, Callback, InsideFacts, LifecycleState, ObservedProcess, Owner, Publisher, Quantiles,
-    ReaderQueue, Subscription, TopicCounts, TopicInside,
+    Buffer, Callback, InsideFacts, LateCallback, LateEntry, LateExample, LifecycleState,
+    ObservedProcess, Owner, Publisher, Quantiles, ReaderQueue, Subscription, TopicCounts,
+    TopicInside,
+};
+use ros2probe_model::facts::calls::late::{
+    Activity, Cause, LateBound, LateCall, OtherThread, Stage,
 };
 use ros2probe_model::facts::calls::report::{Durations, ThreadStates, Trigger};
 use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::facts::names::TopicName;
-use ros2probe_wire::DomainId;
+use ros2probe_wire::{DomainId, Timestamp};
 
 const LAST: ModelTime = ModelTime::from_nanoseconds(1_700_000_000_000_000_000);
 
@@ -79,9 +83,10 @@ pub fn inside() -> InsideFacts {
             waiting: quantiles(),
         }],
         callbacks: vec![
-            callback(0x40, Trigger::Subscription(topic)),
+            callback(0x40, Trigger::Subscription(topic.clone())),
             callback(0x50, Trigger::Timer(Some(Duration::from_millis(50)))),
         ],
+        late: vec![late(topic)],
         states: vec![LifecycleState {
             process: 42,
             domain_id: DomainId(0),
@@ -137,12 +142,83 @@ pub fn source() -> InsideSourceFacts {
             },
         ],
         counters: vec![("hits", 36_000), ("suspended", 0)],
+        late: "events",
+        without_events: None,
         reason_off: None,
     }
 }
 
+/// Returns a callback with one late call, beside which another thread ran.
+fn late(topic: TopicName) -> LateCallback {
+    let trigger = Trigger::Subscription(topic);
+    let other = OtherThread {
+        duration: Duration::from_millis(70),
+        thread: 3_122,
+        process: 3_121,
+        name: "chromium".into(),
+    };
+    let bound = Duration::from_millis(30);
+    let states = |cpu: u64, runnable: u64| ThreadStates {
+        calls: 1,
+        cpu: cpu * 1_000_000,
+        runnable: runnable * 1_000_000,
+        ..ThreadStates::default()
+    };
+    let call = LateCall {
+        process: 42,
+        handle: 0x40,
+        node: Some("/lidar".into()),
+        trigger: trigger.clone(),
+        thread: 43,
+        cpu: 2,
+        source: Some(Timestamp(LAST.nanoseconds() - 30_000_000)),
+        started: Timestamp(LAST.nanoseconds()),
+        duration: Duration::from_millis(95),
+        wait: Some(Duration::from_millis(10)),
+        bound: LateBound {
+            duration: bound,
+            wait: bound,
+        },
+        previous: None,
+        states: Some(states(25, 70)),
+        states_before: Some(states(0, 4)),
+        activity: Some(Activity {
+            runnable: Duration::from_millis(70),
+            others: vec![other],
+            ..Activity::default()
+        }),
+        activity_before: Some(Activity::default()),
+    };
+    let main = call.main_part(ThreadStates::default());
+    let parts = call.parts().into_iter();
+    let example = Arc::new(LateExample {
+        at: LAST,
+        main,
+        call: call.clone(),
+    });
+    let history = LateEntry {
+        at: LAST,
+        stage: Stage::Callback,
+        cause: Cause::Runnable,
+        total: call.total(),
+        culprit: Some("chromium".into()),
+    };
+    LateCallback {
+        owner: owner(0x40),
+        trigger,
+        calls: 1,
+        sums: parts
+            .map(|part| ((part.stage, part.cause), part.duration))
+            .collect(),
+        causes: vec![((Stage::Callback, Cause::Runnable), 1)],
+        history: Arc::new([history].into_iter().collect()),
+        longest: vec![Arc::clone(&example)],
+        latest: vec![example],
+    }
+}
+
 /// Returns a finding of each kind that only calls inside processes show.
-pub fn findings(topic: &TopicKey) -> [Diagnosis; 5] {
+pub fn findings(topic: &TopicKey) -> [Diagnosis; 6] {
     [
         Diagnosis::SlowCallback {
             topic: Some(topic.clone()),
@@ -157,6 +233,16 @@ pub fn findings(topic: &TopicKey) -> [Diagnosis; 5] {
             callback: owner(0x50),
             trigger: Trigger::Timer(Some(Duration::from_millis(50))),
             wait: Duration::from_millis(300),
+        },
+        Diagnosis::LateCallback {
+            topic: Some(topic.clone()),
+            callback: owner(0x40),
+            trigger: Trigger::Subscription(topic.name.clone()),
+            calls: 34,
+            stage: Stage::Callback,
+            cause: Cause::Runnable,
+            by: Some("chromium".into()),
+            longest: Duration::from_millis(105),
         },
         Diagnosis::IntraProcessOverflow {
             topic: topic.clone(),

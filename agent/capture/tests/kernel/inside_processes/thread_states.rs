@@ -20,15 +20,24 @@ struct Schedstat {
 }
 
 /// A process of the same CPU that never sleeps.
-struct Hog(Child);
+pub(super) struct Hog(pub(super) Child);
 
 impl Hog {
-    fn on(cpu: &str) -> Self {
-        let child = Command::new("taskset")
-            .args(["-c", cpu, "sh", "-c", "while :; do :; done"])
-            .stdin(Stdio::null())
-            .spawn();
-        Self(child.expect("install taskset: apt-get install util-linux"))
+    pub(super) fn on(cpu: &str) -> Self {
+        Self::by(&["taskset", "-c", cpu, "sh", "-c", "while :; do :; done"])
+    }
+
+    /// A thread of real-time priority that computes for about half of the time.
+    pub(super) fn real_time(cpu: &str) -> Self {
+        let busy = "while :; do i=0; while [ $i -lt 30000 ]; do i=$((i+1)); done; sleep 0.03; done";
+        Self::by(&["chrt", "-f", "50", "taskset", "-c", cpu, "sh", "-c", busy])
+    }
+
+    fn by(command: &[&str]) -> Self {
+        let (program, arguments) = command.split_first().unwrap();
+        let mut command = Command::new(program);
+        let child = command.args(arguments).stdin(Stdio::null()).spawn();
+        Self(child.expect("install taskset and chrt: apt-get install util-linux"))
     }
 }
 
@@ -40,11 +49,11 @@ impl Drop for Hog {
 }
 
 /// A control group with a quota of its CPU time, by either version of the hierarchy.
-struct Quota(PathBuf);
+pub(super) struct Quota(PathBuf);
 
 impl Quota {
     /// Lets the process run for a twentieth of each 100 ms.
-    fn a_twentieth_for(process: &Process) -> Self {
+    pub(super) fn a_twentieth_for(process: &Process) -> Self {
         let name = format!("r2p-quota-{}", process.child.id());
         let first = PathBuf::from("/sys/fs/cgroup/cpu");
         let (group, limits): (_, &[_]) = if first.join("cpu.cfs_quota_us").exists() {

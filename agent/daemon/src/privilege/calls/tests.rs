@@ -19,7 +19,7 @@ const ROLES: [Role; 9] = [
     Role::Reattach { needs_bpf: false },
     Role::SharedMemory { needs_nice: false },
     Role::Exact,
-    Role::Inside,
+    Role::Inside { needs_bpf: false },
 ];
 
 /// Makes a system call. Returns its error, if it fails.
@@ -225,10 +225,15 @@ fn only_threads_that_need_kernel_maps_can_read_them_and_none_can_probe() {
     let may = call(libc::SYS_bpf, lookup);
     for role in ROLES {
         let is_capture = matches!(role, Role::Capture { .. });
-        let role = if is_capture { Role::capture() } else { role };
+        let is_inside = matches!(role, Role::Inside { .. });
+        let role = match role {
+            Role::Capture { .. } => Role::capture(),
+            Role::Inside { .. } => Role::inside(),
+            role => role,
+        };
         confined(role, move || {
             let looked_up = call(libc::SYS_bpf, lookup);
-            let reads = is_capture || role == Role::Inside;
+            let reads = is_capture || is_inside;
             let expected = if reads { may } else { Some(libc::EPERM) };
             assert_eq!(looked_up, expected, "{role:?}");
             let open = call(libc::SYS_perf_event_open, [0, 0, -1, -1, 0, 0]);

@@ -8,6 +8,7 @@ use std::time::Duration;
 use ros2probe_bag::metadata::{self, Metadata};
 use ros2probe_message::{Library, Sources};
 use ros2probe_model::facts::calls::facts::Owner;
+use ros2probe_model::facts::calls::late;
 use ros2probe_model::facts::calls::report as inside;
 use ros2probe_model::facts::churn;
 use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
@@ -346,6 +347,16 @@ fn a_new_finding_triggers_the_snapshots_of_its_kind() {
             callback: owner.clone(),
             trigger: inside::Trigger::Timer(Some(period)),
             wait: period * 2,
+        },
+        Diagnosis::LateCallback {
+            topic: None,
+            callback: owner.clone(),
+            trigger: inside::Trigger::Timer(Some(period)),
+            calls: 3,
+            stage: late::Stage::Callback,
+            cause: late::Cause::Runnable,
+            by: Some("chromium".into()),
+            longest: period * 2,
         },
         Diagnosis::IntraProcessOverflow {
             topic: topic.clone(),

@@ -83,6 +83,26 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
             trigger: trigger(triggered),
             wait_seconds: wait.as_secs_f64(),
         },
+        diagnosis::Diagnosis::LateCallback {
+            callback,
+            trigger: triggered,
+            calls,
+            stage,
+            cause,
+            by,
+            longest,
+            ..
+        } => Diagnosis::LateCallback {
+            node: callback.node.as_deref().map(Cow::Borrowed),
+            process_id: callback.process,
+            trigger: trigger(triggered),
+            late_calls: *calls,
+            stage: stage.label().into(),
+            cause: cause.label().into(),
+            by: by.as_deref().map(Cow::Borrowed),
+            words: cause.in_words(by.as_deref()).into(),
+            longest_seconds: longest.as_secs_f64(),
+        },
         diagnosis::Diagnosis::IntraProcessOverflow {
             queue,
             overwritten_permille,

@@ -270,7 +270,7 @@ fn process(facts: &facts::ObservedProcess) -> Process<'_> {
     }
 }
 
-fn owner(owner: &facts::Owner) -> Owner<'_> {
+pub(super) fn owner(owner: &facts::Owner) -> Owner<'_> {
     Owner {
         process_id: owner.process,
         handle: Cow::Owned(format!("{:#x}", owner.handle)),
@@ -449,6 +449,7 @@ mod tests {
                 has_callbacks: true,
                 processes: vec![process],
                 transitions: Vec::new(),
+                late: Vec::new(),
             }));
             observer.input(Input::Time(at));
         }

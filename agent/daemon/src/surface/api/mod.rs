@@ -42,6 +42,7 @@ mod services;
 mod snapshots;
 mod topics;
 mod watch;
+mod why;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -181,6 +182,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(needs(Access::All, Access::All, snapshots::routes()))
         .merge(turns(views()))
         .merge(calls(turns(inside::routes())))
+        .merge(calls(turns(why::routes())))
         .merge(processes::routes())
         .merge(health::routes())
         .merge(needs(Access::All, Access::All, reload::routes()))

@@ -8,6 +8,7 @@
 mod additions;
 mod attribution;
 mod findings;
+mod late;
 pub mod reader_queue;
 mod reader_queues;
 pub mod source;

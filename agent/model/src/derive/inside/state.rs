@@ -1,6 +1,7 @@
 //! Processes and handles of the last reports.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::time::Duration;
 
 use foldhash::{HashMap, HashMapExt as _, HashSet};
@@ -8,6 +9,7 @@ use ros2probe_wire::{DomainId, GuidPrefix};
 
 use super::attribution::Attribution;
 use super::findings::{ThreadLoad, TimerThread, judge};
+use super::late::{Late, LateCalls};
 use super::reader_queue::ReaderQueue;
 use super::source::{Seen, Source};
 use super::topics::{Evidence, InsideTopic, InsideTopics, Live, TopicAdded};
@@ -16,7 +18,8 @@ use super::witness::Witness;
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, Counted, Sum};
 use crate::facts::calls::facts::{InsideFacts, LifecycleState, ObservedProcess, TopicInside};
-use crate::facts::calls::report::{ProcessReport, Report, Transition, Trigger};
+use crate::facts::calls::late::LateCall;
+use crate::facts::calls::report::{ProcessReport, Report, ThreadStates, Transition, Trigger};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::measurement::Measurement;
 use crate::facts::model_time::ModelTime;
@@ -43,6 +46,8 @@ pub struct Inside {
     pub(super) topics: InsideTopics,
     /// Participants of observed processes.
     participants: HashSet<GuidPrefix>,
+    /// Late calls of callbacks.
+    late: LateCalls,
     /// Last state of each managed node, by process and node.
     states: Bounded<LifecycleStates, BTreeMap<(u32, Option<NodeName>), LifecycleState>>,
     /// Revisions of the graph that determined nodes and domains.
@@ -105,6 +110,7 @@ impl Inside {
             has_callbacks,
             processes,
             transitions,
+            late,
         } = report;
         let at = clock.model_time(at);
         let began = self.at.filter(|before| *before < at);
@@ -125,6 +131,9 @@ impl Inside {
         }
         self.attribute(discovery, receivers);
         self.add_to_topics(&added, &ended, at);
+        for call in late {
+            self.note_late(call, clock);
+        }
         let transitions = transitions.into_iter();
         let transitions = transitions.map(|each| self.transit(each, clock)).collect();
         for id in ended {
@@ -176,6 +185,10 @@ impl Inside {
                 self.findings_of(*id, tracked, &mut found);
             }
             self.findings_of_queues(*id, process, &mut found);
+        }
+        if let Some(at) = self.at {
+            let late = self.late.findings(at);
+            found.extend(late.map(|late| self.late_finding(&late)));
         }
         found
     }
@@ -248,6 +261,7 @@ impl Inside {
             at: self.at?,
             has_callbacks: self.has_callbacks,
             states: self.states.values().cloned().collect(),
+            late: self.late.facts(),
             ..InsideFacts::default()
         };
         for (id, process) in &self.processes {
@@ -464,6 +478,21 @@ impl Inside {
         state
     }
 
+    /// Adds a late call to those of its callback.
+    fn note_late(&mut self, mut call: LateCall, clock: WallClock) {
+        let process = self.processes.get(&call.process);
+        let key = (Kind::Callback, call.handle);
+        let tracked = process.and_then(|process| process.handles.get(&key));
+        let mut domain_id = process.map_or(DomainId(0), |process| process.facts.domain_id);
+        let mut usual = ThreadStates::default();
+        if let Some(tracked) = tracked {
+            domain_id = tracked.domain_id;
+            usual = tracked.figures.states();
+            call.node = call.node.or_else(|| tracked.node.clone());
+        }
+        self.late.add(call, domain_id, usual, clock);
+    }
+
     /// Removes an ended process; the sums of its topics remain.
     fn remove(&mut self, id: u32) {
         if let Some(process) = self.processes.remove(&id) {
@@ -493,6 +522,7 @@ impl Inside {
 
     /// Evaluates the rules for all handles.
     fn judge(&mut self, at: ModelTime) {
+        self.revision += u64::from(self.late.judge(at));
         for process in self.processes.values_mut() {
             let handles = process.handles.values();
             let timers: Vec<_> = handles.clone().filter_map(TimerThread::of).collect();
@@ -553,6 +583,23 @@ impl Inside {
                 queue: owner(),
                 overwritten_permille: permille,
             });
+        }
+    }
+
+    fn late_finding(&self, late: &Late<'_>) -> Diagnosis {
+        let name = late.trigger.name().map(TopicName::from);
+        let topic = name.and_then(|name| self.topics.get(late.owner.domain_id, &name));
+        let call = &late.example.call;
+        let by = late.example.main.and_then(|part| call.named_by(part));
+        Diagnosis::LateCallback {
+            topic: topic.map(|topic| topic.key(late.owner.domain_id)),
+            callback: late.owner.clone(),
+            trigger: late.trigger.clone(),
+            calls: late.calls,
+            stage: late.stage,
+            cause: late.cause,
+            by: by.map(|other| Arc::clone(&other.name)),
+            longest: call.total(),
         }
     }
 

@@ -233,7 +233,7 @@ impl Figures {
     }
 
     /// Returns what the time of a callback's calls consisted of.
-    fn states(&self) -> ThreadStates {
+    pub(super) fn states(&self) -> ThreadStates {
         match &self.detail {
             Detail::Callback { states, .. } => *states,
             _ => ThreadStates::default(),

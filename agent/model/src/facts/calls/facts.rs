@@ -1,13 +1,17 @@
 //! Calls inside processes, as a snapshot shows them.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_wire::{DomainId, Guid};
 
+use super::late::{Cause, LateCall, Part, Stage};
 use super::report::{Durations, ThreadStates, Trigger};
+use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName};
+use crate::facts::tables::LateHistory;
 
 /// Facts from inside processes. Lists are sorted by process and handle.
 #[derive(Clone, Debug, Default)]
@@ -28,6 +32,8 @@ pub struct InsideFacts {
     pub buffers: Vec<Buffer>,
     /// Callbacks.
     pub callbacks: Vec<Callback>,
+    /// Callbacks with late calls.
+    pub late: Vec<LateCallback>,
     /// Last lifecycle state of each managed node.
     pub states: Vec<LifecycleState>,
 }
@@ -207,6 +213,53 @@ pub struct Callback {
     pub recent_states: ThreadStates,
 }
 
+/// Late calls of a callback.
+#[derive(Clone, Debug)]
+pub struct LateCallback {
+    /// Identity and node. The process may have ended.
+    pub owner: Owner,
+    /// Trigger of the callback.
+    pub trigger: Trigger,
+    /// Late calls.
+    pub calls: u64,
+    /// Time of all late calls, by stage and cause.
+    pub sums: Vec<((Stage, Cause), Duration)>,
+    /// Late calls by the cause that made them late.
+    pub causes: Vec<((Stage, Cause), u64)>,
+    /// The last late calls, oldest first.
+    pub history: Arc<Bounded<LateHistory, VecDeque<LateEntry>>>,
+    /// The longest late calls.
+    pub longest: Vec<Arc<LateExample>>,
+    /// The last late calls, oldest first.
+    pub latest: Vec<Arc<LateExample>>,
+}
+
+/// A late call in a list of many.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LateEntry {
+    /// Start of the call.
+    pub at: ModelTime,
+    /// Stage in which it became late.
+    pub stage: Stage,
+    /// What made it late.
+    pub cause: Cause,
+    /// Time from ready to the end of the call.
+    pub total: Duration,
+    /// Name of the thread that ran instead for longest, released the lock, or continued the process.
+    pub culprit: Option<Arc<str>>,
+}
+
+/// A late call with all its parts.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LateExample {
+    /// Start of the call.
+    pub at: ModelTime,
+    /// What made it late.
+    pub main: Option<Part>,
+    /// The call.
+    pub call: LateCall,
+}
+
 /// The last lifecycle state of a managed node.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LifecycleState {
@@ -271,6 +324,15 @@ pub struct TopicInside {
     /// Messages that arrived at observed processes and were never taken. `None` if no process
     /// allows a comparison of arrived and taken messages.
     pub lost_in_queues: Option<u64>,
+}
+
+impl LateCallback {
+    /// Returns the time of the last late call.
+    #[must_use]
+    pub fn last(&self) -> ModelTime {
+        let last = self.latest.last();
+        last.map_or(ModelTime::ZERO, |example| example.at)
+    }
 }
 
 impl Quantiles {

@@ -2,4 +2,5 @@
 
 pub mod durations;
 pub mod facts;
+pub mod late;
 pub mod report;

@@ -7,6 +7,7 @@ use std::time::Duration;
 use ros2probe_wire::{DomainId, Timestamp};
 
 pub use super::durations::Durations;
+use super::late::LateCall;
 use crate::facts::names::{NodeName, TopicName};
 
 /// A report about calls inside processes. Handles that have not changed since the last report are
@@ -21,6 +22,8 @@ pub struct Report {
     pub processes: Vec<ProcessReport>,
     /// Lifecycle transitions since the last report.
     pub transitions: Vec<Transition>,
+    /// Late calls since the last report, in the order of their end.
+    pub late: Vec<LateCall>,
 }
 
 /// One process.

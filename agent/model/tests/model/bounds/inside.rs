@@ -1,6 +1,7 @@
 //! Reports of ever new processes, handles and states, some of them of an announced participant.
 
 use super::*;
+use ros2probe_model::facts::calls::late::{LateBound, LateCall};
 use ros2probe_model::facts::calls::report::{
     CallbackReport, Durations, ProcessReport, PublisherReport, Report, SubscriptionReport,
     ThreadStates, Transition, Trigger,
@@ -70,7 +71,36 @@ pub(super) fn reports(observer: &mut Observer, dice: &mut Dice, now: u64) {
         has_callbacks: true,
         processes: vec![process],
         transitions: vec![transition],
+        late: vec![late(id, dice, at)],
     }));
+}
+
+/// Returns a late call, one of many of a few callbacks or one of a new callback.
+fn late(process: u32, dice: &mut Dice, at: Timestamp) -> LateCall {
+    LateCall {
+        process,
+        handle: match dice.pick(2) {
+            0 => 1,
+            _ => dice.pick(9_000),
+        },
+        node: None,
+        trigger: Trigger::Timer(None),
+        thread: 1,
+        cpu: 0,
+        source: None,
+        started: at,
+        duration: Duration::from_millis(dice.pick(1_000)),
+        wait: None,
+        bound: LateBound {
+            duration: Duration::ZERO,
+            wait: Duration::MAX,
+        },
+        previous: None,
+        states: None,
+        states_before: None,
+        activity: None,
+        activity_before: None,
+    }
 }
 
 /// Reports a subscription more often than its queue keeps totals.
@@ -102,6 +132,7 @@ pub(super) fn of_a_queue() {
                 ..ProcessReport::default()
             }],
             transitions: Vec::new(),
+            late: Vec::new(),
         }));
     }
 }

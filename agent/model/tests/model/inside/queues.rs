@@ -130,6 +130,7 @@ impl Robot {
                 Vec::new()
             },
             transitions: Vec::new(),
+            late: Vec::new(),
         }));
         if let Some(queue) = self.queue() {
             assert!(queue.lost <= self.dropped, "{queue:?}, {}", self.dropped);

@@ -3,6 +3,9 @@
 use std::time::Duration;
 
 use ros2probe_daemon::agent_facts::InsideSourceFacts;
+use ros2probe_model::facts::calls::late::{
+    Activity, Blocked, LateBound, LateCall, OtherThread, PreviousCall,
+};
 use ros2probe_model::facts::calls::report::{
     CallbackReport, Durations, ProcessReport, PublisherReport, Report, ThreadStates, Transition,
     Trigger,
@@ -63,6 +66,55 @@ fn process(id: u32, second: u64, now: u64) -> ProcessReport {
     }
 }
 
+/// Returns late calls of a process, with all that one can have.
+fn late(process: u32, now: u64) -> impl Iterator<Item = LateCall> {
+    let other = move |number: u32| OtherThread {
+        duration: Duration::from_millis(number.into()),
+        thread: number,
+        process: number,
+        name: format!("thread_{number:08}").into(),
+    };
+    let activity = move || Activity {
+        longest: Some(Blocked {
+            duration: Duration::from_millis(5),
+            kind: 0,
+            call: Some("clock_nanosleep".into()),
+            argument: 0,
+            waker: Some(other(process)),
+        }),
+        others: (1..=8).map(other).collect(),
+        ..Activity::default()
+    };
+    let topic = move || format!("/robot/sensor_{process:04}/data_raw");
+    let states = Some(ThreadStates::default());
+    (0..16).map(move |number| LateCall {
+        process,
+        handle: 1,
+        node: Some(format!("/robot/driver_{process:04}").into()),
+        trigger: Trigger::Subscription(topic().as_str().into()),
+        thread: process,
+        cpu: 0,
+        source: Some(Timestamp(now)),
+        started: Timestamp(now),
+        duration: Duration::from_millis(20 + number),
+        wait: Some(Duration::from_millis(5)),
+        bound: LateBound {
+            duration: Duration::from_millis(5),
+            wait: Duration::from_millis(5),
+        },
+        previous: Some(PreviousCall {
+            handle: 2,
+            trigger: Trigger::Subscription(topic().as_str().into()),
+            duration: Duration::from_millis(5),
+            ended_before: Duration::from_millis(5),
+        }),
+        states,
+        states_before: states,
+        activity: Some(activity()),
+        activity_before: Some(activity()),
+    })
+}
+
 /// Compares the memory of the tables at their caps, with two snapshots and pages, to
 /// [`Limits::INSIDE`].
 #[test]
@@ -88,6 +140,7 @@ fn figures_from_inside_processes_fit_into_their_share_of_the_memory_limit() {
             has_callbacks: true,
             processes: (1..=PROCESSES).map(|id| process(id, second, now)).collect(),
             transitions: (1..=PROCESSES).map(transition).collect(),
+            late: (1..=PROCESSES).flat_map(|id| late(id, now)).collect(),
         }));
         observer.input(Input::Time(Timestamp(now)));
         observer.drain();
@@ -122,7 +175,7 @@ fn figures_from_inside_processes_fit_into_their_share_of_the_memory_limit() {
         pages.push(exposition.render(Format::Classic).unwrap());
     }
     let all = resident() - before;
-    let kernel = 7 << 20;
+    let kernel = 9 << 20;
     println!(
         "model {} KiB, with two snapshots and pages ({} KiB each) {} KiB",
         modelled >> 10,

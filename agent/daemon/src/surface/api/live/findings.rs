@@ -287,6 +287,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
         }
         Diagnosis::SlowCallback { .. }
         | Diagnosis::ExecutorWait { .. }
+        | Diagnosis::LateCallback { .. }
         | Diagnosis::IntraProcessOverflow { .. }
         | Diagnosis::ReaderQueueOverflow { .. }
         | Diagnosis::ObservationSuspended { .. } => inside::in_words(all.ids, diagnosis),

@@ -47,6 +47,23 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
             let remedy = "shorten the callbacks of its thread, or use a multi-threaded executor";
             (about(callback), text, remedy)
         }
+        Diagnosis::LateCallback {
+            callback,
+            trigger,
+            calls,
+            cause,
+            by,
+            longest,
+            ..
+        } => {
+            let text = format!(
+                "The callback of {trigger} in {} was late {calls} times in a minute, up to {}: {}",
+                who(callback),
+                milliseconds(*longest),
+                cause.in_words(by.as_deref())
+            );
+            (about(callback), text, cause.remedy())
+        }
         Diagnosis::IntraProcessOverflow {
             topic,
             queue,

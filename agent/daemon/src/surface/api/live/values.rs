@@ -121,6 +121,7 @@ impl Figures<'_> {
                 | Diagnosis::HangingCall { .. }
                 | Diagnosis::SlowCallback { .. }
                 | Diagnosis::ExecutorWait { .. }
+                | Diagnosis::LateCallback { .. }
                 | Diagnosis::IntraProcessOverflow { .. }
                 | Diagnosis::ReaderQueueOverflow { .. }
                 | Diagnosis::ObservationSuspended { .. }

@@ -1,0 +1,343 @@
+//! Late calls of callbacks: calls beyond the bounds that user space has set.
+
+use core::ptr::{copy_nonoverlapping, read_volatile, write_volatile};
+
+use aya_ebpf::{
+    helpers::bpf_get_smp_processor_id,
+    macros::map,
+    maps::{Array, HashMap, LruHashMap},
+};
+use ros2probe_wire::inside::{
+    Counter, Handle, announced, kind,
+    late::{
+        Activity, BOUND_CAPACITY, Blocked, Bound, LateCall, PER_SECOND, THREAD_CAPACITY,
+        THREAD_IDS, mode,
+    },
+    thread_state,
+};
+
+use crate::{
+    accounting::{self, Accounting},
+    instructions::{add, opaque},
+    maps::{ANNOUNCEMENTS, Current, Thread, count},
+};
+
+const SECOND: u64 = 1_000_000_000;
+/// Numbers of 64 bits in [`FOLLOWED`].
+const WORDS: u32 = THREAD_IDS / 64;
+
+/// One of [`mode`]. Set by user space.
+#[map]
+static LATE_MODE: Array<u32> = Array::with_max_entries(1, 0);
+/// Bounds of callbacks. Set by user space.
+#[map]
+static BOUNDS: HashMap<Handle, Bound> = HashMap::with_max_entries(BOUND_CAPACITY, 0);
+/// Threads that call callbacks, by thread id.
+#[map]
+static FOLLOWED_THREADS: LruHashMap<u32, Followed> =
+    LruHashMap::with_max_entries(THREAD_CAPACITY, 0);
+/// The initial value of a followed thread; never written.
+#[map]
+static NEW_FOLLOWED: Array<Followed> = Array::with_max_entries(1, 0);
+/// One bit for each thread id: the thread is followed.
+#[map]
+static FOLLOWED: Array<u64> = Array::with_max_entries(WORDS, 0);
+/// Number of followed threads that can run and do not.
+#[map]
+static RUNNABLE_THREADS: Array<i64> = Array::with_max_entries(1, 0);
+
+/// States of a followed thread.
+pub mod state {
+    pub const RUNNING: u64 = 0;
+    pub const RUNNABLE: u64 = 1;
+    pub const BLOCKED: u64 = 2;
+}
+
+/// A thread that calls callbacks.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct Followed {
+    /// One of [`state`].
+    pub state: u64,
+    /// Start of that state, or of the present span if that is later.
+    pub since: u64,
+    /// Time at which the thread began to run; 0 = unknown.
+    pub entered: u64,
+    /// The scheduler's CPU time of the thread at its last switch.
+    pub charged: u64,
+    /// The scheduler's waiting time of the thread when it last left a CPU.
+    pub run_delay: u64,
+    /// The present wait, if the thread is blocked.
+    pub wait: Blocked,
+    /// What the thread did since the last start or end of a callback.
+    pub activity: Activity,
+    /// What it did between the call before and the present one.
+    before: Activity,
+    /// The mode when the present call began.
+    mode: u64,
+    /// Time from ready to start of the present call.
+    delay: u64,
+    /// Accounting at the last start or end of a callback.
+    accounting: Accounting,
+    is_accounted: u64,
+    states_before: [u64; thread_state::COUNT],
+    is_accounted_before: u64,
+    /// The call before: its callback, start and end.
+    previous: u64,
+    previous_started: u64,
+    previous_ended: u64,
+}
+
+/// Returns the present mode.
+#[inline(always)]
+pub fn present_mode() -> u32 {
+    match LATE_MODE.get_ptr(0) {
+        // SAFETY: a map value pointer checked against null.
+        Some(mode) => unsafe { read_volatile(mode) },
+        None => mode::OFF,
+    }
+}
+
+/// Returns a followed thread.
+#[inline(always)]
+pub fn followed(thread: u32) -> Option<*mut Followed> {
+    FOLLOWED_THREADS.get_ptr_mut(&thread)
+}
+
+/// Returns whether a thread is followed.
+#[inline(always)]
+pub fn is_followed(thread: u32) -> bool {
+    match FOLLOWED.get_ptr(thread >> 6) {
+        // SAFETY: a map value pointer checked against null.
+        Some(word) => unsafe { read_volatile(word) >> (thread & 63) & 1 != 0 },
+        None => false,
+    }
+}
+
+/// Follows a thread from now on.
+#[inline(always)]
+fn follow(thread: u32) -> Option<*mut Followed> {
+    if !is_followed(thread)
+        && let Some(word) = FOLLOWED.get_ptr_mut(thread >> 6)
+    {
+        // Another thread with the same word may undo this at the same time. The next call repeats
+        // it.
+        // SAFETY: a map value pointer checked against null.
+        unsafe { write_volatile(word, read_volatile(word) | 1 << (thread & 63)) };
+    }
+    if let Some(known) = followed(thread) {
+        return Some(known);
+    }
+    let new = NEW_FOLLOWED.get_ptr(0)?;
+    // SAFETY: a map value pointer checked against null, of an element that is never written.
+    let _ = FOLLOWED_THREADS.insert(&thread, unsafe { &*new }, 0);
+    followed(thread)
+}
+
+/// Follows a thread no longer, because it ends.
+#[inline(always)]
+pub fn forget(thread: u32) {
+    let _ = FOLLOWED_THREADS.remove(&thread);
+    if let Some(word) = FOLLOWED.get_ptr_mut(thread >> 6) {
+        // SAFETY: as in `follow`.
+        unsafe { write_volatile(word, read_volatile(word) & !(1 << (thread & 63))) };
+    }
+}
+
+/// Returns whether a followed thread can run and does not.
+#[inline(always)]
+pub fn is_any_runnable() -> bool {
+    match RUNNABLE_THREADS.get_ptr(0) {
+        // SAFETY: a map value pointer checked against null.
+        Some(count) => unsafe { read_volatile(count) > 0 },
+        None => false,
+    }
+}
+
+/// Changes the number of followed threads that can run and do not.
+#[inline(always)]
+pub fn add_runnable(by: i64) {
+    if let Some(count) = RUNNABLE_THREADS.get_ptr_mut(0) {
+        add(count.cast(), by as u64);
+    }
+}
+
+/// Begins a new span of time of the running thread.
+#[inline(always)]
+unsafe fn begin_span(followed: *mut Followed, now: u64) {
+    // SAFETY: a map value, by the caller.
+    unsafe {
+        let since = (*followed).since;
+        if (*followed).state == state::RUNNING {
+            if since != 0 && now > since {
+                (*followed).activity.cpu += now - since;
+            }
+        } else {
+            // The thread runs, so it entered a CPU without an event.
+            if (*followed).state == state::RUNNABLE {
+                add_runnable(-1);
+            }
+            (*followed).state = state::RUNNING;
+            (*followed).activity.missed += 1;
+        }
+        (*followed).since = now;
+    }
+}
+
+/// Copies plain values of map memory, or of the ring.
+#[inline(always)]
+unsafe fn copy(from: *const Activity, to: *mut Activity) {
+    const WORDS: usize = size_of::<Activity>() / 8;
+    // SAFETY: both have this size, by the caller.
+    unsafe { copy_nonoverlapping(from.cast::<u64>(), to.cast::<u64>(), WORDS) };
+}
+
+/// Empties what a thread did.
+#[inline(always)]
+unsafe fn clear(followed: *mut Followed) {
+    if let Some(new) = NEW_FOLLOWED.get_ptr(0) {
+        // SAFETY: map values checked against null.
+        unsafe { copy(&raw const (*new).activity, &raw mut (*followed).activity) };
+    }
+}
+
+/// Handles the start of a callback.
+#[inline(always)]
+pub fn began(current: &Current, delay: u64, now: u64, accounting: Option<Accounting>) {
+    let mode = present_mode();
+    if mode == mode::OFF {
+        return;
+    }
+    let Some(followed) = follow(current.thread) else {
+        return;
+    };
+    // SAFETY: a map value pointer checked against null, of the running thread.
+    unsafe {
+        begin_span(followed, now);
+        copy(&raw const (*followed).activity, &raw mut (*followed).before);
+        clear(followed);
+        (*followed).mode = u64::from(mode);
+        (*followed).delay = delay;
+        (*followed).is_accounted_before = 0;
+        let previous_ended = (*followed).previous_ended;
+        if let Some(after) = accounting {
+            if (*followed).is_accounted != 0 && previous_ended != 0 && now > previous_ended {
+                let states = accounting::states(
+                    &raw const (*followed).accounting,
+                    &after,
+                    now - previous_ended,
+                );
+                (*followed).states_before = states;
+                (*followed).is_accounted_before = 1;
+            }
+        }
+    }
+}
+
+/// Handles the end of a callback that began at the thread's `started`.
+#[inline(always)]
+pub fn ended(
+    current: &Current,
+    callback: u64,
+    trigger: Handle,
+    thread: *const Thread,
+    now: u64,
+    after: Option<Accounting>,
+    states: Option<[u64; thread_state::COUNT]>,
+) {
+    let mode = present_mode();
+    if mode == mode::OFF {
+        return;
+    }
+    let Some(followed) = followed(current.thread) else {
+        return;
+    };
+    // SAFETY: map value pointers checked against null, of the running thread.
+    unsafe {
+        begin_span(followed, now);
+        let started = (*thread).started;
+        let key = current.handle(callback, kind::CALLBACK);
+        if let Some(bound) = BOUNDS.get_ptr_mut(&key)
+            && (now - started > (*bound).duration || (*followed).delay > (*bound).delay)
+            && may_report(bound, now)
+        {
+            let bounds = [(*bound).duration, (*bound).delay];
+            report(current, callback, trigger, thread, followed, now, mode, states, bounds);
+        }
+        clear(followed);
+        (*followed).previous = callback;
+        (*followed).previous_started = started;
+        (*followed).previous_ended = now;
+        (*followed).is_accounted = 0;
+        if let Some(after) = after {
+            (*followed).accounting = after;
+            (*followed).is_accounted = 1;
+        }
+    }
+}
+
+/// Counts a report; returns `false` beyond the number of a second.
+#[inline(always)]
+unsafe fn may_report(bound: *mut Bound, now: u64) -> bool {
+    // SAFETY: a map value, by the caller.
+    unsafe {
+        if now.wrapping_sub((*bound).since) >= SECOND {
+            (*bound).since = now;
+            (*bound).reported = 0;
+        }
+        if (*bound).reported >= PER_SECOND {
+            count(Counter::LateSkipped);
+            return false;
+        }
+        (*bound).reported += 1;
+    }
+    true
+}
+
+#[inline(always)]
+#[expect(clippy::too_many_arguments, reason = "each is a part of the report")]
+unsafe fn report(
+    current: &Current,
+    callback: u64,
+    trigger: Handle,
+    thread: *const Thread,
+    followed: *const Followed,
+    now: u64,
+    mode: u32,
+    states: Option<[u64; thread_state::COUNT]>,
+    bounds: [u64; 2],
+) {
+    let Some(mut entry) = ANNOUNCEMENTS.reserve::<LateCall>(0) else {
+        count(Counter::LateLost);
+        return;
+    };
+    let late: *mut LateCall = entry.as_mut_ptr();
+    // SAFETY: reserved memory of this size, all of which is written; map values, by the caller.
+    unsafe {
+        let began_as = (*followed).mode as u32;
+        let is_accounted = u32::from(states.is_some());
+        let is_accounted_before = (*followed).is_accounted_before as u32;
+        (*late).kind = announced::LATE;
+        (*late).process = current.process;
+        (*late).thread = current.thread;
+        (*late).mode = if began_as < mode { began_as } else { mode };
+        (*late).cpu = bpf_get_smp_processor_id();
+        (*late).accounted = is_accounted | (opaque(is_accounted_before) as u32 & 1) << 1;
+        (*late).callback = callback;
+        (*late).trigger = trigger;
+        (*late).source_timestamp = (*thread).source_timestamp;
+        (*late).taken = (*thread).taken;
+        (*late).started = (*thread).started;
+        (*late).ended = now;
+        (*late).delay = (*followed).delay;
+        (*late).bounds = bounds;
+        (*late).previous = (*followed).previous;
+        (*late).previous_started = (*followed).previous_started;
+        (*late).previous_ended = (*followed).previous_ended;
+        (*late).states = states.unwrap_or([0; thread_state::COUNT]);
+        (*late).states_before = (*followed).states_before;
+        copy(&raw const (*followed).activity, &raw mut (*late).during);
+        copy(&raw const (*followed).before, &raw mut (*late).before);
+    }
+    entry.submit(0);
+}

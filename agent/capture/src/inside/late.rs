@@ -1,0 +1,553 @@
+//! Late calls: from when on a call is late, whether the scheduler's events are observed, and the
+//! items that the kernel programs report.
+//!
+//! Without a bound from a client or an expectation, a call is late if it takes three times as long
+//! as 99 % of the calls of its callback in the last minutes, and [`LEAST_BOUND`] or more.
+
+use std::collections::{HashMap, HashSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::facts::calls::late::{
+    Activity, Blocked, LateBound, LateCall, OtherThread, PreviousCall,
+};
+use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
+use ros2probe_model::facts::names::NodeName;
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::inside::late::{self, Bound, mode, wait};
+use ros2probe_wire::inside::{BUCKETS, Handle, bucket_start, kind, thread_state};
+
+use super::programs::{Events, Programs, Tables};
+use super::table::ProcessTable;
+use crate::error_chain::in_words;
+use crate::settings::LateChoice;
+use crate::system::Clocks;
+use crate::tables::CallbackBounds;
+
+/// Minimum of a learnt bound.
+pub const LEAST_BOUND: Duration = Duration::from_millis(5);
+/// Ratio of a learnt bound to the 99th percentile.
+const FACTOR: u64 = 3;
+/// Minimum number of calls from which a bound is learnt.
+const LEARNT_FROM: f32 = 50.0;
+/// Part of the calls so far that is forgotten in each round: a round is a second, so that the
+/// bound describes the last minutes.
+const FORGOTTEN: f32 = 1.0 / 180.0;
+
+/// Part of a bound by which it rises in a round at most, as a divisor: it doubles in 70 s.
+const RISE: u64 = 100;
+
+/// What clients want to know about late calls.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct LateDemand {
+    /// Whether a client asks for causes.
+    pub has_question: bool,
+    /// Bounds of clients and expectations. The first one that applies to a callback counts.
+    pub bounds: Vec<RequestedBound>,
+}
+
+/// From when on calls of a callback are late.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RequestedBound {
+    /// Topic that triggers the callback, or its node; `None` = any callback.
+    pub name: Option<Arc<str>>,
+    /// Maximum time of a call, and maximum time from ready to start.
+    pub above: Duration,
+}
+
+/// What the programs observe about late calls.
+pub(super) struct LateObservation {
+    programs: Arc<Programs>,
+    choice: LateChoice,
+    /// The mode that the programs have.
+    mode: u32,
+    events: Option<Events>,
+    without_events: Option<String>,
+    requested: Vec<RequestedBound>,
+    bounds: Bounded<CallbackBounds, HashMap<Handle, Learnt>>,
+}
+
+/// What is known about the durations of one callback.
+struct Learnt {
+    /// Counts at the last round, as in `Figures::buckets`.
+    known: [[u32; BUCKETS]; 2],
+    /// Calls of the last minutes.
+    recent: [[f32; BUCKETS]; 2],
+    /// The learnt bounds.
+    learnt: Option<[u64; 2]>,
+    /// The bounds that the programs have.
+    set: Option<[u64; 2]>,
+}
+
+impl LateObservation {
+    pub(super) fn new(programs: Arc<Programs>, choice: LateChoice) -> Self {
+        Self {
+            programs,
+            choice,
+            mode: mode::OFF,
+            events: None,
+            without_events: None,
+            requested: Vec::new(),
+            bounds: Bounded::default(),
+        }
+    }
+
+    /// Returns what is observed: `off`, `sums` or `events`.
+    pub(super) const fn observed(&self) -> &'static str {
+        match self.mode {
+            mode::EVENTS => "events",
+            mode::SUMS => "sums",
+            _ => "off",
+        }
+    }
+
+    /// Returns why they are not observed although they are needed.
+    pub(super) fn without_events(&self) -> Option<&str> {
+        self.without_events.as_deref()
+    }
+
+    /// Begins or ends the observation of the scheduler's events. `at_calls`: whether callbacks are
+    /// observed.
+    pub(super) fn follow(&mut self, at_calls: bool, demand: &LateDemand, tables: &mut Tables) {
+        self.requested.clone_from(&demand.bounds);
+        let needs_events = match self.choice {
+            LateChoice::Off => false,
+            LateChoice::On => true,
+            LateChoice::Auto => demand.has_question,
+        };
+        let mode = match self.choice {
+            _ if !at_calls => mode::OFF,
+            LateChoice::Off => mode::OFF,
+            _ if needs_events => mode::EVENTS,
+            _ => mode::SUMS,
+        };
+        if mode == mode::EVENTS && self.events.is_none() && self.without_events.is_none() {
+            match self.programs.observe_scheduler() {
+                Ok(events) => self.events = Some(events),
+                Err(reason) => {
+                    tracing::warn!(
+                        reason,
+                        "late callbacks are reported without who ran instead"
+                    );
+                    self.without_events = Some(reason);
+                }
+            }
+        }
+        if mode != mode::EVENTS {
+            self.events = None;
+        }
+        let mode = match mode == mode::EVENTS && self.events.is_none() {
+            true => mode::SUMS,
+            false => mode,
+        };
+        if mode == self.mode {
+            return;
+        }
+        match tables.set_late_mode(mode) {
+            Ok(()) => self.mode = mode,
+            Err(error) => {
+                let reason = in_words(&error);
+                tracing::warn!(reason, "late callbacks are not reported");
+            }
+        }
+    }
+
+    /// Learns from the calls of the last round, and sets the bounds of callbacks.
+    pub(super) fn set_bounds(&mut self, table: &ProcessTable, tables: &mut Tables) {
+        if self.mode == mode::OFF {
+            return;
+        }
+        let callbacks = tables.figures();
+        let callbacks: Vec<_> = callbacks
+            .filter(|(handle, _)| handle.kind == kind::CALLBACK)
+            .collect();
+        let present: HashSet<_> = callbacks.iter().map(|(handle, _)| *handle).collect();
+        let gone = |handle: &Handle| !present.contains(handle);
+        let gone: Vec<_> = self.bounds.keys().copied().filter(gone).collect();
+        for handle in gone {
+            self.bounds.remove(&handle);
+            let _ = tables.remove_bound(handle);
+        }
+        for (handle, figures) in &callbacks {
+            let requested = match &self.requested[..] {
+                [] => None,
+                requested => bound_of(requested, &table.name_callback(*handle, figures)),
+            };
+            let learnt = self.bounds.get_or_insert_with(*handle, Learnt::default);
+            let Some(learnt) = learnt else {
+                continue;
+            };
+            learnt.add(&figures.buckets);
+            let bounds = match requested {
+                Some(above) => Some([above; 2]),
+                None => learnt.learnt,
+            };
+            if learnt.differs(bounds) {
+                let set = match bounds {
+                    Some([duration, delay]) => {
+                        let bound = Bound {
+                            duration,
+                            delay,
+                            ..Bound::default()
+                        };
+                        tables.set_bound(*handle, bound)
+                    }
+                    None => tables.remove_bound(*handle),
+                };
+                if set.is_ok() {
+                    learnt.set = bounds;
+                }
+            }
+        }
+    }
+}
+
+/// Returns the bound of a callback, in nanoseconds, if one applies.
+fn bound_of(requested: &[RequestedBound], of: &(Trigger, Option<NodeName>)) -> Option<u64> {
+    let (trigger, node) = of;
+    let applies = |bound: &&RequestedBound| {
+        let name = bound.name.as_deref();
+        name.is_none() || name == trigger.name() || name == node.as_deref()
+    };
+    let above = requested.iter().find(applies)?.above;
+    Some(u64::try_from(above.as_nanos()).unwrap_or(u64::MAX))
+}
+
+impl Default for Learnt {
+    fn default() -> Self {
+        Self {
+            known: [[0; BUCKETS]; 2],
+            recent: [[0.0; BUCKETS]; 2],
+            learnt: None,
+            set: None,
+        }
+    }
+}
+
+impl Learnt {
+    /// Adds the calls since the last round, and learns the bounds. They rise slowly, so that a
+    /// callback that becomes slow is late for minutes before that is usual.
+    #[expect(clippy::cast_precision_loss, reason = "calls of a second are few")]
+    fn add(&mut self, counts: &[[u32; BUCKETS]; 2]) {
+        let all = self.recent.iter_mut().zip(&mut self.known).zip(counts);
+        for ((recent, known), counts) in all {
+            for ((recent, known), count) in recent.iter_mut().zip(known.iter_mut()).zip(counts) {
+                // Smaller counts began anew.
+                let new = count.checked_sub(*known).unwrap_or(*count);
+                *recent = *recent * (1.0 - FORGOTTEN) + new as f32;
+                *known = *count;
+            }
+        }
+        let Some(bounds) = self.bounds() else {
+            return;
+        };
+        let [duration, delay] = bounds;
+        let slowly = |known: u64, new: u64| new.min(known.saturating_add(known / RISE));
+        self.learnt = Some(match self.learnt {
+            Some([known_duration, known_delay]) => {
+                [slowly(known_duration, duration), slowly(known_delay, delay)]
+            }
+            None => bounds,
+        });
+    }
+
+    /// Returns bounds of duration and delay for the calls of the last minutes, in nanoseconds; `None`
+    /// before enough calls.
+    fn bounds(&self) -> Option<[u64; 2]> {
+        let [duration, delay] = &self.recent;
+        let bound = |counts: &[f32; BUCKETS]| {
+            let least = u64::try_from(LEAST_BOUND.as_nanos()).unwrap_or(u64::MAX);
+            p99(counts).map(|p99| p99.saturating_mul(FACTOR).max(least))
+        };
+        // Some callbacks have no delay, for example those of services.
+        Some([bound(duration)?, bound(delay).unwrap_or(u64::MAX)])
+    }
+
+    /// Returns whether bounds differ from those that the programs have by more than a step of the
+    /// distribution.
+    fn differs(&self, bounds: Option<[u64; 2]>) -> bool {
+        match (self.set, bounds) {
+            (Some(set), Some(bounds)) => {
+                let both = set.iter().zip(&bounds);
+                both.clone()
+                    .any(|(set, bound)| set.abs_diff(*bound) > set / 10)
+            }
+            (set, bounds) => set.is_some() != bounds.is_some(),
+        }
+    }
+}
+
+/// Returns the upper end of the bucket with the 99th percentile, in nanoseconds; `None` if there are
+/// few values.
+fn p99(counts: &[f32; BUCKETS]) -> Option<u64> {
+    let all: f32 = counts.iter().sum();
+    if all < LEARNT_FROM {
+        return None;
+    }
+    let mut below = 0.0;
+    let index = counts.iter().position(|count| {
+        below += count;
+        below >= all * 0.99
+    })?;
+    Some(bucket_start(index + 1))
+}
+
+/// Values of `LateCall::accounted`.
+const DURING: u32 = 1;
+const BEFORE: u32 = 2;
+
+/// Converts one item. `name` returns the trigger and node of a callback of the same process.
+pub(super) fn convert(
+    call: &late::LateCall,
+    clocks: &Clocks,
+    mut name: impl FnMut(u64) -> (Trigger, Option<NodeName>),
+) -> LateCall {
+    let (trigger, node) = name(call.callback);
+    let between = |from: u64, to: u64| Duration::from_nanos(to.saturating_sub(from));
+    let previous = (call.previous_ended != 0).then(|| PreviousCall {
+        handle: call.previous,
+        trigger: name(call.previous).0,
+        duration: between(call.previous_started, call.previous_ended),
+        ended_before: between(call.previous_ended, call.started),
+    });
+    let states = |bit, states: &_| (call.accounted & bit != 0).then(|| thread_states(states));
+    let has_events = call.mode == mode::EVENTS;
+    let [duration, wait] = call.bounds.map(Duration::from_nanos);
+    LateCall {
+        process: call.process,
+        handle: call.callback,
+        node,
+        trigger,
+        thread: call.thread,
+        cpu: call.cpu,
+        source: (call.source_timestamp != 0).then_some(Timestamp(call.source_timestamp)),
+        started: clocks.calendar(call.started),
+        duration: between(call.started, call.ended),
+        wait: (call.delay != 0).then(|| Duration::from_nanos(call.delay)),
+        bound: LateBound { duration, wait },
+        previous,
+        states: states(DURING, &call.states),
+        states_before: states(BEFORE, &call.states_before),
+        activity: has_events.then(|| activity(&call.during)),
+        activity_before: has_events.then(|| activity(&call.before)),
+    }
+}
+
+fn thread_states(states: &[u64; thread_state::COUNT]) -> ThreadStates {
+    let [cpu, throttled, runnable, blocked] = *states;
+    ThreadStates {
+        calls: 1,
+        cpu,
+        throttled,
+        runnable,
+        blocked,
+    }
+}
+
+fn activity(activity: &late::Activity) -> Activity {
+    let others = activity.others.iter();
+    let others = others.filter(|other| other.nanoseconds != 0);
+    let mut others: Vec<_> = others
+        .map(|other| OtherThread {
+            duration: Duration::from_nanos(other.nanoseconds),
+            thread: other.thread,
+            process: other.process,
+            name: name(&other.name),
+        })
+        .collect();
+    others.sort_by(|one, other| other.cmp(one));
+    let longest = &activity.longest;
+    Activity {
+        runnable: Duration::from_nanos(activity.runnable),
+        stolen: Duration::from_nanos(activity.stolen),
+        blocked: activity.blocked.map(Duration::from_nanos),
+        longest: (longest.nanoseconds != 0).then(|| blocked(longest)),
+        others,
+    }
+}
+
+fn blocked(blocked: &late::Blocked) -> Blocked {
+    let kind = blocked.kind as usize;
+    // An interrupt ends any other wait, whatever thread it interrupts.
+    let has_waker = matches!(kind, wait::LOCK | wait::STOPPED) && blocked.waker != 0;
+    Blocked {
+        duration: Duration::from_nanos(blocked.nanoseconds),
+        kind,
+        call: (blocked.call != u32::MAX).then(|| system_call(blocked.call)),
+        argument: blocked.argument,
+        waker: has_waker.then(|| OtherThread {
+            duration: Duration::ZERO,
+            thread: blocked.waker,
+            process: blocked.waker_process,
+            name: name(&blocked.waker_name),
+        }),
+    }
+}
+
+fn name(bytes: &[u8; late::NAME_BYTES]) -> Arc<str> {
+    let end = bytes.iter().position(|byte| *byte == 0);
+    let name = bytes.get(..end.unwrap_or(bytes.len())).unwrap_or_default();
+    String::from_utf8_lossy(name).into()
+}
+
+/// Returns the name of a system call in which threads wait, otherwise its number.
+fn system_call(number: u32) -> Arc<str> {
+    macro_rules! names {
+        ($($name:ident = $call:ident),* $(,)?) => {
+            [$((libc::$call, stringify!($name))),*]
+        };
+    }
+    let names = names![
+        accept4 = SYS_accept4,
+        clock_nanosleep = SYS_clock_nanosleep,
+        close = SYS_close,
+        connect = SYS_connect,
+        epoll_pwait = SYS_epoll_pwait,
+        fallocate = SYS_fallocate,
+        fdatasync = SYS_fdatasync,
+        flock = SYS_flock,
+        fsync = SYS_fsync,
+        ftruncate = SYS_ftruncate,
+        futex = SYS_futex,
+        getdents64 = SYS_getdents64,
+        io_uring_enter = SYS_io_uring_enter,
+        ioctl = SYS_ioctl,
+        madvise = SYS_madvise,
+        mmap = SYS_mmap,
+        mprotect = SYS_mprotect,
+        msync = SYS_msync,
+        munmap = SYS_munmap,
+        nanosleep = SYS_nanosleep,
+        openat = SYS_openat,
+        ppoll = SYS_ppoll,
+        pread64 = SYS_pread64,
+        pselect6 = SYS_pselect6,
+        pwrite64 = SYS_pwrite64,
+        read = SYS_read,
+        readv = SYS_readv,
+        recvfrom = SYS_recvfrom,
+        recvmmsg = SYS_recvmmsg,
+        recvmsg = SYS_recvmsg,
+        sendmmsg = SYS_sendmmsg,
+        sendmsg = SYS_sendmsg,
+        sendto = SYS_sendto,
+        sync_file_range = SYS_sync_file_range,
+        unlinkat = SYS_unlinkat,
+        wait4 = SYS_wait4,
+        waitid = SYS_waitid,
+        write = SYS_write,
+        writev = SYS_writev,
+    ];
+    #[cfg(target_arch = "x86_64")]
+    let old = names![
+        epoll_wait = SYS_epoll_wait,
+        open = SYS_open,
+        poll = SYS_poll,
+        select = SYS_select,
+    ];
+    #[cfg(not(target_arch = "x86_64"))]
+    let old: [(i64, &str); 0] = [];
+    let mut all = names.iter().chain(&old);
+    let known = all.find(|(known, _)| *known == i64::from(number));
+    known.map_or_else(
+        || format!("system call {number}").into(),
+        |(_, name)| Arc::from(*name),
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tables::tests::assert_driven;
+    use ros2probe_wire::inside::bucket;
+
+    fn counts(of: &[(u64, u32)]) -> [[u32; BUCKETS]; 2] {
+        let mut counts = [[0; BUCKETS]; 2];
+        for (milliseconds, calls) in of {
+            counts[0][bucket(milliseconds * 1_000_000)] += calls;
+        }
+        counts
+    }
+
+    #[test]
+    fn a_bound_is_three_times_the_99th_percentile() {
+        let mut learnt = Learnt::default();
+        learnt.add(&counts(&[(20, 49)]));
+        assert_eq!(learnt.learnt, None, "too few calls");
+        learnt.add(&counts(&[(20, 999), (500, 1)]));
+        let [duration, delay] = learnt.learnt.unwrap();
+        assert!((60_000_000..=84_000_000).contains(&duration), "{duration}");
+        assert_eq!(delay, u64::MAX, "no call waited");
+    }
+
+    #[test]
+    fn a_bound_has_a_minimum() {
+        let mut learnt = Learnt::default();
+        learnt.add(&counts(&[(0, 1000)]));
+        let [duration, _] = learnt.learnt.unwrap();
+        assert_eq!(u128::from(duration), LEAST_BOUND.as_nanos());
+    }
+
+    #[test]
+    fn a_callback_that_becomes_slower_has_another_bound_within_minutes() {
+        let mut learnt = Learnt::default();
+        let mut calls = 0;
+        for _ in 0..600 {
+            calls += 10;
+            learnt.add(&counts(&[(5, calls)]));
+        }
+        let usual = learnt.learnt.unwrap()[0];
+        for round in 1..=600 {
+            learnt.add(&counts(&[(5, calls), (50, round * 10)]));
+            let [duration, _] = learnt.learnt.unwrap();
+            match round {
+                ..=60 => assert!(duration < usual * 2, "{duration} after {round} s"),
+                300.. => assert!(duration >= 150_000_000, "{duration} after {round} s"),
+                _ => {}
+            }
+        }
+    }
+
+    #[test]
+    fn the_first_bound_that_applies_to_a_callback_counts() {
+        let bound = |name: Option<&str>, milliseconds| RequestedBound {
+            name: name.map(Arc::from),
+            above: Duration::from_millis(milliseconds),
+        };
+        let requested = [
+            bound(Some("/scan"), 1),
+            bound(Some("/nav"), 2),
+            bound(Some("/scan"), 3),
+        ];
+        let of = |topic: &str, node: &str| {
+            bound_of(
+                &requested,
+                &(Trigger::Subscription(topic.into()), Some(node.into())),
+            )
+        };
+        assert_eq!(of("/scan", "/nav"), Some(1_000_000));
+        assert_eq!(of("/map", "/nav"), Some(2_000_000));
+        assert_eq!(of("/map", "/other"), None);
+        let all = [bound(None, 4)];
+        assert_eq!(
+            bound_of(&all, &(Trigger::Timer(None), None)),
+            Some(4_000_000)
+        );
+    }
+
+    #[test]
+    fn callbacks_beyond_the_cap_have_no_bound() {
+        let mut bounds: Bounded<CallbackBounds, HashMap<Handle, Learnt>> = Bounded::default();
+        for address in 0..10_000 {
+            let handle = Handle {
+                address,
+                process: 1,
+                kind: kind::CALLBACK,
+            };
+            bounds.get_or_insert_with(handle, Learnt::default);
+        }
+        assert_driven::<CallbackBounds>();
+        assert_eq!(bounds.len(), CallbackBounds::CAP);
+    }
+}

@@ -1,0 +1,240 @@
+//! Late calls, each with an injected cause.
+
+use std::process::Command;
+use std::time::Duration;
+
+use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
+use ros2probe_model::facts::calls::report::ThreadStates;
+use ros2probe_wire::inside::late::{Bound, mode};
+use ros2probe_wire::inside::{Handle, kind};
+
+use super::thread_states::{Hog, Quota};
+use super::{Process, Robot};
+
+/// Calls that take longer are late.
+const BOUND: Duration = Duration::from_millis(5);
+
+/// A process whose late calls are observed, by the scheduler's events.
+fn started() -> (Robot, Process) {
+    let mut robot = Robot::new(248, &[], true);
+    robot.attach();
+    let mut process = robot.start();
+    process.run("init");
+    process.run("compute 1 10");
+    process.run("enqueue 1");
+    process.run("receive 1 10");
+    robot.events = Some(robot.programs.observe_scheduler().unwrap());
+    robot.tables.set_late_mode(mode::EVENTS).unwrap();
+    let report = robot.report(&process);
+    for callback in &report.callbacks {
+        let nanoseconds = u64::try_from(BOUND.as_nanos()).unwrap();
+        let bound = Bound {
+            duration: nanoseconds,
+            delay: nanoseconds,
+            ..Bound::default()
+        };
+        let handle = Handle {
+            address: callback.handle,
+            process: process.child.id(),
+            kind: kind::CALLBACK,
+        };
+        robot.tables.set_bound(handle, bound).unwrap();
+    }
+    (robot, process)
+}
+
+/// Runs a command of callbacks, and returns the late ones.
+fn late(robot: &mut Robot, process: &mut Process, command: &str) -> Vec<LateCall> {
+    process.run(command);
+    robot.round().report.late
+}
+
+/// Asserts that each call is late for this cause, which took this share of its time or more.
+fn assert_cause(calls: &[LateCall], number: usize, cause: Cause, share: f64) {
+    assert_eq!(calls.len(), number, "{calls:#?}");
+    for call in calls {
+        let parts = call.parts();
+        let sum: Duration = parts.iter().map(|part| part.duration).sum();
+        assert_eq!(sum, call.total(), "{call:#?}");
+        let main = call.main_part(ThreadStates::default()).unwrap();
+        assert_eq!(main.cause, cause, "{parts:?} {call:#?}");
+        let of_all = main.duration.as_secs_f64() / call.total().as_secs_f64();
+        assert!(of_all >= share, "{parts:?} {call:#?}");
+    }
+}
+
+#[test]
+fn a_call_that_sleeps_names_the_system_call() {
+    let (mut robot, mut process) = started();
+    let calls = late(&mut robot, &mut process, "sleep 10 20000");
+    assert_cause(&calls, 10, Cause::Sleep, 0.5);
+    for call in &calls {
+        let longest = call.activity.as_ref().unwrap().longest.as_ref().unwrap();
+        assert_eq!(longest.call.as_deref(), Some("clock_nanosleep"));
+        assert!(longest.duration >= Duration::from_millis(20), "{longest:?}");
+    }
+}
+
+#[test]
+fn a_call_that_computes_names_no_one() {
+    let (mut robot, mut process) = started();
+    let calls = late(&mut robot, &mut process, "compute 5 20000");
+    assert_eq!(calls.len(), 5, "{calls:#?}");
+    for call in &calls {
+        let main = call.main_part(ThreadStates::default()).unwrap();
+        // On a busy machine another thread may run instead.
+        assert!(
+            matches!(main.cause, Cause::Cpu | Cause::Runnable),
+            "{call:#?}"
+        );
+    }
+}
+
+#[test]
+fn a_call_beside_a_busy_thread_names_that_thread() {
+    let (mut robot, mut process) = started();
+    pin(&process);
+    let hog = Hog::on("0");
+    let calls = late(&mut robot, &mut process, "compute 10 60000");
+    assert_eq!(calls.len(), 10, "{calls:#?}");
+    for call in &calls {
+        let states = call.states.unwrap();
+        let runnable = Duration::from_nanos(states.runnable);
+        assert!(runnable >= call.duration / 5, "{call:#?}");
+        let others = &call.activity.as_ref().unwrap().others;
+        let named: Duration = others.iter().map(|other| other.duration).sum();
+        assert!(named * 10 >= runnable * 9, "{call:#?}");
+        assert!(
+            others.iter().any(|other| other.process == hog.0.id()),
+            "{call:#?}"
+        );
+    }
+}
+
+#[test]
+fn a_call_beside_a_real_time_thread_names_that_thread() {
+    let (mut robot, mut process) = started();
+    pin(&process);
+    let _hog = Hog::real_time("0");
+    let calls = late(&mut robot, &mut process, "compute 10 60000");
+    let is_named = |call: &LateCall| {
+        let culprit = call.culprit(Stage::Callback);
+        culprit.is_some_and(|culprit| &*culprit.name == "sh")
+    };
+    let named = calls.iter().filter(|call| is_named(call)).count();
+    assert!(named >= 8, "{calls:#?}");
+}
+
+#[test]
+fn a_call_that_waits_for_a_lock_names_its_holder() {
+    let (mut robot, mut process) = started();
+    let calls = late(&mut robot, &mut process, "lock 10 30000");
+    assert!(calls.len() >= 8, "{calls:#?}");
+    assert_cause(&calls, calls.len(), Cause::Lock, 0.3);
+    for call in &calls {
+        let activity = call.activity.as_ref().unwrap();
+        let longest = activity.longest.as_ref().unwrap();
+        assert_eq!(longest.call.as_deref(), Some("futex"), "{call:#?}");
+        let waker = longest.waker.as_ref().unwrap();
+        assert_eq!(&*waker.name, "lock-holder", "{call:#?}");
+        assert_eq!(waker.process, process.child.id());
+    }
+}
+
+#[test]
+fn a_call_that_waits_for_the_disk_names_the_system_call() {
+    let (mut robot, mut process) = started();
+    let file = tempfile::NamedTempFile::new_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
+    let path = file.path().display();
+    let calls = late(&mut robot, &mut process, &format!("disk 5 16384 {path}"));
+    assert!(!calls.is_empty());
+    for call in &calls {
+        let disk = call
+            .parts()
+            .into_iter()
+            .find(|part| part.cause == Cause::Disk);
+        assert!(disk.is_some(), "{call:#?}");
+    }
+}
+
+#[test]
+fn a_call_that_waits_for_its_pages_is_named_so() {
+    let (mut robot, mut process) = started();
+    let file = tempfile::NamedTempFile::new_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
+    let path = file.path().display();
+    process.run(&format!("disk 1 16384 {path}"));
+    let calls = late(&mut robot, &mut process, &format!("fault 5 0 {path}"));
+    let calls: Vec<_> = calls.iter().skip(1).collect();
+    assert!(!calls.is_empty());
+    for call in calls {
+        let parts = call.parts();
+        let fault = parts.iter().find(|part| part.cause == Cause::PageFault);
+        assert!(fault.is_some(), "{call:#?}");
+    }
+}
+
+#[test]
+fn a_stopped_call_names_who_continued_it() {
+    let (mut robot, mut process) = started();
+    let id = process.child.id().cast_signed();
+    let stop = std::thread::spawn(move || {
+        for _ in 0..10 {
+            std::thread::sleep(Duration::from_millis(30));
+            // SAFETY: signals a child of this test.
+            unsafe { libc::kill(id, libc::SIGSTOP) };
+            std::thread::sleep(Duration::from_millis(60));
+            // SAFETY: as above.
+            unsafe { libc::kill(id, libc::SIGCONT) };
+        }
+    });
+    let calls = late(&mut robot, &mut process, "compute 10 80000");
+    stop.join().unwrap();
+    let stopped = |call: &&LateCall| {
+        let longest = call.activity.as_ref().unwrap().longest.as_ref();
+        let waker = longest.and_then(|longest| longest.waker.as_ref());
+        waker.is_some_and(|waker| waker.process == std::process::id())
+    };
+    let stopped: Vec<_> = calls.iter().filter(stopped).collect();
+    assert!(stopped.len() >= 4, "{calls:#?}");
+    for call in stopped {
+        let mut parts = call.parts().into_iter();
+        let part = parts.find(|part| part.cause == Cause::Stopped).unwrap();
+        assert!(part.duration >= Duration::from_millis(20), "{call:#?}");
+    }
+}
+
+#[test]
+fn a_call_beyond_the_quota_of_its_control_group_is_throttled() {
+    let (mut robot, mut process) = started();
+    let _quota = Quota::a_twentieth_for(&process);
+    let calls = late(&mut robot, &mut process, "compute 5 200000");
+    assert_cause(&calls, 5, Cause::Throttled, 0.4);
+}
+
+#[test]
+fn a_call_that_waits_for_another_callback_names_it() {
+    let (mut robot, mut process) = started();
+    process.run("enqueue 3");
+    let calls = late(&mut robot, &mut process, "receive 3 30000");
+    assert_eq!(calls.len(), 3, "{calls:#?}");
+    for (index, call) in (0..).zip(&calls) {
+        let main = call.main_part(ThreadStates::default()).unwrap();
+        if index == 0 {
+            assert_eq!(main.stage, Stage::Callback, "{call:#?}");
+            continue;
+        }
+        let mut parts = call.parts().into_iter();
+        let other = parts.find(|part| part.cause == Cause::OtherCallback);
+        let other = other.unwrap();
+        assert!(other.duration >= Duration::from_millis(29), "{call:#?}");
+        let previous = call.previous.as_ref().unwrap();
+        assert_eq!(previous.handle, call.handle);
+    }
+}
+
+/// Binds the process to the first CPU.
+fn pin(process: &Process) {
+    let id = process.child.id().to_string();
+    let pinned = Command::new("taskset").args(["-pc", "0", &id]).output();
+    assert!(pinned.unwrap().status.success());
+}

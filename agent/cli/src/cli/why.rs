@@ -1,0 +1,137 @@
+//! `rp why`: late calls of callbacks, and what made them late.
+
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use clap::Args;
+use jiff::SignedDuration;
+use jiff::tz::TimeZone;
+use ros2probe::client::{Agent, Target};
+use ros2probe::why;
+use ros2probe_api::path::encoded;
+use ros2probe_api::why::Why as Answer;
+
+use super::UserError;
+use super::shared::print_text;
+
+/// Interval of questions while no late call is known.
+const EVERY: Duration = Duration::from_secs(1);
+
+/// `rp why`.
+#[derive(Args, Debug)]
+#[command(after_help = "\
+A call of a callback is late if it takes or waits longer than --above; without it, longer than
+max_latency_ms of its topic in the watchlist; without that, three times as long as 99 % of its
+calls in the last minutes, and at least 5 ms. The command waits until a late call is known.
+
+The sums are those of the kernel's scheduler: cpu, throttled (CPU quota), runnable (others ran
+instead) and blocked. From the first request until ten seconds after the last one, the agent also
+observes the scheduler's events. They tell who ran instead, and divide blocked into lock, sleep,
+disk, page_fault, stopped and system_call. Before a call: other_callback (of the same thread), or
+arrival (the executor waited for the message too). The bar shows the share of each part by its
+first letter. `capture: {late: on}` observes the events whenever callbacks are observed, `off`
+reports no late calls.
+
+Exit code: 0; 1 if no call was late, or if callbacks are not observed.
+
+Examples:
+  rp why
+  rp why /cmd_vel --above 20
+  rp why --node /controller --last 10m
+  rp why /scan --json | jq '.callbacks[].examples[0].parts'")]
+pub(crate) struct Why {
+    /// Only callbacks of this topic or node
+    #[arg(value_name = "TOPIC|NODE")]
+    name: Option<String>,
+    /// Only callbacks of this node
+    #[arg(long, conflicts_with = "name")]
+    node: Option<String>,
+    /// Calls are late that take or wait longer than this, in milliseconds
+    #[arg(long, value_name = "MS", value_parser = milliseconds)]
+    above: Option<f64>,
+    /// Only late calls of this last time, e.g. 10m or 90s [default: all that are known]
+    #[arg(long, value_name = "TIME")]
+    last: Option<SignedDuration>,
+    /// Maximum time to wait for a late call, in seconds; 0 = do not wait
+    #[arg(long, value_name = "S", default_value_t = 30)]
+    wait: u64,
+    /// Print one JSON object, as GET /why answers
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    target: Target,
+}
+
+impl Why {
+    pub(crate) fn ask(self) -> Result<ExitCode> {
+        let agent = Agent::reach(&self.target)?;
+        let path = self.path()?;
+        let end = Instant::now() + Duration::from_secs(self.wait);
+        let mut has_said = false;
+        let answer = loop {
+            let answer: Answer<'static> = match self.json {
+                true => agent.get(&path)?,
+                false => agent.get_visible(&path)?,
+            };
+            let now = Instant::now();
+            if !why::is_empty(&answer) || answer.observed == "off" || now >= end {
+                break answer;
+            }
+            if !std::mem::replace(&mut has_said, true) {
+                let seconds = end.saturating_duration_since(now).as_secs();
+                eprintln!("no late call so far: waiting for at most {seconds} s (Ctrl-C ends)");
+            }
+            std::thread::sleep(EVERY);
+        };
+        if self.json {
+            return print_text(&(serde_json::to_string_pretty(&answer)? + "\n"));
+        }
+        if why::is_empty(&answer) {
+            return Err(UserError(self.nothing(&answer)).into());
+        }
+        print_text(&why::text(&answer, &TimeZone::system()))
+    }
+
+    fn path(&self) -> Result<String> {
+        let mut parameters = Vec::new();
+        if let Some(name) = self.name.as_ref().or(self.node.as_ref()) {
+            parameters.push(format!("name={}", encoded(name)));
+        }
+        if let Some(above) = self.above {
+            parameters.push(format!("above_ms={above}"));
+        }
+        if let Some(last) = self.last {
+            let seconds = last.as_secs_f64();
+            if seconds < 0.0 {
+                let text = "--last must not be negative: 10m means the last ten minutes";
+                return Err(UserError(text.to_owned()).into());
+            }
+            parameters.push(format!("last_s={seconds}"));
+        }
+        Ok(match parameters.is_empty() {
+            true => "/why".to_owned(),
+            false => format!("/why?{}", parameters.join("&")),
+        })
+    }
+
+    fn nothing(&self, answer: &Answer<'_>) -> String {
+        if answer.observed == "off" {
+            let reason = answer.reason.as_deref();
+            let reason = reason.unwrap_or("capture.inside or capture.late is off");
+            return format!("callbacks are not observed: {reason}");
+        }
+        match self.name.as_ref().or(self.node.as_ref()) {
+            Some(name) => format!("no call of a callback of {name} was late (see --above)"),
+            None => "no call of a callback was late (see --above)".to_owned(),
+        }
+    }
+}
+
+fn milliseconds(text: &str) -> Result<f64, String> {
+    let number: f64 = text.parse().map_err(|_| "not a number of milliseconds")?;
+    match (0.0..=3_600_000.0).contains(&number) {
+        true => Ok(number),
+        false => Err("it must be from 0 to 3600000 milliseconds".to_owned()),
+    }
+}

@@ -1,0 +1,268 @@
+//! Text of `rp why`: the causes of late calls, and the worst call of each callback with its stages.
+
+use std::fmt::Write as _;
+
+use jiff::Timestamp;
+use jiff::tz::TimeZone;
+use ros2probe_api::why::{LateCall, LateCallback, Part, Why};
+
+use crate::top::text::{counted, safe, seconds};
+
+/// Width of a drawn bar, in characters.
+const BAR: usize = 48;
+/// Share of a call below which a part has no words.
+const SMALL: f64 = 0.005;
+
+/// Returns whether no late call is known.
+#[must_use]
+pub fn is_empty(why: &Why<'_>) -> bool {
+    why.callbacks.is_empty()
+}
+
+/// Returns the text: the causes by their number of calls, then each callback with its worst call.
+#[must_use]
+pub fn text(why: &Why<'_>, zone: &TimeZone) -> String {
+    let mut out = String::new();
+    let all: u64 = why.causes.iter().map(|cause| cause.late_calls).sum();
+    for cause in &why.causes {
+        let _ = writeln!(
+            out,
+            "{:>4} of {all}, up to {}: {}",
+            cause.late_calls,
+            seconds(cause.longest_seconds),
+            safe(&cause.words)
+        );
+        let _ = writeln!(out, "     > {}", safe(&cause.remedy));
+    }
+    if let Some(reason) = &why.reason {
+        let _ = writeln!(out, "not everything is observed: {}", safe(reason));
+    }
+    for callback in &why.callbacks {
+        out.push('\n');
+        text_of(callback, zone, &mut out);
+    }
+    out
+}
+
+fn text_of(callback: &LateCallback<'_>, zone: &TimeZone, out: &mut String) {
+    let node = callback.owner.node.as_deref().map(safe);
+    let node = node.unwrap_or_else(|| format!("process {}", callback.owner.process_id));
+    let calls = callback.calls.map_or_else(
+        || counted(callback.late_calls, "late call"),
+        |calls| format!("{} of {calls} calls late", callback.late_calls),
+    );
+    let _ = writeln!(
+        out,
+        "{node}, callback of {}: {calls}",
+        safe(&callback.trigger.words())
+    );
+    if let Some(worst) = callback.examples.first() {
+        worst_call(worst, zone, out);
+    }
+}
+
+fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
+    let wait = call.wait_seconds.unwrap_or_default();
+    let total = wait + call.duration_seconds;
+    let _ = writeln!(
+        out,
+        "  worst: {} at {}, thread {} on CPU {}: {}",
+        seconds(total),
+        time(call.timestamp_seconds, zone),
+        call.thread_id,
+        call.cpu,
+        safe(&call.words)
+    );
+    for (stage, words) in [("wait", "before the call"), ("callback", "in the call")] {
+        let parts = call.parts.iter().filter(|part| part.stage == stage);
+        let parts: Vec<_> = parts.collect();
+        let sum: f64 = parts.iter().map(|part| part.seconds).sum();
+        if sum > 0.0 {
+            let _ = writeln!(
+                out,
+                "  {words:<15} {:>6}  {}",
+                seconds(sum),
+                listed(&parts, total)
+            );
+        }
+    }
+    let _ = writeln!(out, "  [{}]", bar(&call.parts, total));
+    let mut others: Vec<_> = call.others.iter().collect();
+    others.sort_by(|one, other| other.seconds.total_cmp(&one.seconds));
+    let others = others.iter().filter(|other| other.seconds >= total * SMALL);
+    let others: Vec<_> = others
+        .take(4)
+        .map(|other| match other.thread_id {
+            0 => format!("no one (idle CPU) {}", seconds(other.seconds)),
+            _ => format!(
+                "{} ({}) {}",
+                safe(&other.name),
+                other.process_id,
+                seconds(other.seconds)
+            ),
+        })
+        .collect();
+    if !others.is_empty() {
+        let _ = writeln!(out, "  ran instead: {}", others.join(", "));
+    }
+    if let Some(blocked) = call
+        .blocked
+        .as_ref()
+        .filter(|it| it.seconds >= total * SMALL)
+    {
+        let system_call = match &blocked.system_call {
+            Some(name) => format!("{}({})", safe(name), safe(&blocked.argument)),
+            None => "no system call".to_owned(),
+        };
+        let ended = blocked
+            .ended_by
+            .as_ref()
+            .map(|by| format!(", ended by {} (thread {})", safe(&by.name), by.thread_id));
+        let _ = writeln!(
+            out,
+            "  longest blocked: {} in {system_call}{}",
+            seconds(blocked.seconds),
+            ended.unwrap_or_default()
+        );
+    }
+    if let Some(previous) = call.previous.as_ref()
+        && call.parts.iter().any(|part| part.cause == "other_callback")
+    {
+        let _ = writeln!(
+            out,
+            "  callback before it: {}, {}",
+            safe(&previous.trigger.words()),
+            seconds(previous.duration_seconds)
+        );
+    }
+}
+
+/// Returns the parts that are not small, with their lengths.
+fn listed(parts: &[&Part<'_>], total: f64) -> String {
+    let shown = parts.iter().filter(|part| part.seconds >= total * SMALL);
+    let words: Vec<_> = shown
+        .map(|part| format!("{} {}", safe(&part.cause), seconds(part.seconds)))
+        .collect();
+    words.join(", ")
+}
+
+/// Draws the parts in the order of their time: the first letter of a cause for each share of the
+/// call.
+fn bar(parts: &[Part<'_>], total: f64) -> String {
+    let mut bar = String::with_capacity(BAR);
+    let mut until = 0.0;
+    for part in parts {
+        until += part.seconds;
+        let letter = part.cause.chars().next().unwrap_or('?');
+        #[expect(clippy::cast_precision_loss, reason = "a bar has few characters")]
+        while bar.len() < BAR && (bar.len() as f64 + 0.5) / BAR as f64 <= until / total {
+            bar.push(letter);
+        }
+    }
+    while bar.len() < BAR {
+        bar.push(' ');
+    }
+    bar
+}
+
+fn time(seconds: f64, zone: &TimeZone) -> String {
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "milliseconds fit until the year 292471208"
+    )]
+    let milliseconds = (seconds * 1e3).round() as i64;
+    let Ok(timestamp) = Timestamp::from_millisecond(milliseconds) else {
+        return "?".to_owned();
+    };
+    let zoned = timestamp.to_zoned(zone.clone());
+    zoned.strftime("%H:%M:%S%.3f").to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_api::inside::{Owner, Trigger};
+    use ros2probe_api::why::{Blocked, Cause, OtherThread};
+
+    use super::*;
+
+    fn part(stage: &'static str, cause: &'static str, seconds: f64) -> Part<'static> {
+        Part {
+            stage: stage.into(),
+            cause: cause.into(),
+            seconds,
+        }
+    }
+
+    fn why() -> Why<'static> {
+        Why {
+            observed: "events".into(),
+            causes: vec![Cause {
+                late_calls: 13,
+                longest_seconds: 0.1054,
+                words: "its control group had used up its CPU quota".into(),
+                remedy: "raise CPUQuota".into(),
+                ..Cause::default()
+            }],
+            callbacks: vec![LateCallback {
+                owner: Owner {
+                    process_id: 42,
+                    node: Some("/filter".into()),
+                    ..Owner::default()
+                },
+                trigger: Trigger {
+                    kind: "subscription".into(),
+                    name: Some("/points".into()),
+                    period_seconds: None,
+                },
+                calls: Some(600),
+                late_calls: 14,
+                examples: vec![LateCall {
+                    timestamp_seconds: 1_700_000_000.25,
+                    duration_seconds: 0.12,
+                    wait_seconds: Some(0.04),
+                    thread_id: 43,
+                    cpu: 1,
+                    words: "its control group had used up its CPU quota".into(),
+                    parts: vec![
+                        part("wait", "arrival", 0.04),
+                        part("callback", "cpu", 0.02),
+                        part("callback", "throttled", 0.08),
+                        part("callback", "lock", 0.02),
+                    ],
+                    others: vec![OtherThread {
+                        name: "chromium\u{1b}".into(),
+                        thread_id: 7,
+                        process_id: 6,
+                        seconds: 0.03,
+                    }],
+                    blocked: Some(Blocked {
+                        seconds: 0.02,
+                        system_call: Some("futex".into()),
+                        argument: "0x7f00".into(),
+                        ..Blocked::default()
+                    }),
+                    ..LateCall::default()
+                }],
+                ..LateCallback::default()
+            }],
+            ..Why::default()
+        }
+    }
+
+    #[test]
+    fn the_worst_call_is_drawn_with_its_stages_and_hostile_names_are_escaped() {
+        let text = text(&why(), &TimeZone::UTC);
+        let expected = "  13 of 13, up to 105ms: its control group had used up its CPU quota
+     > raise CPUQuota
+
+/filter, callback of /points: 14 of 600 calls late
+  worst: 160ms at 22:13:20.250, thread 43 on CPU 1: its control group had used up its CPU quota
+  before the call   40ms  arrival 40ms
+  in the call      120ms  cpu 20ms, throttled 80ms, lock 20ms
+  [aaaaaaaaaaaaccccccttttttttttttttttttttttttllllll]
+  ran instead: chromium\\u{1b} (6) 30ms
+  longest blocked: 20ms in futex(0x7f00)
+";
+        assert_eq!(text, expected);
+    }
+}

@@ -1,0 +1,267 @@
+//! `/why`: late calls of callbacks.
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::Json;
+use axum::extract::State;
+use axum::response::{IntoResponse, Response};
+use serde::Deserialize;
+use utoipa::IntoParams;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::inside::{owner, trigger};
+use super::parameters::Parameters;
+use super::problem::{Code, Problem};
+use super::scope::Domain;
+use crate::agent_facts::InsideSourceFacts;
+use ros2probe_api::why::{
+    Blocked, Cause, LateCall, LateCallback, OtherThread, Part, PreviousCall, Why,
+};
+use ros2probe_model::facts::calls::facts::{self, InsideFacts, LateExample};
+use ros2probe_model::facts::calls::late;
+use ros2probe_model::facts::model_time::ModelTime;
+use ros2probe_model::facts::wall_clock::WallClock;
+use ros2probe_model::report::snapshot::Snapshot;
+
+/// Longest bound that a request may set, in milliseconds.
+const LONGEST_MS: f64 = 3_600_000.0;
+
+/// Query parameters that select late calls.
+#[derive(Clone, Debug, Default, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields, default)]
+#[into_params(parameter_in = Query)]
+struct Of {
+    /// Domain id; by default every domain.
+    #[param(minimum = 0, maximum = 232)]
+    domain_id: Option<u32>,
+    /// ROS name of a topic or node; by default all.
+    name: Option<String>,
+    /// Calls of these callbacks are late if they take or wait longer than this, until ten seconds
+    /// after the last request. Without it, a call is late if it exceeds `max_latency_ms` of its topic,
+    /// otherwise if it takes three times as long as 99 % of the calls of its callback.
+    #[param(minimum = 0, maximum = 3_600_000)]
+    above_ms: Option<f64>,
+    /// Only late calls of the last seconds; by default all that are known.
+    #[param(minimum = 0)]
+    last_s: Option<f64>,
+}
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new().routes(routes!(show))
+}
+
+/// Late calls of callbacks, and what made them late
+///
+/// With `capture.late: auto`, the events of the scheduler are observed from the first request until
+/// ten seconds after the last one. Late calls at other times have no thread that ran instead. The
+/// callbacks must be observed, as for `/inside`.
+#[utoipa::path(
+    get,
+    path = "/why",
+    tag = "graph",
+    params(Of),
+    responses((status = 200, description = "Late calls.", body = Why<'static>))
+)]
+async fn show(
+    State(context): State<Context>,
+    Parameters(of): Parameters<Of>,
+) -> Result<Response, Problem> {
+    let domain = Domain::of(of.domain_id).checked()?;
+    let above = of.above_ms.map(|above| {
+        let is_valid = (0.0..=LONGEST_MS).contains(&above);
+        let wrong = || {
+            let text = format!("above_ms must be from 0 to {LONGEST_MS}, not {above}");
+            Problem::new(Code::MalformedRequest, text)
+        };
+        is_valid
+            .then(|| Duration::from_secs_f64(above / 1e3))
+            .ok_or_else(wrong)
+    });
+    let last = of.last_s.map(Duration::try_from_secs_f64).transpose();
+    let last = last.map_err(|error| {
+        Problem::new(Code::MalformedRequest, format!("last_s is wrong: {error}"))
+    })?;
+    context
+        .latest
+        .want_late(of.name.as_deref(), above.transpose()?);
+    let state = context.state().await;
+    let snapshot = state.known();
+    let source = state.agent.inside.as_ref();
+    let is_meant = |callback: &facts::LateCallback| {
+        let name = of.name.as_deref();
+        domain.admits(callback.owner.domain_id)
+            && (name.is_none()
+                || name == callback.trigger.name()
+                || name == callback.owner.node.as_deref())
+    };
+    Ok(Json(why(snapshot, source, last, is_meant)).into_response())
+}
+
+fn why<'a>(
+    snapshot: &'a Snapshot,
+    source: Option<&'a InsideSourceFacts>,
+    last: Option<Duration>,
+    is_meant: impl Fn(&facts::LateCallback) -> bool,
+) -> Why<'a> {
+    let mut answer = Why {
+        timestamp_seconds: snapshot.time().seconds(),
+        observed: Cow::Borrowed(source.map_or("off", |source| source.late)),
+        reason: source.and_then(|source| {
+            let reason = source
+                .reason_off
+                .as_ref()
+                .or(source.without_events.as_ref());
+            Some(Cow::Borrowed(reason?.as_str()))
+        }),
+        ..Why::default()
+    };
+    let Some(known) = snapshot.inside.as_deref() else {
+        return answer;
+    };
+    let since = last.map_or(ModelTime::ZERO, |last| snapshot.at - last);
+    let clock = snapshot.wall_clock;
+    let callbacks = known.late.iter().filter(|callback| is_meant(callback));
+    let callbacks: Vec<_> = callbacks
+        .filter(|callback| callback.last() >= since)
+        .collect();
+    answer.causes = causes(&callbacks, since);
+    let callbacks = callbacks.into_iter();
+    answer.callbacks = callbacks
+        .map(|callback| late_callback(callback, known, since, clock))
+        .collect();
+    answer
+        .callbacks
+        .sort_by_key(|callback| std::cmp::Reverse(callback.late_calls));
+    answer
+}
+
+/// Returns the causes of the late calls since a time, the most frequent first.
+fn causes(callbacks: &[&facts::LateCallback], since: ModelTime) -> Vec<Cause<'static>> {
+    let mut sums: BTreeMap<(late::Stage, late::Cause, Option<Arc<str>>), (u64, Duration)> =
+        BTreeMap::new();
+    for callback in callbacks {
+        for entry in callback.history.iter().filter(|entry| entry.at >= since) {
+            let key = (entry.stage, entry.cause, entry.culprit.clone());
+            let (calls, longest) = sums.entry(key).or_default();
+            *calls += 1;
+            *longest = (*longest).max(entry.total);
+        }
+    }
+    let mut causes: Vec<_> = sums
+        .into_iter()
+        .map(|((stage, cause, by), (calls, longest))| Cause {
+            stage: stage.label().into(),
+            cause: cause.label().into(),
+            words: cause.in_words(by.as_deref()).into(),
+            by: by.map(|by| Cow::Owned(by.as_ref().to_owned())),
+            late_calls: calls,
+            longest_seconds: longest.as_secs_f64(),
+            remedy: cause.remedy().into(),
+        })
+        .collect();
+    causes.sort_by_key(|cause| std::cmp::Reverse(cause.late_calls));
+    causes
+}
+
+fn late_callback<'a>(
+    callback: &'a facts::LateCallback,
+    known: &InsideFacts,
+    since: ModelTime,
+    clock: WallClock,
+) -> LateCallback<'a> {
+    let mut of = known.callbacks.iter();
+    let of = of.find(|each| {
+        let own = (each.owner.process, each.owner.handle);
+        own == (callback.owner.process, callback.owner.handle)
+    });
+    let mut examples: Vec<&Arc<LateExample>> = Vec::new();
+    for example in callback.longest.iter().chain(&callback.latest) {
+        let is_known = examples.iter().any(|known| Arc::ptr_eq(known, example));
+        if example.at >= since && !is_known {
+            examples.push(example);
+        }
+    }
+    examples.sort_by_key(|example| std::cmp::Reverse(example.call.total()));
+    LateCallback {
+        owner: owner(&callback.owner),
+        trigger: trigger(&callback.trigger),
+        calls: of.map(|of| of.calls),
+        late_calls: callback.calls,
+        parts: (callback.sums.iter())
+            .map(|((stage, cause), sum)| part(*stage, *cause, *sum))
+            .collect(),
+        examples: examples
+            .into_iter()
+            .map(|each| late_call(each, clock))
+            .collect(),
+    }
+}
+
+fn late_call(example: &LateExample, clock: WallClock) -> LateCall<'_> {
+    let call = &example.call;
+    let main = example.main;
+    let named = main.and_then(|part| call.named_by(part));
+    let named = named.map(|other| format!("{} ({})", other.name, other.process));
+    let others = [&call.activity_before, &call.activity];
+    let others = others.into_iter().flatten();
+    LateCall {
+        timestamp_seconds: clock.wall_time(example.at).seconds(),
+        source_timestamp_seconds: call.source.map(|source| source.seconds()),
+        duration_seconds: call.duration.as_secs_f64(),
+        wait_seconds: call.wait.map(|wait| wait.as_secs_f64()),
+        late_duration_seconds: call.bound.duration.as_secs_f64(),
+        late_wait_seconds: (call.bound.wait.as_nanos() < u128::from(u64::MAX))
+            .then(|| call.bound.wait.as_secs_f64()),
+        thread_id: call.thread,
+        cpu: call.cpu,
+        stage: main.map(|part| part.stage.label().into()),
+        cause: main.map(|part| part.cause.label().into()),
+        words: main
+            .map_or(late::Cause::Unexplained, |part| part.cause)
+            .in_words(named.as_deref())
+            .into(),
+        parts: (call.parts().iter())
+            .map(|each| part(each.stage, each.cause, each.duration))
+            .collect(),
+        others: others
+            .flat_map(|activity| activity.others.iter().map(other_thread))
+            .collect(),
+        blocked: call.activity.as_ref().and_then(|activity| {
+            let longest = activity.longest.as_ref()?;
+            Some(Blocked {
+                seconds: longest.duration.as_secs_f64(),
+                cause: late::Cause::of_wait(longest.kind).label().into(),
+                system_call: longest.call.as_deref().map(Cow::Borrowed),
+                argument: format!("{:#x}", longest.argument).into(),
+                ended_by: longest.waker.as_ref().map(other_thread),
+            })
+        }),
+        previous: call.previous.as_ref().map(|previous| PreviousCall {
+            trigger: trigger(&previous.trigger),
+            duration_seconds: previous.duration.as_secs_f64(),
+            ended_before_seconds: previous.ended_before.as_secs_f64(),
+        }),
+    }
+}
+
+fn part(stage: late::Stage, cause: late::Cause, duration: Duration) -> Part<'static> {
+    Part {
+        stage: stage.label().into(),
+        cause: cause.label().into(),
+        seconds: duration.as_secs_f64(),
+    }
+}
+
+fn other_thread(other: &late::OtherThread) -> OtherThread<'_> {
+    OtherThread {
+        name: Cow::Borrowed(&other.name),
+        thread_id: other.thread,
+        process_id: other.process,
+        seconds: other.duration.as_secs_f64(),
+    }
+}

@@ -1,0 +1,243 @@
+//! Late calls of callbacks: their causes, and examples.
+//!
+//! Each callback keeps sums over all late calls, a short entry for each of the last ones, and the
+//! longest and the last ones with all their parts. They remain after the process has ended, so that
+//! a cause is there when somebody asks for it later.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::DomainId;
+
+use super::findings::Alarm;
+use crate::facts::bounded::Bounded;
+use crate::facts::calls::facts::{LateCallback, LateEntry, LateExample, Owner};
+use crate::facts::calls::late::{Cause, LateCall, Part, Stage};
+use crate::facts::calls::report::{ThreadStates, Trigger};
+use crate::facts::model_time::ModelTime;
+use crate::facts::tables::{LastLateCalls, LateCallbacks, LateHistory, LongestLateCalls};
+use crate::facts::wall_clock::WallClock;
+
+/// Time after which a longer example may be replaced by a shorter one.
+const LONGEST_FOR: Duration = Duration::from_secs(3600);
+/// Time over which late calls are counted for a finding.
+const WINDOW: Duration = Duration::from_secs(60);
+/// Minimum number of late calls with one cause in that time.
+const LEAST: usize = 3;
+
+/// Late calls by process and callback.
+#[derive(Debug, Default)]
+pub(super) struct LateCalls {
+    callbacks: Bounded<LateCallbacks, BTreeMap<(u32, u64), Lateness>>,
+}
+
+/// Late calls of one callback.
+#[derive(Debug)]
+struct Lateness {
+    owner: Owner,
+    trigger: Trigger,
+    calls: u64,
+    last: ModelTime,
+    /// Time of all late calls by stage and cause.
+    sums: BTreeMap<(Stage, Cause), Duration>,
+    /// Late calls by the cause that made them late.
+    causes: BTreeMap<(Stage, Cause), u64>,
+    history: Arc<Bounded<LateHistory, VecDeque<LateEntry>>>,
+    longest: Bounded<LongestLateCalls, Vec<Arc<LateExample>>>,
+    latest: Bounded<LastLateCalls, VecDeque<Arc<LateExample>>>,
+    alarm: Alarm,
+}
+
+/// What a finding says about a callback.
+#[derive(Debug)]
+pub(super) struct Late<'a> {
+    pub(super) owner: &'a Owner,
+    pub(super) trigger: &'a Trigger,
+    /// Late calls in the window with this cause.
+    pub(super) calls: u64,
+    pub(super) stage: Stage,
+    pub(super) cause: Cause,
+    /// The longest of the last ones.
+    pub(super) example: &'a LateExample,
+}
+
+impl LateCalls {
+    /// Adds a late call. `usual` is what the time of all calls consisted of.
+    pub(super) fn add(
+        &mut self,
+        call: LateCall,
+        domain_id: DomainId,
+        usual: ThreadStates,
+        clock: WallClock,
+    ) {
+        let key = (call.process, call.handle);
+        if !self.callbacks.contains_key(&key) {
+            self.make_space();
+        }
+        let started = clock.model_time(call.started);
+        let new = || Lateness::new(&call, domain_id, started);
+        let Some(lateness) = self.callbacks.get_or_insert_with(key, new) else {
+            return;
+        };
+        lateness.add(call, usual, started);
+    }
+
+    /// Removes the callback that was late the longest time ago, if the table is full.
+    fn make_space(&mut self) {
+        if !self.callbacks.is_full() {
+            return;
+        }
+        let oldest = self
+            .callbacks
+            .iter()
+            .min_by_key(|(_, lateness)| lateness.last);
+        if let Some(key) = oldest.map(|(key, _)| *key) {
+            self.callbacks.remove(&key);
+            self.callbacks.refuse();
+        }
+    }
+
+    /// Evaluates the rule at `at`. Returns whether a finding appeared, ended or changed.
+    pub(super) fn judge(&mut self, at: ModelTime) -> bool {
+        let mut has_changed = false;
+        for lateness in self.callbacks.values_mut() {
+            let found = lateness.prevailing(at).map(|(_, calls)| (calls, 0));
+            has_changed |= lateness.alarm.judge(found);
+        }
+        has_changed
+    }
+
+    /// Returns the present findings.
+    pub(super) fn findings(&self, at: ModelTime) -> impl Iterator<Item = Late<'_>> {
+        let raised = self.callbacks.values().filter_map(|lateness| {
+            let (calls, _) = lateness.alarm.raised()?;
+            Some((lateness, calls))
+        });
+        raised.filter_map(move |(lateness, calls)| {
+            let ((stage, cause), _) = lateness.prevailing(at).or_else(|| lateness.last())?;
+            let of_cause = |example: &&Arc<LateExample>| {
+                let main = example.main.as_ref();
+                main.is_some_and(|main| (main.stage, main.cause) == (stage, cause))
+            };
+            let latest = lateness.latest.iter().filter(of_cause);
+            Some(Late {
+                owner: &lateness.owner,
+                trigger: &lateness.trigger,
+                calls,
+                stage,
+                cause,
+                example: latest.max_by_key(|example| example.call.total())?,
+            })
+        })
+    }
+
+    /// Returns the facts for a snapshot.
+    pub(super) fn facts(&self) -> Vec<LateCallback> {
+        self.callbacks.values().map(Lateness::facts).collect()
+    }
+}
+
+impl Lateness {
+    fn new(call: &LateCall, domain_id: DomainId, started: ModelTime) -> Self {
+        Self {
+            owner: Owner {
+                process: call.process,
+                handle: call.handle,
+                domain_id,
+                node: None,
+            },
+            trigger: call.trigger.clone(),
+            calls: 0,
+            last: started,
+            sums: BTreeMap::new(),
+            causes: BTreeMap::new(),
+            history: Arc::default(),
+            longest: Bounded::default(),
+            latest: Bounded::default(),
+            alarm: Alarm::default(),
+        }
+    }
+
+    fn add(&mut self, call: LateCall, usual: ThreadStates, started: ModelTime) {
+        self.calls += 1;
+        self.last = started;
+        if call.node.is_some() {
+            self.owner.node.clone_from(&call.node);
+        }
+        self.trigger.clone_from(&call.trigger);
+        for part in call.parts() {
+            *self.sums.entry((part.stage, part.cause)).or_default() += part.duration;
+        }
+        let main = call.main_part(usual);
+        if let Some(part) = main {
+            let Part { stage, cause, .. } = part;
+            *self.causes.entry((stage, cause)).or_default() += 1;
+            let culprit = call.named_by(part);
+            Arc::make_mut(&mut self.history).push_back(LateEntry {
+                at: started,
+                stage,
+                cause,
+                total: call.total(),
+                culprit: culprit.map(|other| Arc::clone(&other.name)),
+            });
+        }
+        let example = Arc::new(LateExample {
+            at: started,
+            main,
+            call,
+        });
+        self.latest.push_back(Arc::clone(&example));
+        self.keep_if_long(example);
+    }
+
+    fn keep_if_long(&mut self, example: Arc<LateExample>) {
+        if self.longest.is_full() {
+            let rank = |kept: &LateExample| {
+                let is_recent = example.at - kept.at < LONGEST_FOR;
+                (is_recent, kept.call.total())
+            };
+            let kept = self.longest.iter().enumerate();
+            let Some((least, kept)) = kept.min_by_key(|(_, kept)| rank(kept)) else {
+                return;
+            };
+            if rank(kept) >= (true, example.call.total()) {
+                return;
+            }
+            self.longest.swap_remove(least);
+        }
+        self.longest.push(example);
+    }
+
+    /// Returns the most frequent cause of the window that ends at `at`, and its late calls; `None`
+    /// if they are few.
+    fn prevailing(&self, at: ModelTime) -> Option<((Stage, Cause), u64)> {
+        let recent = self.history.iter().rev();
+        let recent = recent.take_while(|entry| at - entry.at < WINDOW);
+        let mut counts: BTreeMap<(Stage, Cause), usize> = BTreeMap::new();
+        for entry in recent {
+            *counts.entry((entry.stage, entry.cause)).or_default() += 1;
+        }
+        let (cause, calls) = counts.into_iter().max_by_key(|(_, calls)| *calls)?;
+        (calls >= LEAST).then_some((cause, calls as u64))
+    }
+
+    /// Returns the cause of the last late call.
+    fn last(&self) -> Option<((Stage, Cause), u64)> {
+        let entry = self.history.back()?;
+        Some(((entry.stage, entry.cause), 1))
+    }
+
+    fn facts(&self) -> LateCallback {
+        LateCallback {
+            owner: self.owner.clone(),
+            trigger: self.trigger.clone(),
+            calls: self.calls,
+            sums: self.sums.iter().map(|(key, sum)| (*key, *sum)).collect(),
+            causes: self.causes.iter().map(|(key, sum)| (*key, *sum)).collect(),
+            history: Arc::clone(&self.history),
+            longest: self.longest.to_vec(),
+            latest: self.latest.iter().cloned().collect(),
+        }
+    }
+}

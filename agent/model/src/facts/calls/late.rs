@@ -1,0 +1,470 @@
+//! Late calls of callbacks, and what the time of each consisted of.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::inside::late::wait;
+
+use super::report::{ThreadStates, Trigger};
+use crate::facts::names::NodeName;
+
+/// A call that exceeded a bound of its callback, as a source reports it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LateCall {
+    /// Process of the callback.
+    pub process: u32,
+    /// Address of the callback in its process.
+    pub handle: u64,
+    /// Its node, if known.
+    pub node: Option<NodeName>,
+    /// Trigger of the callback.
+    pub trigger: Trigger,
+    /// Thread of the call.
+    pub thread: u32,
+    /// CPU on which the call ended.
+    pub cpu: u32,
+    /// Source timestamp of the message.
+    pub source: Option<Timestamp>,
+    /// Start of the call.
+    pub started: Timestamp,
+    /// Duration of the call.
+    pub duration: Duration,
+    /// Time from ready to start; `None` if it is unknown.
+    pub wait: Option<Duration>,
+    /// The bounds that the call is compared with.
+    pub bound: LateBound,
+    /// The call before in the same thread.
+    pub previous: Option<PreviousCall>,
+    /// What the thread did during the call, by the scheduler's accounting.
+    pub states: Option<ThreadStates>,
+    /// What it did between the call before and this one.
+    pub states_before: Option<ThreadStates>,
+    /// What it did during the call, by the scheduler's events.
+    pub activity: Option<Activity>,
+    /// What it did between the call before and this one, by events.
+    pub activity_before: Option<Activity>,
+}
+
+/// From when on a call is late.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LateBound {
+    /// Maximum duration of a call.
+    pub duration: Duration,
+    /// Maximum time from ready to start.
+    pub wait: Duration,
+}
+
+/// The call before in the same thread.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PreviousCall {
+    /// Address of its callback.
+    pub handle: u64,
+    /// Trigger of that callback.
+    pub trigger: Trigger,
+    /// Its duration.
+    pub duration: Duration,
+    /// Time from its end to the start of the next call.
+    pub ended_before: Duration,
+}
+
+/// What a thread did in a span of time, by the events of the scheduler.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Activity {
+    /// It could run, and did not.
+    pub runnable: Duration,
+    /// It was on a CPU without being charged for it: interrupts, or the hypervisor.
+    pub stolen: Duration,
+    /// It was blocked, in the order of [`wait`].
+    pub blocked: [Duration; wait::COUNT],
+    /// The longest of these times.
+    pub longest: Option<Blocked>,
+    /// Threads that ran instead, with the longest time first. Idle CPUs are among them.
+    pub others: Vec<OtherThread>,
+}
+
+/// A time in which a thread was blocked.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Blocked {
+    /// Its length.
+    pub duration: Duration,
+    /// One of [`wait`].
+    pub kind: usize,
+    /// The system call: its name, or its number.
+    pub call: Option<Arc<str>>,
+    /// First argument of the system call: the address of a lock, or a file descriptor.
+    pub argument: u64,
+    /// Thread that ended the wait, where that means something: it released the lock, or sent
+    /// SIGCONT.
+    pub waker: Option<OtherThread>,
+}
+
+/// Another thread.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct OtherThread {
+    /// Time for which it ran instead.
+    pub duration: Duration,
+    /// Thread id; 0 = the CPU was idle.
+    pub thread: u32,
+    /// Its process.
+    pub process: u32,
+    /// Name of the thread.
+    pub name: Arc<str>,
+}
+
+/// Where a late call lost its time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Stage {
+    /// Before the callback started, since it was ready.
+    Wait,
+    /// In the callback.
+    Callback,
+}
+
+/// For what a late call needed its time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Cause {
+    /// The thread ran on a CPU.
+    Cpu,
+    /// The CPU served interrupts, or the hypervisor ran another guest.
+    Stolen,
+    /// The CPU quota of its control group was used up.
+    Throttled,
+    /// The thread could run, and others ran instead.
+    Runnable,
+    /// It waited for a lock.
+    Lock,
+    /// It slept.
+    Sleep,
+    /// It waited for a disk, or for the kernel.
+    Disk,
+    /// It waited for a page of its memory.
+    PageFault,
+    /// It was stopped.
+    Stopped,
+    /// It waited in another system call.
+    SystemCall,
+    /// It was blocked; the events that tell why are not observed.
+    Blocked,
+    /// The executor's thread was in another callback.
+    OtherCallback,
+    /// The message came late: the executor's thread waited for it too.
+    Arrival,
+    /// Unknown.
+    Unexplained,
+}
+
+impl Stage {
+    /// Both stages.
+    pub const ALL: [Self; 2] = [Self::Wait, Self::Callback];
+
+    /// Returns the label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Wait => "wait",
+            Self::Callback => "callback",
+        }
+    }
+}
+
+impl Cause {
+    /// Every cause.
+    pub const ALL: [Self; 14] = [
+        Self::Cpu,
+        Self::Stolen,
+        Self::Throttled,
+        Self::Runnable,
+        Self::Lock,
+        Self::Sleep,
+        Self::Disk,
+        Self::PageFault,
+        Self::Stopped,
+        Self::SystemCall,
+        Self::Blocked,
+        Self::OtherCallback,
+        Self::Arrival,
+        Self::Unexplained,
+    ];
+
+    /// Returns the label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Cpu => "cpu",
+            Self::Stolen => "stolen",
+            Self::Throttled => "throttled",
+            Self::Runnable => "runnable",
+            Self::Lock => "lock",
+            Self::Sleep => "sleep",
+            Self::Disk => "disk",
+            Self::PageFault => "page_fault",
+            Self::Stopped => "stopped",
+            Self::SystemCall => "system_call",
+            Self::Blocked => "blocked",
+            Self::OtherCallback => "other_callback",
+            Self::Arrival => "arrival",
+            Self::Unexplained => "unexplained",
+        }
+    }
+
+    /// Returns what the cause did to a call, for the end of a sentence. `by` is the thread that ran
+    /// instead, held the lock, or continued the process.
+    #[must_use]
+    pub fn in_words(self, by: Option<&str>) -> String {
+        let by = by.unwrap_or("another thread");
+        match self {
+            Self::Cpu => "it computed".to_owned(),
+            Self::Stolen => "interrupts or the hypervisor took the CPU".to_owned(),
+            Self::Throttled => "its control group had used up its CPU quota".to_owned(),
+            Self::Runnable => format!("{by} ran instead"),
+            Self::Lock => format!("it waited for a lock that {by} released"),
+            Self::Sleep => "it slept".to_owned(),
+            Self::Disk => "it waited for the disk or the kernel".to_owned(),
+            Self::PageFault => "it waited for a page of its memory".to_owned(),
+            Self::Stopped => format!("it was stopped until {by} continued it"),
+            Self::SystemCall => "it waited in a system call".to_owned(),
+            Self::Blocked => "it was blocked".to_owned(),
+            Self::OtherCallback => "its thread was in another callback".to_owned(),
+            Self::Arrival => "the message came late: the executor waited for it".to_owned(),
+            Self::Unexplained => "the cause is unknown".to_owned(),
+        }
+    }
+
+    /// Returns what helps against the cause.
+    #[must_use]
+    pub const fn remedy(self) -> &'static str {
+        match self {
+            Self::Cpu => "shorten the callback, or divide its work",
+            Self::Stolen => "move interrupts to another CPU, or give the guest more of the host",
+            Self::Throttled => "raise CPUQuota of its unit, or cpu.max of its control group",
+            Self::Runnable => {
+                "give the node a higher priority or a CPU of its own, or limit the other process"
+            }
+            Self::Lock => "hold the lock for a shorter time, or copy the data first",
+            Self::Sleep => "use a timer instead of a sleep in the callback",
+            Self::Disk => "write files in another thread, or without fsync",
+            Self::PageFault => "lock the memory of the process (mlockall), or read files earlier",
+            Self::Stopped => "look for who sends SIGSTOP, or for a debugger",
+            Self::SystemCall | Self::Blocked => "move calls that block to another thread",
+            Self::OtherCallback => {
+                "shorten the other callback, or give this one a callback group and thread of its own"
+            }
+            Self::Arrival => "look at the topic's network path and at its publisher",
+            Self::Unexplained => "set capture.late: on, and look at rp doctor",
+        }
+    }
+
+    /// Returns the cause of a blocked time, one of [`wait`].
+    #[must_use]
+    pub const fn of_wait(kind: usize) -> Self {
+        match kind {
+            wait::LOCK => Self::Lock,
+            wait::SLEEP => Self::Sleep,
+            wait::DISK => Self::Disk,
+            wait::PAGE_FAULT => Self::PageFault,
+            wait::STOPPED => Self::Stopped,
+            _ => Self::SystemCall,
+        }
+    }
+
+    /// Returns the state of the thread that includes this cause: the index of
+    /// [`ThreadStates::nanoseconds`].
+    const fn state(self) -> Option<usize> {
+        match self {
+            Self::Cpu | Self::Stolen => Some(0),
+            Self::Throttled => Some(1),
+            Self::Runnable => Some(2),
+            Self::Lock
+            | Self::Sleep
+            | Self::Disk
+            | Self::PageFault
+            | Self::Stopped
+            | Self::SystemCall
+            | Self::Blocked => Some(3),
+            Self::OtherCallback | Self::Arrival | Self::Unexplained => None,
+        }
+    }
+}
+
+/// A part of the time of a late call.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Part {
+    /// Where.
+    pub stage: Stage,
+    /// For what.
+    pub cause: Cause,
+    /// Its length.
+    pub duration: Duration,
+}
+
+impl LateCall {
+    /// Returns the time from ready to the end of the call.
+    #[must_use]
+    pub fn total(&self) -> Duration {
+        self.wait.unwrap_or_default() + self.duration
+    }
+
+    /// Returns the parts of the time of the call, in the order of their time. They add up to
+    /// [`Self::total`].
+    ///
+    /// The sums are those of the scheduler's accounting. The events only divide them: events can
+    /// get lost, and the accounting cannot.
+    #[must_use]
+    pub fn parts(&self) -> Vec<Part> {
+        let mut parts = self.wait_parts();
+        parts.extend(self.callback_parts());
+        parts.retain(|part| !part.duration.is_zero());
+        parts
+    }
+
+    fn wait_parts(&self) -> Vec<Part> {
+        let Some(wait) = self.wait else {
+            return Vec::new();
+        };
+        let mut rest = Rest::new(Stage::Wait, wait);
+        if let Some(previous) = &self.previous {
+            let began_before = previous.ended_before + previous.duration;
+            let overlap = began_before.min(wait) - previous.ended_before.min(wait);
+            rest.take(Cause::OtherCallback, overlap);
+        }
+        // The thread was between two calls for the remaining time. Without a message, it waits.
+        match self.states_before {
+            Some(states) => {
+                rest.take(Cause::Throttled, nanoseconds(states.throttled));
+                rest.take(Cause::Runnable, nanoseconds(states.runnable));
+                rest.finish(Cause::Arrival)
+            }
+            None => rest.finish(Cause::Unexplained),
+        }
+    }
+
+    fn callback_parts(&self) -> Vec<Part> {
+        let mut rest = Rest::new(Stage::Callback, self.duration);
+        let Some(states) = self.states else {
+            return rest.finish(Cause::Unexplained);
+        };
+        let cpu = nanoseconds(states.cpu);
+        let activity = self.activity.as_ref();
+        let stolen = activity.map_or(Duration::ZERO, |activity| activity.stolen.min(cpu));
+        rest.take(Cause::Cpu, cpu - stolen);
+        rest.take(Cause::Stolen, stolen);
+        rest.take(Cause::Throttled, nanoseconds(states.throttled));
+        rest.take(Cause::Runnable, nanoseconds(states.runnable));
+        let Some(activity) = activity else {
+            return rest.finish(Cause::Blocked);
+        };
+        // The CPU time of the accounting may include a tick that precedes the call. Then the events
+        // show more blocked time.
+        let all: Duration = activity.blocked.iter().sum();
+        let blocked = rest.rest;
+        for (kind, duration) in activity.blocked.iter().enumerate() {
+            let share = match all > blocked {
+                true => share(blocked, *duration, all),
+                false => *duration,
+            };
+            rest.take(Cause::of_wait(kind), share);
+        }
+        rest.finish(Cause::Unexplained)
+    }
+
+    /// Returns the main part: what made the call late. `usual` is what the time of all calls of the
+    /// callback consisted of. A part that each call has explains nothing, unless it exceeds the
+    /// bound by itself.
+    #[must_use]
+    pub fn main_part(&self, usual: ThreadStates) -> Option<Part> {
+        let excess = |time: Duration, bound: Duration| time.saturating_sub(bound);
+        let in_callback = excess(self.duration, self.bound.duration);
+        let in_wait = excess(self.wait.unwrap_or_default(), self.bound.wait);
+        let stage = match in_wait > in_callback {
+            true => Stage::Wait,
+            false => Stage::Callback,
+        };
+        let parts = self.parts();
+        let parts = || parts.iter().filter(|part| part.stage == stage);
+        let largest = parts().max_by_key(|part| part.duration).copied();
+        if stage == Stage::Wait || usual.calls == 0 {
+            return largest;
+        }
+        let beyond = |part: &&Part| {
+            let mean = |state: usize| {
+                let sums = usual.nanoseconds();
+                nanoseconds(sums.get(state).copied().unwrap_or_default() / usual.calls)
+            };
+            let usual = part.cause.state().map_or(Duration::ZERO, mean);
+            part.duration.saturating_sub(usual)
+        };
+        let unusual = parts().max_by_key(beyond);
+        let is_large = |part: &&Part| beyond(part) * 4 >= self.duration;
+        unusual.filter(is_large).copied().or(largest)
+    }
+
+    /// Returns the thread that a cause names: the one that ran instead for longest, released the
+    /// lock, or continued the process.
+    #[must_use]
+    pub fn named_by(&self, part: Part) -> Option<&OtherThread> {
+        match part.cause {
+            Cause::Runnable => self.culprit(part.stage),
+            Cause::Lock | Cause::Stopped => {
+                let longest = self.activity.as_ref()?.longest.as_ref()?;
+                longest.waker.as_ref()
+            }
+            _ => None,
+        }
+    }
+
+    /// Returns the thread that ran instead for longest in this stage. Idle CPUs are left out.
+    #[must_use]
+    pub fn culprit(&self, stage: Stage) -> Option<&OtherThread> {
+        let activity = match stage {
+            Stage::Wait => &self.activity_before,
+            Stage::Callback => &self.activity,
+        };
+        let others = activity.as_ref()?.others.iter();
+        others
+            .filter(|other| other.thread != 0)
+            .max_by_key(|other| other.duration)
+    }
+}
+
+/// The time of a stage that no part has yet.
+struct Rest {
+    stage: Stage,
+    rest: Duration,
+    parts: Vec<Part>,
+}
+
+impl Rest {
+    const fn new(stage: Stage, rest: Duration) -> Self {
+        Self {
+            stage,
+            rest,
+            parts: Vec::new(),
+        }
+    }
+
+    fn take(&mut self, cause: Cause, duration: Duration) {
+        let duration = duration.min(self.rest);
+        self.rest -= duration;
+        self.parts.push(Part {
+            stage: self.stage,
+            cause,
+            duration,
+        });
+    }
+
+    fn finish(mut self, cause: Cause) -> Vec<Part> {
+        self.take(cause, self.rest);
+        self.parts
+    }
+}
+
+const fn nanoseconds(nanoseconds: u64) -> Duration {
+    Duration::from_nanos(nanoseconds)
+}
+
+/// Returns `part / all` of a duration.
+fn share(of: Duration, part: Duration, all: Duration) -> Duration {
+    let nanoseconds = of.as_nanos() * part.as_nanos() / all.as_nanos().max(1);
+    Duration::from_nanos(u64::try_from(nanoseconds).unwrap_or(u64::MAX))
+}

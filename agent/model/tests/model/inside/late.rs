@@ -1,0 +1,300 @@
+//! Late calls: their parts, their main cause, and what is kept of them.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_model::facts::calls::late::{
+    Activity, Blocked, Cause, LateBound, LateCall, OtherThread, PreviousCall, Stage,
+};
+use ros2probe_model::facts::calls::report::{ProcessReport, Report, ThreadStates, Trigger};
+use ros2probe_model::facts::diagnosis::Diagnosis;
+use ros2probe_model::observe::input::Input;
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::inside::late::wait;
+use ros2probe_wire::time::SECOND;
+
+use super::*;
+
+const START: u64 = 1_700_000_000 * SECOND;
+
+const fn milliseconds(number: u64) -> Duration {
+    Duration::from_millis(number)
+}
+
+const fn states(cpu: u64, throttled: u64, runnable: u64, blocked: u64) -> ThreadStates {
+    ThreadStates {
+        calls: 1,
+        cpu: cpu * 1_000_000,
+        throttled: throttled * 1_000_000,
+        runnable: runnable * 1_000_000,
+        blocked: blocked * 1_000_000,
+    }
+}
+
+fn other(name: &str, process: u32, duration: u64) -> OtherThread {
+    OtherThread {
+        duration: milliseconds(duration),
+        thread: process,
+        process,
+        name: name.into(),
+    }
+}
+
+/// A call of 100 ms with a bound of 20 ms.
+fn call(states: ThreadStates) -> LateCall {
+    LateCall {
+        process: 7,
+        handle: 0x40,
+        node: Some("/filter".into()),
+        trigger: Trigger::Subscription("/points".into()),
+        thread: 8,
+        cpu: 1,
+        source: None,
+        started: Timestamp(START),
+        duration: milliseconds(100),
+        wait: None,
+        bound: LateBound {
+            duration: milliseconds(20),
+            wait: milliseconds(20),
+        },
+        previous: None,
+        states: Some(states),
+        states_before: None,
+        activity: Some(Activity::default()),
+        activity_before: Some(Activity::default()),
+    }
+}
+
+fn parts(call: &LateCall) -> Vec<(Stage, Cause, u64)> {
+    let sum: Duration = call.parts().iter().map(|part| part.duration).sum();
+    assert_eq!(sum, call.total(), "{call:?}");
+    let parts = call.parts().into_iter().map(|part| {
+        let milliseconds = u64::try_from(part.duration.as_millis()).unwrap();
+        (part.stage, part.cause, milliseconds)
+    });
+    parts.collect()
+}
+
+#[test]
+fn blocked_time_is_divided_by_events_and_the_rest_is_unexplained() {
+    let mut late = call(states(10, 5, 15, 70));
+    let activity = late.activity.as_mut().unwrap();
+    activity.blocked[wait::LOCK] = milliseconds(40);
+    activity.blocked[wait::DISK] = milliseconds(20);
+    let of = |cause, milliseconds| (Stage::Callback, cause, milliseconds);
+    let expected = [
+        of(Cause::Cpu, 10),
+        of(Cause::Throttled, 5),
+        of(Cause::Runnable, 15),
+        of(Cause::Lock, 40),
+        of(Cause::Disk, 20),
+        of(Cause::Unexplained, 10),
+    ];
+    assert_eq!(parts(&late), expected);
+    late.activity = None;
+    assert_eq!(parts(&late)[3..], [of(Cause::Blocked, 70)]);
+    late.states = None;
+    assert_eq!(parts(&late), [of(Cause::Unexplained, 100)]);
+}
+
+#[test]
+fn events_beyond_the_accounting_are_reduced_to_it() {
+    // The accounting has a tick of CPU time that precedes the call.
+    let mut late = call(states(10, 0, 0, 90));
+    let activity = late.activity.as_mut().unwrap();
+    activity.blocked[wait::SLEEP] = milliseconds(50);
+    activity.blocked[wait::OTHER] = milliseconds(50);
+    let of = |cause, milliseconds| (Stage::Callback, cause, milliseconds);
+    let expected = [
+        of(Cause::Cpu, 10),
+        of(Cause::Sleep, 45),
+        of(Cause::SystemCall, 45),
+    ];
+    assert_eq!(parts(&late), expected);
+}
+
+#[test]
+fn a_wait_is_divided_into_the_callback_before_the_thread_and_the_arrival() {
+    let mut late = call(states(100, 0, 0, 0));
+    late.wait = Some(milliseconds(80));
+    late.states_before = Some(states(1, 0, 5, 14));
+    late.previous = Some(PreviousCall {
+        handle: 0x50,
+        trigger: Trigger::Timer(None),
+        duration: milliseconds(40),
+        ended_before: milliseconds(20),
+    });
+    let of = |cause, milliseconds| (Stage::Wait, cause, milliseconds);
+    let expected = [
+        of(Cause::OtherCallback, 40),
+        of(Cause::Runnable, 5),
+        of(Cause::Arrival, 35),
+    ];
+    assert_eq!(parts(&late)[..3], expected);
+    // The message came while the callback before it ran.
+    late.wait = Some(milliseconds(30));
+    assert_eq!(parts(&late)[0], of(Cause::OtherCallback, 10));
+    late.previous = None;
+    late.states_before = None;
+    assert_eq!(parts(&late)[0], of(Cause::Unexplained, 30));
+}
+
+#[test]
+fn a_part_that_every_call_has_is_not_what_made_one_late() {
+    let late = call(states(52, 0, 48, 0));
+    let usual = states(50, 0, 0, 0);
+    assert_eq!(late.main_part(usual).unwrap().cause, Cause::Runnable);
+    let without = ThreadStates::default();
+    assert_eq!(late.main_part(without).unwrap().cause, Cause::Cpu);
+    // All calls are late in the same way.
+    let usual = states(52, 0, 48, 0);
+    assert_eq!(late.main_part(usual).unwrap().cause, Cause::Cpu);
+}
+
+#[test]
+fn the_stage_that_exceeds_its_bound_more_has_the_main_cause() {
+    let mut late = call(states(25, 0, 0, 0));
+    late.duration = milliseconds(25);
+    late.wait = Some(milliseconds(60));
+    late.states_before = Some(states(0, 0, 0, 60));
+    let main = late.main_part(ThreadStates::default()).unwrap();
+    assert_eq!((main.stage, main.cause), (Stage::Wait, Cause::Arrival));
+    late.wait = Some(milliseconds(24));
+    let main = late.main_part(ThreadStates::default()).unwrap();
+    assert_eq!((main.stage, main.cause), (Stage::Callback, Cause::Cpu));
+}
+
+#[test]
+fn the_thread_that_ran_instead_and_the_holder_of_a_lock_are_named() {
+    let mut late = call(states(10, 0, 90, 0));
+    let activity = late.activity.as_mut().unwrap();
+    activity.others = vec![other("swapper/1", 0, 50), other("chromium", 3121, 40)];
+    activity.longest = Some(Blocked {
+        duration: milliseconds(5),
+        kind: wait::LOCK,
+        call: Some("futex".into()),
+        argument: 0x7f00,
+        waker: Some(other("holder", 99, 0)),
+    });
+    let named = |cause| {
+        let parts = late.parts();
+        let part = parts.into_iter().find(|part| part.cause == cause);
+        let part = part.unwrap_or(ros2probe_model::facts::calls::late::Part {
+            stage: Stage::Callback,
+            cause,
+            duration: Duration::ZERO,
+        });
+        late.named_by(part).map(|other| other.name.to_string())
+    };
+    assert_eq!(named(Cause::Runnable).as_deref(), Some("chromium"));
+    assert_eq!(named(Cause::Lock).as_deref(), Some("holder"));
+    assert_eq!(named(Cause::Cpu), None);
+}
+
+/// Reports late calls at a second.
+fn report(observer: &mut Observer, second: u64, calls: u32) {
+    let at = Timestamp(START + second * SECOND);
+    let late = (0..calls).map(|number| {
+        let mut late = call(states(10, 0, 90, 0));
+        late.started = at;
+        late.duration += milliseconds(number.into());
+        let activity = late.activity.as_mut().unwrap();
+        activity.others = vec![other("chromium", 3121, 90)];
+        late
+    });
+    observer.input(Input::Inside(Report {
+        at,
+        has_callbacks: true,
+        processes: vec![ProcessReport {
+            id: 7,
+            ..ProcessReport::default()
+        }],
+        transitions: Vec::new(),
+        late: late.collect(),
+    }));
+    observer.input(Input::Time(at));
+}
+
+fn late_findings(observer: &mut Observer, second: u64) -> Vec<Diagnosis> {
+    let snapshot = observer.snapshot(Timestamp(START + second * SECOND));
+    let findings = snapshot.diagnoses.list.iter();
+    let late = findings.filter(|finding| finding.kind() == "late_callback");
+    late.cloned().collect()
+}
+
+#[test]
+fn three_late_calls_in_a_minute_are_a_finding_with_the_cause_until_the_minute_is_over() {
+    let mut observer = Observer::new(Settings::default());
+    for second in 0..5 {
+        report(&mut observer, second, u32::from(second < 2));
+    }
+    assert_eq!(late_findings(&mut observer, 4), [], "two calls");
+    for second in 5..12 {
+        report(&mut observer, second, u32::from(second == 5));
+    }
+    let found = late_findings(&mut observer, 11);
+    let [
+        Diagnosis::LateCallback {
+            callback,
+            calls,
+            stage,
+            cause,
+            by,
+            ..
+        },
+    ] = &found[..]
+    else {
+        panic!("{found:?}");
+    };
+    assert_eq!(callback.node.as_deref(), Some("/filter"));
+    assert_eq!(
+        (*calls, *stage, *cause),
+        (3, Stage::Callback, Cause::Runnable)
+    );
+    assert_eq!(by.as_deref(), Some("chromium"));
+    for second in 12..90 {
+        report(&mut observer, second, 0);
+    }
+    assert_eq!(late_findings(&mut observer, 89), []);
+}
+
+#[test]
+fn the_longest_and_the_last_calls_are_kept_after_the_process_has_ended() {
+    let mut observer = Observer::new(Settings::default());
+    report(&mut observer, 0, 100);
+    report(&mut observer, 1, 3);
+    observer.input(Input::Inside(Report {
+        at: Timestamp(START + 2 * SECOND),
+        has_callbacks: true,
+        processes: vec![ProcessReport {
+            id: 7,
+            has_ended: true,
+            ..ProcessReport::default()
+        }],
+        ..Report::default()
+    }));
+    let snapshot = observer.snapshot(Timestamp(START + 2 * SECOND));
+    let inside = snapshot.inside.as_deref().unwrap();
+    let [late] = &inside.late[..] else {
+        panic!("{:?}", inside.late);
+    };
+    assert_eq!(late.calls, 103);
+    assert_eq!(late.causes, [((Stage::Callback, Cause::Runnable), 103)]);
+    assert_eq!(late.longest.len(), 8);
+    let least = late.longest.iter().map(|each| each.call.duration).min();
+    assert_eq!(least, Some(milliseconds(192)), "the eight longest");
+    let latest: Vec<_> = late.latest.iter().map(|each| each.call.started).collect();
+    assert_eq!(latest.len(), 8);
+    assert_eq!(latest[5..], [Timestamp(START + SECOND); 3]);
+    let sum: Duration = late.sums.iter().map(|(_, sum)| *sum).sum();
+    let history = late
+        .history
+        .iter()
+        .map(|entry| entry.total)
+        .sum::<Duration>();
+    assert_eq!(sum, history, "103 calls fit into the history");
+    assert_eq!(
+        late.history.back().unwrap().culprit,
+        Some(Arc::from("chromium"))
+    );
+}
