@@ -38,6 +38,9 @@ const FORGOTTEN: f32 = 1.0 / 180.0;
 /// Part of a bound by which it rises in a round at most, as a divisor: it doubles in 70 s.
 const RISE: u64 = 100;
 
+/// Maximum number of threads that are named for a span of a late call.
+const NAMED: usize = 4;
+
 /// What clients want to know about late calls.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct LateDemand {
@@ -357,6 +360,8 @@ fn activity(activity: &late::Activity) -> Activity {
         })
         .collect();
     others.sort_by(|one, other| other.cmp(one));
+    others.truncate(NAMED);
+    others.shrink_to_fit();
     let longest = &activity.longest;
     Activity {
         runnable: Duration::from_nanos(activity.runnable),

@@ -655,6 +655,17 @@ mod tests {
     }
 
     #[test]
+    fn late_calls_of_a_report_are_bounded() {
+        let (mut table, clocks) = (table(), Clocks::read());
+        for _ in 0..2_000 {
+            let call = Box::new(late::LateCall::new_zeroed());
+            table.note(Some(Item::Late(call)), &clocks, &mut Broker::here());
+        }
+        assert_driven::<LateCalls>();
+        assert_eq!(table.late.len(), LateCalls::CAP);
+    }
+
+    #[test]
     fn handles_beyond_the_cap_cause_a_new_report_of_all_handles() {
         let mut observed = Observed::default();
         let handle = |address| Handle {

@@ -267,7 +267,7 @@ fn a_call_that_sleeps_is_late_with_its_cause_from_the_first_question_on() -> Res
     wait_until("the late call is known", || {
         // A bound is set after the first call of a callback.
         process.write_line("sleep 1 20000")?;
-        process.wait_for("sleep", PATIENCE)?;
+        process.line_with_end("sleep", PATIENCE)?;
         let mut answer = why("/robot1/filter --above 5")?;
         late = answer.callbacks.pop();
         Ok(late.is_some())

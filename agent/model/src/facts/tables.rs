@@ -251,10 +251,10 @@ crate::tables! {
     LateHistory { name: "inside.late.history", entries: 128, rule: Oldest }
     /// The longest late calls of one callback, with all their parts
     LongestLateCalls {
-        name: "inside.late.longest", entries: 8, effect: "the shortest is dropped, or one that is older than an hour",
+        name: "inside.late.longest", entries: 4, effect: "the shortest is dropped, or one that is older than an hour",
     }
     /// The last late calls of one callback, with all their parts
-    LastLateCalls { name: "inside.late.last", entries: 8, rule: Oldest }
+    LastLateCalls { name: "inside.late.last", entries: 4, rule: Oldest }
     /// Topics of observed processes
     InsideTopicSums {
         name: "inside.topics", entries: HANDLE_CAPACITY as usize,

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
 use ros2probe_model::facts::calls::report::ThreadStates;
-use ros2probe_wire::inside::late::{Bound, mode};
-use ros2probe_wire::inside::{Handle, kind};
+use ros2probe_wire::inside::late::{Bound, PER_SECOND, mode};
+use ros2probe_wire::inside::{Counter, Handle, kind};
 
 use super::thread_states::{Hog, Quota};
 use super::{Process, Robot};
@@ -230,6 +230,16 @@ fn a_call_that_waits_for_another_callback_names_it() {
         let previous = call.previous.as_ref().unwrap();
         assert_eq!(previous.handle, call.handle);
     }
+}
+
+#[test]
+fn late_calls_beyond_the_rate_are_skipped_and_counted() {
+    let (mut robot, mut process) = started();
+    let calls = late(&mut robot, &mut process, "sleep 100 6000");
+    let skipped = robot.counter(Counter::LateSkipped);
+    assert_eq!(calls.len() as u64 + skipped, 100);
+    // 100 calls of 6 ms belong to two seconds or more on a busy machine.
+    assert!(calls.len() as u64 >= PER_SECOND && skipped > 0, "{skipped}");
 }
 
 /// Binds the process to the first CPU.

