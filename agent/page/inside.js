@@ -49,8 +49,8 @@ export function waiting(answer) {
   return answer.reason ?? 'No call has been observed yet.';
 }
 
-/** @param {any} it */
-function trigger(it) {
+/** Names what triggers a callback. @param {any} it */
+export function trigger(it) {
   if (it.kind === 'timer') {
     return it.period_seconds == null ? 'timer' : `timer ${duration(it.period_seconds)}`;
   }

@@ -29,7 +29,7 @@ impl File {
 }
 
 /// Every file, by its path below `/page/`; `index.html` is also served at `/`.
-pub static FILES: [File; 38] = [
+pub static FILES: [File; 40] = [
     File::new("api.js", SCRIPT, include_bytes!("../api.js")),
     File::new("app.css", CSS, include_bytes!("../app.css")),
     File::new("app.js", SCRIPT, include_bytes!("../app.js")),
@@ -46,6 +46,7 @@ pub static FILES: [File; 38] = [
     File::new("icon.svg", SVG, include_bytes!("../icon.svg")),
     File::new("index.html", HTML, include_bytes!("../index.html")),
     File::new("inside.js", SCRIPT, include_bytes!("../inside.js")),
+    File::new("late.js", SCRIPT, include_bytes!("../late.js")),
     File::new(
         "layout-worker.js",
         SCRIPT,
@@ -111,6 +112,7 @@ pub static FILES: [File; 38] = [
         SCRIPT,
         include_bytes!("../views/inside.js"),
     ),
+    File::new("views/late.js", SCRIPT, include_bytes!("../views/late.js")),
     File::new(
         "views/nodes.js",
         SCRIPT,

@@ -5,6 +5,7 @@ import { tables, waiting } from '../inside.js';
 import { usePoll } from '../store.js';
 import { Failed, html, Name } from '../ui.js';
 import { useState } from '../vendor/hooks.mjs';
+import { Late } from './late.js';
 
 /** Between requests that keep calls observed. The agent observes them for 10 s after each. */
 const AGAIN_MS = 4000;
@@ -15,6 +16,8 @@ export function Inside({ inside, name, domain }) {
   const [observes, observe] = useState(false);
   const calls = usePoll(observes
     ? `inside?name=${encodeURIComponent(name)}&domain_id=${domain}` : null, AGAIN_MS);
+  const late = usePoll(observes
+    ? `why?name=${encodeURIComponent(name)}&domain_id=${domain}` : null, AGAIN_MS);
   const shown = inside ? tables(inside) : [];
   const isShown = shown.length > 0 || inside?.lifecycle_state;
   if (!observes && !isShown) {
@@ -36,5 +39,6 @@ export function Inside({ inside, name, domain }) {
       <tbody>${rows.map((row, place) => html`<tr key=${place}>${row.map((cell, at) => at === 0
         ? html`<th scope="row"><${Name} text=${cell} /></th>` : at === 1
           ? html`<td><${Name} text=${cell} /></td>` : html`<td class="number">${cell}</td>`)}</tr>`)}
-      </tbody></table></div>`)}</section>`;
+      </tbody></table></div>`)}
+    ${observes && html`<${Late} answer=${late} />`}</section>`;
 }

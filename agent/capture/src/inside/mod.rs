@@ -121,7 +121,7 @@ impl Inside {
         let is_on_demand = choice == InsideChoice::Auto;
         let programs = Arc::new(programs);
         let late = LateObservation::new(Arc::clone(&programs), late);
-        let mut probes = Probes::new(programs, is_on_demand, &progress);
+        let mut probes = Probes::new(&programs, is_on_demand, &progress);
         // A node announces its publishers only once, so the probes are attached to installed
         // libraries in advance.
         probes.install(Instant::now(), &mut broker);

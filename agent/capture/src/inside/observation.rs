@@ -47,12 +47,12 @@ pub(super) struct Probes {
 impl Probes {
     /// Creates probes that are attached to no library.
     pub(super) fn new(
-        programs: Arc<Programs>,
+        programs: &Arc<Programs>,
         is_on_demand: bool,
         progress: &Arc<Progress>,
     ) -> Self {
         let at = |meaning, part| {
-            let (programs, progress) = (Arc::clone(&programs), Arc::clone(progress));
+            let (programs, progress) = (Arc::clone(programs), Arc::clone(progress));
             Attachments::new(
                 meaning,
                 Box::new(move |broker, place| {

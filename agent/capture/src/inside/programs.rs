@@ -158,7 +158,18 @@ fn accounting_offsets() -> [u32; accounting::COUNT] {
 
 /// Loads the programs at the scheduler's events.
 fn load_scheduler(ebpf: &mut Ebpf, offsets: &[u32]) -> Result<[OwnedFd; 2], NoEvents> {
-    if offsets.iter().any(|offset| *offset == accounting::ABSENT) {
+    let needed = [
+        accounting::RUNTIME,
+        accounting::RUN_DELAY,
+        accounting::STATE,
+        accounting::THREAD,
+    ];
+    let is_known = |member: &usize| {
+        offsets
+            .get(*member)
+            .is_some_and(|at| *at != accounting::ABSENT)
+    };
+    if !needed.iter().all(is_known) {
         return Err(NoEvents::Types);
     }
     let mut load = |name: &CStr| {

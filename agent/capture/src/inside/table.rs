@@ -40,7 +40,7 @@ pub struct ProcessTable {
     known: HashMap<u32, Observed>,
     has_callbacks: bool,
     hops: Bounded<CausalHops, Vec<inside::Hop>>,
-    late: Bounded<LateCalls, Vec<Box<late::LateCall>>>,
+    late: Bounded<LateCalls, Vec<late::LateCall>>,
     transitions: Bounded<Transitions, Vec<Transition>>,
     rounds: u32,
     /// Time since calls per second were last evaluated.
@@ -158,7 +158,7 @@ impl ProcessTable {
                 self.hops.push(hop);
             }
             Some(Item::Late(call)) => {
-                self.late.push(call);
+                self.late.push(*call);
             }
             Some(Item::Announcement(announcement)) => self.announced(&announcement, clocks, broker),
             None => {}

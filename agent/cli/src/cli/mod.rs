@@ -76,7 +76,6 @@ pub(crate) enum Command {
 
 /// Commands that query an agent or a capture.
 #[derive(Debug, Subcommand)]
-#[expect(clippy::large_enum_variant, reason = "there is one")]
 pub(crate) enum Question {
     /// Record, convert and inspect bags, as `ros2 bag` does
     Bag(bag::Bag),

@@ -34,6 +34,9 @@ const LONGEST_MS: f64 = 3_600_000.0;
 /// Longest time that a request may look back, in seconds.
 const LONGEST_S: f64 = 1e9;
 
+/// A cause with the thread that it names.
+type Named = (late::Stage, late::Cause, Option<Arc<str>>);
+
 /// Query parameters that select late calls.
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
@@ -147,8 +150,7 @@ fn why<'a>(
 
 /// Returns the causes of the late calls since a time, the most frequent first.
 fn causes(callbacks: &[&facts::LateCallback], since: ModelTime) -> Vec<Cause<'static>> {
-    let mut sums: BTreeMap<(late::Stage, late::Cause, Option<Arc<str>>), (u64, Duration)> =
-        BTreeMap::new();
+    let mut sums: BTreeMap<Named, (u64, Duration)> = BTreeMap::new();
     for callback in callbacks {
         for entry in callback.history.iter().filter(|entry| entry.at >= since) {
             let key = (entry.stage, entry.cause, entry.culprit.clone());
@@ -221,7 +223,7 @@ fn late_call(example: &LateExample, clock: WallClock) -> LateCall<'_> {
         wait_seconds: call.wait.map(|wait| wait.as_secs_f64()),
         late_duration_seconds: call.bound.duration.as_secs_f64(),
         late_wait_seconds: (call.bound.wait.as_nanos() < u128::from(u64::MAX))
-            .then(|| call.bound.wait.as_secs_f64()),
+            .then_some(call.bound.wait.as_secs_f64()),
         thread_id: call.thread,
         cpu: call.cpu,
         stage: main.map(|part| part.stage.label().into()),
