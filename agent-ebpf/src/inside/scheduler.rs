@@ -1,8 +1,8 @@
 //! Events of the scheduler: for what a followed thread waits, and who runs while it could run.
 //!
-//! Nearly all events concern other threads, so the programs first look at one bit of a thread's id.
-//! A followed thread that can run and does not makes every CPU remember who runs on it. When the
-//! thread runs again, the memory of its CPU tells who ran instead.
+//! Nearly all events concern other threads, so the programs first read one bit of a thread's id.
+//! While a followed thread can run and does not, the programs store who runs on each CPU. When the
+//! thread runs again, they add up who ran on its CPU instead.
 //!
 //! The programs take no lock that sleeps, and write no ring: on real-time kernels they run where
 //! nothing may sleep.

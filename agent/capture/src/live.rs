@@ -280,7 +280,7 @@ impl LiveSource {
         self.inside.iter().for_each(|inside| inside.want(wanted));
     }
 
-    /// Sets which calls clients regard as late, and whether one asks for their causes.
+    /// Sets which calls clients regard as late, and whether one requests their causes.
     pub fn want_late(&self, demand: &LateDemand) {
         self.inside
             .iter()

@@ -60,7 +60,7 @@ pub enum LateChoice {
     Off,
     /// While calls are observed.
     On,
-    /// While a client asks for causes. At other times, late calls are reported with the sums of the
+    /// While a client requests causes. At other times, late calls are reported with the sums of the
     /// scheduler's accounting.
     #[default]
     Auto,

@@ -161,7 +161,7 @@ impl SnapshotCell {
         age.is_some_and(|age| age <= CALLS_HELD)
     }
 
-    /// Notes that a client asks for the causes of late calls. With `above`, calls of callbacks of
+    /// Notes that a client requests the causes of late calls. With `above`, calls of callbacks of
     /// this topic or node, or of all, are late if they take longer.
     pub fn want_late(&self, name: Option<&str>, above: Option<Duration>) {
         self.want_calls();

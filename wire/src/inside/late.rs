@@ -120,7 +120,7 @@ pub struct Activity {
     pub blocked: [u64; wait::COUNT],
     /// The longest of these times.
     pub longest: Blocked,
-    /// Who ran instead. A thread with a short time may be missing.
+    /// Threads that ran instead. One with a short time may be missing.
     pub others: [Other; OTHERS],
 }
 

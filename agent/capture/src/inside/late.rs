@@ -1,8 +1,8 @@
 //! Late calls: from when on a call is late, whether the scheduler's events are observed, and the
 //! items that the kernel programs report.
 //!
-//! Without a bound from a client or an expectation, a call is late if it takes three times as long
-//! as 99 % of the calls of its callback in the last minutes, and [`LEAST_BOUND`] or more.
+//! Without a bound from a client or an expectation, the bound is learnt. It is three times the 99th
+//! percentile of the callback's calls in the last minutes, and [`LEAST_BOUND`] or more.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -20,7 +20,7 @@ use ros2probe_wire::inside::{BUCKETS, Handle, bucket_start, kind, thread_state};
 
 use super::programs::{Events, Programs, Tables};
 use super::table::ProcessTable;
-use crate::error_chain::in_words;
+use crate::error_chain::{Reason, in_words};
 use crate::settings::LateChoice;
 use crate::system::Clocks;
 use crate::tables::CallbackBounds;
@@ -44,7 +44,7 @@ const NAMED: usize = 4;
 /// What clients want to know about late calls.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct LateDemand {
-    /// Whether a client asks for causes.
+    /// Whether a client requests causes.
     pub has_question: bool,
     /// Bounds of clients and expectations. The first one that applies to a callback counts.
     pub bounds: Vec<RequestedBound>,
@@ -66,7 +66,7 @@ pub(super) struct LateObservation {
     /// The mode that the programs have.
     mode: u32,
     events: Option<Events>,
-    without_events: Option<String>,
+    without_events: Option<Reason>,
     requested: Vec<RequestedBound>,
     bounds: Bounded<CallbackBounds, HashMap<Handle, Learnt>>,
 }
@@ -107,7 +107,7 @@ impl LateObservation {
 
     /// Returns why they are not observed although they are needed.
     pub(super) fn without_events(&self) -> Option<&str> {
-        self.without_events.as_deref()
+        self.without_events.as_ref().map(Reason::as_str)
     }
 
     /// Begins or ends the observation of the scheduler's events. `at_calls`: whether callbacks are
@@ -130,7 +130,7 @@ impl LateObservation {
                 Ok(events) => self.events = Some(events),
                 Err(reason) => {
                     tracing::warn!(
-                        reason,
+                        reason = reason.as_str(),
                         "late callbacks are reported without who ran instead"
                     );
                     self.without_events = Some(reason);

@@ -22,7 +22,7 @@ use zerocopy::FromZeros as _;
 
 use crate::bpf;
 use crate::breakpoints::{self, Breakpoints, Dispatcher, Means};
-use crate::error_chain::in_words;
+use crate::error_chain::Reason;
 use crate::filter::{Aligned, FilterError, absent_is_fine, failed, take};
 use crate::kernel_types::KernelTypes;
 use crate::system::{Clocks, raw_difference};
@@ -230,12 +230,12 @@ impl Programs {
     ///
     /// # Errors
     /// Fails if the kernel has no such events, or refused the programs when they were loaded.
-    pub fn observe_scheduler(&self) -> Result<Events, String> {
-        let programs = self.scheduler.as_ref().map_err(|error| in_words(error))?;
-        let [switch, waking] = programs;
+    pub fn observe_scheduler(&self) -> Result<Events, Reason> {
+        let programs = self.scheduler.as_ref();
+        let [switch, waking] = programs.map_err(|error| Reason::of(error))?;
         let open = |name, program: &OwnedFd| {
             let opened = bpf::open_tracepoint(name, program.as_fd());
-            opened.map_err(|error| in_words(&NoEvents::Kernel(error)))
+            opened.map_err(|error| Reason::of(&NoEvents::Kernel(error)))
         };
         let [of_switch, of_waking] = EVENTS;
         Ok(Events([open(of_switch, switch)?, open(of_waking, waking)?]))

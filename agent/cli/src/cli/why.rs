@@ -128,10 +128,8 @@ impl Why {
     }
 }
 
-fn milliseconds(text: &str) -> Result<f64, String> {
-    let number: f64 = text.parse().map_err(|_| "not a number of milliseconds")?;
-    match (0.0..=3_600_000.0).contains(&number) {
-        true => Ok(number),
-        false => Err("it must be from 0 to 3600000 milliseconds".to_owned()),
-    }
+fn milliseconds(text: &str) -> Result<f64, UserError> {
+    let number = text.parse().ok();
+    let number = number.filter(|number| (0.0..=3_600_000.0).contains(number));
+    number.ok_or_else(|| UserError("a number of milliseconds from 0 to 3600000".to_owned()))
 }

@@ -48,8 +48,8 @@ struct Of {
     /// ROS name of a topic or node; by default all.
     name: Option<String>,
     /// Calls of these callbacks are late if they take or wait longer than this, until ten seconds
-    /// after the last request. Without it, a call is late if it exceeds `max_latency_ms` of its topic,
-    /// otherwise if it takes three times as long as 99 % of the calls of its callback.
+    /// after the last request. Without it, the bound is `max_latency_ms` of the topic. Without that,
+    /// it is three times the 99th percentile of the callback's calls.
     #[param(minimum = 0, maximum = 3_600_000)]
     above_ms: Option<f64>,
     /// Only late calls of the last seconds; by default all that are known.

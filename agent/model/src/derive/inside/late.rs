@@ -1,8 +1,8 @@
 //! Late calls of callbacks: their causes, and examples.
 //!
-//! Each callback keeps sums over all late calls, a short entry for each of the last ones, and the
-//! longest and the last ones with all their parts. They remain after the process has ended, so that
-//! a cause is there when somebody asks for it later.
+//! Each callback keeps sums over all late calls, and a short entry for each of the last ones. It
+//! keeps the longest and the last ones with all their parts. These facts remain after the process
+//! has ended, so that a client can request a cause later.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;

@@ -144,7 +144,7 @@ pub enum Cause {
     Stopped,
     /// It waited in another system call.
     SystemCall,
-    /// It was blocked; the events that tell why are not observed.
+    /// It was blocked. Without the scheduler's events, the reason is unknown.
     Blocked,
     /// The executor's thread was in another callback.
     OtherCallback,
@@ -290,9 +290,9 @@ impl Cause {
 /// A part of the time of a late call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Part {
-    /// Where.
+    /// Stage of the call.
     pub stage: Stage,
-    /// For what.
+    /// Cause of the part.
     pub cause: Cause,
     /// Its length.
     pub duration: Duration,
