@@ -40,5 +40,6 @@ export function Inside({ inside, name, domain }) {
         ? html`<th scope="row"><${Name} text=${cell} /></th>` : at === 1
           ? html`<td><${Name} text=${cell} /></td>` : html`<td class="number">${cell}</td>`)}</tr>`)}
       </tbody></table></div>`)}
-    ${observes && html`<${Late} answer=${late} />`}</section>`;
+    ${observes ? html`<${Late} answer=${late} />`
+      : html`<p><button type="button" onClick=${() => observe(true)}>Why late?</button></p>`}</section>`;
 }

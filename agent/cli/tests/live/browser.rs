@@ -255,6 +255,8 @@ fn views_of_nodes_and_topics_show_figures_from_inside_processes() -> Result<()> 
         match question {
             "create" => filter.create()?,
             "work" => filter.work()?,
+            "usual" => filter.usual()?,
+            "late" => filter.late()?,
             _ => return place.ask(question),
         }
         Ok(json!({}))

@@ -63,6 +63,23 @@ await scenario(async (open) => {
   await reads(inside, /Its callbacks take [\d.]+ % of the\s+time/);
   await working;
 
+  // After calls that show what is usual, a call that sleeps is late.
+  const late = inside.locator('section[aria-labelledby="late"]');
+  assert.equal(await late.count(), 0);
+  await inside.getByRole('button', { name: 'Why late?' }).click();
+  await reads(late, /No call\s+was late so far/);
+  await ask('usual');
+  await until('a late call', async () => {
+    await ask('late');
+    return (await late.getByRole('table').count()) === 2;
+  });
+  await reads(late.getByRole('group', { name: 'Causes', exact: true }), /it slept/);
+  const worst = late.getByRole('group', { name: 'Worst calls', exact: true });
+  await reads(worst, /it slept: .*sleep [\d.]+ ms/);
+  const drawn = await worst.getByRole('img').first().getAttribute('aria-label');
+  assert.match(drawn, /sleep [\d.]+ ms/);
+  await tab.accessible('late calls of a node');
+
   // The topics of the process, which do not use the network.
   await tab.go('#/topics/%2Fout?domain=0');
   await tab.shows('Rate and messages come from inside');

@@ -48,6 +48,18 @@ impl Filter {
         self.run("miss 3")
     }
 
+    /// Calls a callback so often that its usual duration is known.
+    pub(crate) fn usual(&mut self) -> Result<()> {
+        self.process.write_line("compute 100 100")?;
+        self.process.line_with_end("compute", PATIENCE).map(drop)
+    }
+
+    /// Calls it once with a sleep.
+    pub(crate) fn late(&mut self) -> Result<()> {
+        self.process.write_line("sleep 1 30000")?;
+        self.process.line_with_end("sleep", PATIENCE).map(drop)
+    }
+
     fn run(&mut self, command: &str) -> Result<()> {
         self.process.write_line(command)?;
         let name = command.split(' ').next().unwrap_or(command);
