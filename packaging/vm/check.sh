@@ -18,7 +18,7 @@ confined() {
         filters=$(sed -n 's/^Seccomp:\t//p' "$task/status")
         # CAP_BPF, before Linux 5.19.
         case $thread:$effective in
-        *: | capture:8000000000) ;;
+        *: | capture:8000000000 | inside:8000000000) ;;
         *) bad=1 ;;
         esac
         [ "$filters" = 2 ] || bad=1

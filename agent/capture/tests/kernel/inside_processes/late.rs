@@ -242,6 +242,75 @@ fn late_calls_beyond_the_rate_are_skipped_and_counted() {
     assert!(calls.len() as u64 >= PER_SECOND && skipped > 0, "{skipped}");
 }
 
+/// Measures a hundred late calls of each cause: how often the main cause is the injected one, and
+/// how far the sums are from those that the process reads from the kernel.
+#[test]
+#[ignore = "a measurement of two minutes: run it alone, with --no-capture"]
+fn measure_the_causes_of_a_hundred_calls_each() {
+    let file = tempfile::NamedTempFile::new_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
+    let path = file.path().display();
+    let plain = |command: &str| command.to_owned();
+    let causes = [
+        (plain("sleep 10 20000"), Cause::Sleep),
+        (plain("lock 10 30000"), Cause::Lock),
+        (plain("compute 10 30000"), Cause::Cpu),
+        (format!("disk 10 16384 {path}"), Cause::Disk),
+        (format!("fault 10 0 {path}"), Cause::PageFault),
+        (plain("compute 10 30000 hog"), Cause::Runnable),
+        (plain("compute 10 30000 real-time"), Cause::Runnable),
+        (plain("compute 10 60000 quota"), Cause::Throttled),
+    ];
+    for (command, cause) in causes {
+        let (mut robot, mut process) = started();
+        let is_beside = |word: &str| command.ends_with(word);
+        let hog = match () {
+            () if is_beside("hog") => Some(Hog::on("0")),
+            () if is_beside("real-time") => Some(Hog::real_time("0")),
+            () => None,
+        };
+        if hog.is_some() {
+            pin(&process);
+        }
+        let _quota = is_beside("quota").then(|| Quota::a_twentieth_for(&process));
+        let (mut all, mut right, mut named) = (0, 0, 0);
+        let mut truth = [Duration::ZERO; 2];
+        let mut measured = [Duration::ZERO; 2];
+        for _ in 0..10 {
+            let answer = process.run(&command);
+            let mut sums = answer
+                .split_whitespace()
+                .map_while(|word| word.parse().ok());
+            truth
+                .iter_mut()
+                .for_each(|sum| *sum += Duration::from_nanos(sums.next().unwrap()));
+            let calls = robot.round().report.late;
+            for call in &calls {
+                all += 1;
+                let main = call.main_part(ThreadStates::default()).unwrap();
+                right += u32::from(main.cause == cause);
+                let parts = call.parts();
+                let sum = |causes: &[Cause]| -> Duration {
+                    let parts = parts.iter().filter(|part| causes.contains(&part.cause));
+                    parts.map(|part| part.duration).sum()
+                };
+                measured[0] += sum(&[Cause::Cpu, Cause::Stolen]);
+                measured[1] += sum(&[Cause::Runnable, Cause::Throttled]);
+                let by = call.named_by(main).map(|other| other.name.to_string());
+                named += u32::from(matches!(by.as_deref(), Some("sh" | "lock-holder")));
+            }
+            std::thread::sleep(Duration::from_secs(1));
+        }
+        println!(
+            "{command:.24}: {all} late, {right} by {}, {named} named; CPU {:?} of {:?}, waiting {:?} of {:?}",
+            cause.label(),
+            measured[0],
+            truth[0],
+            measured[1],
+            truth[1]
+        );
+    }
+}
+
 /// Binds the process to the first CPU.
 fn pin(process: &Process) {
     let id = process.child.id().to_string();
