@@ -14,7 +14,7 @@ use std::time::Duration;
 
 use ros2probe_attach::client::{Broker, BrokerError};
 
-use crate::error_chain::in_words;
+use crate::error_chain::Reason;
 
 /// Pause after mappings of other files. It bounds the cost on a machine that starts many programs.
 pub const UNCONCERNED: Duration = Duration::from_millis(2);
@@ -72,18 +72,27 @@ impl MappingEvents {
     }
 
     /// Opens the rings for the configuration key `key`. Without them, the thread of that key finds
-    /// a library only in its next round.
+    /// a library only in its next round. A failure is logged unless it has the reason `logged` of
+    /// the failure before.
     #[must_use]
-    pub fn open_or_warn(key: &str, broker: &mut Broker) -> Option<Self> {
-        let opened = Self::open(broker);
-        if let Err(error) = &opened {
-            let reason = in_words(error);
+    pub fn open_or_warn(
+        key: &str,
+        broker: &mut Broker,
+        logged: &mut Option<Reason>,
+    ) -> Option<Self> {
+        let error = match Self::open(broker) {
+            Ok(opened) => return Some(opened),
+            Err(error) => Some(Reason::of(&error)),
+        };
+        if *logged != error {
+            let reason = error.as_ref().map(Reason::as_str);
             tracing::warn!(
                 reason,
                 "{key}: a library outside of the usual places is attached up to a second late"
             );
+            *logged = error;
         }
-        opened.ok()
+        None
     }
 
     /// Returns descriptors that are readable when a process has mapped a file.

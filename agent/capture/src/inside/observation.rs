@@ -14,7 +14,7 @@ use super::programs::{Attached, Programs, Tables};
 use super::table::ProcessTable;
 use super::{Facts, MAX_HITS, Shared, Work};
 use crate::bell::Bell;
-use crate::error_chain::in_words;
+use crate::error_chain::{Reason, in_words};
 use crate::mappings::{MappingEvents, NewMappings, UNCONCERNED};
 use crate::system::{Clocks, wait};
 use crate::threads::Progress;
@@ -136,6 +136,8 @@ struct Observation {
     processes: Processes,
     table: ProcessTable,
     mappings: Option<MappingEvents>,
+    /// Why there are none, as it was logged.
+    without_mappings: Option<Reason>,
     /// Time when the programs were detached because of the budget of all calls.
     suspended_at: Option<Instant>,
     /// Whether calls are observed on demand, and no client needs them.
@@ -160,6 +162,7 @@ impl Observation {
             processes: Processes::new(work.scope, Library::Tracing),
             table: ProcessTable::new(work.has_callbacks),
             mappings: None,
+            without_mappings: None,
             suspended_at: None,
             is_resting: false,
             rounds: 0,
@@ -212,7 +215,11 @@ impl Observation {
         let failed = found.err().map(|error| in_words(&error));
         if failed.is_none() {
             if self.mappings.is_none() {
-                self.mappings = MappingEvents::open_or_warn("capture.inside", broker);
+                self.mappings = MappingEvents::open_or_warn(
+                    "capture.inside",
+                    broker,
+                    &mut self.without_mappings,
+                );
             }
             self.probes.install(now, broker);
         }

@@ -20,7 +20,7 @@ use super::attachments::{Attachments, LibraryFacts};
 use super::processes::Processes;
 use crate::bell::Bell;
 use crate::breakpoints::Attached;
-use crate::error_chain::in_words;
+use crate::error_chain::{Reason, in_words};
 use crate::filter::Probes;
 use crate::mappings::{MappingEvents, NewMappings, UNCONCERNED};
 use crate::shm::directories::{Name, Scope, ShmDirectories};
@@ -215,6 +215,7 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
         broker,
         failed: None,
         mappings: None,
+        without_mappings: None,
         starting_until: Instant::now() + STARTING,
     };
     let mut shared_memory = ShmDirectories::new(scope);
@@ -281,6 +282,8 @@ struct Followed {
     /// Why the broker did not answer the last request.
     failed: Option<String>,
     mappings: Option<MappingEvents>,
+    /// Why there are none, as it was logged.
+    without_mappings: Option<Reason>,
     /// End of the time in which a process that has started announces its names.
     starting_until: Instant,
 }
@@ -309,7 +312,11 @@ impl Followed {
         let broker = &mut self.broker;
         self.attachments.install(Library::FastDds, now, broker);
         if self.mappings.is_none() {
-            self.mappings = MappingEvents::open_or_warn("capture.shm.exact", &mut self.broker);
+            self.mappings = MappingEvents::open_or_warn(
+                "capture.shm.exact",
+                &mut self.broker,
+                &mut self.without_mappings,
+            );
         }
     }
 
