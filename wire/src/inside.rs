@@ -186,20 +186,18 @@ pub mod accounting {
     pub const RUN_DELAY: usize = 1;
     /// `task_struct.nvcsw`: voluntary context switches.
     pub const VOLUNTARY_SWITCHES: usize = 2;
-    /// `task_struct.nivcsw`: involuntary context switches.
-    pub const INVOLUNTARY_SWITCHES: usize = 3;
     /// `task_struct.sched_task_group`, the control group of the thread.
-    pub const GROUP: usize = 4;
+    pub const GROUP: usize = 3;
     /// `task_group.parent`.
-    pub const GROUP_PARENT: usize = 5;
+    pub const GROUP_PARENT: usize = 4;
     /// `task_group.cfs_bandwidth.throttled_time`: summed over all CPUs.
-    pub const GROUP_THROTTLED: usize = 6;
+    pub const GROUP_THROTTLED: usize = 5;
     /// `task_struct.__state`, before Linux 5.14 `state`.
-    pub const STATE: usize = 7;
+    pub const STATE: usize = 6;
     /// `task_struct.pid`, the id of the thread.
-    pub const THREAD: usize = 8;
+    pub const THREAD: usize = 7;
     /// Number of these members.
-    pub const COUNT: usize = 9;
+    pub const COUNT: usize = 8;
     /// A member that the running kernel does not have.
     pub const ABSENT: u32 = u32::MAX;
 }

@@ -5,7 +5,7 @@ use core::mem::MaybeUninit;
 use aya_ebpf::helpers::{bpf_get_current_task, generated::bpf_probe_read_kernel};
 use ros2probe_wire::inside::{
     accounting::{
-        ABSENT, COUNT, GROUP, GROUP_PARENT, GROUP_THROTTLED, INVOLUNTARY_SWITCHES, RUN_DELAY,
+        ABSENT, COUNT, GROUP, GROUP_PARENT, GROUP_THROTTLED, RUN_DELAY,
         RUNTIME, VOLUNTARY_SWITCHES,
     },
     thread_state,
@@ -26,8 +26,8 @@ pub struct Accounting {
     pub cpu: u64,
     pub runnable: u64,
     pub throttled: u64,
-    /// Context switches.
-    pub switches: u64,
+    /// Context switches at which the thread was blocked.
+    pub voluntary_switches: u64,
 }
 
 /// Reads the accounting of the running thread; `None` if the kernel does not keep it, or does not
@@ -37,18 +37,16 @@ pub fn read() -> Option<Accounting> {
     if offset(RUNTIME) == ABSENT
         || offset(RUN_DELAY) == ABSENT
         || offset(VOLUNTARY_SWITCHES) == ABSENT
-        || offset(INVOLUNTARY_SWITCHES) == ABSENT
     {
         return None;
     }
     // SAFETY: no preconditions.
     let task = unsafe { bpf_get_current_task() };
-    let switches = word(task, VOLUNTARY_SWITCHES)?;
     Some(Accounting {
         cpu: word(task, RUNTIME)?,
         runnable: word(task, RUN_DELAY)?,
         throttled: throttled(task),
-        switches: switches.wrapping_add(word(task, INVOLUNTARY_SWITCHES)?),
+        voluntary_switches: word(task, VOLUNTARY_SWITCHES)?,
     })
 }
 
@@ -65,10 +63,11 @@ pub unsafe fn states(
 ) -> [u64; thread_state::COUNT] {
     // SAFETY: as required of the caller.
     let before = unsafe { &*before };
-    // Waiting is exact. The CPU time may lack a tick, and may have one from before the span.
-    // No part can be larger than what the others leave: groups are throttled on several CPUs.
+    // Waiting is exact. A thread without a voluntary switch was never blocked, so it ran for the
+    // rest. Otherwise the CPU time may lack a tick, and may have one from before the span. No part
+    // can be larger than what the others leave: groups are throttled on several CPUs.
     let waited = least(after.runnable.wrapping_sub(before.runnable), duration);
-    let cpu = if after.switches == before.switches {
+    let cpu = if after.voluntary_switches == before.voluntary_switches {
         duration - waited
     } else {
         least(after.cpu.wrapping_sub(before.cpu), duration - waited)

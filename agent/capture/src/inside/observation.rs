@@ -136,7 +136,7 @@ struct Observation {
     processes: Processes,
     table: ProcessTable,
     mappings: Option<MappingEvents>,
-    /// Why there are none, as it was logged.
+    /// The last logged reason why `mappings` is empty.
     without_mappings: Option<Reason>,
     /// Time when the programs were detached because of the budget of all calls.
     suspended_at: Option<Instant>,

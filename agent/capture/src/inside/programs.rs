@@ -140,7 +140,6 @@ fn accounting_offsets() -> [u32; accounting::COUNT] {
         ("task_struct", "se.sum_exec_runtime"),
         ("task_struct", "sched_info.run_delay"),
         ("task_struct", "nvcsw"),
-        ("task_struct", "nivcsw"),
         ("task_struct", "sched_task_group"),
         ("task_group", "parent"),
         ("task_group", "cfs_bandwidth.throttled_time"),

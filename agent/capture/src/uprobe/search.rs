@@ -282,7 +282,7 @@ struct Followed {
     /// Why the broker did not answer the last request.
     failed: Option<String>,
     mappings: Option<MappingEvents>,
-    /// Why there are none, as it was logged.
+    /// The last logged reason why `mappings` is empty.
     without_mappings: Option<Reason>,
     /// End of the time in which a process that has started announces its names.
     starting_until: Instant,
