@@ -63,21 +63,22 @@ await scenario(async (open) => {
   await reads(inside, /Its callbacks take [\d.]+ % of the\s+time/);
   await working;
 
-  // After calls that show what is usual, a call that sleeps is late.
+  // After calls that show what is usual, a call that sleeps is late. On a busy machine, calls before
+  // it may be late too.
   const late = inside.locator('section[aria-labelledby="late"]');
   assert.equal(await late.count(), 0);
   await inside.getByRole('button', { name: 'Why late?' }).click();
-  await reads(late, /No call\s+was late so far/);
+  await reads(late, /No call\s+was late so far|Worst calls/);
   await ask('usual');
-  await until('a late call', async () => {
+  const slept = late.getByRole('group', { name: 'Causes', exact: true })
+    .getByRole('row', { name: /it slept/ });
+  const drawn = late.getByRole('group', { name: 'Worst calls', exact: true })
+    .getByRole('row', { name: /it slept: .*sleep [\d.]+ ms/ })
+    .getByRole('img', { name: /sleep [\d.]+ ms/ });
+  await until('a call that slept', async () => {
     await ask('late');
-    return (await late.getByRole('table').count()) === 2;
+    return (await slept.count()) === 1 && (await drawn.count()) > 0;
   });
-  await reads(late.getByRole('group', { name: 'Causes', exact: true }), /it slept/);
-  const worst = late.getByRole('group', { name: 'Worst calls', exact: true });
-  await reads(worst, /it slept: .*sleep [\d.]+ ms/);
-  const drawn = await worst.getByRole('img').first().getAttribute('aria-label');
-  assert.match(drawn, /sleep [\d.]+ ms/);
   await tab.accessible('late calls of a node');
 
   // The topics of the process, which do not use the network.

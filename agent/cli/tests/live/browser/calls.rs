@@ -54,9 +54,9 @@ impl Filter {
         self.process.line_with_end("compute", PATIENCE).map(drop)
     }
 
-    /// Calls it once with a sleep.
+    /// Calls it once with a sleep that is longer than the waits of a busy machine.
     pub(crate) fn late(&mut self) -> Result<()> {
-        self.process.write_line("sleep 1 30000")?;
+        self.process.write_line("sleep 1 200000")?;
         self.process.line_with_end("sleep", PATIENCE).map(drop)
     }
 
