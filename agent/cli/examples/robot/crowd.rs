@@ -31,7 +31,7 @@ pub(crate) async fn talk(
         }
         spin(&mut node)?;
     }
-    println!("ready");
+    crate::start::ready();
     // The topics follow one another, as if each node had its own timer.
     let sending = periodic(rate * topics as f64, stop, move |count| {
         let turn = usize::try_from(count).unwrap_or_default() % topics;
@@ -52,7 +52,7 @@ pub(crate) async fn hear(context: &Context, topics: usize, stop: &Arc<AtomicBool
         }
         spin(&mut node)?;
     }
-    println!("ready");
+    crate::start::ready();
     while !stop.load(Ordering::Relaxed) {
         tokio::time::sleep(Duration::from_millis(50)).await;
     }

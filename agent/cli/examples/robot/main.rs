@@ -29,6 +29,7 @@ use crate::messages::{AddTwoIntsRequest, AddTwoIntsResponse, Imu, LaserScan, Poi
 mod crowd;
 mod messages;
 mod patience;
+mod start;
 
 #[derive(Parser)]
 #[command(about = "Demo robot and test peer made of ROS 2 participants in Rust")]
@@ -102,6 +103,7 @@ enum Role {
 #[tokio::main(worker_threads = 2)]
 async fn main() -> Result<()> {
     let options = Options::parse();
+    start::watch()?;
     let stop = Arc::new(AtomicBool::new(false));
     let interrupted = tokio::spawn(stop_on_signal(stop.clone()));
     let log = Arc::new(Log::open(&options)?);
@@ -141,7 +143,7 @@ async fn lidar(
     let measurements = advertise(&mut imu, "/imu", "sensor_msgs/Imu", &patient)?;
     spin(&mut lidar)?;
     spin(&mut imu)?;
-    println!("ready");
+    start::ready();
 
     let cloud = PointCloud2::with_fields(644_000);
     let sensors = [
@@ -172,7 +174,7 @@ async fn base(context: &Context, interrupted: tokio::task::JoinHandle<Result<()>
         )
         .map_err(|error| anyhow!("cannot serve /add_two_ints: {error:?}"))?;
     spin(&mut base)?;
-    println!("ready");
+    start::ready();
 
     let drive = tokio::spawn(async move { while commands.async_take().await.is_ok() {} });
     let serve = tokio::spawn(async move {
@@ -215,7 +217,7 @@ async fn monitor(
         .map_err(|error| anyhow!("cannot create a client of /add_two_ints: {error:?}"))?;
     spin(&mut monitor)?;
     spin(&mut teleop)?;
-    println!("ready");
+    start::ready();
 
     let tasks = [
         tokio::spawn(async move { while points.async_take().await.is_ok() {} }),
@@ -264,7 +266,7 @@ async fn publish(
         nodes.push(node);
     }
     let (publisher, node) = first.zip(nodes.first()).context("no node was created")?;
-    println!("ready");
+    start::ready();
     while publisher.get_subscription_count(node) < options.peers {
         if stop.load(Ordering::Relaxed) {
             return Ok(());
@@ -341,7 +343,7 @@ async fn subscribe(
         nodes.push(node);
     }
     let (subscription, node) = first.zip(nodes.first()).context("no node was created")?;
-    println!("ready");
+    start::ready();
     let mut matched = false;
     let mut received = 0;
     while !stop.load(Ordering::Relaxed) && (options.count == 0 || received < options.count) {
