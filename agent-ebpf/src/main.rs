@@ -5,7 +5,8 @@
 //! submessages and decides what happens to them. This crate adds the socket buffer, the maps and
 //! the fragments. [`wire`] reads frames on interfaces. [`host_ingress`] and [`host_egress`] read
 //! datagrams at sockets, [`zenoh_ingress`] and [`zenoh_egress`] TCP segments. If enabled,
-//! [`shm_handed`] reads messages in the process that sends them.
+//! [`shm_handed`] reads messages in the process that sends them, and [`received_ipv4`] notes when
+//! threads receive datagrams.
 //!
 //! The programs use only what the verifier of Linux 5.10 accepts: bounded loops, global functions
 //! that are verified once, reads of fixed size, no spin lock, no atomics that return a value.
@@ -14,10 +15,13 @@
 #![no_main]
 #![feature(asm_experimental_arch)]
 
+#[path = "inside/accounting.rs"]
+mod accounting;
 mod fragment;
 mod handed;
 mod host;
 mod instructions;
+mod journey;
 mod kernel_memory;
 mod maps;
 mod owners;
@@ -34,8 +38,8 @@ mod zenoh;
 use aya_ebpf::{
     EbpfContext as _,
     bindings::__sk_buff,
-    macros::{cgroup_skb, raw_tracepoint, socket_filter, uprobe},
-    programs::{ProbeContext, RawTracePointContext, SkBuffContext},
+    macros::{cgroup_skb, cgroup_sock_addr, raw_tracepoint, socket_filter, uprobe},
+    programs::{ProbeContext, RawTracePointContext, SkBuffContext, SockAddrContext},
 };
 use ros2probe_wire::filter::Counter;
 
@@ -94,6 +98,21 @@ pub fn zenoh_ingress(context: SkBuffContext) -> i32 {
 #[cgroup_skb(egress)]
 pub fn zenoh_egress(context: SkBuffContext) -> i32 {
     zenoh::socket(context.skb.skb, hook::EGRESS);
+    1
+}
+
+/// Runs at a cgroup after a thread has received an IPv4 datagram with the address of its sender.
+/// Returns 1, which changes nothing.
+#[cgroup_sock_addr(recvmsg4)]
+pub fn received_ipv4(context: SockAddrContext) -> i32 {
+    journey::received(context.sock_addr);
+    1
+}
+
+/// Runs as [`received_ipv4`] does, for IPv6.
+#[cgroup_sock_addr(recvmsg6)]
+pub fn received_ipv6(context: SockAddrContext) -> i32 {
+    journey::received(context.sock_addr);
     1
 }
 

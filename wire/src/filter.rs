@@ -58,6 +58,9 @@ pub enum Counter {
     SocketFull,
     /// Datagrams dropped at a full socket buffer that do not match the host hook's last datagram.
     SocketFullUnseen,
+    /// Received datagrams whose arrival is not known, while a client requests causes of late
+    /// calls.
+    ReceivedUnmatched,
     /// RTPS datagrams with a known first fragment that the kernel did not reassemble: fragments
     /// were missing, or the memory for fragments was full.
     NotReassembled,
@@ -86,7 +89,7 @@ pub enum Counter {
 
 impl Counter {
     /// Every counter, in index order.
-    pub const ALL: [Self; 37] = [
+    pub const ALL: [Self; 38] = [
         Self::Frames,
         Self::Messages,
         Self::Ignored,
@@ -113,6 +116,7 @@ impl Counter {
         Self::CopiesNotCaptured,
         Self::SocketFull,
         Self::SocketFullUnseen,
+        Self::ReceivedUnmatched,
         Self::NotReassembled,
         Self::NotReassembledUnnamed,
         Self::Unreadable,
@@ -156,6 +160,7 @@ impl Counter {
             Self::CopiesNotCaptured => "copies_not_captured",
             Self::SocketFull => "no_room",
             Self::SocketFullUnseen => "no_room_unseen",
+            Self::ReceivedUnmatched => "received_unmatched",
             Self::NotReassembled => "not_reassembled",
             Self::NotReassembledUnnamed => "not_reassembled_unnamed",
             Self::Unreadable => "unreadable",

@@ -155,6 +155,10 @@ pub enum Layout {
     SocketDropCounters,
     /// Distance between the two counters of `numa_drop_counters`, in bytes.
     SecondDropCounter,
+    /// `sock.sk_receive_queue.qlen`: datagrams in the receive buffer.
+    SocketQueue,
+    /// `udp_sock.reader_queue.qlen`: datagrams that readers have taken over from the receive buffer.
+    ReaderQueue,
     /// `file.f_inode`.
     FileInode,
     /// `file.private_data`: the `socket` of a socket's file.

@@ -30,6 +30,7 @@ pub mod frame;
 pub mod guid;
 pub mod host;
 pub mod inside;
+pub mod journey;
 #[cfg(feature = "alloc")]
 pub mod names;
 pub mod parameters;

@@ -5,8 +5,7 @@ use core::mem::MaybeUninit;
 use aya_ebpf::helpers::{bpf_get_current_task, generated::bpf_probe_read_kernel};
 use ros2probe_wire::inside::{
     accounting::{
-        ABSENT, COUNT, GROUP, GROUP_PARENT, GROUP_THROTTLED, RUN_DELAY,
-        RUNTIME, VOLUNTARY_SWITCHES,
+        ABSENT, COUNT, GROUP, GROUP_PARENT, GROUP_THROTTLED, RUN_DELAY, RUNTIME, VOLUNTARY_SWITCHES,
     },
     thread_state,
 };

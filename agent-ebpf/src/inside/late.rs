@@ -262,7 +262,9 @@ pub fn ended(
             && may_report(bound, now)
         {
             let bounds = [(*bound).duration, (*bound).delay];
-            report(current, callback, trigger, thread, followed, now, mode, states, bounds);
+            report(
+                current, callback, trigger, thread, followed, now, mode, states, bounds,
+            );
         }
         clear(followed);
         (*followed).previous = callback;

@@ -29,10 +29,14 @@ pub struct Why<'a> {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Cause<'a> {
-    /// Stage in which the calls became late: `wait` (ready, but not yet started) or `callback`.
+    /// Stage in which the calls became late: `publish`, `network`, `socket`, `wait` or `callback`.
+    /// They end when the message is sent, arrives at the subscriber's socket, is received there,
+    /// when the call starts, and when it ends. Only messages through UDP sockets have the first
+    /// three.
     pub stage: Cow<'a, str>,
     /// `cpu`, `stolen`, `throttled`, `runnable`, `lock`, `sleep`, `disk`, `page_fault`, `stopped`,
-    /// `system_call`, `blocked`, `other_callback`, `arrival` or `unexplained`.
+    /// `system_call`, `blocked`, `other_callback`, `arrival`, `send`, `transit`,
+    /// `queue`, `middleware` or `unexplained`.
     pub cause: Cow<'a, str>,
     /// Name of the thread that ran instead, released the lock, or continued the process; null for
     /// other causes.

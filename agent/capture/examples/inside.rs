@@ -108,10 +108,24 @@ fn check(library: &str, has_callbacks: bool) -> Result<String, Box<dyn Error>> {
     let mut table = ProcessTable::new(has_callbacks);
     let second = Duration::from_secs(1);
     let mut broker = Broker::here();
-    let round = table.round(&mut tables, &Clocks::read(), second, &mut broker, |_| false);
+    let round = table.round(
+        &mut tables,
+        &Clocks::read(),
+        second,
+        &mut broker,
+        |_| false,
+        |_| None,
+    );
     drop(attached);
     let alone = times(message);
-    let after = table.round(&mut tables, &Clocks::read(), second, &mut broker, |_| false);
+    let after = table.round(
+        &mut tables,
+        &Clocks::read(),
+        second,
+        &mut broker,
+        |_| false,
+        |_| None,
+    );
     Ok(format!(
         "{counts:?} of {CALLS} counted, {} calls, {} after the probes were removed; four calls take \
          {watched} ns with probes and {alone} ns without (median / 99th percentile)",

@@ -5,6 +5,7 @@
 //! to a cgroup also needs CAP_NET_ADMIN.
 
 mod host_hook;
+mod journeys;
 mod uprobe;
 
 use std::io;
@@ -21,6 +22,7 @@ use zerocopy::FromBytes;
 use super::tracepoints::KernelLayout;
 
 pub use host_hook::{CapturedPiece, Links};
+pub use journeys::Journeys;
 pub use uprobe::{Form, Probes};
 
 /// The object built by `agent-ebpf/build.sh`. It is aligned because the ELF file is read in place.
@@ -88,6 +90,8 @@ pub struct FilterSettings {
     /// Host hook: whether to use the kernel's types. Without them the hook works as on a kernel
     /// without BTF.
     pub kernel_types: bool,
+    /// Host hook: whether journeys of messages can be followed.
+    pub journeys: bool,
     /// TCP ports of Zenoh; 0 = unused.
     pub zenoh_ports: [u16; PORT_CAPACITY],
 }
@@ -107,6 +111,7 @@ impl Default for FilterSettings {
             piece_ring_bytes: 1024 * 1024,
             accept_new_interfaces: true,
             kernel_types: true,
+            journeys: false,
             zenoh_ports: ports(&[ros2probe_wire::zenoh::PORT]),
         }
     }
@@ -141,7 +146,8 @@ impl Filter {
     /// Returns [`FilterError::NotPermitted`] without the capabilities, other errors if the kernel
     /// refuses it.
     pub fn load(settings: &FilterSettings) -> Result<Self, FilterError> {
-        let sizes = [("PIECES", page_size()), ("SOCKETS", UNUSED)];
+        let mut sizes = vec![("PIECES", page_size()), ("SOCKETS", UNUSED)];
+        sizes.extend(NO_JOURNEYS);
         let mut ebpf = open(settings, false, &sizes, None, 0)?;
         let program = load_program(&mut ebpf, "wire")?;
         let mut wire: ProgramArray<_> = take(&mut ebpf, "WIRE")?;
@@ -356,6 +362,14 @@ fn caused_by(error: &(dyn std::error::Error + 'static), wanted: i32) -> Option<i
 
 /// Number of entries of a map that the loaded programs do not use: an LRU map cannot be empty.
 const UNUSED: u32 = 64;
+
+/// Sizes of the maps of journeys where they are not followed.
+const NO_JOURNEYS: [(&str, u32); 4] = [
+    ("QUEUES", UNUSED),
+    ("QUEUED", UNUSED),
+    ("JOURNEYS", UNUSED),
+    ("SENT", UNUSED),
+];
 
 /// Opens the object and creates its maps with the given `sizes`. `host` selects the host hook.
 /// `layout` is for programs that read the kernel's structures. `within` is the control group of the

@@ -4,6 +4,7 @@
 //! One tap covers the host or one control group. Its kernel state vanishes with this value, however
 //! the process ends. Nothing is sent, delayed or dropped.
 
+use std::fs::File;
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -53,6 +54,8 @@ pub struct HostTapSettings {
     pub record_ring_bytes: usize,
     /// TCP ports of Zenoh.
     pub zenoh_ports: Vec<u16>,
+    /// Whether journeys of messages can be followed.
+    pub journeys: bool,
 }
 
 /// The host hook and the reader of its output.
@@ -79,6 +82,7 @@ impl HostTap {
             record_ring_bytes: size(settings.record_ring_bytes),
             piece_ring_bytes: size(settings.ring_bytes),
             zenoh_ports: ports(&settings.zenoh_ports),
+            journeys: settings.journeys,
             ..FilterSettings::default()
         })?;
         if let Some(Err(error)) = filter.zenoh_programs() {
@@ -140,6 +144,12 @@ impl HostTap {
     #[must_use]
     pub fn cgroup(&self) -> &Path {
         self.cgroup.path()
+    }
+
+    /// Returns the open directory of the observed control group.
+    #[must_use]
+    pub const fn directory(&self) -> &File {
+        self.cgroup.directory()
     }
 
     /// Returns whether every socket of the host is observed, in any container.

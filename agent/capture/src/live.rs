@@ -193,7 +193,7 @@ impl LiveSource {
     /// # Errors
     /// Fails if a capability is missing, a namespace does not exist, or the kernel refuses a tap.
     pub fn open(settings: &CaptureSettings, limits: Limits) -> Result<Self, CaptureError> {
-        let (host, without_host) = open_host(settings)?;
+        let (mut host, without_host) = open_host(settings)?;
         let wires = match &host {
             None => {
                 let (include, exclude) =
@@ -207,7 +207,7 @@ impl LiveSource {
             }
         };
         let (exact, without_exact) = open_exact(settings, host.is_some());
-        let (inside, without_inside) = open_inside(settings);
+        let (inside, without_inside) = open_inside(settings, host.as_mut());
         give_back_memory();
         let shared_memory = match settings.shm.mode {
             ShmMode::Off => Shm::Off,

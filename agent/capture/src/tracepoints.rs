@@ -8,6 +8,7 @@ use aya::programs::raw_trace_point::RawTracePointLink;
 use aya::programs::{ProgramError, RawTracePoint};
 use aya::{Ebpf, EbpfLoader};
 use ros2probe_wire::host::Layout;
+use ros2probe_wire::inside::accounting;
 
 use super::error_chain::{Reason, in_words};
 use super::kernel_types::KernelTypes;
@@ -28,6 +29,8 @@ pub struct Abilities {
 #[derive(Debug)]
 pub struct KernelLayout {
     array: [u32; Layout::COUNT],
+    /// Where the kernel keeps the accounting of threads.
+    accounting: [u32; accounting::COUNT],
     /// Why no type is known; `None` if types were read.
     unknown: Option<Reason>,
 }
@@ -73,6 +76,8 @@ const TABLE: [(Layout, &str, &str); Layout::COUNT] = [
     (Layout::SocketDrops, "sock", "sk_drops"),
     (Layout::SocketDropCounters, "sock", "sk_drop_counters"),
     (Layout::SecondDropCounter, "numa_drop_counters", "drops1"),
+    (Layout::SocketQueue, "sock", "sk_receive_queue.qlen"),
+    (Layout::ReaderQueue, "udp_sock", "reader_queue.qlen"),
     (Layout::FileInode, "file", "f_inode"),
     (Layout::FilePrivate, "file", "private_data"),
     (Layout::InodeMode, "inode", "i_mode"),
@@ -95,6 +100,27 @@ pub struct Tracepoints {
     _links: Vec<RawTracePointLink>,
 }
 
+/// Returns where the running kernel keeps the accounting of threads, by [`accounting`]. Without its
+/// types (CONFIG_DEBUG_INFO_BTF), the states of threads stay unknown.
+pub(crate) fn accounting_offsets(types: Option<&KernelTypes>) -> [u32; accounting::COUNT] {
+    let members = [
+        ("task_struct", "se.sum_exec_runtime"),
+        ("task_struct", "sched_info.run_delay"),
+        ("task_struct", "nvcsw"),
+        ("task_struct", "sched_task_group"),
+        ("task_group", "parent"),
+        ("task_group", "cfs_bandwidth.throttled_time"),
+        ("task_struct", "__state"),
+        ("task_struct", "pid"),
+    ];
+    let find = |(structure, member)| types?.offset(structure, member);
+    let mut offsets = members.map(|member| find(member).unwrap_or(accounting::ABSENT));
+    if let Some(earlier) = find(("task_struct", "state")) {
+        offsets[accounting::STATE] = earlier;
+    }
+    offsets
+}
+
 impl KernelLayout {
     /// Reads the types of the running kernel.
     #[must_use]
@@ -107,9 +133,10 @@ impl KernelLayout {
 
     /// Marks every type as unknown, for this reason.
     #[must_use]
-    pub const fn unknown(reason: Reason) -> Self {
+    pub fn unknown(reason: Reason) -> Self {
         Self {
             array: [Layout::ABSENT; Layout::COUNT],
+            accounting: accounting_offsets(None),
             unknown: Some(reason),
         }
     }
@@ -128,13 +155,16 @@ impl KernelLayout {
         }
         Self {
             array,
+            accounting: accounting_offsets(Some(types)),
             unknown: None,
         }
     }
 
     /// Sets the layout globals of an object before it is loaded.
     pub fn set_globals<'a>(&'a self, loader: &mut EbpfLoader<'a>) {
-        loader.override_global("LAYOUT", &self.array, true);
+        loader
+            .override_global("LAYOUT", &self.array, true)
+            .override_global("ACCOUNTING", &self.accounting, true);
     }
 
     /// Checks that all entries of `layout` are known; otherwise returns why a program cannot run.
@@ -287,6 +317,7 @@ mod tests {
     fn a_reason_names_the_missing_kernel_type() {
         let mut layout = KernelLayout {
             array: [7; Layout::COUNT],
+            accounting: accounting_offsets(None),
             unknown: None,
         };
         let needed = [Layout::BufferHead, Layout::ReasonTimeout];

@@ -10,6 +10,14 @@ use crate::top::text::{counted, safe, seconds};
 
 /// Width of a drawn bar, in characters.
 const BAR: usize = 48;
+/// Stages in the order of time, in words.
+const STAGES: [(&str, &str); 5] = [
+    ("publish", "until sent"),
+    ("network", "on the way"),
+    ("socket", "in the socket"),
+    ("wait", "before the call"),
+    ("callback", "in the call"),
+];
 /// Share of a call below which a part has no words.
 const SMALL: f64 = 0.005;
 
@@ -73,7 +81,7 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
         call.cpu,
         safe(&call.words)
     );
-    for (stage, words) in [("wait", "before the call"), ("callback", "in the call")] {
+    for (stage, words) in STAGES {
         let parts = call.parts.iter().filter(|part| part.stage == stage);
         let parts: Vec<_> = parts.collect();
         let sum: f64 = parts.iter().map(|part| part.seconds).sum();

@@ -13,6 +13,7 @@ use ros2probe_wire::filter::{Budget, Counter};
 use ros2probe_wire::frame::{self, PacketType, Payload};
 use ros2probe_wire::host::Piece;
 use ros2probe_wire::record::{Record, Verdict, kind};
+use ros2probe_wire::time::RtpsTime;
 use ros2probe_wire::walk::{self, Envelope};
 use ros2probe_wire::{Guid, Timestamp};
 
@@ -381,6 +382,20 @@ pub fn message(writer: Guid, numbers: RangeInclusive<u32>, size: usize) -> Vec<u
         bytes.extend_from_slice(&[0, 1, 0, 0]);
         bytes.extend(std::iter::repeat_n(0x33, size - 4));
     }
+    bytes
+}
+
+/// Returns an RTPS message of one DATA with a source timestamp.
+pub fn stamped(writer: Guid, source: Timestamp, number: u32) -> Vec<u8> {
+    let RtpsTime(time) = RtpsTime::of(source);
+    let [seconds, fraction] = [time >> 32, time & 0xffff_ffff].map(|word| word as u32);
+    let mut bytes = message(writer, number..=number, 16);
+    let stamp = [
+        0x09_01_08_00_u32.to_be_bytes(),
+        seconds.to_le_bytes(),
+        fraction.to_le_bytes(),
+    ];
+    bytes.splice(20..20, stamp.concat());
     bytes
 }
 

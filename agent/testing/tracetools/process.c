@@ -1,6 +1,7 @@
 /* A program that calls libtracetools.so in the order of rclcpp (Iron), by commands on standard
  * input. It prints a line after each command. -DPLACE=240 or 248: offset of rmw_handle. */
 #define _GNU_SOURCE
+#include <arpa/inet.h>
 #include <fcntl.h>
 #include <pthread.h>
 #include <stdbool.h>
@@ -10,6 +11,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
+#include <sys/socket.h>
 #include <sys/wait.h>
 #include <time.h>
 #include <unistd.h>
@@ -144,7 +146,30 @@ static bool dequeue(void) {
     return true;
 }
 
+/* Opens a socket on a free port of ::1 or 127.0.0.1. Both kinds of addresses have the port at the
+   same place. */
+static int opened_socket(bool ipv6, struct sockaddr_in6 *address) {
+    struct sockaddr_in ipv4 = { .sin_family = AF_INET, .sin_addr = { htonl(INADDR_LOOPBACK) } };
+    *address = (struct sockaddr_in6){ .sin6_family = AF_INET6, .sin6_addr = IN6ADDR_LOOPBACK_INIT };
+    if (!ipv6) memcpy(address, &ipv4, sizeof ipv4);
+    socklen_t size = ipv6 ? sizeof *address : sizeof ipv4;
+    int receiver = socket(ipv6 ? AF_INET6 : AF_INET, SOCK_DGRAM, 0);
+    if (bind(receiver, (void *)address, size)) abort();
+    if (getsockname(receiver, (void *)address, &size)) abort();
+    return receiver;
+}
+/* Receives a datagram that begins with the RTPS header and INFO_TS. Returns the source timestamp
+   in nanoseconds. */
+static int64_t received_from(int receiver) {
+    uint32_t words[16384];
+    struct sockaddr_in6 from;
+    socklen_t size = sizeof from;
+    if (recvfrom(receiver, words, sizeof words, 0, (void *)&from, &size) < 32) abort();
+    return words[6] * 1000000000LL + ((words[7] * 1000000000ULL + (1u << 31)) >> 32);
+}
+
 int main(int argc, char **argv) {
+    int receiver = -1;
     char line[4096], what[64], path[3072];
     const char *input = argc > 1 ? argv[1] : "/in", *output = argc > 2 ? argv[2] : "/out";
     const char *name = argc > 3 ? argv[3] : "filter";
@@ -238,6 +263,30 @@ int main(int argc, char **argv) {
             int64_t source = clock_now(CLOCK_REALTIME);
             ros_trace_callback_end(callback);
             printf("%ld %ld ", (long)source, (long)(published - began));
+        } else if (!strcmp(what, "socket")) {
+            /* Opens a socket for IPv4, or for IPv6 if `n` is 6. Prints its port. */
+            struct sockaddr_in6 address;
+            receiver = opened_socket(n == 6, &address);
+            printf("%d ", ntohs(address.sin6_port));
+        } else if (!strcmp(what, "network")) {
+            /* Receives datagrams, and takes each one `us` microseconds later. */
+            for (long i = 0; i < n; i++) {
+                ros_trace_rclcpp_executor_get_next_ready();
+                int64_t source = received_from(receiver);
+                if (us) usleep(us);
+                ros_trace_rclcpp_executor_execute(&in);
+                ros_trace_rmw_take(&in_rmw, &message, source, true);
+                ros_trace_callback_start(callback, false);
+                ros_trace_callback_end(callback);
+            }
+        } else if (!strcmp(what, "drain")) {
+            /* Receives everything that waits. Prints the number of datagrams. */
+            char bytes[65536];
+            struct sockaddr_in6 from;
+            socklen_t size = sizeof from;
+            while (recvfrom(receiver, bytes, sizeof bytes, MSG_DONTWAIT, (void *)&from, &size) >= 0)
+                n++;
+            printf("%ld ", n);
         } else if (!strcmp(what, "miss")) {
             for (long i = 0; i < n; i++) ros_trace_rmw_take(&in_rmw, &message, 0, false);
         } else if (!strcmp(what, "timer")) {

@@ -19,7 +19,8 @@ use super::super::bpf;
 use super::super::error_chain::Reason;
 use super::super::tracepoints::{KernelLayout, Tracepoints};
 use super::{
-    Filter, FilterError, FilterSettings, UNUSED, failed, load_program, open, ring_size, take,
+    Filter, FilterError, FilterSettings, Journeys, NO_JOURNEYS, UNUSED, failed, load_program, open,
+    ring_size, take,
 };
 
 /// Attach types of linux/bpf.h.
@@ -37,6 +38,7 @@ pub(super) struct HostHook {
     /// The programs for TCP segments of Zenoh, or why the kernel refuses them.
     zenoh: Result<[ProgramFd; 2], FilterError>,
     links: Vec<OwnedFd>,
+    journeys: Option<Journeys>,
     /// Values are [`Socket`]s.
     sockets: HashMap<MapData, u64, [u64; 3]>,
 }
@@ -76,12 +78,19 @@ impl Filter {
         } else {
             KernelLayout::unknown(Reason("kernel types were not read".to_owned()))
         };
-        let sizes = [("PIECES", pieces), ("FLOWS", UNUSED)];
+        let mut sizes = vec![("PIECES", pieces), ("FLOWS", UNUSED)];
+        if !settings.journeys {
+            sizes.extend(NO_JOURNEYS);
+        }
         let mut ebpf = open(settings, true, &sizes, Some(&layout), 0)?;
         let ingress = load_program(&mut ebpf, "host_ingress")?;
         let egress = load_program(&mut ebpf, "host_egress")?;
         let zenoh = load_program(&mut ebpf, "zenoh_ingress")
             .and_then(|ingress| Ok([ingress, load_program(&mut ebpf, "zenoh_egress")?]));
+        let journeys = match settings.journeys {
+            true => Some(Journeys::load(&mut ebpf)?),
+            false => None,
+        };
         let (pieces, sockets) = (take(&mut ebpf, "PIECES")?, take(&mut ebpf, "SOCKETS")?);
         let mut filter = Self::with_maps(&mut ebpf, ingress.as_fd(), None)?;
         filter.host = Some(HostHook {
@@ -91,6 +100,7 @@ impl Filter {
             egress,
             zenoh,
             links: Vec::new(),
+            journeys,
             sockets,
         });
         filter.pieces = Some(pieces);
@@ -143,6 +153,11 @@ impl Filter {
             let tracepoints = Tracepoints::attach(programs, &host.layout, whole_host);
             host.tracepoints = Some(tracepoints);
         }
+    }
+
+    /// Removes and returns the programs and tables of journeys; `None` if they are not loaded.
+    pub fn take_journeys(&mut self) -> Option<Journeys> {
+        self.host.as_mut()?.journeys.take()
     }
 
     /// Frees memory that only further attaching would need. Attached programs stay.

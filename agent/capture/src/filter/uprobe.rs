@@ -14,7 +14,9 @@ use ros2probe_attach::functions::Calls;
 pub use ros2probe_attach::library::Form;
 use ros2probe_attach::request::Place;
 
-use super::{Filter, FilterError, FilterSettings, OBJECT, UNUSED, open, ring_size, take};
+use super::{
+    Filter, FilterError, FilterSettings, NO_JOURNEYS, OBJECT, UNUSED, open, ring_size, take,
+};
 use crate::breakpoints::{Attached, Breakpoints, Means};
 use crate::uprobe::attachments::Refusal;
 
@@ -34,13 +36,14 @@ impl Filter {
         within: Option<u64>,
         means: Means,
     ) -> Result<(Self, Probes), FilterError> {
-        let sizes = [
+        let mut sizes = vec![
             ("PIECES", ring_size(settings.piece_ring_bytes)),
             ("FLOWS", UNUSED),
             ("SOCKETS", UNUSED),
             ("CONNECTIONS", UNUSED),
             ("CANDIDATES", UNUSED),
         ];
+        sizes.extend(NO_JOURNEYS);
         let ebpf = open(settings, false, &sizes, None, within.unwrap_or(0))?;
         let calls = Calls::SharedMemory;
         let mut breakpoints = Breakpoints::load(ebpf, &OBJECT.0, calls, None, means)?;

@@ -5,12 +5,13 @@
 //! percentile of the callback's calls in the last minutes, and [`LEAST_BOUND`] or more.
 
 use std::collections::{HashMap, HashSet};
+use std::fs::File;
 use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::calls::late::{
-    Activity, Blocked, LateBound, LateCall, OtherThread, PreviousCall,
+    Activity, Blocked, LateBound, LateCall, MessageJourney, OtherThread, PreviousCall,
 };
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
 use ros2probe_model::facts::names::NodeName;
@@ -21,6 +22,7 @@ use ros2probe_wire::inside::{BUCKETS, Handle, bucket_start, kind, thread_state};
 use super::programs::{Events, Programs, Tables};
 use super::table::ProcessTable;
 use crate::error_chain::{Reason, in_words};
+use crate::filter::Journeys;
 use crate::settings::LateChoice;
 use crate::system::Clocks;
 use crate::tables::CallbackBounds;
@@ -67,6 +69,9 @@ pub(super) struct LateObservation {
     mode: u32,
     events: Option<Events>,
     without_events: Option<Reason>,
+    /// Programs that follow journeys of messages, with the control group of the host hook.
+    journeys: Option<(Journeys, File)>,
+    without_journeys: Option<Reason>,
     requested: Vec<RequestedBound>,
     bounds: Bounded<CallbackBounds, HashMap<Handle, Learnt>>,
 }
@@ -84,13 +89,25 @@ struct Learnt {
 }
 
 impl LateObservation {
-    pub(super) fn new(programs: Arc<Programs>, choice: LateChoice) -> Self {
+    pub(super) fn new(
+        programs: Arc<Programs>,
+        choice: LateChoice,
+        journeys: Option<(Journeys, File)>,
+    ) -> Self {
+        let without_journeys = match journeys {
+            Some(_) => None,
+            None => Some(Reason(
+                "the sockets of this host are not observed".to_owned(),
+            )),
+        };
         Self {
             programs,
             choice,
             mode: mode::OFF,
             events: None,
             without_events: None,
+            journeys,
+            without_journeys,
             requested: Vec::new(),
             bounds: Bounded::default(),
         }
@@ -108,6 +125,16 @@ impl LateObservation {
     /// Returns why they are not observed although they are needed.
     pub(super) fn without_events(&self) -> Option<&str> {
         self.without_events.as_ref().map(Reason::as_str)
+    }
+
+    /// Returns why journeys of messages are not followed although they are needed.
+    pub(super) fn without_journeys(&self) -> Option<&str> {
+        self.without_journeys.as_ref().map(Reason::as_str)
+    }
+
+    /// Returns the journey of the message that triggered a call.
+    pub(super) fn journey(&self, call: &late::LateCall) -> Option<MessageJourney> {
+        self.journeys.as_ref()?.0.of(call)
     }
 
     /// Begins or ends the observation of the scheduler's events. `at_calls`: whether callbacks are
@@ -144,6 +171,7 @@ impl LateObservation {
             true => mode::SUMS,
             false => mode,
         };
+        self.follow_journeys(mode == mode::EVENTS);
         if mode == self.mode {
             return;
         }
@@ -153,6 +181,25 @@ impl LateObservation {
                 let reason = in_words(&error);
                 tracing::warn!(reason, "late callbacks are not reported");
             }
+        }
+    }
+
+    /// Begins or ends following journeys of messages, together with the scheduler's events.
+    fn follow_journeys(&mut self, wanted: bool) {
+        let Some((journeys, cgroup)) = &mut self.journeys else {
+            return;
+        };
+        if !wanted {
+            journeys.leave();
+            return;
+        }
+        if let Err(reason) = journeys.follow(cgroup) {
+            tracing::warn!(
+                reason = reason.as_str(),
+                "late callbacks are reported without the way of their messages"
+            );
+            self.without_journeys = Some(reason);
+            self.journeys = None;
         }
     }
 
@@ -304,6 +351,7 @@ const BEFORE: u32 = 2;
 pub(super) fn convert(
     call: &late::LateCall,
     clocks: &Clocks,
+    journey: Option<MessageJourney>,
     mut name: impl FnMut(u64) -> (Trigger, Option<NodeName>),
 ) -> LateCall {
     let (trigger, node) = name(call.callback);
@@ -324,6 +372,7 @@ pub(super) fn convert(
         trigger,
         thread: call.thread,
         cpu: call.cpu,
+        journey,
         source: (call.source_timestamp != 0).then_some(Timestamp(call.source_timestamp)),
         started: clocks.calendar(call.started),
         duration: between(call.started, call.ended),

@@ -15,6 +15,7 @@ pub mod process;
 pub mod programs;
 pub mod table;
 
+use std::fs::File;
 use std::io;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -30,7 +31,7 @@ use self::programs::Tables;
 use self::table::Round;
 use crate::bell::Bell;
 use crate::breakpoints::Means;
-use crate::filter::FilterError;
+use crate::filter::{FilterError, Journeys};
 use crate::settings::{InsideChoice, LateChoice};
 use crate::shm::directories::Scope;
 use crate::system::Clocks;
@@ -70,6 +71,8 @@ pub struct Facts {
     pub late: &'static str,
     /// Why the scheduler's events are not observed although they are needed.
     pub without_events: Option<String>,
+    /// Why journeys of messages are not followed although they are needed.
+    pub without_journeys: Option<String>,
     /// Counters of the programs.
     pub counters: Vec<(&'static str, u64)>,
 }
@@ -98,7 +101,8 @@ struct Work {
 
 impl Inside {
     /// Loads the programs, and attaches them to installed libraries. `cgroup` restricts them to
-    /// processes of this control group.
+    /// processes of this control group. `journeys` are programs of the host hook, with its control
+    /// group.
     ///
     /// # Errors
     /// Fails if a capability is missing, or if the kernel has no uprobes.
@@ -106,6 +110,7 @@ impl Inside {
         (choice, late): (InsideChoice, LateChoice),
         cgroup: Option<&Path>,
         broker: &Path,
+        journeys: Option<(Journeys, File)>,
     ) -> Result<Self, UprobeError> {
         let mut broker = uprobe::broker(broker)?;
         let within = cgroup.map(uprobe::inode).transpose()?;
@@ -120,7 +125,7 @@ impl Inside {
         let progress = Arc::new(Progress::default());
         let is_on_demand = choice == InsideChoice::Auto;
         let programs = Arc::new(programs);
-        let late = LateObservation::new(Arc::clone(&programs), late);
+        let late = LateObservation::new(Arc::clone(&programs), late, journeys);
         let mut probes = Probes::new(&programs, is_on_demand, &progress);
         // A node announces its publishers only once, so the probes are attached to installed
         // libraries in advance.

@@ -234,7 +234,9 @@ impl Observation {
         let showing = self.showing_intra_process();
         let (tables, broker) = (&mut self.tables, &mut self.broker);
         let is_showing = |process| showing.contains(&process);
-        let mut round = (self.table).round(tables, clocks, elapsed, broker, is_showing);
+        let late = &self.late;
+        let journey = |call: &_| late.journey(call);
+        let mut round = (self.table).round(tables, clocks, elapsed, broker, is_showing, journey);
         self.late.set_bounds(&self.table, &mut self.tables);
         round.is_last = is_last;
         let hits = round.hits;
@@ -398,6 +400,7 @@ impl Observation {
             shows_rates: self.rounds >= ROUNDS_OF_RATES,
             late: self.late.observed(),
             without_events: self.late.without_events().map(str::to_owned),
+            without_journeys: self.late.without_journeys().map(str::to_owned),
             counters: labels.zip(values).collect(),
         });
     }

@@ -26,6 +26,7 @@ use crate::error_chain::Reason;
 use crate::filter::{Aligned, FilterError, absent_is_fine, failed, take};
 use crate::kernel_types::KernelTypes;
 use crate::system::{Clocks, raw_difference};
+use crate::tracepoints::accounting_offsets;
 use crate::uprobe::attachments::Refusal;
 
 /// The object built by `agent-ebpf/build.sh`. It is aligned because the ELF file is read in place.
@@ -97,7 +98,7 @@ pub fn load(
     means: Means,
 ) -> Result<(Programs, Tables), FilterError> {
     let architecture = u32::from(cfg!(target_arch = "aarch64"));
-    let offsets = accounting_offsets();
+    let offsets = accounting_offsets(KernelTypes::read().ok().as_ref());
     let (callbacks, within) = (u32::from(has_callbacks), within.unwrap_or(0));
     let ebpf = EbpfLoader::new()
         .override_global("ARCHITECTURE", &architecture, true)
@@ -131,28 +132,6 @@ pub fn load(
         scheduler,
     };
     Ok((programs, tables))
-}
-
-/// Returns where the running kernel keeps the accounting of threads, by [`accounting`]. Without its
-/// types (CONFIG_DEBUG_INFO_BTF), the states of threads stay unknown.
-fn accounting_offsets() -> [u32; accounting::COUNT] {
-    let members = [
-        ("task_struct", "se.sum_exec_runtime"),
-        ("task_struct", "sched_info.run_delay"),
-        ("task_struct", "nvcsw"),
-        ("task_struct", "sched_task_group"),
-        ("task_group", "parent"),
-        ("task_group", "cfs_bandwidth.throttled_time"),
-        ("task_struct", "__state"),
-        ("task_struct", "pid"),
-    ];
-    let types = KernelTypes::read().ok();
-    let find = |(structure, member)| types.as_ref()?.offset(structure, member);
-    let mut offsets = members.map(|member| find(member).unwrap_or(accounting::ABSENT));
-    if let Some(earlier) = find(("task_struct", "state")) {
-        offsets[accounting::STATE] = earlier;
-    }
-    offsets
 }
 
 /// Loads the programs at the scheduler's events.

@@ -7,7 +7,7 @@ use std::time::Duration;
 use ros2probe_attach::client::Broker;
 use ros2probe_model::derive::chain::causality::CausalPublication;
 use ros2probe_model::facts::bounded::Bounded;
-use ros2probe_model::facts::calls::late::LateCall;
+use ros2probe_model::facts::calls::late::{LateCall, MessageJourney};
 use ros2probe_model::facts::calls::report::{
     BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report,
     SubscriptionReport, ThreadStates, Transition, Trigger,
@@ -246,7 +246,8 @@ impl ProcessTable {
     }
 
     /// Reads everything once. `elapsed`: time since the last round. `shows_intra_process`: whether
-    /// a process's library reports every step of messages within it.
+    /// a process's library reports every step of messages within it. `journey`: how the message of a
+    /// late call came into its process.
     pub fn round(
         &mut self,
         tables: &mut Tables,
@@ -254,6 +255,7 @@ impl ProcessTable {
         elapsed: Duration,
         broker: &mut Broker,
         shows_intra_process: impl Fn(u32) -> bool,
+        journey: impl Fn(&late::LateCall) -> Option<MessageJourney>,
     ) -> Round {
         self.rounds = self.rounds.wrapping_add(1);
         self.unjudged += elapsed;
@@ -308,7 +310,7 @@ impl ProcessTable {
         let calls = self.late.take();
         let late = calls
             .iter()
-            .filter_map(|call| self.late_call(call, &figures, clocks));
+            .filter_map(|call| self.late_call(call, journey(call), &figures, clocks));
         let late = late.collect();
         let hops = self.hops.take();
         let hops = hops.iter().filter_map(|hop| self.hop(hop, clocks));
@@ -512,11 +514,12 @@ impl ProcessTable {
     fn late_call(
         &self,
         call: &late::LateCall,
+        journey: Option<MessageJourney>,
         figures: &[(Handle, Figures)],
         clocks: &Clocks,
     ) -> Option<LateCall> {
         self.known.get(&call.process)?;
-        Some(convert(call, clocks, |address| {
+        Some(convert(call, clocks, journey, |address| {
             let key = Handle {
                 address,
                 process: call.process,

@@ -12,7 +12,7 @@ use super::CaptureError;
 use crate::error_chain::in_words;
 use crate::inside::Inside;
 use crate::reassembly::Limits;
-use crate::settings::{CaptureSettings, ExactChoice, InsideChoice, SourceChoice};
+use crate::settings::{CaptureSettings, ExactChoice, InsideChoice, LateChoice, SourceChoice};
 
 /// Minimum bytes of a namespace: one fragmented datagram fits, however many namespaces share the
 /// cap.
@@ -49,6 +49,7 @@ pub(super) fn open_host(
         ring_bytes: settings.ring_bytes,
         record_ring_bytes: settings.record_ring_bytes,
         zenoh_ports: settings.zenoh_ports.clone(),
+        journeys: observes_late_calls(settings),
     });
     match opened {
         Ok(host) => Ok((Some(host), None)),
@@ -85,18 +86,33 @@ pub(super) fn open_exact(
 }
 
 /// Returns the programs inside processes, or why they are unavailable.
-pub(super) fn open_inside(settings: &CaptureSettings) -> (Option<Inside>, Option<String>) {
+/// `host` has the programs that follow journeys of messages.
+pub(super) fn open_inside(
+    settings: &CaptureSettings,
+    host: Option<&mut HostTap>,
+) -> (Option<Inside>, Option<String>) {
     if settings.inside == InsideChoice::Off {
         return (None, None);
     }
+    let journeys = host.and_then(|host| {
+        let cgroup = host.directory().try_clone().ok()?;
+        Some((host.filter_mut().take_journeys()?, cgroup))
+    });
     match Inside::open(
         (settings.inside, settings.late),
         settings.cgroup.as_deref(),
         &settings.broker,
+        journeys,
     ) {
         Ok(inside) => (Some(inside), None),
         Err(error) => (None, Some(in_words(&error))),
     }
+}
+
+/// Returns whether late calls of callbacks are observed.
+fn observes_late_calls(settings: &CaptureSettings) -> bool {
+    let has_callbacks = matches!(settings.inside, InsideChoice::Full | InsideChoice::Auto);
+    has_callbacks && settings.late != LateChoice::Off
 }
 
 /// Opens a tap for this namespace and for each configured one.

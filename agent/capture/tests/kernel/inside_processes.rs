@@ -1,15 +1,18 @@
 //! Programs at the functions of `libtracetools.so`, in processes that call them as rclcpp does.
 
+mod journeys;
 mod late;
 mod thread_states;
 
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Write as _};
+use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::Duration;
 
 use ros2probe_attach::client::Broker;
 use ros2probe_capture::breakpoints::Means;
+use ros2probe_capture::filter::Journeys;
 use ros2probe_capture::inside::programs::{self, Attached, Events, Programs, Tables};
 use ros2probe_capture::inside::table::{MAX_PROCESS_HITS, ProcessTable, Round};
 use ros2probe_capture::system::Clocks;
@@ -25,6 +28,7 @@ struct Robot {
     table: ProcessTable,
     attached: Option<Attached>,
     events: Option<Events>,
+    journeys: Option<Journeys>,
 }
 
 /// A process that takes commands.
@@ -52,6 +56,7 @@ impl Robot {
             table: ProcessTable::new(has_callbacks),
             attached: None,
             events: None,
+            journeys: None,
         }
     }
 
@@ -61,19 +66,7 @@ impl Robot {
     }
 
     fn start(&self) -> Process {
-        let mut child = Command::new(self.program.program())
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .env("ROS_DOMAIN_ID", "7")
-            .spawn()
-            .unwrap();
-        let commands = child.stdin.take().unwrap();
-        let answers = BufReader::new(child.stdout.take().unwrap());
-        Process {
-            child,
-            commands,
-            answers,
-        }
+        Process::start(&self.program.program())
     }
 
     fn round(&mut self) -> Round {
@@ -87,12 +80,14 @@ impl Robot {
             .as_ref()
             .is_some_and(|it| it.shows_intra_process);
         let clocks = Clocks::read();
+        let journeys = self.journeys.as_ref();
         self.table.round(
             &mut self.tables,
             &clocks,
             elapsed,
             &mut Broker::here(),
             |_| shows,
+            |call| journeys?.of(call),
         )
     }
 
@@ -110,12 +105,36 @@ impl Robot {
 }
 
 impl Process {
+    fn start(program: &Path) -> Self {
+        let mut child = Command::new(program)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .env("ROS_DOMAIN_ID", "7")
+            .spawn()
+            .unwrap();
+        let commands = child.stdin.take().unwrap();
+        let answers = BufReader::new(child.stdout.take().unwrap());
+        Self {
+            child,
+            commands,
+            answers,
+        }
+    }
+
     fn run(&mut self, command: &str) -> String {
+        self.begin(command);
+        self.end(command.split(' ').next().unwrap())
+    }
+
+    fn begin(&mut self, command: &str) {
         writeln!(self.commands, "{command}").unwrap();
+    }
+
+    /// Waits for the end of a command, and returns its answer.
+    fn end(&mut self, name: &str) -> String {
         let mut answer = String::new();
         self.answers.read_line(&mut answer).unwrap();
-        let name = command.split(' ').next().unwrap();
-        assert!(answer.trim_end().ends_with(name), "{command}: {answer}");
+        assert!(answer.trim_end().ends_with(name), "{name}: {answer}");
         answer
     }
 }

@@ -1,14 +1,17 @@
 //! Chains by causality: two processes that pass on messages within their callbacks, observed from
 //! inside by a running agent.
 
+use std::net::UdpSocket;
 use std::path::Path;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_api::chains::ChainList;
 use ros2probe_api::inside::Inside;
-use ros2probe_api::why::Why;
+use ros2probe_api::why::{LateCallback, Why};
 use ros2probe_capture::breakpoints::Means;
+use ros2probe_capture::netns;
+use ros2probe_capture::system::Clocks;
 use ros2probe_testing::harness::agent::Agent;
 use ros2probe_testing::harness::code;
 use ros2probe_testing::harness::network::Namespace;
@@ -16,9 +19,12 @@ use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::traced_program::TracedProgram;
 use ros2probe_testing::harness::usage::Usage;
 use ros2probe_testing::harness::{run, wait_until};
+use ros2probe_testing::program_run;
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 const RP: &str = env!("CARGO_BIN_EXE_rp");
 const PATIENCE: Duration = Duration::from_secs(20);
+const WRITER: Guid = Guid::new(GuidPrefix(*b"\x01\x0fsocketsock"), EntityId([0, 0, 1, 3]));
 /// Name of a node, its topics, and the time that its callback takes, in microseconds.
 const NODES: [(&str, [&str; 2], u64); 2] = [
     ("filter", ["/points", "/filtered"], 12_000),
@@ -238,6 +244,57 @@ fn calls_are_observed_while_a_client_requests_them_and_names_always() -> Result<
         Ok(published("first")? == Some(MESSAGES as u64))
     })?;
     ensure!(published("second")? == Some(0));
+    Ok(())
+}
+
+#[test]
+fn a_message_that_nobody_receives_is_late_in_its_socket() -> Result<()> {
+    let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let program = TracedProgram::build(248, &[])?;
+    let _agent = agent_with(&host, directory.path(), "auto")?;
+    let arguments = ["/in", "/out", "filter"];
+    let mut process = Process::start(&host.inside(), program.program(), arguments)?;
+    let socket = directory.path().join("api.sock");
+    let ask = |options: &str| run(&format!("{RP} why {options} --socket {}", socket.display()));
+    for command in ["init", "socket 4"] {
+        process.write_line(command)?;
+    }
+    let port = process.line_with_end("socket", PATIENCE)?;
+    let port: u16 = port.split(' ').next().unwrap_or_default().parse()?;
+    let open = || netns::within(&host.network(), || UdpSocket::bind("127.0.0.1:0"));
+    let publisher = host.hold(open)???;
+    let mut number = 0;
+    let mut late = None;
+    wait_until("the late message is known", || {
+        // Some messages are not late. After one that waits, the next question shows it.
+        for wait in [0, 0, 80] {
+            number += 1;
+            publisher.send_to(
+                &program_run::stamped(WRITER, Clocks::read().now, number),
+                ("127.0.0.1", port),
+            )?;
+            std::thread::sleep(Duration::from_millis(wait));
+            process.write_line("network 1 0")?;
+            process.line_with_end("network", PATIENCE)?;
+        }
+        let answer = ask("/in --json --wait 0 --above 30")?;
+        let mut answer: Why<'static> = serde_json::from_str(&answer)?;
+        late = answer.callbacks.pop();
+        let in_socket = |late: &LateCallback<'_>| {
+            let causes = late.examples.iter().map(|call| (&call.stage, &call.cause));
+            causes
+                .into_iter()
+                .any(|of| of == (&Some("socket".into()), &Some("queue".into())))
+        };
+        Ok(late.as_ref().is_some_and(in_socket))
+    })?;
+    let text = ask("/in --last 10m")?;
+    ensure!(
+        text.contains("the message waited in the socket's receive buffer")
+            && text.contains("  in the socket "),
+        "{text}"
+    );
     Ok(())
 }
 

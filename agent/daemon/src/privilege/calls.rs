@@ -280,7 +280,8 @@ impl Allowed {
             Role::Inside { .. } => {
                 allowed.ask_broker()?;
                 let commands = command::MAPS.into_iter();
-                allowed.bpf(commands.chain([command::RAW_TRACEPOINT_OPEN]))?;
+                let attaching = [command::RAW_TRACEPOINT_OPEN, command::LINK_CREATE];
+                allowed.bpf(commands.chain(attaching))?;
             }
             Role::Broker => allowed.answer_agents()?,
         }

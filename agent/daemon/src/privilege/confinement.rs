@@ -65,7 +65,7 @@ pub enum Role {
     /// Requests to the broker, which attaches programs to libraries. No capability.
     Exact,
     /// Like [`Role::Exact`], but also uses the programs' maps, and runs loaded programs at
-    /// tracepoints. `CAP_BPF` where the kernel requires it.
+    /// tracepoints and receive calls. `CAP_BPF` where the kernel requires it.
     Inside {
         /// Whether the kernel requires `CAP_BPF`, as [`Role::inside`] determines.
         needs_bpf: bool,

@@ -144,6 +144,7 @@ pub fn source() -> InsideSourceFacts {
         counters: vec![("hits", 36_000), ("suspended", 0)],
         late: "events",
         without_events: None,
+        without_journeys: None,
         reason_off: None,
     }
 }
@@ -179,6 +180,7 @@ fn late(topic: TopicName) -> LateCallback {
             duration: bound,
             wait: bound,
         },
+        journey: None,
         previous: None,
         states: Some(states(25, 70)),
         states_before: Some(states(0, 4)),

@@ -23,9 +23,15 @@ fn started() -> (Robot, Process) {
     process.run("compute 1 10");
     process.run("enqueue 1");
     process.run("receive 1 10");
+    set_bounds(&mut robot, &process);
+    (robot, process)
+}
+
+/// Observes the scheduler's events, and calls late beyond [`BOUND`].
+pub(super) fn set_bounds(robot: &mut Robot, process: &Process) {
     robot.events = Some(robot.programs.observe_scheduler().unwrap());
     robot.tables.set_late_mode(mode::EVENTS).unwrap();
-    let report = robot.report(&process);
+    let report = robot.report(process);
     for callback in &report.callbacks {
         let nanoseconds = u64::try_from(BOUND.as_nanos()).unwrap();
         let bound = Bound {
@@ -40,11 +46,10 @@ fn started() -> (Robot, Process) {
         };
         robot.tables.set_bound(handle, bound).unwrap();
     }
-    (robot, process)
 }
 
 /// Runs a command of callbacks, and returns the late ones.
-fn late(robot: &mut Robot, process: &mut Process, command: &str) -> Vec<LateCall> {
+pub(super) fn late(robot: &mut Robot, process: &mut Process, command: &str) -> Vec<LateCall> {
     process.run(command);
     robot.round().report.late
 }

@@ -123,7 +123,8 @@ fn why<'a>(
             let reason = source
                 .reason_off
                 .as_ref()
-                .or(source.without_events.as_ref());
+                .or(source.without_events.as_ref())
+                .or(source.without_journeys.as_ref());
             Some(Cow::Borrowed(reason?.as_str()))
         }),
         ..Why::default()

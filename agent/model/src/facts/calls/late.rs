@@ -34,6 +34,8 @@ pub struct LateCall {
     pub wait: Option<Duration>,
     /// The bounds that the call is compared with.
     pub bound: LateBound,
+    /// How the message came into the process; `None` without a message through a UDP socket.
+    pub journey: Option<MessageJourney>,
     /// The call before in the same thread.
     pub previous: Option<PreviousCall>,
     /// What the thread did during the call, by the scheduler's accounting.
@@ -66,6 +68,28 @@ pub struct PreviousCall {
     pub duration: Duration,
     /// Time from its end to the start of the next call.
     pub ended_before: Duration,
+}
+
+/// How a message came into a process: times before the start of its call.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MessageJourney {
+    /// A socket of this host sent the first datagram; `None` if the publisher is on another host.
+    pub sent_before: Option<Duration>,
+    /// The last datagram arrived at the subscriber's socket.
+    pub arrived_before: Duration,
+    /// A thread of the process received that datagram.
+    pub received_before: Duration,
+    /// States of that thread between the two, if they are known.
+    pub receiver: Option<ReceiverStates>,
+}
+
+/// Why a thread did not receive a datagram at once.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ReceiverStates {
+    /// It could run, and did not. This does not include `throttled`.
+    pub runnable: Duration,
+    /// The CPU quota of its control group was used up.
+    pub throttled: Duration,
 }
 
 /// What a thread did in a span of time, by the events of the scheduler.
@@ -115,7 +139,15 @@ pub struct OtherThread {
 /// Where a late call lost its time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Stage {
-    /// Before the callback started, since it was ready.
+    /// From the call that publishes the message until its first datagram is sent.
+    Publish,
+    /// Until its last datagram arrives at the subscriber's socket. If the publisher is on another
+    /// host, this includes [`Self::Publish`].
+    Network,
+    /// In the receive buffer of that socket.
+    Socket,
+    /// Until the callback started, since it was ready. If the way of the message is not known, this
+    /// includes the other stages.
     Wait,
     /// In the callback.
     Callback,
@@ -150,18 +182,35 @@ pub enum Cause {
     OtherCallback,
     /// The message came late: the executor's thread waited for it too.
     Arrival,
+    /// The publisher took long to send the message.
+    Send,
+    /// The message was long on its way.
+    Transit,
+    /// No thread received the message from its socket.
+    Queue,
+    /// The middleware had received the message, and the executor's thread waited for it.
+    Middleware,
     /// Unknown.
     Unexplained,
 }
 
 impl Stage {
-    /// Both stages.
-    pub const ALL: [Self; 2] = [Self::Wait, Self::Callback];
+    /// Every stage, in the order of time.
+    pub const ALL: [Self; 5] = [
+        Self::Publish,
+        Self::Network,
+        Self::Socket,
+        Self::Wait,
+        Self::Callback,
+    ];
 
     /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
+            Self::Publish => "publish",
+            Self::Network => "network",
+            Self::Socket => "socket",
             Self::Wait => "wait",
             Self::Callback => "callback",
         }
@@ -170,7 +219,7 @@ impl Stage {
 
 impl Cause {
     /// Every cause.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 18] = [
         Self::Cpu,
         Self::Stolen,
         Self::Throttled,
@@ -184,6 +233,10 @@ impl Cause {
         Self::Blocked,
         Self::OtherCallback,
         Self::Arrival,
+        Self::Send,
+        Self::Transit,
+        Self::Queue,
+        Self::Middleware,
         Self::Unexplained,
     ];
 
@@ -204,6 +257,10 @@ impl Cause {
             Self::Blocked => "blocked",
             Self::OtherCallback => "other_callback",
             Self::Arrival => "arrival",
+            Self::Send => "send",
+            Self::Transit => "transit",
+            Self::Queue => "queue",
+            Self::Middleware => "middleware",
             Self::Unexplained => "unexplained",
         }
     }
@@ -227,6 +284,10 @@ impl Cause {
             Self::Blocked => "it was blocked".to_owned(),
             Self::OtherCallback => "its thread was in another callback".to_owned(),
             Self::Arrival => "the message came late: the executor waited for it".to_owned(),
+            Self::Send => "its publisher took long to send it".to_owned(),
+            Self::Transit => "the message was long on its way to the socket".to_owned(),
+            Self::Queue => "the message waited in the socket's receive buffer".to_owned(),
+            Self::Middleware => "the middleware passed the message on late".to_owned(),
             Self::Unexplained => "the cause is unknown".to_owned(),
         }
     }
@@ -251,6 +312,12 @@ impl Cause {
                 "shorten the other callback, or give this one a callback group and thread of its own"
             }
             Self::Arrival => "look at the topic's network path and at its publisher",
+            Self::Send => "look at the publisher's process: it is busy, or its CPU is",
+            Self::Transit => "look at the link between the hosts, and at losses on it",
+            Self::Queue => "find what keeps the process from running: a busy CPU, a quota, SIGSTOP",
+            Self::Middleware => {
+                "send smaller messages, or give the middleware's threads a free CPU"
+            }
             Self::Unexplained => "set capture.late: on, and look at rp doctor",
         }
     }
@@ -282,7 +349,13 @@ impl Cause {
             | Self::Stopped
             | Self::SystemCall
             | Self::Blocked => Some(3),
-            Self::OtherCallback | Self::Arrival | Self::Unexplained => None,
+            Self::OtherCallback
+            | Self::Arrival
+            | Self::Send
+            | Self::Transit
+            | Self::Queue
+            | Self::Middleware
+            | Self::Unexplained => None,
         }
     }
 }
@@ -318,22 +391,53 @@ impl LateCall {
         parts
     }
 
+    /// Divides the wait from its end to its begin: what happened last on the way of the message
+    /// explains the latest time.
     fn wait_parts(&self) -> Vec<Part> {
         let Some(wait) = self.wait else {
             return Vec::new();
         };
+        let Some(journey) = &self.journey else {
+            return self.executor_parts(wait, Cause::Arrival);
+        };
+        let in_process = wait.min(journey.received_before);
+        let since_arrival = wait.min(journey.arrived_before);
+        let since_sent = match journey.sent_before {
+            Some(sent_before) => wait.min(sent_before),
+            None => wait,
+        };
+        let mut parts = Rest::new(Stage::Publish, wait - since_sent).finish(Cause::Send);
+        let network = Rest::new(Stage::Network, since_sent - since_arrival);
+        parts.extend(network.finish(Cause::Transit));
+        let mut socket = Rest::new(Stage::Socket, since_arrival - in_process);
+        if let Some(receiver) = &journey.receiver {
+            socket.take(Cause::Throttled, receiver.throttled);
+            socket.take(Cause::Runnable, receiver.runnable);
+        }
+        // A signal stops all threads of a process.
+        let stopped = self.activity_before.as_ref();
+        let stopped = stopped.and_then(|activity| activity.blocked.get(wait::STOPPED));
+        socket.take(Cause::Stopped, stopped.copied().unwrap_or_default());
+        parts.extend(socket.finish(Cause::Queue));
+        parts.extend(self.executor_parts(in_process, Cause::Middleware));
+        parts
+    }
+
+    /// Divides the last `wait` before the call by what the executor's thread did. `waiting` is the
+    /// cause of the time in which that thread waited too.
+    fn executor_parts(&self, wait: Duration, waiting: Cause) -> Vec<Part> {
         let mut rest = Rest::new(Stage::Wait, wait);
         if let Some(previous) = &self.previous {
             let began_before = previous.ended_before + previous.duration;
             let overlap = began_before.min(wait) - previous.ended_before.min(wait);
             rest.take(Cause::OtherCallback, overlap);
         }
-        // The thread was between two calls for the remaining time. Without a message, it waits.
+        // The thread was between two calls for the remaining time.
         match self.states_before {
             Some(states) => {
                 rest.take(Cause::Throttled, nanoseconds(states.throttled));
                 rest.take(Cause::Runnable, nanoseconds(states.runnable));
-                rest.finish(Cause::Arrival)
+                rest.finish(waiting)
             }
             None => rest.finish(Cause::Unexplained),
         }
@@ -376,14 +480,14 @@ impl LateCall {
         let excess = |time: Duration, bound: Duration| time.saturating_sub(bound);
         let in_callback = excess(self.duration, self.bound.duration);
         let in_wait = excess(self.wait.unwrap_or_default(), self.bound.wait);
-        let stage = match in_wait > in_callback {
-            true => Stage::Wait,
-            false => Stage::Callback,
-        };
+        let is_wait = in_wait > in_callback;
         let parts = self.parts();
-        let parts = || parts.iter().filter(|part| part.stage == stage);
+        let parts = || {
+            let of_wait = |part: &&Part| (part.stage != Stage::Callback) == is_wait;
+            parts.iter().filter(of_wait)
+        };
         let largest = parts().max_by_key(|part| part.duration).copied();
-        if stage == Stage::Wait || usual.calls == 0 {
+        if is_wait || usual.calls == 0 {
             return largest;
         }
         let beyond = |part: &&Part| {
@@ -404,9 +508,11 @@ impl LateCall {
     #[must_use]
     pub fn named_by(&self, part: Part) -> Option<&OtherThread> {
         match part.cause {
+            // The events are those of the executor's thread. Another one reads the socket.
+            Cause::Runnable if part.stage == Stage::Socket => None,
             Cause::Runnable => self.culprit(part.stage),
             Cause::Lock | Cause::Stopped => {
-                let longest = self.activity.as_ref()?.longest.as_ref()?;
+                let longest = self.activity(part.stage)?.longest.as_ref()?;
                 longest.waker.as_ref()
             }
             _ => None,
@@ -416,14 +522,18 @@ impl LateCall {
     /// Returns the thread that ran instead for longest in this stage. Idle CPUs are left out.
     #[must_use]
     pub fn culprit(&self, stage: Stage) -> Option<&OtherThread> {
-        let activity = match stage {
-            Stage::Wait => &self.activity_before,
-            Stage::Callback => &self.activity,
-        };
-        let others = activity.as_ref()?.others.iter();
+        let others = self.activity(stage)?.others.iter();
         others
             .filter(|other| other.thread != 0)
             .max_by_key(|other| other.duration)
+    }
+
+    /// Returns what the executor's thread did in a stage, by events.
+    fn activity(&self, stage: Stage) -> Option<&Activity> {
+        match stage {
+            Stage::Callback => self.activity.as_ref(),
+            _ => self.activity_before.as_ref(),
+        }
     }
 }
 

@@ -95,6 +95,7 @@ fn late(process: u32, dice: &mut Dice, at: Timestamp) -> LateCall {
             duration: Duration::ZERO,
             wait: Duration::MAX,
         },
+        journey: None,
         previous: None,
         states: None,
         states_before: None,

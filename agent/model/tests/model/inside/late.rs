@@ -4,7 +4,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_model::facts::calls::late::{
-    Activity, Blocked, Cause, LateBound, LateCall, OtherThread, PreviousCall, Stage,
+    Activity, Blocked, Cause, LateBound, LateCall, MessageJourney, OtherThread, PreviousCall,
+    ReceiverStates, Stage,
 };
 use ros2probe_model::facts::calls::report::{ProcessReport, Report, ThreadStates, Trigger};
 use ros2probe_model::facts::diagnosis::Diagnosis;
@@ -57,6 +58,7 @@ fn call(states: ThreadStates) -> LateCall {
             duration: milliseconds(20),
             wait: milliseconds(20),
         },
+        journey: None,
         previous: None,
         states: Some(states),
         states_before: None,
@@ -137,6 +139,99 @@ fn a_wait_is_divided_into_the_callback_before_the_thread_and_the_arrival() {
     late.previous = None;
     late.states_before = None;
     assert_eq!(parts(&late)[0], of(Cause::Unexplained, 30));
+}
+
+/// A call after 90 ms. Its message was sent after 10 ms, arrived after 30 ms, and was received
+/// after 60 ms.
+fn call_of_a_message() -> LateCall {
+    let mut late = call(states(5, 0, 0, 0));
+    late.duration = milliseconds(5);
+    late.wait = Some(milliseconds(90));
+    late.states_before = Some(states(1, 0, 4, 85));
+    late.journey = Some(MessageJourney {
+        sent_before: Some(milliseconds(80)),
+        arrived_before: milliseconds(60),
+        received_before: milliseconds(30),
+        receiver: Some(ReceiverStates {
+            runnable: milliseconds(3),
+            throttled: milliseconds(2),
+        }),
+    });
+    late
+}
+
+#[test]
+fn a_wait_is_divided_by_the_way_of_the_message() {
+    let mut late = call_of_a_message();
+    let expected = [
+        (Stage::Publish, Cause::Send, 10),
+        (Stage::Network, Cause::Transit, 20),
+        (Stage::Socket, Cause::Throttled, 2),
+        (Stage::Socket, Cause::Runnable, 3),
+        (Stage::Socket, Cause::Queue, 25),
+        (Stage::Wait, Cause::Runnable, 4),
+        (Stage::Wait, Cause::Middleware, 26),
+        (Stage::Callback, Cause::Cpu, 5),
+    ];
+    assert_eq!(parts(&late), expected);
+    let main = late.main_part(ThreadStates::default()).unwrap();
+    assert_eq!((main.stage, main.cause), (Stage::Wait, Cause::Middleware));
+    // Its publisher is on another host.
+    late.journey.as_mut().unwrap().sent_before = None;
+    assert_eq!(parts(&late)[0], (Stage::Network, Cause::Transit, 30));
+}
+
+#[test]
+fn only_the_latest_time_of_a_journey_belongs_to_a_shorter_wait() {
+    // The usual time of a message is not a part of the wait.
+    let mut late = call_of_a_message();
+    late.wait = Some(milliseconds(50));
+    let socket: Vec<_> = parts(&late);
+    assert_eq!(
+        socket[..3],
+        [
+            (Stage::Socket, Cause::Throttled, 2),
+            (Stage::Socket, Cause::Runnable, 3),
+            (Stage::Socket, Cause::Queue, 15),
+        ]
+    );
+    late.wait = Some(milliseconds(20));
+    assert_eq!(parts(&late)[0], (Stage::Wait, Cause::Runnable, 4));
+}
+
+#[test]
+fn a_callback_before_explains_only_the_time_since_the_message_was_received() {
+    let mut late = call_of_a_message();
+    late.previous = Some(PreviousCall {
+        handle: 0x50,
+        trigger: Trigger::Timer(None),
+        duration: milliseconds(70),
+        ended_before: milliseconds(10),
+    });
+    let all = parts(&late);
+    assert!(
+        all.contains(&(Stage::Wait, Cause::OtherCallback, 20)),
+        "{all:?}"
+    );
+    assert!(all.contains(&(Stage::Socket, Cause::Queue, 25)), "{all:?}");
+}
+
+#[test]
+fn a_stopped_process_is_named_with_who_continued_it() {
+    let mut late = call_of_a_message();
+    late.journey.as_mut().unwrap().receiver = None;
+    let before = late.activity_before.as_mut().unwrap();
+    before.blocked[wait::STOPPED] = milliseconds(28);
+    before.longest = Some(Blocked {
+        duration: milliseconds(28),
+        kind: wait::STOPPED,
+        call: None,
+        argument: 0,
+        waker: Some(other("operator", 77, 0)),
+    });
+    let main = late.main_part(ThreadStates::default()).unwrap();
+    assert_eq!((main.stage, main.cause), (Stage::Socket, Cause::Stopped));
+    assert_eq!(&*late.named_by(main).unwrap().name, "operator");
 }
 
 #[test]

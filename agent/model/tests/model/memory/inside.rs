@@ -105,6 +105,7 @@ fn late(process: u32, now: u64) -> impl Iterator<Item = LateCall> {
             duration: Duration::from_millis(5),
             wait: Duration::from_millis(5),
         },
+        journey: None,
         previous: Some(PreviousCall {
             handle: 2,
             trigger: Trigger::Subscription(topic().as_str().into()),

@@ -1,0 +1,290 @@
+//! The way of a message to the process that is late: its publisher, the network, the socket, and
+//! the thread that receives.
+
+use std::fs::File;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
+use std::process::Command;
+use std::thread::sleep;
+use std::time::Duration;
+
+use anyhow::Result;
+use ros2probe_capture::filter::{Filter, FilterSettings};
+use ros2probe_capture::netns;
+use ros2probe_capture::system::Clocks;
+use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
+use ros2probe_model::facts::calls::report::ThreadStates;
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::program_run;
+use ros2probe_wire::filter::Counter;
+use ros2probe_wire::journey::{JOURNEY_CAPACITY, QUEUE_CAPACITY};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+
+use super::late::{late, set_bounds};
+use super::{Process, Robot};
+
+const WRITER: Guid = Guid::new(GuidPrefix(*b"\x01\x0fjourneyjou"), EntityId([0, 0, 1, 3]));
+/// Time for which a message is late in each test: longer than the waits of a busy machine.
+const LATE: Duration = Duration::from_millis(100);
+/// Part of that time which another stage may have.
+const IMPRECISION: Duration = Duration::from_millis(20);
+
+/// A subscriber on a host of its own, and sockets that send to it.
+struct Way {
+    host: Namespace,
+    filter: Filter,
+    robot: Robot,
+    process: Process,
+    subscriber: SocketAddr,
+    /// A socket whose datagrams the agent sees when they are sent.
+    near: UdpSocket,
+    /// A socket that is not observed, like those of another host.
+    far: UdpSocket,
+    sequence_number: u32,
+}
+
+impl Way {
+    fn new() -> Result<Way> {
+        Self::over(Ipv4Addr::LOCALHOST.into())
+    }
+
+    fn over(address: IpAddr) -> Result<Way> {
+        let host = Namespace::alone()?;
+        let mut filter = Filter::load_host(&FilterSettings {
+            journeys: true,
+            ..FilterSettings::default()
+        })?;
+        filter.attach_tracepoints(false);
+        let cgroup = File::open(host.cgroup())?;
+        filter.attach(&cgroup)?;
+        let mut journeys = filter.take_journeys().unwrap();
+        journeys.follow(&cgroup).unwrap();
+        let mut robot = Robot::new(248, &[], true);
+        robot.journeys = Some(journeys);
+        robot.attach();
+        let program = robot.program.program();
+        let start = || Process::start(&program);
+        let mut process = host.hold(|| netns::within(&host.network(), start))??;
+        process.run("init");
+        let port = process.run(if address.is_ipv6() {
+            "socket 6"
+        } else {
+            "socket 4"
+        });
+        let port = port.split(' ').next().unwrap().parse()?;
+        let open = || netns::within(&host.network(), || UdpSocket::bind((address, 0)));
+        let (near, far) = (host.hold(open)???, open()??);
+        let mut way = Way {
+            filter,
+            robot,
+            process,
+            subscriber: SocketAddr::from((address, port)),
+            near,
+            far,
+            sequence_number: 0,
+            host,
+        };
+        // The delay of a message is its time beyond the fastest one.
+        for _ in 0..3 {
+            way.send(Duration::ZERO)?;
+            way.process.run("network 1 0");
+        }
+        set_bounds(&mut way.robot, &way.process);
+        // The states of the thread before a call are known from the second call on.
+        way.send(Duration::ZERO)?;
+        way.process.run("network 1 0");
+        Ok(way)
+    }
+
+    /// Sends a message that was published some time ago.
+    fn send(&mut self, ago: Duration) -> Result<()> {
+        let datagram = self.datagram(ago);
+        self.near.send_to(&datagram, self.subscriber)?;
+        Ok(())
+    }
+
+    fn datagram(&mut self, ago: Duration) -> Vec<u8> {
+        self.sequence_number += 1;
+        program_run::stamped(WRITER, Clocks::read().now - ago, self.sequence_number)
+    }
+
+    /// Receives the message that waits, and returns the late call.
+    fn receive(&mut self, command: &str) -> LateCall {
+        let mut calls = late(&mut self.robot, &mut self.process, command);
+        assert_eq!(calls.len(), 1, "{calls:#?}");
+        calls.remove(0)
+    }
+
+    /// Returns the number of received datagrams whose arrival was not known.
+    fn unmatched(&self) -> Result<u64> {
+        let counters = self.filter.counters()?.into_iter();
+        let of = |(counter, count)| (counter == Counter::ReceivedUnmatched).then_some(count);
+        Ok(counters.filter_map(of).sum())
+    }
+}
+
+/// Asserts that a call is late for this part, and that the part has the injected length or more.
+fn assert_late_for(call: &LateCall, stage: Stage, cause: Cause) {
+    let parts = call.parts();
+    let sum: Duration = parts.iter().map(|part| part.duration).sum();
+    assert_eq!(sum, call.total(), "{call:#?}");
+    let main = call.main_part(ThreadStates::default()).unwrap();
+    assert_eq!(
+        (main.stage, main.cause),
+        (stage, cause),
+        "{parts:?} {call:#?}"
+    );
+    assert!(main.duration >= LATE - IMPRECISION, "{parts:?} {call:#?}");
+}
+
+#[test]
+fn a_message_that_its_publisher_sends_late_names_the_publisher() -> Result<()> {
+    let mut way = Way::new()?;
+    way.send(LATE)?;
+    let call = way.receive("network 1 0");
+    assert_late_for(&call, Stage::Publish, Cause::Send);
+    assert!(call.journey.unwrap().sent_before.is_some());
+    assert_eq!(way.unmatched()?, 0);
+    Ok(())
+}
+
+#[test]
+fn a_message_of_another_host_that_arrives_late_names_the_network() -> Result<()> {
+    let mut way = Way::new()?;
+    let datagram = way.datagram(LATE);
+    way.far.send_to(&datagram, way.subscriber)?;
+    let call = way.receive("network 1 0");
+    assert_late_for(&call, Stage::Network, Cause::Transit);
+    Ok(())
+}
+
+#[test]
+fn a_message_that_nobody_receives_names_the_socket() -> Result<()> {
+    let mut way = Way::new()?;
+    way.send(Duration::ZERO)?;
+    sleep(LATE);
+    let call = way.receive("network 1 0");
+    assert_late_for(&call, Stage::Socket, Cause::Queue);
+    Ok(())
+}
+
+#[test]
+fn a_message_that_the_middleware_keeps_names_the_middleware() -> Result<()> {
+    let mut way = Way::new()?;
+    way.send(Duration::ZERO)?;
+    let call = way.receive(&format!("network 1 {}", LATE.as_micros()));
+    assert_late_for(&call, Stage::Wait, Cause::Middleware);
+    Ok(())
+}
+
+#[test]
+fn a_message_keeps_its_place_before_others_and_a_full_buffer() -> Result<()> {
+    let mut way = Way::new()?;
+    way.send(Duration::ZERO)?;
+    way.send(Duration::ZERO)?;
+    // The buffer has room for some of these only.
+    let foreign = vec![0; 30_000];
+    for _ in 0..50 {
+        way.near.send_to(&foreign, way.subscriber)?;
+    }
+    sleep(LATE);
+    let calls = late(&mut way.robot, &mut way.process, "network 2 0");
+    assert_eq!(calls.len(), 2, "{calls:#?}");
+    for call in &calls {
+        assert_late_for(call, Stage::Socket, Cause::Queue);
+    }
+    let drained = way.process.run("drain");
+    let drained: u32 = drained.split(' ').next().unwrap().parse()?;
+    assert!((1..50).contains(&drained), "{drained}");
+    assert_eq!(way.unmatched()?, 0);
+    Ok(())
+}
+
+#[test]
+fn a_message_over_ipv6_has_a_journey_too() -> Result<()> {
+    let mut way = Way::over(Ipv6Addr::LOCALHOST.into())?;
+    way.send(Duration::ZERO)?;
+    sleep(LATE);
+    let call = way.receive("network 1 0");
+    assert_late_for(&call, Stage::Socket, Cause::Queue);
+    Ok(())
+}
+
+#[test]
+fn a_stopped_process_is_the_cause_of_a_wait_in_its_socket() -> Result<()> {
+    let mut way = Way::new()?;
+    let process = way.process.child.id().to_string();
+    let signal = |name: &str| -> Result<()> {
+        let sent = Command::new("kill").args([name, &process]).status()?;
+        anyhow::ensure!(sent.success());
+        Ok(())
+    };
+    // It is stopped while it waits for the message.
+    way.process.begin("network 1 0");
+    sleep(Duration::from_millis(20));
+    signal("-STOP")?;
+    way.send(Duration::ZERO)?;
+    sleep(LATE);
+    signal("-CONT")?;
+    way.process.end("network");
+    let call = way.robot.round().report.late.remove(0);
+    assert_late_for(&call, Stage::Socket, Cause::Stopped);
+    Ok(())
+}
+
+#[test]
+fn a_message_has_a_journey_after_more_messages_than_the_cap() -> Result<()> {
+    let mut way = Way::new()?;
+    for _ in 0..2 * JOURNEY_CAPACITY / 50 {
+        for _ in 0..50 {
+            way.send(Duration::ZERO)?;
+        }
+        assert_eq!(way.process.run("drain"), "50 drain\n");
+    }
+    assert_eq!(way.unmatched()?, 0);
+    way.send(Duration::ZERO)?;
+    sleep(LATE);
+    let call = way.receive("network 1 0");
+    assert_late_for(&call, Stage::Socket, Cause::Queue);
+    Ok(())
+}
+
+#[test]
+fn a_socket_keeps_its_numbers_while_more_sockets_than_the_cap_receive() -> Result<()> {
+    let mut way = Way::new()?;
+    let address = way.subscriber.ip();
+    for _ in 0..2 * QUEUE_CAPACITY / 64 {
+        for _ in 0..64 {
+            let datagram = way.datagram(Duration::ZERO);
+            let open = || netns::within(&way.host.network(), || UdpSocket::bind((address, 0)));
+            let other = way.host.hold(open)???;
+            way.near.send_to(&datagram, other.local_addr()?)?;
+        }
+        way.send(Duration::ZERO)?;
+        assert_eq!(way.process.run("drain"), "1 drain\n");
+    }
+    way.send(Duration::ZERO)?;
+    sleep(LATE);
+    let call = way.receive("network 1 0");
+    assert_late_for(&call, Stage::Socket, Cause::Queue);
+    Ok(())
+}
+
+#[test]
+fn a_filled_buffer_before_the_first_question_is_no_wait() -> Result<()> {
+    let mut way = Way::new()?;
+    let mut journeys = way.robot.journeys.take().unwrap();
+    journeys.leave();
+    way.send(LATE)?;
+    way.send(LATE)?;
+    journeys.follow(&File::open(way.host.cgroup())?).unwrap();
+    way.robot.journeys = Some(journeys);
+    way.send(LATE)?;
+    let mut calls = late(&mut way.robot, &mut way.process, "network 3 0");
+    assert_eq!(calls.len(), 3, "{calls:#?}");
+    let last = calls.pop().unwrap();
+    assert_late_for(&last, Stage::Publish, Cause::Send);
+    for call in calls {
+        assert!(call.journey.is_none(), "{call:#?}");
+    }
+    Ok(())
+}
