@@ -60,8 +60,8 @@ pub enum LateChoice {
     Off,
     /// While calls are observed.
     On,
-    /// While a client requests causes. At other times, late calls are reported with the sums of the
-    /// scheduler's accounting.
+    /// While a client or an event requires causes. At other times, late calls are reported with the
+    /// sums of the scheduler's accounting.
     #[default]
     Auto,
 }

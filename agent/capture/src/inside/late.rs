@@ -413,6 +413,8 @@ fn activity(activity: &late::Activity) -> Activity {
     others.shrink_to_fit();
     let longest = &activity.longest;
     Activity {
+        cpu: Duration::from_nanos(activity.cpu),
+        missed_events: activity.missed,
         runnable: Duration::from_nanos(activity.runnable),
         stolen: Duration::from_nanos(activity.stolen),
         blocked: activity.blocked.map(Duration::from_nanos),

@@ -195,7 +195,8 @@ pub(super) struct CaptureShape {
     pub(super) inside: InsideChoice,
     /// Causes of late callbacks, where callbacks are observed: who ran instead, and for what a
     /// callback waited. `on`: by the events of the kernel's scheduler, as long as calls are observed;
-    /// `auto`: only while a client requests causes; `off`: late calls are not reported.
+    /// `auto`: only while a client requests causes, and for a minute after a violated expectation or
+    /// a slow chain; `off`: late calls are not reported.
     pub(super) late: LateChoice,
     /// Socket of the process that attaches breakpoints (`rp attach`). Without a socket there, an
     /// agent with the privileges starts one of its own.

@@ -2,6 +2,7 @@
 //! snapshots. Surfaces only read snapshots.
 
 mod capture_time;
+mod causes;
 pub mod replay;
 mod source;
 
@@ -12,6 +13,7 @@ use std::time::{Duration, Instant};
 use ros2probe_wire::{GuidPrefix, Timestamp};
 use tokio_util::sync::CancellationToken;
 
+use self::causes::CauseDemand;
 use crate::agent_facts::AgentFacts;
 use crate::events::DropMonitor;
 use crate::events::EventLog;
@@ -21,13 +23,11 @@ use crate::state::StateWriter;
 use crate::subscriptions::Subscriptions;
 use crate::watches::Watches;
 pub use capture_time::CaptureTime;
-use ros2probe_capture::inside::late::RequestedBound;
 use ros2probe_capture::live::{CaptureError, LiveSource};
 use ros2probe_capture::pcap::PcapError;
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_metrics::otlp::SpanSink;
 use ros2probe_model::facts::selection::SampleRequest;
-use ros2probe_model::facts::watch::Watch;
 use ros2probe_model::measure::history::History;
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Observer;
@@ -72,8 +72,8 @@ pub struct Run {
     observer: Observer,
     /// Participants for which the kernel filter records the time of the last message.
     followed: BTreeSet<GuidPrefix>,
-    /// Maximum latencies of watched topics: calls of callbacks beyond them are late.
-    expected_latencies: Vec<RequestedBound>,
+    /// What watches and events require about late calls.
+    causes: CauseDemand,
     outputs: Outputs,
     drops: DropMonitor,
     watches: Arc<Watches>,
@@ -120,7 +120,7 @@ impl Run {
             source,
             observer,
             followed: BTreeSet::new(),
-            expected_latencies: Vec::new(),
+            causes: CauseDemand::default(),
             outputs,
             drops: DropMonitor::default(),
             watches,
@@ -286,7 +286,8 @@ impl Run {
             let now = Instant::now();
             live.want_inside(self.outputs.latest.are_calls_wanted(now));
             let mut demand = self.outputs.latest.late_demand(now);
-            demand.bounds.extend_from_slice(&self.expected_latencies);
+            self.causes.note(&output.events.events, now);
+            self.causes.add_to(&mut demand, now);
             live.want_late(&demand);
         }
         self.outputs.events.add(output.events, now);
@@ -311,7 +312,7 @@ impl Run {
                     // The expectations of the new list begin now, not at the last round.
                     self.observer.input(Input::Time(live.clock()));
                 }
-                self.expected_latencies = expected_latencies(watchlist.watches());
+                self.causes.take_watches(watchlist.watches());
                 self.observer.input(Input::Watchlist(watchlist));
             }
             if let Some(sample_requests) = self.subscriptions.take_changed() {
@@ -430,18 +431,6 @@ impl Run {
 }
 
 /// Copies the model's list of participants to the kernel filter.
-/// Returns the maximum latencies of topics that watches name.
-fn expected_latencies(watches: &[Arc<Watch>]) -> Vec<RequestedBound> {
-    let named = watches.iter().filter(|watch| watch.is_literal());
-    let expected = named.filter_map(|watch| {
-        Some(RequestedBound {
-            name: Some(Arc::from(watch.pattern.as_str())),
-            above: watch.expectations.max_latency?,
-        })
-    });
-    expected.collect()
-}
-
 fn follow(live: &mut LiveSource, followed: &mut BTreeSet<GuidPrefix>, snapshot: &Snapshot) {
     let present: BTreeSet<_> = snapshot
         .participants

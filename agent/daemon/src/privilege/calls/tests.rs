@@ -291,12 +291,14 @@ fn only_threads_that_need_links_inotify_or_scheduling_can_use_them() {
     for role in ROLES {
         let role = match role {
             Role::Reattach { .. } => Role::reattach(),
+            Role::Inside { .. } => Role::inside(),
             other => other,
         };
         confined(role, move || {
             let attaches = matches!(role, Role::Reattach { .. });
             let schedules = matches!(role, Role::SharedMemory { .. });
-            assert_eq!(call(libc::SYS_bpf, link) != refused, attaches, "{role:?}");
+            let links = attaches || matches!(role, Role::Inside { .. });
+            assert_eq!(call(libc::SYS_bpf, link) != refused, links, "{role:?}");
             let notices = call(libc::SYS_inotify_init1, [0; 6]) != refused;
             let is_noticed = attaches || role == Role::Exact;
             assert_eq!(notices, is_noticed || schedules, "{role:?}");

@@ -95,6 +95,10 @@ pub struct ReceiverStates {
 /// What a thread did in a span of time, by the events of the scheduler.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Activity {
+    /// It was on a CPU.
+    pub cpu: Duration,
+    /// Changes of its state that had no event.
+    pub missed_events: u64,
     /// It could run, and did not.
     pub runnable: Duration,
     /// It was on a CPU without being charged for it: interrupts, or the hypervisor.
@@ -381,8 +385,9 @@ impl LateCall {
     /// Returns the parts of the time of the call, in the order of their time. They add up to
     /// [`Self::total`].
     ///
-    /// The sums are those of the scheduler's accounting. The events only divide them: events can
-    /// get lost, and the accounting cannot.
+    /// The sums are those of the scheduler's accounting. The events divide them: events can get
+    /// lost, and the accounting cannot. Only the CPU time is that of the events, if none is missing:
+    /// the accounting counts it by ticks.
     #[must_use]
     pub fn parts(&self) -> Vec<Part> {
         let mut parts = self.wait_parts();
@@ -448,8 +453,10 @@ impl LateCall {
         let Some(states) = self.states else {
             return rest.finish(Cause::Unexplained);
         };
-        let cpu = nanoseconds(states.cpu);
         let activity = self.activity.as_ref();
+        // The CPU time of the accounting may lack a tick, or have one that precedes the call.
+        let exact = activity.and_then(|activity| activity.cpu_of(self.duration));
+        let cpu = exact.unwrap_or(nanoseconds(states.cpu));
         let stolen = activity.map_or(Duration::ZERO, |activity| activity.stolen.min(cpu));
         rest.take(Cause::Cpu, cpu - stolen);
         rest.take(Cause::Stolen, stolen);
@@ -458,8 +465,7 @@ impl LateCall {
         let Some(activity) = activity else {
             return rest.finish(Cause::Blocked);
         };
-        // The CPU time of the accounting may include a tick that precedes the call. Then the events
-        // show more blocked time.
+        // With a tick too many, the events show more blocked time.
         let all: Duration = activity.blocked.iter().sum();
         let blocked = rest.rest;
         for (kind, duration) in activity.blocked.iter().enumerate() {
@@ -534,6 +540,16 @@ impl LateCall {
             Stage::Callback => self.activity.as_ref(),
             _ => self.activity_before.as_ref(),
         }
+    }
+}
+
+impl Activity {
+    /// Returns the CPU time if the events cover the whole `duration`.
+    fn cpu_of(&self, duration: Duration) -> Option<Duration> {
+        let blocked: Duration = self.blocked.iter().sum();
+        let covered = self.cpu + self.runnable + blocked;
+        let is_whole = covered.abs_diff(duration) * 100 <= duration;
+        (self.missed_events == 0 && is_whole).then_some(self.cpu)
     }
 }
 

@@ -104,6 +104,7 @@ fn events_beyond_the_accounting_are_reduced_to_it() {
     // The accounting has a tick of CPU time that precedes the call.
     let mut late = call(states(10, 0, 0, 90));
     let activity = late.activity.as_mut().unwrap();
+    activity.missed_events = 1;
     activity.blocked[wait::SLEEP] = milliseconds(50);
     activity.blocked[wait::OTHER] = milliseconds(50);
     let of = |cause, milliseconds| (Stage::Callback, cause, milliseconds);
@@ -111,6 +112,31 @@ fn events_beyond_the_accounting_are_reduced_to_it() {
         of(Cause::Cpu, 10),
         of(Cause::Sleep, 45),
         of(Cause::SystemCall, 45),
+    ];
+    assert_eq!(parts(&late), expected);
+}
+
+#[test]
+fn complete_events_have_the_exact_cpu_time_of_a_blocked_call() {
+    // The last tick of the accounting is not counted yet.
+    let mut late = call(states(1, 0, 2, 97));
+    let activity = late.activity.as_mut().unwrap();
+    activity.cpu = milliseconds(8);
+    activity.runnable = milliseconds(2);
+    activity.blocked[wait::LOCK] = milliseconds(90);
+    let of = |cause, milliseconds| (Stage::Callback, cause, milliseconds);
+    let expected = [
+        of(Cause::Cpu, 8),
+        of(Cause::Runnable, 2),
+        of(Cause::Lock, 90),
+    ];
+    assert_eq!(parts(&late), expected);
+    late.activity.as_mut().unwrap().missed_events = 1;
+    let expected = [
+        of(Cause::Cpu, 1),
+        of(Cause::Runnable, 2),
+        of(Cause::Lock, 90),
+        of(Cause::Unexplained, 7),
     ];
     assert_eq!(parts(&late), expected);
 }
