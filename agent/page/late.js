@@ -35,7 +35,8 @@ export function worst(why) {
       late: it.calls == null ? count(it.late_calls) : `${count(it.late_calls)} of ${count(it.calls)}`,
       total: duration(total), at: call.timestamp_seconds, words: call.words, parts,
       text: named.map((/** @type {any} */ part) =>
-        `${part.cause.replace('_', ' ')} ${duration(part.seconds)}`).join(', '),
+        `${part.cause.replace('_', ' ')} ${duration(part.seconds)}`).concat(call.cpu_limits ?? [])
+        .join(', '),
     };
   });
 }

@@ -117,6 +117,9 @@ pub struct LateCall<'a> {
     pub others: Vec<OtherThread<'a>>,
     /// The longest time for which the callback was blocked.
     pub blocked: Option<Blocked<'a>>,
+    /// Limits on the speed of CPUs, at most a second after the call, in words: a lower maximum
+    /// frequency, heat, or a weak power supply.
+    pub cpu_limits: Vec<Cow<'a, str>>,
     /// The call before in the same thread.
     pub previous: Option<PreviousCall<'a>>,
 }

@@ -133,6 +133,10 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
             ended.unwrap_or_default()
         );
     }
+    if !call.cpu_limits.is_empty() {
+        let limits: Vec<_> = call.cpu_limits.iter().map(|limit| safe(limit)).collect();
+        let _ = writeln!(out, "  slow CPUs: {}", limits.join("; "));
+    }
     if let Some(previous) = call.previous.as_ref()
         && call.parts.iter().any(|part| part.cause == "other_callback")
     {

@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::calls::late::{
-    Activity, Blocked, LateBound, LateCall, MessageJourney, OtherThread, PreviousCall,
+    Activity, Blocked, CpuLimit, LateBound, LateCall, MessageJourney, OtherThread, PreviousCall,
 };
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
 use ros2probe_model::facts::names::NodeName;
@@ -352,6 +352,7 @@ pub(super) fn convert(
     call: &late::LateCall,
     clocks: &Clocks,
     journey: Option<MessageJourney>,
+    cpu_limits: &Arc<[CpuLimit]>,
     mut name: impl FnMut(u64) -> (Trigger, Option<NodeName>),
 ) -> LateCall {
     let (trigger, node) = name(call.callback);
@@ -373,6 +374,7 @@ pub(super) fn convert(
         thread: call.thread,
         cpu: call.cpu,
         journey,
+        cpu_limits: Arc::clone(cpu_limits),
         source: (call.source_timestamp != 0).then_some(Timestamp(call.source_timestamp)),
         started: clocks.calendar(call.started),
         duration: between(call.started, call.ended),

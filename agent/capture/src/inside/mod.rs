@@ -8,6 +8,7 @@
 //! the model. Apart from the breakpoints, it changes nothing in the processes, and it never waits
 //! for them.
 
+pub mod cpu_limits;
 pub mod late;
 pub mod names;
 mod observation;

@@ -1,13 +1,14 @@
 //! The observed processes: their names, budgets, and changes since the last report.
 
 use std::collections::{HashMap, HashSet};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_attach::client::Broker;
 use ros2probe_model::derive::chain::causality::CausalPublication;
 use ros2probe_model::facts::bounded::Bounded;
-use ros2probe_model::facts::calls::late::{LateCall, MessageJourney};
+use ros2probe_model::facts::calls::late::{CpuLimit, LateCall, MessageJourney};
 use ros2probe_model::facts::calls::report::{
     BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report,
     SubscriptionReport, ThreadStates, Transition, Trigger,
@@ -21,6 +22,7 @@ use ros2probe_wire::inside::{
 use ros2probe_wire::{DomainId, Timestamp};
 use zerocopy::FromBytes as _;
 
+use super::cpu_limits;
 use super::late::convert;
 use super::names::{Endpoint, Names, text};
 use super::process::Stat;
@@ -308,9 +310,13 @@ impl ProcessTable {
             }
         }
         let calls = self.late.take();
+        let cpu_limits = match calls.is_empty() {
+            true => Arc::new([]),
+            false => cpu_limits::read(Path::new("/sys")),
+        };
         let late = calls
             .iter()
-            .filter_map(|call| self.late_call(call, journey(call), &figures, clocks));
+            .filter_map(|call| self.late_call(call, journey(call), &cpu_limits, &figures, clocks));
         let late = late.collect();
         let hops = self.hops.take();
         let hops = hops.iter().filter_map(|hop| self.hop(hop, clocks));
@@ -515,11 +521,12 @@ impl ProcessTable {
         &self,
         call: &late::LateCall,
         journey: Option<MessageJourney>,
+        cpu_limits: &Arc<[CpuLimit]>,
         figures: &[(Handle, Figures)],
         clocks: &Clocks,
     ) -> Option<LateCall> {
         self.known.get(&call.process)?;
-        Some(convert(call, clocks, journey, |address| {
+        Some(convert(call, clocks, journey, cpu_limits, |address| {
             let key = Handle {
                 address,
                 process: call.process,

@@ -181,6 +181,7 @@ fn late(topic: TopicName) -> LateCallback {
             wait: bound,
         },
         journey: None,
+        cpu_limits: Arc::new([]),
         previous: None,
         states: Some(states(25, 70)),
         states_before: Some(states(0, 4)),

@@ -249,6 +249,11 @@ fn late_call(example: &LateExample, clock: WallClock) -> LateCall<'_> {
                 ended_by: longest.waker.as_ref().map(other_thread),
             })
         }),
+        cpu_limits: call
+            .cpu_limits
+            .iter()
+            .map(|limit| limit.in_words().into())
+            .collect(),
         previous: call.previous.as_ref().map(|previous| PreviousCall {
             trigger: trigger(&previous.trigger),
             duration_seconds: previous.duration.as_secs_f64(),

@@ -36,6 +36,8 @@ pub struct LateCall {
     pub bound: LateBound,
     /// How the message came into the process; `None` without a message through a UDP socket.
     pub journey: Option<MessageJourney>,
+    /// Limits on the speed of CPUs, at most a second after the call.
+    pub cpu_limits: Arc<[CpuLimit]>,
     /// The call before in the same thread.
     pub previous: Option<PreviousCall>,
     /// What the thread did during the call, by the scheduler's accounting.
@@ -46,6 +48,60 @@ pub struct LateCall {
     pub activity: Option<Activity>,
     /// What it did between the call before and this one, by events.
     pub activity_before: Option<Activity>,
+}
+
+/// Why CPUs are slower than they can be.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum CpuLimit {
+    /// Their maximum frequency is set to less.
+    Frequency {
+        /// The CPUs, as the kernel lists them.
+        cpus: Arc<str>,
+        /// Maximum frequency at present.
+        allowed_mhz: u32,
+        /// Maximum frequency of these CPUs.
+        maximum_mhz: u32,
+    },
+    /// The kernel slows them down because of heat.
+    Cooling {
+        /// Type of the cooling device.
+        device: Arc<str>,
+        /// Its state; 0 = it does not slow them down.
+        state: u32,
+        /// Its maximum state.
+        maximum: u32,
+    },
+    /// Raspberry Pi: the voltage is too low.
+    UnderVoltage,
+    /// Raspberry Pi: the frequency is capped.
+    FrequencyCapped,
+    /// Raspberry Pi: the firmware slows the CPUs down.
+    Throttled,
+    /// Raspberry Pi: the soft temperature limit is reached.
+    SoftTemperatureLimit,
+}
+
+impl CpuLimit {
+    /// Returns a sentence without a period.
+    #[must_use]
+    pub fn in_words(&self) -> String {
+        match self {
+            Self::Frequency {
+                cpus,
+                allowed_mhz,
+                maximum_mhz,
+            } => format!("CPUs {cpus} run at {allowed_mhz} of {maximum_mhz} MHz at most"),
+            Self::Cooling {
+                device,
+                state,
+                maximum,
+            } => format!("heat: {device} slows CPUs down ({state} of {maximum})"),
+            Self::UnderVoltage => "the power supply is too weak: the voltage is low".to_owned(),
+            Self::FrequencyCapped => "the firmware caps the frequency of CPUs".to_owned(),
+            Self::Throttled => "the firmware slows the CPUs down".to_owned(),
+            Self::SoftTemperatureLimit => "heat: the soft temperature limit is reached".to_owned(),
+        }
+    }
 }
 
 /// From when on a call is late.

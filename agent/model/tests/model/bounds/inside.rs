@@ -7,6 +7,7 @@ use ros2probe_model::facts::calls::report::{
     ThreadStates, Transition, Trigger,
 };
 use ros2probe_testing::model::host;
+use std::sync::Arc;
 
 const PROCESS: u32 = 0x0101;
 /// A participant of Fast DDS in this process.
@@ -96,6 +97,7 @@ fn late(process: u32, dice: &mut Dice, at: Timestamp) -> LateCall {
             wait: Duration::MAX,
         },
         journey: None,
+        cpu_limits: Arc::new([]),
         previous: None,
         states: None,
         states_before: None,

@@ -59,6 +59,7 @@ fn call(states: ThreadStates) -> LateCall {
             wait: milliseconds(20),
         },
         journey: None,
+        cpu_limits: Arc::new([]),
         previous: None,
         states: Some(states),
         states_before: None,

@@ -1,5 +1,6 @@
 //! Memory of the figures from inside processes, at the caps of their tables.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_daemon::agent_facts::InsideSourceFacts;
@@ -106,6 +107,7 @@ fn late(process: u32, now: u64) -> impl Iterator<Item = LateCall> {
             wait: Duration::from_millis(5),
         },
         journey: None,
+        cpu_limits: Arc::new([]),
         previous: Some(PreviousCall {
             handle: 2,
             trigger: Trigger::Subscription(topic().as_str().into()),
