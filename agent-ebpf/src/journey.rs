@@ -58,6 +58,11 @@ struct Queue {
     accounting: Accounting,
     /// That thread.
     thread: u64,
+    /// The last time in which the receiving thread waited for a CPU for longer than [`STALL`]: its
+    /// end, and its parts.
+    stall_ended: u64,
+    stall_runnable: u64,
+    stall_throttled: u64,
 }
 
 #[repr(C)]
@@ -89,7 +94,13 @@ const NEW_QUEUE: Queue = Queue {
         voluntary_switches: 0,
     },
     thread: 0,
+    stall_ended: 0,
+    stall_runnable: 0,
+    stall_throttled: 0,
 };
+
+/// Minimum of a wait for a CPU that explains the waits of several datagrams, in nanoseconds.
+const STALL: u64 = 500_000;
 
 /// Returns whether journeys are followed.
 #[inline(always)]
@@ -220,7 +231,7 @@ pub fn received(context: *mut bpf_sock_addr) {
 /// is the accounting of the running thread.
 #[inline(always)]
 unsafe fn note(
-    queue: *const Queue,
+    queue: *mut Queue,
     socket: u64,
     address: u64,
     port: u16,
@@ -263,11 +274,22 @@ unsafe fn note(
         {
             let before = &raw const (*queue).accounting;
             let states = accounting::states(before, after, now - since);
-            // Both began with the last receive call. No part of the journey can be longer than it.
+            let mut throttled = states[thread_state::THROTTLED];
+            let mut runnable = states[thread_state::RUNNABLE];
+            if throttled + runnable > STALL {
+                (*queue).stall_ended = now;
+                (*queue).stall_runnable = runnable;
+                (*queue).stall_throttled = throttled;
+            } else if (*queue).stall_ended > arrived {
+                // The datagram arrived during that wait, behind the one that was received then.
+                let during = (*queue).stall_ended - arrived;
+                throttled += accounting::least((*queue).stall_throttled, during);
+                runnable += accounting::least((*queue).stall_runnable, during);
+            }
+            // Both began with an earlier receive call. No part of the journey is longer than it.
             let most = now - arrived;
-            journey.throttled = accounting::least(states[thread_state::THROTTLED], most);
-            let rest = most - journey.throttled;
-            journey.runnable = accounting::least(states[thread_state::RUNNABLE], rest);
+            journey.throttled = accounting::least(throttled, most);
+            journey.runnable = accounting::least(runnable, most - journey.throttled);
             journey.accounted = 1;
         }
     }

@@ -71,6 +71,9 @@ pub struct Followed {
     pub wait: Blocked,
     /// What the thread did since the last start or end of a callback.
     pub activity: Activity,
+    /// The last time in which the thread was stopped, and its end; 0 = never.
+    pub stop: Blocked,
+    pub stop_ended: u64,
     /// What it did between the call before and the present one.
     before: Activity,
     /// The mode when the present call began.
@@ -338,6 +341,8 @@ unsafe fn report(
         (*late).previous_ended = (*followed).previous_ended;
         (*late).states = states.unwrap_or([0; thread_state::COUNT]);
         (*late).states_before = (*followed).states_before;
+        (*late).stop = (*followed).stop;
+        (*late).stop_ended = (*followed).stop_ended;
         copy(&raw const (*followed).activity, &raw mut (*late).during);
         copy(&raw const (*followed).before, &raw mut (*late).before);
     }

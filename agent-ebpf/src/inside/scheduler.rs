@@ -136,11 +136,23 @@ unsafe fn unblocked(followed: *mut Followed, now: u64) {
         (*followed).wait.nanoseconds = waited;
         block(followed, waited);
         if waited > (*followed).activity.longest.nanoseconds {
-            const WORDS: usize = size_of::<Blocked>() / 8;
-            let from = (&raw const (*followed).wait).cast::<u64>();
-            let to = (&raw mut (*followed).activity.longest).cast::<u64>();
-            core::ptr::copy_nonoverlapping(from, to, WORDS);
+            copy_wait(followed, &raw mut (*followed).activity.longest);
         }
+        if (*followed).wait.kind == wait::STOPPED as u32 {
+            copy_wait(followed, &raw mut (*followed).stop);
+            (*followed).stop_ended = now;
+        }
+    }
+}
+
+/// Copies the present wait.
+#[inline(always)]
+unsafe fn copy_wait(followed: *const Followed, to: *mut Blocked) {
+    const WORDS: usize = size_of::<Blocked>() / 8;
+    // SAFETY: both are in map values, by the caller.
+    unsafe {
+        let from = (&raw const (*followed).wait).cast::<u64>();
+        core::ptr::copy_nonoverlapping(from, to.cast::<u64>(), WORDS);
     }
 }
 

@@ -145,6 +145,8 @@ fn begin(socket: OwnedFd, users: &[u32], listener: &mut Option<OwnedFd>) -> Opti
 /// # Errors
 /// Fails if the kernel refuses to wait.
 pub fn serve_one(socket: OwnedFd) -> io::Result<()> {
+    // Without a name, this process has that of its file: `exe`.
+    let _ = rustix::thread::set_name(c"rp-attach");
     let peer = peer(&socket)?;
     Connection::new(socket, peer).serve()
 }

@@ -162,6 +162,10 @@ pub struct LateCall {
     pub previous_started: u64,
     /// End of the call before.
     pub previous_ended: u64,
+    /// The last time in which the thread was stopped.
+    pub stop: Blocked,
+    /// End of that time; 0 = never.
+    pub stop_ended: u64,
     /// The thread during the call, by [`thread_state`], in nanoseconds.
     pub states: [u64; thread_state::COUNT],
     /// The thread between the call before and this one.

@@ -12,6 +12,7 @@ use std::time::Duration;
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::calls::late::{
     Activity, Blocked, CpuLimit, LateBound, LateCall, MessageJourney, OtherThread, PreviousCall,
+    Stop,
 };
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
 use ros2probe_model::facts::names::NodeName;
@@ -375,6 +376,10 @@ pub(super) fn convert(
         cpu: call.cpu,
         journey,
         cpu_limits: Arc::clone(cpu_limits),
+        stop: (call.stop_ended != 0 && call.stop_ended <= call.started).then(|| Stop {
+            ended_before: between(call.stop_ended, call.started),
+            wait: blocked(&call.stop),
+        }),
         source: (call.source_timestamp != 0).then_some(Timestamp(call.source_timestamp)),
         started: clocks.calendar(call.started),
         duration: between(call.started, call.ended),

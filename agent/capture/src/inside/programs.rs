@@ -44,8 +44,8 @@ type ThreadWords = [u64; 14];
 type EntryWords = [u64; 2];
 type BoundWords = [u64; size_of::<Bound>() / 8];
 /// Words of `Followed` in the kernel programs.
-type FollowedWords = [u64; 5 + FOLLOWED_STATES + 15];
-const FOLLOWED_STATES: usize = (size_of::<Blocked>() + 2 * size_of::<Activity>()) / 8;
+type FollowedWords = [u64; 6 + FOLLOWED_STATES + 15];
+const FOLLOWED_STATES: usize = 2 * (size_of::<Blocked>() + size_of::<Activity>()) / 8;
 /// Tracepoints of the scheduler. The programs have the same names.
 const EVENTS: [&CStr; 2] = [c"sched_switch", c"sched_waking"];
 const _: () = assert!(size_of::<Figures>().is_multiple_of(8));

@@ -182,6 +182,7 @@ fn late(topic: TopicName) -> LateCallback {
         },
         journey: None,
         cpu_limits: Arc::new([]),
+        stop: None,
         previous: None,
         states: Some(states(25, 70)),
         states_before: Some(states(0, 4)),

@@ -20,6 +20,7 @@ use ros2probe_wire::journey::{JOURNEY_CAPACITY, QUEUE_CAPACITY};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 use super::late::{late, set_bounds};
+use super::thread_states::{Hog, Quota};
 use super::{Process, Robot};
 
 const WRITER: Guid = Guid::new(GuidPrefix(*b"\x01\x0fjourneyjou"), EntityId([0, 0, 1, 3]));
@@ -219,15 +220,56 @@ fn a_stopped_process_is_the_cause_of_a_wait_in_its_socket() -> Result<()> {
         Ok(())
     };
     // It is stopped while it waits for the message.
-    way.process.begin("network 1 0");
+    way.process.begin("network 5 0");
     sleep(Duration::from_millis(20));
     signal("-STOP")?;
-    way.send(Duration::ZERO)?;
+    for _ in 0..5 {
+        way.send(Duration::ZERO)?;
+    }
     sleep(LATE);
     signal("-CONT")?;
     way.process.end("network");
-    let call = way.robot.round().report.late.remove(0);
-    assert_late_for(&call, Stage::Socket, Cause::Stopped);
+    let calls = way.robot.round().report.late;
+    assert_eq!(calls.len(), 5, "{calls:#?}");
+    for call in &calls {
+        assert_late_for(call, Stage::Socket, Cause::Stopped);
+        let named = call.named_by(call.main_part(ThreadStates::default()).unwrap());
+        assert!(
+            named.is_some_and(|thread| &*thread.name == "kill"),
+            "{named:?}"
+        );
+    }
+    Ok(())
+}
+
+#[test]
+fn a_quota_is_the_cause_of_the_waits_of_messages() -> Result<()> {
+    let mut way = Way::new()?;
+    // The process waits for the messages while another thread of its group computes.
+    way.process.begin("network 5 0");
+    sleep(Duration::from_millis(20));
+    let quota = Quota::a_twentieth_for(&way.process);
+    let hog = Hog::on("0-1");
+    quota.use_up(&hog);
+    sleep(Duration::from_millis(150));
+    for _ in 0..5 {
+        way.send(Duration::ZERO)?;
+    }
+    way.process.end("network");
+    drop(hog);
+    drop(quota);
+    let calls = way.robot.round().report.late;
+    assert!(!calls.is_empty());
+    for call in &calls {
+        let parts = call.parts();
+        let main = call.main_part(ThreadStates::default()).unwrap();
+        // Since Linux 6.18, a thread is throttled at the end of its system call.
+        let is_in_process = matches!(main.stage, Stage::Socket | Stage::Wait);
+        assert!(
+            is_in_process && main.cause == Cause::Throttled,
+            "{parts:?} {call:#?}"
+        );
+    }
     Ok(())
 }
 

@@ -38,6 +38,8 @@ pub struct LateCall {
     pub journey: Option<MessageJourney>,
     /// Limits on the speed of CPUs, at most a second after the call.
     pub cpu_limits: Arc<[CpuLimit]>,
+    /// The last time before the call in which the thread was stopped.
+    pub stop: Option<Stop>,
     /// The call before in the same thread.
     pub previous: Option<PreviousCall>,
     /// What the thread did during the call, by the scheduler's accounting.
@@ -48,6 +50,15 @@ pub struct LateCall {
     pub activity: Option<Activity>,
     /// What it did between the call before and this one, by events.
     pub activity_before: Option<Activity>,
+}
+
+/// A time in which a thread was stopped, by SIGSTOP or a debugger.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Stop {
+    /// Time from its end to the start of the call.
+    pub ended_before: Duration,
+    /// Its length, and the thread that ended it.
+    pub wait: Blocked,
 }
 
 /// Why CPUs are slower than they can be.
@@ -476,9 +487,12 @@ impl LateCall {
             socket.take(Cause::Runnable, receiver.runnable);
         }
         // A signal stops all threads of a process.
-        let stopped = self.activity_before.as_ref();
-        let stopped = stopped.and_then(|activity| activity.blocked.get(wait::STOPPED));
-        socket.take(Cause::Stopped, stopped.copied().unwrap_or_default());
+        if let Some(stop) = &self.stop {
+            let began_before = stop.ended_before + stop.wait.duration;
+            let end = stop.ended_before.clamp(in_process, since_arrival);
+            let stopped = began_before.clamp(in_process, since_arrival) - end;
+            socket.take(Cause::Stopped, stopped);
+        }
         parts.extend(socket.finish(Cause::Queue));
         parts.extend(self.executor_parts(in_process, Cause::Middleware));
         parts
@@ -573,6 +587,9 @@ impl LateCall {
             // The events are those of the executor's thread. Another one reads the socket.
             Cause::Runnable if part.stage == Stage::Socket => None,
             Cause::Runnable => self.culprit(part.stage),
+            Cause::Stopped if part.stage == Stage::Socket => {
+                self.stop.as_ref()?.wait.waker.as_ref()
+            }
             Cause::Lock | Cause::Stopped => {
                 let longest = self.activity(part.stage)?.longest.as_ref()?;
                 longest.waker.as_ref()

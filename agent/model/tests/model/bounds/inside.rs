@@ -98,6 +98,7 @@ fn late(process: u32, dice: &mut Dice, at: Timestamp) -> LateCall {
         },
         journey: None,
         cpu_limits: Arc::new([]),
+        stop: None,
         previous: None,
         states: None,
         states_before: None,

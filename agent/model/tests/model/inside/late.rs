@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use ros2probe_model::facts::calls::late::{
     Activity, Blocked, Cause, LateBound, LateCall, MessageJourney, OtherThread, PreviousCall,
-    ReceiverStates, Stage,
+    ReceiverStates, Stage, Stop,
 };
 use ros2probe_model::facts::calls::report::{ProcessReport, Report, ThreadStates, Trigger};
 use ros2probe_model::facts::diagnosis::Diagnosis;
@@ -60,6 +60,7 @@ fn call(states: ThreadStates) -> LateCall {
         },
         journey: None,
         cpu_limits: Arc::new([]),
+        stop: None,
         previous: None,
         states: Some(states),
         states_before: None,
@@ -247,15 +248,18 @@ fn a_callback_before_explains_only_the_time_since_the_message_was_received() {
 fn a_stopped_process_is_named_with_who_continued_it() {
     let mut late = call_of_a_message();
     late.journey.as_mut().unwrap().receiver = None;
-    let before = late.activity_before.as_mut().unwrap();
-    before.blocked[wait::STOPPED] = milliseconds(28);
-    before.longest = Some(Blocked {
-        duration: milliseconds(28),
-        kind: wait::STOPPED,
-        call: None,
-        argument: 0,
-        waker: Some(other("operator", 77, 0)),
+    // It was stopped before the message arrived, which is 60 ms before the call.
+    late.stop = Some(Stop {
+        ended_before: milliseconds(31),
+        wait: Blocked {
+            duration: milliseconds(500),
+            kind: wait::STOPPED,
+            call: None,
+            argument: 0,
+            waker: Some(other("operator", 77, 0)),
+        },
     });
+    assert!(parts(&late).contains(&(Stage::Socket, Cause::Stopped, 29)));
     let main = late.main_part(ThreadStates::default()).unwrap();
     assert_eq!((main.stage, main.cause), (Stage::Socket, Cause::Stopped));
     assert_eq!(&*late.named_by(main).unwrap().name, "operator");

@@ -108,6 +108,7 @@ fn late(process: u32, now: u64) -> impl Iterator<Item = LateCall> {
         },
         journey: None,
         cpu_limits: Arc::new([]),
+        stop: None,
         previous: Some(PreviousCall {
             handle: 2,
             trigger: Trigger::Subscription(topic().as_str().into()),
