@@ -15,7 +15,7 @@ use aya_ebpf::{
 use ros2probe_wire::{filter::Counter, host::Socket};
 
 use crate::{
-    journey,
+    delivery,
     maps::{
         Recent, SOCKETS, Scratch, claim_incoming, claim_outgoing, count, last, recent, release,
         scratch,
@@ -99,8 +99,8 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
     }
     scratch.get().walk.record.datagram = 0;
     let mut capture = verdict::whole(skb, slot) != 0;
-    if journey::are_followed() {
-        journey::passed(skb, slot, at);
+    if delivery::are_followed() {
+        delivery::passed(skb, slot, at);
     }
     let record = &scratch.get().walk.record;
     let (socket, token) = (record.socket, record.datagram);

@@ -17,11 +17,11 @@
 
 #[path = "inside/accounting.rs"]
 mod accounting;
+mod delivery;
 mod fragment;
 mod handed;
 mod host;
 mod instructions;
-mod journey;
 mod kernel_memory;
 mod maps;
 mod owners;
@@ -105,14 +105,14 @@ pub fn zenoh_egress(context: SkBuffContext) -> i32 {
 /// Returns 1, which changes nothing.
 #[cgroup_sock_addr(recvmsg4)]
 pub fn received_ipv4(context: SockAddrContext) -> i32 {
-    journey::received(context.sock_addr);
+    delivery::received(context.sock_addr);
     1
 }
 
 /// Runs as [`received_ipv4`] does, for IPv6.
 #[cgroup_sock_addr(recvmsg6)]
 pub fn received_ipv6(context: SockAddrContext) -> i32 {
-    journey::received(context.sock_addr);
+    delivery::received(context.sock_addr);
     1
 }
 

@@ -17,8 +17,8 @@ use ros2probe_wire::{
 };
 
 use crate::{
+    delivery,
     instructions::add,
-    journey,
     kernel_memory::{member, place, read},
     maps::{Last, RECORDS_PER_DATAGRAM, SOCKETS, count_outside, last, scratch},
     verdict::write,
@@ -125,7 +125,7 @@ fn end(last: &Last) {
 /// Counts the drop for a known socket.
 #[inline(always)]
 fn refusal(socket: u64) {
-    journey::refused(socket);
+    delivery::refused(socket);
     if let Some(known) = SOCKETS.get_ptr_mut(&socket) {
         // SAFETY: a map value pointer checked against null.
         add(unsafe { &raw mut (*known).rcvbuf_errors }, 1);

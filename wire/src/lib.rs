@@ -19,6 +19,7 @@ extern crate std;
 extern crate self as ros2probe_wire;
 
 pub mod cursor;
+pub mod delivery;
 #[cfg(feature = "alloc")]
 pub mod discovery;
 mod domain;
@@ -30,7 +31,6 @@ pub mod frame;
 pub mod guid;
 pub mod host;
 pub mod inside;
-pub mod journey;
 #[cfg(feature = "alloc")]
 pub mod names;
 pub mod parameters;

@@ -4,8 +4,8 @@
 //! Loading needs CAP_BPF and CAP_PERFMON (CAP_SYS_ADMIN before Linux 5.8). Attaching the host hook
 //! to a cgroup also needs CAP_NET_ADMIN.
 
+mod deliveries;
 mod host_hook;
-mod journeys;
 mod uprobe;
 
 use std::io;
@@ -21,8 +21,8 @@ use zerocopy::FromBytes;
 
 use super::tracepoints::KernelLayout;
 
+pub use deliveries::Deliveries;
 pub use host_hook::{CapturedPiece, Links};
-pub use journeys::Journeys;
 pub use uprobe::{Form, Probes};
 
 /// The object built by `agent-ebpf/build.sh`. It is aligned because the ELF file is read in place.
@@ -90,8 +90,8 @@ pub struct FilterSettings {
     /// Host hook: whether to use the kernel's types. Without them the hook works as on a kernel
     /// without BTF.
     pub kernel_types: bool,
-    /// Host hook: whether journeys of messages can be followed.
-    pub journeys: bool,
+    /// Host hook: whether deliveries of messages can be followed.
+    pub deliveries: bool,
     /// TCP ports of Zenoh; 0 = unused.
     pub zenoh_ports: [u16; PORT_CAPACITY],
 }
@@ -111,7 +111,7 @@ impl Default for FilterSettings {
             piece_ring_bytes: 1024 * 1024,
             accept_new_interfaces: true,
             kernel_types: true,
-            journeys: false,
+            deliveries: false,
             zenoh_ports: ports(&[ros2probe_wire::zenoh::PORT]),
         }
     }
@@ -147,7 +147,7 @@ impl Filter {
     /// refuses it.
     pub fn load(settings: &FilterSettings) -> Result<Self, FilterError> {
         let mut sizes = vec![("PIECES", page_size()), ("SOCKETS", UNUSED)];
-        sizes.extend(NO_JOURNEYS);
+        sizes.extend(NO_DELIVERIES);
         let mut ebpf = open(settings, false, &sizes, None, 0)?;
         let program = load_program(&mut ebpf, "wire")?;
         let mut wire: ProgramArray<_> = take(&mut ebpf, "WIRE")?;
@@ -363,11 +363,11 @@ fn caused_by(error: &(dyn std::error::Error + 'static), wanted: i32) -> Option<i
 /// Number of entries of a map that the loaded programs do not use: an LRU map cannot be empty.
 const UNUSED: u32 = 64;
 
-/// Sizes of the maps of journeys where they are not followed.
-const NO_JOURNEYS: [(&str, u32); 4] = [
+/// Sizes of the maps of deliveries where they are not followed.
+const NO_DELIVERIES: [(&str, u32); 4] = [
     ("QUEUES", UNUSED),
     ("QUEUED", UNUSED),
-    ("JOURNEYS", UNUSED),
+    ("DELIVERIES", UNUSED),
     ("SENT", UNUSED),
 ];
 

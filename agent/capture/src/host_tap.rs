@@ -54,8 +54,8 @@ pub struct HostTapSettings {
     pub record_ring_bytes: usize,
     /// TCP ports of Zenoh.
     pub zenoh_ports: Vec<u16>,
-    /// Whether journeys of messages can be followed.
-    pub journeys: bool,
+    /// Whether deliveries of messages can be followed.
+    pub deliveries: bool,
 }
 
 /// The host hook and the reader of its output.
@@ -82,7 +82,7 @@ impl HostTap {
             record_ring_bytes: size(settings.record_ring_bytes),
             piece_ring_bytes: size(settings.ring_bytes),
             zenoh_ports: ports(&settings.zenoh_ports),
-            journeys: settings.journeys,
+            deliveries: settings.deliveries,
             ..FilterSettings::default()
         })?;
         if let Some(Err(error)) = filter.zenoh_programs() {

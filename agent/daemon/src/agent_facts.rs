@@ -106,8 +106,8 @@ pub struct InsideSourceFacts {
     pub late: &'static str,
     /// Why the scheduler's events are not observed although they are needed.
     pub without_events: Option<String>,
-    /// Why journeys of messages are not followed although they are needed.
-    pub without_journeys: Option<String>,
+    /// Why deliveries of messages are not followed although they are needed.
+    pub without_deliveries: Option<String>,
     /// Why nothing is observed although the source is switched on. `None` if it works.
     pub reason_off: Option<String>,
 }

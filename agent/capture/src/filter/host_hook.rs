@@ -19,8 +19,8 @@ use super::super::bpf;
 use super::super::error_chain::Reason;
 use super::super::tracepoints::{KernelLayout, Tracepoints};
 use super::{
-    Filter, FilterError, FilterSettings, Journeys, NO_JOURNEYS, UNUSED, failed, load_program, open,
-    ring_size, take,
+    Deliveries, Filter, FilterError, FilterSettings, NO_DELIVERIES, UNUSED, failed, load_program,
+    open, ring_size, take,
 };
 
 /// Attach types of linux/bpf.h.
@@ -38,7 +38,7 @@ pub(super) struct HostHook {
     /// The programs for TCP segments of Zenoh, or why the kernel refuses them.
     zenoh: Result<[ProgramFd; 2], FilterError>,
     links: Vec<OwnedFd>,
-    journeys: Option<Journeys>,
+    deliveries: Option<Deliveries>,
     /// Values are [`Socket`]s.
     sockets: HashMap<MapData, u64, [u64; 3]>,
 }
@@ -79,16 +79,16 @@ impl Filter {
             KernelLayout::unknown(Reason("kernel types were not read".to_owned()))
         };
         let mut sizes = vec![("PIECES", pieces), ("FLOWS", UNUSED)];
-        if !settings.journeys {
-            sizes.extend(NO_JOURNEYS);
+        if !settings.deliveries {
+            sizes.extend(NO_DELIVERIES);
         }
         let mut ebpf = open(settings, true, &sizes, Some(&layout), 0)?;
         let ingress = load_program(&mut ebpf, "host_ingress")?;
         let egress = load_program(&mut ebpf, "host_egress")?;
         let zenoh = load_program(&mut ebpf, "zenoh_ingress")
             .and_then(|ingress| Ok([ingress, load_program(&mut ebpf, "zenoh_egress")?]));
-        let journeys = match settings.journeys {
-            true => Some(Journeys::load(&mut ebpf)?),
+        let deliveries = match settings.deliveries {
+            true => Some(Deliveries::load(&mut ebpf)?),
             false => None,
         };
         let (pieces, sockets) = (take(&mut ebpf, "PIECES")?, take(&mut ebpf, "SOCKETS")?);
@@ -100,7 +100,7 @@ impl Filter {
             egress,
             zenoh,
             links: Vec::new(),
-            journeys,
+            deliveries,
             sockets,
         });
         filter.pieces = Some(pieces);
@@ -155,9 +155,9 @@ impl Filter {
         }
     }
 
-    /// Removes and returns the programs and tables of journeys; `None` if they are not loaded.
-    pub fn take_journeys(&mut self) -> Option<Journeys> {
-        self.host.as_mut()?.journeys.take()
+    /// Removes and returns the programs and tables of deliveries; `None` if they are not loaded.
+    pub fn take_deliveries(&mut self) -> Option<Deliveries> {
+        self.host.as_mut()?.deliveries.take()
     }
 
     /// Frees memory that only further attaching would need. Attached programs stay.

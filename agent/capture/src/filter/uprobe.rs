@@ -15,7 +15,7 @@ pub use ros2probe_attach::library::Form;
 use ros2probe_attach::request::Place;
 
 use super::{
-    Filter, FilterError, FilterSettings, NO_JOURNEYS, OBJECT, UNUSED, open, ring_size, take,
+    Filter, FilterError, FilterSettings, NO_DELIVERIES, OBJECT, UNUSED, open, ring_size, take,
 };
 use crate::breakpoints::{Attached, Breakpoints, Means};
 use crate::uprobe::attachments::Refusal;
@@ -43,7 +43,7 @@ impl Filter {
             ("CONNECTIONS", UNUSED),
             ("CANDIDATES", UNUSED),
         ];
-        sizes.extend(NO_JOURNEYS);
+        sizes.extend(NO_DELIVERIES);
         let ebpf = open(settings, false, &sizes, None, within.unwrap_or(0))?;
         let calls = Calls::SharedMemory;
         let mut breakpoints = Breakpoints::load(ebpf, &OBJECT.0, calls, None, means)?;

@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::calls::late::{
-    Activity, Blocked, CpuLimit, LateBound, LateCall, MessageJourney, OtherThread, PreviousCall,
+    Activity, Blocked, CpuLimit, LateBound, LateCall, MessageDelivery, OtherThread, PreviousCall,
     Stop,
 };
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
@@ -23,7 +23,7 @@ use ros2probe_wire::inside::{BUCKETS, Handle, bucket_start, kind, thread_state};
 use super::programs::{Events, Programs, Tables};
 use super::table::ProcessTable;
 use crate::error_chain::{Reason, in_words};
-use crate::filter::Journeys;
+use crate::filter::Deliveries;
 use crate::settings::LateChoice;
 use crate::system::Clocks;
 use crate::tables::CallbackBounds;
@@ -70,9 +70,9 @@ pub(super) struct LateObservation {
     mode: u32,
     events: Option<Events>,
     without_events: Option<Reason>,
-    /// Programs that follow journeys of messages, with the control group of the host hook.
-    journeys: Option<(Journeys, File)>,
-    without_journeys: Option<Reason>,
+    /// Programs that follow deliveries of messages, with the control group of the host hook.
+    deliveries: Option<(Deliveries, File)>,
+    without_deliveries: Option<Reason>,
     requested: Vec<RequestedBound>,
     bounds: Bounded<CallbackBounds, HashMap<Handle, Learnt>>,
 }
@@ -93,9 +93,9 @@ impl LateObservation {
     pub(super) fn new(
         programs: Arc<Programs>,
         choice: LateChoice,
-        journeys: Option<(Journeys, File)>,
+        deliveries: Option<(Deliveries, File)>,
     ) -> Self {
-        let without_journeys = match journeys {
+        let without_deliveries = match deliveries {
             Some(_) => None,
             None => Some(Reason(
                 "the sockets of this host are not observed".to_owned(),
@@ -107,8 +107,8 @@ impl LateObservation {
             mode: mode::OFF,
             events: None,
             without_events: None,
-            journeys,
-            without_journeys,
+            deliveries,
+            without_deliveries,
             requested: Vec::new(),
             bounds: Bounded::default(),
         }
@@ -128,14 +128,14 @@ impl LateObservation {
         self.without_events.as_ref().map(Reason::as_str)
     }
 
-    /// Returns why journeys of messages are not followed although they are needed.
-    pub(super) fn without_journeys(&self) -> Option<&str> {
-        self.without_journeys.as_ref().map(Reason::as_str)
+    /// Returns why deliveries of messages are not followed although they are needed.
+    pub(super) fn without_deliveries(&self) -> Option<&str> {
+        self.without_deliveries.as_ref().map(Reason::as_str)
     }
 
-    /// Returns the journey of the message that triggered a call.
-    pub(super) fn journey(&self, call: &late::LateCall) -> Option<MessageJourney> {
-        self.journeys.as_ref()?.0.of(call)
+    /// Returns the delivery of the message that triggered a call.
+    pub(super) fn delivery(&self, call: &late::LateCall) -> Option<MessageDelivery> {
+        self.deliveries.as_ref()?.0.of(call)
     }
 
     /// Begins or ends the observation of the scheduler's events. `at_calls`: whether callbacks are
@@ -172,7 +172,7 @@ impl LateObservation {
             true => mode::SUMS,
             false => mode,
         };
-        self.follow_journeys(mode == mode::EVENTS);
+        self.follow_deliveries(mode == mode::EVENTS);
         if mode == self.mode {
             return;
         }
@@ -185,22 +185,22 @@ impl LateObservation {
         }
     }
 
-    /// Begins or ends following journeys of messages, together with the scheduler's events.
-    fn follow_journeys(&mut self, wanted: bool) {
-        let Some((journeys, cgroup)) = &mut self.journeys else {
+    /// Begins or ends following deliveries of messages, together with the scheduler's events.
+    fn follow_deliveries(&mut self, wanted: bool) {
+        let Some((deliveries, cgroup)) = &mut self.deliveries else {
             return;
         };
         if !wanted {
-            journeys.leave();
+            deliveries.leave();
             return;
         }
-        if let Err(reason) = journeys.follow(cgroup) {
+        if let Err(reason) = deliveries.follow(cgroup) {
             tracing::warn!(
                 reason = reason.as_str(),
                 "late callbacks are reported without the way of their messages"
             );
-            self.without_journeys = Some(reason);
-            self.journeys = None;
+            self.without_deliveries = Some(reason);
+            self.deliveries = None;
         }
     }
 
@@ -352,7 +352,7 @@ const BEFORE: u32 = 2;
 pub(super) fn convert(
     call: &late::LateCall,
     clocks: &Clocks,
-    journey: Option<MessageJourney>,
+    delivery: Option<MessageDelivery>,
     cpu_limits: &Arc<[CpuLimit]>,
     mut name: impl FnMut(u64) -> (Trigger, Option<NodeName>),
 ) -> LateCall {
@@ -374,7 +374,7 @@ pub(super) fn convert(
         trigger,
         thread: call.thread,
         cpu: call.cpu,
-        journey,
+        delivery,
         cpu_limits: Arc::clone(cpu_limits),
         stop: (call.stop_ended != 0 && call.stop_ended <= call.started).then(|| Stop {
             ended_before: between(call.stop_ended, call.started),

@@ -32,7 +32,7 @@ use self::programs::Tables;
 use self::table::Round;
 use crate::bell::Bell;
 use crate::breakpoints::Means;
-use crate::filter::{FilterError, Journeys};
+use crate::filter::{Deliveries, FilterError};
 use crate::settings::{InsideChoice, LateChoice};
 use crate::shm::directories::Scope;
 use crate::system::Clocks;
@@ -72,8 +72,8 @@ pub struct Facts {
     pub late: &'static str,
     /// Why the scheduler's events are not observed although they are needed.
     pub without_events: Option<String>,
-    /// Why journeys of messages are not followed although they are needed.
-    pub without_journeys: Option<String>,
+    /// Why deliveries of messages are not followed although they are needed.
+    pub without_deliveries: Option<String>,
     /// Counters of the programs.
     pub counters: Vec<(&'static str, u64)>,
 }
@@ -102,7 +102,7 @@ struct Work {
 
 impl Inside {
     /// Loads the programs, and attaches them to installed libraries. `cgroup` restricts them to
-    /// processes of this control group. `journeys` are programs of the host hook, with its control
+    /// processes of this control group. `deliveries` are programs of the host hook, with its control
     /// group.
     ///
     /// # Errors
@@ -111,7 +111,7 @@ impl Inside {
         (choice, late): (InsideChoice, LateChoice),
         cgroup: Option<&Path>,
         broker: &Path,
-        journeys: Option<(Journeys, File)>,
+        deliveries: Option<(Deliveries, File)>,
     ) -> Result<Self, UprobeError> {
         let mut broker = uprobe::broker(broker)?;
         let within = cgroup.map(uprobe::inode).transpose()?;
@@ -126,7 +126,7 @@ impl Inside {
         let progress = Arc::new(Progress::default());
         let is_on_demand = choice == InsideChoice::Auto;
         let programs = Arc::new(programs);
-        let late = LateObservation::new(Arc::clone(&programs), late, journeys);
+        let late = LateObservation::new(Arc::clone(&programs), late, deliveries);
         let mut probes = Probes::new(&programs, is_on_demand, &progress);
         // A node announces its publishers only once, so the probes are attached to installed
         // libraries in advance.

@@ -235,8 +235,8 @@ impl Observation {
         let (tables, broker) = (&mut self.tables, &mut self.broker);
         let is_showing = |process| showing.contains(&process);
         let late = &self.late;
-        let journey = |call: &_| late.journey(call);
-        let mut round = (self.table).round(tables, clocks, elapsed, broker, is_showing, journey);
+        let delivery = |call: &_| late.delivery(call);
+        let mut round = (self.table).round(tables, clocks, elapsed, broker, is_showing, delivery);
         self.late.set_bounds(&self.table, &mut self.tables);
         round.is_last = is_last;
         let hits = round.hits;
@@ -400,7 +400,7 @@ impl Observation {
             shows_rates: self.rounds >= ROUNDS_OF_RATES,
             late: self.late.observed(),
             without_events: self.late.without_events().map(str::to_owned),
-            without_journeys: self.late.without_journeys().map(str::to_owned),
+            without_deliveries: self.late.without_deliveries().map(str::to_owned),
             counters: labels.zip(values).collect(),
         });
     }

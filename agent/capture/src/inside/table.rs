@@ -8,7 +8,7 @@ use std::time::Duration;
 use ros2probe_attach::client::Broker;
 use ros2probe_model::derive::chain::causality::CausalPublication;
 use ros2probe_model::facts::bounded::Bounded;
-use ros2probe_model::facts::calls::late::{CpuLimit, LateCall, MessageJourney};
+use ros2probe_model::facts::calls::late::{CpuLimit, LateCall, MessageDelivery};
 use ros2probe_model::facts::calls::report::{
     BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report,
     SubscriptionReport, ThreadStates, Transition, Trigger,
@@ -248,7 +248,7 @@ impl ProcessTable {
     }
 
     /// Reads everything once. `elapsed`: time since the last round. `shows_intra_process`: whether
-    /// a process's library reports every step of messages within it. `journey`: how the message of a
+    /// a process's library reports every step of messages within it. `delivery`: how the message of a
     /// late call came into its process.
     pub fn round(
         &mut self,
@@ -257,7 +257,7 @@ impl ProcessTable {
         elapsed: Duration,
         broker: &mut Broker,
         shows_intra_process: impl Fn(u32) -> bool,
-        journey: impl Fn(&late::LateCall) -> Option<MessageJourney>,
+        delivery: impl Fn(&late::LateCall) -> Option<MessageDelivery>,
     ) -> Round {
         self.rounds = self.rounds.wrapping_add(1);
         self.unjudged += elapsed;
@@ -316,7 +316,7 @@ impl ProcessTable {
         };
         let late = calls
             .iter()
-            .filter_map(|call| self.late_call(call, journey(call), &cpu_limits, &figures, clocks));
+            .filter_map(|call| self.late_call(call, delivery(call), &cpu_limits, &figures, clocks));
         let late = late.collect();
         let hops = self.hops.take();
         let hops = hops.iter().filter_map(|hop| self.hop(hop, clocks));
@@ -520,13 +520,13 @@ impl ProcessTable {
     fn late_call(
         &self,
         call: &late::LateCall,
-        journey: Option<MessageJourney>,
+        delivery: Option<MessageDelivery>,
         cpu_limits: &Arc<[CpuLimit]>,
         figures: &[(Handle, Figures)],
         clocks: &Clocks,
     ) -> Option<LateCall> {
         self.known.get(&call.process)?;
-        Some(convert(call, clocks, journey, cpu_limits, |address| {
+        Some(convert(call, clocks, delivery, cpu_limits, |address| {
             let key = Handle {
                 address,
                 process: call.process,

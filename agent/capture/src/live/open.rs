@@ -49,7 +49,7 @@ pub(super) fn open_host(
         ring_bytes: settings.ring_bytes,
         record_ring_bytes: settings.record_ring_bytes,
         zenoh_ports: settings.zenoh_ports.clone(),
-        journeys: observes_late_calls(settings),
+        deliveries: observes_late_calls(settings),
     });
     match opened {
         Ok(host) => Ok((Some(host), None)),
@@ -86,7 +86,7 @@ pub(super) fn open_exact(
 }
 
 /// Returns the programs inside processes, or why they are unavailable.
-/// `host` has the programs that follow journeys of messages.
+/// `host` has the programs that follow deliveries of messages.
 pub(super) fn open_inside(
     settings: &CaptureSettings,
     host: Option<&mut HostTap>,
@@ -94,15 +94,15 @@ pub(super) fn open_inside(
     if settings.inside == InsideChoice::Off {
         return (None, None);
     }
-    let journeys = host.and_then(|host| {
+    let deliveries = host.and_then(|host| {
         let cgroup = host.directory().try_clone().ok()?;
-        Some((host.filter_mut().take_journeys()?, cgroup))
+        Some((host.filter_mut().take_deliveries()?, cgroup))
     });
     match Inside::open(
         (settings.inside, settings.late),
         settings.cgroup.as_deref(),
         &settings.broker,
-        journeys,
+        deliveries,
     ) {
         Ok(inside) => (Some(inside), None),
         Err(error) => (None, Some(in_words(&error))),

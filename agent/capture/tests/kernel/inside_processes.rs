@@ -1,6 +1,6 @@
 //! Programs at the functions of `libtracetools.so`, in processes that call them as rclcpp does.
 
-mod journeys;
+mod deliveries;
 mod late;
 mod thread_states;
 
@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use ros2probe_attach::client::Broker;
 use ros2probe_capture::breakpoints::Means;
-use ros2probe_capture::filter::Journeys;
+use ros2probe_capture::filter::Deliveries;
 use ros2probe_capture::inside::programs::{self, Attached, Events, Programs, Tables};
 use ros2probe_capture::inside::table::{MAX_PROCESS_HITS, ProcessTable, Round};
 use ros2probe_capture::system::Clocks;
@@ -28,7 +28,7 @@ struct Robot {
     table: ProcessTable,
     attached: Option<Attached>,
     events: Option<Events>,
-    journeys: Option<Journeys>,
+    deliveries: Option<Deliveries>,
 }
 
 /// A process that takes commands.
@@ -56,7 +56,7 @@ impl Robot {
             table: ProcessTable::new(has_callbacks),
             attached: None,
             events: None,
-            journeys: None,
+            deliveries: None,
         }
     }
 
@@ -80,14 +80,14 @@ impl Robot {
             .as_ref()
             .is_some_and(|it| it.shows_intra_process);
         let clocks = Clocks::read();
-        let journeys = self.journeys.as_ref();
+        let deliveries = self.deliveries.as_ref();
         self.table.round(
             &mut self.tables,
             &clocks,
             elapsed,
             &mut Broker::here(),
             |_| shows,
-            |call| journeys?.of(call),
+            |call| deliveries?.of(call),
         )
     }
 

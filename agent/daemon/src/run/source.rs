@@ -332,7 +332,7 @@ fn inside(live: &LiveSource) -> Option<InsideSourceFacts> {
         counters: facts.counters,
         late: facts.late,
         without_events: facts.without_events,
-        without_journeys: facts.without_journeys,
+        without_deliveries: facts.without_deliveries,
         reason_off: reason_off.or_else(resting),
     })
 }

@@ -144,7 +144,7 @@ pub fn source() -> InsideSourceFacts {
         counters: vec![("hits", 36_000), ("suspended", 0)],
         late: "events",
         without_events: None,
-        without_journeys: None,
+        without_deliveries: None,
         reason_off: None,
     }
 }
@@ -180,7 +180,7 @@ fn late(topic: TopicName) -> LateCallback {
             duration: bound,
             wait: bound,
         },
-        journey: None,
+        delivery: None,
         cpu_limits: Arc::new([]),
         stop: None,
         previous: None,

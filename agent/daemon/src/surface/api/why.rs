@@ -124,7 +124,7 @@ fn why<'a>(
                 .reason_off
                 .as_ref()
                 .or(source.without_events.as_ref())
-                .or(source.without_journeys.as_ref());
+                .or(source.without_deliveries.as_ref());
             Some(Cow::Borrowed(reason?.as_str()))
         }),
         ..Why::default()

@@ -35,7 +35,7 @@ pub struct LateCall {
     /// The bounds that the call is compared with.
     pub bound: LateBound,
     /// How the message came into the process; `None` without a message through a UDP socket.
-    pub journey: Option<MessageJourney>,
+    pub delivery: Option<MessageDelivery>,
     /// Limits on the speed of CPUs, at most a second after the call.
     pub cpu_limits: Arc<[CpuLimit]>,
     /// The last time before the call in which the thread was stopped.
@@ -139,7 +139,7 @@ pub struct PreviousCall {
 
 /// How a message came into a process: times before the start of its call.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct MessageJourney {
+pub struct MessageDelivery {
     /// A socket of this host sent the first datagram; `None` if the publisher is on another host.
     pub sent_before: Option<Duration>,
     /// The last datagram arrived at the subscriber's socket.
@@ -469,12 +469,12 @@ impl LateCall {
         let Some(wait) = self.wait else {
             return Vec::new();
         };
-        let Some(journey) = &self.journey else {
+        let Some(delivery) = &self.delivery else {
             return self.executor_parts(wait, Cause::Arrival);
         };
-        let in_process = wait.min(journey.received_before);
-        let since_arrival = wait.min(journey.arrived_before);
-        let since_sent = match journey.sent_before {
+        let in_process = wait.min(delivery.received_before);
+        let since_arrival = wait.min(delivery.arrived_before);
+        let since_sent = match delivery.sent_before {
             Some(sent_before) => wait.min(sent_before),
             None => wait,
         };
@@ -482,7 +482,7 @@ impl LateCall {
         let network = Rest::new(Stage::Network, since_sent - since_arrival);
         parts.extend(network.finish(Cause::Transit));
         let mut socket = Rest::new(Stage::Socket, since_arrival - in_process);
-        if let Some(receiver) = &journey.receiver {
+        if let Some(receiver) = &delivery.receiver {
             socket.take(Cause::Throttled, receiver.throttled);
             socket.take(Cause::Runnable, receiver.runnable);
         }

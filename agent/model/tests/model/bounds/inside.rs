@@ -96,7 +96,7 @@ fn late(process: u32, dice: &mut Dice, at: Timestamp) -> LateCall {
             duration: Duration::ZERO,
             wait: Duration::MAX,
         },
-        journey: None,
+        delivery: None,
         cpu_limits: Arc::new([]),
         stop: None,
         previous: None,

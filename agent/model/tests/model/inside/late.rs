@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_model::facts::calls::late::{
-    Activity, Blocked, Cause, LateBound, LateCall, MessageJourney, OtherThread, PreviousCall,
+    Activity, Blocked, Cause, LateBound, LateCall, MessageDelivery, OtherThread, PreviousCall,
     ReceiverStates, Stage, Stop,
 };
 use ros2probe_model::facts::calls::report::{ProcessReport, Report, ThreadStates, Trigger};
@@ -58,7 +58,7 @@ fn call(states: ThreadStates) -> LateCall {
             duration: milliseconds(20),
             wait: milliseconds(20),
         },
-        journey: None,
+        delivery: None,
         cpu_limits: Arc::new([]),
         stop: None,
         previous: None,
@@ -176,7 +176,7 @@ fn call_of_a_message() -> LateCall {
     late.duration = milliseconds(5);
     late.wait = Some(milliseconds(90));
     late.states_before = Some(states(1, 0, 4, 85));
-    late.journey = Some(MessageJourney {
+    late.delivery = Some(MessageDelivery {
         sent_before: Some(milliseconds(80)),
         arrived_before: milliseconds(60),
         received_before: milliseconds(30),
@@ -205,12 +205,12 @@ fn a_wait_is_divided_by_the_way_of_the_message() {
     let main = late.main_part(ThreadStates::default()).unwrap();
     assert_eq!((main.stage, main.cause), (Stage::Wait, Cause::Middleware));
     // Its publisher is on another host.
-    late.journey.as_mut().unwrap().sent_before = None;
+    late.delivery.as_mut().unwrap().sent_before = None;
     assert_eq!(parts(&late)[0], (Stage::Network, Cause::Transit, 30));
 }
 
 #[test]
-fn only_the_latest_time_of_a_journey_belongs_to_a_shorter_wait() {
+fn only_the_latest_time_of_a_delivery_belongs_to_a_shorter_wait() {
     // The usual time of a message is not a part of the wait.
     let mut late = call_of_a_message();
     late.wait = Some(milliseconds(50));
@@ -247,7 +247,7 @@ fn a_callback_before_explains_only_the_time_since_the_message_was_received() {
 #[test]
 fn a_stopped_process_is_named_with_who_continued_it() {
     let mut late = call_of_a_message();
-    late.journey.as_mut().unwrap().receiver = None;
+    late.delivery.as_mut().unwrap().receiver = None;
     // It was stopped before the message arrived, which is 60 ms before the call.
     late.stop = Some(Stop {
         ended_before: milliseconds(31),

@@ -106,7 +106,7 @@ fn late(process: u32, now: u64) -> impl Iterator<Item = LateCall> {
             duration: Duration::from_millis(5),
             wait: Duration::from_millis(5),
         },
-        journey: None,
+        delivery: None,
         cpu_limits: Arc::new([]),
         stop: None,
         previous: Some(PreviousCall {

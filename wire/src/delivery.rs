@@ -1,4 +1,4 @@
-//! Journeys of messages: when a message left its publisher's socket, and when its last datagram
+//! Deliveries of messages: when a message left its publisher's socket, and when its last datagram
 //! arrived at a subscriber's socket and was received there.
 //!
 //! The kernel programs and user space share this binary layout. Times are CLOCK_MONOTONIC
@@ -10,14 +10,14 @@ use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 pub const QUEUE_CAPACITY: u32 = 1_024;
 /// Maximum number of sent messages, of datagrams in receive buffers, and of received messages that
 /// are remembered.
-pub const JOURNEY_CAPACITY: u32 = 8_192;
+pub const DELIVERY_CAPACITY: u32 = 8_192;
 
 /// One message in one subscribing process.
 #[derive(
     Clone, Copy, Debug, Default, PartialEq, Eq, FromBytes, IntoBytes, Immutable, KnownLayout,
 )]
 #[repr(C)]
-pub struct JourneyKey {
+pub struct DeliveryKey {
     /// Source timestamp, nanoseconds since the Unix epoch.
     pub source_timestamp: u64,
     /// Process id in the initial namespace.
@@ -29,7 +29,7 @@ pub struct JourneyKey {
     Clone, Copy, Debug, Default, PartialEq, Eq, FromBytes, IntoBytes, Immutable, KnownLayout,
 )]
 #[repr(C)]
-pub struct Journey {
+pub struct Delivery {
     /// Its last datagram was about to enter the socket's receive buffer.
     pub arrived: u64,
     /// A thread received that datagram.

@@ -15,15 +15,15 @@ use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
 use ros2probe_model::facts::calls::report::ThreadStates;
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::program_run;
+use ros2probe_wire::delivery::{DELIVERY_CAPACITY, QUEUE_CAPACITY};
 use ros2probe_wire::filter::Counter;
-use ros2probe_wire::journey::{JOURNEY_CAPACITY, QUEUE_CAPACITY};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 use super::late::{late, set_bounds};
 use super::thread_states::{Hog, Quota};
 use super::{Process, Robot};
 
-const WRITER: Guid = Guid::new(GuidPrefix(*b"\x01\x0fjourneyjou"), EntityId([0, 0, 1, 3]));
+const WRITER: Guid = Guid::new(GuidPrefix(*b"\x01\x0fdeliveries"), EntityId([0, 0, 1, 3]));
 /// Time for which a message is late in each test: longer than the waits of a busy machine.
 const LATE: Duration = Duration::from_millis(100);
 /// Part of that time which another stage may have.
@@ -51,16 +51,16 @@ impl Way {
     fn over(address: IpAddr) -> Result<Way> {
         let host = Namespace::alone()?;
         let mut filter = Filter::load_host(&FilterSettings {
-            journeys: true,
+            deliveries: true,
             ..FilterSettings::default()
         })?;
         filter.attach_tracepoints(false);
         let cgroup = File::open(host.cgroup())?;
         filter.attach(&cgroup)?;
-        let mut journeys = filter.take_journeys().unwrap();
-        journeys.follow(&cgroup).unwrap();
+        let mut deliveries = filter.take_deliveries().unwrap();
+        deliveries.follow(&cgroup).unwrap();
         let mut robot = Robot::new(248, &[], true);
-        robot.journeys = Some(journeys);
+        robot.deliveries = Some(deliveries);
         robot.attach();
         let program = robot.program.program();
         let start = || Process::start(&program);
@@ -143,7 +143,7 @@ fn a_message_that_its_publisher_sends_late_names_the_publisher() -> Result<()> {
     way.send(LATE)?;
     let call = way.receive("network 1 0");
     assert_late_for(&call, Stage::Publish, Cause::Send);
-    assert!(call.journey.unwrap().sent_before.is_some());
+    assert!(call.delivery.unwrap().sent_before.is_some());
     assert_eq!(way.unmatched()?, 0);
     Ok(())
 }
@@ -201,7 +201,7 @@ fn a_message_keeps_its_place_before_others_and_a_full_buffer() -> Result<()> {
 }
 
 #[test]
-fn a_message_over_ipv6_has_a_journey_too() -> Result<()> {
+fn a_message_over_ipv6_has_a_delivery_too() -> Result<()> {
     let mut way = Way::over(Ipv6Addr::LOCALHOST.into())?;
     way.send(Duration::ZERO)?;
     sleep(LATE);
@@ -274,9 +274,9 @@ fn a_quota_is_the_cause_of_the_waits_of_messages() -> Result<()> {
 }
 
 #[test]
-fn a_message_has_a_journey_after_more_messages_than_the_cap() -> Result<()> {
+fn a_message_has_a_delivery_after_more_messages_than_the_cap() -> Result<()> {
     let mut way = Way::new()?;
-    for _ in 0..2 * JOURNEY_CAPACITY / 50 {
+    for _ in 0..2 * DELIVERY_CAPACITY / 50 {
         for _ in 0..50 {
             way.send(Duration::ZERO)?;
         }
@@ -314,19 +314,19 @@ fn a_socket_keeps_its_numbers_while_more_sockets_than_the_cap_receive() -> Resul
 #[test]
 fn a_filled_buffer_before_the_first_question_is_no_wait() -> Result<()> {
     let mut way = Way::new()?;
-    let mut journeys = way.robot.journeys.take().unwrap();
-    journeys.leave();
+    let mut deliveries = way.robot.deliveries.take().unwrap();
+    deliveries.leave();
     way.send(LATE)?;
     way.send(LATE)?;
-    journeys.follow(&File::open(way.host.cgroup())?).unwrap();
-    way.robot.journeys = Some(journeys);
+    deliveries.follow(&File::open(way.host.cgroup())?).unwrap();
+    way.robot.deliveries = Some(deliveries);
     way.send(LATE)?;
     let mut calls = late(&mut way.robot, &mut way.process, "network 3 0");
     assert_eq!(calls.len(), 3, "{calls:#?}");
     let last = calls.pop().unwrap();
     assert_late_for(&last, Stage::Publish, Cause::Send);
     for call in calls {
-        assert!(call.journey.is_none(), "{call:#?}");
+        assert!(call.delivery.is_none(), "{call:#?}");
     }
     Ok(())
 }

@@ -1,11 +1,11 @@
-//! Journeys of messages through the sockets of this host, while a client requests causes of late
+//! Deliveries of messages through the sockets of this host, while a client requests causes of late
 //! calls.
 //!
 //! [`passed`] numbers the datagrams of each socket just before they enter its receive buffer.
 //! [`received`] runs when a thread has received one. The buffer is a queue: the number of that
 //! datagram is the newest number, less the datagrams that are still in the buffer.
 //! A missed drop cannot shift later numbers. A datagram that enters the buffer at the same moment
-//! can hide one journey, which is then unknown.
+//! can hide one delivery, which is then unknown.
 
 use aya_ebpf::{
     bindings::{__sk_buff, bpf_sock_addr},
@@ -14,10 +14,10 @@ use aya_ebpf::{
     maps::{Array, LruHashMap},
 };
 use ros2probe_wire::{
+    delivery::{DELIVERY_CAPACITY, Delivery, DeliveryKey, QUEUE_CAPACITY},
     filter::Counter,
     host::Layout,
     inside::thread_state,
-    journey::{JOURNEY_CAPACITY, Journey, JourneyKey, QUEUE_CAPACITY},
 };
 
 use crate::{
@@ -28,22 +28,22 @@ use crate::{
     packet::hook,
 };
 
-/// 1 = journeys are followed. Set by user space.
+/// 1 = deliveries are followed. Set by user space.
 #[map]
-static FOLLOW_JOURNEYS: Array<u32> = Array::with_max_entries(1, 0);
+static FOLLOW_DELIVERIES: Array<u32> = Array::with_max_entries(1, 0);
 /// Sockets that receive datagrams, by cookie.
 #[map]
 static QUEUES: LruHashMap<u64, Queue> = LruHashMap::with_max_entries(QUEUE_CAPACITY, 0);
 /// Datagrams in the receive buffers.
 #[map]
-static QUEUED: LruHashMap<QueuedKey, Queued> = LruHashMap::with_max_entries(JOURNEY_CAPACITY, 0);
+static QUEUED: LruHashMap<QueuedKey, Queued> = LruHashMap::with_max_entries(DELIVERY_CAPACITY, 0);
 /// Messages that were received.
 #[map]
-static JOURNEYS: LruHashMap<JourneyKey, Journey> =
-    LruHashMap::with_max_entries(JOURNEY_CAPACITY, 0);
+static DELIVERIES: LruHashMap<DeliveryKey, Delivery> =
+    LruHashMap::with_max_entries(DELIVERY_CAPACITY, 0);
 /// Messages that sockets of this host sent: source timestamp to the time of the first datagram.
 #[map]
-static SENT: LruHashMap<u64, u64> = LruHashMap::with_max_entries(JOURNEY_CAPACITY, 0);
+static SENT: LruHashMap<u64, u64> = LruHashMap::with_max_entries(DELIVERY_CAPACITY, 0);
 
 /// A socket's receive buffer.
 #[repr(C)]
@@ -102,10 +102,10 @@ const NEW_QUEUE: Queue = Queue {
 /// Minimum of a wait for a CPU that explains the waits of several datagrams, in nanoseconds.
 const STALL: u64 = 500_000;
 
-/// Returns whether journeys are followed.
+/// Returns whether deliveries are followed.
 #[inline(always)]
 pub fn are_followed() -> bool {
-    match FOLLOW_JOURNEYS.get_ptr(0) {
+    match FOLLOW_DELIVERIES.get_ptr(0) {
         // SAFETY: a map value pointer checked against null.
         Some(followed) => unsafe { core::ptr::read_volatile(followed) != 0 },
         None => false,
@@ -227,7 +227,7 @@ pub fn received(context: *mut bpf_sock_addr) {
     }
 }
 
-/// Notes the journey of the received datagram; `None` if it is not known which one that is. `after`
+/// Notes the delivery of the received datagram; `None` if it is not known which one that is. `after`
 /// is the accounting of the running thread.
 #[inline(always)]
 unsafe fn note(
@@ -256,7 +256,7 @@ unsafe fn note(
         return None;
     }
     let thread = bpf_get_current_pid_tgid();
-    let mut journey = Journey {
+    let mut delivery = Delivery {
         arrived,
         received: now,
         runnable: 0,
@@ -286,19 +286,19 @@ unsafe fn note(
                 throttled += accounting::least((*queue).stall_throttled, during);
                 runnable += accounting::least((*queue).stall_runnable, during);
             }
-            // Both began with an earlier receive call. No part of the journey is longer than it.
+            // Both began with an earlier receive call. No part of the delivery is longer than it.
             let most = now - arrived;
-            journey.throttled = accounting::least(throttled, most);
-            journey.runnable = accounting::least(runnable, most - journey.throttled);
-            journey.accounted = 1;
+            delivery.throttled = accounting::least(throttled, most);
+            delivery.runnable = accounting::least(runnable, most - delivery.throttled);
+            delivery.accounted = 1;
         }
     }
     let process = thread >> 32;
-    let key = JourneyKey {
+    let key = DeliveryKey {
         source_timestamp,
         process,
     };
-    let _ = JOURNEYS.insert(&key, &journey, 0);
+    let _ = DELIVERIES.insert(&key, &delivery, 0);
     Some(())
 }
 

@@ -1,4 +1,4 @@
-//! Journeys of messages from user space: attaches the programs at receive calls to the observed
+//! Deliveries of messages from user space: attaches the programs at receive calls to the observed
 //! control group, and looks messages up.
 
 use std::fs::File;
@@ -9,9 +9,9 @@ use std::time::Duration;
 use aya::Ebpf;
 use aya::maps::{Array, HashMap, MapData};
 use aya::programs::{CgroupSockAddr, ProgramError, ProgramFd};
-use ros2probe_model::facts::calls::late::{MessageJourney, ReceiverStates};
+use ros2probe_model::facts::calls::late::{MessageDelivery, ReceiverStates};
+use ros2probe_wire::delivery::{Delivery, DeliveryKey};
 use ros2probe_wire::inside::late::LateCall;
-use ros2probe_wire::journey::{Journey, JourneyKey};
 
 use super::super::bpf;
 use super::super::error_chain::Reason;
@@ -20,22 +20,22 @@ use super::{FilterError, failed, take};
 /// Programs and their attach types of linux/bpf.h.
 const RECEIVERS: [(&str, u32); 2] = [("received_ipv4", 19), ("received_ipv6", 20)];
 
-type KeyWords = [u64; size_of::<JourneyKey>() / 8];
-type JourneyWords = [u64; size_of::<Journey>() / 8];
+type KeyWords = [u64; size_of::<DeliveryKey>() / 8];
+type DeliveryWords = [u64; size_of::<Delivery>() / 8];
 
-/// The programs and tables of journeys.
-pub struct Journeys {
+/// The programs and tables of deliveries.
+pub struct Deliveries {
     receivers: Result<[ProgramFd; 2], Reason>,
     followed: Array<MapData, u32>,
-    journeys: HashMap<MapData, KeyWords, JourneyWords>,
+    deliveries: HashMap<MapData, KeyWords, DeliveryWords>,
     sent: HashMap<MapData, u64, u64>,
-    /// Present while journeys are followed.
+    /// Present while deliveries are followed.
     links: Vec<OwnedFd>,
 }
 
-/// Why journeys are not followed.
+/// Why deliveries are not followed.
 #[derive(Debug, thiserror::Error)]
-enum NoJourneys {
+enum NoDeliveries {
     /// The kernel does not attach a program.
     #[error("the kernel refuses to observe receive calls")]
     Link(#[source] io::Error),
@@ -44,13 +44,13 @@ enum NoJourneys {
     Program(#[from] ProgramError),
 }
 
-impl Journeys {
+impl Deliveries {
     /// Loads the programs without attaching them.
     ///
     /// # Errors
-    /// Fails if the object lacks a table. A refused program is an error of [`Journeys::follow`].
+    /// Fails if the object lacks a table. A refused program is an error of [`Deliveries::follow`].
     pub(super) fn load(ebpf: &mut Ebpf) -> Result<Self, FilterError> {
-        let mut load = |name| -> Result<ProgramFd, NoJourneys> {
+        let mut load = |name| -> Result<ProgramFd, NoDeliveries> {
             let program = ebpf.program_mut(name);
             let program = program.ok_or(ProgramError::NotLoaded)?;
             let program: &mut CgroupSockAddr = program.try_into()?;
@@ -62,14 +62,14 @@ impl Journeys {
         let receivers = load(ipv4).and_then(|ipv4| Ok([ipv4, load(ipv6)?]));
         Ok(Self {
             receivers: receivers.map_err(|error| Reason::of(&error)),
-            followed: take(ebpf, "FOLLOW_JOURNEYS")?,
-            journeys: take(ebpf, "JOURNEYS")?,
+            followed: take(ebpf, "FOLLOW_DELIVERIES")?,
+            deliveries: take(ebpf, "DELIVERIES")?,
             sent: take(ebpf, "SENT")?,
             links: Vec::new(),
         })
     }
 
-    /// Follows the journeys of all messages from now on, if it does not yet. `cgroup` is the directory of the
+    /// Follows the deliveries of all messages from now on, if it does not yet. `cgroup` is the directory of the
     /// host hook's control group.
     ///
     /// # Errors
@@ -85,9 +85,9 @@ impl Journeys {
             bpf::create_link(program, cgroup, at)
         });
         let links: io::Result<_> = links.collect();
-        self.links = links.map_err(|error| Reason::of(&NoJourneys::Link(error)))?;
+        self.links = links.map_err(|error| Reason::of(&NoDeliveries::Link(error)))?;
         let set = self.followed.set(0, 1, 0);
-        let set = set.map_err(failed("FOLLOW_JOURNEYS", "set"));
+        let set = set.map_err(failed("FOLLOW_DELIVERIES", "set"));
         set.map_err(|error| Reason::of(&error))
     }
 
@@ -100,41 +100,41 @@ impl Journeys {
         let _ = self.followed.set(0, 0, 0);
     }
 
-    /// Returns the journey of the message that triggered a late call; `None` if it is not known: the
+    /// Returns the delivery of the message that triggered a late call; `None` if it is not known: the
     /// message came through no UDP socket, or another copy of it came later.
     #[must_use]
-    pub fn of(&self, call: &LateCall) -> Option<MessageJourney> {
-        let (source_timestamp, journey) = self.find(call)?;
-        if journey.received > call.taken {
+    pub fn of(&self, call: &LateCall) -> Option<MessageDelivery> {
+        let (source_timestamp, delivery) = self.find(call)?;
+        if delivery.received > call.taken {
             return None;
         }
         let before = |time| Duration::from_nanos(call.started.saturating_sub(time));
         let sent = self.sent.get(&source_timestamp, 0).ok();
-        Some(MessageJourney {
-            sent_before: sent.filter(|sent| *sent <= journey.arrived).map(before),
-            arrived_before: before(journey.arrived),
-            received_before: before(journey.received),
-            receiver: (journey.accounted != 0).then(|| ReceiverStates {
-                runnable: Duration::from_nanos(journey.runnable),
-                throttled: Duration::from_nanos(journey.throttled),
+        Some(MessageDelivery {
+            sent_before: sent.filter(|sent| *sent <= delivery.arrived).map(before),
+            arrived_before: before(delivery.arrived),
+            received_before: before(delivery.received),
+            receiver: (delivery.accounted != 0).then(|| ReceiverStates {
+                runnable: Duration::from_nanos(delivery.runnable),
+                throttled: Duration::from_nanos(delivery.throttled),
             }),
         })
     }
 
-    /// Finds a journey with the source timestamp of its datagrams. Middlewares round the wire's
+    /// Finds a delivery with the source timestamp of its datagrams. Middlewares round the wire's
     /// fraction of a second to nanoseconds in different ways.
-    fn find(&self, call: &LateCall) -> Option<(u64, Journey)> {
+    fn find(&self, call: &LateCall) -> Option<(u64, Delivery)> {
         let taken = call.source_timestamp;
         if taken == 0 {
             return None;
         }
         let all = [taken, taken.wrapping_sub(1), taken.wrapping_add(1)];
         all.into_iter().find_map(|source_timestamp| {
-            let key: KeyWords = zerocopy::transmute!(JourneyKey {
+            let key: KeyWords = zerocopy::transmute!(DeliveryKey {
                 source_timestamp,
                 process: u64::from(call.process),
             });
-            let words = self.journeys.get(&key, 0).ok()?;
+            let words = self.deliveries.get(&key, 0).ok()?;
             Some((source_timestamp, zerocopy::transmute!(words)))
         })
     }
