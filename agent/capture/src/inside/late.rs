@@ -153,6 +153,8 @@ impl LateObservation {
             _ if needs_events => mode::EVENTS,
             _ => mode::SUMS,
         };
+        // These need an older kernel than the events.
+        self.follow_deliveries(mode == mode::EVENTS);
         if mode == mode::EVENTS && self.events.is_none() && self.without_events.is_none() {
             match self.programs.observe_scheduler() {
                 Ok(events) => self.events = Some(events),
@@ -172,7 +174,6 @@ impl LateObservation {
             true => mode::SUMS,
             false => mode,
         };
-        self.follow_deliveries(mode == mode::EVENTS);
         if mode == self.mode {
             return;
         }
@@ -185,7 +186,7 @@ impl LateObservation {
         }
     }
 
-    /// Begins or ends following deliveries of messages, together with the scheduler's events.
+    /// Begins or ends following deliveries of messages.
     fn follow_deliveries(&mut self, wanted: bool) {
         let Some((deliveries, cgroup)) = &mut self.deliveries else {
             return;

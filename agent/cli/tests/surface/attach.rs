@@ -66,16 +66,13 @@ impl Running {
             .arg(&socket)
             .spawn()
             .unwrap();
-        let began = Instant::now();
-        while !socket.exists() {
-            assert!(began.elapsed() < PATIENCE, "no socket");
-            std::thread::sleep(Duration::from_millis(10));
-        }
-        Self {
+        let running = Self {
             child,
             socket,
             directory,
-        }
+        };
+        drop(running.raw());
+        running
     }
 
     fn client(&self) -> Broker {
@@ -86,7 +83,7 @@ impl Running {
         let kind = SocketType::SEQPACKET;
         let socket = socket_with(AddressFamily::UNIX, kind, SocketFlags::CLOEXEC, None).unwrap();
         let address = SocketAddrUnix::new(&self.socket).unwrap();
-        // The broker may not listen yet.
+        // The socket may not exist yet, or the broker may not listen.
         let began = Instant::now();
         while connect(&socket, &address).is_err() {
             assert!(began.elapsed() < PATIENCE, "refused");
