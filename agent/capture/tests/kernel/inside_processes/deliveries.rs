@@ -246,30 +246,31 @@ fn a_stopped_process_is_the_cause_of_a_wait_in_its_socket() -> Result<()> {
 fn a_quota_is_the_cause_of_the_waits_of_messages() -> Result<()> {
     let mut way = Way::new()?;
     // The process waits for the messages while another thread of its group computes.
-    way.process.begin("network 5 0");
+    const MESSAGES: usize = 60;
+    way.process.begin(&format!("network {MESSAGES} 0"));
     sleep(Duration::from_millis(20));
     let quota = Quota::a_twentieth_for(&way.process);
     let hog = Hog::on("0-1");
     quota.use_up(&hog);
-    sleep(Duration::from_millis(150));
-    for _ in 0..5 {
+    for _ in 0..MESSAGES {
         way.send(Duration::ZERO)?;
+        sleep(Duration::from_millis(15));
     }
     way.process.end("network");
     drop(hog);
     drop(quota);
     let calls = way.robot.round().report.late;
-    assert!(!calls.is_empty());
-    for call in &calls {
-        let parts = call.parts();
-        let main = call.main_part(ThreadStates::default()).unwrap();
-        // Since Linux 6.18, a thread is throttled at the end of its system call.
+    let mains = calls
+        .iter()
+        .map(|call| call.main_part(ThreadStates::default()).unwrap());
+    // Since Linux 6.18, a thread is throttled at the end of its system call.
+    let throttled = mains.filter(|main| {
         let is_in_process = matches!(main.stage, Stage::Socket | Stage::Wait);
-        assert!(
-            is_in_process && main.cause == Cause::Throttled,
-            "{parts:?} {call:#?}"
-        );
-    }
+        is_in_process && main.cause == Cause::Throttled
+    });
+    // On a busy machine, other threads make some messages late.
+    let throttled = throttled.count();
+    assert!(throttled > 0 && throttled * 2 >= calls.len(), "{calls:#?}");
     Ok(())
 }
 
