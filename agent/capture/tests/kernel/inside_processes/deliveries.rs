@@ -137,6 +137,15 @@ fn assert_late_for(call: &LateCall, stage: Stage, cause: Cause) {
     assert!(main.duration >= LATE - IMPRECISION, "{parts:?} {call:#?}");
 }
 
+/// Asserts that a message that no thread receives is late for that reason.
+fn assert_waits_in_socket(way: &mut Way) -> Result<()> {
+    way.send(Duration::ZERO)?;
+    sleep(LATE);
+    let call = way.receive("network 1 0");
+    assert_late_for(&call, Stage::Socket, Cause::Queue);
+    Ok(())
+}
+
 #[test]
 fn a_message_that_its_publisher_sends_late_names_the_publisher() -> Result<()> {
     let mut way = Way::new()?;
@@ -161,10 +170,7 @@ fn a_message_of_another_host_that_arrives_late_names_the_network() -> Result<()>
 #[test]
 fn a_message_that_nobody_receives_names_the_socket() -> Result<()> {
     let mut way = Way::new()?;
-    way.send(Duration::ZERO)?;
-    sleep(LATE);
-    let call = way.receive("network 1 0");
-    assert_late_for(&call, Stage::Socket, Cause::Queue);
+    assert_waits_in_socket(&mut way)?;
     Ok(())
 }
 
@@ -203,10 +209,7 @@ fn a_message_keeps_its_place_before_others_and_a_full_buffer() -> Result<()> {
 #[test]
 fn a_message_over_ipv6_has_a_delivery_too() -> Result<()> {
     let mut way = Way::over(Ipv6Addr::LOCALHOST.into())?;
-    way.send(Duration::ZERO)?;
-    sleep(LATE);
-    let call = way.receive("network 1 0");
-    assert_late_for(&call, Stage::Socket, Cause::Queue);
+    assert_waits_in_socket(&mut way)?;
     Ok(())
 }
 
@@ -284,10 +287,7 @@ fn a_message_has_a_delivery_after_more_messages_than_the_cap() -> Result<()> {
         assert_eq!(way.process.run("drain"), "50 drain\n");
     }
     assert_eq!(way.unmatched()?, 0);
-    way.send(Duration::ZERO)?;
-    sleep(LATE);
-    let call = way.receive("network 1 0");
-    assert_late_for(&call, Stage::Socket, Cause::Queue);
+    assert_waits_in_socket(&mut way)?;
     Ok(())
 }
 
@@ -305,10 +305,7 @@ fn a_socket_keeps_its_numbers_while_more_sockets_than_the_cap_receive() -> Resul
         way.send(Duration::ZERO)?;
         assert_eq!(way.process.run("drain"), "1 drain\n");
     }
-    way.send(Duration::ZERO)?;
-    sleep(LATE);
-    let call = way.receive("network 1 0");
-    assert_late_for(&call, Stage::Socket, Cause::Queue);
+    assert_waits_in_socket(&mut way)?;
     Ok(())
 }
 
