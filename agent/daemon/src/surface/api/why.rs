@@ -120,11 +120,14 @@ fn why<'a>(
         timestamp_seconds: snapshot.time().seconds(),
         observed: Cow::Borrowed(source.map_or("off", |source| source.late)),
         reason: source.and_then(|source| {
+            // Where late calls are off, nothing is missing for them.
+            let without_deliveries = source.without_deliveries.as_ref();
+            let without_deliveries = without_deliveries.filter(|_| source.late != "off");
             let reason = source
                 .reason_off
                 .as_ref()
                 .or(source.without_events.as_ref())
-                .or(source.without_deliveries.as_ref());
+                .or(without_deliveries);
             Some(Cow::Borrowed(reason?.as_str()))
         }),
         ..Why::default()
