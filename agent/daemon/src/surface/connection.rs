@@ -118,6 +118,14 @@ impl Connections {
         longest.map(|(_, state)| state.end.cancel()).is_some()
     }
 
+    /// Returns whether a connection was not read since it was accepted or answered.
+    pub(super) fn has_unread(&self) -> bool {
+        self.lock().iter().any(|state| {
+            let progress = state.lock();
+            progress.phase == Phase::Waiting && !progress.was_empty && !state.end.is_cancelled()
+        })
+    }
+
     /// Waits until a connection has been closed.
     pub(super) async fn left(&self) {
         self.left.notified().await;

@@ -1,6 +1,6 @@
 //! A listener with a limited number of connections. If all slots are in use, the connection that
 //! has waited longest for its client is closed. If no connection waits, a further client receives
-//! 503 immediately.
+//! 503: immediately, or after 100 ms if some connections were not read yet.
 
 use std::io;
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use std::time::Duration;
 use axum::serve::Listener;
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 use tokio::task::JoinSet;
-use tokio::time::timeout;
+use tokio::time::{sleep, timeout};
 
 use super::connection::{Connection, Connections};
 use crate::config::Limit;
@@ -21,8 +21,11 @@ const REFUSAL_TIMEOUT: Duration = Duration::from_secs(1);
 const FAREWELLS: usize = 64;
 /// Maximum number of bytes read of a refused request, so that its sender receives the answer.
 const REQUEST: u64 = 64 << 10;
-/// Maximum time that an evicted connection may take to close.
+/// Maximum time until a new connection gets the slot of another one: until one is found that waits
+/// for its client, and is closed.
 const EVICTION_TIMEOUT: Duration = Duration::from_millis(100);
+/// Time between two searches for a connection that waits for its client.
+const PAUSE: Duration = Duration::from_millis(2);
 
 /// A listener with a limited number of connections.
 #[derive(Debug)]
@@ -66,22 +69,25 @@ impl<L> LimitedListener<L> {
             return Some(slot);
         }
         self.limits.reached(self.limit, 1);
-        if !self.connections.make_room() {
-            // Connections that were just accepted have not been read yet.
-            tokio::task::yield_now().await;
-            if !self.connections.make_room() {
-                return None;
-            }
-        }
         let freed = async {
+            while !self.connections.make_room() {
+                // Threads without CPU time have not read some connections yet.
+                if !self.connections.has_unread() {
+                    return None;
+                }
+                sleep(PAUSE).await;
+                if let Some(slot) = self.slots.take() {
+                    return Some(slot);
+                }
+            }
             loop {
                 self.connections.left().await;
                 if let Some(slot) = self.slots.take() {
-                    return slot;
+                    return Some(slot);
                 }
             }
         };
-        timeout(EVICTION_TIMEOUT, freed).await.ok()
+        timeout(EVICTION_TIMEOUT, freed).await.ok().flatten()
     }
 
     /// Refuses a connection without a slot, in the background. The number of such answers in
@@ -130,5 +136,57 @@ impl Refusal {
         // Closing with unread data would reset the connection and might lose the answer.
         tokio::io::copy(&mut stream.take(REQUEST), &mut tokio::io::sink()).await?;
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{DuplexStream, duplex};
+
+    use super::*;
+    use crate::config::Limits;
+
+    /// Accepts a connection of a client that sends nothing, whenever one is wanted.
+    struct Silent(Vec<DuplexStream>);
+
+    impl Listener for Silent {
+        type Io = DuplexStream;
+        type Addr = ();
+
+        async fn accept(&mut self) -> (DuplexStream, ()) {
+            let (ours, theirs) = duplex(64);
+            self.0.push(theirs);
+            (ours, ())
+        }
+
+        fn local_addr(&self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_new_client_waits_until_one_of_the_unread_connections_is_read_and_closed() {
+        let limits = Arc::new(LimitFigures::new(Limits::default()));
+        let limit = Limit::ApiClients;
+        let mut listener = LimitedListener::new(Silent(Vec::new()), limits.clone(), limit, None);
+        let mut unread = Vec::new();
+        for _ in 0..limits.caps().get(limit) {
+            unread.push(listener.accept().await);
+        }
+        let mut first = unread.remove(0);
+        tokio::spawn(async move {
+            sleep(Duration::from_millis(50)).await;
+            let ended = Arc::clone(first.state());
+            tokio::select! {
+                _ = first.read_u8() => {}
+                () = ended.ended() => {}
+            }
+        });
+        let began = tokio::time::Instant::now();
+        let _new = listener.accept().await;
+        let waited = began.elapsed().as_millis();
+        assert!((50..60).contains(&waited), "{waited} ms");
+        // Each of the other connections stays unread.
+        assert!(listener.slot().await.is_none());
     }
 }

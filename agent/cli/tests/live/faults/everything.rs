@@ -214,13 +214,14 @@ fn answers(askers: Vec<Asker>) -> Result<Vec<String>> {
     let mut answered = Vec::new();
     for asker in askers {
         let (what, answers) = asker.end()?;
-        let refused = answers.refused.join("; ");
         // An unoptimized agent may fall behind, and reports it.
-        let may_refuse = long().is_none() && what == "/readyz";
-        ensure!(
-            (refused.is_empty() || may_refuse) && answers.count > 0,
-            "{what}: {refused}"
-        );
+        let (may, not): (Vec<_>, Vec<_>) = answers
+            .refused
+            .into_iter()
+            .partition(|answer| long().is_none() && is_busy(answer));
+        ensure!(not.is_empty(), "{what}: {}", not.join("; "));
+        let answered_once = answers.count > may.len() as u64 || what == "/readyz";
+        ensure!(answered_once, "{what}: {}", may.join("; "));
         let longest = answers.longest;
         ensure!(
             longest < LONGEST[usize::from(long().is_none())],
@@ -255,10 +256,23 @@ fn storms(link: &Link) -> Result<[Storm; 4]> {
     ])
 }
 
-/// Reads the metrics without a scraper's timeout.
+/// Returns whether an answer says that the agent cannot process the request now.
+fn is_busy(answer: &str) -> bool {
+    answer.starts_with("HTTP/1.1 503 ")
+}
+
+/// Reads the metrics without a scraper's timeout. Repeats the request, as a scraper does, while an
+/// unoptimized agent refuses it.
 fn page(doors: &Doors) -> Result<Scrape> {
     let head = "GET /metrics HTTP/1.1\r\nHost: localhost:17400";
-    let answer = answer(doors.metrics()?, head)?;
+    let deadline = Instant::now() + SENT;
+    let answer = loop {
+        let answer = answer(doors.metrics()?, head)?;
+        if !is_busy(&answer) || long().is_some() || Instant::now() > deadline {
+            break answer;
+        }
+        std::thread::sleep(Duration::from_millis(500));
+    };
     ensure!(answer.starts_with("HTTP/1.1 200 "), "{answer:.600}");
     Ok(Scrape(answer))
 }
