@@ -196,8 +196,10 @@ pub mod accounting {
     pub const STATE: usize = 6;
     /// `task_struct.pid`, the id of the thread.
     pub const THREAD: usize = 7;
+    /// `task_struct.prio`, the priority that the scheduler uses.
+    pub const PRIORITY: usize = 8;
     /// Number of these members.
-    pub const COUNT: usize = 8;
+    pub const COUNT: usize = 9;
     /// A member that the running kernel does not have.
     pub const ABSENT: u32 = u32::MAX;
 }

@@ -15,15 +15,18 @@ use core::{
 use aya_ebpf::{
     helpers::{
         bpf_get_current_pid_tgid, bpf_get_current_task, bpf_probe_read_kernel,
-        generated::{bpf_get_current_comm, bpf_get_current_task_btf, bpf_task_pt_regs},
+        generated::{
+            bpf_get_current_cgroup_id, bpf_get_current_comm, bpf_get_current_task_btf,
+            bpf_task_pt_regs,
+        },
     },
     macros::map,
     maps::PerCpuArray,
     programs::RawTracePointContext,
 };
 use ros2probe_wire::inside::{
-    accounting::{RUN_DELAY, RUNTIME, STATE, THREAD},
-    late::{Activity, Blocked, NAME_BYTES, OTHERS, Other, wait},
+    accounting::{PRIORITY, RUN_DELAY, RUNTIME, STATE, THREAD},
+    late::{Activity, Blocked, NAME_BYTES, OTHERS, Other, UNKNOWN_PRIORITY, wait},
 };
 
 use crate::{
@@ -55,6 +58,9 @@ struct Run {
     /// Thread id in the low half, process id in the high half.
     id: u64,
     name: [u64; NAME_BYTES / 8],
+    /// As in [`Other`].
+    group: u64,
+    priority: i64,
 }
 
 /// The last runs of a CPU. Only those are present during which a followed thread could run.
@@ -120,6 +126,7 @@ pub fn woken(context: &RawTracePointContext) {
         (*followed).wait.waker_process = (id >> 32) as u32;
         let name = (&raw mut (*followed).wait.waker_name).cast();
         bpf_get_current_comm(name, NAME_BYTES as u32);
+        (*followed).wait.waker_group = bpf_get_current_cgroup_id();
         unblocked(followed, now);
         (*followed).state = state::RUNNABLE;
         (*followed).since = now;
@@ -255,6 +262,10 @@ unsafe fn remember(runs: *mut Runs, id: u64, now: u64) {
         (*run).until = now;
         (*run).id = id << 32 | id >> 32;
         bpf_get_current_comm((&raw mut (*run).name).cast(), NAME_BYTES as u32);
+        (*run).group = bpf_get_current_cgroup_id();
+        let task = bpf_get_current_task();
+        let priority = read::<i32>(member(task, PRIORITY));
+        (*run).priority = priority.map_or(UNKNOWN_PRIORITY, i64::from);
     }
 }
 
@@ -298,6 +309,14 @@ unsafe fn attribute(activity: *mut Activity, runs: *const Runs, since: u64) {
                 (read_volatile(other.add(2)), read_volatile(other.add(3)));
             write_volatile(other.add(2), select(is_named, low, known_low));
             write_volatile(other.add(3), select(is_named, high, known_high));
+            let (group, priority) = (
+                read_volatile(&raw const (*run).group),
+                read_volatile(&raw const (*run).priority) as u64,
+            );
+            let (known_group, known_priority) =
+                (read_volatile(other.add(4)), read_volatile(other.add(5)));
+            write_volatile(other.add(4), select(is_named, group, known_group));
+            write_volatile(other.add(5), select(is_named, priority, known_priority));
             back += 1;
         }
     }
@@ -377,7 +396,13 @@ fn kind_of(state: u64, number: u32) -> usize {
 /// Returns a member of 32 bits of a task; 0 if it cannot be read.
 #[inline(always)]
 fn number(task: u64, of: usize) -> u32 {
-    read(task.wrapping_add(u64::from(crate::accounting::offset(of)))).unwrap_or(0)
+    read(member(task, of)).unwrap_or(0)
+}
+
+/// Returns the address of a member of a task, by `accounting`.
+#[inline(always)]
+fn member(task: u64, of: usize) -> u64 {
+    task.wrapping_add(u64::from(crate::accounting::offset(of)))
 }
 
 #[inline(always)]

@@ -108,6 +108,8 @@ pub enum Diagnosis<'a> {
         cause: Cow<'a, str>,
         /// Name of the thread that ran instead or released the lock; null without one.
         by: Option<Cow<'a, str>>,
+        /// Systemd unit, container or control group of that thread, as in the answer of `/why`.
+        by_unit: Option<Cow<'a, str>>,
         /// The cause in words.
         words: Cow<'a, str>,
         /// Time from ready to the end of the longest of the last of these calls.

@@ -41,6 +41,8 @@ pub struct Cause<'a> {
     /// Name of the thread that ran instead, released the lock, or continued the process; null for
     /// other causes.
     pub by: Option<Cow<'a, str>>,
+    /// Systemd unit, container or control group of that thread, as in [`OtherThread`].
+    pub by_unit: Option<Cow<'a, str>>,
     /// Late calls.
     pub late_calls: u64,
     /// The longest of these calls, from ready to the end.
@@ -135,6 +137,14 @@ pub struct OtherThread<'a> {
     pub thread_id: u32,
     /// Id of its process.
     pub process_id: u32,
+    /// Its systemd unit, the first digits of its container's id, or the last part of its control
+    /// group's path; null if that is the root of version 2 or no longer exists.
+    #[cfg_attr(feature = "openapi", schema(example = "kiosk.service"))]
+    pub unit: Option<Cow<'a, str>>,
+    /// Its priority when it last left the CPU: `real-time N`, `nice N` or `deadline`; null if it is
+    /// unknown, as for a thread that ended a wait.
+    #[cfg_attr(feature = "openapi", schema(example = "nice -5"))]
+    pub priority: Option<Cow<'a, str>>,
     /// Time for which it ran instead.
     pub seconds: f64,
 }

@@ -112,6 +112,7 @@ pub(crate) fn accounting_offsets(types: Option<&KernelTypes>) -> [u32; accountin
         ("task_group", "cfs_bandwidth.throttled_time"),
         ("task_struct", "__state"),
         ("task_struct", "pid"),
+        ("task_struct", "prio"),
     ];
     let find = |(structure, member)| types?.offset(structure, member);
     let mut offsets = members.map(|member| find(member).unwrap_or(accounting::ABSENT));

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use jiff::Timestamp;
 use jiff::tz::TimeZone;
-use ros2probe_api::why::{LateCall, LateCallback, Part, Why};
+use ros2probe_api::why::{LateCall, LateCallback, OtherThread, Part, Why};
 
 use crate::top::text::{counted, safe, seconds};
 
@@ -103,9 +103,8 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
         .map(|other| match other.thread_id {
             0 => format!("no one (idle CPU) {}", seconds(other.seconds)),
             _ => format!(
-                "{} ({}) {}",
-                safe(&other.name),
-                other.process_id,
+                "{} {}",
+                named(other, other.process_id.to_string()),
                 seconds(other.seconds)
             ),
         })
@@ -122,10 +121,12 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
             Some(name) => format!("{}({})", safe(name), safe(&blocked.argument)),
             None => "no system call".to_owned(),
         };
-        let ended = blocked
-            .ended_by
-            .as_ref()
-            .map(|by| format!(", ended by {} (thread {})", safe(&by.name), by.thread_id));
+        let ended = blocked.ended_by.as_ref().map(|by| {
+            format!(
+                ", ended by {}",
+                named(by, format!("thread {}", by.thread_id))
+            )
+        });
         let _ = writeln!(
             out,
             "  longest blocked: {} in {system_call}{}",
@@ -147,6 +148,15 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
             seconds(previous.duration_seconds)
         );
     }
+}
+
+/// Returns a thread with its id in words, its unit, and a priority other than the usual one.
+fn named(other: &OtherThread<'_>, id: String) -> String {
+    let mut facts = vec![id];
+    facts.extend(other.unit.as_deref().map(safe));
+    let priority = other.priority.as_deref().filter(|it| *it != "nice 0");
+    facts.extend(priority.map(safe));
+    format!("{} ({})", safe(&other.name), facts.join(", "))
 }
 
 /// Returns the parts that are not small, with their lengths.
@@ -193,7 +203,7 @@ fn time(seconds: f64, zone: &TimeZone) -> String {
 #[cfg(test)]
 mod tests {
     use ros2probe_api::inside::{Owner, Trigger};
-    use ros2probe_api::why::{Blocked, Cause, OtherThread};
+    use ros2probe_api::why::{Blocked, Cause};
 
     use super::*;
 
@@ -245,6 +255,8 @@ mod tests {
                         name: "chromium\u{1b}".into(),
                         thread_id: 7,
                         process_id: 6,
+                        unit: Some("kiosk.service".into()),
+                        priority: Some("nice -5".into()),
                         seconds: 0.03,
                     }],
                     blocked: Some(Blocked {
@@ -272,7 +284,7 @@ mod tests {
   before the call   40ms  arrival 40ms
   in the call      120ms  cpu 20ms, throttled 80ms, lock 20ms
   [aaaaaaaaaaaaccccccttttttttttttttttttttttttllllll]
-  ran instead: chromium\\u{1b} (6) 30ms
+  ran instead: chromium\\u{1b} (6, kiosk.service, nice -5) 30ms
   longest blocked: 20ms in futex(0x7f00)
 ";
         assert_eq!(text, expected);

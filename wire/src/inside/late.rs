@@ -20,6 +20,9 @@ pub const OTHERS: usize = 8;
 /// Size of a thread's name with its terminating zero, `TASK_COMM_LEN` of the kernel.
 pub const NAME_BYTES: usize = 16;
 
+/// The priority of a thread whose priority cannot be read.
+pub const UNKNOWN_PRIORITY: i64 = i64::MIN;
+
 /// What the programs observe.
 pub mod mode {
     /// No late calls.
@@ -78,6 +81,11 @@ pub struct Other {
     pub process: u32,
     /// Name of the thread.
     pub name: [u8; NAME_BYTES],
+    /// Its control group: the inode of its directory.
+    pub group: u64,
+    /// Its priority as in `task_struct.prio`: -1 = deadline, 0 to 98 = real time, 100 to 139 = a nice
+    /// value. [`UNKNOWN_PRIORITY`] = unknown.
+    pub priority: i64,
 }
 
 /// A time in which a thread was blocked.
@@ -100,6 +108,8 @@ pub struct Blocked {
     pub waker_process: u32,
     /// Name of that thread.
     pub waker_name: [u8; NAME_BYTES],
+    /// Control group of that thread, as in [`Other`].
+    pub waker_group: u64,
 }
 
 /// What a thread did in a span of time, by the events of the scheduler, in nanoseconds.

@@ -4,7 +4,7 @@
 //! Without a bound from a client or an expectation, the bound is learnt. It is three times the 99th
 //! percentile of the callback's calls in the last minutes, and [`LEAST_BOUND`] or more.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::fs::File;
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,7 +12,7 @@ use std::time::Duration;
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::calls::late::{
     Activity, Blocked, CpuLimit, LateBound, LateCall, MessageDelivery, OtherThread, PreviousCall,
-    Stop,
+    Priority, Stop,
 };
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
 use ros2probe_model::facts::names::NodeName;
@@ -349,12 +349,33 @@ fn p99(counts: &[f32; BUCKETS]) -> Option<u64> {
 const DURING: u32 = 1;
 const BEFORE: u32 = 2;
 
+/// Returns the unit of a control group, by the inode of its directory.
+pub(super) type UnitOf<'a> = &'a dyn Fn(u64) -> Option<Arc<str>>;
+
+/// Returns the control groups of other threads in these calls, by the inodes of their directories.
+pub(super) fn groups(calls: &[late::LateCall]) -> BTreeSet<u64> {
+    let of_call = |call: &late::LateCall| {
+        let activities = [call.during, call.before];
+        let waker = |blocked: &late::Blocked| blocked.waker_group;
+        let others = activities.map(|activity| activity.others.map(|other| other.group));
+        let wakers = activities.map(|activity| waker(&activity.longest));
+        let groups = others.into_iter().flatten().chain(wakers);
+        groups.chain([waker(&call.stop)])
+    };
+    calls
+        .iter()
+        .flat_map(of_call)
+        .filter(|group| *group != 0)
+        .collect()
+}
+
 /// Converts one item. `name` returns the trigger and node of a callback of the same process.
 pub(super) fn convert(
     call: &late::LateCall,
     clocks: &Clocks,
     delivery: Option<MessageDelivery>,
     cpu_limits: &Arc<[CpuLimit]>,
+    unit_of: UnitOf<'_>,
     mut name: impl FnMut(u64) -> (Trigger, Option<NodeName>),
 ) -> LateCall {
     let (trigger, node) = name(call.callback);
@@ -379,7 +400,7 @@ pub(super) fn convert(
         cpu_limits: Arc::clone(cpu_limits),
         stop: (call.stop_ended != 0 && call.stop_ended <= call.started).then(|| Stop {
             ended_before: between(call.stop_ended, call.started),
-            wait: blocked(&call.stop),
+            wait: blocked(&call.stop, unit_of),
         }),
         source: (call.source_timestamp != 0).then_some(Timestamp(call.source_timestamp)),
         started: clocks.calendar(call.started),
@@ -389,8 +410,8 @@ pub(super) fn convert(
         previous,
         states: states(DURING, &call.states),
         states_before: states(BEFORE, &call.states_before),
-        activity: has_events.then(|| activity(&call.during)),
-        activity_before: has_events.then(|| activity(&call.before)),
+        activity: has_events.then(|| activity(&call.during, unit_of)),
+        activity_before: has_events.then(|| activity(&call.before, unit_of)),
     }
 }
 
@@ -405,7 +426,7 @@ fn thread_states(states: &[u64; thread_state::COUNT]) -> ThreadStates {
     }
 }
 
-fn activity(activity: &late::Activity) -> Activity {
+fn activity(activity: &late::Activity, unit_of: UnitOf<'_>) -> Activity {
     let others = activity.others.iter();
     let others = others.filter(|other| other.nanoseconds != 0);
     let mut others: Vec<_> = others
@@ -414,6 +435,8 @@ fn activity(activity: &late::Activity) -> Activity {
             thread: other.thread,
             process: other.process,
             name: name(&other.name),
+            unit: unit_of(other.group),
+            priority: Priority::of_kernel(other.priority),
         })
         .collect();
     others.sort_by(|one, other| other.cmp(one));
@@ -426,12 +449,12 @@ fn activity(activity: &late::Activity) -> Activity {
         runnable: Duration::from_nanos(activity.runnable),
         stolen: Duration::from_nanos(activity.stolen),
         blocked: activity.blocked.map(Duration::from_nanos),
-        longest: (longest.nanoseconds != 0).then(|| blocked(longest)),
+        longest: (longest.nanoseconds != 0).then(|| blocked(longest, unit_of)),
         others,
     }
 }
 
-fn blocked(blocked: &late::Blocked) -> Blocked {
+fn blocked(blocked: &late::Blocked, unit_of: UnitOf<'_>) -> Blocked {
     let kind = blocked.kind as usize;
     // An interrupt ends any other wait, whatever thread it interrupts.
     let has_waker = matches!(kind, wait::LOCK | wait::STOPPED) && blocked.waker != 0;
@@ -445,6 +468,8 @@ fn blocked(blocked: &late::Blocked) -> Blocked {
             thread: blocked.waker,
             process: blocked.waker_process,
             name: name(&blocked.waker_name),
+            unit: unit_of(blocked.waker_group),
+            priority: None,
         }),
     }
 }

@@ -23,10 +23,12 @@ use ros2probe_wire::{DomainId, Timestamp};
 use zerocopy::FromBytes as _;
 
 use super::cpu_limits;
-use super::late::convert;
+use super::late::{convert, groups};
 use super::names::{Endpoint, Names, text};
 use super::process::Stat;
 use super::programs::Tables;
+use crate::cgroup;
+use crate::cgroup_paths::{CgroupPaths, short_name};
 use crate::system::Clocks;
 use crate::tables::{CausalHops, InsideBuffers, LateCalls, NewNodes, ReportedHandles, Transitions};
 
@@ -44,6 +46,8 @@ pub struct ProcessTable {
     hops: Bounded<CausalHops, Vec<inside::Hop>>,
     late: Bounded<LateCalls, Vec<late::LateCall>>,
     transitions: Bounded<Transitions, Vec<Transition>>,
+    /// Control groups of the threads that late calls name.
+    groups: CgroupPaths,
     rounds: u32,
     /// Time since calls per second were last evaluated.
     unjudged: Duration,
@@ -130,6 +134,7 @@ impl ProcessTable {
             hops: Bounded::default(),
             late: Bounded::default(),
             transitions: Bounded::default(),
+            groups: CgroupPaths::new(cgroup::mount_point().unwrap_or_default()),
             rounds: 0,
             unjudged: Duration::ZERO,
         }
@@ -314,6 +319,7 @@ impl ProcessTable {
             true => Arc::new([]),
             false => cpu_limits::read(Path::new("/sys")),
         };
+        self.groups.refresh(&groups(&calls));
         let late = calls
             .iter()
             .filter_map(|call| self.late_call(call, delivery(call), &cpu_limits, &figures, clocks));
@@ -526,18 +532,29 @@ impl ProcessTable {
         clocks: &Clocks,
     ) -> Option<LateCall> {
         self.known.get(&call.process)?;
-        Some(convert(call, clocks, delivery, cpu_limits, |address| {
-            let key = Handle {
-                address,
-                process: call.process,
-                kind: kind::CALLBACK,
-            };
-            let found = figures.iter().find(|(handle, _)| *handle == key);
-            let unknown = (Trigger::Service(None), None);
-            found.map_or(unknown, |(handle, figures)| {
-                self.name_callback(*handle, figures)
-            })
-        }))
+        let unit_of = |group| {
+            let path = self.groups.path(group).filter(|path| *path != "/")?;
+            Some(short_name(path).into())
+        };
+        Some(convert(
+            call,
+            clocks,
+            delivery,
+            cpu_limits,
+            &unit_of,
+            |address| {
+                let key = Handle {
+                    address,
+                    process: call.process,
+                    kind: kind::CALLBACK,
+                };
+                let found = figures.iter().find(|(handle, _)| *handle == key);
+                let unknown = (Trigger::Service(None), None);
+                found.map_or(unknown, |(handle, figures)| {
+                    self.name_callback(*handle, figures)
+                })
+            },
+        ))
     }
 
     /// Returns the trigger of a callback, and its node.

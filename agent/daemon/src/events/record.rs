@@ -468,7 +468,11 @@ fn inside(finding: &Diagnosis) -> Values {
             ("late_calls", number(*calls)),
             ("stage", Some(text(stage.label()))),
             ("cause", Some(text(cause.label()))),
-            ("by", by.as_deref().map(text)),
+            ("by", by.as_ref().map(|by| text(&by.name))),
+            (
+                "by_unit",
+                by.as_ref().and_then(|by| by.unit.as_deref().map(text)),
+            ),
             ("longest_seconds", seconds(longest)),
         ]),
         Diagnosis::IntraProcessOverflow {

@@ -16,7 +16,7 @@ use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{DomainId, Guid};
 
 use crate::facts::calls::facts::Owner;
-use crate::facts::calls::late::{Cause, Stage};
+use crate::facts::calls::late::{Cause, Culprit, Stage};
 use crate::facts::calls::report::Trigger;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
 use crate::facts::topic_kind::TopicKind;
@@ -150,8 +150,8 @@ pub enum Diagnosis {
         stage: Stage,
         /// What made them late.
         cause: Cause,
-        /// Name of the thread that ran instead or held the lock, in the longest of the last calls.
-        by: Option<Arc<str>>,
+        /// Thread that ran instead or held the lock, in the longest of the last calls.
+        by: Option<Culprit>,
         /// Time from ready to the end of that call.
         longest: Duration,
     },

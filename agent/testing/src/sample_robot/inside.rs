@@ -10,7 +10,7 @@ use ros2probe_model::facts::calls::facts::{
     TopicInside,
 };
 use ros2probe_model::facts::calls::late::{
-    Activity, Cause, LateBound, LateCall, OtherThread, Stage,
+    Activity, Cause, Culprit, LateBound, LateCall, OtherThread, Priority, Stage,
 };
 use ros2probe_model::facts::calls::report::{Durations, ThreadStates, Trigger};
 use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
@@ -149,6 +149,13 @@ pub fn source() -> InsideSourceFacts {
     }
 }
 
+fn chromium() -> Culprit {
+    Culprit {
+        name: "chromium".into(),
+        unit: Some("kiosk.service".into()),
+    }
+}
+
 /// Returns a callback with one late call, beside which another thread ran.
 fn late(topic: TopicName) -> LateCallback {
     let trigger = Trigger::Subscription(topic);
@@ -157,6 +164,8 @@ fn late(topic: TopicName) -> LateCallback {
         thread: 3_122,
         process: 3_121,
         name: "chromium".into(),
+        unit: Some("kiosk.service".into()),
+        priority: Some(Priority::Nice(-5)),
     };
     let bound = Duration::from_millis(30);
     let states = |cpu: u64, runnable: u64| ThreadStates {
@@ -205,7 +214,7 @@ fn late(topic: TopicName) -> LateCallback {
         stage: Stage::Callback,
         cause: Cause::Runnable,
         total: call.total(),
-        culprit: Some("chromium".into()),
+        culprit: Some(chromium()),
     };
     LateCallback {
         owner: owner(0x40),
@@ -245,7 +254,7 @@ pub fn findings(topic: &TopicKey) -> [Diagnosis; 6] {
             calls: 34,
             stage: Stage::Callback,
             cause: Cause::Runnable,
-            by: Some("chromium".into()),
+            by: Some(chromium()),
             longest: Duration::from_millis(105),
         },
         Diagnosis::IntraProcessOverflow {

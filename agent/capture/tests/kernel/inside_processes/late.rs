@@ -3,8 +3,9 @@
 use std::process::Command;
 use std::time::Duration;
 
-use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
+use ros2probe_model::facts::calls::late::{Cause, LateCall, Priority, Stage};
 use ros2probe_model::facts::calls::report::ThreadStates;
+use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_wire::inside::late::{Bound, PER_SECOND, mode};
 use ros2probe_wire::inside::{Counter, Handle, kind};
 
@@ -99,7 +100,10 @@ fn a_call_that_computes_names_no_one() {
 fn a_call_beside_a_busy_thread_names_that_thread() {
     let (mut robot, mut process) = started();
     pin(&process);
+    let name = format!("r2p-{}-kiosk.service", std::process::id());
+    let unit = Cgroup::create(&name).unwrap();
     let hog = Hog::on("0");
+    std::fs::write(unit.path().join("cgroup.procs"), hog.0.id().to_string()).unwrap();
     let calls = late(&mut robot, &mut process, "compute 10 60000");
     assert_eq!(calls.len(), 10, "{calls:#?}");
     for call in &calls {
@@ -109,10 +113,10 @@ fn a_call_beside_a_busy_thread_names_that_thread() {
         let others = &call.activity.as_ref().unwrap().others;
         let named: Duration = others.iter().map(|other| other.duration).sum();
         assert!(named * 10 >= runnable * 9, "{call:#?}");
-        assert!(
-            others.iter().any(|other| other.process == hog.0.id()),
-            "{call:#?}"
-        );
+        let hog = others.iter().find(|other| other.process == hog.0.id());
+        let hog = hog.unwrap_or_else(|| panic!("{call:#?}"));
+        assert_eq!(hog.unit.as_deref(), Some(&*name), "{call:#?}");
+        assert_eq!(hog.priority, Some(Priority::Nice(0)));
     }
 }
 
@@ -124,7 +128,9 @@ fn a_call_beside_a_real_time_thread_names_that_thread() {
     let calls = late(&mut robot, &mut process, "compute 10 60000");
     let is_named = |call: &LateCall| {
         let culprit = call.culprit(Stage::Callback);
-        culprit.is_some_and(|culprit| &*culprit.name == "sh")
+        culprit.is_some_and(|culprit| {
+            &*culprit.name == "sh" && culprit.priority == Some(Priority::RealTime(50))
+        })
     };
     let named = calls.iter().filter(|call| is_named(call)).count();
     assert!(named >= 8, "{calls:#?}");

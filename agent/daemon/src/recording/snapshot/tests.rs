@@ -355,7 +355,7 @@ fn a_new_finding_triggers_the_snapshots_of_its_kind() {
             calls: 3,
             stage: late::Stage::Callback,
             cause: late::Cause::Runnable,
-            by: Some("chromium".into()),
+            by: None,
             longest: period * 2,
         },
         Diagnosis::IntraProcessOverflow {

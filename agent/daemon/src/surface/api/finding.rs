@@ -99,8 +99,11 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
             late_calls: *calls,
             stage: stage.label().into(),
             cause: cause.label().into(),
-            by: by.as_deref().map(Cow::Borrowed),
-            words: cause.in_words(by.as_deref()).into(),
+            by: by.as_ref().map(|by| Cow::Borrowed(&*by.name)),
+            by_unit: by
+                .as_ref()
+                .and_then(|by| Some(Cow::Borrowed(by.unit.as_deref()?))),
+            words: cause.in_words(by.as_ref().map(|by| by as _)).into(),
             longest_seconds: longest.as_secs_f64(),
         },
         diagnosis::Diagnosis::IntraProcessOverflow {

@@ -35,7 +35,7 @@ const LONGEST_MS: f64 = 3_600_000.0;
 const LONGEST_S: f64 = 1e9;
 
 /// A cause with the thread that it names.
-type Named = (late::Stage, late::Cause, Option<Arc<str>>);
+type Named = (late::Stage, late::Cause, Option<late::Culprit>);
 
 /// Query parameters that select late calls.
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
@@ -168,8 +168,9 @@ fn causes(callbacks: &[&facts::LateCallback], since: ModelTime) -> Vec<Cause<'st
         .map(|((stage, cause, by), (calls, longest))| Cause {
             stage: stage.label().into(),
             cause: cause.label().into(),
-            words: cause.in_words(by.as_deref()).into(),
-            by: by.map(|by| Cow::Owned(by.as_ref().to_owned())),
+            words: cause.in_words(by.as_ref().map(|by| by as _)).into(),
+            by: by.as_ref().map(|by| by.name.to_string().into()),
+            by_unit: by.and_then(|by| Some(by.unit?.to_string().into())),
             late_calls: calls,
             longest_seconds: longest.as_secs_f64(),
             remedy: cause.remedy().into(),
@@ -217,7 +218,6 @@ fn late_call(example: &LateExample, clock: WallClock) -> LateCall<'_> {
     let call = &example.call;
     let main = example.main;
     let named = main.and_then(|part| call.named_by(part));
-    let named = named.map(|other| format!("{} ({})", other.name, other.process));
     let others = [&call.activity_before, &call.activity];
     let others = others.into_iter().flatten();
     LateCall {
@@ -234,7 +234,7 @@ fn late_call(example: &LateExample, clock: WallClock) -> LateCall<'_> {
         cause: main.map(|part| part.cause.label().into()),
         words: main
             .map_or(late::Cause::Unexplained, |part| part.cause)
-            .in_words(named.as_deref())
+            .in_words(named.map(|other| other as _))
             .into(),
         parts: (call.parts().iter())
             .map(|each| part(each.stage, each.cause, each.duration))
@@ -278,6 +278,8 @@ fn other_thread(other: &late::OtherThread) -> OtherThread<'_> {
         name: Cow::Borrowed(&other.name),
         thread_id: other.thread,
         process_id: other.process,
+        unit: other.unit.as_deref().map(Cow::Borrowed),
+        priority: other.priority.map(|priority| priority.to_string().into()),
         seconds: other.duration.as_secs_f64(),
     }
 }

@@ -13,7 +13,7 @@ use ros2probe_wire::DomainId;
 use super::findings::Alarm;
 use crate::facts::bounded::Bounded;
 use crate::facts::calls::facts::{LateCallback, LateEntry, LateExample, Owner};
-use crate::facts::calls::late::{Cause, LateCall, Part, Stage};
+use crate::facts::calls::late::{Cause, LateCall, OtherThread, Part, Stage};
 use crate::facts::calls::report::{ThreadStates, Trigger};
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{LastLateCalls, LateCallbacks, LateHistory, LongestLateCalls};
@@ -179,7 +179,7 @@ impl Lateness {
                 stage,
                 cause,
                 total: call.total(),
-                culprit: culprit.map(|other| Arc::clone(&other.name)),
+                culprit: culprit.map(OtherThread::culprit),
             });
         }
         let example = Arc::new(LateExample {

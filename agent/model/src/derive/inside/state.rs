@@ -1,7 +1,6 @@
 //! Processes and handles of the last reports.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
 use std::time::Duration;
 
 use foldhash::{HashMap, HashMapExt as _, HashSet};
@@ -18,7 +17,7 @@ use super::witness::Witness;
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, Counted, Sum};
 use crate::facts::calls::facts::{InsideFacts, LifecycleState, ObservedProcess, TopicInside};
-use crate::facts::calls::late::LateCall;
+use crate::facts::calls::late::{LateCall, OtherThread};
 use crate::facts::calls::report::{ProcessReport, Report, ThreadStates, Transition, Trigger};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::measurement::Measurement;
@@ -598,7 +597,7 @@ impl Inside {
             calls: late.calls,
             stage: late.stage,
             cause: late.cause,
-            by: by.map(|other| Arc::clone(&other.name)),
+            by: by.map(OtherThread::culprit),
             longest: call.total(),
         }
     }

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use ros2probe_wire::{DomainId, Guid};
 
-use super::late::{Cause, LateCall, Part, Stage};
+use super::late::{Cause, Culprit, LateCall, Part, Stage};
 use super::report::{Durations, ThreadStates, Trigger};
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
@@ -245,8 +245,8 @@ pub struct LateEntry {
     pub cause: Cause,
     /// Time from ready to the end of the call.
     pub total: Duration,
-    /// Name of the thread that ran instead for longest, released the lock, or continued the process.
-    pub culprit: Option<Arc<str>>,
+    /// Thread that ran instead for longest, released the lock, or continued the process.
+    pub culprit: Option<Culprit>,
 }
 
 /// A late call with all its parts.

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use ros2probe_model::facts::calls::late::{
     Activity, Blocked, Cause, LateBound, LateCall, MessageDelivery, OtherThread, PreviousCall,
-    ReceiverStates, Stage, Stop,
+    Priority, ReceiverStates, Stage, Stop,
 };
 use ros2probe_model::facts::calls::report::{ProcessReport, Report, ThreadStates, Trigger};
 use ros2probe_model::facts::diagnosis::Diagnosis;
@@ -38,6 +38,8 @@ fn other(name: &str, process: u32, duration: u64) -> OtherThread {
         thread: process,
         process,
         name: name.into(),
+        unit: Some("kiosk.service".into()),
+        priority: None,
     }
 }
 
@@ -378,7 +380,8 @@ fn three_late_calls_in_a_minute_are_a_finding_with_the_cause_until_the_minute_is
         (*calls, *stage, *cause),
         (3, Stage::Callback, Cause::Runnable)
     );
-    assert_eq!(by.as_deref(), Some("chromium"));
+    let by = by.as_ref().map(ToString::to_string);
+    assert_eq!(by.as_deref(), Some("chromium (kiosk.service)"));
     for second in 12..90 {
         report(&mut observer, second, 0);
     }
@@ -422,6 +425,32 @@ fn the_longest_and_the_last_calls_are_kept_after_the_process_has_ended() {
     assert_eq!(sum, history, "103 calls fit into the history");
     assert_eq!(
         late.history.back().unwrap().culprit,
-        Some(Arc::from("chromium"))
+        Some(other("chromium", 3121, 90).culprit())
     );
+}
+
+#[test]
+fn another_thread_is_named_with_its_unit_and_an_unusual_priority() {
+    let mut thread = other("chromium", 3121, 90);
+    assert_eq!(thread.to_string(), "chromium (3121, kiosk.service)");
+    let named = |number| Priority::of_kernel(number).map(|it| it.to_string());
+    for (number, words) in [
+        (-1, "deadline"),
+        (0, "real-time 99"),
+        (98, "real-time 1"),
+        (100, "nice -20"),
+        (120, "nice 0"),
+        (139, "nice 19"),
+    ] {
+        assert_eq!(named(number).as_deref(), Some(words));
+    }
+    for unknown in [i64::MIN, -2, 99, 140, i64::MAX] {
+        assert_eq!(named(unknown), None);
+    }
+    thread.priority = Priority::of_kernel(49);
+    thread.unit = None;
+    assert_eq!(thread.to_string(), "chromium (3121, real-time 50)");
+    thread.priority = Priority::of_kernel(120);
+    assert_eq!(thread.to_string(), "chromium (3121)");
+    assert_eq!(thread.culprit().to_string(), "chromium");
 }

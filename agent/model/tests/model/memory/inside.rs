@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use ros2probe_daemon::agent_facts::InsideSourceFacts;
 use ros2probe_model::facts::calls::late::{
-    Activity, Blocked, LateBound, LateCall, OtherThread, PreviousCall,
+    Activity, Blocked, LateBound, LateCall, OtherThread, PreviousCall, Priority,
 };
 use ros2probe_model::facts::calls::report::{
     CallbackReport, Durations, ProcessReport, PublisherReport, Report, ThreadStates, Transition,
@@ -77,6 +77,8 @@ fn late(process: u32, now: u64) -> impl Iterator<Item = LateCall> {
         thread: number,
         process: number,
         name: format!("thread_{number:08}").into(),
+        unit: Some(format!("a-unit-with-a-long-name-{number:08}.service").into()),
+        priority: Some(Priority::Nice(0)),
     };
     let activity = move || Activity {
         longest: Some(Blocked {

@@ -60,7 +60,7 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
                 "The callback of {trigger} in {} was late {calls} times in a minute, up to {}: {}",
                 who(callback),
                 milliseconds(*longest),
-                cause.in_words(by.as_deref())
+                cause.in_words(by.as_ref().map(|by| by as _))
             );
             (about(callback), text, cause.remedy())
         }
