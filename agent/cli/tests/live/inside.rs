@@ -3,6 +3,7 @@
 
 use std::net::UdpSocket;
 use std::path::Path;
+use std::process::Command;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
@@ -20,6 +21,7 @@ use ros2probe_testing::harness::traced_program::TracedProgram;
 use ros2probe_testing::harness::usage::Usage;
 use ros2probe_testing::harness::{run, wait_until};
 use ros2probe_testing::program_run;
+use ros2probe_testing::rotel::{Item, Rotel, exports};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 const RP: &str = env!("CARGO_BIN_EXE_rp");
@@ -167,7 +169,7 @@ fn calls_are_observed_while_a_client_requests_them_and_names_always() -> Result<
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
-    let agent = agent_with(&host, directory.path(), "auto")?;
+    let agent = agent_with(&host, directory.path(), "auto", "")?;
     let start = |node: &str| {
         let arguments = ["/in", "/out", node];
         Process::start(&host.inside(), program.program(), arguments)
@@ -252,7 +254,7 @@ fn a_message_that_nobody_receives_is_late_in_its_socket() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
-    let _agent = agent_with(&host, directory.path(), "auto")?;
+    let _agent = agent_with(&host, directory.path(), "auto", "")?;
     let arguments = ["/in", "/out", "filter"];
     let mut process = Process::start(&host.inside(), program.program(), arguments)?;
     let socket = directory.path().join("api.sock");
@@ -303,7 +305,15 @@ fn a_call_that_sleeps_is_late_with_its_cause_from_the_first_question_on() -> Res
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let program = TracedProgram::build(248, &[])?;
-    let _agent = agent_with(&host, directory.path(), "auto")?;
+    let [enter, network] = host.outside();
+    let mut command = Command::new(enter);
+    command.arg(network).arg(Rotel::binary());
+    let mut receiver = Rotel::start(&mut command, directory.path(), None);
+    let export = format!(
+        "otlp: {{endpoint: 'http://{}', late_calls: true, metrics: false}}\n",
+        receiver.address
+    );
+    let _agent = agent_with(&host, directory.path(), "auto", &export)?;
     let arguments = ["/in", "/out", "filter"];
     let mut process = Process::start(&host.inside(), program.program(), arguments)?;
     let socket = directory.path().join("api.sock");
@@ -355,21 +365,73 @@ fn a_call_that_sleeps_is_late_with_its_cause_from_the_first_question_on() -> Res
         none.callbacks.is_empty() && none.causes.is_empty(),
         "{none:?}"
     );
+    is_exported(&mut receiver, call.thread_id)
+}
+
+/// Checks that a late call that slept is a trace: the call, and its stages below.
+fn is_exported(receiver: &mut Rotel, thread: u32) -> Result<()> {
+    let is_call = |item: &Item| {
+        let attribute = |name| item.attributes.get(name).map(String::as_str);
+        attribute("cause") == Some("sleep") && attribute("thread.id") == Some(&*thread.to_string())
+    };
+    let spans = |text: &str| -> Vec<Item> {
+        let exports = exports(text).into_iter();
+        exports.flat_map(|export| export.items).collect()
+    };
+    let text = receiver.wait_for("the late call has come", |text| {
+        spans(text).iter().any(is_call)
+    });
+    let spans = spans(&text);
+    let call = spans.iter().find(|item| is_call(item)).context("call")?;
+    ensure!(
+        call.attributes.get("ros_node").map(String::as_str) == Some("/robot1/filter"),
+        "{call:?}"
+    );
+    let of_call = |name: &str| call.fields.get(name).cloned().unwrap_or_default();
+    let is_below = |item: &&Item| item.fields.get("Parent ID") == Some(&of_call("ID"));
+    let stages: Vec<_> = spans.iter().filter(is_below).collect();
+    let nanoseconds = |item: &Item, name: &str| -> Result<u64> {
+        Ok(item.fields.get(name).context("time")?.parse()?)
+    };
+    let mut covered = 0;
+    for stage in &stages {
+        ensure!(
+            stage.fields.get("Trace ID") == Some(&of_call("Trace ID")),
+            "{stage:?}"
+        );
+        covered += nanoseconds(stage, "End time")? - nanoseconds(stage, "Start time")?;
+    }
+    let whole = nanoseconds(call, "End time")? - nanoseconds(call, "Start time")?;
+    ensure!(
+        covered == whole && whole > 20_000_000,
+        "{call:?} {stages:?}"
+    );
+    let slept = stages
+        .iter()
+        .find_map(|it| it.attributes.get("sleep_seconds"));
+    let slept: f64 = slept.context("sleep")?.parse()?;
+    ensure!(slept >= 0.019, "{stages:?}");
     Ok(())
 }
 
 fn agent<'n>(host: &'n Namespace, directory: &Path) -> Result<Agent<'n>> {
-    agent_with(host, directory, "full")
+    agent_with(host, directory, "full", "")
 }
 
-fn agent_with<'n>(host: &'n Namespace, directory: &Path, inside: &str) -> Result<Agent<'n>> {
+/// Starts an agent with this setting of `capture.inside`, and `more` lines of configuration.
+fn agent_with<'n>(
+    host: &'n Namespace,
+    directory: &Path,
+    inside: &str,
+    more: &str,
+) -> Result<Agent<'n>> {
     let configuration = directory.join("ros2probe.yaml");
     let capture = format!(
         "capture: {{source: host, cgroup: {}, inside: {inside}}}\n",
         host.cgroup().display()
     );
     let socket = directory.join("api.sock");
-    let text = format!("{capture}api: {{socket: {}}}\n", socket.display());
+    let text = format!("{capture}api: {{socket: {}}}\n{more}", socket.display());
     std::fs::write(&configuration, text)?;
     Agent::start(host, RP, &configuration)
 }

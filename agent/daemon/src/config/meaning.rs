@@ -582,6 +582,7 @@ fn otlp(shape: OtlpShape) -> OtlpSettings {
         metrics: shape.metrics,
         events: shape.events,
         traces: shape.traces,
+        late_calls: shape.late_calls.unwrap_or(false),
         log: shape.log.map(Level::filter),
         robot: shape.robot,
         attributes: shape.attributes.unwrap_or_default(),

@@ -540,6 +540,8 @@ pub(super) struct OtlpShape {
     pub(super) events: Option<bool>,
     /// Whether spans are exported, for watches with `trace`.
     pub(super) traces: Option<bool>,
+    /// Whether late calls of callbacks are exported as spans, with their stages; default false.
+    pub(super) late_calls: Option<bool>,
     /// Minimum severity of lines of the agent's own log that are exported, e.g. `warn`. By default
     /// no line is exported.
     pub(super) log: Option<Level>,

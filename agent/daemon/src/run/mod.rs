@@ -291,7 +291,8 @@ impl Run {
             live.want_late(&demand);
         }
         self.outputs.events.add(output.events, now);
-        self.outputs.spans.add(output.spans, output.chain_spans);
+        let spans = &self.outputs.spans;
+        spans.add(output.spans, output.chain_spans, &output.late_calls);
         let clock = self.observer.dispatched_until(now);
         if clock + SET_BACK < self.published_until {
             self.published_until = clock;

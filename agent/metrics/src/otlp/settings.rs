@@ -52,6 +52,8 @@ pub struct OtlpSettings {
     pub events: Option<bool>,
     /// Whether spans are exported, for watches with `trace`.
     pub traces: Option<bool>,
+    /// Whether late calls of callbacks are exported as spans.
+    pub late_calls: bool,
     /// Minimum severity of exported lines of the log; `None` exports no line.
     pub log: Option<LevelFilter>,
     /// Name of the robot.

@@ -5,6 +5,7 @@
 //! depend on that host.
 
 mod chains;
+mod late_calls;
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -20,6 +21,7 @@ use opentelemetry_sdk::trace::{SpanData, SpanEvents, SpanExporter as _, SpanLink
 use ros2probe_wire::Timestamp;
 use tokio::sync::Notify;
 
+use self::late_calls::LateSpan;
 use super::delivery::{Export, Queue};
 use super::events::time;
 use super::exports::{Exports, Reason, Signal};
@@ -28,6 +30,7 @@ use crate::tables::WaitingSpans;
 use ros2probe_model::derive::chain::spans::{ChainSpan, ChainSpans};
 use ros2probe_model::derive::trace::{Span, SpanStage, Spans};
 use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::facts::calls::facts::NewLateCalls;
 use ros2probe_model::facts::identity::Identity;
 
 /// Maximum number of spans in one request.
@@ -51,6 +54,8 @@ enum QueuedSpan {
     Message(Span),
     /// A span of a chain.
     Chain(ChainSpan),
+    /// A span of a late call.
+    LateCall(LateSpan),
 }
 
 /// The input of the queue, if traces are exported.
@@ -60,18 +65,28 @@ pub struct SpanSink {
     pub queue: Arc<SpanQueue>,
     /// Counts spans that do not fit.
     pub exports: Arc<Exports>,
+    /// Whether late calls are exported.
+    pub has_late_calls: bool,
 }
 
 impl SpanSink {
     /// Queues spans if the signal is enabled.
-    pub fn add(&self, messages: Spans, chains: ChainSpans) {
+    pub fn add(&self, messages: Spans, chains: ChainSpans, late: &NewLateCalls) {
         let Spans { spans, lost } = messages;
         let spans = spans.into_iter().map(QueuedSpan::Message);
         let of_chains = chains.spans.into_iter().map(QueuedSpan::Chain);
-        let lost = lost + chains.lost;
+        let mut lost = lost + chains.lost;
+        let mut of_late_calls = Vec::new();
+        if self.has_late_calls {
+            lost += late.lost;
+            for (domain_id, example) in &*late.calls {
+                of_late_calls.extend(LateSpan::of(*domain_id, example));
+            }
+        }
+        let of_late_calls = of_late_calls.into_iter().map(QueuedSpan::LateCall);
         let mut signals = self.exports.signals();
         if signals.any(|signal| signal == Signal::Traces) {
-            let refused = self.queue.put(spans.chain(of_chains));
+            let refused = self.queue.put(spans.chain(of_chains).chain(of_late_calls));
             self.exports
                 .count_dropped(Signal::Traces, Reason::Overflow, refused + lost);
         }
@@ -149,6 +164,7 @@ impl Queue for Tracing {
         let exported = spans.iter().map(|span| match span {
             QueuedSpan::Message(span) => self.of_message(span),
             QueuedSpan::Chain(span) => self.exported(chains::parts(span, self.host)),
+            QueuedSpan::LateCall(span) => self.exported(span.parts(self.host)),
         });
         let exported: Vec<_> = exported.collect();
         ((!exported.is_empty()).then_some(exported), 0)

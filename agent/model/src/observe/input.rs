@@ -11,6 +11,7 @@ use crate::derive::chain::causality::CausalPublication;
 use crate::derive::chain::expected::ExpectedChain;
 use crate::derive::chain::spans::ChainSpans;
 use crate::derive::trace::Spans;
+use crate::facts::calls::facts::NewLateCalls;
 use crate::facts::calls::report::Report;
 use crate::facts::dispatch::Dispatch;
 use crate::facts::event::Taken;
@@ -164,4 +165,6 @@ pub struct Output {
     pub spans: Spans,
     /// Completed spans of traced chains.
     pub chain_spans: ChainSpans,
+    /// Late calls of callbacks.
+    pub late_calls: NewLateCalls,
 }

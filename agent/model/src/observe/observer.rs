@@ -262,6 +262,7 @@ impl Observer {
             samples: self.measure.payloads.take(self.graph.wall_clock),
             spans: self.derive.tracer.take(self.graph.wall_clock),
             chain_spans: self.derive.chains.take_spans(),
+            late_calls: self.derive.inside.take_late_calls(),
         };
         self.keep_dispatched(&output.samples);
         self.zenoh_interest(&mut output.interest);

@@ -12,7 +12,7 @@ use ros2probe_wire::DomainId;
 
 use super::findings::Alarm;
 use crate::facts::bounded::Bounded;
-use crate::facts::calls::facts::{LateCallback, LateEntry, LateExample, Owner};
+use crate::facts::calls::facts::{LateCallback, LateEntry, LateExample, NewLateCalls, Owner};
 use crate::facts::calls::late::{Cause, LateCall, OtherThread, Part, Stage};
 use crate::facts::calls::report::{ThreadStates, Trigger};
 use crate::facts::model_time::ModelTime;
@@ -30,6 +30,7 @@ const LEAST: usize = 3;
 #[derive(Debug, Default)]
 pub(super) struct LateCalls {
     callbacks: Bounded<LateCallbacks, BTreeMap<(u32, u64), Lateness>>,
+    new: NewLateCalls,
 }
 
 /// Late calls of one callback.
@@ -80,7 +81,14 @@ impl LateCalls {
         let Some(lateness) = self.callbacks.get_or_insert_with(key, new) else {
             return;
         };
-        lateness.add(call, usual, started);
+        let example = lateness.add(call, usual, started);
+        let left_out = self.new.calls.push((domain_id, example));
+        self.new.lost += u64::from(left_out.is_some());
+    }
+
+    /// Removes and returns the late calls since the last call.
+    pub(super) fn take_new(&mut self) -> NewLateCalls {
+        std::mem::take(&mut self.new)
     }
 
     /// Removes the callback that was late the longest time ago, if the table is full.
@@ -159,7 +167,7 @@ impl Lateness {
         }
     }
 
-    fn add(&mut self, call: LateCall, usual: ThreadStates, started: ModelTime) {
+    fn add(&mut self, call: LateCall, usual: ThreadStates, started: ModelTime) -> Arc<LateExample> {
         self.calls += 1;
         self.last = started;
         if call.node.is_some() {
@@ -188,7 +196,8 @@ impl Lateness {
             call,
         });
         self.latest.push_back(Arc::clone(&example));
-        self.keep_if_long(example);
+        self.keep_if_long(Arc::clone(&example));
+        example
     }
 
     fn keep_if_long(&mut self, example: Arc<LateExample>) {

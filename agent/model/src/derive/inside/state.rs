@@ -16,7 +16,9 @@ use super::tracked::{Added, Figures, HALF_WINDOW, Kind, Tracked, ratio};
 use super::witness::Witness;
 use crate::facts::bounded::TableFacts;
 use crate::facts::bounded::{Bounded, Counted, Sum};
-use crate::facts::calls::facts::{InsideFacts, LifecycleState, ObservedProcess, TopicInside};
+use crate::facts::calls::facts::{
+    InsideFacts, LifecycleState, NewLateCalls, ObservedProcess, TopicInside,
+};
 use crate::facts::calls::late::{LateCall, OtherThread};
 use crate::facts::calls::report::{ProcessReport, Report, ThreadStates, Transition, Trigger};
 use crate::facts::diagnosis::Diagnosis;
@@ -475,6 +477,11 @@ impl Inside {
             self.handles.refuse();
         }
         state
+    }
+
+    /// Removes and returns the late calls since the last call.
+    pub fn take_late_calls(&mut self) -> NewLateCalls {
+        self.late.take_new()
     }
 
     /// Adds a late call to those of its callback.

@@ -11,7 +11,7 @@ use super::report::{Durations, ThreadStates, Trigger};
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName};
-use crate::facts::tables::LateHistory;
+use crate::facts::tables::{LateHistory, UntakenLateCalls};
 
 /// Facts from inside processes. Lists are sorted by process and handle.
 #[derive(Clone, Debug, Default)]
@@ -247,6 +247,15 @@ pub struct LateEntry {
     pub total: Duration,
     /// Thread that ran instead for longest, released the lock, or continued the process.
     pub culprit: Option<Culprit>,
+}
+
+/// Late calls since the last output.
+#[derive(Debug, Default)]
+pub struct NewLateCalls {
+    /// The calls with their domains, in the order of the reports.
+    pub calls: Bounded<UntakenLateCalls, Vec<(DomainId, Arc<LateExample>)>>,
+    /// Number of calls left out because the list was full.
+    pub lost: u64,
 }
 
 /// A late call with all its parts.

@@ -9,6 +9,7 @@ use ros2probe_model::facts::calls::late::{
 };
 use ros2probe_model::facts::calls::report::{ProcessReport, Report, ThreadStates, Trigger};
 use ros2probe_model::facts::diagnosis::Diagnosis;
+use ros2probe_model::facts::tables::UntakenLateCalls;
 use ros2probe_model::observe::input::Input;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::inside::late::wait;
@@ -453,4 +454,19 @@ fn another_thread_is_named_with_its_unit_and_an_unusual_priority() {
     thread.priority = Priority::of_kernel(120);
     assert_eq!(thread.to_string(), "chromium (3121)");
     assert_eq!(thread.culprit().to_string(), "chromium");
+}
+
+#[test]
+fn late_calls_beyond_the_cap_until_the_next_output_are_counted() {
+    let mut observer = Observer::new(Settings::default());
+    report(&mut observer, 0, 600);
+    report(&mut observer, 1, 600);
+    let late = observer.drain().late_calls;
+    let [cap, beyond] = [UntakenLateCalls::CAP, 1200 - UntakenLateCalls::CAP];
+    assert_eq!((late.calls.len(), late.lost), (cap, beyond as u64));
+    let (_, first) = &late.calls[0];
+    assert_eq!(first.main.unwrap().cause, Cause::Runnable);
+    report(&mut observer, 2, 1);
+    let late = observer.drain().late_calls;
+    assert_eq!((late.calls.len(), late.lost), (1, 0));
 }
