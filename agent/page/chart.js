@@ -47,9 +47,10 @@ function faint(variable, alpha) {
 
 /**
  * @param {{title: string, times: number[], lines: Line[], print: (value: number|null) => string,
- *   note?: string, whole?: boolean}} props `whole`: values are counts
+ *   note?: string, whole?: boolean, pick?: (picked: {time: number}) => void}} props
+ *   `whole`: values are counts. `pick` receives the time of a click, or of Enter at the cursor.
  */
-export function Chart({ title, times, lines, print, note, whole }) {
+export function Chart({ title, times, lines, print, note, whole, pick }) {
   const place = useRef(/** @type {HTMLElement|null} */ (null));
   const plot = useRef(/** @type {any} */ (null));
   const [asTable, showTable] = useState(false);
@@ -114,9 +115,14 @@ export function Chart({ title, times, lines, print, note, whole }) {
     while (latest > 0 && lines.every((line) => line.values[latest] == null)) latest -= 1;
     own.setLegend({ idx: latest });
   });
+  const pickCursor = () => {
+    const time = times[plot.current?.cursor.idx ?? -1];
+    if (pick && time != null) pick({ time });
+  };
   const move = (/** @type {KeyboardEvent} */ event) => {
     const by = { ArrowLeft: -1, ArrowRight: 1, PageUp: -60, PageDown: 60 }[event.key];
     const own = plot.current;
+    if (event.key === 'Enter') pickCursor();
     if (!by || !own || !times.length) return;
     event.preventDefault();
     const at = own.cursor.idx ?? times.length - 1;
@@ -132,6 +138,7 @@ export function Chart({ title, times, lines, print, note, whole }) {
     ${asTable
       ? html`<${ValueTable} title=${title} times=${times} lines=${lines} print=${print} />`
       : html`<div class="plot" ref=${place} role="img" tabindex="0" onKeyDown=${move}
+        onClick=${pickCursor}
         aria-label="${title} over the last ten minutes. ${words}."></div>`}
     <p class="dim">${words}${note ? html`. ${note}` : ''}</p></figure>`;
 }

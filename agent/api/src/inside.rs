@@ -317,6 +317,21 @@ pub struct LifecycleState<'a> {
     pub timestamp_seconds: f64,
 }
 
+/// Late calls of the callbacks of a topic in the last minute. `/why` has more about each.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct LateSummary<'a> {
+    /// Their number. At most the last 128 of a callback count.
+    pub calls: u64,
+    /// Time from ready to the end of the longest one.
+    pub longest_seconds: f64,
+    /// The most frequent cause, as in the answer of `/why`.
+    pub cause: Cow<'a, str>,
+    /// That cause in words.
+    pub words: Cow<'a, str>,
+}
+
 /// Data about a topic from inside processes. Counts cover all processes since the agent started.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
@@ -350,6 +365,8 @@ pub struct TopicInside<'a> {
     pub observed_publishers: usize,
     /// Subscriptions in observed processes.
     pub observed_subscriptions: usize,
+    /// Late calls of callbacks that its messages triggered, in the last minute; null without any.
+    pub late: Option<LateSummary<'a>>,
     /// Publishers; only in the answer about one topic.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub publishers: Vec<Publisher<'a>>,

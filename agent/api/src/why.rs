@@ -71,6 +71,26 @@ pub struct LateCallback<'a> {
     pub parts: Vec<Part<'a>>,
     /// Examples: the longest and the last late calls, the longest first.
     pub examples: Vec<LateCall<'a>>,
+    /// The last late calls, at most 128, the oldest first; empty unless the request has
+    /// `history=true`.
+    pub history: Vec<LateMoment<'a>>,
+}
+
+/// A late call in a list of many.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct LateMoment<'a> {
+    /// Unix time of the start of the call.
+    pub timestamp_seconds: f64,
+    /// Time from ready to the end of the call.
+    pub seconds: f64,
+    /// Stage in which it became late, as in [`Cause`].
+    pub stage: Cow<'a, str>,
+    /// What made it late, as in [`Cause`].
+    pub cause: Cow<'a, str>,
+    /// The cause in words.
+    pub words: Cow<'a, str>,
 }
 
 /// A part of the time of late calls.

@@ -1,6 +1,6 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
-import { causes, missing, WIDTH, worst } from '../late.js';
+import { callsOf, causes, closest, course, missing, WIDTH, worst } from '../late.js';
 
 const why = {
   observed: 'events', reason: null,
@@ -41,4 +41,38 @@ test('what is not observed is said', () => {
   assert.equal(missing(why), '');
   assert.match(missing({ observed: 'off', reason: null }), /capture\.late is off/);
   assert.equal(missing({ observed: 'sums', reason: 'needs Linux 5.15' }), 'needs Linux 5.15');
+});
+
+const moment = (timestamp_seconds, cause, seconds = 0.02) => ({ timestamp_seconds, cause, seconds,
+  stage: 'callback', words: `because of ${cause}` });
+const late = {
+  timestamp_seconds: 1003,
+  callbacks: [{ ...why.callbacks[0], history: [moment(409, 'lock'), moment(411, 'cpu'),
+    moment(995, 'runnable', 0.2), moment(996, 'lock'), moment(1001, 'lock')],
+  examples: [{ ...why.callbacks[0].examples[0], timestamp_seconds: 995 }] },
+  { ...why.callbacks[1], history: [moment(997, 'lock', 0.3)] }],
+};
+
+test('late calls are counted in periods of ten seconds by cause, those before ten minutes left out', () => {
+  const { bars, colours, from, end } = course(late);
+  assert.deepEqual([from, end], [410, 1010]);
+  assert.deepEqual(bars.map((bar) => [bar.begin, bar.list.length]), [[410, 1], [990, 3], [1000, 1]]);
+  assert.deepEqual(colours.map(({ cause, calls }) => [cause, calls])[0], ['lock', 3]);
+  const [, most] = bars;
+  assert.deepEqual(most.parts.map((part) => part.from), [0, most.parts[0].height]);
+  const height = most.parts.reduce((sum, part) => sum + part.height, 0);
+  assert.ok(Math.abs(height - 1) < 1e-9, 'the period with the most calls has the full height');
+  assert.match(most.label, /: 3 late calls, up to 300 ms: lock 2, runnable 1$/);
+  assert.deepEqual(course(null).bars, []);
+});
+
+test('the period closest to a picked time has its calls, the longest first, with known parts', () => {
+  const shown = course(late);
+  assert.equal(closest(shown, 985).begin, 990);
+  assert.equal(closest(shown, 1019).begin, 1000);
+  assert.equal(closest(shown, 700), null);
+  const calls = callsOf(closest(shown, 992));
+  assert.deepEqual(calls.map((call) => call.who), ['process 43', '/filter', '/filter']);
+  assert.deepEqual(calls.map((call) => call.example != null), [false, true, false]);
+  assert.equal(calls[0].words, 'because of lock');
 });

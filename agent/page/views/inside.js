@@ -4,20 +4,24 @@ import { percent } from '../format.js';
 import { tables, waiting } from '../inside.js';
 import { usePoll } from '../store.js';
 import { Failed, html, Name } from '../ui.js';
-import { useState } from '../vendor/hooks.mjs';
+import { useEffect, useState } from '../vendor/hooks.mjs';
 import { Late } from './late.js';
 
 /** Between requests that keep calls observed. The agent observes them for 10 s after each. */
 const AGAIN_MS = 4000;
 
-/** Shows what details say, and lets the agent observe calls on request.
- * @param {{inside: any, name: string, domain: number}} props */
-export function Inside({ inside, name, domain }) {
+/** Shows what details say, and lets the agent observe calls on request, or once a time in a chart is
+ * `picked`.
+ * @param {{inside: any, name: string, domain: number, picked?: {time: number}|null}} props */
+export function Inside({ inside, name, domain, picked = null }) {
   const [observes, observe] = useState(false);
+  useEffect(() => {
+    if (picked) observe(true);
+  }, [picked]);
   const calls = usePoll(observes
     ? `inside?name=${encodeURIComponent(name)}&domain_id=${domain}` : null, AGAIN_MS);
   const late = usePoll(observes
-    ? `why?name=${encodeURIComponent(name)}&domain_id=${domain}` : null, AGAIN_MS);
+    ? `why?name=${encodeURIComponent(name)}&domain_id=${domain}&history=true` : null, AGAIN_MS);
   const shown = inside ? tables(inside) : [];
   const isShown = shown.length > 0 || inside?.lifecycle_state;
   if (!observes && !isShown) {
@@ -40,6 +44,6 @@ export function Inside({ inside, name, domain }) {
         ? html`<th scope="row"><${Name} text=${cell} /></th>` : at === 1
           ? html`<td><${Name} text=${cell} /></td>` : html`<td class="number">${cell}</td>`)}</tr>`)}
       </tbody></table></div>`)}
-    ${observes ? html`<${Late} answer=${late} />`
+    ${observes ? html`<${Late} answer=${late} picked=${picked} />`
       : html`<p><button type="button" onClick=${() => observe(true)}>Why late?</button></p>`}</section>`;
 }

@@ -1,11 +1,17 @@
 // A part of the views of a topic and of a node: which calls of callbacks were late, and why.
 
-import { causes, missing, WIDTH, worst } from '../late.js';
+import { clock } from '../format.js';
+import { callsOf, causes, closest, course, missing, WIDTH, worst } from '../late.js';
 import { Failed, html, Name } from '../ui.js';
+import { useEffect, useState } from '../vendor/hooks.mjs';
 
-/** Shows the answer of the agent about late calls.
- * @param {{answer: {data: any, problem: any}}} props */
-export function Late({ answer }) {
+/** Size of a period in the drawing of late calls over time. */
+const BAR = 10;
+const HEIGHT = 60;
+
+/** Shows the answer of the agent about late calls. `picked` is a time that was picked in a chart.
+ * @param {{answer: {data: any, problem: any}, picked?: {time: number}|null}} props */
+export function Late({ answer, picked = null }) {
   const rows = causes(answer.data);
   const calls = worst(answer.data);
   const note = missing(answer.data);
@@ -20,6 +26,7 @@ export function Late({ answer }) {
       <tbody>${rows.map(([words, late, longest, remedy]) => html`<tr key=${words}><th scope="row"><${Name}
         text=${words} /></th><td class="number">${late}</td><td class="number">${longest}</td>
         <td>${remedy}</td></tr>`)}</tbody></table></div>`}
+    <${Course} why=${answer.data} picked=${picked} />
     ${calls.length > 0 && html`<div class="scroll" tabindex="0" role="group" aria-label="Worst calls">
       <table><caption>Worst calls</caption><thead><tr><th scope="col">Callback</th><th scope="col">Node</th>
       <th scope="col" class="number">Late</th><th scope="col" class="number">Time</th>
@@ -28,6 +35,47 @@ export function Late({ answer }) {
         <td><${Name} text=${it.who} /></td><td class="number">${it.late}</td>
         <td class="number">${it.total}</td><td><${Parts} call=${it} /></td></tr>`)}
       </tbody></table></div>`}</section>`;
+}
+
+/** Draws the late calls of the last ten minutes by cause, and lists those of a chosen period.
+ * @param {{why: any, picked: {time: number}|null}} props */
+function Course({ why, picked }) {
+  const [chosen, choose] = useState(/** @type {number|null} */ (null));
+  const shown = course(why);
+  const near = picked && closest(shown, picked.time);
+  useEffect(() => {
+    if (picked) choose(near ? near.begin : null);
+  }, [picked, near?.begin]);
+  const bar = shown.bars.find((/** @type {any} */ it) => it.begin === chosen);
+  const note = picked && !near ? `No late call is known near ${clock(picked.time)}.` : '';
+  if (shown.bars.length === 0) return note && html`<p class="dim" role="status">${note}</p>`;
+  return html`<h4>Late calls over time</h4>
+    <p>${shown.colours.map((/** @type {any} */ it) => html`<span key=${it.cause} class="cause"
+      style="--cause: var(${it.colour})">${it.words} ${it.calls}</span>`)}</p>
+    <svg class="course" viewBox="0 0 ${BAR * shown.periods} ${HEIGHT}" preserveAspectRatio="none"
+      role="group" aria-label="Late calls over time">${shown.bars.map((/** @type {any} */ it) => {
+    const pick = () => choose(it.begin === chosen ? null : it.begin);
+    return html`<g key=${it.begin} role="button" tabindex="0" aria-label=${it.label}
+        aria-pressed=${it.begin === chosen} onClick=${pick}
+        onKeyDown=${(/** @type {KeyboardEvent} */ event) => {
+          if (event.key !== 'Enter' && event.key !== ' ') return;
+          event.preventDefault();
+          pick();
+        }}><title>${it.label}</title>
+        <rect class="place" x=${BAR * it.place} y="0" width=${BAR} height=${HEIGHT} />
+        ${it.parts.map((/** @type {any} */ part) => html`<rect key=${part.colour}
+          x=${BAR * it.place + 1} width=${BAR - 2} y=${HEIGHT * (1 - part.from - part.height)}
+          height=${HEIGHT * part.height} style="fill: var(${part.colour})" />`)}</g>`;
+  })}</svg>
+    <p class="dim">${clock(shown.from)} to ${clock(shown.end)}. Choose a bar to list its calls.</p>
+    ${note && html`<p class="dim" role="status">${note}</p>`}
+    ${bar && html`<div class="scroll" tabindex="0" role="group" aria-label="Calls of a period"><table>
+      <caption>${bar.label}</caption><thead><tr><th scope="col">Time</th><th scope="col">Callback</th>
+      <th scope="col">Node</th><th scope="col" class="number">Length</th><th scope="col">Why</th></tr>
+      </thead><tbody>${callsOf(bar).map((it, place) => html`<tr key=${place}><th scope="row">${it.time}
+        </th><td><${Name} text=${it.callback} /></td><td><${Name} text=${it.who} /></td>
+        <td class="number">${it.total}</td><td>${it.example ? html`<${Parts} call=${it.example} />`
+          : html`<${Name} text=${it.words} />`}</td></tr>`)}</tbody></table></div>`}`;
 }
 
 /** Draws the parts of a call in the order of their stages, and names them.

@@ -26,6 +26,7 @@ export function Topic({ name, query }) {
   const domain = query.domain ? Number(query.domain) : null;
   const topic = state.topicNamed(name, domain);
   const scope = topic ? `?domain_id=${topic.domain}` : domain == null ? '' : `?domain_id=${domain}`;
+  const [picked, pick] = useState(/** @type {{time: number}|null} */ (null));
   const details = usePoll(topic ? named('topics', apiName(topic), scope) : null, 2000);
   if (!topic) {
     return html`<h1 tabindex="-1"><${Name} text=${name} /></h1>
@@ -60,13 +61,13 @@ export function Topic({ name, query }) {
       <${Figure} label="latency p99" value=${duration(figures.p99)} />
       <${Figure} label="last message" value=${clock(figures.last)} />
     </div>
-    <${Charts} key=${topic.id} topic=${topic} scope=${scope} />
+    <${Charts} key=${topic.id} topic=${topic} scope=${scope} pick=${pick} />
     <${Failed} problem=${details.problem} what="No details" />
     ${details.data && html`
       <${Endpoints} details=${details.data} topic=${topic} />
       <${Offered} details=${details.data} />
       <${Inside} key=${`inside ${topic.id}`} inside=${details.data.inside} name=${topic.name}
-        domain=${topic.domain} />
+        domain=${topic.domain} picked=${picked} />
       <${Waterfall} details=${details.data} />
       <${Passages} details=${details.data} />`}
     <${Definition} key=${`definition ${topic.id}`} path=${named('topics', apiName(topic),
@@ -79,8 +80,9 @@ function apiName(topic) {
   return topic.kind === 'dds' ? topic.ddsName : topic.name;
 }
 
-/** @param {{topic: import('../state.js').Topic, scope: string}} props */
-function Charts({ topic, scope }) {
+/** @param {{topic: import('../state.js').Topic, scope: string,
+ *   pick: (picked: {time: number}) => void}} props */
+function Charts({ topic, scope, pick }) {
   const columns = useRef(/** @type {(number|null)[][]} */ (COLUMNS.map(() => [])));
   const [, draw] = useState(0);
   const path = named('topics', apiName(topic), `/history${scope}`);
@@ -134,7 +136,8 @@ function Charts({ topic, scope }) {
     <${Chart} title="Latency" times=${own} print=${duration} lines=${[
       { label: 'p50', colour: '--line-1', values: half },
       { label: 'p99', colour: '--line-3', values: most }]}
-      note="From the writer’s timestamp to the capture; between hosts it needs equal clocks" />
+      note="From the writer’s timestamp to the capture; between hosts it needs equal clocks. A click
+        shows the late calls of that time" pick=${pick} />
     <${Chart} title="Lost messages" times=${own} print=${count} whole
       lines=${[{ label: 'lost', colour: '--line-4', values: lost, fill: true }]} />
     </div></section>`;

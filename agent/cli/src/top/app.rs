@@ -423,7 +423,7 @@ impl App {
             KeyCode::Char('s' | '>') => self.sort_by(1),
             KeyCode::Char('<') => self.sort_by(Column::ALL.len() - 1),
             KeyCode::Char('r') => self.reverse = !self.reverse,
-            KeyCode::Char(digit @ '1'..='8') => {
+            KeyCode::Char(digit @ '1'..='9') => {
                 let place = digit as usize - '1' as usize;
                 if let Some(column) = Column::ALL.get(place) {
                     (self.sort, self.reverse) = (*column, false);

@@ -43,6 +43,12 @@ pub fn lines(details: &TopicDetails<'_>, width: usize, theme: Theme) -> Vec<Styl
     measured(topic, &mut lines);
     if let Some(inside) = &topic.inside {
         lines.push((inside::counts(inside), Kind::Plain));
+        lines.extend(
+            inside
+                .late
+                .iter()
+                .map(|late| (inside::late(late), Kind::Problem)),
+        );
     }
     for finding in &topic.diagnoses {
         lines.push((format!("! {}", diagnosis(finding, topic)), Kind::Problem));

@@ -11,7 +11,7 @@ rp top: a robot's topics as its agent sees them     any key: back
  p                 only topics with problems (! in STATE)
  m                 only topics that are measured
  h                 also hidden topics and those of services
- s < >  or 1 to 8  sort by the next column, or by this one      r   reverse
+ s < >  or 1 to 9  sort by the next column, or by this one      r   reverse
  Enter d           details of the selected topic
  e                 events                 v   warnings only
  Tab               next pane: arrows scroll it      z   give it the screen
@@ -23,6 +23,7 @@ rp top: a robot's topics as its agent sees them     any key: back
  LOSS       of 30 s, of the subscriber that lost most
  MED P99    from the writer's timestamp to the capture; across hosts this needs
             synchronised clocks          P/S      publishers/subscribers
+ LATE       late calls of callbacks in the last minute: rp why
  STATE      ok, quiet (no message), no pub, no sub, unwatched (not measured),
             gone; with !: slow fast late loss silent against what is expected,
             qos type hash: endpoints do not match; unseen: agent is blind here";

@@ -3,9 +3,19 @@
 use std::borrow::Cow;
 
 use ros2probe_api::diagnosis::Diagnosis;
-use ros2probe_api::inside::TopicInside;
+use ros2probe_api::inside::{LateSummary, TopicInside};
 
-use super::text::{ratio, safe, seconds};
+use super::text::{counted, ratio, safe, seconds};
+
+/// Returns the late calls of a topic's callbacks, as text.
+pub(super) fn late(late: &LateSummary<'_>) -> String {
+    format!(
+        "{} in the last minute, up to {}: {} (rp why)",
+        counted(late.calls, "late call"),
+        seconds(late.longest_seconds),
+        safe(&late.words)
+    )
+}
 
 /// Returns the text of a problem that only calls inside processes show; `None` for any other.
 pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {

@@ -87,6 +87,8 @@ pub struct Row {
     pub median: Option<f64>,
     /// 99th percentile of the latency in seconds.
     pub p99: Option<f64>,
+    /// Late calls of its callbacks in the last minute, if there were any.
+    pub late: Option<u64>,
     /// Number of writers.
     pub publishers: usize,
     /// Number of readers.
@@ -183,6 +185,10 @@ impl Row {
             loss,
             median: latency.map(|it| it.p50_seconds),
             p99: latency.map(|it| it.p99_seconds),
+            late: topic
+                .inside
+                .as_ref()
+                .and_then(|inside| Some(inside.late.as_ref()?.calls)),
             publishers: topic.publishers.len(),
             subscriptions: topic.subscriptions.len(),
             standing,
@@ -306,6 +312,7 @@ fn problems(topic: &Topic<'_>, standing: Standing, is_losing: bool) -> Vec<&'sta
     for finding in &topic.diagnoses {
         match finding.kind() {
             "qos_incompatible" => say("qos"),
+            "late_callback" => say("late"),
             "type_conflict" => say("type"),
             "type_hash_conflict" => say("hash"),
             // Tools that publish without a subscriber are common.
@@ -330,6 +337,8 @@ pub enum Column {
     Loss,
     /// 99th percentile of latency, the worst first.
     Latency,
+    /// Late calls of callbacks in the last minute, the most first.
+    Late,
     /// Number of publishers, the highest first.
     Publishers,
     /// Number of subscribers, the highest first.
@@ -339,8 +348,8 @@ pub enum Column {
 }
 
 impl Column {
-    /// All columns, in the table's order.
-    pub const ALL: [Self; 8] = [
+    /// All columns, in the order of their keys.
+    pub const ALL: [Self; 9] = [
         Self::Name,
         Self::Rate,
         Self::Bandwidth,
@@ -349,6 +358,7 @@ impl Column {
         Self::Publishers,
         Self::Subscribers,
         Self::State,
+        Self::Late,
     ];
 
     /// Returns the name of the column in the header.
@@ -360,6 +370,7 @@ impl Column {
             Self::Bandwidth => "bandwidth",
             Self::Loss => "loss",
             Self::Latency => "latency",
+            Self::Late => "late calls",
             Self::Publishers => "publishers",
             Self::Subscribers => "subscribers",
             Self::State => "state",
@@ -381,6 +392,7 @@ impl Column {
             Self::Bandwidth => known(one.bandwidth, other.bandwidth),
             Self::Loss => known(one.loss, other.loss),
             Self::Latency => known(one.p99, other.p99),
+            Self::Late => turn(other.late.cmp(&one.late)),
             Self::Publishers => turn(other.publishers.cmp(&one.publishers)),
             Self::Subscribers => turn(other.subscriptions.cmp(&one.subscriptions)),
             Self::State => turn(

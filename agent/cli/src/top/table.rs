@@ -22,6 +22,7 @@ enum Field {
     Loss,
     Median,
     P99,
+    Late,
     Ends,
     State,
 }
@@ -34,7 +35,7 @@ pub struct Table {
 }
 
 impl Field {
-    const ORDER: [Self; 11] = [
+    const ORDER: [Self; 12] = [
         Self::Name,
         Self::Domain,
         Self::Type,
@@ -44,6 +45,7 @@ impl Field {
         Self::Loss,
         Self::Median,
         Self::P99,
+        Self::Late,
         Self::Ends,
         Self::State,
     ];
@@ -59,6 +61,7 @@ impl Field {
             Self::Loss => "LOSS",
             Self::Median => "MED",
             Self::P99 => "P99",
+            Self::Late => "LATE",
             Self::Ends => "P/S",
             Self::State => "STATE",
         }
@@ -72,6 +75,7 @@ impl Field {
             Self::Wanted => 7,
             Self::Rate | Self::Bandwidth => 6,
             Self::Loss | Self::Median | Self::P99 | Self::Ends => 5,
+            Self::Late => 4,
             Self::Domain => 3,
             Self::State => 9,
         }
@@ -84,6 +88,7 @@ impl Field {
             Self::Bandwidth => column == Column::Bandwidth,
             Self::Loss => column == Column::Loss,
             Self::P99 => column == Column::Latency,
+            Self::Late => column == Column::Late,
             Self::Ends => matches!(column, Column::Publishers | Column::Subscribers),
             Self::State => column == Column::State,
             Self::Domain | Self::Type | Self::Wanted | Self::Median => false,
@@ -111,6 +116,9 @@ impl Field {
             Self::Loss => known(row.loss, text::ratio),
             Self::Median => known(row.median, text::seconds),
             Self::P99 => known(row.p99, text::seconds),
+            Self::Late => row
+                .late
+                .map_or_else(|| "-".to_owned(), |late| late.to_string()),
             Self::Ends => format!("{}/{}", row.publishers, row.subscriptions),
             Self::State => row.state(),
         }
@@ -123,6 +131,7 @@ impl Table {
     pub fn plan(width: usize, rows: &[&Row], cut: char) -> Self {
         let domains: BTreeSet<_> = rows.iter().map(|row| row.key.domain_id).collect();
         let is_expected = rows.iter().any(|row| row.wanted != (None, None));
+        let is_late = rows.iter().any(|row| row.late.is_some());
         let longest = |field: Field| {
             let lengths = rows.iter().map(|row| field.value(row).chars().count());
             lengths.max().unwrap_or(0)
@@ -134,6 +143,7 @@ impl Table {
             (Field::Bandwidth, true),
             (Field::Loss, true),
             (Field::P99, true),
+            (Field::Late, is_late),
             (Field::Ends, true),
             (Field::Wanted, is_expected),
             (Field::Median, true),
@@ -186,7 +196,12 @@ impl Table {
     pub fn whole(rows: &[&Row], cut: char) -> Self {
         let is_expected = rows.iter().any(|row| row.wanted != (None, None));
         let fields = Field::ORDER.into_iter();
-        let fields = fields.filter(|field| *field != Field::Wanted || is_expected);
+        let is_late = rows.iter().any(|row| row.late.is_some());
+        let fields = fields.filter(|field| match field {
+            Field::Wanted => is_expected,
+            Field::Late => is_late,
+            _ => true,
+        });
         let sized = fields.map(|field| {
             let lengths = rows.iter().map(|row| field.value(row).chars().count());
             let width = lengths.max().unwrap_or(0).max(field.label().len());
@@ -279,6 +294,24 @@ mod tests {
                 assert!(heading.ends_with("STATE    "), "{heading}");
             }
         }
+    }
+
+    #[test]
+    fn a_topic_with_late_calls_has_a_column_for_their_number() {
+        let mut rows = rows("/camera/image");
+        let heading = |rows: &[Row]| Table::plan(78, &[&rows[0]], '~').heading(Column::Late);
+        assert_eq!(heading(&rows).1, None);
+        rows[0].late = Some(34);
+        let (names, place) = heading(&rows);
+        let (begin, width) = place.unwrap();
+        assert_eq!(&names[begin..begin + width], "LATE");
+        let line = Table::plan(78, &[&rows[0]], '~').line(&rows[0]);
+        assert_eq!(&line[begin..begin + width], "  34");
+        assert!(
+            Table::whole(&[&rows[0]], '~')
+                .line(&rows[0])
+                .contains(" 34 ")
+        );
     }
 
     #[test]

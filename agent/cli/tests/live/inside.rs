@@ -297,6 +297,16 @@ fn a_message_that_nobody_receives_is_late_in_its_socket() -> Result<()> {
             && text.contains("  in the socket "),
         "{text}"
     );
+    wait_until("the number of late calls is in the table", || {
+        let table = run(&format!("{RP} top --once --socket {}", socket.display()))?;
+        let mut lines = table.lines();
+        // Other cells may be empty.
+        let end = lines.find_map(|line| Some(line.find("LATE")? + "LATE".len()));
+        let topic = lines.find(|line| line.starts_with("/in "));
+        let until = topic.zip(end).and_then(|(line, end)| line.get(..end));
+        let late = until.and_then(|cells| cells.split_whitespace().last()?.parse::<u64>().ok());
+        Ok(late.is_some_and(|late| late > 0))
+    })?;
     Ok(())
 }
 

@@ -79,7 +79,14 @@ await scenario(async (open) => {
     await ask('late');
     return (await slept.count()) === 1 && (await drawn.count()) > 0;
   });
+  const bars = late.getByRole('group', { name: 'Late calls over time', exact: true })
+    .getByRole('button', { name: /late calls?, up to .*sleep/ });
+  await bars.last().click();
+  const chosen = late.getByRole('group', { name: 'Calls of a period', exact: true });
+  await there(chosen.getByRole('row', { name: /it slept/ }).first());
   await tab.accessible('late calls of a node');
+  await bars.last().press('Enter');
+  await until('no chosen period', async () => (await chosen.count()) === 0);
 
   // The topics of the process, which do not use the network.
   await tab.go('#/topics/%2Fout?domain=0');
@@ -91,6 +98,10 @@ await scenario(async (open) => {
   await tab.accessible('a topic from inside');
   await tab.go('#/topics/%2Fin?domain=0');
   await first('Subscriptions', ['/in', '/robot1/filter', '100', '15']);
+  // A click into the chart of the latency shows the late calls of that time. On a busy machine there
+  // may be some.
+  await tab.page.locator('figure.chart', { hasText: 'Latency' }).locator('.u-over').click();
+  await reads(late, /Choose a bar|No late call is known near \d\d:\d\d:\d\d/);
 
   // The process publishes within the callback of its input. This is a chain by causality. Its parts
   // are the wait and the callback of at least 2 ms.

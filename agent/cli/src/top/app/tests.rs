@@ -77,10 +77,12 @@ fn keys_select_the_column_and_the_direction_of_the_order() {
     keys(&mut app, "8");
     assert_eq!((app.sort, app.reverse), (Column::State, false));
     assert_eq!(names(&app)[0], "/b");
+    keys(&mut app, "9");
+    assert_eq!(app.sort, Column::Late);
     keys(&mut app, "s");
     assert_eq!(app.sort, Column::Name);
     keys(&mut app, "<");
-    assert_eq!(app.sort, Column::State);
+    assert_eq!(app.sort, Column::Late);
 }
 
 #[test]

@@ -1,6 +1,8 @@
 //! `/inside`: observations from inside processes, also for answers about topics and nodes.
 
 use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::time::Duration;
 
 use axum::Json;
 use axum::extract::State;
@@ -18,14 +20,17 @@ use super::scope::Domain;
 use crate::agent_facts::InsideSourceFacts;
 use crate::surface::inside_nodes::NodeActivity;
 use ros2probe_api::inside::{
-    Buffer, Callback, Counter, Durations, Inside, Library, LifecycleState, NodeInside, Owner,
-    Process, Publisher, ReaderQueue, Subscription, ThreadStates, TopicInside, Trigger,
+    Buffer, Callback, Counter, Durations, Inside, LateSummary, Library, LifecycleState, NodeInside,
+    Owner, Process, Publisher, ReaderQueue, Subscription, ThreadStates, TopicInside, Trigger,
 };
 use ros2probe_model::facts::calls::facts::{self, Quantiles};
 use ros2probe_model::facts::calls::report;
 use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot::{Snapshot, TopicFacts};
 use ros2probe_wire::DomainId;
+
+/// Time span of late calls in the answer about a topic.
+const LATE_WINDOW: Duration = Duration::from_secs(60);
 
 /// Query parameters that select the facts of an answer.
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
@@ -157,8 +162,9 @@ fn select(inside: &mut Inside<'_>, name: &str) {
 }
 
 /// Returns the observations of a topic, without the lists.
-pub(super) fn topic(facts: &TopicFacts, clock: WallClock) -> Option<TopicInside<'_>> {
+pub(super) fn topic<'a>(facts: &'a TopicFacts, snapshot: &Snapshot) -> Option<TopicInside<'a>> {
     let inside = facts.inside.as_deref()?;
+    let clock = snapshot.wall_clock;
     let counts = inside.counts;
     Some(TopicInside {
         published_messages: counts.published,
@@ -174,8 +180,39 @@ pub(super) fn topic(facts: &TopicFacts, clock: WallClock) -> Option<TopicInside<
         last_message_timestamp_seconds: inside.last.map(|last| clock.wall_time(last).seconds()),
         observed_publishers: inside.publishers,
         observed_subscriptions: inside.subscriptions,
+        late: late(facts, snapshot),
         ..TopicInside::default()
     })
+}
+
+/// Returns the late calls of the callbacks of a topic in the last minute.
+fn late(facts: &TopicFacts, snapshot: &Snapshot) -> Option<LateSummary<'static>> {
+    let callbacks = snapshot.inside.as_deref()?.late.iter();
+    let own = callbacks.filter(|callback| {
+        callback.owner.domain_id == facts.domain_id && is_triggered_by(&callback.trigger, facts)
+    });
+    let recent = own.flat_map(|callback| {
+        let entries = callback.history.iter().rev();
+        entries.take_while(|entry| snapshot.at - entry.at < LATE_WINDOW)
+    });
+    let (mut calls, mut longest, mut causes) = (0, Duration::ZERO, BTreeMap::new());
+    for entry in recent {
+        calls += 1;
+        longest = longest.max(entry.total);
+        *causes.entry((entry.cause, &entry.culprit)).or_insert(0) += 1;
+    }
+    let ((cause, culprit), _) = causes.into_iter().max_by_key(|(_, calls)| *calls)?;
+    Some(LateSummary {
+        calls,
+        longest_seconds: longest.as_secs_f64(),
+        cause: cause.label().into(),
+        words: cause.in_words(culprit.as_ref().map(|by| by as _)).into(),
+    })
+}
+
+/// Returns whether messages of the topic trigger a callback.
+fn is_triggered_by(trigger: &report::Trigger, facts: &TopicFacts) -> bool {
+    !matches!(trigger, report::Trigger::Service(_)) && trigger.name() == Some(facts.name.as_str())
 }
 
 /// Returns the observations of a topic, with its publishers, subscriptions, buffers and callbacks.
@@ -184,7 +221,7 @@ pub(super) fn topic_details<'a>(
     snapshot: &'a Snapshot,
 ) -> Option<TopicInside<'a>> {
     let clock = snapshot.wall_clock;
-    let (mut shown, known) = (topic(facts, clock)?, snapshot.inside.as_deref()?);
+    let (mut shown, known) = (topic(facts, snapshot)?, snapshot.inside.as_deref()?);
     let name = &facts.name;
     let is_here = |owner: &facts::Owner| owner.domain_id == facts.domain_id;
     let own =
@@ -204,10 +241,8 @@ pub(super) fn topic_details<'a>(
     let buffers = buffers.filter(|each| is_here(&each.owner) && each.topic.as_ref() == Some(name));
     shown.buffers = buffers.map(|each| buffer(each, clock)).collect();
     let callbacks = known.callbacks.iter();
-    let callbacks = callbacks.filter(|each| {
-        let is_topic = !matches!(each.trigger, report::Trigger::Service(_));
-        is_topic && is_here(&each.owner) && each.trigger.name() == Some(name.as_str())
-    });
+    let callbacks =
+        callbacks.filter(|each| is_here(&each.owner) && is_triggered_by(&each.trigger, facts));
     shown.callbacks = callbacks.map(|each| callback(each, clock)).collect();
     Some(shown)
 }

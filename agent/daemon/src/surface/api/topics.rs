@@ -270,7 +270,7 @@ impl<'a> TopicAnswers<'a> {
             diagnoses: findings.map(|finding| diagnosis(finding)).collect(),
             reasons: self.circumstances.reasons(facts),
             source: facts.source.label().into(),
-            inside: inside::topic(facts, clock),
+            inside: inside::topic(facts, self.snapshot),
         }
     }
 

@@ -20,7 +20,7 @@ use super::problem::{Code, Problem};
 use super::scope::Domain;
 use crate::agent_facts::InsideSourceFacts;
 use ros2probe_api::why::{
-    Blocked, Cause, LateCall, LateCallback, OtherThread, Part, PreviousCall, Why,
+    Blocked, Cause, LateCall, LateCallback, LateMoment, OtherThread, Part, PreviousCall, Why,
 };
 use ros2probe_model::facts::calls::facts::{self, InsideFacts, LateExample};
 use ros2probe_model::facts::calls::late;
@@ -55,6 +55,8 @@ struct Of {
     /// Only late calls of the last seconds; by default all that are known.
     #[param(minimum = 0, maximum = 1_000_000_000)]
     last_s: Option<f64>,
+    /// Whether each callback also lists its last late calls.
+    history: bool,
 }
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
@@ -96,7 +98,11 @@ async fn show(
                 || name == callback.trigger.name()
                 || name == callback.owner.node.as_deref())
     };
-    Ok(Json(why(snapshot, source, last, is_meant)).into_response())
+    let span = Span {
+        last,
+        has_history: of.history,
+    };
+    Ok(Json(why(snapshot, source, span, is_meant)).into_response())
 }
 
 /// Returns a number from 0 to `largest`, or the problem of another one.
@@ -110,10 +116,19 @@ fn within(name: &str, number: f64, largest: f64) -> Result<f64, Problem> {
     }
 }
 
+/// Which late calls an answer has, and how.
+#[derive(Clone, Copy, Debug)]
+struct Span {
+    /// Only those of this time until now.
+    last: Option<Duration>,
+    /// Whether each callback lists its last late calls.
+    has_history: bool,
+}
+
 fn why<'a>(
     snapshot: &'a Snapshot,
     source: Option<&'a InsideSourceFacts>,
-    last: Option<Duration>,
+    span: Span,
     is_meant: impl Fn(&facts::LateCallback) -> bool,
 ) -> Why<'a> {
     let mut answer = Why {
@@ -135,7 +150,7 @@ fn why<'a>(
     let Some(known) = snapshot.inside.as_deref() else {
         return answer;
     };
-    let since = last.map_or(ModelTime::ZERO, |last| snapshot.at - last);
+    let since = span.last.map_or(ModelTime::ZERO, |last| snapshot.at - last);
     let clock = snapshot.wall_clock;
     let callbacks = known.late.iter().filter(|callback| is_meant(callback));
     let callbacks: Vec<_> = callbacks
@@ -144,7 +159,14 @@ fn why<'a>(
     answer.causes = causes(&callbacks, since);
     let callbacks = callbacks.into_iter();
     answer.callbacks = callbacks
-        .map(|callback| late_callback(callback, known, since, clock))
+        .map(|callback| {
+            let mut shown = late_callback(callback, known, since, clock);
+            if span.has_history {
+                let calls = callback.history.iter().filter(|entry| entry.at >= since);
+                shown.history = calls.map(|entry| moment(entry, clock)).collect();
+            }
+            shown
+        })
         .collect();
     answer
         .callbacks
@@ -211,6 +233,20 @@ fn late_callback<'a>(
             .into_iter()
             .map(|each| late_call(each, clock))
             .collect(),
+        history: Vec::new(),
+    }
+}
+
+fn moment(entry: &facts::LateEntry, clock: WallClock) -> LateMoment<'_> {
+    LateMoment {
+        timestamp_seconds: clock.wall_time(entry.at).seconds(),
+        seconds: entry.total.as_secs_f64(),
+        stage: entry.stage.label().into(),
+        cause: entry.cause.label().into(),
+        words: entry
+            .cause
+            .in_words(entry.culprit.as_ref().map(|by| by as _))
+            .into(),
     }
 }
 
