@@ -7,11 +7,17 @@ import { trigger } from './inside.js';
 const SMALL = 0.005;
 /** Width of a drawn call. */
 export const WIDTH = 200;
-/** Length of a period of the course, in seconds, and number of periods. */
+/** Length of a period of the timeline, in seconds, and number of periods. */
 const PERIOD = 10;
 const PERIODS = 60;
-/** Colours of the most frequent causes, as CSS variables; further causes share the last one. */
-const COLOURS = ['--line-1', '--line-3', '--line-2', '--line-4', '--dim'];
+/** Colours of causes, as CSS variables: others took the CPU, it computed, it waited, and the way of
+ * its message. */
+const COLOURS = Object.fromEntries(/** @type {[string, string[]][]} */ ([
+  ['--line-1', ['runnable', 'throttled', 'stolen', 'stopped']],
+  ['--line-2', ['cpu', 'other_callback']],
+  ['--line-3', ['lock', 'sleep', 'disk', 'page_fault', 'system_call', 'blocked']],
+  ['--line-4', ['send', 'transit', 'queue', 'middleware', 'arrival']],
+]).flatMap(([colour, causes]) => causes.map((cause) => [cause, colour])));
 
 /** Returns the causes as rows: the cause, the calls, the longest one, and what helps.
  * @param {any} why @returns {[string, string, string, string][]} */
@@ -61,10 +67,10 @@ function inWords(cause) {
 
 /**
  * Returns the late calls of the last ten minutes by periods of ten seconds, the latest last, and
- * the colour of each cause. Heights are shares of the period with the most calls.
+ * the colour of each cause, the most frequent one first. Heights are shares of the period with the most calls.
  * @param {any} why
  */
-export function course(why) {
+export function timeline(why) {
   const end = Math.ceil((why?.timestamp_seconds ?? 0) / PERIOD) * PERIOD;
   const from = end - PERIOD * PERIODS;
   const calls = (why?.callbacks ?? []).flatMap((/** @type {any} */ it) =>
@@ -74,8 +80,8 @@ export function course(why) {
   const counts = new Map();
   for (const { cause } of shown) counts.set(cause, (counts.get(cause) ?? 0) + 1);
   const ranked = [...counts.keys()].sort((one, other) => counts.get(other) - counts.get(one));
-  const colours = ranked.map((cause, rank) => ({ cause, words: inWords(cause), calls: counts.get(cause),
-    colour: COLOURS[Math.min(rank, COLOURS.length - 1)] }));
+  const colours = ranked.map((cause) => ({ cause, words: inWords(cause), calls: counts.get(cause),
+    colour: COLOURS[cause] ?? '--dim' }));
   const periods = new Map();
   for (const call of shown) {
     const place = Math.floor((call.timestamp_seconds - from) / PERIOD);
@@ -86,11 +92,11 @@ export function course(why) {
     let below = 0;
     const parts = colours.flatMap(({ cause, words, colour }) => {
       const number = list.filter((/** @type {any} */ call) => call.cause === cause).length;
-      const part = { words: `${words} ${number}`, colour, from: below / most, height: number / most };
+      const part = { cause, words: `${words} ${number}`, colour, from: below / most, height: number / most };
       below += number;
       return number > 0 ? [part] : [];
     });
-    const longest = Math.max(...list.map((/** @type {any} */ call) => call.seconds));
+    const longest = Math.max(...list.map((/** @type {any} */ call) => call.total_seconds));
     const begin = from + place * PERIOD;
     return { place, begin, parts, list,
       label: `${clock(begin)}: ${several(list.length, 'late call')}, up to ${duration(longest)}: ${
@@ -102,7 +108,7 @@ export function course(why) {
 /**
  * Returns the period with late calls that is closest to a time, at most one period away; null if
  * there is none.
- * @param {{bars: any[]}} course @param {number} time
+ * @param {{bars: any[]}} shown @param {number} time
  */
 export function closest({ bars }, time) {
   const away = (/** @type {any} */ bar) => Math.max(bar.begin - time, time - bar.begin - PERIOD, 0);
@@ -116,12 +122,12 @@ export function closest({ bars }, time) {
  * @param {any} bar
  */
 export function callsOf(bar) {
-  const list = [...bar.list].sort((one, other) => other.seconds - one.seconds);
+  const list = [...bar.list].sort((one, other) => other.total_seconds - one.total_seconds);
   return list.map(({ of, ...call }) => {
     const example = (of.examples ?? []).find((/** @type {any} */ it) =>
       Math.abs(it.timestamp_seconds - call.timestamp_seconds) < 1e-6);
     return { callback: trigger(of.trigger), who: whose(of), time: clock(call.timestamp_seconds),
-      total: duration(call.seconds), words: call.words, example: example ? drawn(example) : null };
+      total: duration(call.total_seconds), words: call.words, example: example ? drawn(example) : null };
   });
 }
 

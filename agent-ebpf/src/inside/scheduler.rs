@@ -59,7 +59,7 @@ struct Run {
     id: u64,
     name: [u64; NAME_BYTES / 8],
     /// As in [`Other`].
-    group: u64,
+    cgroup_id: u64,
     priority: i64,
 }
 
@@ -126,7 +126,7 @@ pub fn woken(context: &RawTracePointContext) {
         (*followed).wait.waker_process = (id >> 32) as u32;
         let name = (&raw mut (*followed).wait.waker_name).cast();
         bpf_get_current_comm(name, NAME_BYTES as u32);
-        (*followed).wait.waker_group = bpf_get_current_cgroup_id();
+        (*followed).wait.waker_cgroup_id = bpf_get_current_cgroup_id();
         unblocked(followed, now);
         (*followed).state = state::RUNNABLE;
         (*followed).since = now;
@@ -262,7 +262,7 @@ unsafe fn remember(runs: *mut Runs, id: u64, now: u64) {
         (*run).until = now;
         (*run).id = id << 32 | id >> 32;
         bpf_get_current_comm((&raw mut (*run).name).cast(), NAME_BYTES as u32);
-        (*run).group = bpf_get_current_cgroup_id();
+        (*run).cgroup_id = bpf_get_current_cgroup_id();
         let task = bpf_get_current_task();
         let priority = read::<i32>(member(task, PRIORITY));
         (*run).priority = priority.map_or(UNKNOWN_PRIORITY, i64::from);
@@ -309,13 +309,13 @@ unsafe fn attribute(activity: *mut Activity, runs: *const Runs, since: u64) {
                 (read_volatile(other.add(2)), read_volatile(other.add(3)));
             write_volatile(other.add(2), select(is_named, low, known_low));
             write_volatile(other.add(3), select(is_named, high, known_high));
-            let (group, priority) = (
-                read_volatile(&raw const (*run).group),
+            let (cgroup_id, priority) = (
+                read_volatile(&raw const (*run).cgroup_id),
                 read_volatile(&raw const (*run).priority) as u64,
             );
-            let (known_group, known_priority) =
+            let (known_cgroup_id, known_priority) =
                 (read_volatile(other.add(4)), read_volatile(other.add(5)));
-            write_volatile(other.add(4), select(is_named, group, known_group));
+            write_volatile(other.add(4), select(is_named, cgroup_id, known_cgroup_id));
             write_volatile(other.add(5), select(is_named, priority, known_priority));
             back += 1;
         }

@@ -321,8 +321,8 @@ pub struct LifecycleState<'a> {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
-pub struct LateSummary<'a> {
-    /// Their number. At most the last 128 of a callback count.
+pub struct RecentLateCalls<'a> {
+    /// Number of late calls; counts at most the last 128 of each callback.
     pub calls: u64,
     /// Time from ready to the end of the longest one.
     pub longest_seconds: f64,
@@ -366,7 +366,7 @@ pub struct TopicInside<'a> {
     /// Subscriptions in observed processes.
     pub observed_subscriptions: usize,
     /// Late calls of callbacks that its messages triggered, in the last minute; null without any.
-    pub late: Option<LateSummary<'a>>,
+    pub late: Option<RecentLateCalls<'a>>,
     /// Publishers; only in the answer about one topic.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub publishers: Vec<Publisher<'a>>,

@@ -73,18 +73,18 @@ pub struct LateCallback<'a> {
     pub examples: Vec<LateCall<'a>>,
     /// The last late calls, at most 128, the oldest first; empty unless the request has
     /// `history=true`.
-    pub history: Vec<LateMoment<'a>>,
+    pub history: Vec<LateCallSummary<'a>>,
 }
 
 /// A late call in a list of many.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
-pub struct LateMoment<'a> {
+pub struct LateCallSummary<'a> {
     /// Unix time of the start of the call.
     pub timestamp_seconds: f64,
     /// Time from ready to the end of the call.
-    pub seconds: f64,
+    pub total_seconds: f64,
     /// Stage in which it became late, as in [`Cause`].
     pub stage: Cow<'a, str>,
     /// What made it late, as in [`Cause`].
@@ -125,6 +125,8 @@ pub struct LateCall<'a> {
     pub late_wait_seconds: Option<f64>,
     /// Thread of the call.
     pub thread_id: u32,
+    /// Thread that received the message from its socket; null if that was not observed.
+    pub receiver_thread_id: Option<u32>,
     /// CPU on which the call ended.
     pub cpu: u32,
     /// Stage in which it became late; null if it is unknown.
@@ -157,8 +159,8 @@ pub struct OtherThread<'a> {
     pub thread_id: u32,
     /// Id of its process.
     pub process_id: u32,
-    /// Its systemd unit, the first digits of its container's id, or the last part of its control
-    /// group's path; null if that is the root of version 2 or no longer exists.
+    /// First digits of its container's id, else its systemd unit, else the last part of its control
+    /// group's path; null for the root group, or if the path is not found.
     #[cfg_attr(feature = "openapi", schema(example = "kiosk.service"))]
     pub unit: Option<Cow<'a, str>>,
     /// Its priority when it last left the CPU: `real-time N`, `nice N` or `deadline`; null if it is

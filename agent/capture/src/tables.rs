@@ -134,6 +134,8 @@ ros2probe_model::tables! {
     CallbackBounds {
         name: "inside.bounds", entries: late::BOUND_CAPACITY as usize, effect: "further ones are never late",
     }
+    /// Control groups of the threads that late calls name
+    NamedCgroups { name: "inside.cgroups", entries: 1024, effect: "all are searched again" }
     /// Late calls until the next report
     LateCalls { name: "inside.late", entries: 1024 }
     /// Changes of managed nodes' states until the next report

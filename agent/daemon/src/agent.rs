@@ -156,7 +156,7 @@ impl Components<'_> {
             spans: SpanSink {
                 queue: self.spans,
                 exports: sources.exports,
-                has_late_calls: config.otlp.late_calls,
+                exports_late_calls: config.otlp.late_calls,
             },
         };
         let run = Run::new(

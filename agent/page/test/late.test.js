@@ -1,6 +1,6 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
-import { callsOf, causes, closest, course, missing, WIDTH, worst } from '../late.js';
+import { callsOf, causes, closest, missing, timeline, WIDTH, worst } from '../late.js';
 
 const why = {
   observed: 'events', reason: null,
@@ -43,7 +43,7 @@ test('what is not observed is said', () => {
   assert.equal(missing({ observed: 'sums', reason: 'needs Linux 5.15' }), 'needs Linux 5.15');
 });
 
-const moment = (timestamp_seconds, cause, seconds = 0.02) => ({ timestamp_seconds, cause, seconds,
+const moment = (timestamp_seconds, cause, total_seconds = 0.02) => ({ timestamp_seconds, cause, total_seconds,
   stage: 'callback', words: `because of ${cause}` });
 const late = {
   timestamp_seconds: 1003,
@@ -54,7 +54,7 @@ const late = {
 };
 
 test('late calls are counted in periods of ten seconds by cause, those before ten minutes left out', () => {
-  const { bars, colours, from, end } = course(late);
+  const { bars, colours, from, end } = timeline(late);
   assert.deepEqual([from, end], [410, 1010]);
   assert.deepEqual(bars.map((bar) => [bar.begin, bar.list.length]), [[410, 1], [990, 3], [1000, 1]]);
   assert.deepEqual(colours.map(({ cause, calls }) => [cause, calls])[0], ['lock', 3]);
@@ -63,11 +63,11 @@ test('late calls are counted in periods of ten seconds by cause, those before te
   const height = most.parts.reduce((sum, part) => sum + part.height, 0);
   assert.ok(Math.abs(height - 1) < 1e-9, 'the period with the most calls has the full height');
   assert.match(most.label, /: 3 late calls, up to 300 ms: lock 2, runnable 1$/);
-  assert.deepEqual(course(null).bars, []);
+  assert.deepEqual(timeline(null).bars, []);
 });
 
 test('the period closest to a picked time has its calls, the longest first, with known parts', () => {
-  const shown = course(late);
+  const shown = timeline(late);
   assert.equal(closest(shown, 985).begin, 990);
   assert.equal(closest(shown, 1019).begin, 1000);
   assert.equal(closest(shown, 700), null);
@@ -75,4 +75,14 @@ test('the period closest to a picked time has its calls, the longest first, with
   assert.deepEqual(calls.map((call) => call.who), ['process 43', '/filter', '/filter']);
   assert.deepEqual(calls.map((call) => call.example != null), [false, true, false]);
   assert.equal(calls[0].words, 'because of lock');
+});
+
+test('each cause keeps its colour whatever its rank', () => {
+  const one = timeline({ timestamp_seconds: 5, callbacks: [{ history: [moment(1, 'cpu'), moment(2, 'cpu'),
+    moment(3, 'lock'), moment(4, 'sleep'), moment(4, 'queue'), moment(4, 'new_cause')] }] });
+  const colours = Object.fromEntries(one.colours.map(({ cause, colour }) => [cause, colour]));
+  assert.deepEqual(colours, { cpu: '--line-2', lock: '--line-3', sleep: '--line-3', queue: '--line-4',
+    new_cause: '--dim' });
+  const [bar] = one.bars;
+  assert.equal(new Set(bar.parts.map((part) => part.cause)).size, 5);
 });

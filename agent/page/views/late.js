@@ -1,9 +1,9 @@
 // A part of the views of a topic and of a node: which calls of callbacks were late, and why.
 
 import { clock } from '../format.js';
-import { callsOf, causes, closest, course, missing, WIDTH, worst } from '../late.js';
+import { callsOf, causes, closest, missing, timeline, WIDTH, worst } from '../late.js';
 import { Failed, html, Name } from '../ui.js';
-import { useEffect, useState } from '../vendor/hooks.mjs';
+import { useEffect, useRef, useState } from '../vendor/hooks.mjs';
 
 /** Size of a period in the drawing of late calls over time. */
 const BAR = 10;
@@ -26,7 +26,7 @@ export function Late({ answer, picked = null }) {
       <tbody>${rows.map(([words, late, longest, remedy]) => html`<tr key=${words}><th scope="row"><${Name}
         text=${words} /></th><td class="number">${late}</td><td class="number">${longest}</td>
         <td>${remedy}</td></tr>`)}</tbody></table></div>`}
-    <${Course} why=${answer.data} picked=${picked} />
+    <${Timeline} why=${answer.data} picked=${picked} />
     ${calls.length > 0 && html`<div class="scroll" tabindex="0" role="group" aria-label="Worst calls">
       <table><caption>Worst calls</caption><thead><tr><th scope="col">Callback</th><th scope="col">Node</th>
       <th scope="col" class="number">Late</th><th scope="col" class="number">Time</th>
@@ -39,22 +39,32 @@ export function Late({ answer, picked = null }) {
 
 /** Draws the late calls of the last ten minutes by cause, and lists those of a chosen period.
  * @param {{why: any, picked: {time: number}|null}} props */
-function Course({ why, picked }) {
+function Timeline({ why, picked }) {
   const [chosen, choose] = useState(/** @type {number|null} */ (null));
-  const shown = course(why);
-  const near = picked && closest(shown, picked.time);
+  const [note, say] = useState('');
+  const handled = useRef(/** @type {object|null} */ (null));
+  const place = useRef(/** @type {HTMLElement|null} */ (null));
+  const shown = timeline(why);
   useEffect(() => {
-    if (picked) choose(near ? near.begin : null);
-  }, [picked, near?.begin]);
+    if (!picked || !why || handled.current === picked) return;
+    handled.current = picked;
+    const near = closest(shown, picked.time);
+    choose(near ? near.begin : null);
+    say(near ? '' : `No late call is known near ${clock(picked.time)}.`);
+    place.current?.scrollIntoView({ block: 'nearest' });
+  });
   const bar = shown.bars.find((/** @type {any} */ it) => it.begin === chosen);
-  const note = picked && !near ? `No late call is known near ${clock(picked.time)}.` : '';
-  if (shown.bars.length === 0) return note && html`<p class="dim" role="status">${note}</p>`;
+  const status = html`<p class="dim" role="status" ref=${place}>${note}</p>`;
+  if (shown.bars.length === 0) return status;
   return html`<h4>Late calls over time</h4>
     <p>${shown.colours.map((/** @type {any} */ it) => html`<span key=${it.cause} class="cause"
       style="--cause: var(${it.colour})">${it.words} ${it.calls}</span>`)}</p>
-    <svg class="course" viewBox="0 0 ${BAR * shown.periods} ${HEIGHT}" preserveAspectRatio="none"
+    <svg class="timeline" viewBox="0 0 ${BAR * shown.periods} ${HEIGHT}" preserveAspectRatio="none"
       role="group" aria-label="Late calls over time">${shown.bars.map((/** @type {any} */ it) => {
-    const pick = () => choose(it.begin === chosen ? null : it.begin);
+    const pick = () => {
+      choose(it.begin === chosen ? null : it.begin);
+      say('');
+    };
     return html`<g key=${it.begin} role="button" tabindex="0" aria-label=${it.label}
         aria-pressed=${it.begin === chosen} onClick=${pick}
         onKeyDown=${(/** @type {KeyboardEvent} */ event) => {
@@ -62,13 +72,13 @@ function Course({ why, picked }) {
           event.preventDefault();
           pick();
         }}><title>${it.label}</title>
-        <rect class="place" x=${BAR * it.place} y="0" width=${BAR} height=${HEIGHT} />
-        ${it.parts.map((/** @type {any} */ part) => html`<rect key=${part.colour}
+        <rect class="hit-area" x=${BAR * it.place} y="0" width=${BAR} height=${HEIGHT} />
+        ${it.parts.map((/** @type {any} */ part) => html`<rect key=${part.cause}
           x=${BAR * it.place + 1} width=${BAR - 2} y=${HEIGHT * (1 - part.from - part.height)}
           height=${HEIGHT * part.height} style="fill: var(${part.colour})" />`)}</g>`;
   })}</svg>
     <p class="dim">${clock(shown.from)} to ${clock(shown.end)}. Choose a bar to list its calls.</p>
-    ${note && html`<p class="dim" role="status">${note}</p>`}
+    ${status}
     ${bar && html`<div class="scroll" tabindex="0" role="group" aria-label="Calls of a period"><table>
       <caption>${bar.label}</caption><thead><tr><th scope="col">Time</th><th scope="col">Callback</th>
       <th scope="col">Node</th><th scope="col" class="number">Length</th><th scope="col">Why</th></tr>

@@ -26,7 +26,7 @@ export function Topic({ name, query }) {
   const domain = query.domain ? Number(query.domain) : null;
   const topic = state.topicNamed(name, domain);
   const scope = topic ? `?domain_id=${topic.domain}` : domain == null ? '' : `?domain_id=${domain}`;
-  const [picked, pick] = useState(/** @type {{time: number}|null} */ (null));
+  const [picked, pick] = useState(/** @type {{time: number, topic?: number}|null} */ (null));
   const details = usePoll(topic ? named('topics', apiName(topic), scope) : null, 2000);
   if (!topic) {
     return html`<h1 tabindex="-1"><${Name} text=${name} /></h1>
@@ -61,13 +61,14 @@ export function Topic({ name, query }) {
       <${Figure} label="latency p99" value=${duration(figures.p99)} />
       <${Figure} label="last message" value=${clock(figures.last)} />
     </div>
-    <${Charts} key=${topic.id} topic=${topic} scope=${scope} pick=${pick} />
+    <${Charts} key=${topic.id} topic=${topic} scope=${scope} pick=${(/** @type {{time: number}} */
+      { time }) => pick({ time, topic: topic.id })} />
     <${Failed} problem=${details.problem} what="No details" />
     ${details.data && html`
       <${Endpoints} details=${details.data} topic=${topic} />
       <${Offered} details=${details.data} />
       <${Inside} key=${`inside ${topic.id}`} inside=${details.data.inside} name=${topic.name}
-        domain=${topic.domain} picked=${picked} />
+        domain=${topic.domain} picked=${picked?.topic === topic.id ? picked : null} />
       <${Waterfall} details=${details.data} />
       <${Passages} details=${details.data} />`}
     <${Definition} key=${`definition ${topic.id}`} path=${named('topics', apiName(topic),
@@ -136,8 +137,8 @@ function Charts({ topic, scope, pick }) {
     <${Chart} title="Latency" times=${own} print=${duration} lines=${[
       { label: 'p50', colour: '--line-1', values: half },
       { label: 'p99', colour: '--line-3', values: most }]}
-      note="From the writer’s timestamp to the capture; between hosts it needs equal clocks. A click
-        shows the late calls of that time" pick=${pick} />
+      note="From the writer’s timestamp to the capture; between hosts it needs equal clocks. A click, or
+        Enter at the cursor, observes calls and lists the late ones of that time" pick=${pick} />
     <${Chart} title="Lost messages" times=${own} print=${count} whole
       lines=${[{ label: 'lost', colour: '--line-4', values: lost, fill: true }]} />
     </div></section>`;

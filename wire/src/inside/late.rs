@@ -82,7 +82,7 @@ pub struct Other {
     /// Name of the thread.
     pub name: [u8; NAME_BYTES],
     /// Its control group: the inode of its directory.
-    pub group: u64,
+    pub cgroup_id: u64,
     /// Its priority as in `task_struct.prio`: -1 = deadline, 0 to 98 = real time, 100 to 139 = a nice
     /// value. [`UNKNOWN_PRIORITY`] = unknown.
     pub priority: i64,
@@ -109,7 +109,7 @@ pub struct Blocked {
     /// Name of that thread.
     pub waker_name: [u8; NAME_BYTES],
     /// Control group of that thread, as in [`Other`].
-    pub waker_group: u64,
+    pub waker_cgroup_id: u64,
 }
 
 /// What a thread did in a span of time, by the events of the scheduler, in nanoseconds.

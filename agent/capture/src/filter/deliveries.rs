@@ -114,6 +114,7 @@ impl Deliveries {
             sent_before: sent.filter(|sent| *sent <= delivery.arrived).map(before),
             arrived_before: before(delivery.arrived),
             received_before: before(delivery.received),
+            receiver_thread: delivery.thread,
             receiver: (delivery.accounted != 0).then(|| ReceiverStates {
                 runnable: Duration::from_nanos(delivery.runnable),
                 throttled: Duration::from_nanos(delivery.throttled),

@@ -352,12 +352,16 @@ const BEFORE: u32 = 2;
 /// Returns the unit of a control group, by the inode of its directory.
 pub(super) type UnitOf<'a> = &'a dyn Fn(u64) -> Option<Arc<str>>;
 
-/// Returns the control groups of other threads in these calls, by the inodes of their directories.
-pub(super) fn groups(calls: &[late::LateCall]) -> BTreeSet<u64> {
+/// Returns the control groups of the threads that these calls name, by the inodes of their
+/// directories.
+pub(super) fn cgroup_ids(calls: &[late::LateCall]) -> BTreeSet<u64> {
     let of_call = |call: &late::LateCall| {
         let activities = [call.during, call.before];
-        let waker = |blocked: &late::Blocked| blocked.waker_group;
-        let others = activities.map(|activity| activity.others.map(|other| other.group));
+        let waker = |blocked: &late::Blocked| match has_waker(blocked) {
+            true => blocked.waker_cgroup_id,
+            false => 0,
+        };
+        let others = activities.map(|activity| activity.others.map(|other| other.cgroup_id));
         let wakers = activities.map(|activity| waker(&activity.longest));
         let groups = others.into_iter().flatten().chain(wakers);
         groups.chain([waker(&call.stop)])
@@ -435,7 +439,7 @@ fn activity(activity: &late::Activity, unit_of: UnitOf<'_>) -> Activity {
             thread: other.thread,
             process: other.process,
             name: name(&other.name),
-            unit: unit_of(other.group),
+            unit: unit_of(other.cgroup_id),
             priority: Priority::of_kernel(other.priority),
         })
         .collect();
@@ -455,23 +459,26 @@ fn activity(activity: &late::Activity, unit_of: UnitOf<'_>) -> Activity {
 }
 
 fn blocked(blocked: &late::Blocked, unit_of: UnitOf<'_>) -> Blocked {
-    let kind = blocked.kind as usize;
-    // An interrupt ends any other wait, whatever thread it interrupts.
-    let has_waker = matches!(kind, wait::LOCK | wait::STOPPED) && blocked.waker != 0;
     Blocked {
         duration: Duration::from_nanos(blocked.nanoseconds),
-        kind,
+        kind: blocked.kind as usize,
         call: (blocked.call != u32::MAX).then(|| system_call(blocked.call)),
         argument: blocked.argument,
-        waker: has_waker.then(|| OtherThread {
+        waker: has_waker(blocked).then(|| OtherThread {
             duration: Duration::ZERO,
             thread: blocked.waker,
             process: blocked.waker_process,
             name: name(&blocked.waker_name),
-            unit: unit_of(blocked.waker_group),
+            unit: unit_of(blocked.waker_cgroup_id),
             priority: None,
         }),
     }
+}
+
+/// Returns whether the thread that ended a wait is known. An interrupt ends any other wait, whatever
+/// thread it interrupts.
+const fn has_waker(blocked: &late::Blocked) -> bool {
+    matches!(blocked.kind as usize, wait::LOCK | wait::STOPPED) && blocked.waker != 0
 }
 
 fn name(bytes: &[u8; late::NAME_BYTES]) -> Arc<str> {

@@ -141,6 +141,7 @@ fn load_scheduler(ebpf: &mut Ebpf, offsets: &[u32]) -> Result<[OwnedFd; 2], NoEv
         accounting::RUN_DELAY,
         accounting::STATE,
         accounting::THREAD,
+        accounting::PRIORITY,
     ];
     let is_known = |member: &usize| {
         offsets

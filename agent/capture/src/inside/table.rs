@@ -1,6 +1,6 @@
 //! The observed processes: their names, budgets, and changes since the last report.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -23,14 +23,16 @@ use ros2probe_wire::{DomainId, Timestamp};
 use zerocopy::FromBytes as _;
 
 use super::cpu_limits;
-use super::late::{convert, groups};
+use super::late::{cgroup_ids, convert};
 use super::names::{Endpoint, Names, text};
 use super::process::Stat;
 use super::programs::Tables;
 use crate::cgroup;
 use crate::cgroup_paths::{CgroupPaths, short_name};
 use crate::system::Clocks;
-use crate::tables::{CausalHops, InsideBuffers, LateCalls, NewNodes, ReportedHandles, Transitions};
+use crate::tables::{
+    CausalHops, InsideBuffers, LateCalls, NamedCgroups, NewNodes, ReportedHandles, Transitions,
+};
 
 /// Maximum calls per second of one process. Above it, its calls are no longer counted.
 pub const MAX_PROCESS_HITS: u64 = 50_000;
@@ -46,8 +48,9 @@ pub struct ProcessTable {
     hops: Bounded<CausalHops, Vec<inside::Hop>>,
     late: Bounded<LateCalls, Vec<late::LateCall>>,
     transitions: Bounded<Transitions, Vec<Transition>>,
-    /// Control groups of the threads that late calls name.
-    groups: CgroupPaths,
+    cgroups: CgroupPaths,
+    /// Units by the ids of control groups; `None`: it is the root, or its path is not found.
+    units: Bounded<NamedCgroups, HashMap<u64, Option<Arc<str>>>>,
     rounds: u32,
     /// Time since calls per second were last evaluated.
     unjudged: Duration,
@@ -134,7 +137,8 @@ impl ProcessTable {
             hops: Bounded::default(),
             late: Bounded::default(),
             transitions: Bounded::default(),
-            groups: CgroupPaths::new(cgroup::mount_point().unwrap_or_default()),
+            cgroups: CgroupPaths::new(cgroup::mount_point().unwrap_or_default()),
+            units: Bounded::default(),
             rounds: 0,
             unjudged: Duration::ZERO,
         }
@@ -319,7 +323,7 @@ impl ProcessTable {
             true => Arc::new([]),
             false => cpu_limits::read(Path::new("/sys")),
         };
-        self.groups.refresh(&groups(&calls));
+        self.name_cgroups(cgroup_ids(&calls));
         let late = calls
             .iter()
             .filter_map(|call| self.late_call(call, delivery(call), &cpu_limits, &figures, clocks));
@@ -532,10 +536,7 @@ impl ProcessTable {
         clocks: &Clocks,
     ) -> Option<LateCall> {
         self.known.get(&call.process)?;
-        let unit_of = |group| {
-            let path = self.groups.path(group).filter(|path| *path != "/")?;
-            Some(short_name(path).into())
-        };
+        let unit_of = |cgroup_id| self.units.get(&cgroup_id).cloned().flatten();
         Some(convert(
             call,
             clocks,
@@ -555,6 +556,23 @@ impl ProcessTable {
                 })
             },
         ))
+    }
+
+    /// Finds the units of control groups that are not known yet.
+    fn name_cgroups(&mut self, mut ids: BTreeSet<u64>) {
+        ids.retain(|id| !self.units.contains_key(id));
+        if ids.is_empty() {
+            return;
+        }
+        self.cgroups.refresh(&ids);
+        for id in ids {
+            let path = self.cgroups.path(id).filter(|path| *path != "/");
+            let unit = path.map(|path| Arc::from(short_name(path)));
+            if let Some((id, unit)) = self.units.insert(id, unit) {
+                self.units.clear();
+                self.units.insert(id, unit);
+            }
+        }
     }
 
     /// Returns the trigger of a callback, and its node.
@@ -690,6 +708,18 @@ mod tests {
         }
         assert_driven::<LateCalls>();
         assert_eq!(table.late.len(), LateCalls::CAP);
+    }
+
+    #[test]
+    fn control_groups_beyond_the_cap_are_searched_again() {
+        let mut table = table();
+        table.name_cgroups((1..=NamedCgroups::CAP as u64).collect());
+        assert_eq!(table.units.len(), NamedCgroups::CAP);
+        // The id is 0 for no control group.
+        table.name_cgroups([u64::MAX].into());
+        assert_driven::<NamedCgroups>();
+        assert_eq!(table.units.get(&u64::MAX), Some(&None));
+        assert_eq!(table.units.len(), 1);
     }
 
     #[test]

@@ -3,12 +3,12 @@
 use std::borrow::Cow;
 
 use ros2probe_api::diagnosis::Diagnosis;
-use ros2probe_api::inside::{LateSummary, TopicInside};
+use ros2probe_api::inside::{RecentLateCalls, TopicInside};
 
 use super::text::{counted, ratio, safe, seconds};
 
 /// Returns the late calls of a topic's callbacks, as text.
-pub(super) fn late(late: &LateSummary<'_>) -> String {
+pub(super) fn late(late: &RecentLateCalls<'_>) -> String {
     format!(
         "{} in the last minute, up to {}: {} (rp why)",
         counted(late.calls, "late call"),

@@ -452,6 +452,8 @@ mod tests {
         let qos = json!([{"kind": "qos_incompatible"}, {"kind": "unmatched_publisher"}]);
         assert_eq!(state(json!([{"state": "ok"}]), qos), "!qos");
         assert_eq!(state(json!([{"state": "silent"}]), json!([])), "!silent");
+        let late = json!([{"kind": "late_callback"}]);
+        assert_eq!(state(json!([]), late), "!late");
     }
 
     #[test]

@@ -538,7 +538,7 @@ pub(super) struct OtlpShape {
     pub(super) metrics: Option<bool>,
     /// Whether events are exported, as log records.
     pub(super) events: Option<bool>,
-    /// Whether spans are exported, for watches with `trace`.
+    /// Whether spans are exported, for watches with `trace` and for `late_calls`.
     pub(super) traces: Option<bool>,
     /// Whether late calls of callbacks are exported as spans, with their stages; default false.
     pub(super) late_calls: Option<bool>,

@@ -54,6 +54,7 @@ const FINDING: &[&str] = &[
     "stage",
     "cause",
     "by",
+    "by_unit",
     "longest_seconds",
     "overwritten_ratio",
     "lost_ratio",

@@ -85,7 +85,8 @@ pub(super) struct Connection<S> {
     state: Arc<ConnectionState>,
     connections: Arc<Connections>,
     deadline: Pin<Box<Sleep>>,
-    _place: Slot,
+    /// `None` only while the value is dropped.
+    slot: Option<Slot>,
 }
 
 impl Connections {
@@ -98,7 +99,7 @@ impl Connections {
             state,
             connections: Arc::clone(self),
             deadline: Box::pin(sleep_until(Instant::now() + IDLE)),
-            _place: slot,
+            slot: Some(slot),
         }
     }
 
@@ -118,7 +119,8 @@ impl Connections {
         longest.map(|(_, state)| state.end.cancel()).is_some()
     }
 
-    /// Returns whether a connection was not read since it was accepted or answered.
+    /// Returns whether a connection without a request may have unread data: its last read found
+    /// some, or it was never read.
     pub(super) fn has_unread(&self) -> bool {
         self.lock().iter().any(|state| {
             let progress = state.lock();
@@ -317,6 +319,8 @@ impl<S> Drop for Connection<S> {
         let mut connections = self.connections.lock();
         connections.retain(|state| !Arc::ptr_eq(state, &self.state));
         drop(connections);
+        // A waiting client finds the slot free.
+        self.slot = None;
         self.connections.left.notify_one();
     }
 }

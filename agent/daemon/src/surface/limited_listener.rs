@@ -1,6 +1,7 @@
 //! A listener with a limited number of connections. If all slots are in use, the connection that
 //! has waited longest for its client is closed. If no connection waits, a further client receives
-//! 503: immediately, or after 100 ms if some connections were not read yet.
+//! 503. While some connections are not read yet, it first waits for up to 100 ms. Clients behind it
+//! wait as well.
 
 use std::io;
 use std::sync::Arc;
@@ -21,8 +22,9 @@ const REFUSAL_TIMEOUT: Duration = Duration::from_secs(1);
 const FAREWELLS: usize = 64;
 /// Maximum number of bytes read of a refused request, so that its sender receives the answer.
 const REQUEST: u64 = 64 << 10;
-/// Maximum time until a new connection gets the slot of another one: until one is found that waits
-/// for its client, and is closed.
+/// Maximum time until a connection is found that waits for its client, if some were not read yet.
+const SEARCH_TIMEOUT: Duration = Duration::from_millis(100);
+/// Maximum time that an evicted connection may take to close.
 const EVICTION_TIMEOUT: Duration = Duration::from_millis(100);
 /// Time between two searches for a connection that waits for its client.
 const PAUSE: Duration = Duration::from_millis(2);
@@ -69,25 +71,29 @@ impl<L> LimitedListener<L> {
             return Some(slot);
         }
         self.limits.reached(self.limit, 1);
-        let freed = async {
-            while !self.connections.make_room() {
-                // Threads without CPU time have not read some connections yet.
-                if !self.connections.has_unread() {
-                    return None;
-                }
-                sleep(PAUSE).await;
-                if let Some(slot) = self.slots.take() {
-                    return Some(slot);
-                }
-            }
+        // Threads without CPU time have not read some connections yet.
+        let evicted = async {
             loop {
-                self.connections.left().await;
-                if let Some(slot) = self.slots.take() {
-                    return Some(slot);
+                match self.connections.make_room() {
+                    true => return true,
+                    false if !self.connections.has_unread() => return false,
+                    false => sleep(PAUSE).await,
                 }
             }
         };
-        timeout(EVICTION_TIMEOUT, freed).await.ok().flatten()
+        let freed = async {
+            loop {
+                if let Some(slot) = self.slots.take() {
+                    return slot;
+                }
+                self.connections.left().await;
+            }
+        };
+        match timeout(SEARCH_TIMEOUT, evicted).await {
+            Ok(true) => timeout(EVICTION_TIMEOUT, freed).await.ok(),
+            // A client may have left in the meantime.
+            Ok(false) | Err(_) => self.slots.take(),
+        }
     }
 
     /// Refuses a connection without a slot, in the background. The number of such answers in

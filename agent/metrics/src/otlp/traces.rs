@@ -66,7 +66,7 @@ pub struct SpanSink {
     /// Counts spans that do not fit.
     pub exports: Arc<Exports>,
     /// Whether late calls are exported.
-    pub has_late_calls: bool,
+    pub exports_late_calls: bool,
 }
 
 impl SpanSink {
@@ -75,25 +75,49 @@ impl SpanSink {
         let Spans { spans, lost } = messages;
         let spans = spans.into_iter().map(QueuedSpan::Message);
         let of_chains = chains.spans.into_iter().map(QueuedSpan::Chain);
-        let mut lost = lost + chains.lost;
-        let mut of_late_calls = Vec::new();
-        if self.has_late_calls {
-            lost += late.lost;
-            for (domain_id, example) in &*late.calls {
-                of_late_calls.extend(LateSpan::of(*domain_id, example));
-            }
-        }
-        let of_late_calls = of_late_calls.into_iter().map(QueuedSpan::LateCall);
+        let lost = lost + chains.lost;
         let mut signals = self.exports.signals();
         if signals.any(|signal| signal == Signal::Traces) {
-            let refused = self.queue.put(spans.chain(of_chains).chain(of_late_calls));
+            let refused = self.queue.put(spans.chain(of_chains));
+            let refused = refused + self.add_late_calls(late);
             self.exports
                 .count_dropped(Signal::Traces, Reason::Overflow, refused + lost);
         }
     }
 }
 
+impl SpanSink {
+    /// Queues the spans of late calls, if they are exported. Returns the number of spans that did
+    /// not fit: those of whole calls. A call that the model left out counts as one.
+    fn add_late_calls(&self, late: &NewLateCalls) -> u64 {
+        if !self.exports_late_calls {
+            return 0;
+        }
+        let calls = late.calls.iter();
+        let refused = calls.map(|(domain_id, example)| {
+            let spans = LateSpan::of(*domain_id, example).into_iter();
+            self.queue.put_whole(spans.map(QueuedSpan::LateCall))
+        });
+        late.lost + refused.sum::<u64>()
+    }
+}
+
 impl SpanQueue {
+    /// Appends all of these spans, or none. Returns the number of spans that did not fit.
+    fn put_whole(&self, spans: impl ExactSizeIterator<Item = QueuedSpan>) -> u64 {
+        let count = spans.len();
+        let mut waiting = self.waiting();
+        if waiting.len() + count > WaitingSpans::CAP {
+            return count as u64;
+        }
+        spans.for_each(|span| {
+            waiting.push_back(span);
+        });
+        drop(waiting);
+        self.added.notify_one();
+        0
+    }
+
     /// Appends spans and returns the number of spans that did not fit.
     fn put(&self, spans: impl IntoIterator<Item = QueuedSpan>) -> u64 {
         let mut spans = spans.into_iter().peekable();

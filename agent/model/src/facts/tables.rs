@@ -256,8 +256,8 @@ crate::tables! {
     /// The last late calls of one callback, with all their parts
     LastLateCalls { name: "inside.late.last", entries: 4, rule: Oldest }
     /// Late calls that are not yet taken for export
-    UntakenLateCalls {
-        name: "inside.late.untaken", entries: 1024, effect: "has no span", reported: "`ros2probe_otlp_dropped_total`",
+    WaitingLateCalls {
+        name: "inside.late.waiting", entries: 1024, effect: "has no span", reported: "`ros2probe_otlp_dropped_total`",
     }
     /// Topics of observed processes
     InsideTopicSums {

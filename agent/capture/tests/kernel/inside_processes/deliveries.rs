@@ -152,7 +152,9 @@ fn a_message_that_its_publisher_sends_late_names_the_publisher() -> Result<()> {
     way.send(LATE)?;
     let call = way.receive("network 1 0");
     assert_late_for(&call, Stage::Publish, Cause::Send);
-    assert!(call.delivery.unwrap().sent_before.is_some());
+    let delivery = call.delivery.as_ref().unwrap();
+    assert!(delivery.sent_before.is_some());
+    assert_eq!(delivery.receiver_thread, call.thread);
     assert_eq!(way.unmatched()?, 0);
     Ok(())
 }

@@ -139,6 +139,10 @@ fn a_call_beside_a_real_time_thread_names_that_thread() {
 #[test]
 fn a_call_that_waits_for_a_lock_names_its_holder() {
     let (mut robot, mut process) = started();
+    let name = format!("r2p-{}-filter.service", std::process::id());
+    let unit = Cgroup::create(&name).unwrap();
+    let id = process.child.id().to_string();
+    std::fs::write(unit.path().join("cgroup.procs"), id).unwrap();
     let calls = late(&mut robot, &mut process, "lock 10 30000");
     assert!(calls.len() >= 8, "{calls:#?}");
     assert_cause(&calls, calls.len(), Cause::Lock, 0.3);
@@ -148,6 +152,7 @@ fn a_call_that_waits_for_a_lock_names_its_holder() {
         assert_eq!(longest.call.as_deref(), Some("futex"), "{call:#?}");
         let waker = longest.waker.as_ref().unwrap();
         assert_eq!(&*waker.name, "lock-holder", "{call:#?}");
+        assert_eq!(waker.unit.as_deref(), Some(&*name), "{call:#?}");
         assert_eq!(waker.process, process.child.id());
     }
 }

@@ -355,7 +355,10 @@ fn a_new_finding_triggers_the_snapshots_of_its_kind() {
             calls: 3,
             stage: late::Stage::Callback,
             cause: late::Cause::Runnable,
-            by: None,
+            by: Some(late::Culprit {
+                name: "chromium".into(),
+                unit: Some("kiosk.service".into()),
+            }),
             longest: period * 2,
         },
         Diagnosis::IntraProcessOverflow {

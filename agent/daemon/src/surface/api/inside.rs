@@ -20,8 +20,9 @@ use super::scope::Domain;
 use crate::agent_facts::InsideSourceFacts;
 use crate::surface::inside_nodes::NodeActivity;
 use ros2probe_api::inside::{
-    Buffer, Callback, Counter, Durations, Inside, LateSummary, Library, LifecycleState, NodeInside,
-    Owner, Process, Publisher, ReaderQueue, Subscription, ThreadStates, TopicInside, Trigger,
+    Buffer, Callback, Counter, Durations, Inside, Library, LifecycleState, NodeInside, Owner,
+    Process, Publisher, ReaderQueue, RecentLateCalls, Subscription, ThreadStates, TopicInside,
+    Trigger,
 };
 use ros2probe_model::facts::calls::facts::{self, Quantiles};
 use ros2probe_model::facts::calls::report;
@@ -186,14 +187,14 @@ pub(super) fn topic<'a>(facts: &'a TopicFacts, snapshot: &Snapshot) -> Option<To
 }
 
 /// Returns the late calls of the callbacks of a topic in the last minute.
-fn late(facts: &TopicFacts, snapshot: &Snapshot) -> Option<LateSummary<'static>> {
+fn late(facts: &TopicFacts, snapshot: &Snapshot) -> Option<RecentLateCalls<'static>> {
     let callbacks = snapshot.inside.as_deref()?.late.iter();
     let own = callbacks.filter(|callback| {
         callback.owner.domain_id == facts.domain_id && is_triggered_by(&callback.trigger, facts)
     });
     let recent = own.flat_map(|callback| {
-        let entries = callback.history.iter().rev();
-        entries.take_while(|entry| snapshot.at - entry.at < LATE_WINDOW)
+        let entries = callback.history.iter();
+        entries.filter(|entry| snapshot.at - entry.at < LATE_WINDOW)
     });
     let (mut calls, mut longest, mut causes) = (0, Duration::ZERO, BTreeMap::new());
     for entry in recent {
@@ -202,7 +203,7 @@ fn late(facts: &TopicFacts, snapshot: &Snapshot) -> Option<LateSummary<'static>>
         *causes.entry((entry.cause, &entry.culprit)).or_insert(0) += 1;
     }
     let ((cause, culprit), _) = causes.into_iter().max_by_key(|(_, calls)| *calls)?;
-    Some(LateSummary {
+    Some(RecentLateCalls {
         calls,
         longest_seconds: longest.as_secs_f64(),
         cause: cause.label().into(),
@@ -426,13 +427,14 @@ fn lifecycle_state(facts: &facts::LifecycleState, clock: WallClock) -> Lifecycle
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
+    use std::sync::Arc;
 
     use ros2probe_model::facts::calls::report::{
         CallbackReport, ProcessReport, PublisherReport, Report, Trigger,
     };
     use ros2probe_model::observe::input::Input;
     use ros2probe_model::observe::observer::{Observer, Settings};
+    use ros2probe_testing::sample_robot;
     use ros2probe_wire::Timestamp;
     use ros2probe_wire::time::SECOND;
 
@@ -552,5 +554,26 @@ mod tests {
         };
         let answer = inside(&snapshot, Some(&source), |_| true);
         assert_eq!(answer.reason.as_deref(), Some("CAP_BPF is missing"));
+    }
+
+    #[test]
+    fn a_topic_has_the_late_calls_of_its_own_callbacks_in_the_last_minute() {
+        let mut snapshot = sample_robot::snapshot(["/points"]);
+        let facts = sample_robot::topic("/points");
+        let found = late(&facts, &snapshot).unwrap();
+        assert_eq!((found.calls, &*found.cause), (1, "runnable"));
+        assert_eq!(found.words, "chromium (kiosk.service) ran instead");
+        assert_eq!(late(&sample_robot::topic("/other"), &snapshot), None);
+        let elsewhere = TopicFacts {
+            domain_id: DomainId(9),
+            ..sample_robot::topic("/points")
+        };
+        assert_eq!(late(&elsewhere, &snapshot), None);
+        let mut of_service = snapshot.clone();
+        let inside = Arc::make_mut(of_service.inside.as_mut().unwrap());
+        inside.late[0].trigger = report::Trigger::Service(Some("/points".into()));
+        assert_eq!(late(&facts, &of_service), None);
+        snapshot.at = snapshot.at + Duration::from_secs(60);
+        assert_eq!(late(&facts, &snapshot), None, "a minute ago");
     }
 }

@@ -20,7 +20,7 @@ use super::problem::{Code, Problem};
 use super::scope::Domain;
 use crate::agent_facts::InsideSourceFacts;
 use ros2probe_api::why::{
-    Blocked, Cause, LateCall, LateCallback, LateMoment, OtherThread, Part, PreviousCall, Why,
+    Blocked, Cause, LateCall, LateCallSummary, LateCallback, OtherThread, Part, PreviousCall, Why,
 };
 use ros2probe_model::facts::calls::facts::{self, InsideFacts, LateExample};
 use ros2probe_model::facts::calls::late;
@@ -98,11 +98,11 @@ async fn show(
                 || name == callback.trigger.name()
                 || name == callback.owner.node.as_deref())
     };
-    let span = Span {
+    let selection = Selection {
         last,
         has_history: of.history,
     };
-    Ok(Json(why(snapshot, source, span, is_meant)).into_response())
+    Ok(Json(why(snapshot, source, selection, is_meant)).into_response())
 }
 
 /// Returns a number from 0 to `largest`, or the problem of another one.
@@ -116,9 +116,9 @@ fn within(name: &str, number: f64, largest: f64) -> Result<f64, Problem> {
     }
 }
 
-/// Which late calls an answer has, and how.
+/// Which late calls an answer has.
 #[derive(Clone, Copy, Debug)]
-struct Span {
+struct Selection {
     /// Only those of this time until now.
     last: Option<Duration>,
     /// Whether each callback lists its last late calls.
@@ -128,7 +128,7 @@ struct Span {
 fn why<'a>(
     snapshot: &'a Snapshot,
     source: Option<&'a InsideSourceFacts>,
-    span: Span,
+    selection: Selection,
     is_meant: impl Fn(&facts::LateCallback) -> bool,
 ) -> Why<'a> {
     let mut answer = Why {
@@ -150,7 +150,9 @@ fn why<'a>(
     let Some(known) = snapshot.inside.as_deref() else {
         return answer;
     };
-    let since = span.last.map_or(ModelTime::ZERO, |last| snapshot.at - last);
+    let since = selection
+        .last
+        .map_or(ModelTime::ZERO, |last| snapshot.at - last);
     let clock = snapshot.wall_clock;
     let callbacks = known.late.iter().filter(|callback| is_meant(callback));
     let callbacks: Vec<_> = callbacks
@@ -161,7 +163,7 @@ fn why<'a>(
     answer.callbacks = callbacks
         .map(|callback| {
             let mut shown = late_callback(callback, known, since, clock);
-            if span.has_history {
+            if selection.has_history {
                 let calls = callback.history.iter().filter(|entry| entry.at >= since);
                 shown.history = calls.map(|entry| moment(entry, clock)).collect();
             }
@@ -237,10 +239,10 @@ fn late_callback<'a>(
     }
 }
 
-fn moment(entry: &facts::LateEntry, clock: WallClock) -> LateMoment<'_> {
-    LateMoment {
+fn moment(entry: &facts::LateEntry, clock: WallClock) -> LateCallSummary<'_> {
+    LateCallSummary {
         timestamp_seconds: clock.wall_time(entry.at).seconds(),
-        seconds: entry.total.as_secs_f64(),
+        total_seconds: entry.total.as_secs_f64(),
         stage: entry.stage.label().into(),
         cause: entry.cause.label().into(),
         words: entry
@@ -265,6 +267,7 @@ fn late_call(example: &LateExample, clock: WallClock) -> LateCall<'_> {
         late_wait_seconds: (call.bound.wait.as_nanos() < u128::from(u64::MAX))
             .then_some(call.bound.wait.as_secs_f64()),
         thread_id: call.thread,
+        receiver_thread_id: call.delivery.as_ref().map(|it| it.receiver_thread),
         cpu: call.cpu,
         stage: main.map(|part| part.stage.label().into()),
         cause: main.map(|part| part.cause.label().into()),
@@ -317,5 +320,33 @@ fn other_thread(other: &late::OtherThread) -> OtherThread<'_> {
         unit: other.unit.as_deref().map(Cow::Borrowed),
         priority: other.priority.map(|priority| priority.to_string().into()),
         seconds: other.duration.as_secs_f64(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_testing::sample_robot;
+
+    use super::*;
+
+    #[test]
+    fn the_last_late_calls_are_listed_on_request_within_the_selected_time() {
+        let mut snapshot = sample_robot::snapshot(["/points"]);
+        let listed = |snapshot: &Snapshot, last, has_history| -> Vec<(f64, String)> {
+            let selection = Selection { last, has_history };
+            let answer = why(snapshot, None, selection, |_| true);
+            let callbacks = answer.callbacks.iter();
+            let calls = callbacks.flat_map(|callback| &callback.history);
+            calls
+                .map(|call| (call.total_seconds, call.words.to_string()))
+                .collect()
+        };
+        assert_eq!(listed(&snapshot, None, false), []);
+        let call = (0.105, "chromium (kiosk.service) ran instead".to_owned());
+        assert_eq!(listed(&snapshot, None, true), std::slice::from_ref(&call));
+        let minute = Some(Duration::from_secs(60));
+        assert_eq!(listed(&snapshot, minute, true), [call]);
+        snapshot.at = snapshot.at + Duration::from_secs(61);
+        assert_eq!(listed(&snapshot, minute, true), []);
     }
 }

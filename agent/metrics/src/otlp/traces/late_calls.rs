@@ -21,7 +21,7 @@ pub(super) struct LateSpan {
     example: Arc<LateExample>,
     /// The stage; `None` for the whole call, the parent of the stages.
     stage: Option<Stage>,
-    /// From the start of the call back to the begin of the span.
+    /// Time from the begin of the span to the start of the call.
     before: Duration,
     duration: Duration,
 }
@@ -64,8 +64,9 @@ impl LateSpan {
             trace_id,
             id: id(label.as_bytes(), trace_id, &[]),
             parent: self.stage.map(|_| id(b"late", trace_id, &[])),
-            kind: match call.trigger.name() {
-                Some(_) if self.stage.is_none() => SpanKind::Consumer,
+            kind: match (&call.trigger, self.stage) {
+                (Trigger::Subscription(_) | Trigger::IntraProcess(_), None) => SpanKind::Consumer,
+                (Trigger::Service(_), None) => SpanKind::Server,
                 _ => SpanKind::Internal,
             },
             name: format!("{label} {}", call.trigger),
@@ -96,16 +97,25 @@ impl LateSpan {
     fn of_call(&self) -> Vec<KeyValue> {
         let LateExample { call, main, .. } = &*self.example;
         let mut attributes = vec![
-            attribute("messaging.system", "ros2"),
             int("domain_id", self.domain_id.into()),
             attribute("trigger", call.trigger.label()),
             int("process.pid", call.process.into()),
             int("thread.id", call.thread.into()),
-            int("cpu", call.cpu.into()),
+            int("cpu.logical_number", call.cpu.into()),
         ];
-        if let Trigger::Subscription(topic) = &call.trigger {
-            let key = "messaging.destination.name";
-            attributes.push(attribute(key, topic.to_string()));
+        match &call.trigger {
+            Trigger::Subscription(topic) | Trigger::IntraProcess(Some(topic)) => {
+                attributes.extend([
+                    attribute("messaging.system", "ros2"),
+                    attribute("messaging.operation.name", "process"),
+                    attribute("messaging.operation.type", "process"),
+                    attribute("messaging.destination.name", topic.to_string()),
+                ]);
+            }
+            Trigger::Service(Some(service)) => {
+                attributes.push(attribute("service", service.to_string()));
+            }
+            Trigger::IntraProcess(None) | Trigger::Timer(_) | Trigger::Service(None) => {}
         }
         if let Some(node) = &call.node {
             attributes.push(attribute("ros_node", node.to_string()));
@@ -140,7 +150,7 @@ impl LateSpan {
         let words = part.cause.in_words(by.map(|by| by as _));
         let mut attributes = vec![
             attribute("cause", part.cause.label()),
-            attribute("cause_in_words", words),
+            attribute("cause_description", words),
         ];
         attributes.extend(by.into_iter().flat_map(named));
         attributes
@@ -150,7 +160,7 @@ impl LateSpan {
 fn named(by: &OtherThread) -> Vec<KeyValue> {
     let mut attributes = vec![
         attribute("by", by.name.to_string()),
-        int("by_process", by.process.into()),
+        int("by_process_id", by.process.into()),
     ];
     let texts = [
         ("by_unit", by.unit.as_ref().map(ToString::to_string)),
@@ -208,6 +218,7 @@ mod tests {
                 sent_before: Some(milliseconds(50)),
                 arrived_before: milliseconds(40),
                 received_before: milliseconds(15),
+                receiver_thread: 44,
                 receiver: None,
             }),
             cpu_limits: Arc::new([]),
@@ -252,6 +263,31 @@ mod tests {
     }
 
     #[test]
+    fn the_kind_of_a_span_is_that_of_its_trigger() {
+        for (trigger, kind, service) in [
+            (Trigger::Timer(None), SpanKind::Internal, None),
+            (
+                Trigger::Service(Some("/plan".into())),
+                SpanKind::Server,
+                Some("/plan"),
+            ),
+            (Trigger::IntraProcess(None), SpanKind::Consumer, None),
+        ] {
+            let mut example = Arc::unwrap_or_clone(example());
+            example.call.trigger = trigger;
+            // The call was ready when it started.
+            (example.call.wait, example.call.delivery) = (None, None);
+            let spans = LateSpan::of(DomainId(0), &Arc::new(example));
+            let all: Vec<_> = spans.iter().map(|span| span.parts(5)).collect();
+            assert_eq!(all.len(), 2, "the call and its callback");
+            assert_eq!((&all[0].kind, &all[1].kind), (&kind, &SpanKind::Internal));
+            assert_eq!(value(&all[0], "service").as_deref(), service);
+            assert_eq!(value(&all[0], "messaging.destination.name"), None);
+            assert_eq!(all[0].times, all[1].times);
+        }
+    }
+
+    #[test]
     fn the_stages_of_a_late_call_are_adjacent_children_with_the_culprit_as_attribute() {
         let spans = LateSpan::of(DomainId(3), &example());
         let all: Vec<_> = spans.iter().map(|span| span.parts(5)).collect();
@@ -276,7 +312,7 @@ mod tests {
             ("cause", "lock"),
             ("stage", "callback"),
             ("by", "holder"),
-            ("by_process", "7"),
+            ("by_process_id", "7"),
             ("by_unit", "map.service"),
             ("by_priority", "real-time 9"),
             ("messaging.destination.name", "/points"),

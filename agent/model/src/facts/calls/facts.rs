@@ -11,7 +11,7 @@ use super::report::{Durations, ThreadStates, Trigger};
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName};
-use crate::facts::tables::{LateHistory, UntakenLateCalls};
+use crate::facts::tables::{LateHistory, WaitingLateCalls};
 
 /// Facts from inside processes. Lists are sorted by process and handle.
 #[derive(Clone, Debug, Default)]
@@ -253,7 +253,7 @@ pub struct LateEntry {
 #[derive(Debug, Default)]
 pub struct NewLateCalls {
     /// The calls with their domains, in the order of the reports.
-    pub calls: Bounded<UntakenLateCalls, Vec<(DomainId, Arc<LateExample>)>>,
+    pub calls: Bounded<WaitingLateCalls, Vec<(DomainId, Arc<LateExample>)>>,
     /// Number of calls left out because the list was full.
     pub lost: u64,
 }

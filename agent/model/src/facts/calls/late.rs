@@ -147,6 +147,8 @@ pub struct MessageDelivery {
     pub arrived_before: Duration,
     /// A thread of the process received that datagram.
     pub received_before: Duration,
+    /// That thread.
+    pub receiver_thread: u32,
     /// States of that thread between the two, if they are known.
     pub receiver: Option<ReceiverStates>,
 }
@@ -206,8 +208,8 @@ pub struct OtherThread {
     pub process: u32,
     /// Name of the thread.
     pub name: Arc<str>,
-    /// Its systemd unit, the first digits of its container's id, or the last part of its control
-    /// group's path; `None` if that is the root of version 2 or no longer exists.
+    /// First digits of its container's id, else its systemd unit, else the last part of its control
+    /// group's path; `None` for the root group, or if the path is not found.
     pub unit: Option<Arc<str>>,
     /// Its priority when it last left the CPU, if known.
     pub priority: Option<Priority>,

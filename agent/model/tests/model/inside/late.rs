@@ -9,7 +9,7 @@ use ros2probe_model::facts::calls::late::{
 };
 use ros2probe_model::facts::calls::report::{ProcessReport, Report, ThreadStates, Trigger};
 use ros2probe_model::facts::diagnosis::Diagnosis;
-use ros2probe_model::facts::tables::UntakenLateCalls;
+use ros2probe_model::facts::tables::WaitingLateCalls;
 use ros2probe_model::observe::input::Input;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::inside::late::wait;
@@ -183,6 +183,7 @@ fn call_of_a_message() -> LateCall {
         sent_before: Some(milliseconds(80)),
         arrived_before: milliseconds(60),
         received_before: milliseconds(30),
+        receiver_thread: 44,
         receiver: Some(ReceiverStates {
             runnable: milliseconds(3),
             throttled: milliseconds(2),
@@ -462,7 +463,7 @@ fn late_calls_beyond_the_cap_until_the_next_output_are_counted() {
     report(&mut observer, 0, 600);
     report(&mut observer, 1, 600);
     let late = observer.drain().late_calls;
-    let [cap, beyond] = [UntakenLateCalls::CAP, 1200 - UntakenLateCalls::CAP];
+    let [cap, beyond] = [WaitingLateCalls::CAP, 1200 - WaitingLateCalls::CAP];
     assert_eq!((late.calls.len(), late.lost), (cap, beyond as u64));
     let (_, first) = &late.calls[0];
     assert_eq!(first.main.unwrap().cause, Cause::Runnable);
