@@ -11,9 +11,9 @@ use std::time::Duration;
 
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::calls::late::{
-    Activity, Blocked, CpuLimit, LateBound, LateCall, MessageDelivery, OtherThread, PreviousCall,
-    Priority, Stop,
+    Activity, Blocked, CpuLimit, LateBound, LateCall, MessageDelivery, PreviousCall, Stop,
 };
+use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
 use ros2probe_model::facts::names::NodeName;
 use ros2probe_wire::Timestamp;

@@ -16,7 +16,8 @@ use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{DomainId, Guid};
 
 use crate::facts::calls::facts::Owner;
-use crate::facts::calls::late::{Cause, Culprit, Stage};
+use crate::facts::calls::late::{Cause, Stage};
+use crate::facts::calls::other_thread::Culprit;
 use crate::facts::calls::report::Trigger;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
 use crate::facts::topic_kind::TopicKind;

@@ -9,9 +9,8 @@ use ros2probe_model::facts::calls::facts::{
     ObservedProcess, Owner, Publisher, Quantiles, ReaderQueue, Subscription, TopicCounts,
     TopicInside,
 };
-use ros2probe_model::facts::calls::late::{
-    Activity, Cause, Culprit, LateBound, LateCall, OtherThread, Priority, Stage,
-};
+use ros2probe_model::facts::calls::late::{Activity, Cause, LateBound, LateCall, Stage};
+use ros2probe_model::facts::calls::other_thread::{Culprit, OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{Durations, ThreadStates, Trigger};
 use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::facts::model_time::ModelTime;

@@ -3,7 +3,8 @@
 use std::process::Command;
 use std::time::Duration;
 
-use ros2probe_model::facts::calls::late::{Cause, LateCall, Priority, Stage};
+use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
+use ros2probe_model::facts::calls::other_thread::Priority;
 use ros2probe_model::facts::calls::report::ThreadStates;
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_wire::inside::late::{Bound, PER_SECOND, mode};

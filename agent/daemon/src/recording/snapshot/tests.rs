@@ -8,8 +8,8 @@ use std::time::Duration;
 use ros2probe_bag::metadata::{self, Metadata};
 use ros2probe_message::{Library, Sources};
 use ros2probe_model::facts::calls::facts::Owner;
-use ros2probe_model::facts::calls::late;
 use ros2probe_model::facts::calls::report as inside;
+use ros2probe_model::facts::calls::{late, other_thread};
 use ros2probe_model::facts::churn;
 use ros2probe_model::facts::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::facts::dispatch::Sample;
@@ -355,7 +355,7 @@ fn a_new_finding_triggers_the_snapshots_of_its_kind() {
             calls: 3,
             stage: late::Stage::Callback,
             cause: late::Cause::Runnable,
-            by: Some(late::Culprit {
+            by: Some(other_thread::Culprit {
                 name: "chromium".into(),
                 unit: Some("kiosk.service".into()),
             }),

@@ -23,7 +23,7 @@ use ros2probe_api::why::{
     Blocked, Cause, LateCall, LateCallSummary, LateCallback, OtherThread, Part, PreviousCall, Why,
 };
 use ros2probe_model::facts::calls::facts::{self, InsideFacts, LateExample};
-use ros2probe_model::facts::calls::late;
+use ros2probe_model::facts::calls::{late, other_thread};
 use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::report::snapshot::Snapshot;
@@ -35,7 +35,7 @@ const LONGEST_MS: f64 = 3_600_000.0;
 const LONGEST_S: f64 = 1e9;
 
 /// A cause with the thread that it names.
-type Named = (late::Stage, late::Cause, Option<late::Culprit>);
+type Named = (late::Stage, late::Cause, Option<other_thread::Culprit>);
 
 /// Query parameters that select late calls.
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
@@ -312,7 +312,7 @@ fn part(stage: late::Stage, cause: late::Cause, duration: Duration) -> Part<'sta
     }
 }
 
-fn other_thread(other: &late::OtherThread) -> OtherThread<'_> {
+fn other_thread(other: &other_thread::OtherThread) -> OtherThread<'_> {
     OtherThread {
         name: Cow::Borrowed(&other.name),
         thread_id: other.thread,

@@ -10,7 +10,8 @@ use ros2probe_wire::{DomainId, Timestamp};
 
 use super::{Parts, attribute, id, int};
 use ros2probe_model::facts::calls::facts::LateExample;
-use ros2probe_model::facts::calls::late::{OtherThread, Part, Stage};
+use ros2probe_model::facts::calls::late::{Part, Stage};
+use ros2probe_model::facts::calls::other_thread::OtherThread;
 use ros2probe_model::facts::calls::report::Trigger;
 use ros2probe_model::facts::identity::Identity;
 
@@ -180,8 +181,9 @@ fn nanoseconds(duration: Duration) -> u64 {
 mod tests {
     use super::*;
     use ros2probe_model::facts::calls::late::{
-        Activity, Blocked, Cause, LateBound, LateCall, MessageDelivery, Priority,
+        Activity, Blocked, Cause, LateBound, LateCall, MessageDelivery,
     };
+    use ros2probe_model::facts::calls::other_thread::Priority;
     use ros2probe_model::facts::calls::report::ThreadStates;
     use ros2probe_model::facts::model_time::ModelTime;
     use ros2probe_wire::inside::late::wait;

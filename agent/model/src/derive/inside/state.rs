@@ -19,7 +19,8 @@ use crate::facts::bounded::{Bounded, Counted, Sum};
 use crate::facts::calls::facts::{
     InsideFacts, LifecycleState, NewLateCalls, ObservedProcess, TopicInside,
 };
-use crate::facts::calls::late::{LateCall, OtherThread};
+use crate::facts::calls::late::LateCall;
+use crate::facts::calls::other_thread::OtherThread;
 use crate::facts::calls::report::{ProcessReport, Report, ThreadStates, Transition, Trigger};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::measurement::Measurement;

@@ -6,7 +6,8 @@ use std::time::Duration;
 
 use ros2probe_wire::{DomainId, Guid};
 
-use super::late::{Cause, Culprit, LateCall, Part, Stage};
+use super::late::{Cause, LateCall, Part, Stage};
+use super::other_thread::Culprit;
 use super::report::{Durations, ThreadStates, Trigger};
 use crate::facts::bounded::Bounded;
 use crate::facts::model_time::ModelTime;

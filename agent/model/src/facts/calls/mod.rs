@@ -3,4 +3,5 @@
 pub mod durations;
 pub mod facts;
 pub mod late;
+pub mod other_thread;
 pub mod report;

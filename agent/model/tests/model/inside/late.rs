@@ -4,9 +4,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_model::facts::calls::late::{
-    Activity, Blocked, Cause, LateBound, LateCall, MessageDelivery, OtherThread, PreviousCall,
-    Priority, ReceiverStates, Stage, Stop,
+    Activity, Blocked, Cause, LateBound, LateCall, MessageDelivery, PreviousCall, ReceiverStates,
+    Stage, Stop,
 };
+use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{ProcessReport, Report, ThreadStates, Trigger};
 use ros2probe_model::facts::diagnosis::Diagnosis;
 use ros2probe_model::facts::tables::WaitingLateCalls;

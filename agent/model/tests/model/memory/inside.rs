@@ -4,9 +4,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_daemon::agent_facts::InsideSourceFacts;
-use ros2probe_model::facts::calls::late::{
-    Activity, Blocked, LateBound, LateCall, OtherThread, PreviousCall, Priority,
-};
+use ros2probe_model::facts::calls::late::{Activity, Blocked, LateBound, LateCall, PreviousCall};
+use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{
     CallbackReport, Durations, ProcessReport, PublisherReport, Report, ThreadStates, Transition,
     Trigger,
