@@ -12,10 +12,10 @@ use aya::maps::{HashMap, Map, MapData, MapInfo};
 
 const PROG_LOAD: libc::c_int = 5;
 const PROG_ATTACH: libc::c_int = 8;
-const PROG_GET_FD_BY_ID: libc::c_int = 13;
-const MAP_GET_FD_BY_ID: libc::c_int = 14;
+const PROG_GET_NEXT_ID: libc::c_int = 11;
+const MAP_GET_NEXT_ID: libc::c_int = 12;
 const PROG_QUERY: libc::c_int = 16;
-const LINK_GET_FD_BY_ID: libc::c_int = 30;
+const LINK_GET_NEXT_ID: libc::c_int = 31;
 const CGROUP_SKB: u32 = 8;
 const ALLOW_MULTI: u32 = 2;
 
@@ -153,22 +153,20 @@ pub fn exists(program: u32) -> Result<bool> {
     is_there(Object::Program(program))
 }
 
-/// Returns whether the object still exists.
+/// Returns whether the object still exists. It is not opened: a `BPF_MAP_TYPE_PROG_ARRAY` that is
+/// opened and closed while the kernel clears it is never freed (Linux 6.18).
 pub fn is_there(object: Object) -> Result<bool> {
     let (command, id) = match object {
-        Object::Program(id) => (PROG_GET_FD_BY_ID, id),
-        Object::Map(id) => (MAP_GET_FD_BY_ID, id),
-        Object::Link(id) => (LINK_GET_FD_BY_ID, id),
+        Object::Program(id) => (PROG_GET_NEXT_ID, id),
+        Object::Map(id) => (MAP_GET_NEXT_ID, id),
+        Object::Link(id) => (LINK_GET_NEXT_ID, id),
     };
-    let by_id = ObjectById {
-        id,
-        ..ObjectById::default()
+    let mut next = NextObject {
+        start: id - 1,
+        ..NextObject::default()
     };
-    match bpf(command, &by_id) {
-        Ok(number) => {
-            drop(descriptor(number));
-            Ok(true)
-        }
+    match bpf_mut(command, &mut next) {
+        Ok(_) => Ok(next.next == id),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
         Err(error) => Err(error).with_context(|| format!("cannot ask for {object:?}")),
     }
@@ -217,8 +215,8 @@ struct ProgramsToFind {
 
 #[derive(Clone, Copy, Default)]
 #[repr(C)]
-struct ObjectById {
-    id: u32,
+struct NextObject {
+    start: u32,
     next: u32,
     open_flags: u32,
 }
@@ -226,7 +224,7 @@ struct ObjectById {
 impl Attributes for ProgramToLoad {}
 impl Attributes for ProgramToAttach {}
 impl Attributes for ProgramsToFind {}
-impl Attributes for ObjectById {}
+impl Attributes for NextObject {}
 
 fn bpf<A: Attributes>(command: libc::c_int, attributes: &A) -> io::Result<i32> {
     let mut attributes = *attributes;
