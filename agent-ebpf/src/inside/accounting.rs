@@ -83,7 +83,7 @@ pub const fn least(one: u64, other: u64) -> u64 {
 
 /// Returns how long the quotas of the thread's control groups have stopped them.
 #[inline(always)]
-fn throttled(task: u64) -> u64 {
+pub fn throttled(task: u64) -> u64 {
     let has_quotas = offset(GROUP) != ABSENT && offset(GROUP_PARENT) != ABSENT;
     if !has_quotas || offset(GROUP_THROTTLED) == ABSENT {
         return 0;

@@ -10,7 +10,7 @@ use aya_ebpf::{
 use ros2probe_wire::inside::{
     Counter, Handle, announced, kind,
     late::{
-        Activity, BOUND_CAPACITY, Blocked, Bound, LateCall, PER_SECOND, THREAD_CAPACITY,
+        Activity, BOUND_CAPACITY, Blocked, Bound, Handoff, LateCall, PER_SECOND, THREAD_CAPACITY,
         THREAD_IDS, mode,
     },
     thread_state,
@@ -32,7 +32,7 @@ static LATE_MODE: Array<u32> = Array::with_max_entries(1, 0);
 /// Bounds of callbacks. Set by user space.
 #[map]
 static BOUNDS: HashMap<Handle, Bound> = HashMap::with_max_entries(BOUND_CAPACITY, 0);
-/// Threads that call callbacks, by thread id.
+/// Threads that call callbacks, and those of the middleware that wake them, by thread id.
 #[map]
 static FOLLOWED_THREADS: LruHashMap<u32, Followed> =
     LruHashMap::with_max_entries(THREAD_CAPACITY, 0);
@@ -53,7 +53,19 @@ pub mod state {
     pub const BLOCKED: u64 = 2;
 }
 
-/// A thread that calls callbacks.
+/// What a followed thread does for callbacks.
+pub mod role {
+    /// Unknown until it calls a callback, or wakes a thread that does.
+    pub const NONE: u64 = 0;
+    /// It calls callbacks, and waits at present.
+    pub const EXECUTOR: u64 = 1;
+    /// It is in a callback.
+    pub const IN_CALLBACK: u64 = 2;
+    /// It passes messages on to threads that call callbacks.
+    pub const RECEIVER: u64 = 3;
+}
+
+/// A thread that calls callbacks, or passes messages on to such a thread.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct Followed {
@@ -67,8 +79,19 @@ pub struct Followed {
     pub charged: u64,
     /// The scheduler's waiting time of the thread when it last left a CPU.
     pub run_delay: u64,
+    /// Its process.
+    pub process: u64,
+    /// One of [`role`].
+    pub role: u64,
     /// The present wait, if the thread is blocked.
     pub wait: Blocked,
+    /// Of an executor's thread, how it was woken after the longest wait that a thread of its process
+    /// ended since the last call. Of a receiver, how itself was last woken for a message.
+    pub handoff: Handoff,
+    /// That wait.
+    pub handoff_wait: u64,
+    /// How long the control groups of a receiver had been throttled at that wake-up.
+    pub throttled: u64,
     /// What the thread did since the last start or end of a callback.
     pub activity: Activity,
     /// The last time in which the thread was stopped, and its end; 0 = never.
@@ -119,7 +142,7 @@ pub fn is_followed(thread: u32) -> bool {
 
 /// Follows a thread from now on.
 #[inline(always)]
-fn follow(thread: u32) -> Option<*mut Followed> {
+pub fn follow(thread: u32) -> Option<*mut Followed> {
     if !is_followed(thread)
         && let Some(word) = FOLLOWED.get_ptr_mut(thread >> 6)
     {
@@ -187,17 +210,16 @@ unsafe fn begin_span(followed: *mut Followed, now: u64) {
     }
 }
 
-/// Copies plain values of map memory, or of the ring.
+/// Copies a plain value of map memory, or of the ring, word by word.
 #[inline(always)]
-unsafe fn copy(from: *const Activity, to: *mut Activity) {
-    const WORDS: usize = size_of::<Activity>() / 8;
+pub unsafe fn copy<T: Copy>(from: *const T, to: *mut T) {
     // SAFETY: both have this size, by the caller.
-    unsafe { copy_nonoverlapping(from.cast::<u64>(), to.cast::<u64>(), WORDS) };
+    unsafe { copy_nonoverlapping(from.cast::<u64>(), to.cast::<u64>(), size_of::<T>() / 8) };
 }
 
 /// Empties what a thread did.
 #[inline(always)]
-unsafe fn clear(followed: *mut Followed) {
+pub unsafe fn clear(followed: *mut Followed) {
     if let Some(new) = NEW_FOLLOWED.get_ptr(0) {
         // SAFETY: map values checked against null.
         unsafe { copy(&raw const (*new).activity, &raw mut (*followed).activity) };
@@ -219,6 +241,12 @@ pub fn began(current: &Current, delay: u64, now: u64, accounting: Option<Account
         begin_span(followed, now);
         copy(&raw const (*followed).activity, &raw mut (*followed).before);
         clear(followed);
+        (*followed).process = u64::from(current.process);
+        if (*followed).role == role::RECEIVER {
+            // Its wake-ups were its own.
+            (*followed).handoff.at = 0;
+        }
+        (*followed).role = role::IN_CALLBACK;
         (*followed).mode = u64::from(mode);
         (*followed).delay = delay;
         (*followed).is_accounted_before = 0;
@@ -270,6 +298,9 @@ pub fn ended(
             );
         }
         clear(followed);
+        (*followed).role = role::EXECUTOR;
+        (*followed).handoff.at = 0;
+        (*followed).handoff_wait = 0;
         (*followed).previous = callback;
         (*followed).previous_started = started;
         (*followed).previous_ended = now;
@@ -341,6 +372,7 @@ unsafe fn report(
         (*late).previous_ended = (*followed).previous_ended;
         (*late).states = states.unwrap_or([0; thread_state::COUNT]);
         (*late).states_before = (*followed).states_before;
+        copy(&raw const (*followed).handoff, &raw mut (*late).handoff);
         (*late).stop = (*followed).stop;
         (*late).stop_ended = (*followed).stop_ended;
         copy(&raw const (*followed).activity, &raw mut (*late).during);

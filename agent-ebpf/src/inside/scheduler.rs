@@ -26,13 +26,16 @@ use aya_ebpf::{
 };
 use ros2probe_wire::inside::{
     accounting::{PRIORITY, RUN_DELAY, RUNTIME, STATE, THREAD},
-    late::{Activity, Blocked, NAME_BYTES, OTHERS, Other, UNKNOWN_PRIORITY, wait},
+    late::{Activity, Blocked, NAME_BYTES, OTHERS, Other, STALL, UNKNOWN_PRIORITY, wait},
 };
 
 use crate::{
-    accounting::{least, word},
+    accounting::{least, throttled, word},
     instructions::opaque,
-    late::{Followed, add_runnable, followed, forget, is_any_runnable, is_followed, state},
+    late::{
+        Followed, add_runnable, clear, copy, follow, followed, forget, is_any_runnable,
+        is_followed, role, state,
+    },
     maps::now,
     registers::is_aarch64,
 };
@@ -128,9 +131,90 @@ pub fn woken(context: &RawTracePointContext) {
         bpf_get_current_comm(name, NAME_BYTES as u32);
         (*followed).wait.waker_cgroup_id = bpf_get_current_cgroup_id();
         unblocked(followed, now);
+        let role = (*followed).role;
+        if role == role::RECEIVER {
+            receiver_woken(followed, context.arg(0), now);
+        } else if role == role::EXECUTOR {
+            executor_woken(followed, id, now);
+        }
         (*followed).state = state::RUNNABLE;
         (*followed).since = now;
         add_runnable(1);
+    }
+}
+
+/// Handles that a thread of the middleware is woken. Messages come through a system call, or from
+/// another process that wakes it in shared memory. All other waits delay the message.
+#[inline(always)]
+unsafe fn receiver_woken(receiver: *mut Followed, task: u64, now: u64) {
+    // SAFETY: a map value, by the caller.
+    unsafe {
+        let kind = (*receiver).wait.kind;
+        let is_own = u64::from((*receiver).wait.waker_process) == (*receiver).process;
+        let is_shared = kind == wait::LOCK as u32 && !is_own;
+        if kind != wait::OTHER as u32 && !is_shared {
+            return;
+        }
+        clear(receiver);
+        copy(
+            &raw const (*receiver).wait,
+            &raw mut (*receiver).handoff.wait,
+        );
+        (*receiver).handoff.woken = now;
+        (*receiver).throttled = throttled(task);
+    }
+}
+
+/// Handles that the running thread ends a wait of a thread that calls callbacks. The longest such
+/// wait is that for a message: those for locks of the middleware follow it.
+#[inline(always)]
+unsafe fn executor_woken(executor: *mut Followed, id: u64, now: u64) {
+    // SAFETY: map values, by the caller.
+    unsafe {
+        let waited = (*executor).wait.nanoseconds;
+        if (*executor).wait.kind != wait::LOCK as u32
+            || id >> 32 != (*executor).process
+            || waited <= (*executor).handoff_wait
+        {
+            return;
+        }
+        (*executor).handoff_wait = waited;
+        (*executor).handoff.at = 0;
+        let Some(receiver) = follow(thread_of(id)) else {
+            return;
+        };
+        let role = (*receiver).role;
+        if role == role::NONE {
+            (*receiver).role = role::RECEIVER;
+            (*receiver).process = id >> 32;
+            (*receiver).since = now;
+        } else if role != role::RECEIVER {
+            return;
+        }
+        let handoff = &raw mut (*executor).handoff;
+        let woken = (*receiver).handoff.woken;
+        (*handoff).at = now;
+        (*handoff).thread = id & 0xffff_ffff;
+        (*handoff).woken = woken;
+        let runnable = (*receiver).activity.runnable;
+        (*handoff).runnable = runnable;
+        (*handoff).throttled = 0;
+        if woken == 0 {
+            return;
+        }
+        copy(
+            &raw const (*receiver).handoff.wait,
+            &raw mut (*handoff).wait,
+        );
+        if runnable >= STALL {
+            let throttled = throttled(bpf_get_current_task());
+            let throttled = throttled.wrapping_sub((*receiver).throttled);
+            (*handoff).throttled = least(throttled, runnable);
+            copy(
+                &raw const (*receiver).activity.others,
+                &raw mut (*handoff).others,
+            );
+        }
     }
 }
 
@@ -143,23 +227,15 @@ unsafe fn unblocked(followed: *mut Followed, now: u64) {
         (*followed).wait.nanoseconds = waited;
         block(followed, waited);
         if waited > (*followed).activity.longest.nanoseconds {
-            copy_wait(followed, &raw mut (*followed).activity.longest);
+            copy(
+                &raw const (*followed).wait,
+                &raw mut (*followed).activity.longest,
+            );
         }
         if (*followed).wait.kind == wait::STOPPED as u32 {
-            copy_wait(followed, &raw mut (*followed).stop);
+            copy(&raw const (*followed).wait, &raw mut (*followed).stop);
             (*followed).stop_ended = now;
         }
-    }
-}
-
-/// Copies the present wait.
-#[inline(always)]
-unsafe fn copy_wait(followed: *const Followed, to: *mut Blocked) {
-    const WORDS: usize = size_of::<Blocked>() / 8;
-    // SAFETY: both are in map values, by the caller.
-    unsafe {
-        let from = (&raw const (*followed).wait).cast::<u64>();
-        core::ptr::copy_nonoverlapping(from, to.cast::<u64>(), WORDS);
     }
 }
 
@@ -260,7 +336,7 @@ unsafe fn remember(runs: *mut Runs, id: u64, now: u64) {
         let index = opaque(count as u32) & (RUNS as u64 - 1);
         let run = (&raw mut (*runs).runs).cast::<Run>().add(index as usize);
         (*run).until = now;
-        (*run).id = id << 32 | id >> 32;
+        (*run).id = id;
         bpf_get_current_comm((&raw mut (*run).name).cast(), NAME_BYTES as u32);
         (*run).cgroup_id = bpf_get_current_cgroup_id();
         let task = bpf_get_current_task();

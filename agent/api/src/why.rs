@@ -125,7 +125,8 @@ pub struct LateCall<'a> {
     pub late_wait_seconds: Option<f64>,
     /// Thread of the call.
     pub thread_id: u32,
-    /// Thread that received the message from its socket; null if that was not observed.
+    /// Thread of the middleware that received the message, or passed it to the thread of the call; null
+    /// if that was not observed.
     pub receiver_thread_id: Option<u32>,
     /// CPU on which the call ended.
     pub cpu: u32,
@@ -137,7 +138,7 @@ pub struct LateCall<'a> {
     pub words: Cow<'a, str>,
     /// Parts of its time, in the order of the stages.
     pub parts: Vec<Part<'a>>,
-    /// Threads that ran while the callback could run.
+    /// Threads that ran while the callback, or the thread that received its message, could run.
     pub others: Vec<OtherThread<'a>>,
     /// The longest time for which the callback was blocked.
     pub blocked: Option<Blocked<'a>>,

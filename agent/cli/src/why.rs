@@ -11,10 +11,11 @@ use crate::top::text::{counted, safe, seconds};
 /// Width of a drawn bar, in characters.
 const BAR: usize = 48;
 /// Stages in the order of time, in words.
-const STAGES: [(&str, &str); 5] = [
+const STAGES: [(&str, &str); 6] = [
     ("publish", "until sent"),
     ("network", "on the way"),
     ("socket", "in the socket"),
+    ("receive", "in the middleware"),
     ("wait", "before the call"),
     ("callback", "in the call"),
 ];

@@ -3,6 +3,7 @@
 #define _GNU_SOURCE
 #include <arpa/inet.h>
 #include <fcntl.h>
+#include <linux/futex.h>
 #include <pthread.h>
 #include <stdbool.h>
 #include <stddef.h>
@@ -12,6 +13,7 @@
 #include <string.h>
 #include <sys/mman.h>
 #include <sys/socket.h>
+#include <sys/syscall.h>
 #include <sys/wait.h>
 #include <time.h>
 #include <unistd.h>
@@ -168,8 +170,47 @@ static int64_t received_from(int receiver) {
     return words[6] * 1000000000LL + ((words[7] * 1000000000ULL + (1u << 31)) >> 32);
 }
 
+/* What another process writes into shared memory. */
+struct port { uint32_t count; uint32_t padding; int64_t source; };
+/* A thread of the middleware: it waits for messages in shared memory, and passes each one on after
+   `us` microseconds. */
+struct listener { struct port *port; long us; uint32_t passed; int64_t source; };
+static pthread_mutex_t ready_lock = PTHREAD_MUTEX_INITIALIZER;
+static pthread_cond_t ready = PTHREAD_COND_INITIALIZER;
+static void *listen_for_messages(void *argument) {
+    struct listener *own = argument;
+    pthread_setname_np(pthread_self(), "dds-listener");
+    for (;;) {
+        uint32_t count = __atomic_load_n(&own->port->count, __ATOMIC_ACQUIRE);
+        if (count == own->passed) {
+            syscall(SYS_futex, &own->port->count, FUTEX_WAIT, count, 0, 0, 0);
+            continue;
+        }
+        if (own->us) usleep(own->us);
+        pthread_mutex_lock(&ready_lock);
+        own->source = own->port->source;
+        own->passed = count;
+        pthread_cond_signal(&ready);
+        pthread_mutex_unlock(&ready_lock);
+    }
+    return 0;
+}
+static struct listener *started_listener(const char *path) {
+    struct listener *own = calloc(1, sizeof *own);
+    int file = open(path, O_RDWR);
+    own->port = mmap(0, sizeof *own->port, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+    if (own->port == MAP_FAILED) abort();
+    close(file);
+    own->passed = own->port->count;
+    pthread_t thread;
+    if (pthread_create(&thread, 0, listen_for_messages, own)) abort();
+    return own;
+}
+
 int main(int argc, char **argv) {
     int receiver = -1;
+    struct listener *listener = 0;
+    uint32_t seen = 0;
     char line[4096], what[64], path[3072];
     const char *input = argc > 1 ? argv[1] : "/in", *output = argc > 2 ? argv[2] : "/out";
     const char *name = argc > 3 ? argv[3] : "filter";
@@ -274,6 +315,25 @@ int main(int argc, char **argv) {
                 ros_trace_rclcpp_executor_get_next_ready();
                 int64_t source = received_from(receiver);
                 if (us) usleep(us);
+                ros_trace_rclcpp_executor_execute(&in);
+                ros_trace_rmw_take(&in_rmw, &message, source, true);
+                ros_trace_callback_start(callback, false);
+                ros_trace_callback_end(callback);
+            }
+        } else if (!strcmp(what, "listen")) {
+            /* Listens at a file that other processes map. */
+            listener = started_listener(path);
+            seen = listener->passed;
+        } else if (!strcmp(what, "shared")) {
+            /* Takes `n` messages that the listener passes on after `us` microseconds each. */
+            listener->us = us;
+            for (long i = 0; i < n; i++) {
+                ros_trace_rclcpp_executor_get_next_ready();
+                pthread_mutex_lock(&ready_lock);
+                while (listener->passed == seen) pthread_cond_wait(&ready, &ready_lock);
+                int64_t source = listener->source;
+                seen = listener->passed;
+                pthread_mutex_unlock(&ready_lock);
                 ros_trace_rclcpp_executor_execute(&in);
                 ros_trace_rmw_take(&in_rmw, &message, source, true);
                 ros_trace_callback_start(callback, false);

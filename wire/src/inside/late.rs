@@ -20,6 +20,9 @@ pub const OTHERS: usize = 8;
 /// Size of a thread's name with its terminating zero, `TASK_COMM_LEN` of the kernel.
 pub const NAME_BYTES: usize = 16;
 
+/// Minimum of [`Handoff::runnable`] for which other threads are named, in nanoseconds.
+pub const STALL: u64 = 500_000;
+
 /// The priority of a thread whose priority cannot be read.
 pub const UNKNOWN_PRIORITY: i64 = i64::MIN;
 
@@ -134,6 +137,28 @@ pub struct Activity {
     pub others: [Other; OTHERS],
 }
 
+/// How a thread of the middleware passed a message to the thread that calls callbacks.
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, FromBytes, IntoBytes, Immutable, KnownLayout,
+)]
+#[repr(C)]
+pub struct Handoff {
+    /// Time at which it woke that thread; 0 = it did not.
+    pub at: u64,
+    /// The thread of the middleware.
+    pub thread: u64,
+    /// Time at which it was itself woken for the message; 0 = unknown.
+    pub woken: u64,
+    /// Time since then for which it could run and did not, in nanoseconds.
+    pub runnable: u64,
+    /// Part of `runnable` for which its control groups were throttled.
+    pub throttled: u64,
+    /// For what it waited before, and the thread that woke it.
+    pub wait: Blocked,
+    /// Threads that ran instead. They mean nothing if `runnable` is less than [`STALL`].
+    pub others: [Other; OTHERS],
+}
+
 /// One late call: an item of the ring of announcements.
 #[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[repr(C)]
@@ -176,6 +201,9 @@ pub struct LateCall {
     pub stop: Blocked,
     /// End of that time; 0 = never.
     pub stop_ended: u64,
+    /// How the thread was woken, after the longest wait that a thread of its process ended since the call
+    /// before.
+    pub handoff: Handoff,
     /// The thread during the call, by [`thread_state`], in nanoseconds.
     pub states: [u64; thread_state::COUNT],
     /// The thread between the call before and this one.

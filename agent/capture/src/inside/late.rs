@@ -11,7 +11,8 @@ use std::time::Duration;
 
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::calls::late::{
-    Activity, Blocked, CpuLimit, LateBound, LateCall, MessageDelivery, PreviousCall, Stop,
+    Activity, Blocked, CpuLimit, Handoff, LateBound, LateCall, MessageDelivery, PreviousCall,
+    ReceiverStates, Stop,
 };
 use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
@@ -361,10 +362,12 @@ pub(super) fn cgroup_ids(calls: &[late::LateCall]) -> BTreeSet<u64> {
             true => blocked.waker_cgroup_id,
             false => 0,
         };
-        let others = activities.map(|activity| activity.others.map(|other| other.cgroup_id));
+        let of_others = |others: [late::Other; late::OTHERS]| others.map(|other| other.cgroup_id);
+        let others = activities.map(|activity| of_others(activity.others));
+        let others = others.into_iter().chain([of_others(call.handoff.others)]);
         let wakers = activities.map(|activity| waker(&activity.longest));
-        let groups = others.into_iter().flatten().chain(wakers);
-        groups.chain([waker(&call.stop)])
+        let groups = others.flatten().chain(wakers);
+        groups.chain([waker(&call.stop), waker(&call.handoff.wait)])
     };
     calls
         .iter()
@@ -401,6 +404,7 @@ pub(super) fn convert(
         thread: call.thread,
         cpu: call.cpu,
         delivery,
+        handoff: (has_events && call.handoff.at != 0).then(|| handoff(call, unit_of)),
         cpu_limits: Arc::clone(cpu_limits),
         stop: (call.stop_ended != 0 && call.stop_ended <= call.started).then(|| Stop {
             ended_before: between(call.stop_ended, call.started),
@@ -430,9 +434,30 @@ fn thread_states(states: &[u64; thread_state::COUNT]) -> ThreadStates {
     }
 }
 
-fn activity(activity: &late::Activity, unit_of: UnitOf<'_>) -> Activity {
-    let others = activity.others.iter();
-    let others = others.filter(|other| other.nanoseconds != 0);
+fn handoff(call: &late::LateCall, unit_of: UnitOf<'_>) -> Handoff {
+    let handoff = &call.handoff;
+    let before = |time| Duration::from_nanos(call.started.saturating_sub(time));
+    let throttled = Duration::from_nanos(handoff.throttled);
+    let sender = blocked(&handoff.wait, unit_of).waker;
+    Handoff {
+        thread: handoff.thread as u32,
+        woken_before: before(handoff.at),
+        received_before: (handoff.woken != 0).then(|| before(handoff.woken)),
+        receiver: ReceiverStates {
+            runnable: Duration::from_nanos(handoff.runnable).saturating_sub(throttled),
+            throttled,
+        },
+        others: match handoff.runnable {
+            late::STALL.. => others(&handoff.others, unit_of),
+            _ => Vec::new(),
+        },
+        sender: sender.filter(|_| handoff.woken != 0),
+    }
+}
+
+/// Returns the threads that ran for longest, with the longest time first.
+fn others(others: &[late::Other], unit_of: UnitOf<'_>) -> Vec<OtherThread> {
+    let others = others.iter().filter(|other| other.nanoseconds != 0);
     let mut others: Vec<_> = others
         .map(|other| OtherThread {
             duration: Duration::from_nanos(other.nanoseconds),
@@ -446,6 +471,10 @@ fn activity(activity: &late::Activity, unit_of: UnitOf<'_>) -> Activity {
     others.sort_by(|one, other| other.cmp(one));
     others.truncate(NAMED);
     others.shrink_to_fit();
+    others
+}
+
+fn activity(activity: &late::Activity, unit_of: UnitOf<'_>) -> Activity {
     let longest = &activity.longest;
     Activity {
         cpu: Duration::from_nanos(activity.cpu),
@@ -454,7 +483,7 @@ fn activity(activity: &late::Activity, unit_of: UnitOf<'_>) -> Activity {
         stolen: Duration::from_nanos(activity.stolen),
         blocked: activity.blocked.map(Duration::from_nanos),
         longest: (longest.nanoseconds != 0).then(|| blocked(longest, unit_of)),
-        others,
+        others: others(&activity.others, unit_of),
     }
 }
 

@@ -16,7 +16,7 @@ use ros2probe_attach::attach::AttachError;
 use ros2probe_attach::client::Broker;
 use ros2probe_attach::functions::{Calls, ENQUEUE};
 use ros2probe_attach::request::Place;
-use ros2probe_wire::inside::late::{self, Activity, Blocked, Bound};
+use ros2probe_wire::inside::late::{self, Activity, Blocked, Bound, Handoff};
 use ros2probe_wire::inside::{Counter, Figures, Handle, Process, accounting, clock};
 use zerocopy::FromZeros as _;
 
@@ -44,8 +44,9 @@ type ThreadWords = [u64; 14];
 type EntryWords = [u64; 2];
 type BoundWords = [u64; size_of::<Bound>() / 8];
 /// Words of `Followed` in the kernel programs.
-type FollowedWords = [u64; 6 + FOLLOWED_STATES + 15];
-const FOLLOWED_STATES: usize = 2 * (size_of::<Blocked>() + size_of::<Activity>()) / 8;
+type FollowedWords = [u64; 10 + FOLLOWED_STATES + 15];
+const FOLLOWED_STATES: usize =
+    (2 * (size_of::<Blocked>() + size_of::<Activity>()) + size_of::<Handoff>()) / 8;
 /// Tracepoints of the scheduler. The programs have the same names.
 const EVENTS: [&CStr; 2] = [c"sched_switch", c"sched_waking"];
 const _: () = assert!(size_of::<Figures>().is_multiple_of(8));

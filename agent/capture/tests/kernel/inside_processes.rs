@@ -1,6 +1,7 @@
 //! Programs at the functions of `libtracetools.so`, in processes that call them as rclcpp does.
 
 mod deliveries;
+mod handoffs;
 mod late;
 mod thread_states;
 

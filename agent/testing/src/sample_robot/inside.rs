@@ -189,6 +189,7 @@ fn late(topic: TopicName) -> LateCallback {
             wait: bound,
         },
         delivery: None,
+        handoff: None,
         cpu_limits: Arc::new([]),
         stop: None,
         previous: None,

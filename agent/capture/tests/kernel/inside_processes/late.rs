@@ -1,6 +1,8 @@
 //! Late calls, each with an injected cause.
 
 use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
@@ -119,6 +121,35 @@ fn a_call_beside_a_busy_thread_names_that_thread() {
         assert_eq!(hog.unit.as_deref(), Some(&*name), "{call:#?}");
         assert_eq!(hog.priority, Some(Priority::Nice(0)));
     }
+}
+
+#[test]
+fn a_call_beside_a_thread_of_another_process_names_that_process() {
+    let (mut robot, mut process) = started();
+    pin(&process);
+    let is_over = Arc::new(AtomicBool::new(false));
+    let until = Arc::clone(&is_over);
+    let hog = std::thread::spawn(move || {
+        // SAFETY: no preconditions.
+        let thread = unsafe { libc::gettid() };
+        let arguments = ["-pc", "0", &thread.to_string()];
+        let pinned = Command::new("taskset").args(arguments).output();
+        assert!(pinned.unwrap().status.success());
+        while !until.load(Ordering::Relaxed) {}
+        thread.cast_unsigned()
+    });
+    let calls = late(&mut robot, &mut process, "compute 10 60000");
+    is_over.store(true, Ordering::Relaxed);
+    let thread = hog.join().unwrap();
+    let others = calls
+        .iter()
+        .flat_map(|call| &call.activity.as_ref().unwrap().others);
+    let mut hog = others.filter(|other| other.thread == thread).peekable();
+    assert!(hog.peek().is_some(), "{calls:#?}");
+    assert!(
+        hog.all(|other| other.process == std::process::id()),
+        "{calls:#?}"
+    );
 }
 
 #[test]

@@ -256,8 +256,9 @@ fn late_call(example: &LateExample, clock: WallClock) -> LateCall<'_> {
     let call = &example.call;
     let main = example.main;
     let named = main.and_then(|part| call.named_by(part));
-    let others = [&call.activity_before, &call.activity];
-    let others = others.into_iter().flatten();
+    let activities = [&call.activity_before, &call.activity];
+    let others = activities.into_iter().flatten().flat_map(|it| &it.others);
+    let of_receiver = call.handoff.iter().flat_map(|it| &it.others);
     LateCall {
         timestamp_seconds: clock.wall_time(example.at).seconds(),
         source_timestamp_seconds: call.source.map(|source| source.seconds()),
@@ -267,7 +268,10 @@ fn late_call(example: &LateExample, clock: WallClock) -> LateCall<'_> {
         late_wait_seconds: (call.bound.wait.as_nanos() < u128::from(u64::MAX))
             .then_some(call.bound.wait.as_secs_f64()),
         thread_id: call.thread,
-        receiver_thread_id: call.delivery.as_ref().map(|it| it.receiver_thread),
+        receiver_thread_id: match (&call.delivery, &call.handoff) {
+            (Some(delivery), _) => Some(delivery.receiver_thread),
+            (None, handoff) => handoff.as_ref().map(|it| it.thread),
+        },
         cpu: call.cpu,
         stage: main.map(|part| part.stage.label().into()),
         cause: main.map(|part| part.cause.label().into()),
@@ -278,9 +282,7 @@ fn late_call(example: &LateExample, clock: WallClock) -> LateCall<'_> {
         parts: (call.parts().iter())
             .map(|each| part(each.stage, each.cause, each.duration))
             .collect(),
-        others: others
-            .flat_map(|activity| activity.others.iter().map(other_thread))
-            .collect(),
+        others: of_receiver.chain(others).map(other_thread).collect(),
         blocked: call.activity.as_ref().and_then(|activity| {
             let longest = activity.longest.as_ref()?;
             Some(Blocked {

@@ -223,6 +223,7 @@ mod tests {
                 receiver_thread: 44,
                 receiver: None,
             }),
+            handoff: None,
             cpu_limits: Arc::new([]),
             stop: None,
             previous: None,

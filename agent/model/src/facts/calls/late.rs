@@ -38,6 +38,8 @@ pub struct LateCall {
     pub bound: LateBound,
     /// How the message came into the process; `None` without a message through a UDP socket.
     pub delivery: Option<MessageDelivery>,
+    /// How the executor's thread was woken, if a thread of the middleware did that.
+    pub handoff: Option<Handoff>,
     /// Limits on the speed of CPUs, at most a second after the call.
     pub cpu_limits: Arc<[CpuLimit]>,
     /// The last time before the call in which the thread was stopped.
@@ -154,7 +156,25 @@ pub struct MessageDelivery {
     pub receiver: Option<ReceiverStates>,
 }
 
-/// Why a thread did not receive a datagram at once.
+/// How a thread of the middleware passed a message to the executor's thread: times before the start
+/// of the call.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Handoff {
+    /// The middleware's thread.
+    pub thread: u32,
+    /// It woke the executor's thread.
+    pub woken_before: Duration,
+    /// It was woken for the message; `None` if that is not known.
+    pub received_before: Option<Duration>,
+    /// What it did between the two.
+    pub receiver: ReceiverStates,
+    /// Threads that ran instead of it, with the longest time first.
+    pub others: Vec<OtherThread>,
+    /// Thread of another process that woke it: it put the message into shared memory.
+    pub sender: Option<OtherThread>,
+}
+
+/// Why a thread did not receive a message at once.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ReceiverStates {
     /// It could run, and did not. This does not include `throttled`.
@@ -208,6 +228,8 @@ pub enum Stage {
     Network,
     /// In the receive buffer of that socket.
     Socket,
+    /// Until a thread of the middleware passed it to the executor. Known without a socket.
+    Receive,
     /// Until the callback started, since it was ready. If the way of the message is not known, this
     /// includes the other stages.
     Wait,
@@ -258,10 +280,11 @@ pub enum Cause {
 
 impl Stage {
     /// Every stage, in the order of time.
-    pub const ALL: [Self; 5] = [
+    pub const ALL: [Self; 6] = [
         Self::Publish,
         Self::Network,
         Self::Socket,
+        Self::Receive,
         Self::Wait,
         Self::Callback,
     ];
@@ -273,6 +296,7 @@ impl Stage {
             Self::Publish => "publish",
             Self::Network => "network",
             Self::Socket => "socket",
+            Self::Receive => "receive",
             Self::Wait => "wait",
             Self::Callback => "callback",
         }
@@ -328,25 +352,28 @@ impl Cause {
     }
 
     /// Returns what the cause did to a call, for the end of a sentence. `by` is the thread that ran
-    /// instead, held the lock, or continued the process.
+    /// instead, held the lock, continued the process, or sent the message.
     #[must_use]
     pub fn in_words(self, by: Option<&dyn fmt::Display>) -> String {
-        let by = by.unwrap_or(&"another thread");
+        let other = by.unwrap_or(&"another thread");
         match self {
             Self::Cpu => "it computed".to_owned(),
             Self::Stolen => "interrupts or the hypervisor took the CPU".to_owned(),
             Self::Throttled => "its control group had used up its CPU quota".to_owned(),
-            Self::Runnable => format!("{by} ran instead"),
-            Self::Lock => format!("it waited for a lock that {by} released"),
+            Self::Runnable => format!("{other} ran instead"),
+            Self::Lock => format!("it waited for a lock that {other} released"),
             Self::Sleep => "it slept".to_owned(),
             Self::Disk => "it waited for the disk or the kernel".to_owned(),
             Self::PageFault => "it waited for a page of its memory".to_owned(),
-            Self::Stopped => format!("it was stopped until {by} continued it"),
+            Self::Stopped => format!("it was stopped until {other} continued it"),
             Self::SystemCall => "it waited in a system call".to_owned(),
             Self::Blocked => "it was blocked".to_owned(),
             Self::OtherCallback => "its thread was in another callback".to_owned(),
             Self::Arrival => "the message came late: the executor waited for it".to_owned(),
-            Self::Send => "its publisher took long to send it".to_owned(),
+            Self::Send => match by {
+                Some(by) => format!("{by} published it and took long to send it"),
+                None => "its publisher took long to send it".to_owned(),
+            },
             Self::Transit => "the message was long on its way to the socket".to_owned(),
             Self::Queue => "the message waited in the socket's receive buffer".to_owned(),
             Self::Middleware => "the middleware passed the message on late".to_owned(),
@@ -461,7 +488,11 @@ impl LateCall {
             return Vec::new();
         };
         let Some(delivery) = &self.delivery else {
-            return self.executor_parts(wait, Cause::Arrival);
+            return match &self.handoff {
+                // The thread ran already when the message was published.
+                Some(handoff) if handoff.woken_before <= wait => self.handoff_parts(handoff, wait),
+                _ => self.executor_parts(wait, Cause::Arrival),
+            };
         };
         let in_process = wait.min(delivery.received_before);
         let since_arrival = wait.min(delivery.arrived_before);
@@ -477,27 +508,58 @@ impl LateCall {
             socket.take(Cause::Throttled, receiver.throttled);
             socket.take(Cause::Runnable, receiver.runnable);
         }
-        // A signal stops all threads of a process.
-        if let Some(stop) = &self.stop {
-            let began_before = stop.ended_before + stop.wait.duration;
-            let end = stop.ended_before.clamp(in_process, since_arrival);
-            let stopped = began_before.clamp(in_process, since_arrival) - end;
-            socket.take(Cause::Stopped, stopped);
-        }
+        socket.take(Cause::Stopped, self.stopped(in_process, since_arrival));
         parts.extend(socket.finish(Cause::Queue));
         parts.extend(self.executor_parts(in_process, Cause::Middleware));
         parts
+    }
+
+    /// Divides the wait for a message that came through no socket, or whose way is not known.
+    fn handoff_parts(&self, handoff: &Handoff, wait: Duration) -> Vec<Part> {
+        let since_woken = handoff.woken_before;
+        let Some(received_before) = handoff.received_before else {
+            let mut parts = Rest::new(Stage::Wait, wait - since_woken).finish(Cause::Arrival);
+            parts.extend(self.executor_parts(since_woken, Cause::Middleware));
+            return parts;
+        };
+        let since_received = wait.min(received_before);
+        let (stage, cause) = match handoff.sender {
+            Some(_) => (Stage::Publish, Cause::Send),
+            None => (Stage::Network, Cause::Transit),
+        };
+        let mut parts = Rest::new(stage, wait - since_received).finish(cause);
+        let mut receive = Rest::new(Stage::Receive, since_received - since_woken);
+        receive.take(Cause::Throttled, handoff.receiver.throttled);
+        receive.take(Cause::Runnable, handoff.receiver.runnable);
+        receive.take(Cause::Stopped, self.stopped(since_woken, since_received));
+        parts.extend(receive.finish(Cause::Middleware));
+        parts.extend(self.executor_parts(since_woken, Cause::Middleware));
+        parts
+    }
+
+    /// Returns for how long the process was stopped between two times before the call. A signal
+    /// stops all threads of a process.
+    fn stopped(&self, until_before: Duration, from_before: Duration) -> Duration {
+        let Some(stop) = &self.stop else {
+            return Duration::ZERO;
+        };
+        let began_before = stop.ended_before + stop.wait.duration;
+        let end = stop.ended_before.clamp(until_before, from_before);
+        began_before.clamp(until_before, from_before) - end
     }
 
     /// Divides the last `wait` before the call by what the executor's thread did. `waiting` is the
     /// cause of the time in which that thread waited too.
     fn executor_parts(&self, wait: Duration, waiting: Cause) -> Vec<Part> {
         let mut rest = Rest::new(Stage::Wait, wait);
+        let mut since_previous = wait;
         if let Some(previous) = &self.previous {
             let began_before = previous.ended_before + previous.duration;
-            let overlap = began_before.min(wait) - previous.ended_before.min(wait);
+            since_previous = previous.ended_before.min(wait);
+            let overlap = began_before.min(wait) - since_previous;
             rest.take(Cause::OtherCallback, overlap);
         }
+        rest.take(Cause::Stopped, self.stopped(Duration::ZERO, since_previous));
         // The thread was between two calls for the remaining time.
         match self.states_before {
             Some(states) => {
@@ -571,16 +633,17 @@ impl LateCall {
     }
 
     /// Returns the thread that a cause names: the one that ran instead for longest, released the
-    /// lock, or continued the process.
+    /// lock, continued the process, or sent the message.
     #[must_use]
     pub fn named_by(&self, part: Part) -> Option<&OtherThread> {
         match part.cause {
             // The events are those of the executor's thread. Another one reads the socket.
             Cause::Runnable if part.stage == Stage::Socket => None,
             Cause::Runnable => self.culprit(part.stage),
-            Cause::Stopped if part.stage == Stage::Socket => {
+            Cause::Stopped if part.stage != Stage::Callback => {
                 self.stop.as_ref()?.wait.waker.as_ref()
             }
+            Cause::Send if self.delivery.is_none() => self.handoff.as_ref()?.sender.as_ref(),
             Cause::Lock | Cause::Stopped => {
                 let longest = self.activity(part.stage)?.longest.as_ref()?;
                 longest.waker.as_ref()
@@ -592,7 +655,11 @@ impl LateCall {
     /// Returns the thread that ran instead for longest in this stage. Idle CPUs are left out.
     #[must_use]
     pub fn culprit(&self, stage: Stage) -> Option<&OtherThread> {
-        let others = self.activity(stage)?.others.iter();
+        let others = match stage {
+            Stage::Receive => &self.handoff.as_ref()?.others,
+            _ => &self.activity(stage)?.others,
+        };
+        let others = others.iter();
         others
             .filter(|other| other.thread != 0)
             .max_by_key(|other| other.duration)

@@ -97,6 +97,7 @@ fn late(process: u32, dice: &mut Dice, at: Timestamp) -> LateCall {
             wait: Duration::MAX,
         },
         delivery: None,
+        handoff: None,
         cpu_limits: Arc::new([]),
         stop: None,
         previous: None,

@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_model::facts::calls::late::{
-    Activity, Blocked, Cause, LateBound, LateCall, MessageDelivery, PreviousCall, ReceiverStates,
-    Stage, Stop,
+    Activity, Blocked, Cause, Handoff, LateBound, LateCall, MessageDelivery, PreviousCall,
+    ReceiverStates, Stage, Stop,
 };
 use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{ProcessReport, Report, ThreadStates, Trigger};
@@ -63,6 +63,7 @@ fn call(states: ThreadStates) -> LateCall {
             wait: milliseconds(20),
         },
         delivery: None,
+        handoff: None,
         cpu_limits: Arc::new([]),
         stop: None,
         previous: None,
@@ -268,6 +269,91 @@ fn a_stopped_process_is_named_with_who_continued_it() {
     let main = late.main_part(ThreadStates::default()).unwrap();
     assert_eq!((main.stage, main.cause), (Stage::Socket, Cause::Stopped));
     assert_eq!(&*late.named_by(main).unwrap().name, "operator");
+}
+
+/// A call after 90 ms. Another process woke the middleware's thread after 20 ms, which woke the
+/// executor's thread after 70 ms.
+fn call_of_a_handoff() -> LateCall {
+    let mut late = call_of_a_message();
+    late.delivery = None;
+    late.handoff = Some(Handoff {
+        thread: 44,
+        woken_before: milliseconds(20),
+        received_before: Some(milliseconds(70)),
+        receiver: ReceiverStates {
+            runnable: milliseconds(30),
+            throttled: milliseconds(5),
+        },
+        others: vec![other("chromium", 99, 29)],
+        sender: Some(other("talker", 55, 0)),
+    });
+    late
+}
+
+#[test]
+fn a_wait_without_a_socket_is_divided_by_the_threads_that_passed_the_message() {
+    let mut late = call_of_a_handoff();
+    let expected = [
+        (Stage::Publish, Cause::Send, 20),
+        (Stage::Receive, Cause::Throttled, 5),
+        (Stage::Receive, Cause::Runnable, 30),
+        (Stage::Receive, Cause::Middleware, 15),
+        (Stage::Wait, Cause::Runnable, 4),
+        (Stage::Wait, Cause::Middleware, 16),
+        (Stage::Callback, Cause::Cpu, 5),
+    ];
+    assert_eq!(parts(&late), expected);
+    let main = late.main_part(ThreadStates::default()).unwrap();
+    assert_eq!((main.stage, main.cause), (Stage::Receive, Cause::Runnable));
+    assert_eq!(&*late.named_by(main).unwrap().name, "chromium");
+    let send = late.parts()[0];
+    assert_eq!(&*late.named_by(send).unwrap().name, "talker");
+    // A thread that received it from the network has no publisher.
+    late.handoff.as_mut().unwrap().sender = None;
+    assert_eq!(parts(&late)[0], (Stage::Network, Cause::Transit, 20));
+    // Nor is it known when that thread was woken.
+    late.handoff.as_mut().unwrap().received_before = None;
+    assert_eq!(parts(&late)[0], (Stage::Wait, Cause::Arrival, 70));
+}
+
+#[test]
+fn a_thread_that_was_awake_before_the_message_explains_nothing_earlier() {
+    let mut late = call_of_a_handoff();
+    // The middleware's thread was busy with earlier messages.
+    late.wait = Some(milliseconds(60));
+    assert_eq!(parts(&late)[0], (Stage::Receive, Cause::Throttled, 5));
+    // The executor's thread was woken for another message.
+    late.wait = Some(milliseconds(19));
+    assert_eq!(parts(&late)[1], (Stage::Wait, Cause::Arrival, 15));
+}
+
+#[test]
+fn a_stop_explains_the_wait_after_the_callback_before() {
+    let mut late = call_of_a_message();
+    late.delivery = None;
+    late.previous = Some(PreviousCall {
+        handle: 0x50,
+        trigger: Trigger::Timer(None),
+        duration: milliseconds(70),
+        ended_before: milliseconds(50),
+    });
+    late.stop = Some(Stop {
+        ended_before: milliseconds(10),
+        wait: Blocked {
+            duration: milliseconds(60),
+            kind: wait::STOPPED,
+            call: None,
+            argument: 0,
+            waker: Some(other("operator", 77, 0)),
+        },
+    });
+    let expected = [
+        (Stage::Wait, Cause::OtherCallback, 40),
+        (Stage::Wait, Cause::Stopped, 40),
+    ];
+    assert_eq!(parts(&late)[..2], expected);
+    let stopped = late.parts()[1];
+    assert_eq!(&*late.named_by(stopped).unwrap().name, "operator");
 }
 
 #[test]

@@ -108,6 +108,7 @@ fn late(process: u32, now: u64) -> impl Iterator<Item = LateCall> {
             wait: Duration::from_millis(5),
         },
         delivery: None,
+        handoff: None,
         cpu_limits: Arc::new([]),
         stop: None,
         previous: Some(PreviousCall {

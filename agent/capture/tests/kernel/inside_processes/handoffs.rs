@@ -1,0 +1,262 @@
+//! Messages through shared memory: another process wakes a thread of the middleware, and that
+//! thread wakes the executor's thread.
+
+use std::fs;
+use std::os::fd::AsRawFd as _;
+use std::process::Command;
+use std::sync::atomic::{AtomicI64, AtomicU32, Ordering};
+use std::thread::sleep;
+use std::time::Duration;
+
+use ros2probe_capture::system::Clocks;
+use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
+use ros2probe_model::facts::calls::report::ThreadStates;
+
+use super::late::set_bounds;
+use super::thread_states::{Hog, Quota};
+use super::{Process, Robot};
+
+/// Time for which a message is late in each test: longer than the waits of a busy machine.
+const LATE: Duration = Duration::from_millis(100);
+/// Part of that time which another stage may have.
+const IMPRECISION: Duration = Duration::from_millis(20);
+
+/// What the listener reads, as in `process.c`.
+#[repr(C)]
+struct Port {
+    count: AtomicU32,
+    padding: u32,
+    source: AtomicI64,
+}
+
+/// A subscriber with a thread of the middleware, and the memory that it shares with this process.
+struct Subscriber {
+    robot: Robot,
+    process: Process,
+    port: &'static Port,
+}
+
+impl Subscriber {
+    fn new() -> Subscriber {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        file.as_file().set_len(size_of::<Port>() as u64).unwrap();
+        // SAFETY: a new mapping of a file of this size, which this process never unmaps.
+        let port = unsafe {
+            let address = libc::mmap(
+                std::ptr::null_mut(),
+                size_of::<Port>(),
+                libc::PROT_READ | libc::PROT_WRITE,
+                libc::MAP_SHARED,
+                file.as_file().as_raw_fd(),
+                0,
+            );
+            assert_ne!(address, libc::MAP_FAILED);
+            &*address.cast::<Port>()
+        };
+        let mut robot = Robot::new(248, &[], true);
+        robot.attach();
+        let mut process = robot.start();
+        process.run("init");
+        process.run(&format!("listen 0 0 {}", file.path().display()));
+        let mut subscriber = Subscriber {
+            robot,
+            process,
+            port,
+        };
+        // The delay of a message is its time beyond the fastest one.
+        for _ in 0..3 {
+            subscriber.pass(Duration::ZERO);
+        }
+        set_bounds(&mut subscriber.robot, &subscriber.process);
+        // The executor's thread is followed from its first call on, then the listener.
+        for _ in 0..3 {
+            subscriber.pass(Duration::ZERO);
+        }
+        subscriber.robot.round();
+        subscriber
+    }
+
+    /// Sends a message that was published some time ago, and lets the executor take it.
+    fn pass(&mut self, ago: Duration) {
+        self.process.begin("shared 1 0");
+        self.send_to_waiting(ago);
+        self.process.end("shared");
+    }
+
+    /// Sends a message when all threads of the process wait.
+    fn send_to_waiting(&self, ago: Duration) {
+        while !self.is_waiting() {
+            sleep(Duration::from_millis(1));
+        }
+        self.send(ago);
+    }
+
+    fn send(&self, ago: Duration) {
+        let source = (Clocks::read().now - ago).0;
+        self.port
+            .source
+            .store(source.cast_signed(), Ordering::Relaxed);
+        self.port.count.fetch_add(1, Ordering::Release);
+        let address = std::ptr::from_ref(&self.port.count);
+        // SAFETY: wakes those that wait for a word that stays mapped.
+        unsafe { libc::syscall(libc::SYS_futex, address, libc::FUTEX_WAKE, 1) };
+    }
+
+    fn is_waiting(&self) -> bool {
+        self.tasks().iter().all(|task| {
+            let call = fs::read_to_string(format!("{task}/syscall")).unwrap_or_default();
+            call.split(' ').next() == Some(&libc::SYS_futex.to_string())
+        })
+    }
+
+    fn tasks(&self) -> Vec<String> {
+        let tasks = format!("/proc/{}/task", self.process.child.id());
+        let tasks = fs::read_dir(tasks).unwrap().flatten();
+        tasks
+            .map(|task| task.path().display().to_string())
+            .collect()
+    }
+
+    /// Returns the thread id of the middleware's thread.
+    fn listener(&self) -> String {
+        let is_listener = |task: &&String| {
+            let name = fs::read_to_string(format!("{task}/comm")).unwrap_or_default();
+            name.trim_end() == "dds-listener"
+        };
+        let tasks = self.tasks();
+        let task = tasks.iter().find(is_listener).unwrap();
+        task.rsplit('/').next().unwrap().to_owned()
+    }
+
+    fn one_late_call(&mut self) -> LateCall {
+        let mut calls = self.robot.round().report.late;
+        assert_eq!(calls.len(), 1, "{calls:#?}");
+        calls.remove(0)
+    }
+}
+
+/// Asserts that a call is late for this part, and that the part has the injected length or more.
+fn assert_late_for(call: &LateCall, stage: Stage, cause: Cause) {
+    let parts = call.parts();
+    let sum: Duration = parts.iter().map(|part| part.duration).sum();
+    assert_eq!(sum, call.total(), "{call:#?}");
+    let main = call.main_part(ThreadStates::default()).unwrap();
+    assert_eq!(
+        (main.stage, main.cause),
+        (stage, cause),
+        "{parts:?} {call:#?}"
+    );
+    assert!(main.duration >= LATE - IMPRECISION, "{parts:?} {call:#?}");
+}
+
+#[test]
+fn a_message_that_is_put_late_into_shared_memory_names_the_publisher() {
+    let mut subscriber = Subscriber::new();
+    subscriber.pass(LATE);
+    let call = subscriber.one_late_call();
+    assert_late_for(&call, Stage::Publish, Cause::Send);
+    let named = call.named_by(call.main_part(ThreadStates::default()).unwrap());
+    assert_eq!(
+        named.map(|it| it.process),
+        Some(std::process::id()),
+        "{call:#?}"
+    );
+    let handoff = call.handoff.as_ref().unwrap();
+    assert_eq!(handoff.thread.to_string(), subscriber.listener());
+}
+
+#[test]
+fn a_message_that_the_middleware_passes_on_late_names_the_middleware() {
+    let mut subscriber = Subscriber::new();
+    let command = format!("shared 1 {}", LATE.as_micros());
+    subscriber.process.begin(&command);
+    subscriber.send_to_waiting(Duration::ZERO);
+    subscriber.process.end("shared");
+    let call = subscriber.one_late_call();
+    assert_late_for(&call, Stage::Receive, Cause::Middleware);
+}
+
+#[test]
+fn a_message_for_a_thread_without_a_cpu_names_who_ran_instead() {
+    let mut subscriber = Subscriber::new();
+    let listener = subscriber.listener();
+    for command in [
+        ["chrt", "-i", "-p", "0", &listener],
+        ["taskset", "-p", "-c", "0", &listener],
+    ] {
+        let [program, arguments @ ..] = command;
+        let output = Command::new(program).args(arguments).output().unwrap();
+        assert!(output.status.success(), "{output:?}");
+    }
+    let _hogs = [Hog::on("0"), Hog::on("0")];
+    for _ in 0..20 {
+        subscriber.process.begin("shared 1 0");
+        subscriber.send_to_waiting(Duration::ZERO);
+        subscriber.process.end("shared");
+    }
+    let calls = subscriber.robot.round().report.late;
+    assert!(!calls.is_empty());
+    let is_named = |call: &&LateCall| {
+        let main = call.main_part(ThreadStates::default()).unwrap();
+        let named = call.named_by(main);
+        (main.stage, main.cause) == (Stage::Receive, Cause::Runnable)
+            && named.is_some_and(|thread| &*thread.name == "sh")
+    };
+    // On a busy machine, the executor's thread is sometimes late, too.
+    let named = calls.iter().filter(is_named).count();
+    assert!(named * 4 >= calls.len() * 3, "{calls:#?}");
+}
+
+#[test]
+fn a_message_for_a_process_beyond_its_quota_is_throttled() {
+    let mut subscriber = Subscriber::new();
+    let quota = Quota::a_twentieth_for(&subscriber.process);
+    let hog = Hog::on("0-1");
+    quota.use_up(&hog);
+    const MESSAGES: usize = 30;
+    subscriber.process.begin(&format!("shared {MESSAGES} 0"));
+    for _ in 0..MESSAGES {
+        subscriber.send_to_waiting(Duration::ZERO);
+        sleep(Duration::from_millis(15));
+    }
+    subscriber.process.end("shared");
+    drop(hog);
+    drop(quota);
+    let calls = subscriber.robot.round().report.late;
+    let mains = calls
+        .iter()
+        .map(|call| call.main_part(ThreadStates::default()).unwrap());
+    let throttled = mains.filter(|main| main.cause == Cause::Throttled).count();
+    assert!(throttled > 0 && throttled * 2 >= calls.len(), "{calls:#?}");
+}
+
+#[test]
+fn a_stopped_process_is_the_cause_of_a_wait_in_shared_memory() {
+    let mut subscriber = Subscriber::new();
+    subscriber.process.begin("shared 1 0");
+    while !subscriber.is_waiting() {
+        sleep(Duration::from_millis(1));
+    }
+    let process = subscriber.process.child.id().cast_signed();
+    // SAFETY: signals a child of this test.
+    unsafe { libc::kill(process, libc::SIGSTOP) };
+    subscriber.send(Duration::ZERO);
+    sleep(LATE);
+    // SAFETY: as above.
+    unsafe { libc::kill(process, libc::SIGCONT) };
+    subscriber.process.end("shared");
+    let call = subscriber.one_late_call();
+    // After SIGCONT, either of the two threads can be the first to see the message.
+    let main = call.main_part(ThreadStates::default()).unwrap();
+    assert_late_for(&call, main.stage, Cause::Stopped);
+    assert!(
+        matches!(main.stage, Stage::Receive | Stage::Wait),
+        "{call:#?}"
+    );
+    let named = call.named_by(main);
+    assert_eq!(
+        named.map(|it| it.process),
+        Some(std::process::id()),
+        "{call:#?}"
+    );
+}
