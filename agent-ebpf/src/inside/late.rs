@@ -10,8 +10,8 @@ use aya_ebpf::{
 use ros2probe_wire::inside::{
     Counter, Handle, announced, kind,
     late::{
-        Activity, BOUND_CAPACITY, Blocked, Bound, Handoff, LateCall, PER_SECOND, THREAD_CAPACITY,
-        THREAD_IDS, mode,
+        Activity, BOUND_CAPACITY, Blocked, Bound, Call, Handoff, LateCall, PER_SECOND,
+        THREAD_CAPACITY, THREAD_IDS, mode,
     },
     thread_state,
 };
@@ -23,6 +23,8 @@ use crate::{
 };
 
 const SECOND: u64 = 1_000_000_000;
+/// Time between two calls from which on a blocked thread waited for work, in nanoseconds.
+const IDLE: u64 = 100_000;
 /// Numbers of 64 bits in [`FOLLOWED`].
 const WORDS: u32 = THREAD_IDS / 64;
 
@@ -90,6 +92,8 @@ pub struct Followed {
     pub handoff: Handoff,
     /// That wait.
     pub handoff_wait: u64,
+    /// The last call since the own last one after which another thread woke this one.
+    pub released_by: Call,
     /// How long the control groups of a receiver had been throttled at that wake-up.
     pub throttled: u64,
     /// What the thread did since the last start or end of a callback.
@@ -108,10 +112,16 @@ pub struct Followed {
     is_accounted: u64,
     states_before: [u64; thread_state::COUNT],
     is_accounted_before: u64,
-    /// The call before: its callback, start and end.
-    previous: u64,
-    previous_started: u64,
-    previous_ended: u64,
+    /// The call that ends.
+    present: Call,
+    /// The call before.
+    pub previous: Call,
+    /// Since when it makes one call after the other: the start of the first one.
+    busy_since: u64,
+    /// Time in calls since then.
+    in_calls: u64,
+    /// The longest of these calls.
+    longest_call: Call,
 }
 
 /// Returns the present mode.
@@ -229,8 +239,7 @@ pub unsafe fn clear(followed: *mut Followed) {
 /// Handles the start of a callback.
 #[inline(always)]
 pub fn began(current: &Current, delay: u64, now: u64, accounting: Option<Accounting>) {
-    let mode = present_mode();
-    if mode == mode::OFF {
+    if present_mode() == mode::OFF {
         return;
     }
     let Some(followed) = follow(current.thread) else {
@@ -247,10 +256,9 @@ pub fn began(current: &Current, delay: u64, now: u64, accounting: Option<Account
             (*followed).handoff.at = 0;
         }
         (*followed).role = role::IN_CALLBACK;
-        (*followed).mode = u64::from(mode);
         (*followed).delay = delay;
         (*followed).is_accounted_before = 0;
-        let previous_ended = (*followed).previous_ended;
+        let previous_ended = (*followed).previous.ended;
         if let Some(after) = accounting {
             if (*followed).is_accounted != 0 && previous_ended != 0 && now > previous_ended {
                 let states = accounting::states(
@@ -262,6 +270,37 @@ pub fn began(current: &Current, delay: u64, now: u64, accounting: Option<Account
                 (*followed).is_accounted_before = 1;
             }
         }
+        if has_waited(followed) {
+            (*followed).busy_since = now;
+            (*followed).in_calls = 0;
+            (*followed).longest_call.ended = 0;
+            (*followed).longest_call.started = 0;
+        }
+        (*followed).mode = u64::from(present_mode());
+    }
+}
+
+/// Returns whether a thread waited for work before the call that begins.
+#[inline(always)]
+unsafe fn has_waited(followed: *const Followed) -> bool {
+    // SAFETY: a map value, by the caller.
+    unsafe {
+        if read_volatile(&raw const (*followed).previous.ended) == 0 {
+            return true;
+        }
+        // The mode is that of the call before.
+        let had_events = read_volatile(&raw const (*followed).mode) == u64::from(mode::EVENTS);
+        if had_events && present_mode() == mode::EVENTS && (*followed).before.missed == 0 {
+            let [lock, sleep, disk, page_fault, stopped, other] = (*followed).before.blocked;
+            if lock + sleep + disk + page_fault + stopped + other <= IDLE {
+                return false;
+            }
+        }
+        if read_volatile(&raw const (*followed).is_accounted_before) == 0 {
+            return true;
+        }
+        let blocked = (&raw const (*followed).states_before).cast::<u64>();
+        read_volatile(blocked.add(thread_state::BLOCKED)) > IDLE
     }
 }
 
@@ -287,6 +326,16 @@ pub fn ended(
     unsafe {
         begin_span(followed, now);
         let started = (*thread).started;
+        // All that follows the report is in the map before it: the verifier of Linux 6.18 fails at
+        // numbers that stay on the stack.
+        (*followed).present.callback = callback;
+        (*followed).present.started = started;
+        (*followed).present.ended = now;
+        (*followed).is_accounted = 0;
+        if let Some(after) = after {
+            (*followed).accounting = after;
+            (*followed).is_accounted = 1;
+        }
         let key = current.handle(callback, kind::CALLBACK);
         if let Some(bound) = BOUNDS.get_ptr_mut(&key)
             && (now - started > (*bound).duration || (*followed).delay > (*bound).delay)
@@ -301,15 +350,22 @@ pub fn ended(
         (*followed).role = role::EXECUTOR;
         (*followed).handoff.at = 0;
         (*followed).handoff_wait = 0;
-        (*followed).previous = callback;
-        (*followed).previous_started = started;
-        (*followed).previous_ended = now;
-        (*followed).is_accounted = 0;
-        if let Some(after) = after {
-            (*followed).accounting = after;
-            (*followed).is_accounted = 1;
+        (*followed).released_by.ended = 0;
+        let present = &raw const (*followed).present;
+        copy(present, &raw mut (*followed).previous);
+        (*followed).in_calls += duration(present);
+        let longest = &raw mut (*followed).longest_call;
+        if duration(present) > duration(longest) {
+            copy(present, longest);
         }
     }
+}
+
+/// Returns the duration of a call.
+#[inline(always)]
+unsafe fn duration(call: *const Call) -> u64 {
+    // SAFETY: a map value, by the caller.
+    unsafe { read_volatile(&raw const (*call).ended) - read_volatile(&raw const (*call).started) }
 }
 
 /// Counts a report; returns `false` beyond the number of a second.
@@ -367,9 +423,17 @@ unsafe fn report(
         (*late).ended = now;
         (*late).delay = (*followed).delay;
         (*late).bounds = bounds;
-        (*late).previous = (*followed).previous;
-        (*late).previous_started = (*followed).previous_started;
-        (*late).previous_ended = (*followed).previous_ended;
+        copy(&raw const (*followed).previous, &raw mut (*late).previous);
+        copy(
+            &raw const (*followed).released_by,
+            &raw mut (*late).released_by,
+        );
+        (*late).busy_since = (*followed).busy_since;
+        (*late).in_calls = (*followed).in_calls;
+        copy(
+            &raw const (*followed).longest_call,
+            &raw mut (*late).longest_call,
+        );
         (*late).states = states.unwrap_or([0; thread_state::COUNT]);
         (*late).states_before = (*followed).states_before;
         copy(&raw const (*followed).handoff, &raw mut (*late).handoff);

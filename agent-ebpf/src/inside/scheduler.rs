@@ -45,6 +45,9 @@ const RUNS: usize = 64;
 /// Waits below this time are not divided among other threads, in nanoseconds.
 const SHORT: u64 = 20_000;
 
+/// Maximum time from the end of a call until its thread wakes others, in nanoseconds.
+const RELEASE: u64 = 1_000_000;
+
 /// States of `task_struct.__state` (include/linux/sched.h).
 mod task {
     pub const UNINTERRUPTIBLE: u64 = 2;
@@ -166,20 +169,15 @@ unsafe fn receiver_woken(receiver: *mut Followed, task: u64, now: u64) {
 }
 
 /// Handles that the running thread ends a wait of a thread that calls callbacks. The longest such
-/// wait is that for a message: those for locks of the middleware follow it.
+/// wait is that for a message: those for locks of the middleware follow it. An executor's thread
+/// wakes others after each call, because the callback group of that call may have further ones.
 #[inline(always)]
 unsafe fn executor_woken(executor: *mut Followed, id: u64, now: u64) {
     // SAFETY: map values, by the caller.
     unsafe {
-        let waited = (*executor).wait.nanoseconds;
-        if (*executor).wait.kind != wait::LOCK as u32
-            || id >> 32 != (*executor).process
-            || waited <= (*executor).handoff_wait
-        {
+        if (*executor).wait.kind != wait::LOCK as u32 || id >> 32 != (*executor).process {
             return;
         }
-        (*executor).handoff_wait = waited;
-        (*executor).handoff.at = 0;
         let Some(receiver) = follow(thread_of(id)) else {
             return;
         };
@@ -188,9 +186,20 @@ unsafe fn executor_woken(executor: *mut Followed, id: u64, now: u64) {
             (*receiver).role = role::RECEIVER;
             (*receiver).process = id >> 32;
             (*receiver).since = now;
+        } else if role == role::EXECUTOR && now - (*receiver).previous.ended < RELEASE {
+            copy(
+                &raw const (*receiver).previous,
+                &raw mut (*executor).released_by,
+            );
+            return;
         } else if role != role::RECEIVER {
             return;
         }
+        let waited = (*executor).wait.nanoseconds;
+        if waited <= (*executor).handoff_wait {
+            return;
+        }
+        (*executor).handoff_wait = waited;
         let handoff = &raw mut (*executor).handoff;
         let woken = (*receiver).handoff.woken;
         (*handoff).at = now;

@@ -145,7 +145,7 @@ pub struct LateCall<'a> {
     /// Limits on the speed of CPUs, at most a second after the call, in words: a lower maximum
     /// frequency, heat, or a weak power supply.
     pub cpu_limits: Vec<Cow<'a, str>>,
-    /// The call before in the same thread.
+    /// The call for which it waited, otherwise the call before in the same thread.
     pub previous: Option<PreviousCall<'a>>,
 }
 
@@ -190,7 +190,7 @@ pub struct Blocked<'a> {
     pub ended_by: Option<OtherThread<'a>>,
 }
 
-/// The call before in the same thread.
+/// An earlier call.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]

@@ -144,7 +144,7 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
     {
         let _ = writeln!(
             out,
-            "  callback before it: {}, {}",
+            "  waited for the callback of {}: {}",
             safe(&previous.trigger.words()),
             seconds(previous.duration_seconds)
         );

@@ -207,6 +207,22 @@ static struct listener *started_listener(const char *path) {
     return own;
 }
 
+/* A call of the timer's callback in another thread of the executor. */
+struct turn { long us; bool is_over; };
+static void *call_first(void *argument) {
+    struct turn *turn = argument;
+    ros_trace_rclcpp_executor_get_next_ready();
+    ros_trace_rclcpp_executor_execute(&timer);
+    ros_trace_callback_start(&timer_callback, false);
+    usleep(turn->us);
+    ros_trace_callback_end(&timer_callback);
+    pthread_mutex_lock(&ready_lock);
+    turn->is_over = true;
+    pthread_cond_signal(&ready);
+    pthread_mutex_unlock(&ready_lock);
+    return 0;
+}
+
 int main(int argc, char **argv) {
     int receiver = -1;
     struct listener *listener = 0;
@@ -338,6 +354,24 @@ int main(int argc, char **argv) {
                 ros_trace_rmw_take(&in_rmw, &message, source, true);
                 ros_trace_callback_start(callback, false);
                 ros_trace_callback_end(callback);
+            }
+        } else if (!strcmp(what, "group")) {
+            /* Takes `n` messages with a thread that waits while another one of the same callback
+               group is in a callback of `us` microseconds, which begins first. */
+            for (long i = 0; i < n; i++) {
+                struct turn turn = { .us = us };
+                int64_t source = clock_now(CLOCK_REALTIME);
+                pthread_t thread;
+                pthread_mutex_lock(&ready_lock);
+                if (pthread_create(&thread, 0, call_first, &turn)) abort();
+                while (!turn.is_over) pthread_cond_wait(&ready, &ready_lock);
+                pthread_mutex_unlock(&ready_lock);
+                ros_trace_rclcpp_executor_get_next_ready();
+                ros_trace_rclcpp_executor_execute(&in);
+                ros_trace_rmw_take(&in_rmw, &message, source, true);
+                ros_trace_callback_start(callback, false);
+                ros_trace_callback_end(callback);
+                pthread_join(thread, 0);
             }
         } else if (!strcmp(what, "drain")) {
             /* Receives everything that waits. Prints the number of datagrams. */

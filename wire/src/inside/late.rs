@@ -159,6 +159,20 @@ pub struct Handoff {
     pub others: [Other; OTHERS],
 }
 
+/// A call of a callback.
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, FromBytes, IntoBytes, Immutable, KnownLayout,
+)]
+#[repr(C)]
+pub struct Call {
+    /// The callback.
+    pub callback: u64,
+    /// Start of the call.
+    pub started: u64,
+    /// End of the call; 0 = there is none.
+    pub ended: u64,
+}
+
 /// One late call: an item of the ring of announcements.
 #[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[repr(C)]
@@ -191,12 +205,16 @@ pub struct LateCall {
     pub delay: u64,
     /// The bounds that the call was compared with, in nanoseconds: of its duration and its delay.
     pub bounds: [u64; 2],
-    /// The call before, in the same thread: its callback, or 0.
-    pub previous: u64,
-    /// Start of the call before.
-    pub previous_started: u64,
-    /// End of the call before.
-    pub previous_ended: u64,
+    /// The call before, in the same thread.
+    pub previous: Call,
+    /// The last call since then after which another thread woke this one.
+    pub released_by: Call,
+    /// Start of the first call since the thread last waited for work.
+    pub busy_since: u64,
+    /// Time in calls since then, in nanoseconds.
+    pub in_calls: u64,
+    /// The longest of these calls.
+    pub longest_call: Call,
     /// The last time in which the thread was stopped.
     pub stop: Blocked,
     /// End of that time; 0 = never.

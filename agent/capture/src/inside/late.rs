@@ -11,8 +11,8 @@ use std::time::Duration;
 
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::calls::late::{
-    Activity, Blocked, CpuLimit, Handoff, LateBound, LateCall, MessageDelivery, PreviousCall,
-    ReceiverStates, Stop,
+    Activity, Blocked, BusyTime, CpuLimit, Handoff, LateBound, LateCall, MessageDelivery,
+    PreviousCall, ReceiverStates, Stop,
 };
 use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
@@ -387,12 +387,25 @@ pub(super) fn convert(
 ) -> LateCall {
     let (trigger, node) = name(call.callback);
     let between = |from: u64, to: u64| Duration::from_nanos(to.saturating_sub(from));
-    let previous = (call.previous_ended != 0).then(|| PreviousCall {
-        handle: call.previous,
-        trigger: name(call.previous).0,
-        duration: between(call.previous_started, call.previous_ended),
-        ended_before: between(call.previous_ended, call.started),
+    let mut earlier = |earlier: &late::Call| {
+        let (trigger, node) = name(earlier.callback);
+        let earlier = PreviousCall {
+            handle: earlier.callback,
+            trigger,
+            duration: between(earlier.started, earlier.ended),
+            ended_before: between(earlier.ended, call.started),
+        };
+        (earlier, node)
+    };
+    let previous = (call.previous.ended != 0).then(|| earlier(&call.previous).0);
+    let busy = (call.longest_call.ended != 0).then(|| BusyTime {
+        began_before: between(call.busy_since, call.started),
+        in_callbacks: Duration::from_nanos(call.in_calls),
+        longest: earlier(&call.longest_call).0,
     });
+    // A callback group belongs to one node.
+    let released_by = (call.released_by.ended != 0).then(|| earlier(&call.released_by));
+    let released_by = released_by.filter(|(_, of)| *of == node);
     let states = |bit, states: &_| (call.accounted & bit != 0).then(|| thread_states(states));
     let has_events = call.mode == mode::EVENTS;
     let [duration, wait] = call.bounds.map(Duration::from_nanos);
@@ -416,6 +429,8 @@ pub(super) fn convert(
         wait: (call.delay != 0).then(|| Duration::from_nanos(call.delay)),
         bound: LateBound { duration, wait },
         previous,
+        busy,
+        released_by: released_by.map(|(call, _)| call),
         states: states(DURING, &call.states),
         states_before: states(BEFORE, &call.states_before),
         activity: has_events.then(|| activity(&call.during, unit_of)),

@@ -192,6 +192,8 @@ fn late(topic: TopicName) -> LateCallback {
         handoff: None,
         cpu_limits: Arc::new([]),
         stop: None,
+        released_by: None,
+        busy: None,
         previous: None,
         states: Some(states(25, 70)),
         states_before: Some(states(0, 4)),

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
 use ros2probe_model::facts::calls::other_thread::Priority;
-use ros2probe_model::facts::calls::report::ThreadStates;
+use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_wire::inside::late::{Bound, PER_SECOND, mode};
 use ros2probe_wire::inside::{Counter, Handle, kind};
@@ -274,9 +274,34 @@ fn a_call_that_waits_for_another_callback_names_it() {
         let mut parts = call.parts().into_iter();
         let other = parts.find(|part| part.cause == Cause::OtherCallback);
         let other = other.unwrap();
-        assert!(other.duration >= Duration::from_millis(29), "{call:#?}");
+        assert!(
+            other.duration >= Duration::from_millis(29) * index,
+            "{call:#?}"
+        );
         let previous = call.previous.as_ref().unwrap();
         assert_eq!(previous.handle, call.handle);
+    }
+}
+
+#[test]
+fn a_call_that_waits_for_a_callback_of_another_thread_names_it() {
+    let (mut robot, mut process) = started();
+    let id = process.child.id();
+    // The delay of a message is its time beyond the fastest one, and the thread is followed.
+    process.run("group 4 1");
+    set_bounds(&mut robot, &process);
+    process.run("group 2 1");
+    robot.round();
+    let calls = late(&mut robot, &mut process, "group 5 60000");
+    let of_messages = |call: &&LateCall| matches!(call.trigger, Trigger::Subscription(_));
+    let calls: Vec<_> = calls.iter().filter(of_messages).cloned().collect();
+    assert_cause(&calls, 5, Cause::OtherCallback, 0.9);
+    for call in &calls {
+        assert_eq!(call.thread, id, "{call:#?}");
+        let other = call.waited_for().unwrap();
+        assert!(matches!(other.trigger, Trigger::Timer(_)), "{call:#?}");
+        assert!(other.duration >= Duration::from_millis(60), "{call:#?}");
+        assert_ne!(call.previous.as_ref(), Some(other));
     }
 }
 

@@ -298,7 +298,7 @@ fn late_call(example: &LateExample, clock: WallClock) -> LateCall<'_> {
             .iter()
             .map(|limit| limit.in_words().into())
             .collect(),
-        previous: call.previous.as_ref().map(|previous| PreviousCall {
+        previous: call.waited_for().map(|previous| PreviousCall {
             trigger: trigger(&previous.trigger),
             duration_seconds: previous.duration.as_secs_f64(),
             ended_before_seconds: previous.ended_before.as_secs_f64(),

@@ -226,6 +226,8 @@ mod tests {
             handoff: None,
             cpu_limits: Arc::new([]),
             stop: None,
+            released_by: None,
+            busy: None,
             previous: None,
             states: Some(ThreadStates {
                 calls: 1,

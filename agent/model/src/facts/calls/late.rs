@@ -46,6 +46,10 @@ pub struct LateCall {
     pub stop: Option<Stop>,
     /// The call before in the same thread.
     pub previous: Option<PreviousCall>,
+    /// The time in which that thread made one call after the other until this one.
+    pub busy: Option<BusyTime>,
+    /// A later call of the same node after which another thread woke this one.
+    pub released_by: Option<PreviousCall>,
     /// What the thread did during the call, by the scheduler's accounting.
     pub states: Option<ThreadStates>,
     /// What it did between the call before and this one.
@@ -128,7 +132,18 @@ pub struct LateBound {
     pub wait: Duration,
 }
 
-/// The call before in the same thread.
+/// A time in which a thread did not wait for work.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BusyTime {
+    /// Time from the start of its first call to the start of the present one.
+    pub began_before: Duration,
+    /// Its part in callbacks.
+    pub in_callbacks: Duration,
+    /// The longest of these calls.
+    pub longest: PreviousCall,
+}
+
+/// An earlier call.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PreviousCall {
     /// Address of its callback.
@@ -540,26 +555,40 @@ impl LateCall {
     /// Returns for how long the process was stopped between two times before the call. A signal
     /// stops all threads of a process.
     fn stopped(&self, until_before: Duration, from_before: Duration) -> Duration {
-        let Some(stop) = &self.stop else {
-            return Duration::ZERO;
+        let span = Span {
+            began_before: from_before,
+            ended_before: until_before,
         };
-        let began_before = stop.ended_before + stop.wait.duration;
-        let end = stop.ended_before.clamp(until_before, from_before);
-        began_before.clamp(until_before, from_before) - end
+        let stop = self.stop.as_ref();
+        stop.map_or(Duration::ZERO, |stop| span.common(stop.span()))
     }
 
     /// Divides the last `wait` before the call by what the executor's thread did. `waiting` is the
     /// cause of the time in which that thread waited too.
     fn executor_parts(&self, wait: Duration, waiting: Cause) -> Vec<Part> {
         let mut rest = Rest::new(Stage::Wait, wait);
-        let mut since_previous = wait;
-        if let Some(previous) = &self.previous {
-            let began_before = previous.ended_before + previous.duration;
-            since_previous = previous.ended_before.min(wait);
-            let overlap = began_before.min(wait) - since_previous;
-            rest.take(Cause::OtherCallback, overlap);
+        let stop = self.stop.as_ref().map_or(Span::default(), Stop::span);
+        let stop = stop.within(wait);
+        rest.take(Cause::Stopped, stop.duration());
+        // The thread made one call, and waited during another one of the same callback group.
+        let mut until = Duration::ZERO;
+        for call in [&self.released_by, &self.previous].into_iter().flatten() {
+            let span = call.span().within(wait).before(until);
+            rest.take(Cause::OtherCallback, span.duration() - span.common(stop));
+            until = until.max(span.began_before);
         }
-        rest.take(Cause::Stopped, self.stopped(Duration::ZERO, since_previous));
+        if let (Some(busy), Some(previous)) = (&self.busy, &self.previous) {
+            // Earlier calls, between which the thread did not wait.
+            let earlier = Span {
+                began_before: busy.began_before,
+                ended_before: previous.span().began_before,
+            };
+            let in_callbacks = busy.in_callbacks.saturating_sub(previous.duration);
+            let span = earlier.within(wait).before(until);
+            let in_callbacks = share(span.duration(), in_callbacks, earlier.duration());
+            let stopped = span.common(stop);
+            rest.take(Cause::OtherCallback, in_callbacks.saturating_sub(stopped));
+        }
         // The thread was between two calls for the remaining time.
         match self.states_before {
             Some(states) => {
@@ -637,8 +666,6 @@ impl LateCall {
     #[must_use]
     pub fn named_by(&self, part: Part) -> Option<&OtherThread> {
         match part.cause {
-            // The events are those of the executor's thread. Another one reads the socket.
-            Cause::Runnable if part.stage == Stage::Socket => None,
             Cause::Runnable => self.culprit(part.stage),
             Cause::Stopped if part.stage != Stage::Callback => {
                 self.stop.as_ref()?.wait.waker.as_ref()
@@ -652,11 +679,29 @@ impl LateCall {
         }
     }
 
+    /// Returns the call for which this one waited longest, otherwise the call before in the same
+    /// thread.
+    #[must_use]
+    pub fn waited_for(&self) -> Option<&PreviousCall> {
+        let wait = self.wait.unwrap_or_default();
+        let longest = self.busy.as_ref().map(|busy| &busy.longest);
+        let earlier = [longest, self.released_by.as_ref(), self.previous.as_ref()];
+        let earlier = earlier.into_iter().flatten();
+        earlier.max_by_key(|call| call.span().within(wait).duration())
+    }
+
     /// Returns the thread that ran instead for longest in this stage. Idle CPUs are left out.
     #[must_use]
     pub fn culprit(&self, stage: Stage) -> Option<&OtherThread> {
-        let others = match stage {
-            Stage::Receive => &self.handoff.as_ref()?.others,
+        let others = match (stage, &self.handoff, &self.delivery) {
+            (Stage::Receive, Some(handoff), _) => &handoff.others,
+            // Another thread may have read the socket.
+            (Stage::Socket, Some(handoff), Some(delivery))
+                if handoff.thread == delivery.receiver_thread =>
+            {
+                &handoff.others
+            }
+            (Stage::Receive | Stage::Socket, _, _) => return None,
             _ => &self.activity(stage)?.others,
         };
         let others = others.iter();
@@ -671,6 +716,60 @@ impl LateCall {
             Stage::Callback => self.activity.as_ref(),
             _ => self.activity_before.as_ref(),
         }
+    }
+}
+
+impl PreviousCall {
+    const fn span(&self) -> Span {
+        Span::ending(self.ended_before, self.duration)
+    }
+}
+
+impl Stop {
+    const fn span(&self) -> Span {
+        Span::ending(self.ended_before, self.wait.duration)
+    }
+}
+
+/// A span of time before a call: its begin is the longer time.
+#[derive(Clone, Copy, Default)]
+struct Span {
+    began_before: Duration,
+    ended_before: Duration,
+}
+
+impl Span {
+    const fn ending(ended_before: Duration, duration: Duration) -> Self {
+        Self {
+            began_before: ended_before.saturating_add(duration),
+            ended_before,
+        }
+    }
+
+    /// Returns the part in the last `time` before the call.
+    fn within(self, time: Duration) -> Self {
+        Self {
+            began_before: self.began_before.min(time),
+            ended_before: self.ended_before.min(time),
+        }
+    }
+
+    /// Returns the part that is earlier than `time` before the call.
+    fn before(self, time: Duration) -> Self {
+        Self {
+            began_before: self.began_before.max(time),
+            ended_before: self.ended_before.max(time),
+        }
+    }
+
+    fn duration(self) -> Duration {
+        self.began_before.saturating_sub(self.ended_before)
+    }
+
+    /// Returns the time that both have.
+    fn common(self, other: Self) -> Duration {
+        let began_before = self.began_before.min(other.began_before);
+        began_before.saturating_sub(self.ended_before.max(other.ended_before))
     }
 }
 
@@ -703,11 +802,14 @@ impl Rest {
     fn take(&mut self, cause: Cause, duration: Duration) {
         let duration = duration.min(self.rest);
         self.rest -= duration;
-        self.parts.push(Part {
-            stage: self.stage,
-            cause,
-            duration,
-        });
+        match self.parts.iter_mut().find(|part| part.cause == cause) {
+            Some(part) => part.duration += duration,
+            None => self.parts.push(Part {
+                stage: self.stage,
+                cause,
+                duration,
+            }),
+        }
     }
 
     fn finish(mut self, cause: Cause) -> Vec<Part> {

@@ -100,6 +100,8 @@ fn late(process: u32, dice: &mut Dice, at: Timestamp) -> LateCall {
         handoff: None,
         cpu_limits: Arc::new([]),
         stop: None,
+        released_by: None,
+        busy: None,
         previous: None,
         states: None,
         states_before: None,

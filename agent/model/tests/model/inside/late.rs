@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_model::facts::calls::late::{
-    Activity, Blocked, Cause, Handoff, LateBound, LateCall, MessageDelivery, PreviousCall,
-    ReceiverStates, Stage, Stop,
+    Activity, Blocked, BusyTime, Cause, Handoff, LateBound, LateCall, MessageDelivery,
+    PreviousCall, ReceiverStates, Stage, Stop,
 };
 use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{ProcessReport, Report, ThreadStates, Trigger};
@@ -66,6 +66,8 @@ fn call(states: ThreadStates) -> LateCall {
         handoff: None,
         cpu_limits: Arc::new([]),
         stop: None,
+        released_by: None,
+        busy: None,
         previous: None,
         states: Some(states),
         states_before: None,
@@ -271,6 +273,60 @@ fn a_stopped_process_is_named_with_who_continued_it() {
     assert_eq!(&*late.named_by(main).unwrap().name, "operator");
 }
 
+#[test]
+fn a_callback_of_another_thread_explains_the_wait_after_the_one_of_its_own() {
+    let mut late = call(states(100, 0, 0, 0));
+    late.wait = Some(milliseconds(80));
+    late.states_before = Some(states(1, 0, 0, 59));
+    let earlier = |handle, duration, ended_before| PreviousCall {
+        handle,
+        trigger: Trigger::Timer(None),
+        duration: milliseconds(duration),
+        ended_before: milliseconds(ended_before),
+    };
+    late.previous = Some(earlier(0x50, 30, 60));
+    late.released_by = Some(earlier(0x60, 45, 5));
+    let expected = [
+        (Stage::Wait, Cause::OtherCallback, 65),
+        (Stage::Wait, Cause::Arrival, 15),
+    ];
+    assert_eq!(parts(&late)[..2], expected);
+    assert_eq!(late.waited_for().map(|call| call.handle), Some(0x60));
+    // The message came while that one ran.
+    late.wait = Some(milliseconds(25));
+    assert_eq!(parts(&late)[0], (Stage::Wait, Cause::OtherCallback, 20));
+}
+
+#[test]
+fn earlier_callbacks_explain_the_wait_behind_several_messages() {
+    let mut late = call(states(100, 0, 0, 0));
+    late.wait = Some(milliseconds(80));
+    late.states_before = Some(states(1, 0, 0, 1));
+    let earlier = |handle, duration, ended_before| PreviousCall {
+        handle,
+        trigger: Trigger::Timer(None),
+        duration: milliseconds(duration),
+        ended_before: milliseconds(ended_before),
+    };
+    late.previous = Some(earlier(0x50, 8, 2));
+    // The thread has been busy for 100 ms, and for 90 ms before the last call.
+    late.busy = Some(BusyTime {
+        began_before: milliseconds(100),
+        in_callbacks: milliseconds(98),
+        longest: earlier(0x60, 70, 15),
+    });
+    let expected = [
+        (Stage::Wait, Cause::OtherCallback, 78),
+        (Stage::Wait, Cause::Arrival, 2),
+    ];
+    assert_eq!(parts(&late)[..2], expected);
+    assert_eq!(late.waited_for().map(|call| call.handle), Some(0x60));
+    // The thread waited for work until 50 ms before the call.
+    late.busy.as_mut().unwrap().began_before = milliseconds(50);
+    late.busy.as_mut().unwrap().in_callbacks = milliseconds(38);
+    assert_eq!(parts(&late)[0], (Stage::Wait, Cause::OtherCallback, 38));
+}
+
 /// A call after 90 ms. Another process woke the middleware's thread after 20 ms, which woke the
 /// executor's thread after 70 ms.
 fn call_of_a_handoff() -> LateCall {
@@ -347,12 +403,13 @@ fn a_stop_explains_the_wait_after_the_callback_before() {
             waker: Some(other("operator", 77, 0)),
         },
     });
+    // The last 20 ms of that callback belong to the stop.
     let expected = [
-        (Stage::Wait, Cause::OtherCallback, 40),
-        (Stage::Wait, Cause::Stopped, 40),
+        (Stage::Wait, Cause::Stopped, 60),
+        (Stage::Wait, Cause::OtherCallback, 20),
     ];
     assert_eq!(parts(&late)[..2], expected);
-    let stopped = late.parts()[1];
+    let stopped = late.parts()[0];
     assert_eq!(&*late.named_by(stopped).unwrap().name, "operator");
 }
 

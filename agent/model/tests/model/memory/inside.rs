@@ -111,6 +111,8 @@ fn late(process: u32, now: u64) -> impl Iterator<Item = LateCall> {
         handoff: None,
         cpu_limits: Arc::new([]),
         stop: None,
+        released_by: None,
+        busy: None,
         previous: Some(PreviousCall {
             handle: 2,
             trigger: Trigger::Subscription(topic().as_str().into()),
