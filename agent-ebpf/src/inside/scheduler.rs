@@ -26,7 +26,7 @@ use aya_ebpf::{
 };
 use ros2probe_wire::inside::{
     accounting::{PRIORITY, RUN_DELAY, RUNTIME, STATE, THREAD},
-    late::{Activity, Blocked, NAME_BYTES, OTHERS, Other, STALL, UNKNOWN_PRIORITY, wait},
+    late::{Activity, Blocked, Call, NAME_BYTES, OTHERS, Other, STALL, UNKNOWN_PRIORITY, wait},
 };
 
 use crate::{
@@ -45,8 +45,8 @@ const RUNS: usize = 64;
 /// Waits below this time are not divided among other threads, in nanoseconds.
 const SHORT: u64 = 20_000;
 
-/// Maximum time from the end of a call until its thread wakes others, in nanoseconds.
-const RELEASE: u64 = 1_000_000;
+/// Maximum time from the end of a call until other threads are woken because of it, in nanoseconds.
+const RELEASE: u64 = 5_000_000;
 
 /// States of `task_struct.__state` (include/linux/sched.h).
 mod task {
@@ -186,13 +186,10 @@ unsafe fn executor_woken(executor: *mut Followed, id: u64, now: u64) {
             (*receiver).role = role::RECEIVER;
             (*receiver).process = id >> 32;
             (*receiver).since = now;
-        } else if role == role::EXECUTOR && now - (*receiver).previous.ended < RELEASE {
-            copy(
-                &raw const (*receiver).previous,
-                &raw mut (*executor).released_by,
-            );
-            return;
         } else if role != role::RECEIVER {
+            if role == role::EXECUTOR {
+                released(executor, receiver, now);
+            }
             return;
         }
         let waited = (*executor).wait.nanoseconds;
@@ -223,6 +220,23 @@ unsafe fn executor_woken(executor: *mut Followed, id: u64, now: u64) {
                 &raw const (*receiver).activity.others,
                 &raw mut (*handoff).others,
             );
+        }
+    }
+}
+
+/// Handles that one thread of an executor wakes another one: it has just ended a call, or it was
+/// itself woken after one, and passes on the right to wait for work.
+#[inline(always)]
+unsafe fn released(woken: *mut Followed, waker: *const Followed, now: u64) {
+    // SAFETY: map values, by the caller.
+    unsafe {
+        let of = |call: *const Call| now - read_volatile(&raw const (*call).ended) < RELEASE;
+        let mut call = &raw const (*waker).previous;
+        if !of(call) {
+            call = &raw const (*waker).released_by;
+        }
+        if of(call) {
+            copy(call, &raw mut (*woken).released_by);
         }
     }
 }

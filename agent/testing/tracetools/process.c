@@ -223,6 +223,20 @@ static void *call_first(void *argument) {
     return 0;
 }
 
+/* A thread of a large executor. */
+static pthread_mutex_t all_called = PTHREAD_MUTEX_INITIALIZER;
+static long called;
+static void *call_once(void *unused) {
+    ros_trace_rclcpp_executor_get_next_ready();
+    ros_trace_rclcpp_executor_execute(&timer);
+    ros_trace_callback_start(&timer_callback, false);
+    ros_trace_callback_end(&timer_callback);
+    __atomic_fetch_add(&called, 1, __ATOMIC_RELEASE);
+    pthread_mutex_lock(&all_called);
+    pthread_mutex_unlock(&all_called);
+    return unused;
+}
+
 int main(int argc, char **argv) {
     int receiver = -1;
     struct listener *listener = 0;
@@ -373,6 +387,16 @@ int main(int argc, char **argv) {
                 ros_trace_callback_end(callback);
                 pthread_join(thread, 0);
             }
+        } else if (!strcmp(what, "threads")) {
+            /* `n` threads call a callback each, one after the other. All end after the last one. */
+            pthread_t *threads = calloc(n, sizeof *threads);
+            pthread_mutex_lock(&all_called);
+            for (long i = 0; i < n; i++)
+                if (pthread_create(&threads[i], 0, call_once, 0)) abort();
+            while (__atomic_load_n(&called, __ATOMIC_ACQUIRE) < n) usleep(1000);
+            pthread_mutex_unlock(&all_called);
+            for (long i = 0; i < n; i++) pthread_join(threads[i], 0);
+            called = 0;
         } else if (!strcmp(what, "drain")) {
             /* Receives everything that waits. Prints the number of datagrams. */
             char bytes[65536];

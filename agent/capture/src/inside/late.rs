@@ -42,6 +42,9 @@ const FORGOTTEN: f32 = 1.0 / 180.0;
 /// Part of a bound by which it rises in a round at most, as a divisor: it doubles in 70 s.
 const RISE: u64 = 100;
 
+/// Maximum time from the end of a call until a thread that waited for it begins the next one, but for
+/// its wait for a CPU.
+const RELEASED: Duration = Duration::from_millis(5);
 /// Maximum number of threads that are named for a span of a late call.
 const NAMED: usize = 4;
 
@@ -403,9 +406,10 @@ pub(super) fn convert(
         in_callbacks: Duration::from_nanos(call.in_calls),
         longest: earlier(&call.longest_call).0,
     });
-    // A callback group belongs to one node.
+    // A callback group belongs to one node, and the thread began soon after it could run.
     let released_by = (call.released_by.ended != 0).then(|| earlier(&call.released_by));
-    let released_by = released_by.filter(|(_, of)| *of == node);
+    let soon = RELEASED + Duration::from_nanos(call.before.runnable);
+    let released_by = released_by.filter(|(call, of)| *of == node && call.ended_before <= soon);
     let states = |bit, states: &_| (call.accounted & bit != 0).then(|| thread_states(states));
     let has_events = call.mode == mode::EVENTS;
     let [duration, wait] = call.bounds.map(Duration::from_nanos);

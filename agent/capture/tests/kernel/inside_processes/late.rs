@@ -9,7 +9,7 @@ use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
 use ros2probe_model::facts::calls::other_thread::Priority;
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
 use ros2probe_testing::harness::cgroup::Cgroup;
-use ros2probe_wire::inside::late::{Bound, PER_SECOND, mode};
+use ros2probe_wire::inside::late::{Bound, PER_SECOND, THREAD_CAPACITY, mode};
 use ros2probe_wire::inside::{Counter, Handle, kind};
 
 use super::thread_states::{Hog, Quota};
@@ -119,7 +119,9 @@ fn a_call_beside_a_busy_thread_names_that_thread() {
         let hog = others.iter().find(|other| other.process == hog.0.id());
         let hog = hog.unwrap_or_else(|| panic!("{call:#?}"));
         assert_eq!(hog.unit.as_deref(), Some(&*name), "{call:#?}");
-        assert_eq!(hog.priority, Some(Priority::Nice(0)));
+        // SAFETY: no preconditions.
+        let nice = unsafe { libc::getpriority(libc::PRIO_PROCESS, 0) };
+        assert_eq!(hog.priority, Some(Priority::Nice(nice.try_into().unwrap())));
     }
 }
 
@@ -303,6 +305,15 @@ fn a_call_that_waits_for_a_callback_of_another_thread_names_it() {
         assert!(other.duration >= Duration::from_millis(60), "{call:#?}");
         assert_ne!(call.previous.as_ref(), Some(other));
     }
+}
+
+#[test]
+fn a_thread_is_followed_again_after_more_threads_than_the_cap() {
+    let (mut robot, mut process) = started();
+    process.run(&format!("threads {}", THREAD_CAPACITY + 200));
+    robot.round();
+    let calls = late(&mut robot, &mut process, "sleep 10 20000");
+    assert_cause(&calls, 10, Cause::Sleep, 0.5);
 }
 
 #[test]
