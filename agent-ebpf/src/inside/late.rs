@@ -23,7 +23,7 @@ use crate::{
 };
 
 const SECOND: u64 = 1_000_000_000;
-/// Time between two calls from which on a blocked thread waited for work, in nanoseconds.
+/// Minimum time for which a thread that waits for work is blocked between two calls, in nanoseconds.
 const IDLE: u64 = 100_000;
 /// Numbers of 64 bits in [`FOLLOWED`].
 const WORDS: u32 = THREAD_IDS / 64;
@@ -87,12 +87,12 @@ pub struct Followed {
     pub role: u64,
     /// The present wait, if the thread is blocked.
     pub wait: Blocked,
-    /// Of an executor's thread, how it was woken after the longest wait that a thread of its process
-    /// ended since the last call. Of a receiver, how itself was last woken for a message.
+    /// Of an executor's thread, how a thread of its process woke it after its wait for work. Of a
+    /// receiver, how it was itself woken for a message.
     pub handoff: Handoff,
     /// That wait.
     pub handoff_wait: u64,
-    /// The last call since the own last one after which another thread woke this one.
+    /// The last call of another thread, at whose end that thread woke this one since its own last call.
     pub released_by: Call,
     /// How long the control groups of a receiver had been throttled at that wake-up.
     pub throttled: u64,
@@ -116,10 +116,15 @@ pub struct Followed {
     present: Call,
     /// The call before.
     pub previous: Call,
-    /// Since when it makes one call after the other: the start of the first one.
+    /// Time at which it was last woken.
+    pub woken: u64,
+    /// Since when it makes one call after the other: it was woken for the first one.
     busy_since: u64,
     /// Time in calls since then.
     in_calls: u64,
+    /// Time between these calls, for which it could run and did not, and was throttled.
+    busy_runnable: u64,
+    busy_throttled: u64,
     /// The longest of these calls.
     longest_call: Call,
 }
@@ -236,6 +241,25 @@ pub unsafe fn clear(followed: *mut Followed) {
     }
 }
 
+/// Forgets what an earlier thread of the same id did.
+#[inline(always)]
+unsafe fn restart(followed: *mut Followed) {
+    // SAFETY: a map value, by the caller.
+    unsafe {
+        clear(followed);
+        (*followed).state = state::RUNNING;
+        (*followed).since = 0;
+        (*followed).entered = 0;
+        (*followed).role = role::NONE;
+        (*followed).handoff.at = 0;
+        (*followed).handoff_wait = 0;
+        (*followed).released_by.ended = 0;
+        (*followed).stop_ended = 0;
+        (*followed).is_accounted = 0;
+        (*followed).previous.ended = 0;
+    }
+}
+
 /// Handles the start of a callback.
 #[inline(always)]
 pub fn began(current: &Current, delay: u64, now: u64, accounting: Option<Accounting>) {
@@ -247,17 +271,23 @@ pub fn began(current: &Current, delay: u64, now: u64, accounting: Option<Account
     };
     // SAFETY: a map value pointer checked against null, of the running thread.
     unsafe {
+        let process = read_volatile(&raw const (*followed).process);
+        if process != 0 && process != u64::from(current.process) {
+            // Another thread had the id, and its end was not observed.
+            restart(followed);
+        }
         begin_span(followed, now);
         copy(&raw const (*followed).activity, &raw mut (*followed).before);
         clear(followed);
         (*followed).process = u64::from(current.process);
         if (*followed).role == role::RECEIVER {
-            // Its wake-ups were its own.
+            // That was how it was woken itself.
             (*followed).handoff.at = 0;
         }
         (*followed).role = role::IN_CALLBACK;
         (*followed).delay = delay;
         (*followed).is_accounted_before = 0;
+        (*followed).states_before = [0; thread_state::COUNT];
         let previous_ended = (*followed).previous.ended;
         if let Some(after) = accounting {
             if (*followed).is_accounted != 0 && previous_ended != 0 && now > previous_ended {
@@ -271,11 +301,22 @@ pub fn began(current: &Current, delay: u64, now: u64, accounting: Option<Account
             }
         }
         if has_waited(followed) {
-            (*followed).busy_since = now;
+            let woken = read_volatile(&raw const (*followed).woken);
+            let is_later = woken > read_volatile(&raw const (*followed).previous.ended);
+            (*followed).busy_since = if is_later { woken } else { now };
             (*followed).in_calls = 0;
+            (*followed).busy_runnable = 0;
+            (*followed).busy_throttled = 0;
             (*followed).longest_call.ended = 0;
             (*followed).longest_call.started = 0;
         }
+        // Of a wait for a CPU before the thread was woken, no part is longer than the busy time.
+        let states = (&raw const (*followed).states_before).cast::<u64>();
+        let busy = now - read_volatile(&raw const (*followed).busy_since);
+        let runnable = read_volatile(states.add(thread_state::RUNNABLE));
+        let throttled = read_volatile(states.add(thread_state::THROTTLED));
+        (*followed).busy_runnable += accounting::least(runnable, busy);
+        (*followed).busy_throttled += accounting::least(throttled, busy);
         (*followed).mode = u64::from(present_mode());
     }
 }
@@ -326,7 +367,7 @@ pub fn ended(
     unsafe {
         begin_span(followed, now);
         let started = (*thread).started;
-        // All that follows the report is in the map before it: the verifier of Linux 6.18 fails at
+        // What is needed after the report is stored before it: the verifier of Linux 6.18 fails at
         // numbers that stay on the stack.
         (*followed).present.callback = callback;
         (*followed).present.started = started;
@@ -355,8 +396,16 @@ pub fn ended(
         copy(present, &raw mut (*followed).previous);
         (*followed).in_calls += duration(present);
         let longest = &raw mut (*followed).longest_call;
-        if duration(present) > duration(longest) {
+        let is_old = now - read_volatile(&raw const (*longest).ended) > SECOND;
+        if is_old || duration(present) > duration(longest) {
             copy(present, longest);
+        }
+        // Of a thread that never waits, the last seconds count.
+        if now - read_volatile(&raw const (*followed).busy_since) > 8 * SECOND {
+            (*followed).busy_since += (now - (*followed).busy_since) / 2;
+            (*followed).in_calls /= 2;
+            (*followed).busy_runnable /= 2;
+            (*followed).busy_throttled /= 2;
         }
     }
 }
@@ -430,6 +479,8 @@ unsafe fn report(
         );
         (*late).busy_since = (*followed).busy_since;
         (*late).in_calls = (*followed).in_calls;
+        (*late).busy_runnable = (*followed).busy_runnable;
+        (*late).busy_throttled = (*followed).busy_throttled;
         copy(
             &raw const (*followed).longest_call,
             &raw mut (*late).longest_call,

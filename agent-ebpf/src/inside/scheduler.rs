@@ -45,6 +45,8 @@ const RUNS: usize = 64;
 /// Waits below this time are not divided among other threads, in nanoseconds.
 const SHORT: u64 = 20_000;
 
+/// Minimum of a wait that is not one for a lock of the middleware, in nanoseconds.
+const LONG: u64 = 1_000_000;
 /// Maximum time from the end of a call until other threads are woken because of it, in nanoseconds.
 const RELEASE: u64 = 5_000_000;
 
@@ -142,12 +144,14 @@ pub fn woken(context: &RawTracePointContext) {
         }
         (*followed).state = state::RUNNABLE;
         (*followed).since = now;
+        (*followed).woken = now;
         add_runnable(1);
     }
 }
 
 /// Handles that a thread of the middleware is woken. Messages come through a system call, or from
-/// another process that wakes it in shared memory. All other waits delay the message.
+/// another process that wakes it in shared memory. Another thread of its own process may have
+/// received one. All other waits delay the message.
 #[inline(always)]
 unsafe fn receiver_woken(receiver: *mut Followed, task: u64, now: u64) {
     // SAFETY: a map value, by the caller.
@@ -156,6 +160,10 @@ unsafe fn receiver_woken(receiver: *mut Followed, task: u64, now: u64) {
         let is_own = u64::from((*receiver).wait.waker_process) == (*receiver).process;
         let is_shared = kind == wait::LOCK as u32 && !is_own;
         if kind != wait::OTHER as u32 && !is_shared {
+            if kind == wait::LOCK as u32 && (*receiver).wait.nanoseconds > LONG {
+                (*receiver).handoff.woken = 0;
+                clear(receiver);
+            }
             return;
         }
         clear(receiver);
@@ -168,8 +176,8 @@ unsafe fn receiver_woken(receiver: *mut Followed, task: u64, now: u64) {
     }
 }
 
-/// Handles that the running thread ends a wait of a thread that calls callbacks. The longest such
-/// wait is that for a message: those for locks of the middleware follow it. An executor's thread
+/// Handles that the running thread ends a wait of a thread that calls callbacks. A long wait is that
+/// for a message, and short ones for locks of the middleware may follow it. An executor's thread
 /// wakes others after each call, because the callback group of that call may have further ones.
 #[inline(always)]
 unsafe fn executor_woken(executor: *mut Followed, id: u64, now: u64) {
@@ -193,7 +201,7 @@ unsafe fn executor_woken(executor: *mut Followed, id: u64, now: u64) {
             return;
         }
         let waited = (*executor).wait.nanoseconds;
-        if waited <= (*executor).handoff_wait {
+        if waited <= (*executor).handoff_wait && waited <= LONG {
             return;
         }
         (*executor).handoff_wait = waited;
@@ -201,6 +209,7 @@ unsafe fn executor_woken(executor: *mut Followed, id: u64, now: u64) {
         let woken = (*receiver).handoff.woken;
         (*handoff).at = now;
         (*handoff).thread = id & 0xffff_ffff;
+        (*handoff).runnable_before = (*executor).activity.runnable;
         (*handoff).woken = woken;
         let runnable = (*receiver).activity.runnable;
         (*handoff).runnable = runnable;
@@ -246,7 +255,9 @@ unsafe fn released(woken: *mut Followed, waker: *const Followed, now: u64) {
 unsafe fn unblocked(followed: *mut Followed, now: u64) {
     // SAFETY: a map value, by the caller.
     unsafe {
-        let waited = now - (*followed).since;
+        let since = (*followed).since;
+        // The clocks of two CPUs may differ by nanoseconds.
+        let waited = if now > since { now - since } else { 0 };
         (*followed).wait.nanoseconds = waited;
         block(followed, waited);
         if waited > (*followed).activity.longest.nanoseconds {

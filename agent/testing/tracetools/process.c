@@ -195,12 +195,16 @@ static void *listen_for_messages(void *argument) {
     }
     return 0;
 }
+static struct port *mapped_port(const char *path) {
+    int file = open(path, O_RDWR);
+    struct port *port = mmap(0, sizeof *port, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+    if (port == MAP_FAILED) abort();
+    close(file);
+    return port;
+}
 static struct listener *started_listener(const char *path) {
     struct listener *own = calloc(1, sizeof *own);
-    int file = open(path, O_RDWR);
-    own->port = mmap(0, sizeof *own->port, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
-    if (own->port == MAP_FAILED) abort();
-    close(file);
+    own->port = mapped_port(path);
     own->passed = own->port->count;
     pthread_t thread;
     if (pthread_create(&thread, 0, listen_for_messages, own)) abort();
@@ -240,6 +244,7 @@ static void *call_once(void *unused) {
 int main(int argc, char **argv) {
     int receiver = -1;
     struct listener *listener = 0;
+    struct port *port = 0;
     uint32_t seen = 0;
     char line[4096], what[64], path[3072];
     const char *input = argc > 1 ? argv[1] : "/in", *output = argc > 2 ? argv[2] : "/out";
@@ -354,6 +359,13 @@ int main(int argc, char **argv) {
             /* Listens at a file that other processes map. */
             listener = started_listener(path);
             seen = listener->passed;
+        } else if (!strcmp(what, "send")) {
+            /* Publishes a message into that memory whose source timestamp is `us` microseconds old. */
+            if (!port) port = mapped_port(path);
+            ros_trace_rcl_publish(&out, &message);
+            port->source = clock_now(CLOCK_REALTIME) - us * 1000;
+            __atomic_fetch_add(&port->count, 1, __ATOMIC_RELEASE);
+            syscall(SYS_futex, &port->count, FUTEX_WAKE, 1, 0, 0, 0);
         } else if (!strcmp(what, "shared")) {
             /* Takes `n` messages that the listener passes on after `us` microseconds each. */
             listener->us = us;

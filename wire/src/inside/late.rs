@@ -147,6 +147,8 @@ pub struct Handoff {
     pub at: u64,
     /// The thread of the middleware.
     pub thread: u64,
+    /// Time for which the woken thread could run and did not, in its span before `at`, in nanoseconds.
+    pub runnable_before: u64,
     /// Time at which it was itself woken for the message; 0 = unknown.
     pub woken: u64,
     /// Time since then for which it could run and did not, in nanoseconds.
@@ -209,10 +211,14 @@ pub struct LateCall {
     pub previous: Call,
     /// The last call since then after which another thread woke this one.
     pub released_by: Call,
-    /// Start of the first call since the thread last waited for work.
+    /// Since when the thread makes one call after the other: it was woken for the first one.
     pub busy_since: u64,
     /// Time in calls since then, in nanoseconds.
     pub in_calls: u64,
+    /// Time between these calls for which it could run and did not.
+    pub busy_runnable: u64,
+    /// Time between them for which its control groups were throttled.
+    pub busy_throttled: u64,
     /// The longest of these calls.
     pub longest_call: Call,
     /// The last time in which the thread was stopped.

@@ -9,7 +9,7 @@ use std::time::Duration;
 use aya::Ebpf;
 use aya::maps::{Array, HashMap, MapData};
 use aya::programs::{CgroupSockAddr, ProgramError, ProgramFd};
-use ros2probe_model::facts::calls::late::{MessageDelivery, ReceiverStates};
+use ros2probe_model::facts::calls::late::{MessageDelivery, WaitingStates};
 use ros2probe_wire::delivery::{Delivery, DeliveryKey};
 use ros2probe_wire::inside::late::LateCall;
 
@@ -115,7 +115,7 @@ impl Deliveries {
             arrived_before: before(delivery.arrived),
             received_before: before(delivery.received),
             receiver_thread: delivery.thread,
-            receiver: (delivery.accounted != 0).then(|| ReceiverStates {
+            receiver: (delivery.accounted != 0).then(|| WaitingStates {
                 runnable: Duration::from_nanos(delivery.runnable),
                 throttled: Duration::from_nanos(delivery.throttled),
             }),

@@ -12,7 +12,7 @@ use std::time::Duration;
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::calls::late::{
     Activity, Blocked, BusyTime, CpuLimit, Handoff, LateBound, LateCall, MessageDelivery,
-    PreviousCall, ReceiverStates, Stop,
+    PreviousCall, Stop, WaitingStates,
 };
 use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{ThreadStates, Trigger};
@@ -404,14 +404,20 @@ pub(super) fn convert(
     let busy = (call.longest_call.ended != 0).then(|| BusyTime {
         began_before: between(call.busy_since, call.started),
         in_callbacks: Duration::from_nanos(call.in_calls),
+        states: WaitingStates {
+            runnable: Duration::from_nanos(call.busy_runnable),
+            throttled: Duration::from_nanos(call.busy_throttled),
+        },
         longest: earlier(&call.longest_call).0,
     });
     // A callback group belongs to one node, and the thread began soon after it could run.
     let released_by = (call.released_by.ended != 0).then(|| earlier(&call.released_by));
     let soon = RELEASED + Duration::from_nanos(call.before.runnable);
-    let released_by = released_by.filter(|(call, of)| *of == node && call.ended_before <= soon);
+    let released_by =
+        released_by.filter(|(call, of)| of.is_some() && *of == node && call.ended_before <= soon);
     let states = |bit, states: &_| (call.accounted & bit != 0).then(|| thread_states(states));
     let has_events = call.mode == mode::EVENTS;
+    let is_message = matches!(trigger, Trigger::Subscription(_));
     let [duration, wait] = call.bounds.map(Duration::from_nanos);
     LateCall {
         process: call.process,
@@ -421,7 +427,7 @@ pub(super) fn convert(
         thread: call.thread,
         cpu: call.cpu,
         delivery,
-        handoff: (has_events && call.handoff.at != 0).then(|| handoff(call, unit_of)),
+        handoff: (has_events && is_message && call.handoff.at != 0).then(|| handoff(call, unit_of)),
         cpu_limits: Arc::clone(cpu_limits),
         stop: (call.stop_ended != 0 && call.stop_ended <= call.started).then(|| Stop {
             ended_before: between(call.stop_ended, call.started),
@@ -461,8 +467,9 @@ fn handoff(call: &late::LateCall, unit_of: UnitOf<'_>) -> Handoff {
     Handoff {
         thread: handoff.thread as u32,
         woken_before: before(handoff.at),
+        runnable_before: Duration::from_nanos(handoff.runnable_before),
         received_before: (handoff.woken != 0).then(|| before(handoff.woken)),
-        receiver: ReceiverStates {
+        receiver: WaitingStates {
             runnable: Duration::from_nanos(handoff.runnable).saturating_sub(throttled),
             throttled,
         },

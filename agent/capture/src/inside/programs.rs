@@ -44,7 +44,7 @@ type ThreadWords = [u64; 14];
 type EntryWords = [u64; 2];
 type BoundWords = [u64; size_of::<Bound>() / 8];
 /// Words of `Followed` in the kernel programs.
-type FollowedWords = [u64; 21 + FOLLOWED_STATES + 15];
+type FollowedWords = [u64; 24 + FOLLOWED_STATES + 15];
 const FOLLOWED_STATES: usize =
     (2 * (size_of::<Blocked>() + size_of::<Activity>()) + size_of::<Handoff>()) / 8;
 /// Tracepoints of the scheduler. The programs have the same names.

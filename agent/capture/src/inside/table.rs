@@ -9,6 +9,7 @@ use ros2probe_attach::client::Broker;
 use ros2probe_model::derive::chain::causality::CausalPublication;
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::calls::late::{CpuLimit, LateCall, MessageDelivery};
+use ros2probe_model::facts::calls::other_thread::OtherThread;
 use ros2probe_model::facts::calls::report::{
     BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report,
     SubscriptionReport, ThreadStates, Transition, Trigger,
@@ -537,25 +538,38 @@ impl ProcessTable {
     ) -> Option<LateCall> {
         self.known.get(&call.process)?;
         let unit_of = |cgroup_id| self.units.get(&cgroup_id).cloned().flatten();
-        Some(convert(
-            call,
-            clocks,
-            delivery,
-            cpu_limits,
-            &unit_of,
-            |address| {
-                let key = Handle {
-                    address,
-                    process: call.process,
-                    kind: kind::CALLBACK,
-                };
-                let found = figures.iter().find(|(handle, _)| *handle == key);
-                let unknown = (Trigger::Service(None), None);
-                found.map_or(unknown, |(handle, figures)| {
-                    self.name_callback(*handle, figures)
-                })
-            },
-        ))
+        let mut late = convert(call, clocks, delivery, cpu_limits, &unit_of, |address| {
+            let key = Handle {
+                address,
+                process: call.process,
+                kind: kind::CALLBACK,
+            };
+            let found = figures.iter().find(|(handle, _)| *handle == key);
+            let unknown = (Trigger::Service(None), None);
+            found.map_or(unknown, |(handle, figures)| {
+                self.name_callback(*handle, figures)
+            })
+        });
+        // A process that does not publish the topic sent another message to the same thread.
+        if let (Some(handoff), Trigger::Subscription(topic)) = (&mut late.handoff, &late.trigger) {
+            let is_publisher =
+                |thread: &OtherThread| self.publishes(thread.process, topic, figures);
+            handoff.sender = handoff.sender.take().filter(is_publisher);
+        }
+        Some(late)
+    }
+
+    /// Returns whether a process has a publisher of this topic.
+    fn publishes(&self, process: u32, topic: &str, figures: &[(Handle, Figures)]) -> bool {
+        let Some(observed) = self.known.get(&process) else {
+            return false;
+        };
+        let publishers = figures
+            .iter()
+            .filter(|(handle, _)| handle.process == process && handle.kind == kind::PUBLISHER);
+        let mut publishers =
+            publishers.filter_map(|(handle, _)| observed.names.publisher(handle.address));
+        publishers.any(|publisher| &*publisher.name == topic)
     }
 
     /// Finds the units of control groups that are not known yet.

@@ -110,7 +110,12 @@ impl Robot {
 
 impl Process {
     fn start(program: &Path) -> Self {
+        Self::with(program, &[])
+    }
+
+    fn with(program: &Path, arguments: &[&str]) -> Self {
         let mut child = Command::new(program)
+            .args(arguments)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .env("ROS_DOMAIN_ID", "7")

@@ -2,15 +2,14 @@
 //! thread wakes the executor's thread.
 
 use std::fs;
-use std::os::fd::AsRawFd as _;
 use std::process::Command;
-use std::sync::atomic::{AtomicI64, AtomicU32, Ordering};
 use std::thread::sleep;
 use std::time::Duration;
 
-use ros2probe_capture::system::Clocks;
 use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
 use ros2probe_model::facts::calls::report::ThreadStates;
+
+use tempfile::NamedTempFile;
 
 use super::late::set_bounds;
 use super::thread_states::{Hog, Quota};
@@ -21,46 +20,35 @@ const LATE: Duration = Duration::from_millis(100);
 /// Part of that time which another stage may have.
 const IMPRECISION: Duration = Duration::from_millis(20);
 
-/// What the listener reads, as in `process.c`.
-#[repr(C)]
-struct Port {
-    count: AtomicU32,
-    padding: u32,
-    source: AtomicI64,
-}
-
-/// A subscriber with a thread of the middleware, and the memory that it shares with this process.
+/// A subscriber with a thread of the middleware, and a publisher that shares memory with it.
 struct Subscriber {
     robot: Robot,
     process: Process,
-    port: &'static Port,
+    publisher: Process,
+    port: NamedTempFile,
 }
 
 impl Subscriber {
     fn new() -> Subscriber {
-        let file = tempfile::NamedTempFile::new().unwrap();
-        file.as_file().set_len(size_of::<Port>() as u64).unwrap();
-        // SAFETY: a new mapping of a file of this size, which this process never unmaps.
-        let port = unsafe {
-            let address = libc::mmap(
-                std::ptr::null_mut(),
-                size_of::<Port>(),
-                libc::PROT_READ | libc::PROT_WRITE,
-                libc::MAP_SHARED,
-                file.as_file().as_raw_fd(),
-                0,
-            );
-            assert_ne!(address, libc::MAP_FAILED);
-            &*address.cast::<Port>()
-        };
+        Self::of("/in")
+    }
+
+    /// Starts a publisher of this topic, and a subscriber to `/in`.
+    fn of(topic: &str) -> Subscriber {
+        let port = NamedTempFile::new().unwrap();
+        port.as_file().set_len(16).unwrap();
         let mut robot = Robot::new(248, &[], true);
         robot.attach();
         let mut process = robot.start();
         process.run("init");
-        process.run(&format!("listen 0 0 {}", file.path().display()));
+        process.run(&format!("listen 0 0 {}", port.path().display()));
+        let program = robot.program.program();
+        let mut publisher = Process::with(&program, &["/unused", topic, "talker"]);
+        publisher.run("init");
         let mut subscriber = Subscriber {
             robot,
             process,
+            publisher,
             port,
         };
         // The delay of a message is its time beyond the fastest one.
@@ -84,22 +72,17 @@ impl Subscriber {
     }
 
     /// Sends a message when all threads of the process wait.
-    fn send_to_waiting(&self, ago: Duration) {
+    fn send_to_waiting(&mut self, ago: Duration) {
         while !self.is_waiting() {
             sleep(Duration::from_millis(1));
         }
         self.send(ago);
     }
 
-    fn send(&self, ago: Duration) {
-        let source = (Clocks::read().now - ago).0;
-        self.port
-            .source
-            .store(source.cast_signed(), Ordering::Relaxed);
-        self.port.count.fetch_add(1, Ordering::Release);
-        let address = std::ptr::from_ref(&self.port.count);
-        // SAFETY: wakes those that wait for a word that stays mapped.
-        unsafe { libc::syscall(libc::SYS_futex, address, libc::FUTEX_WAKE, 1) };
+    fn send(&mut self, ago: Duration) {
+        let path = self.port.path().display();
+        let command = format!("send 0 {} {path}", ago.as_micros());
+        self.publisher.run(&command);
     }
 
     fn is_waiting(&self) -> bool {
@@ -158,11 +141,19 @@ fn a_message_that_is_put_late_into_shared_memory_names_the_publisher() {
     let named = call.named_by(call.main_part(ThreadStates::default()).unwrap());
     assert_eq!(
         named.map(|it| it.process),
-        Some(std::process::id()),
+        Some(subscriber.publisher.child.id()),
         "{call:#?}"
     );
     let handoff = call.handoff.as_ref().unwrap();
     assert_eq!(handoff.thread.to_string(), subscriber.listener());
+}
+
+#[test]
+fn a_process_that_does_not_publish_the_topic_is_not_named() {
+    let mut subscriber = Subscriber::of("/other");
+    subscriber.pass(LATE);
+    let call = subscriber.one_late_call();
+    assert_late_for(&call, Stage::Wait, Cause::Arrival);
 }
 
 #[test]

@@ -135,10 +135,12 @@ pub struct LateBound {
 /// A time in which a thread did not wait for work.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BusyTime {
-    /// Time from the start of its first call to the start of the present one.
+    /// Time from its begin to the start of the present call.
     pub began_before: Duration,
     /// Its part in callbacks.
     pub in_callbacks: Duration,
+    /// What the thread did between them.
+    pub states: WaitingStates,
     /// The longest of these calls.
     pub longest: PreviousCall,
 }
@@ -168,7 +170,7 @@ pub struct MessageDelivery {
     /// That thread.
     pub receiver_thread: u32,
     /// States of that thread between the two, if they are known.
-    pub receiver: Option<ReceiverStates>,
+    pub receiver: Option<WaitingStates>,
 }
 
 /// How a thread of the middleware passed a message to the executor's thread: times before the start
@@ -179,19 +181,21 @@ pub struct Handoff {
     pub thread: u32,
     /// It woke the executor's thread.
     pub woken_before: Duration,
+    /// For how long the executor's thread could run and did not before that, since the call before.
+    pub runnable_before: Duration,
     /// It was woken for the message; `None` if that is not known.
     pub received_before: Option<Duration>,
     /// What it did between the two.
-    pub receiver: ReceiverStates,
+    pub receiver: WaitingStates,
     /// Threads that ran instead of it, with the longest time first.
     pub others: Vec<OtherThread>,
-    /// Thread of another process that woke it: it put the message into shared memory.
+    /// Thread of a publisher's process that woke it: it put the message into shared memory.
     pub sender: Option<OtherThread>,
 }
 
-/// Why a thread did not receive a message at once.
+/// Why a thread did not run although it could.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ReceiverStates {
+pub struct WaitingStates {
     /// It could run, and did not. This does not include `throttled`.
     pub runnable: Duration,
     /// The CPU quota of its control group was used up.
@@ -533,23 +537,42 @@ impl LateCall {
     fn handoff_parts(&self, handoff: &Handoff, wait: Duration) -> Vec<Part> {
         let since_woken = handoff.woken_before;
         let Some(received_before) = handoff.received_before else {
-            let mut parts = Rest::new(Stage::Wait, wait - since_woken).finish(Cause::Arrival);
-            parts.extend(self.executor_parts(since_woken, Cause::Middleware));
+            let mut before = Rest::new(Stage::Wait, wait - since_woken);
+            before.take(Cause::Stopped, self.stopped(since_woken, wait));
+            let mut parts = before.finish(Cause::Arrival);
+            parts.extend(self.woken_parts(handoff));
             return parts;
         };
         let since_received = wait.min(received_before);
         let (stage, cause) = match handoff.sender {
             Some(_) => (Stage::Publish, Cause::Send),
-            None => (Stage::Network, Cause::Transit),
+            None => (Stage::Wait, Cause::Arrival),
         };
         let mut parts = Rest::new(stage, wait - since_received).finish(cause);
         let mut receive = Rest::new(Stage::Receive, since_received - since_woken);
-        receive.take(Cause::Throttled, handoff.receiver.throttled);
-        receive.take(Cause::Runnable, handoff.receiver.runnable);
+        // The thread may have been awake before the message was published.
+        let awake = received_before.saturating_sub(since_woken);
+        let share = |of| share(receive.rest, of, awake);
+        let throttled = share(handoff.receiver.throttled);
+        let runnable = share(handoff.receiver.runnable);
+        receive.take(Cause::Throttled, throttled);
+        receive.take(Cause::Runnable, runnable);
         receive.take(Cause::Stopped, self.stopped(since_woken, since_received));
         parts.extend(receive.finish(Cause::Middleware));
-        parts.extend(self.executor_parts(since_woken, Cause::Middleware));
+        parts.extend(self.woken_parts(handoff));
         parts
+    }
+
+    /// Divides the time since the executor's thread was woken.
+    fn woken_parts(&self, handoff: &Handoff) -> Vec<Part> {
+        let states = self.states_before.map(|states| {
+            let before = u64::try_from(handoff.runnable_before.as_nanos()).unwrap_or(u64::MAX);
+            ThreadStates {
+                runnable: states.runnable.saturating_sub(before),
+                ..states
+            }
+        });
+        self.parts_by(states, handoff.woken_before, Cause::Middleware)
     }
 
     /// Returns for how long the process was stopped between two times before the call. A signal
@@ -566,6 +589,11 @@ impl LateCall {
     /// Divides the last `wait` before the call by what the executor's thread did. `waiting` is the
     /// cause of the time in which that thread waited too.
     fn executor_parts(&self, wait: Duration, waiting: Cause) -> Vec<Part> {
+        self.parts_by(self.states_before, wait, waiting)
+    }
+
+    /// The same, with what that thread did since the call before.
+    fn parts_by(&self, states: Option<ThreadStates>, wait: Duration, waiting: Cause) -> Vec<Part> {
         let mut rest = Rest::new(Stage::Wait, wait);
         let stop = self.stop.as_ref().map_or(Span::default(), Stop::span);
         let stop = stop.within(wait);
@@ -583,14 +611,22 @@ impl LateCall {
                 began_before: busy.began_before,
                 ended_before: previous.span().began_before,
             };
-            let in_callbacks = busy.in_callbacks.saturating_sub(previous.duration);
             let span = earlier.within(wait).before(until);
-            let in_callbacks = share(span.duration(), in_callbacks, earlier.duration());
+            let share = |of| share(span.duration(), of, earlier.duration());
+            let in_callbacks = share(busy.in_callbacks.saturating_sub(previous.duration));
             let stopped = span.common(stop);
             rest.take(Cause::OtherCallback, in_callbacks.saturating_sub(stopped));
+            let last = self.states_before.unwrap_or_default();
+            let between = |all: Duration, last| share(all.saturating_sub(nanoseconds(last)));
+            let throttled = between(busy.states.throttled, last.throttled);
+            rest.take(Cause::Throttled, throttled);
+            rest.take(
+                Cause::Runnable,
+                between(busy.states.runnable, last.runnable),
+            );
         }
         // The thread was between two calls for the remaining time.
-        match self.states_before {
+        match states {
             Some(states) => {
                 rest.take(Cause::Throttled, nanoseconds(states.throttled));
                 rest.take(Cause::Runnable, nanoseconds(states.runnable));
@@ -666,6 +702,12 @@ impl LateCall {
     #[must_use]
     pub fn named_by(&self, part: Part) -> Option<&OtherThread> {
         match part.cause {
+            Cause::Runnable if part.stage == Stage::Wait => {
+                // The rest precedes an earlier call, and has no events.
+                let runnable = self.activity_before.as_ref()?.runnable;
+                let is_most = runnable * 2 >= part.duration;
+                is_most.then(|| self.culprit(part.stage)).flatten()
+            }
             Cause::Runnable => self.culprit(part.stage),
             Cause::Stopped if part.stage != Stage::Callback => {
                 self.stop.as_ref()?.wait.waker.as_ref()
@@ -694,7 +736,13 @@ impl LateCall {
     #[must_use]
     pub fn culprit(&self, stage: Stage) -> Option<&OtherThread> {
         let others = match (stage, &self.handoff, &self.delivery) {
-            (Stage::Receive, Some(handoff), _) => &handoff.others,
+            // Otherwise they may have run before the message was published. A wait is shorter than
+            // the time since then, by that of the fastest message.
+            (Stage::Receive, Some(handoff), _)
+                if handoff.received_before? <= self.wait? * 9 / 8 =>
+            {
+                &handoff.others
+            }
             // Another thread may have read the socket.
             (Stage::Socket, Some(handoff), Some(delivery))
                 if handoff.thread == delivery.receiver_thread =>

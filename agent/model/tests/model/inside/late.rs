@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use ros2probe_model::facts::calls::late::{
     Activity, Blocked, BusyTime, Cause, Handoff, LateBound, LateCall, MessageDelivery,
-    PreviousCall, ReceiverStates, Stage, Stop,
+    PreviousCall, Stage, Stop, WaitingStates,
 };
 use ros2probe_model::facts::calls::other_thread::{OtherThread, Priority};
 use ros2probe_model::facts::calls::report::{ProcessReport, Report, ThreadStates, Trigger};
@@ -188,7 +188,7 @@ fn call_of_a_message() -> LateCall {
         arrived_before: milliseconds(60),
         received_before: milliseconds(30),
         receiver_thread: 44,
-        receiver: Some(ReceiverStates {
+        receiver: Some(WaitingStates {
             runnable: milliseconds(3),
             throttled: milliseconds(2),
         }),
@@ -312,19 +312,34 @@ fn earlier_callbacks_explain_the_wait_behind_several_messages() {
     // The thread has been busy for 100 ms, and for 90 ms before the last call.
     late.busy = Some(BusyTime {
         began_before: milliseconds(100),
-        in_callbacks: milliseconds(98),
+        in_callbacks: milliseconds(88),
+        states: WaitingStates {
+            runnable: milliseconds(8),
+            throttled: milliseconds(2),
+        },
         longest: earlier(0x60, 70, 15),
     });
+    let all = parts(&late);
+    // Of these 90 ms, 70 are in the wait: 80 of 90 in callbacks, 8 runnable, and 2 throttled.
     let expected = [
-        (Stage::Wait, Cause::OtherCallback, 78),
+        (Stage::Wait, Cause::OtherCallback, 70),
+        (Stage::Wait, Cause::Throttled, 1),
+        (Stage::Wait, Cause::Runnable, 6),
         (Stage::Wait, Cause::Arrival, 2),
     ];
-    assert_eq!(parts(&late)[..2], expected);
+    assert_eq!(all[..4], expected, "{all:?}");
     assert_eq!(late.waited_for().map(|call| call.handle), Some(0x60));
+    let runnable = late.parts()[2];
+    assert_eq!(late.named_by(runnable), None, "no event is known");
     // The thread waited for work until 50 ms before the call.
     late.busy.as_mut().unwrap().began_before = milliseconds(50);
     late.busy.as_mut().unwrap().in_callbacks = milliseconds(38);
     assert_eq!(parts(&late)[0], (Stage::Wait, Cause::OtherCallback, 38));
+    // It waited for its CPU, made the last call, and then this one.
+    let busy = late.busy.as_mut().unwrap();
+    busy.in_callbacks = milliseconds(8);
+    busy.states.runnable = milliseconds(40);
+    assert_eq!(parts(&late)[2], (Stage::Wait, Cause::Runnable, 40));
 }
 
 /// A call after 90 ms. Another process woke the middleware's thread after 20 ms, which woke the
@@ -335,8 +350,9 @@ fn call_of_a_handoff() -> LateCall {
     late.handoff = Some(Handoff {
         thread: 44,
         woken_before: milliseconds(20),
+        runnable_before: milliseconds(1),
         received_before: Some(milliseconds(70)),
-        receiver: ReceiverStates {
+        receiver: WaitingStates {
             runnable: milliseconds(30),
             throttled: milliseconds(5),
         },
@@ -354,8 +370,8 @@ fn a_wait_without_a_socket_is_divided_by_the_threads_that_passed_the_message() {
         (Stage::Receive, Cause::Throttled, 5),
         (Stage::Receive, Cause::Runnable, 30),
         (Stage::Receive, Cause::Middleware, 15),
-        (Stage::Wait, Cause::Runnable, 4),
-        (Stage::Wait, Cause::Middleware, 16),
+        (Stage::Wait, Cause::Runnable, 3),
+        (Stage::Wait, Cause::Middleware, 17),
         (Stage::Callback, Cause::Cpu, 5),
     ];
     assert_eq!(parts(&late), expected);
@@ -364,9 +380,9 @@ fn a_wait_without_a_socket_is_divided_by_the_threads_that_passed_the_message() {
     assert_eq!(&*late.named_by(main).unwrap().name, "chromium");
     let send = late.parts()[0];
     assert_eq!(&*late.named_by(send).unwrap().name, "talker");
-    // A thread that received it from the network has no publisher.
+    // The thread received it from the network, or a process that does not publish it woke the thread.
     late.handoff.as_mut().unwrap().sender = None;
-    assert_eq!(parts(&late)[0], (Stage::Network, Cause::Transit, 20));
+    assert_eq!(parts(&late)[0], (Stage::Wait, Cause::Arrival, 20));
     // Nor is it known when that thread was woken.
     late.handoff.as_mut().unwrap().received_before = None;
     assert_eq!(parts(&late)[0], (Stage::Wait, Cause::Arrival, 70));
@@ -376,8 +392,15 @@ fn a_wait_without_a_socket_is_divided_by_the_threads_that_passed_the_message() {
 fn a_thread_that_was_awake_before_the_message_explains_nothing_earlier() {
     let mut late = call_of_a_handoff();
     // The middleware's thread was busy with earlier messages.
-    late.wait = Some(milliseconds(60));
-    assert_eq!(parts(&late)[0], (Stage::Receive, Cause::Throttled, 5));
+    late.wait = Some(milliseconds(45));
+    let all = parts(&late);
+    let expected = [
+        (Stage::Receive, Cause::Throttled, 2),
+        (Stage::Receive, Cause::Runnable, 15),
+        (Stage::Receive, Cause::Middleware, 7),
+    ];
+    assert_eq!(all[..3], expected, "{all:?}");
+    assert_eq!(late.named_by(late.parts()[1]), None);
     // The executor's thread was woken for another message.
     late.wait = Some(milliseconds(19));
     assert_eq!(parts(&late)[1], (Stage::Wait, Cause::Arrival, 15));
