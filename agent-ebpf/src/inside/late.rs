@@ -92,7 +92,8 @@ pub struct Followed {
     pub handoff: Handoff,
     /// That wait.
     pub handoff_wait: u64,
-    /// The last call of another thread, at whose end that thread woke this one since its own last call.
+    /// The last call of another thread at whose end that thread woke this one, since the last call
+    /// of this one.
     pub released_by: Call,
     /// How long the control groups of a receiver had been throttled at that wake-up.
     pub throttled: u64,

@@ -29,17 +29,18 @@ pub struct Why<'a> {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Cause<'a> {
-    /// Stage in which the calls became late: `publish`, `network`, `socket`, `wait` or `callback`.
-    /// They end when the message is sent, arrives at the subscriber's socket, is received there,
-    /// when the call starts, and when it ends. Only messages through UDP sockets have the first
-    /// three.
+    /// Stage in which the calls became late: `publish`, `network`, `socket`, `receive`, `wait` or
+    /// `callback`. They end when the message is sent, arrives at the subscriber's socket, is
+    /// received there, when a thread of the middleware wakes the executor, when the call starts, and
+    /// when it ends. Only messages through UDP sockets have `network` and `socket`, and only others have
+    /// `receive`.
     pub stage: Cow<'a, str>,
     /// `cpu`, `stolen`, `throttled`, `runnable`, `lock`, `sleep`, `disk`, `page_fault`, `stopped`,
     /// `system_call`, `blocked`, `other_callback`, `arrival`, `send`, `transit`,
     /// `queue`, `middleware` or `unexplained`.
     pub cause: Cow<'a, str>,
-    /// Name of the thread that ran instead, released the lock, or continued the process; null for
-    /// other causes.
+    /// Name of the thread that ran instead, released the lock, continued the process, or sent the
+    /// message; null for other causes.
     pub by: Option<Cow<'a, str>>,
     /// Systemd unit, container or control group of that thread, as in [`OtherThread`].
     pub by_unit: Option<Cow<'a, str>>,
@@ -125,8 +126,8 @@ pub struct LateCall<'a> {
     pub late_wait_seconds: Option<f64>,
     /// Thread of the call.
     pub thread_id: u32,
-    /// Thread of the middleware that received the message, or passed it to the thread of the call; null
-    /// if that was not observed.
+    /// Thread of the middleware that received the message, or woke the thread of the call; null if
+    /// that was not observed.
     pub receiver_thread_id: Option<u32>,
     /// CPU on which the call ended.
     pub cpu: u32,

@@ -147,7 +147,8 @@ pub struct Handoff {
     pub at: u64,
     /// The thread of the middleware.
     pub thread: u64,
-    /// Time for which the woken thread could run and did not, in its span before `at`, in nanoseconds.
+    /// Time for which the woken thread could run and did not since its last call, before `at`, in
+    /// nanoseconds.
     pub runnable_before: u64,
     /// Time at which it was itself woken for the message; 0 = unknown.
     pub woken: u64,
@@ -225,8 +226,7 @@ pub struct LateCall {
     pub stop: Blocked,
     /// End of that time; 0 = never.
     pub stop_ended: u64,
-    /// How the thread was woken, after the longest wait that a thread of its process ended since the call
-    /// before.
+    /// How a thread of its process woke the thread after its wait for work.
     pub handoff: Handoff,
     /// The thread during the call, by [`thread_state`], in nanoseconds.
     pub states: [u64; thread_state::COUNT],

@@ -42,7 +42,7 @@ const FORGOTTEN: f32 = 1.0 / 180.0;
 /// Part of a bound by which it rises in a round at most, as a divisor: it doubles in 70 s.
 const RISE: u64 = 100;
 
-/// Maximum time from the end of a call until a thread that waited for it begins the next one, but for
+/// Maximum time from the end of a call until a thread that waited for it begins the next one, without
 /// its wait for a CPU.
 const RELEASED: Duration = Duration::from_millis(5);
 /// Maximum number of threads that are named for a span of a late call.

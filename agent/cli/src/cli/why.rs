@@ -28,10 +28,10 @@ calls in the last minutes, and at least 5 ms. The command waits until a late cal
 The sums are those of the kernel's scheduler: cpu, throttled (CPU quota), runnable (others ran
 instead) and blocked. From the first request until ten seconds after the last one, the agent also
 observes the scheduler's events. They show who ran instead, and divide blocked into lock, sleep,
-disk, page_fault, stopped and system_call. Before a call: other_callback (of the same thread), or
-arrival (the executor waited for the message too). The bar shows the share of each part by its
-first letter. `capture: {late: on}` observes the events whenever callbacks are observed, `off`
-reports no late calls.
+disk, page_fault, stopped and system_call. Before a call: where its message was, other_callback
+(earlier calls), or arrival (the executor waited for the message too). The bar shows the share of
+each part by its first letter. `capture: {late: on}` observes the events whenever callbacks are
+observed, `off` reports no late calls.
 
 Exit code: 0; 1 if no call was late, or if callbacks are not observed.
 

@@ -48,7 +48,7 @@ pub struct LateCall {
     pub previous: Option<PreviousCall>,
     /// The time in which that thread made one call after the other until this one.
     pub busy: Option<BusyTime>,
-    /// A later call of the same node after which another thread woke this one.
+    /// A call of the same node in another thread, which woke this one at its end, after `previous`.
     pub released_by: Option<PreviousCall>,
     /// What the thread did during the call, by the scheduler's accounting.
     pub states: Option<ThreadStates>,
@@ -240,7 +240,8 @@ pub struct Blocked {
 /// Where a late call lost its time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Stage {
-    /// From the call that publishes the message until its first datagram is sent.
+    /// From the call that publishes the message until its first datagram is sent, or until it is in
+    /// shared memory.
     Publish,
     /// Until its last datagram arrives at the subscriber's socket. If the publisher is on another
     /// host, this includes [`Self::Publish`].
