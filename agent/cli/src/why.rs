@@ -89,7 +89,7 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
         if sum > 0.0 {
             let _ = writeln!(
                 out,
-                "  {words:<15} {:>6}  {}",
+                "  {words:<17} {:>6}  {}",
                 seconds(sum),
                 listed(&parts, total)
             );
@@ -139,12 +139,19 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
         let limits: Vec<_> = call.cpu_limits.iter().map(|limit| safe(limit)).collect();
         let _ = writeln!(out, "  slow CPUs: {}", limits.join("; "));
     }
-    if let Some(previous) = call.previous.as_ref()
-        && call.parts.iter().any(|part| part.cause == "other_callback")
-    {
+    let others = call
+        .parts
+        .iter()
+        .filter(|part| part.cause == "other_callback");
+    let in_others: f64 = others.map(|part| part.seconds).sum();
+    if let Some(previous) = call.previous.as_ref().filter(|_| in_others > 0.0) {
+        let several = match previous.duration_seconds < in_others / 2.0 {
+            true => "several callbacks, one of them",
+            false => "the callback",
+        };
         let _ = writeln!(
             out,
-            "  waited for the callback of {}: {}",
+            "  waited for {several} of {}: {}",
             safe(&previous.trigger.words()),
             seconds(previous.duration_seconds)
         );
@@ -204,7 +211,7 @@ fn time(seconds: f64, zone: &TimeZone) -> String {
 #[cfg(test)]
 mod tests {
     use ros2probe_api::inside::{Owner, Trigger};
-    use ros2probe_api::why::{Blocked, Cause};
+    use ros2probe_api::why::{Blocked, Cause, PreviousCall};
 
     use super::*;
 
@@ -282,12 +289,40 @@ mod tests {
 
 /filter, callback of /points: 14 of 600 calls late
   worst: 160ms at 22:13:20.250, thread 43 on CPU 1: its control group had used up its CPU quota
-  before the call   40ms  arrival 40ms
-  in the call      120ms  cpu 20ms, throttled 80ms, lock 20ms
+  before the call     40ms  arrival 40ms
+  in the call        120ms  cpu 20ms, throttled 80ms, lock 20ms
   [aaaaaaaaaaaaccccccttttttttttttttttttttttttllllll]
   ran instead: chromium\\u{1b} (6, kiosk.service, nice -5) 30ms
   longest blocked: 20ms in futex(0x7f00)
 ";
         assert_eq!(text, expected);
+    }
+
+    #[test]
+    fn a_call_that_waited_names_the_callback_before_it_also_among_several() {
+        let mut why = why();
+        let worst = &mut why.callbacks[0].examples[0];
+        worst.parts[0] = part("receive", "runnable", 0.01);
+        worst.parts.insert(1, part("wait", "other_callback", 0.03));
+        worst.previous = Some(PreviousCall {
+            trigger: Trigger {
+                kind: "timer".into(),
+                ..Trigger::default()
+            },
+            duration_seconds: 0.03,
+            ..PreviousCall::default()
+        });
+        let first = text(&why, &TimeZone::UTC);
+        let stages = "  in the middleware   10ms  runnable 10ms
+  before the call     30ms  other_callback 30ms
+";
+        assert!(first.contains(stages), "{first}");
+        let waited = "  waited for the callback of timer: 30ms\n";
+        assert!(first.ends_with(waited), "{first}");
+        let worst = &mut why.callbacks[0].examples[0];
+        worst.previous.as_mut().unwrap().duration_seconds = 0.01;
+        let several = text(&why, &TimeZone::UTC);
+        let waited = "  waited for several callbacks, one of them of timer: 10ms\n";
+        assert!(several.ends_with(waited), "{several}");
     }
 }

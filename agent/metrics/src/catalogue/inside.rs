@@ -130,7 +130,7 @@ pub const CALLBACK_TIME: Metric = Metric::counter(
 pub const LATE_TIME: Metric = Metric::counter(
     "ros2_late_seconds_total",
     CALLBACK_CAUSE,
-    "Time of late calls by stage (wait or callback) and cause: what their time consisted of.",
+    "Time of late calls by stage and cause: where their messages were, and what the threads did.",
 )
 .unit("seconds")
 .experimental();
