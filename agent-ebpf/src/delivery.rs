@@ -56,6 +56,8 @@ struct Queue {
     /// Time of the last receive call, and the accounting of its thread then.
     received: u64,
     accounting: Accounting,
+    /// The accounting at the present receive call.
+    after: Accounting,
     /// That thread.
     thread: u64,
     /// The last time in which the receiving thread waited for a CPU for longer than [`STALL`]: its
@@ -83,16 +85,18 @@ struct Queued {
     port: u64,
 }
 
+const NO_ACCOUNTING: Accounting = Accounting {
+    cpu: 0,
+    runnable: 0,
+    throttled: 0,
+    voluntary_switches: 0,
+};
 const NEW_QUEUE: Queue = Queue {
     count: 0,
     socket: 0,
     received: 0,
-    accounting: Accounting {
-        cpu: 0,
-        runnable: 0,
-        throttled: 0,
-        voluntary_switches: 0,
-    },
+    accounting: NO_ACCOUNTING,
+    after: NO_ACCOUNTING,
     thread: 0,
     stall_ended: 0,
     stall_runnable: 0,
@@ -200,35 +204,24 @@ pub fn received(context: *mut bpf_sock_addr) {
         core::ptr::write_volatile(address, (*context).__bindgen_anon_1.sk as u64);
         (core::ptr::read_volatile(address), (*context).user_port)
     };
-    let after = accounting::read();
     // SAFETY: a map value, as above.
-    if unsafe {
-        note(
-            queue,
-            socket,
-            address,
-            u16::from_be(port as u16),
-            now,
-            &after,
-        )
-    }
-    .is_none()
-    {
-        count_outside(Counter::ReceivedUnmatched, 1);
-    }
-    // SAFETY: as above.
     unsafe {
+        let is_known = accounting::read_into(&raw mut (*queue).after) != 0;
+        let port = u16::from_be(port as u16);
+        if note(queue, socket, address, port, now, is_known).is_none() {
+            count_outside(Counter::ReceivedUnmatched, 1);
+        }
         (*queue).received = 0;
-        if let Some(accounting) = after {
-            (*queue).accounting = accounting;
+        if is_known {
+            (*queue).accounting = (*queue).after;
             (*queue).thread = bpf_get_current_pid_tgid();
             (*queue).received = now;
         }
     }
 }
 
-/// Notes the delivery of the received datagram; `None` if it is not known which one that is. `after`
-/// is the accounting of the running thread.
+/// Notes the delivery of the received datagram; `None` if it is not known which one that is.
+/// `is_known`: whether the accounting of the running thread is.
 #[inline(always)]
 unsafe fn note(
     queue: *mut Queue,
@@ -236,7 +229,7 @@ unsafe fn note(
     address: u64,
     port: u16,
     now: u64,
-    after: &Option<Accounting>,
+    is_known: bool,
 ) -> Option<()> {
     // SAFETY: a map value, by the caller.
     let count = unsafe { core::ptr::read_volatile(&raw const (*queue).count) };
@@ -267,13 +260,9 @@ unsafe fn note(
     // SAFETY: a map value, by the caller.
     unsafe {
         let since = (*queue).received;
-        if since != 0
-            && now > since
-            && (*queue).thread == thread
-            && let Some(after) = after
-        {
+        if is_known && since != 0 && now > since && (*queue).thread == thread {
             let before = &raw const (*queue).accounting;
-            let states = accounting::states(before, after, now - since);
+            let states = accounting::states(before, &(*queue).after, now - since);
             let mut throttled = states[thread_state::THROTTLED];
             let mut runnable = states[thread_state::RUNNABLE];
             if throttled + runnable > STALL {

@@ -29,24 +29,29 @@ pub struct Accounting {
     pub voluntary_switches: u64,
 }
 
-/// Reads the accounting of the running thread; `None` if the kernel does not keep it, or does not
-/// allow the read.
+/// Reads the accounting of the running thread into a map value, and returns whether it is known: 0
+/// or 1. An `Option` would stay on the stack, partly unwritten. Linux before 6.3 refuses a program
+/// that may read such a place.
+///
+/// # Safety
+/// `to` is in a map value.
 #[inline(always)]
-pub fn read() -> Option<Accounting> {
+pub unsafe fn read_into(to: *mut Accounting) -> u64 {
     if offset(RUNTIME) == ABSENT
         || offset(RUN_DELAY) == ABSENT
         || offset(VOLUNTARY_SWITCHES) == ABSENT
     {
-        return None;
+        return 0;
     }
-    // SAFETY: no preconditions.
-    let task = unsafe { bpf_get_current_task() };
-    Some(Accounting {
-        cpu: word(task, RUNTIME)?,
-        runnable: word(task, RUN_DELAY)?,
-        throttled: throttled(task),
-        voluntary_switches: word(task, VOLUNTARY_SWITCHES)?,
-    })
+    // SAFETY: no preconditions; `to` is as required of the caller.
+    unsafe {
+        let task = bpf_get_current_task();
+        (*to).cpu = word(task, RUNTIME).unwrap_or(0);
+        (*to).runnable = word(task, RUN_DELAY).unwrap_or(0);
+        (*to).throttled = throttled(task);
+        (*to).voluntary_switches = word(task, VOLUNTARY_SWITCHES).unwrap_or(0);
+    }
+    1
 }
 
 /// Returns what the running thread did in the last `duration` nanoseconds, which began with

@@ -3,7 +3,7 @@
 use core::ptr::{read_volatile, write_volatile};
 
 use ros2probe_wire::inside::{
-    Counter, Figures, HOPS_PER_SECOND, Handle, Hop, announced, distribution, kind,
+    Counter, Figures, HOPS_PER_SECOND, Handle, Hop, announced, distribution, kind, thread_state,
 };
 
 use crate::{
@@ -74,12 +74,7 @@ pub fn started(callback: u64, within: bool) {
         (*thread).callback = callback;
         (*thread).started = now;
         (*figures).thread = current.thread;
-        (*thread).is_accounted = 0;
-        let accounting = accounting::read();
-        if let Some(accounting) = accounting {
-            (*thread).is_accounted = 1;
-            (*thread).accounting = accounting;
-        }
+        (*thread).is_accounted = accounting::read_into(&raw mut (*thread).accounting);
         let input = (*thread).input;
         let mut delay = 0;
         if within {
@@ -103,7 +98,7 @@ pub fn started(callback: u64, within: bool) {
         } else {
             (*figures).trigger = current.handle(0, 0);
         }
-        late::began(&current, delay, now, accounting);
+        late::began(&current, delay, now, thread);
     }
 }
 
@@ -240,13 +235,11 @@ pub fn ended(callback: u64) {
         if (*thread).callback == callback && now > (*thread).started {
             let duration = now - (*thread).started;
             observe(figures, distribution::INTERVAL, duration);
-            let after = accounting::read();
-            let mut known = None;
-            if let Some(after) = &after
-                && (*thread).is_accounted != 0
-            {
+            (*thread).is_accounted &= accounting::read_into(&raw mut (*thread).after);
+            (*thread).states = [0; thread_state::COUNT];
+            if (*thread).is_accounted != 0 {
                 let before = &raw const (*thread).accounting;
-                let states = accounting::states(before, after, duration);
+                let states = accounting::states(before, &(*thread).after, duration);
                 let sums = (&raw mut (*figures).states).cast::<u64>();
                 let mut state = 0;
                 while state < states.len() {
@@ -254,10 +247,10 @@ pub fn ended(callback: u64) {
                     state += 1;
                 }
                 add(&raw mut (*figures).states_known, 1);
-                known = Some(states);
+                (*thread).states = states;
             }
             let trigger = (*figures).trigger;
-            late::ended(&current, callback, trigger, thread, now, after, known);
+            late::ended(&current, callback, trigger, thread, now);
         }
         (*thread).callback = 0;
         (*thread).executed = 0;

@@ -263,7 +263,7 @@ unsafe fn restart(followed: *mut Followed) {
 
 /// Handles the start of a callback.
 #[inline(always)]
-pub fn began(current: &Current, delay: u64, now: u64, accounting: Option<Accounting>) {
+pub fn began(current: &Current, delay: u64, now: u64, thread: *const Thread) {
     if present_mode() == mode::OFF {
         return;
     }
@@ -290,16 +290,14 @@ pub fn began(current: &Current, delay: u64, now: u64, accounting: Option<Account
         (*followed).is_accounted_before = 0;
         (*followed).states_before = [0; thread_state::COUNT];
         let previous_ended = (*followed).previous.ended;
-        if let Some(after) = accounting {
-            if (*followed).is_accounted != 0 && previous_ended != 0 && now > previous_ended {
-                let states = accounting::states(
-                    &raw const (*followed).accounting,
-                    &after,
-                    now - previous_ended,
-                );
-                (*followed).states_before = states;
-                (*followed).is_accounted_before = 1;
-            }
+        let is_accounted = (*thread).is_accounted & (*followed).is_accounted;
+        if is_accounted != 0 && previous_ended != 0 && now > previous_ended {
+            (*followed).states_before = accounting::states(
+                &raw const (*followed).accounting,
+                &(*thread).accounting,
+                now - previous_ended,
+            );
+            (*followed).is_accounted_before = 1;
         }
         if has_waited(followed) {
             let woken = read_volatile(&raw const (*followed).woken);
@@ -348,15 +346,7 @@ unsafe fn has_waited(followed: *const Followed) -> bool {
 
 /// Handles the end of a callback that began at the thread's `started`.
 #[inline(always)]
-pub fn ended(
-    current: &Current,
-    callback: u64,
-    trigger: Handle,
-    thread: *const Thread,
-    now: u64,
-    after: Option<Accounting>,
-    states: Option<[u64; thread_state::COUNT]>,
-) {
+pub fn ended(current: &Current, callback: u64, trigger: Handle, thread: *const Thread, now: u64) {
     let mode = present_mode();
     if mode == mode::OFF {
         return;
@@ -373,11 +363,8 @@ pub fn ended(
         (*followed).present.callback = callback;
         (*followed).present.started = started;
         (*followed).present.ended = now;
-        (*followed).is_accounted = 0;
-        if let Some(after) = after {
-            (*followed).accounting = after;
-            (*followed).is_accounted = 1;
-        }
+        (*followed).is_accounted = (*thread).is_accounted;
+        copy(&raw const (*thread).after, &raw mut (*followed).accounting);
         let key = current.handle(callback, kind::CALLBACK);
         if let Some(bound) = BOUNDS.get_ptr_mut(&key)
             && (now - started > (*bound).duration || (*followed).delay > (*bound).delay)
@@ -385,7 +372,7 @@ pub fn ended(
         {
             let bounds = [(*bound).duration, (*bound).delay];
             report(
-                current, callback, trigger, thread, followed, now, mode, states, bounds,
+                current, callback, trigger, thread, followed, now, mode, bounds,
             );
         }
         clear(followed);
@@ -446,7 +433,6 @@ unsafe fn report(
     followed: *const Followed,
     now: u64,
     mode: u32,
-    states: Option<[u64; thread_state::COUNT]>,
     bounds: [u64; 2],
 ) {
     let Some(mut entry) = ANNOUNCEMENTS.reserve::<LateCall>(0) else {
@@ -457,14 +443,15 @@ unsafe fn report(
     // SAFETY: reserved memory of this size, all of which is written; map values, by the caller.
     unsafe {
         let began_as = (*followed).mode as u32;
-        let is_accounted = u32::from(states.is_some());
+        let is_accounted = (*thread).is_accounted as u32;
         let is_accounted_before = (*followed).is_accounted_before as u32;
         (*late).kind = announced::LATE;
         (*late).process = current.process;
         (*late).thread = current.thread;
         (*late).mode = if began_as < mode { began_as } else { mode };
         (*late).cpu = bpf_get_smp_processor_id();
-        (*late).accounted = is_accounted | (opaque(is_accounted_before) as u32 & 1) << 1;
+        (*late).accounted =
+            (opaque(is_accounted) as u32 & 1) | (opaque(is_accounted_before) as u32 & 1) << 1;
         (*late).callback = callback;
         (*late).trigger = trigger;
         (*late).source_timestamp = (*thread).source_timestamp;
@@ -486,7 +473,7 @@ unsafe fn report(
             &raw const (*followed).longest_call,
             &raw mut (*late).longest_call,
         );
-        (*late).states = states.unwrap_or([0; thread_state::COUNT]);
+        (*late).states = (*thread).states;
         (*late).states_before = (*followed).states_before;
         copy(&raw const (*followed).handoff, &raw mut (*late).handoff);
         (*late).stop = (*followed).stop;

@@ -9,7 +9,7 @@ use aya_ebpf::{
 };
 use ros2probe_wire::inside::{
     BUCKETS, Counter, Figures, HANDLE_CAPACITY, Handle, PROCESS_CAPACITY, Process, THREAD_CAPACITY,
-    WAITING_CAPACITY, bucket, clock, distribution, state,
+    WAITING_CAPACITY, bucket, clock, distribution, state, thread_state,
 };
 
 use crate::{
@@ -79,6 +79,9 @@ pub struct Thread {
     pub is_accounted: u64,
     /// The accounting at that time.
     pub accounting: Accounting,
+    /// The accounting at the end of the last callback, and what the thread did during it.
+    pub after: Accounting,
+    pub states: [u64; thread_state::COUNT],
 }
 
 /// A position in a ring buffer.

@@ -172,7 +172,7 @@ pub struct Call {
     pub callback: u64,
     /// Start of the call.
     pub started: u64,
-    /// End of the call; 0 = there is none.
+    /// End of the call; 0 = no call is known.
     pub ended: u64,
 }
 

@@ -40,7 +40,7 @@ type FiguresWords = [u64; size_of::<Figures>() / 8];
 type ProcessWords = [u64; size_of::<Process>() / 8];
 type HandleWords = [u64; size_of::<Handle>() / 8];
 /// Words of `Thread` and `Entry` in the kernel programs.
-type ThreadWords = [u64; 14];
+type ThreadWords = [u64; 22];
 type EntryWords = [u64; 2];
 type BoundWords = [u64; size_of::<Bound>() / 8];
 /// Words of `Followed` in the kernel programs.
