@@ -29,9 +29,9 @@ pub struct Accounting {
     pub voluntary_switches: u64,
 }
 
-/// Reads the accounting of the running thread into a map value, and returns whether it is known: 0
-/// or 1. An `Option` would stay on the stack, partly unwritten. Linux before 6.3 refuses a program
-/// that may read such a place.
+/// Reads the accounting of the running thread into a map value. Returns 1, or 0 if the kernel does
+/// not keep it, or does not allow the read. An `Option` would stay on the stack, partly unwritten.
+/// Linux before 6.3 refuses a program that may read such a place.
 ///
 /// # Safety
 /// `to` is in a map value.
@@ -46,12 +46,12 @@ pub unsafe fn read_into(to: *mut Accounting) -> u64 {
     // SAFETY: no preconditions; `to` is as required of the caller.
     unsafe {
         let task = bpf_get_current_task();
-        (*to).cpu = word(task, RUNTIME).unwrap_or(0);
-        (*to).runnable = word(task, RUN_DELAY).unwrap_or(0);
         (*to).throttled = throttled(task);
-        (*to).voluntary_switches = word(task, VOLUNTARY_SWITCHES).unwrap_or(0);
+        let refused = copy_word(task, RUNTIME, &raw mut (*to).cpu)
+            | copy_word(task, RUN_DELAY, &raw mut (*to).runnable)
+            | copy_word(task, VOLUNTARY_SWITCHES, &raw mut (*to).voluntary_switches);
+        u64::from(refused == 0)
     }
-    1
 }
 
 /// Returns what the running thread did in the last `duration` nanoseconds, which began with
@@ -118,15 +118,16 @@ pub fn offset(of: usize) -> u32 {
 #[inline(always)]
 pub fn word(address: u64, of: usize) -> Option<u64> {
     let mut value = MaybeUninit::<u64>::zeroed();
-    let address = address.wrapping_add(u64::from(offset(of)));
-    // SAFETY: the destination has the size given; the kernel checks the address.
-    let result = unsafe {
-        bpf_probe_read_kernel(
-            value.as_mut_ptr().cast(),
-            size_of::<u64>() as u32,
-            address as *const _,
-        )
-    };
+    // SAFETY: the destination has the size of the member.
+    let result = unsafe { copy_word(address, of, value.as_mut_ptr()) };
     // SAFETY: any bytes are a number.
     (result == 0).then(|| unsafe { value.assume_init() })
+}
+
+/// Copies a member of the structure at `address`. Returns 0, or an error; `to` is then 0.
+#[inline(always)]
+unsafe fn copy_word(address: u64, of: usize, to: *mut u64) -> i64 {
+    let address = address.wrapping_add(u64::from(offset(of)));
+    // SAFETY: `to` is writable, by the caller; the kernel checks the address.
+    unsafe { bpf_probe_read_kernel(to.cast(), size_of::<u64>() as u32, address as *const _) }
 }

@@ -26,7 +26,9 @@ use aya_ebpf::{
 };
 use ros2probe_wire::inside::{
     accounting::{PRIORITY, RUN_DELAY, RUNTIME, STATE, THREAD},
-    late::{Activity, Blocked, Call, NAME_BYTES, OTHERS, Other, STALL, UNKNOWN_PRIORITY, wait},
+    late::{
+        Activity, Blocked, Call, NAME_BYTES, OTHERS, Other, RELEASE, STALL, UNKNOWN_PRIORITY, wait,
+    },
 };
 
 use crate::{
@@ -47,8 +49,6 @@ const SHORT: u64 = 20_000;
 
 /// Minimum of a wait that is not one for a lock of the middleware, in nanoseconds.
 const LONG: u64 = 1_000_000;
-/// Maximum time from the end of a call until other threads are woken because of it, in nanoseconds.
-const RELEASE: u64 = 5_000_000;
 
 /// States of `task_struct.__state` (include/linux/sched.h).
 mod task {

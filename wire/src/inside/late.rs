@@ -20,6 +20,9 @@ pub const OTHERS: usize = 8;
 /// Size of a thread's name with its terminating zero, `TASK_COMM_LEN` of the kernel.
 pub const NAME_BYTES: usize = 16;
 
+/// Maximum time from the end of a call until a thread that waited for it is woken, in nanoseconds. The
+/// next call begins within this time, too.
+pub const RELEASE: u64 = 5_000_000;
 /// Minimum of [`Handoff::runnable`] for which other threads are named, in nanoseconds.
 pub const STALL: u64 = 500_000;
 

@@ -42,9 +42,6 @@ const FORGOTTEN: f32 = 1.0 / 180.0;
 /// Part of a bound by which it rises in a round at most, as a divisor: it doubles in 70 s.
 const RISE: u64 = 100;
 
-/// Maximum time from the end of a call until a thread that waited for it begins the next one, without
-/// its wait for a CPU.
-const RELEASED: Duration = Duration::from_millis(5);
 /// Maximum number of threads that are named for a span of a late call.
 const NAMED: usize = 4;
 
@@ -410,9 +407,9 @@ pub(super) fn convert(
         },
         longest: earlier(&call.longest_call).0,
     });
-    // A callback group belongs to one node, and the thread began soon after it could run.
+    // A callback group belongs to one node, and the thread began soon after it had a CPU.
     let released_by = (call.released_by.ended != 0).then(|| earlier(&call.released_by));
-    let soon = RELEASED + Duration::from_nanos(call.before.runnable);
+    let soon = Duration::from_nanos(late::RELEASE + call.before.runnable);
     let released_by =
         released_by.filter(|(call, of)| of.is_some() && *of == node && call.ended_before <= soon);
     let states = |bit, states: &_| (call.accounted & bit != 0).then(|| thread_states(states));
