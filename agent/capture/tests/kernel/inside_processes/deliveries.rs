@@ -25,7 +25,7 @@ use super::{Process, Robot};
 
 const WRITER: Guid = Guid::new(GuidPrefix(*b"\x01\x0fdeliveries"), EntityId([0, 0, 1, 3]));
 /// Time for which a message is late in each test: longer than the waits of a busy machine.
-const LATE: Duration = Duration::from_millis(100);
+pub(super) const LATE: Duration = Duration::from_millis(100);
 /// Part of that time which another stage may have.
 const IMPRECISION: Duration = Duration::from_millis(20);
 
@@ -124,7 +124,7 @@ impl Way {
 }
 
 /// Asserts that a call is late for this part, and that the part has the injected length or more.
-fn assert_late_for(call: &LateCall, stage: Stage, cause: Cause) {
+pub(super) fn assert_late_for(call: &LateCall, stage: Stage, cause: Cause) {
     let parts = call.parts();
     let sum: Duration = parts.iter().map(|part| part.duration).sum();
     assert_eq!(sum, call.total(), "{call:#?}");

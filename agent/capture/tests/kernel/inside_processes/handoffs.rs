@@ -8,17 +8,12 @@ use std::time::Duration;
 
 use ros2probe_model::facts::calls::late::{Cause, LateCall, Stage};
 use ros2probe_model::facts::calls::report::ThreadStates;
-
 use tempfile::NamedTempFile;
 
+use super::deliveries::{LATE, assert_late_for};
 use super::late::set_bounds;
 use super::thread_states::{Hog, Quota};
 use super::{Process, Robot};
-
-/// Time for which a message is late in each test: longer than the waits of a busy machine.
-const LATE: Duration = Duration::from_millis(100);
-/// Part of that time which another stage may have.
-const IMPRECISION: Duration = Duration::from_millis(20);
 
 /// A subscriber with a thread of the middleware, and a publisher that shares memory with it.
 struct Subscriber {
@@ -116,20 +111,6 @@ impl Subscriber {
         assert_eq!(calls.len(), 1, "{calls:#?}");
         calls.remove(0)
     }
-}
-
-/// Asserts that a call is late for this part, and that the part has the injected length or more.
-fn assert_late_for(call: &LateCall, stage: Stage, cause: Cause) {
-    let parts = call.parts();
-    let sum: Duration = parts.iter().map(|part| part.duration).sum();
-    assert_eq!(sum, call.total(), "{call:#?}");
-    let main = call.main_part(ThreadStates::default()).unwrap();
-    assert_eq!(
-        (main.stage, main.cause),
-        (stage, cause),
-        "{parts:?} {call:#?}"
-    );
-    assert!(main.duration >= LATE - IMPRECISION, "{parts:?} {call:#?}");
 }
 
 #[test]
