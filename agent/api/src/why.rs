@@ -32,8 +32,8 @@ pub struct Cause<'a> {
     /// Stage in which the calls became late: `publish`, `network`, `socket`, `receive`, `wait` or
     /// `callback`. The first three end when the message is sent, arrives at the subscriber's
     /// socket, and is received there. `receive` ends when a thread of the middleware wakes the
-    /// executor. The others end when the call starts, and when it ends. Only messages through UDP sockets have `network` and `socket`, and only others have
-    /// `receive`.
+    /// executor. The others end when the call starts, and when it ends. Only messages through UDP
+    /// sockets have `network` and `socket`, and only others have `receive`.
     pub stage: Cow<'a, str>,
     /// `cpu`, `stolen`, `throttled`, `runnable`, `lock`, `sleep`, `disk`, `page_fault`, `stopped`,
     /// `system_call`, `blocked`, `other_callback`, `arrival`, `send`, `transit`,
