@@ -102,6 +102,10 @@ peers() {
         CFLAGS="-O2 $headers" \
         CXXFLAGS="-std=c++17 -O2 $headers -L$libraries/usr/lib/$gnu -Wl,-rpath-link,$libraries/usr/lib/$gnu" \
         "$place/fastdds" "$place/cyclonedds" >&2
+    # Calls the functions of rclcpp, as the tests of `rp why` describe.
+    "$gnu-gcc" -O2 -shared -fPIC -o "$place/libtracetools.so" agent/testing/tracetools/tracetools.c >&2
+    "$gnu-gcc" -O2 -pthread -DPLACE=248 -o "$place/traced" agent/testing/tracetools/process.c \
+        "$place/libtracetools.so" -Wl,-rpath,'$ORIGIN' >&2
     echo "$place"
 }
 
@@ -204,7 +208,7 @@ payload() {
     cleanup+=("rm -rf '$tree'")
     cp packaging/vm/*.sh "$target/dist"/ros2probe_*_"$architecture.deb" "$tree"
     cp "$program" "$tree/robot"
-    cp "$(peers "$architecture")"/{fastdds,cyclonedds} "$tree"
+    cp "$(peers "$architecture")"/{fastdds,cyclonedds,traced,libtracetools.so} "$tree"
     mv "$tree/$script" "$tree/main.sh"
     shift 3
     printf 'export %s\n' "$@" >"$tree/settings"

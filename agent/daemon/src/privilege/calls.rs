@@ -406,7 +406,8 @@ impl Allowed {
     }
 
     fn open_for_reading(&mut self) -> Result<(), BackendError> {
-        let changing = libc::O_ACCMODE | libc::O_CREAT | libc::O_TRUNC;
+        // musl's O_ACCMODE contains O_PATH, which reads nothing.
+        let changing = libc::O_WRONLY | libc::O_RDWR | libc::O_CREAT | libc::O_TRUNC;
         #[cfg(target_arch = "x86_64")]
         self.when(libc::SYS_open, &[without(1, changing)?])?;
         self.when(libc::SYS_openat, &[without(2, changing)?])

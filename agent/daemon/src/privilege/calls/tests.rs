@@ -255,6 +255,10 @@ fn the_broker_attaches_probes_but_creates_no_socket_file_or_namespace() {
         let fork = call(libc::SYS_clone, [namespace, 0, 0, 0, 0, 0]);
         assert_eq!(fork, Some(libc::EPERM));
         assert!(std::fs::read("/proc/self/stat").is_ok());
+        // The broker walks to a library by its path, with O_PATH of asm-generic/fcntl.h.
+        let (directory, path_only) = (c"/".as_ptr() as c_long, 0o10_000_000);
+        let walk = call(libc::SYS_openat, [SELF, directory, path_only, 0, 0, 0]);
+        assert_eq!(walk, None);
         assert!(std::fs::write("/tmp/ros2probe-broker", "x").is_err());
         for kind in [libc::SOCK_STREAM, libc::SOCK_SEQPACKET] {
             let socket = [libc::AF_UNIX.into(), kind.into(), 0, 0, 0, 0];
