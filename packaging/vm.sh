@@ -103,7 +103,7 @@ peers() {
         CXXFLAGS="-std=c++17 -O2 $headers -L$libraries/usr/lib/$gnu -Wl,-rpath-link,$libraries/usr/lib/$gnu" \
         "$place/fastdds" "$place/cyclonedds" >&2
     # Calls the functions of rclcpp, as the tests of `rp why` describe.
-    "$gnu-gcc" -O2 -shared -fPIC -o "$place/libtracetools.so" agent/testing/tracetools/tracetools.c >&2
+    "$gnu-gcc" -O2 -shared -fPIC -Wl,-soname,libtracetools.so -o "$place/libtracetools.so" agent/testing/tracetools/tracetools.c >&2
     "$gnu-gcc" -O2 -pthread -DPLACE=248 -o "$place/traced" agent/testing/tracetools/process.c \
         "$place/libtracetools.so" -Wl,-rpath,'$ORIGIN' >&2
     echo "$place"
@@ -210,6 +210,8 @@ payload() {
     cp "$program" "$tree/robot"
     cp "$(peers "$architecture")"/{fastdds,cyclonedds,traced,libtracetools.so} "$tree"
     mv "$tree/$script" "$tree/main.sh"
+    # The broker's user reads libraries there.
+    chmod 755 "$tree"
     shift 3
     printf 'export %s\n' "$@" >"$tree/settings"
     tar cf "$place/payload" -C "$tree" .

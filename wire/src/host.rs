@@ -1,5 +1,5 @@
-//! Output of the host hook besides records: captured datagrams in pieces, chunks of the TCP
-//! connections of Zenoh, and the sockets that receive and send them.
+//! Output of the host hook besides records: captured datagrams in pieces, chunks of TCP
+//! connections, and the sockets that receive and send them.
 //!
 //! The kernel program shares this binary layout. Words are in the host's byte order unless they
 //! hold wire bytes (addresses).
@@ -26,13 +26,15 @@ pub mod chunk {
     pub const END: u16 = 1 << 4;
     /// The chunk is the beginning of a UDP datagram with an Initial packet of QUIC.
     pub const QUIC: u16 = 1 << 5;
+    /// The connection is one of RTPS over TCP, not of Zenoh.
+    pub const RTPS: u16 = 1 << 6;
 }
 
 /// Header of one piece of a captured datagram; the bytes follow. Pieces of one datagram arrive in
 /// order of their offset with the same token, possibly between pieces of other datagrams. If the
 /// last piece is missing, the ring was full.
 ///
-/// With [`crate::record::flag::STREAM`] the piece is a chunk of a connection of Zenoh instead.
+/// With [`crate::record::flag::STREAM`] the piece is a chunk of a TCP connection instead.
 #[derive(
     Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
 )]

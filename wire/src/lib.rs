@@ -39,6 +39,7 @@ pub mod qos;
 pub mod quic;
 pub mod record;
 pub mod rtps;
+pub mod rtps_tcp;
 #[cfg(test)]
 mod testing;
 #[cfg(feature = "alloc")]

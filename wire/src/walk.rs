@@ -572,4 +572,4 @@ mod datagram;
 #[cfg(test)]
 mod tests;
 
-pub use datagram::{Envelope, Found, Outcome, datagram};
+pub use datagram::{Envelope, Found, Outcome, beginning, datagram};

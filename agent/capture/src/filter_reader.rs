@@ -17,8 +17,8 @@ use super::border::observe;
 use super::filter::Filter;
 use super::piece_assembler::PieceAssembler;
 use super::reorder_buffer::{Next, ReorderBuffer, Segment};
+use super::streams::{Chunk, Streams};
 use super::system::Clocks;
-use super::zenoh::{Chunk, Streams};
 use crate::tables::FreshDatagrams;
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::observe::input::Input;
@@ -94,7 +94,7 @@ impl FilterReader {
         self.pieces.advance(clocks.monotonic);
         let now = Timestamp(clocks.now.0.saturating_sub(SETTLE_NANOSECONDS));
         self.streams
-            .advance(now, |report| observer.input(Input::Zenoh(report)));
+            .advance(now, |streamed| streamed.pass(observer));
     }
 
     /// Passes all buffered data to the model at the end.
@@ -199,9 +199,10 @@ impl FilterReader {
                 let chunk = Chunk::of_piece(&piece, bytes, clocks.calendar(piece.time));
                 if piece.chunk & chunk::QUIC != 0 {
                     let seen = (chunk.time, chunk.stream);
-                    self.streams.datagram(seen, bytes, chunk.length, |report| {
-                        observer.input(Input::Zenoh(report));
-                    });
+                    self.streams
+                        .datagram(seen, bytes, chunk.length, |streamed| {
+                            streamed.pass(observer)
+                        });
                     continue;
                 }
                 self.order.segment(piece.time, &chunk);
@@ -253,9 +254,7 @@ fn deliver(
 
 /// Reads a segment of Zenoh, and passes the messages that it completes to the model.
 fn read_segment(streams: &mut Streams, segment: &Segment, observer: &mut Observer) {
-    streams.chunk(&segment.chunk(), |report| {
-        observer.input(Input::Zenoh(report));
-    });
+    streams.chunk(&segment.chunk(), |streamed| streamed.pass(observer));
 }
 
 fn decode_datagram(

@@ -10,7 +10,7 @@ use ros2probe_wire::walk::Envelope;
 
 use super::pcap::{Captured, PcapError, PcapReader};
 use crate::reassembly::{FlowKey, Limits, Reassembly};
-use crate::zenoh::{Chunk, Streams, flow, flow_of};
+use crate::streams::{Chunk, Streams, flow, flow_of};
 use ros2probe_model::graph::zenoh::StreamId;
 use ros2probe_model::observe::observer::Observer;
 
@@ -55,7 +55,7 @@ impl FrameDecoder {
         self.last = self.last.max(captured.time);
         observer.input(Input::Time(self.last));
         self.streams
-            .advance(self.last, |report| observer.input(Input::Zenoh(report)));
+            .advance(self.last, |streamed| streamed.pass(observer));
         let parsed = match frame::parse(captured.link, captured.bytes, captured.length) {
             Ok(parsed) => parsed,
             Err(error) => {
@@ -85,8 +85,8 @@ impl FrameDecoder {
                 let (bytes, length) = (datagram.payload, datagram.length);
                 let is_quic =
                     self.streams
-                        .datagram((captured.time, stream), bytes, length, |report| {
-                            observer.input(Input::Zenoh(report));
+                        .datagram((captured.time, stream), bytes, length, |streamed| {
+                            streamed.pass(observer)
                         });
                 if is_quic {
                     return;
@@ -118,7 +118,7 @@ impl FrameDecoder {
                 };
                 let chunk = Chunk::of_segment(&segment, captured.time, stream);
                 self.streams
-                    .chunk(&chunk, |report| observer.input(Input::Zenoh(report)));
+                    .chunk(&chunk, |streamed| streamed.pass(observer));
             }
             Payload::Other(_) => {}
         }

@@ -27,8 +27,8 @@ use ros2probe_wire::walk::{self, Envelope};
 
 use super::border::observe;
 use super::filter::Filter;
+use super::streams::Chunk;
 use super::system::Clocks;
-use super::zenoh::Chunk;
 use crate::tables::{
     PolledRecords, SegmentBytes, UndeliveredDatagrams, WaitingRecords, WalkedRecords,
 };
@@ -346,8 +346,8 @@ mod tests {
     use ros2probe_wire::record::kind;
 
     use super::*;
+    use crate::streams::Before;
     use crate::tables::tests::assert_driven;
-    use crate::zenoh::Before;
     use ros2probe_wire::time::MILLISECOND;
 
     const SETTLE: u64 = 80 * MILLISECOND;
@@ -536,7 +536,7 @@ mod tests {
             sequence_number: number,
             syn: false,
             end: false,
-            is_boundary: true,
+            boundary: Some(crate::streams::Protocol::Zenoh),
             before: Before::Unknown,
             bytes,
             length: 4,

@@ -20,8 +20,8 @@ use super::interfaces::{Change, Interface, Interfaces, InterfacesError, Selectio
 use super::reattach::{Identity, identity};
 use super::reorder_buffer::{Next, ReorderBuffer, Segment as Waiting};
 use super::ring::{self, Ring, RingError, RingFrame};
+use super::streams::{Chunk, Streams, flow, flow_of};
 use super::system::Clocks;
-use super::zenoh::{Chunk, Streams, flow, flow_of};
 use crate::ahead::{Ahead, Ready};
 use crate::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
 use ros2probe_model::graph::zenoh::StreamId;
@@ -448,7 +448,7 @@ impl FrameAssembly {
         self.reassembly.advance(clocks.now);
         let now = Timestamp(clocks.now.0.saturating_sub(SETTLE_NANOSECONDS));
         self.streams
-            .advance(now, |report| observer.input(Input::Zenoh(report)));
+            .advance(now, |streamed| streamed.pass(observer));
     }
 
     /// Reads a segment of Zenoh, and passes the messages that it completes to the model.
@@ -463,7 +463,7 @@ impl FrameAssembly {
             return;
         }
         self.streams
-            .chunk(&chunk, |report| observer.input(Input::Zenoh(report)));
+            .chunk(&chunk, |streamed| streamed.pass(observer));
     }
 
     fn frame(
@@ -501,8 +501,8 @@ impl FrameAssembly {
                 };
                 let is_quic =
                     self.streams
-                        .datagram((time, stream), udp.payload, udp.length, |report| {
-                            observer.input(Input::Zenoh(report));
+                        .datagram((time, stream), udp.payload, udp.length, |streamed| {
+                            streamed.pass(observer)
                         });
                 if is_quic {
                     return Ok(());

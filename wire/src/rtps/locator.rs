@@ -68,6 +68,12 @@ impl Locator {
         Some(SocketAddr::new(address, u16::try_from(self.port).ok()?))
     }
 
+    /// Returns whether the transport is TCP (Fast DDS).
+    #[must_use]
+    pub const fn is_tcp(&self) -> bool {
+        matches!(self.kind, LocatorKind::TCP_V4 | LocatorKind::TCP_V6)
+    }
+
     /// Returns whether the transport is shared memory, in the numbering of any vendor.
     #[must_use]
     pub const fn is_shared_memory(&self) -> bool {

@@ -31,6 +31,9 @@ pub struct Envelope {
     pub socket: u64,
     /// Whether the datagram was seen at a socket, not on an interface.
     pub host: bool,
+    /// The participant that receives the message; unknown for datagrams. The receiver's state
+    /// begins with it (RTPS 2.5, 8.3.4).
+    pub receiver: GuidPrefix,
 }
 
 impl Envelope {
@@ -148,12 +151,35 @@ pub fn datagram<'a>(
     payload: &'a [u8],
     envelope: &Envelope,
     handover: Option<&Handover>,
+    show: impl FnMut(Found<'a>),
+) -> Outcome {
+    let length = u32::try_from(payload.len()).unwrap_or(u32::MAX);
+    walk(payload, length, envelope, handover, show)
+}
+
+/// Walks a message of `length` bytes, of which only the beginning is present, as [`datagram`]
+/// does. The payload of the last submessage may be incomplete.
+pub fn beginning<'a>(
+    present: &'a [u8],
+    length: u32,
+    envelope: &Envelope,
+    show: impl FnMut(Found<'a>),
+) -> Outcome {
+    walk(present, length, envelope, None, show)
+}
+
+fn walk<'a>(
+    payload: &'a [u8],
+    datagram_len: u32,
+    envelope: &Envelope,
+    handover: Option<&Handover>,
     mut show: impl FnMut(Found<'a>),
 ) -> Outcome {
-    let length = u32::try_from(payload.len()).ok();
-    let Some(datagram_len) = length.filter(|length| *length <= MAX_MESSAGE) else {
+    if datagram_len > MAX_MESSAGE {
         return Outcome::Malformed;
-    };
+    }
+    let present = u32::try_from(payload.len()).unwrap_or(u32::MAX);
+    let present = present.min(datagram_len);
     let mut walk = Walk {
         record: envelope.record(),
         ..Walk::default()
@@ -171,23 +197,26 @@ pub fn datagram<'a>(
             return Outcome::NotRtps;
         }
         walk.begin(source, datagram_len);
+        walk.destination = prefix_words(envelope.receiver);
     }
     walk.record.datagram_len = u16::try_from(datagram_len).unwrap_or(u16::MAX);
     loop {
         let start = walk.offset;
-        let step = step(&mut walk, &payload, datagram_len);
+        let step = step(&mut walk, &payload, present);
         match step {
             Step::End | Step::Later => return Outcome::Complete,
+            Step::Split if present < datagram_len => return Outcome::Complete,
             Step::Split | Step::Malformed => return Outcome::Malformed,
             Step::Passed => {}
             Step::Endpoint | Step::LongGap => {
-                let body = slice(payload, start + 4, walk.offset);
+                let end = walk.offset.min(present);
+                let body = slice(payload, start + 4, end);
                 let payload_len = if walk.record.is_sample() {
                     walk.record.payload_len
                 } else {
                     0
                 };
-                let data = slice(payload, walk.offset - payload_len, walk.offset);
+                let data = slice(payload, walk.offset - payload_len, end);
                 show(Found {
                     record: walk.record,
                     body,

@@ -16,12 +16,11 @@ use ros2probe_capture::netns;
 use ros2probe_capture::pcap::PcapReader;
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::sockets::Sockets;
+use ros2probe_capture::streams::{Before, Chunk, Protocol, Streamed, Streams, flow};
 use ros2probe_capture::system::Clocks;
 use ros2probe_capture::wire_tap::{WireTap, WireTapSettings};
-use ros2probe_capture::zenoh::{Before, Chunk, Streams, flow};
 use ros2probe_model::facts::route::Destination;
-use ros2probe_model::graph::zenoh::{Flow, StreamEvent, StreamId, StreamReport, Unseen};
-use ros2probe_model::observe::input::Input;
+use ros2probe_model::graph::zenoh::{Flow, StreamEvent, StreamId, Unseen};
 use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_testing::harness::PREFIX;
 use ros2probe_testing::harness::cgroup::Cgroup;
@@ -134,7 +133,7 @@ impl Observed {
         for (piece, bytes) in self.chunks() {
             let chunk = Chunk::of_piece(&piece, &bytes, Timestamp(piece.time));
             self.streams
-                .chunk(&chunk, |report| observer.input(Input::Zenoh(report)));
+                .chunk(&chunk, |streamed| streamed.pass(observer));
         }
     }
 }
@@ -149,7 +148,10 @@ fn connect(address: &str) -> Result<[TcpStream; 2]> {
     Ok([client, server])
 }
 
-fn note(seen: &mut BTreeMap<StreamId, Seen>, report: &StreamReport<'_>) {
+fn note(seen: &mut BTreeMap<StreamId, Seen>, streamed: &Streamed<'_>) {
+    let Streamed::Zenoh(report) = streamed else {
+        panic!("{streamed:?}");
+    };
     let seen = seen.entry(*report.stream).or_default();
     match report.event {
         StreamEvent::Batch { bytes, length } => seen.batches.push((bytes.to_vec(), length)),
@@ -184,7 +186,10 @@ fn connections(capture: &str) -> Result<Vec<Vec<Sent>>> {
             ..StreamId::default()
         };
         let chunk = Chunk::of_segment(&segment, captured.time, stream);
-        streams.chunk(&chunk, |report| {
+        streams.chunk(&chunk, |streamed| {
+            let Streamed::Zenoh(report) = streamed else {
+                return;
+            };
             let StreamEvent::Batch { bytes, .. } = report.event else {
                 return;
             };

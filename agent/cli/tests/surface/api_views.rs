@@ -189,7 +189,7 @@ fn believed(name: &str, capture: &Path, line: &GraphLine) {
         let name = each["name"].as_str().unwrap().to_owned();
         (name, texts(&each["types"]))
     });
-    let expected: BTreeMap<_, _> = line.services.clone().into_iter().collect();
+    let expected: BTreeMap<_, _> = line.services.clone().unwrap().into_iter().collect();
     assert_eq!(found.collect::<BTreeMap<_, _>>(), expected, "{name}");
 
     drawn(&robot);

@@ -15,7 +15,7 @@ use super::CaptureTime;
 use ros2probe_capture::frame_decoder::FrameDecoder;
 use ros2probe_capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed, link_name};
 use ros2probe_capture::reassembly::{Limits, Reassembly};
-use ros2probe_capture::zenoh::Streams;
+use ros2probe_capture::streams::Streams;
 use ros2probe_model::observe::observer::Observer;
 
 /// Interval of progress reports on a terminal.

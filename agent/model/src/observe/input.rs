@@ -52,6 +52,16 @@ pub enum Input<'a> {
         /// Length of the whole RTPS message in bytes.
         length: u32,
     },
+    /// The beginning of an RTPS message on a TCP connection, whose rest the source left out. Its
+    /// payloads are not read.
+    MessageBeginning {
+        /// Its addresses and time.
+        envelope: &'a Envelope,
+        /// The beginning of the RTPS message.
+        payload: &'a [u8],
+        /// Length of the whole RTPS message in bytes.
+        length: u32,
+    },
     /// A submessage of a captured datagram, which is read for discovery and payloads. The caller
     /// passes observations of user data separately, in their order. [`Self::DatagramEnd`] follows
     /// the last one.

@@ -217,6 +217,11 @@ impl Observer {
                 payload,
                 length,
             } => self.cut_datagram(envelope, payload, length),
+            Input::MessageBeginning {
+                envelope,
+                payload,
+                length,
+            } => self.message_beginning(envelope, payload, length),
             Input::Submessage { captured, found } => {
                 self.submessage(captured, found, UserData::Separate);
             }
@@ -326,6 +331,13 @@ impl Observer {
         walk::datagram(&padded, envelope, None, |found| {
             self.observe(&Observation::of(&found.record, self.graph.wall_clock));
         });
+    }
+
+    fn message_beginning(&mut self, envelope: &Envelope, payload: &[u8], length: u32) {
+        let outcome = walk::beginning(payload, length, envelope, |found| {
+            self.observe(&Observation::of(&found.record, self.graph.wall_clock));
+        });
+        self.datagram_end(outcome);
     }
 
     /// Restores saved state, valid for at most one lease from `now` on.

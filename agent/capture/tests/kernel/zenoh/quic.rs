@@ -41,7 +41,10 @@ fn quic_at_sockets_is_reported_only_on_a_port_of_zenoh() -> Result<()> {
             for (piece, head) in observed.chunks() {
                 assert_eq!(piece.chunk, chunk::QUIC, "{piece:?}");
                 let chunk = Chunk::of_piece(&piece, &head, Timestamp(1));
-                let note = |report: &StreamReport<'_>| {
+                let note = |streamed: &Streamed<'_>| {
+                    let Streamed::Zenoh(report) = streamed else {
+                        panic!("{streamed:?}");
+                    };
                     let StreamEvent::Unseen(reason) = report.event else {
                         panic!("{report:?}");
                     };

@@ -120,7 +120,7 @@ fn a_connection_seen_at_the_sockets_is_not_reported_again_on_the_wire() -> Resul
         sequence_number: 1,
         syn: true,
         end: false,
-        is_boundary: true,
+        boundary: Some(Protocol::Zenoh),
         before: Before::Unknown,
         bytes: &init,
         length: init.len() as u32,

@@ -1,14 +1,15 @@
-//! One direction of a connection: bytes in their order, and the batches in them.
+//! One direction of a connection: bytes in their order, and the batches or frames in them.
 
 use std::collections::VecDeque;
 use std::time::Duration;
 
 use ros2probe_model::facts::bounded::{Bounded, Sum};
 use ros2probe_model::graph::zenoh::StreamEvent;
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::rtps_tcp::{self, FrameHeader};
+use ros2probe_wire::{GuidPrefix, Timestamp};
 
-use super::search::{Looks, Search};
-use super::{Before, Chunk, Counters};
+use super::search::{self, Looks, Search};
+use super::{Before, Chunk, Counters, Protocol};
 use crate::tables::{SegmentsAhead, SegmentsAheadBytes};
 
 /// Maximum distance of a segment from the next expected byte: the largest TCP window.
@@ -16,8 +17,10 @@ const WINDOW: u32 = 1 << 30;
 /// Time after which missing bytes are given up. TCP sends them again earlier, but late if the
 /// receiver does not read.
 const WAIT: Duration = Duration::from_secs(10);
-/// Size of the length field before each batch, in bytes.
+/// Size of the length field before each batch of Zenoh, in bytes.
 const PREFIX: usize = 2;
+/// Maximum number of bytes kept of a frame of RTPS. Payloads of a longer one are not read.
+pub const MAX_FRAME: usize = 4 << 20;
 /// Maximum number of consecutive batches without a message. Zenoh sends one when it drops the rest
 /// of a message. More of them are zeros of other data.
 const MAX_EMPTY: usize = 64;
@@ -27,10 +30,26 @@ const MAX_EMPTY: usize = 64;
 pub enum Took {
     /// The chunk was read, or waits for earlier bytes.
     Chunk,
-    /// The connection does not appear to be one of Zenoh.
-    NotZenoh,
+    /// The connection appears to be one of another protocol.
+    Other,
     /// The connection begins as TLS on a port of Zenoh.
     Tls,
+}
+
+/// What the bytes of a direction contain.
+#[derive(Debug)]
+pub enum Event<'a> {
+    /// An event of a connection of Zenoh.
+    Zenoh(StreamEvent<'a>),
+    /// An RTPS message.
+    Message {
+        /// The captured bytes, which are the first ones of the message.
+        bytes: &'a [u8],
+        /// Length of the message in bytes.
+        length: u32,
+        /// The participant that sent it, according to its header.
+        sender: GuidPrefix,
+    },
 }
 
 /// Position of the next byte.
@@ -40,16 +59,17 @@ enum Position {
     Searching(Search),
     /// At the beginning of the connection.
     Beginning(Search),
-    /// In a batch, or before one.
+    /// In a batch or frame, or before one.
     Batch(Partial),
     /// In a connection of another protocol.
     Other,
 }
 
-/// A batch of which some bytes have arrived.
-#[derive(Debug, Default)]
+/// A batch or frame of which some bytes have arrived.
+#[derive(Debug)]
 struct Partial {
-    /// Captured bytes, beginning with the length prefix.
+    protocol: Protocol,
+    /// Captured bytes, beginning with the length prefix or the header.
     captured: Vec<u8>,
     /// Bytes that have arrived, captured or not.
     arrived: usize,
@@ -62,7 +82,7 @@ struct Partial {
 struct Ahead {
     sequence_number: u32,
     length: u32,
-    is_boundary: bool,
+    boundary: Option<Protocol>,
     before: Before,
     bytes: Box<[u8]>,
 }
@@ -86,8 +106,9 @@ pub struct Stream {
     ahead_bytes: Sum<SegmentsAheadBytes>,
     /// When the first segment began to wait.
     waiting_since: Timestamp,
-    /// Whether batches were read in the stream, or it uses TLS on a port of Zenoh.
-    was_zenoh: bool,
+    /// The protocol whose batches or frames were read in the stream. TLS on a port of Zenoh counts as
+    /// Zenoh.
+    protocol: Option<Protocol>,
     is_zenoh_port: bool,
 }
 
@@ -105,7 +126,7 @@ impl Stream {
             ahead: Bounded::default(),
             ahead_bytes: Sum::default(),
             waiting_since: Timestamp(0),
-            was_zenoh: false,
+            protocol: None,
             is_zenoh_port,
         }
     }
@@ -115,9 +136,9 @@ impl Stream {
         self.first == chunk.sequence_number
     }
 
-    /// Returns whether batches were read in the stream, or it uses TLS on a port of Zenoh.
-    pub const fn is_zenoh(&self) -> bool {
-        self.was_zenoh
+    /// Returns the protocol, if the stream was recognized.
+    pub const fn protocol(&self) -> Option<Protocol> {
+        self.protocol
     }
 
     /// Returns the number of held bytes.
@@ -145,15 +166,15 @@ impl Stream {
         &mut self,
         chunk: &Chunk<'_>,
         counters: &mut Counters,
-        report: &mut impl FnMut(StreamEvent<'_>),
+        report: &mut impl FnMut(Event<'_>),
     ) -> Took {
         let start = chunk.sequence_number.wrapping_add(u32::from(chunk.syn));
         if chunk.syn {
-            report(StreamEvent::Begin);
+            report(Event::Zenoh(StreamEvent::Begin));
         }
-        if matches!(self.position, Position::Other) && !chunk.is_boundary {
+        if matches!(self.position, Position::Other) && chunk.boundary.is_none() {
             self.next = start.wrapping_add(chunk.length);
-            return Took::NotZenoh;
+            return Took::Other;
         }
         match chunk.before {
             Before::Lost => self.lost(start, counters, report),
@@ -176,7 +197,7 @@ impl Stream {
             start,
             chunk.bytes,
             chunk.length,
-            chunk.is_boundary,
+            chunk.boundary,
             counters,
             report,
         );
@@ -187,33 +208,36 @@ impl Stream {
     }
 
     /// Gives up the missing bytes and continues with the segments that wait.
-    pub fn give_up(&mut self, counters: &mut Counters, report: &mut impl FnMut(StreamEvent<'_>)) {
+    pub fn give_up(&mut self, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
         let Some(first) = self.ahead.front() else {
             return;
         };
-        counters.gaps += 1;
         self.next = first.sequence_number;
         self.position = Position::Searching(Search::default());
-        if self.was_zenoh {
-            report(StreamEvent::Gap);
-        }
+        self.gap(counters, report);
         self.catch_up(counters, report);
     }
 
     /// Continues at a later byte, because the bytes before it will not arrive.
-    fn lost(
-        &mut self,
-        start: u32,
-        counters: &mut Counters,
-        report: &mut impl FnMut(StreamEvent<'_>),
-    ) {
+    fn lost(&mut self, start: u32, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
         self.ahead.clear();
         self.ahead_bytes.clear();
         self.next = start;
         self.position = Position::Searching(Search::default());
-        if self.was_zenoh {
-            counters.gaps += 1;
-            report(StreamEvent::Gap);
+        if self.protocol.is_some() {
+            self.gap(counters, report);
+        }
+    }
+
+    /// Counts missing bytes.
+    fn gap(&self, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
+        match self.protocol {
+            Some(Protocol::Rtps) => counters.frame_gaps += 1,
+            Some(Protocol::Zenoh) => {
+                counters.gaps += 1;
+                report(Event::Zenoh(StreamEvent::Gap));
+            }
+            None => counters.gaps += 1,
         }
     }
 
@@ -233,7 +257,7 @@ impl Stream {
         let ahead = Ahead {
             sequence_number: start,
             length: chunk.length,
-            is_boundary: chunk.is_boundary,
+            boundary: chunk.boundary,
             before: chunk.before,
             bytes: chunk.bytes.into(),
         };
@@ -242,7 +266,7 @@ impl Stream {
     }
 
     /// Reads the waiting segments that continue the bytes read so far.
-    fn catch_up(&mut self, counters: &mut Counters, report: &mut impl FnMut(StreamEvent<'_>)) {
+    fn catch_up(&mut self, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
         while let Some(first) = self.ahead.front() {
             let (start, before) = (first.sequence_number, first.before);
             if before == Before::Skipped {
@@ -257,14 +281,8 @@ impl Stream {
             };
             self.ahead_bytes.sub(first.held());
             let length = first.length;
-            self.read(
-                start,
-                &first.bytes,
-                length,
-                first.is_boundary,
-                counters,
-                report,
-            );
+            let boundary = first.boundary;
+            self.read(start, &first.bytes, length, boundary, counters, report);
         }
     }
 
@@ -274,9 +292,9 @@ impl Stream {
         start: u32,
         bytes: &[u8],
         length: u32,
-        is_boundary: bool,
+        boundary: Option<Protocol>,
         counters: &mut Counters,
-        report: &mut impl FnMut(StreamEvent<'_>),
+        report: &mut impl FnMut(Event<'_>),
     ) -> Took {
         let repeated = self.next.wrapping_sub(start).min(length);
         counters.retransmitted_bytes += u64::from(repeated);
@@ -287,16 +305,15 @@ impl Stream {
         let skipped = usize::try_from(repeated).unwrap_or(usize::MAX);
         let new = bytes.get(skipped..).unwrap_or_default();
         let length = usize::try_from(length - repeated).unwrap_or(usize::MAX);
-        if is_boundary && repeated == 0 {
+        if let Some(protocol) = boundary.filter(|_| repeated == 0) {
             if matches!(&self.position, Position::Batch(partial) if partial.arrived > 0) {
                 // The source knows that a batch begins here, so the previous one is incomplete.
-                counters.gaps += 1;
-                report(StreamEvent::Gap);
+                self.gap(counters, report);
             }
             if !matches!(&self.position, Position::Batch(partial) if partial.arrived == 0) {
-                self.position = Position::Batch(Partial::default());
+                self.position = Position::Batch(Partial::of(protocol));
             }
-            self.was_zenoh = true;
+            self.protocol = Some(protocol);
         }
         self.new_bytes(new, length, counters, report)
     }
@@ -306,58 +323,73 @@ impl Stream {
         bytes: &[u8],
         length: usize,
         counters: &mut Counters,
-        report: &mut impl FnMut(StreamEvent<'_>),
+        report: &mut impl FnMut(Event<'_>),
     ) -> Took {
         match &mut self.position {
             Position::Batch(partial) => {
                 if !partial.read(bytes, length, counters, report) {
-                    // A prefix was not captured, or is 0.
-                    counters.gaps += 1;
-                    report(StreamEvent::Gap);
+                    // A prefix was not captured, or is not one.
                     self.position = Position::Searching(Search::default());
+                    self.gap(counters, report);
                 }
                 Took::Chunk
             }
             Position::Beginning(search) => {
                 match search.add(bytes, length, true, self.is_zenoh_port) {
-                    Looks::Zenoh(held) => self.found(&held, counters, report),
+                    Looks::Zenoh(held) => {
+                        self.found(Protocol::Zenoh, &held, held.len(), counters, report);
+                    }
+                    Looks::Rtps(held) => {
+                        self.found(Protocol::Rtps, &held, held.len(), counters, report);
+                    }
                     Looks::Undecided => {}
                     Looks::Tls => {
                         self.position = Position::Other;
-                        self.was_zenoh = true;
+                        self.protocol = Some(Protocol::Zenoh);
                         return Took::Tls;
                     }
                     Looks::Other => {
                         self.position = Position::Other;
-                        return Took::NotZenoh;
+                        return Took::Other;
                     }
                 }
                 Took::Chunk
             }
             Position::Searching(search) => {
+                if let Some(at) = search::frame(bytes) {
+                    let rest = bytes.get(at..).unwrap_or_default();
+                    self.found(Protocol::Rtps, rest, length - at, counters, report);
+                    return Took::Chunk;
+                }
+                if self.protocol == Some(Protocol::Rtps) {
+                    return Took::Chunk;
+                }
                 counters.unsynchronized_bytes += length as u64;
                 if let Looks::Zenoh(held) = search.add(bytes, length, false, self.is_zenoh_port) {
+                    let held_bytes = held.len();
                     counters.unsynchronized_bytes = counters
                         .unsynchronized_bytes
-                        .saturating_sub(held.len() as u64);
-                    self.found(&held, counters, report);
+                        .saturating_sub(held_bytes as u64);
+                    self.found(Protocol::Zenoh, &held, held_bytes, counters, report);
                 }
                 Took::Chunk
             }
-            Position::Other => Took::NotZenoh,
+            Position::Other => Took::Other,
         }
     }
 
-    /// Reads the bytes that the search held, which begin with a batch.
+    /// Reads `length` bytes, of which the first ones were captured. They begin with a batch or frame.
     fn found(
         &mut self,
-        held: &[u8],
+        protocol: Protocol,
+        bytes: &[u8],
+        length: usize,
         counters: &mut Counters,
-        report: &mut impl FnMut(StreamEvent<'_>),
+        report: &mut impl FnMut(Event<'_>),
     ) {
-        self.was_zenoh = true;
-        let mut partial = Partial::default();
-        let is_read = partial.read(held, held.len(), counters, report);
+        self.protocol = Some(protocol);
+        let mut partial = Partial::of(protocol);
+        let is_read = partial.read(bytes, length, counters, report);
         self.position = match is_read {
             true => Position::Batch(partial),
             false => Position::Searching(Search::default()),
@@ -365,7 +397,26 @@ impl Stream {
     }
 }
 
+/// What the captured bytes of a batch or frame show of its length.
+enum Prefix {
+    /// More bytes are needed.
+    Incomplete,
+    /// The length in bytes, prefix or header included.
+    Length(usize),
+    /// The bytes are no prefix, or they were not captured.
+    Wrong,
+}
+
 impl Partial {
+    const fn of(protocol: Protocol) -> Self {
+        Self {
+            protocol,
+            captured: Vec::new(),
+            arrived: 0,
+            empty: 0,
+        }
+    }
+
     /// Reads `length` bytes, of which the first ones were captured. Returns whether the boundaries
     /// are known.
     fn read(
@@ -373,55 +424,97 @@ impl Partial {
         mut bytes: &[u8],
         mut length: usize,
         counters: &mut Counters,
-        report: &mut impl FnMut(StreamEvent<'_>),
+        report: &mut impl FnMut(Event<'_>),
     ) -> bool {
         while length > 0 {
             let wanted = match self.prefix() {
-                Some(batch) => PREFIX + usize::from(batch) - self.arrived,
-                None => PREFIX - self.arrived,
+                Prefix::Length(total) => total - self.arrived,
+                Prefix::Incomplete => self.prefix_len() - self.arrived,
+                Prefix::Wrong => return false,
             };
             let count = wanted.min(length);
             let captured = count.min(bytes.len());
             let (now, rest) = bytes.split_at(captured);
             // Bytes after uncaptured ones cannot be used.
             if self.captured.len() == self.arrived {
-                self.captured.extend_from_slice(now);
+                let room = MAX_FRAME.saturating_sub(self.arrived);
+                let kept = now.get(..room).unwrap_or(now);
+                self.captured.extend_from_slice(kept);
             }
             self.arrived += count;
             (bytes, length) = (rest, length - count);
-            let Some(batch) = self.prefix() else {
-                if self.arrived < PREFIX {
-                    continue;
+            match self.prefix() {
+                Prefix::Length(total) if self.arrived == total => {
+                    self.pass(total, counters, report);
+                    if self.empty > MAX_EMPTY {
+                        return false;
+                    }
+                    self.captured.clear();
+                    self.arrived = 0;
+                    if self.captured.capacity() > 4096 {
+                        self.captured.shrink_to(4096);
+                    }
                 }
-                return false;
-            };
-            if self.arrived == PREFIX + usize::from(batch) {
-                if batch == 0 {
-                    self.empty += 1;
-                } else {
-                    self.empty = 0;
-                    counters.batches += 1;
-                    report(StreamEvent::Batch {
-                        bytes: self.captured.get(PREFIX..).unwrap_or_default(),
-                        length: batch,
-                    });
-                }
-                if self.empty > MAX_EMPTY {
-                    return false;
-                }
-                self.captured.clear();
-                self.arrived = 0;
-                if self.captured.capacity() > 4096 {
-                    self.captured.shrink_to(4096);
-                }
+                Prefix::Length(_) | Prefix::Incomplete => {}
+                Prefix::Wrong => return false,
             }
         }
         true
     }
 
-    /// Returns the length of the batch; `None` until both of its bytes are captured.
-    fn prefix(&self) -> Option<u16> {
-        let prefix = self.captured.first_chunk()?;
-        Some(u16::from_le_bytes(*prefix))
+    /// Reports a complete batch or frame of `total` bytes.
+    fn pass(&mut self, total: usize, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
+        let length = total - self.prefix_len();
+        let bytes = self.captured.get(self.prefix_len()..).unwrap_or_default();
+        match self.protocol {
+            Protocol::Zenoh if length == 0 => self.empty += 1,
+            Protocol::Zenoh => {
+                self.empty = 0;
+                counters.batches += 1;
+                let length = u16::try_from(length).unwrap_or(u16::MAX);
+                report(Event::Zenoh(StreamEvent::Batch { bytes, length }));
+            }
+            Protocol::Rtps => {
+                counters.frames += 1;
+                // The header of a message has magic, version and vendor before the prefix (RTPS 2.5,
+                // 9.4.4). A control message has none.
+                let is_message = bytes.starts_with(b"RTPS");
+                if let Some(sender) = bytes.get(8..20).filter(|_| is_message)
+                    && let Ok(sender) = sender.try_into()
+                {
+                    report(Event::Message {
+                        bytes,
+                        length: u32::try_from(length).unwrap_or(u32::MAX),
+                        sender: GuidPrefix(sender),
+                    });
+                }
+            }
+        }
+    }
+
+    const fn prefix_len(&self) -> usize {
+        match self.protocol {
+            Protocol::Zenoh => PREFIX,
+            Protocol::Rtps => rtps_tcp::HEADER_LEN,
+        }
+    }
+
+    fn prefix(&self) -> Prefix {
+        let length = match self.protocol {
+            Protocol::Zenoh => {
+                let prefix = self.captured.first_chunk();
+                prefix.map(|prefix| Some(PREFIX + usize::from(u16::from_le_bytes(*prefix))))
+            }
+            Protocol::Rtps => {
+                let header = self.captured.first_chunk();
+                let header = header.map(|header| FrameHeader::read(*header));
+                header.map(|header| usize::try_from(header?.length).ok())
+            }
+        };
+        match length {
+            Some(Some(total)) => Prefix::Length(total),
+            None if self.arrived < self.prefix_len() => Prefix::Incomplete,
+            None | Some(None) => Prefix::Wrong,
+        }
     }
 }

@@ -7,7 +7,7 @@ use ros2probe_wire::frame::{Packet, Segment};
 use ros2probe_wire::host::{Piece, chunk};
 use ros2probe_wire::record::flag;
 
-use super::{Before, Chunk};
+use super::{Before, Chunk, Protocol};
 
 /// Returns the direction to which a segment belongs.
 #[must_use]
@@ -40,7 +40,7 @@ impl<'a> Chunk<'a> {
             sequence_number: segment.sequence_number,
             syn: segment.syn,
             end: segment.fin || segment.rst,
-            is_boundary: false,
+            boundary: None,
             before: Before::Unknown,
             bytes: segment.payload,
             length: segment.length,
@@ -53,6 +53,10 @@ impl<'a> Chunk<'a> {
     pub fn of_piece(piece: &Piece, bytes: &'a [u8], time: Timestamp) -> Self {
         let is = |bit| piece.chunk & bit != 0;
         let syn = is(chunk::SYN);
+        let protocol = match is(chunk::RTPS) {
+            true => Protocol::Rtps,
+            false => Protocol::Zenoh,
+        };
         let before = match (is(chunk::LOST), is(chunk::SKIPPED)) {
             (true, _) => Before::Lost,
             (false, true) => Before::Skipped,
@@ -79,7 +83,7 @@ impl<'a> Chunk<'a> {
             sequence_number: piece.datagram.wrapping_sub(u32::from(syn)),
             syn,
             end: is(chunk::END),
-            is_boundary: is(chunk::BOUNDARY),
+            boundary: is(chunk::BOUNDARY).then_some(protocol),
             before,
             bytes,
             length: piece

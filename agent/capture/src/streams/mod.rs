@@ -1,9 +1,13 @@
-//! Follows the TCP connections of Zenoh: segments in, batches out.
+//! Follows the TCP connections of Zenoh and of RTPS: segments in, batches and messages out.
 //!
 //! A connection is one of Zenoh if it begins with an INIT. A connection that is older than the
-//! agent is recognized by consecutive batches that fit together. Retransmissions are dropped, and
-//! segments out of order wait for the missing ones. After a gap, the next boundary of a batch is
-//! searched for. For other connections, only the addresses are kept.
+//! agent is recognized by consecutive batches that fit together. A connection of RTPS is recognized
+//! by the header of a frame anywhere in it. Retransmissions are dropped, and segments out of order
+//! wait for the missing ones. After a gap, the next boundary is searched for. For other
+//! connections, only the addresses are kept.
+//!
+//! A connection of RTPS links two participants, in both directions. So the participant that sends
+//! in one direction receives in the other one.
 
 mod chunks;
 mod search;
@@ -16,13 +20,16 @@ use std::time::Duration;
 use crate::tables::{ZenohOrder, ZenohStreamBytes, ZenohStreams};
 use ros2probe_model::facts::bounded::{Bounded, Counted, Sum};
 use ros2probe_model::graph::zenoh::{Flow, StreamEvent, StreamId, StreamReport, Unseen};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Observer;
 use ros2probe_model::report::snapshot::TableFacts;
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::quic;
+use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::zenoh::PORT;
+use ros2probe_wire::{GuidPrefix, Timestamp};
 
 pub use chunks::{flow, flow_of};
-use stream::{Stream, Took};
+use stream::{Event, Stream, Took};
 
 /// Interval at which segments that wait are examined.
 const EXAMINATION_INTERVAL: Duration = Duration::from_millis(100);
@@ -40,8 +47,8 @@ pub struct Chunk<'a> {
     pub syn: bool,
     /// Whether the sender sends nothing after this chunk, or aborts the connection.
     pub end: bool,
-    /// Whether the source knows that a batch begins here, on a connection of Zenoh.
-    pub is_boundary: bool,
+    /// The protocol, if the source knows that a batch or frame begins here.
+    pub boundary: Option<Protocol>,
     /// What is known about missing bytes before the chunk.
     pub before: Before,
     /// The captured bytes, which are the first ones of the chunk.
@@ -60,10 +67,60 @@ impl Chunk<'_> {
             sequence_number: self.sequence_number,
             syn: self.syn,
             end: self.end,
-            is_boundary: self.is_boundary,
+            boundary: self.boundary,
             before: self.before,
             bytes: &[],
             length: self.length,
+        }
+    }
+}
+
+/// A protocol over TCP that is read.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Protocol {
+    /// Batches of Zenoh.
+    Zenoh,
+    /// Frames of RTPS, as Fast DDS sends them.
+    Rtps,
+}
+
+/// What the bytes of connections contain.
+#[derive(Debug)]
+pub enum Streamed<'a> {
+    /// A report about a direction of a Zenoh connection.
+    Zenoh(&'a StreamReport<'a>),
+    /// An RTPS message on a TCP connection.
+    Message {
+        /// Its addresses and time.
+        envelope: &'a Envelope,
+        /// The captured bytes, which are the first ones of the message.
+        bytes: &'a [u8],
+        /// Length of the message in bytes.
+        length: u32,
+    },
+}
+
+impl Streamed<'_> {
+    /// Passes this to the model.
+    pub fn pass(&self, observer: &mut Observer) {
+        match *self {
+            Self::Zenoh(report) => observer.input(Input::Zenoh(report)),
+            Self::Message {
+                envelope,
+                bytes: payload,
+                length,
+            } => observer.input(match u32::try_from(payload.len()) == Ok(length) {
+                true => Input::Datagram {
+                    envelope,
+                    payload,
+                    handover: None,
+                },
+                false => Input::MessageBeginning {
+                    envelope,
+                    payload,
+                    length,
+                },
+            }),
         }
     }
 }
@@ -80,7 +137,8 @@ pub enum Before {
     Lost,
 }
 
-/// Counters of segments and batches.
+/// Counters of segments, batches and frames. The last two count connections of RTPS, the others all
+/// other ones.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
     /// Number of batches.
@@ -91,6 +149,10 @@ pub struct Counters {
     pub gaps: u64,
     /// Number of bytes before a boundary was found.
     pub unsynchronized_bytes: u64,
+    /// Number of frames.
+    pub frames: u64,
+    /// Number of gaps between frames.
+    pub frame_gaps: u64,
 }
 
 /// All followed connections.
@@ -99,14 +161,23 @@ pub struct Streams {
     /// TCP ports of Zenoh.
     ports: Vec<u16>,
     streams: Bounded<Counted<ZenohStreams>, HashMap<StreamId, Box<Stream>>>,
-    /// Number of streams of each flow: two if both sockets are on this host.
-    flows: HashMap<Flow, usize>,
+    /// Streams of each flow.
+    flows: HashMap<Flow, Streaming>,
     /// Streams in the order of eviction, including some that have ended.
     order: Bounded<ZenohOrder, VecDeque<StreamId>>,
     bytes: Sum<Counted<ZenohStreamBytes>>,
     /// Time of the last examination for segments that wait too long.
     examined: Timestamp,
     counters: Counters,
+}
+
+/// What is known about the streams of one flow.
+#[derive(Debug, Default)]
+struct Streaming {
+    /// Number of streams: two if both sockets are on this host.
+    count: usize,
+    /// The participant that sends, of a connection of RTPS.
+    sender: Option<GuidPrefix>,
 }
 
 impl Default for Streams {
@@ -131,15 +202,8 @@ impl Streams {
     }
 
     /// Adds a chunk and reports the events that result.
-    pub fn chunk(&mut self, chunk: &Chunk<'_>, mut report: impl FnMut(&StreamReport<'_>)) {
+    pub fn chunk(&mut self, chunk: &Chunk<'_>, mut report: impl FnMut(&Streamed<'_>)) {
         let id = chunk.stream;
-        let mut pass = |event: StreamEvent<'_>| {
-            report(&StreamReport {
-                time: chunk.time,
-                stream: &id,
-                event,
-            });
-        };
         if chunk.syn {
             let known = self.streams.get(&id);
             if known.is_some_and(|stream| stream.began_with(chunk)) {
@@ -159,31 +223,30 @@ impl Streams {
             let is_zenoh_port = self.ports.contains(&one) || self.ports.contains(&other);
             let stream = Box::new(Stream::new(chunk, is_zenoh_port));
             self.streams.insert(id, stream);
-            *self.flows.entry(id.flow).or_default() += 1;
+            self.flows.entry(id.flow).or_default().count += 1;
         }
         let Some(stream) = self.streams.get_mut(&id) else {
             return;
         };
         let before = stream.held();
-        let was_zenoh = stream.is_zenoh();
-        let counters = &mut self.counters;
-        let took = stream.take(chunk, counters, &mut |event| pass(event));
+        let is_zenoh = |stream: &Stream| stream.protocol() == Some(Protocol::Zenoh);
+        let was_zenoh = is_zenoh(stream);
+        let (counters, flows) = (&mut self.counters, &mut self.flows);
+        let mut pass = |event: Event<'_>| tell(flows, &id, chunk.time, &event, &mut report);
+        let took = stream.take(chunk, counters, &mut pass);
         while chunk.end && stream.waits() {
-            stream.give_up(counters, &mut |event| pass(event));
+            stream.give_up(counters, &mut pass);
         }
-        let (after, is_zenoh) = (stream.held(), stream.is_zenoh());
         self.bytes.sub(before);
-        self.bytes.add(after);
-        if chunk.end || took == Took::NotZenoh {
-            if (is_zenoh || was_zenoh) && chunk.end {
-                pass(StreamEvent::End);
-            }
-            if chunk.end {
-                self.forget(&id);
-            }
+        self.bytes.add(stream.held());
+        if chunk.end && (was_zenoh || is_zenoh(stream)) {
+            pass(Event::Zenoh(StreamEvent::End));
         }
         if took == Took::Tls {
-            pass(StreamEvent::Unseen(Unseen::Tls));
+            pass(Event::Zenoh(StreamEvent::Unseen(Unseen::Tls)));
+        }
+        if chunk.end {
+            self.forget(&id);
         }
         while self.bytes.is_exceeded() {
             self.evict();
@@ -197,7 +260,7 @@ impl Streams {
         (time, mut stream): (Timestamp, StreamId),
         bytes: &[u8],
         length: u32,
-        mut report: impl FnMut(&StreamReport<'_>),
+        mut report: impl FnMut(&Streamed<'_>),
     ) -> bool {
         let Flow {
             source,
@@ -216,33 +279,29 @@ impl Streams {
             true => source.port = 0,
             false => destination.port = 0,
         }
-        report(&StreamReport {
+        report(&Streamed::Zenoh(&StreamReport {
             time,
             stream: &stream,
             event: StreamEvent::Unseen(Unseen::Quic),
-        });
+        }));
         true
     }
 
     /// Gives up missing bytes for which segments have waited too long. The interval between calls
     /// does not matter.
-    pub fn advance(&mut self, now: Timestamp, mut report: impl FnMut(&StreamReport<'_>)) {
+    pub fn advance(&mut self, now: Timestamp, mut report: impl FnMut(&Streamed<'_>)) {
         if now.distance(self.examined) < EXAMINATION_INTERVAL {
             return;
         }
         self.examined = now;
-        let counters = &mut self.counters;
+        let (counters, flows) = (&mut self.counters, &mut self.flows);
         for (id, stream) in self.streams.iter_mut() {
             if !stream.has_waited(now) {
                 continue;
             }
             let before = stream.held();
             stream.give_up(counters, &mut |event| {
-                report(&StreamReport {
-                    time: now,
-                    stream: id,
-                    event,
-                });
+                tell(flows, id, now, &event, &mut report);
             });
             self.bytes.sub(before);
             self.bytes.add(stream.held());
@@ -278,8 +337,9 @@ impl Streams {
         if let Some(stream) = self.streams.remove(id) {
             self.bytes.sub(stream.held());
             if let Entry::Occupied(mut count) = self.flows.entry(id.flow) {
-                *count.get_mut() -= 1;
-                if *count.get() == 0 {
+                let streaming = count.get_mut();
+                streaming.count -= 1;
+                if streaming.count == 0 {
                     count.remove();
                 }
             }
@@ -296,10 +356,10 @@ impl Streams {
         }
     }
 
-    /// Drops a connection: the oldest one that is not known to be of Zenoh, otherwise the oldest
-    /// one of all.
+    /// Drops a connection: the oldest one whose protocol is not known, otherwise the oldest one of
+    /// all.
     fn evict(&mut self) {
-        let known = |id: &StreamId| self.streams.get(id).map(|stream| stream.is_zenoh());
+        let known = |id: &StreamId| Some(self.streams.get(id)?.protocol().is_some());
         let stranger = self.order.iter().position(|id| known(id) == Some(false));
         let oldest = stranger.or_else(|| self.order.iter().position(|id| known(id).is_some()));
         match oldest.and_then(|position| self.order.remove(position)) {
@@ -313,6 +373,56 @@ impl Streams {
                 self.flows.clear();
                 self.bytes.clear();
             }
+        }
+    }
+}
+
+/// Reports an event of a direction. A message of RTPS also shows which participant sends in the
+/// direction, and thus who receives in the opposite one.
+fn tell(
+    flows: &mut HashMap<Flow, Streaming>,
+    id: &StreamId,
+    time: Timestamp,
+    event: &Event<'_>,
+    report: &mut impl FnMut(&Streamed<'_>),
+) {
+    match *event {
+        Event::Zenoh(event) => report(&Streamed::Zenoh(&StreamReport {
+            time,
+            stream: id,
+            event,
+        })),
+        Event::Message {
+            bytes,
+            length,
+            sender,
+        } => {
+            let Flow {
+                source,
+                destination,
+            } = id.flow;
+            if let Some(streaming) = flows.get_mut(&id.flow) {
+                streaming.sender = Some(sender);
+            }
+            let opposite = flows.get(&id.flow.reversed());
+            let receiver = opposite.and_then(|streaming| streaming.sender);
+            let envelope = Envelope {
+                time: time.0,
+                destination: destination.address,
+                destination_port: destination.port,
+                source_port: source.port,
+                interface: id.interface,
+                outgoing: id.outgoing,
+                socket: id.socket,
+                host: id.socket != 0,
+                receiver: receiver.unwrap_or(GuidPrefix::UNKNOWN),
+                ..Envelope::default()
+            };
+            report(&Streamed::Message {
+                envelope: &envelope,
+                bytes,
+                length,
+            });
         }
     }
 }

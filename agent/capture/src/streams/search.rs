@@ -1,10 +1,11 @@
-//! Searches for the boundary of a batch, at the beginning of a connection or inside it.
+//! Searches for the boundary of a batch or frame, at the beginning of a connection or inside it.
 //!
 //! Segments of small messages begin with a batch. From the start of such a segment, bytes are
 //! collected as long as they can be read as batches. The rules are those of the kernel programs
 //! ([`ros2probe_wire::zenoh_stream`]).
 
 use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_wire::rtps_tcp::{self, FrameHeader};
 use ros2probe_wire::zenoh::{Batch, Lane, Message};
 use ros2probe_wire::zenoh_stream::{Beginning, Lanes, message};
 
@@ -14,6 +15,8 @@ use crate::tables::SearchedBytes;
 pub enum Looks {
     /// The bytes are batches, beginning with the first byte.
     Zenoh(Vec<u8>),
+    /// The bytes are frames of RTPS, beginning with the first byte.
+    Rtps(Vec<u8>),
     /// More bytes are needed.
     Undecided,
     /// A TLS handshake on a port of Zenoh.
@@ -46,7 +49,7 @@ impl Search {
                 false => Looks::Other,
             };
             return self.settled(match looks {
-                Looks::Zenoh(_) | Looks::Undecided if !is_whole => Looks::Other,
+                Looks::Zenoh(_) | Looks::Rtps(_) | Looks::Undecided if !is_whole => Looks::Other,
                 looks => looks,
             });
         }
@@ -75,6 +78,15 @@ impl Search {
 
     /// Assesses the first bytes of a connection.
     fn begin(&mut self, is_port: bool) -> Looks {
+        if self.held.starts_with(&rtps_tcp::MAGIC) {
+            return match self.held.first_chunk() {
+                Some(head) if FrameHeader::recognize(*head).is_some() => {
+                    Looks::Rtps(self.held.take())
+                }
+                Some(_) => Looks::Other,
+                None => Looks::Undecided,
+            };
+        }
         let Some(head) = self.held.first_chunk() else {
             return match self.held.get(2) {
                 Some(header) if header & message::ID != message::INIT => Looks::Other,
@@ -121,6 +133,14 @@ impl Search {
         }
         Looks::Undecided
     }
+}
+
+/// Returns where the first frame of RTPS begins whose first bytes are in this segment.
+pub fn frame(bytes: &[u8]) -> Option<usize> {
+    let mut windows = bytes.array_windows::<{ rtps_tcp::RECOGNIZED }>();
+    windows.position(|head| {
+        head.starts_with(&rtps_tcp::MAGIC) && FrameHeader::recognize(*head).is_some()
+    })
 }
 
 /// Returns whether this batch may follow the earlier ones.

@@ -1,3 +1,5 @@
+mod rtps;
+
 use std::path::Path;
 
 use proptest::prelude::*;
@@ -20,7 +22,10 @@ struct Reported {
 }
 
 impl Reported {
-    fn note(&mut self, report: &StreamReport<'_>) {
+    fn note(&mut self, streamed: &Streamed<'_>) {
+        let Streamed::Zenoh(report) = streamed else {
+            panic!("{streamed:?}");
+        };
         match report.event {
             StreamEvent::Batch { bytes, length } => {
                 assert_eq!(bytes.len(), usize::from(length));
@@ -88,7 +93,7 @@ fn follow(segments: &[Segment]) -> (Reported, Counters) {
             sequence_number: segment.sequence_number,
             syn: segment.syn,
             end: segment.end,
-            is_boundary: false,
+            boundary: None,
             before: Before::Unknown,
             bytes: &segment.bytes,
             length: u32::try_from(segment.bytes.len()).unwrap(),
@@ -230,7 +235,7 @@ proptest! {
                 sequence_number: *number % 1000,
                 syn: *syn && *end,
                 end: *end && !*syn,
-                is_boundary: *is_boundary,
+                boundary: is_boundary.then_some(Protocol::Zenoh),
                 before: [Before::Unknown, Before::Skipped, Before::Lost][bytes.len() % 3],
                 bytes,
                 length: u32::try_from(bytes.len()).unwrap() + more,
@@ -261,7 +266,7 @@ fn chunk(port: u16, sequence_number: u32, bytes: &[u8]) -> Chunk<'_> {
         sequence_number,
         syn: false,
         end: false,
-        is_boundary: false,
+        boundary: None,
         before: Before::Unknown,
         bytes,
         length: u32::try_from(bytes.len()).unwrap(),
@@ -272,7 +277,7 @@ fn chunk(port: u16, sequence_number: u32, bytes: &[u8]) -> Chunk<'_> {
 fn directions_beyond_the_cap_evict_the_oldest_one_of_another_protocol() {
     let mut streams = Streams::default();
     let zenoh = Chunk {
-        is_boundary: true,
+        boundary: Some(Protocol::Zenoh),
         ..chunk(1, 1, &[1, 0, 4])
     };
     streams.chunk(&zenoh, |_| {});
@@ -293,7 +298,7 @@ fn unfinished_batches_stay_within_the_byte_cap() {
     let begun = [&[0xff, 0xff][..], &[5; 65_000]].concat();
     for port in 1..400 {
         let begun = Chunk {
-            is_boundary: true,
+            boundary: Some(Protocol::Zenoh),
             ..chunk(port, 1, &begun)
         };
         streams.chunk(&begun, |_| {});
@@ -308,7 +313,7 @@ fn unfinished_batches_stay_within_the_byte_cap() {
 fn missing_bytes_are_given_up_when_the_cap_of_waiting_segments_is_reached() {
     let mut streams = Streams::default();
     let first = Chunk {
-        is_boundary: true,
+        boundary: Some(Protocol::Zenoh),
         ..chunk(1, 1, &[1, 0, 4])
     };
     streams.chunk(&first, |_| {});
@@ -325,7 +330,7 @@ fn missing_bytes_are_given_up_when_the_cap_of_waiting_segments_is_reached() {
 fn missing_bytes_are_given_up_when_the_cap_of_waiting_bytes_is_reached() {
     let mut streams = Streams::default();
     let first = Chunk {
-        is_boundary: true,
+        boundary: Some(Protocol::Zenoh),
         ..chunk(1, 1, &[1, 0, 4])
     };
     streams.chunk(&first, |_| {});
@@ -389,7 +394,7 @@ fn an_empty_batch_is_not_a_gap_but_a_run_of_zeros_is() {
         let mut next = 1;
         for part in first.chunks(parts) {
             let chunk = Chunk {
-                is_boundary: next == 1,
+                boundary: (next == 1).then_some(Protocol::Zenoh),
                 ..chunk(1, next, part)
             };
             streams.chunk(&chunk, |report| reported.note(report));
@@ -420,7 +425,7 @@ fn skipped_bytes_are_not_a_gap_but_lost_bytes_are() {
     let mut gaps = Vec::new();
     for (number, before, bytes) in chunks {
         let chunk = Chunk {
-            is_boundary: true,
+            boundary: Some(Protocol::Zenoh),
             before,
             ..chunk(1, number, &bytes)
         };
