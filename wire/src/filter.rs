@@ -85,11 +85,19 @@ pub enum Counter {
     ZenohConnections,
     /// Zenoh, on interfaces: frames of connections copied to user space.
     ZenohFrames,
+    /// RTPS over TCP: directions of connections that were recognized.
+    TcpConnections,
+    /// RTPS over TCP: frames in followed directions of connections.
+    TcpFrames,
+    /// RTPS over TCP: chunks lost because the ring was full.
+    TcpChunksLost,
+    /// RTPS over TCP: losses of the boundary between frames.
+    TcpGaps,
 }
 
 impl Counter {
     /// Every counter, in index order.
-    pub const ALL: [Self; 38] = [
+    pub const ALL: [Self; 42] = [
         Self::Frames,
         Self::Messages,
         Self::Ignored,
@@ -128,6 +136,10 @@ impl Counter {
         Self::ZenohCandidates,
         Self::ZenohConnections,
         Self::ZenohFrames,
+        Self::TcpConnections,
+        Self::TcpFrames,
+        Self::TcpChunksLost,
+        Self::TcpGaps,
     ];
 
     /// Returns the label value.
@@ -172,6 +184,10 @@ impl Counter {
             Self::ZenohCandidates => "zenoh_candidates",
             Self::ZenohConnections => "zenoh_connections",
             Self::ZenohFrames => "zenoh_frames",
+            Self::TcpConnections => "rtps_tcp_connections",
+            Self::TcpFrames => "rtps_tcp_frames",
+            Self::TcpChunksLost => "rtps_tcp_chunks_lost",
+            Self::TcpGaps => "rtps_tcp_gaps",
         }
     }
 }

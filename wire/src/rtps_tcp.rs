@@ -36,15 +36,36 @@ impl FrameHeader {
     #[must_use]
     pub const fn read(head: [u8; HEADER_LEN]) -> Option<Self> {
         let [m0, m1, m2, m3, l0, l1, l2, l3, _, _, _, _, p0, p1] = head;
-        let [r, t, c, p] = MAGIC;
-        let length = u32::from_le_bytes([l0, l1, l2, l3]);
-        if m0 != r || m1 != t || m2 != c || m3 != p || length < SHORTEST || length > LONGEST {
+        let header = Self {
+            length: u32::from_le_bytes([l0, l1, l2, l3]),
+            logical_port: u16::from_le_bytes([p0, p1]),
+        };
+        let is_magic = u32::from_ne_bytes([m0, m1, m2, m3]) == u32::from_ne_bytes(MAGIC);
+        if is_magic && Self::is_length(header.length) {
+            Some(header)
+        } else {
+            None
+        }
+    }
+
+    /// Reads the header of a frame as [`Self::recognize`] does, from words in memory order: those at
+    /// offsets 0, 4, 12 and 14.
+    #[inline(always)]
+    #[must_use]
+    pub const fn of_words([magic, length, port, next]: [u32; 4]) -> Option<Self> {
+        let header = Self {
+            length: u32::from_le(length),
+            logical_port: u16::from_le(port as u16),
+        };
+        if magic != u32::from_ne_bytes(MAGIC) || !Self::is_length(header.length) {
             return None;
         }
-        Some(Self {
-            length,
-            logical_port: u16::from_le_bytes([p0, p1]),
-        })
+        let is_frame = if header.is_control() {
+            header.has_control(next.to_ne_bytes())
+        } else {
+            next == crate::walk::MAGIC
+        };
+        if is_frame { Some(header) } else { None }
     }
 
     /// Reads the header of a frame that begins with these bytes; `None` if they cannot be the
@@ -57,18 +78,28 @@ impl FrameHeader {
         let Some(header) = Self::read(head) else {
             return None;
         };
-        if header.logical_port != 0 {
-            let is_rtps = a == b'R' && b == b'T' && c == b'P' && d == b'S';
-            return if is_rtps { Some(header) } else { None };
-        }
-        // Here these are kind, flags and length.
-        let is_kind = matches!(a, 0xd1..=0xd6 | 0xe1..=0xe4);
-        let length = u16::from_le_bytes([c, d]) as u32;
-        if is_kind && b & LITTLE_ENDIAN != 0 && length + HEADER_LEN as u32 == header.length {
-            Some(header)
+        let next = [a, b, c, d];
+        let is_frame = if header.is_control() {
+            header.has_control(next)
         } else {
-            None
-        }
+            u32::from_ne_bytes(next) == crate::walk::MAGIC
+        };
+        if is_frame { Some(header) } else { None }
+    }
+
+    /// Returns whether a frame may have this length in bytes.
+    #[inline(always)]
+    #[must_use]
+    pub const fn is_length(length: u32) -> bool {
+        length >= SHORTEST && length <= LONGEST
+    }
+
+    /// Returns whether these bytes begin a control message of the frame: kind, flags and length.
+    #[inline(always)]
+    const fn has_control(&self, [kind, flags, low, high]: [u8; 4]) -> bool {
+        let is_kind = matches!(kind, 0xd1..=0xd6 | 0xe1..=0xe4);
+        let length = u16::from_le_bytes([low, high]) as u32;
+        is_kind && flags & LITTLE_ENDIAN != 0 && length + HEADER_LEN as u32 == self.length
     }
 
     /// Returns whether the frame has a control message instead of an RTPS message.

@@ -4,6 +4,8 @@
 //! The kernel programs and the replay compile this module. It decides on values that the caller has
 //! read, and allocates no memory. The formats are those of `zenoh-protocol`, `transport/`.
 
+use crate::rtps_tcp::MAGIC;
+
 /// Number of bytes that [`Beginning::of`] reads.
 pub const HEAD: usize = 8;
 /// Version of the wire format since Zenoh 1.0.
@@ -45,6 +47,8 @@ pub mod message {
 /// The start of a TCP segment's payload.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Beginning {
+    /// Possibly a frame of RTPS.
+    Frame,
     /// INIT: a connection of the known version begins.
     Init,
     /// INIT of another version, on a port of Zenoh.
@@ -66,6 +70,10 @@ impl Beginning {
     #[must_use]
     pub const fn of(head: [u8; HEAD], length: u32, is_zenoh_port: bool) -> Self {
         let [low, high, header, next, flags, kind, ..] = head;
+        let [r, t, c, p] = MAGIC;
+        if low == r && high == t && header == c && next == p {
+            return Self::Frame;
+        }
         if low == 0x16 && high == 3 && header <= 4 {
             // A handshake record: ClientHello or ServerHello.
             let is_hello = kind == 1 || kind == 2;

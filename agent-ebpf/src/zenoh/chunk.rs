@@ -17,7 +17,7 @@ use crate::{
     verdict::{AVAILABLE_DATA, FORCE_WAKEUP, NO_WAKEUP},
 };
 
-use super::state::{WINDOW, segment};
+use super::state::{WINDOW, protocol, segment};
 
 /// Maximum number of chunks of one packet, which cover 128 KB.
 const PARTS: u32 = 8;
@@ -140,7 +140,12 @@ pub extern "C" fn head(
         flag::OUTGOING
     };
     piece.flags = flag::HOST | flag::STREAM | ipv6 | outgoing;
-    piece.chunk = (flags | this.state.pending) as u16;
+    let protocol = if this.state.protocol == protocol::RTPS {
+        u32::from(part::RTPS)
+    } else {
+        0
+    };
+    piece.chunk = (flags | this.state.pending | protocol) as u16;
     let wake = if flags & WAKE != 0 || PIECES.query(AVAILABLE_DATA) > setting(&WAKE_PIECE_BYTES) {
         FORCE_WAKEUP
     } else {
@@ -154,7 +159,9 @@ pub extern "C" fn head(
     if !written {
         return lost(slot);
     }
-    count(slot, Counter::ZenohChunks, 1);
+    if this.state.protocol == protocol::ZENOH {
+        count(slot, Counter::ZenohChunks, 1);
+    }
     this.state.pending = 0;
     this.state.reported = this.now;
     1
@@ -162,8 +169,13 @@ pub extern "C" fn head(
 
 #[inline(always)]
 fn lost(slot: u32) -> u32 {
-    count(slot, Counter::ZenohChunksLost, 1);
     if let Some(mut this) = segment(slot) {
+        let counter = if this.state.protocol == protocol::RTPS {
+            Counter::TcpChunksLost
+        } else {
+            Counter::ZenohChunksLost
+        };
+        count(slot, counter, 1);
         this.state.pending |= u32::from(part::LOST);
     }
     0

@@ -8,15 +8,20 @@
 
 use aya_ebpf::bindings::__sk_buff;
 use core::mem::swap;
-use ros2probe_wire::{filter::Counter, host::chunk as part, zenoh_stream::PREFIX};
+use ros2probe_wire::{
+    filter::Counter,
+    host::chunk as part,
+    rtps_tcp::{FrameHeader, RECOGNIZED},
+    zenoh_stream::PREFIX,
+};
 
 use crate::maps::{Working, copy, count};
 
 use super::{
     chunk::{self, WAKE},
     message::{self, WHOLE},
-    search,
-    state::{CONNECTIONS, Segment, Window, body, mode, segment as current},
+    rtps, search,
+    state::{CONNECTIONS, Segment, Window, body, mode, protocol, segment as current},
 };
 
 /// Maximum number of batches of one packet that are read. The bytes after them are passed on as a
@@ -90,13 +95,21 @@ extern "C" fn take(skb: *mut __sk_buff, slot: u32) -> u32 {
         this.state.hole_len = this.sequence_number.wrapping_sub(this.state.hole);
     }
     let end = this.sequence_number.wrapping_add(this.len);
+    if this.state.mode == mode::GAP
+        && this.state.protocol == protocol::RTPS
+        && rtps::begins(skb, this.body, this.len)
+    {
+        this.state.mode = mode::FOLLOWED;
+        this.state.boundary = this.sequence_number;
+        this.state.prefix = 0;
+    }
     if this.state.mode == mode::GAP {
         chunk::whole(skb, slot, 0, this.len, 0);
         this.state.gap_bytes = this.state.gap_bytes.wrapping_add(this.len);
         if end.wrapping_sub(this.state.next) as i32 > 0 {
             this.state.next = end;
         }
-        if search::judge(skb, slot, 1) != 0 {
+        if this.state.protocol == protocol::ZENOH && search::judge(skb, slot, 1) != 0 {
             this.state.mode = mode::FOLLOWED;
             this.state.boundary = this.state.guess.boundary;
             this.state.covered = end;
@@ -150,7 +163,12 @@ fn finish(skb: *mut __sk_buff, slot: u32, left: u32) {
 
 #[inline(always)]
 fn lose(slot: u32, mut this: Working<Segment>) {
-    count(slot, Counter::ZenohGaps, 1);
+    let counter = if this.state.protocol == protocol::RTPS {
+        Counter::TcpGaps
+    } else {
+        Counter::ZenohGaps
+    };
+    count(slot, counter, 1);
     this.state.mode = mode::GAP;
     this.state.gap_bytes = 0;
     this.state.guess.is_open = 0;
@@ -165,13 +183,21 @@ extern "C" fn batch(skb: *mut __sk_buff, slot: u32) -> u32 {
         return 0;
     };
     let offset = this.state.boundary.wrapping_sub(this.sequence_number);
+    let is_rtps = this.state.protocol == protocol::RTPS;
     if this.state.prefix != 0 {
-        return split(skb, slot);
+        return if is_rtps {
+            split_header(skb, slot)
+        } else {
+            split(skb, slot)
+        };
     }
     if offset >= this.len {
         return 0;
     }
     let read = chunk::load_window(skb, slot, offset);
+    if is_rtps {
+        return frame(skb, slot, offset, read);
+    }
     let Some(low) = window.byte(0, read) else {
         return unreadable(skb, slot, offset);
     };
@@ -196,7 +222,101 @@ extern "C" fn batch(skb: *mut __sk_buff, slot: u32) -> u32 {
         }
         count(slot, Counter::ZenohBatches, 1);
     }
-    let left = this.len - offset;
+    pass(skb, slot, offset)
+}
+
+/// Handles the frame of RTPS that begins at `offset` of the segment, of which the first `read`
+/// bytes are in the window.
+#[inline(always)]
+fn frame(skb: *mut __sk_buff, slot: u32, offset: u32, read: u32) -> u32 {
+    let (Some(mut this), Some(window)) = (current(slot), Window::of(slot)) else {
+        return 0;
+    };
+    let left = this.len.wrapping_sub(offset);
+    if left < RECOGNIZED as u32 {
+        return cut_header(skb, slot, offset, left);
+    }
+    let total = rtps::length(window, read);
+    if total == 0 {
+        return unreadable(skb, slot, offset);
+    }
+    count(slot, Counter::TcpFrames, 1);
+    this.total = total;
+    if this.end > total {
+        this.end = total;
+    }
+    if rtps::read(slot) == 0 {
+        return 0;
+    }
+    pass(skb, slot, offset)
+}
+
+/// Keeps what the segment has of the header of a frame: its last `left` bytes.
+#[inline(always)]
+fn cut_header(skb: *mut __sk_buff, slot: u32, offset: u32, left: u32) -> u32 {
+    let (Some(mut this), Some(window)) = (current(slot), Window::of(slot)) else {
+        return 0;
+    };
+    this.state.length = length_bytes(window, 0, left);
+    this.state.prefix = left;
+    let lengths = u64::from(left) << 32 | u64::from(left);
+    chunk::head(skb, slot, offset, lengths, u32::from(part::BOUNDARY));
+    0
+}
+
+/// Returns those bytes of a frame's length that are in the window, whose first byte is byte `from`
+/// of the header.
+#[inline(always)]
+fn length_bytes(window: Window, from: u32, read: u32) -> u32 {
+    let (mut number, mut length) = (0, 0);
+    while number < 4 {
+        let at = number + 4;
+        if at >= from
+            && let Some(byte) = window.byte(at - from, read)
+        {
+            length |= byte << (8 * number);
+        }
+        number += 1;
+    }
+    length
+}
+
+/// Handles a frame whose header is split: the previous segment had its first bytes. The whole frame
+/// is passed on.
+#[inline(always)]
+fn split_header(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let (Some(mut this), Some(window)) = (current(slot), Window::of(slot)) else {
+        return 0;
+    };
+    let before = this.state.prefix;
+    let read = chunk::load_window(skb, slot, 0);
+    if before + this.len < RECOGNIZED as u32 {
+        // The whole header has not arrived: the frame is found again at a later segment.
+        return unreadable(skb, slot, 0);
+    }
+    let total = this.state.length | length_bytes(window, before, read);
+    if !FrameHeader::is_length(total) {
+        return unreadable(skb, slot, 0);
+    }
+    count(slot, Counter::TcpFrames, 1);
+    this.state.prefix = 0;
+    let rest = total.wrapping_sub(before);
+    let now = if rest > this.len { this.len } else { rest };
+    this.state.boundary = this.state.boundary.wrapping_add(total);
+    this.state.body = body::WHOLE;
+    chunk::whole(skb, slot, 0, now, 0);
+    this.state.covered = this.sequence_number.wrapping_add(now);
+    1
+}
+
+/// Passes on what is wanted of the batch at `offset`.
+#[inline(always)]
+fn pass(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
+    let Some(mut this) = current(slot) else {
+        return 0;
+    };
+    let total = this.total;
+    let left = this.len.wrapping_sub(offset);
     let now = if total > left { left } else { total };
     this.state.boundary = this.state.boundary.wrapping_add(total);
     if this.wanted == 0 && this.now.wrapping_sub(this.state.reported) > ALIVE_NANOSECONDS {
@@ -208,7 +328,9 @@ extern "C" fn batch(skb: *mut __sk_buff, slot: u32) -> u32 {
         this.state.body = body::WHOLE;
         chunk::whole(skb, slot, offset, now, boundary | wake);
     } else if this.wanted == 0 {
-        count(slot, Counter::ZenohSkipped, 1);
+        if this.state.protocol == protocol::ZENOH {
+            count(slot, Counter::ZenohSkipped, 1);
+        }
         this.state.body = body::SKIPPED;
         this.state.pending |= u32::from(part::SKIPPED);
     } else {

@@ -11,6 +11,7 @@ mod chunk;
 mod follow;
 mod message;
 mod push;
+mod rtps;
 mod search;
 mod state;
 
@@ -57,8 +58,9 @@ struct Header {
 pub fn socket(skb: *mut __sk_buff, at: u32) -> Option<()> {
     // SAFETY: the verifier rewrites reads of this field.
     let interface = unsafe { (*skb).ifindex };
-    if at != hook::EGRESS && interface == LOOPBACK {
-        // These bytes were captured at the socket of their sender.
+    // Of Zenoh, these bytes were captured at the socket of their sender.
+    let is_repeated = at != hook::EGRESS && interface == LOOPBACK;
+    if is_repeated && !state::is_any_rtps() {
         return None;
     }
     let header = header(skb, 0)?;
@@ -73,7 +75,21 @@ pub fn socket(skb: *mut __sk_buff, at: u32) -> Option<()> {
         outgoing,
     };
     let is_noted = state::is_noted(key.socket);
-    let is_known = is_noted && CONNECTIONS.get_ptr_mut(&key).is_some();
+    let known = match is_noted {
+        true => CONNECTIONS.get_ptr_mut(&key),
+        false => None,
+    };
+    let is_known = known.is_some();
+    if is_repeated {
+        let is_rtps = match known {
+            // SAFETY: a map value pointer checked against null.
+            Some(known) => unsafe { (*known).protocol == state::protocol::RTPS },
+            None => rtps::begins(skb, header.body, header.len),
+        };
+        if !is_rtps {
+            return None;
+        }
+    }
     if is_known {
         state::note(key.socket);
     } else if !search::may_be(skb, header.body, header.len, &key, is_noted) {

@@ -19,8 +19,11 @@ use crate::{
 
 use super::{
     chunk::{self, WAKE},
-    is_zenoh_port, message,
-    state::{CANDIDATES, CONNECTIONS, Direction, Key, Segment, Window, body, mode, note, segment},
+    is_zenoh_port, message, rtps,
+    state::{
+        CANDIDATES, CONNECTIONS, Direction, Key, Segment, Window, body, found_rtps, mode, note,
+        protocol, segment,
+    },
 };
 
 /// Maximum number of batches of one packet that the search reads.
@@ -69,6 +72,15 @@ pub extern "C" fn at_socket(skb: *mut __sk_buff, slot: u32) -> u32 {
             begin(slot, u32::from(part::LOST));
             know(slot, this, mode::FOLLOWED)
         }
+        Beginning::Frame => {
+            if !rtps::begins(skb, this.body, this.len) {
+                return 0;
+            }
+            begin(slot, u32::from(part::LOST));
+            this.state.protocol = protocol::RTPS;
+            found_rtps();
+            know(slot, this, mode::FOLLOWED)
+        }
         Beginning::OtherVersion | Beginning::Tls => {
             begin(slot, u32::from(part::SYN));
             let all = if begins == Beginning::Tls {
@@ -106,10 +118,18 @@ pub extern "C" fn on_interface(skb: *mut __sk_buff, slot: u32) -> u32 {
         return 0;
     };
     let begins = begins_with(skb, this.body, this.len, this.key.ports);
-    if !matches!(begins, Beginning::Init | Beginning::KeepAlive) && guess(skb, slot) == 0 {
+    let is_certain = match begins {
+        Beginning::Init | Beginning::KeepAlive => true,
+        Beginning::Frame => rtps::begins(skb, this.body, this.len),
+        _ => guess(skb, slot) != 0,
+    };
+    if !is_certain {
         return 0;
     }
     begin(slot, 0);
+    if begins == Beginning::Frame {
+        this.state.protocol = protocol::RTPS;
+    }
     know(slot, this, mode::UNREADABLE);
     this.key.ports = this.key.ports << 16 | this.key.ports >> 16;
     know(slot, this, mode::UNREADABLE);
@@ -132,6 +152,8 @@ extern "C" fn begin(slot: u32, pending: u32) -> u32 {
     this.state.prefix = 0;
     this.state.pending = pending;
     this.state.gap_bytes = 0;
+    this.state.protocol = protocol::ZENOH;
+    this.state.length = 0;
     this.state.unused = 0;
     close(slot)
 }
@@ -155,7 +177,12 @@ extern "C" fn close(slot: u32) -> u32 {
 #[inline(always)]
 fn know(slot: u32, mut this: Working<Segment>, mode: u32) -> u32 {
     this.state.mode = mode;
-    count(slot, Counter::ZenohConnections, 1);
+    let counter = if this.state.protocol == protocol::RTPS {
+        Counter::TcpConnections
+    } else {
+        Counter::ZenohConnections
+    };
+    count(slot, counter, 1);
     note(this.key.socket);
     u32::from(CONNECTIONS.insert(&this.key, &this.state, 0).is_ok())
 }

@@ -40,6 +40,9 @@ const NOTED_ENTRIES: u32 = 16_384;
 /// Lifetime of an entry in jiffies, of which a second has 100 to 1000: longer than the pause
 /// between two KEEP_ALIVEs.
 const NOTED_JIFFIES: u32 = 600_000;
+/// Whether a connection of RTPS was found on this host.
+#[map]
+static ANY_RTPS: Array<Shared<u32>> = Array::with_max_entries(1, 0);
 /// The current segment, by slot.
 #[map]
 static SEGMENT: PerCpuArray<Segment> = PerCpuArray::with_max_entries(SLOTS, 0);
@@ -52,6 +55,13 @@ pub mod mode {
     pub const GAP: u32 = 1;
     /// No batch of the direction can be read.
     pub const UNREADABLE: u32 = 2;
+}
+
+/// Protocols of a direction.
+pub mod protocol {
+    pub const ZENOH: u32 = 0;
+    /// The batches are frames of RTPS.
+    pub const RTPS: u32 = 1;
 }
 
 /// The part of a batch that is passed on.
@@ -119,7 +129,8 @@ pub struct Direction {
     pub body: u32,
     /// Bits of [`chain`].
     pub chain: u32,
-    /// The first byte of a length, with bit 8 set, if the last segment ended after it.
+    /// Of Zenoh the first byte of a length, with bit 8 set, if the last segment ended after it. Of
+    /// RTPS the number of bytes of a header at whose middle the last segment ended.
     pub prefix: u32,
     /// Flags of the next chunk.
     pub pending: u32,
@@ -129,6 +140,10 @@ pub struct Direction {
     pub hole: u32,
     /// Number of missing bytes that begin at `hole`, which TCP may retransmit.
     pub hole_len: u32,
+    /// One of [`protocol`].
+    pub protocol: u32,
+    /// The bytes of a frame's length that the last segment had.
+    pub length: u32,
     pub unused: u32,
     pub guess: Guess,
 }
@@ -186,6 +201,23 @@ pub struct Segment {
     pub lane: u32,
     /// Sequence number in the lane.
     pub number: u32,
+}
+
+/// Returns whether a connection of RTPS was found on this host.
+#[inline(always)]
+pub fn is_any_rtps() -> bool {
+    match ANY_RTPS.get(0) {
+        Some(found) => found.get() != 0,
+        None => false,
+    }
+}
+
+/// Records that a connection of RTPS was found on this host.
+#[inline(always)]
+pub fn found_rtps() {
+    if let Some(found) = ANY_RTPS.get(0) {
+        found.set(1);
+    }
 }
 
 /// Returns whether a socket may be in one of the tables.

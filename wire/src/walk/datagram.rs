@@ -34,6 +34,9 @@ pub struct Envelope {
     /// The participant that receives the message; unknown for datagrams. The receiver's state
     /// begins with it (RTPS 2.5, 8.3.4).
     pub receiver: GuidPrefix,
+    /// The port that a datagram with this message would have (RTPS 2.5, 9.6.2.3), if the message came
+    /// by TCP; otherwise 0.
+    pub logical_port: u16,
 }
 
 impl Envelope {

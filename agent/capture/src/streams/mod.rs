@@ -396,6 +396,7 @@ fn tell(
             bytes,
             length,
             sender,
+            logical_port,
         } => {
             let Flow {
                 source,
@@ -416,6 +417,7 @@ fn tell(
                 socket: id.socket,
                 host: id.socket != 0,
                 receiver: receiver.unwrap_or(GuidPrefix::UNKNOWN),
+                logical_port,
                 ..Envelope::default()
             };
             report(&Streamed::Message {

@@ -49,6 +49,8 @@ pub enum Event<'a> {
         length: u32,
         /// The participant that sent it, according to its header.
         sender: GuidPrefix,
+        /// The logical port of its frame.
+        logical_port: u16,
     },
 }
 
@@ -479,6 +481,9 @@ impl Partial {
                 // The header of a message has magic, version and vendor before the prefix (RTPS 2.5,
                 // 9.4.4). A control message has none.
                 let is_message = bytes.starts_with(b"RTPS");
+                let header = self.captured.first_chunk();
+                let header = header.and_then(|header| FrameHeader::read(*header));
+                let logical_port = header.map_or(0, |header| header.logical_port);
                 if let Some(sender) = bytes.get(8..20).filter(|_| is_message)
                     && let Ok(sender) = sender.try_into()
                 {
@@ -486,6 +491,7 @@ impl Partial {
                         bytes,
                         length: u32::try_from(length).unwrap_or(u32::MAX),
                         sender: GuidPrefix(sender),
+                        logical_port,
                     });
                 }
             }

@@ -82,11 +82,13 @@ struct Options {
   // Fast DDS: use its default transports, and share histories.
   bool default_transport = false;
   bool data_sharing = false;
+  // Fast DDS: only TCP, with a listening address or an address to connect to (IPV4:PORT).
+  std::string tcp_listen, tcp_peer;
 
   static Options parse(int argc, char** argv) {
     enum { kRole = 1, kTopic, kSize, kRate, kCount, kReliable, kBestEffort, kTransientLocal, kDepth,
            kDomain, kGidSize, kNode, kLog, kPeers, kHold, kStretch, kLinger,
-           kReceiveBuffer, kTransport, kDataSharing, kHelp };
+           kReceiveBuffer, kTransport, kDataSharing, kTcpListen, kTcpPeer, kHelp };
     static const option names[] = {
         {"role", 1, nullptr, kRole},           {"topic", 1, nullptr, kTopic},
         {"size", 1, nullptr, kSize},           {"rate", 1, nullptr, kRate},
@@ -100,6 +102,7 @@ struct Options {
         {"receive-buffer", 1, nullptr, kReceiveBuffer},
         {"stretch", 1, nullptr, kStretch},
         {"transport", 1, nullptr, kTransport}, {"data-sharing", 0, nullptr, kDataSharing},
+        {"tcp-listen", 1, nullptr, kTcpListen}, {"tcp-peer", 1, nullptr, kTcpPeer},
         {"help", 0, nullptr, kHelp},           {nullptr, 0, nullptr, 0}};
     Options options;
     bool role_given = false;
@@ -135,12 +138,14 @@ struct Options {
             fail("--transport is default or udp");
           break;
         case kDataSharing: options.data_sharing = true; break;
+        case kTcpListen: options.tcp_listen = optarg; break;
+        case kTcpPeer: options.tcp_peer = optarg; break;
         default:
           fail("usage: --role pub|sub [--topic /t] [--size BYTES] [--rate HZ] [--count N]\n"
                "  [--reliable|--best-effort] [--transient-local] [--depth N] [--domain D]\n"
                "  [--gid-size 24|16] [--node /ns/name]... [--log FILE] [--peers N] [--hold]\n"
                "  [--stretch SAMPLES] [--linger SECONDS] [--receive-buffer BYTES]\n"
-               "  [--transport default|udp] [--data-sharing]");
+               "  [--transport default|udp] [--data-sharing] [--tcp-listen IPV4:PORT | --tcp-peer IPV4:PORT]");
       }
     }
     if (!role_given) fail("--role pub|sub is missing");

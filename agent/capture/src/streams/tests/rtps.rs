@@ -97,6 +97,7 @@ impl Connection {
                 panic!("{streamed:?}");
             };
             assert_eq!(envelope.destination_port, flow.destination.port);
+            assert_eq!(envelope.logical_port, PORT);
             read.push(Read {
                 bytes: bytes.to_vec(),
                 length: *length,

@@ -13,7 +13,9 @@
 #include <fastdds/dds/subscriber/Subscriber.hpp>
 #include <fastdds/dds/subscriber/qos/DataReaderQos.hpp>
 #include <fastdds/dds/topic/TopicDataType.hpp>
+#include <fastdds/rtps/transport/TCPv4TransportDescriptor.h>
 #include <fastdds/rtps/transport/UDPv4TransportDescriptor.h>
+#include <fastrtps/utils/IPLocator.h>
 
 #include <atomic>
 #include <memory>
@@ -21,7 +23,10 @@
 #include "../peer.hpp"
 
 using namespace eprosima::fastdds::dds;
+using eprosima::fastdds::rtps::TCPv4TransportDescriptor;
 using eprosima::fastdds::rtps::UDPv4TransportDescriptor;
+using eprosima::fastrtps::rtps::IPLocator;
+using eprosima::fastrtps::rtps::Locator_t;
 using eprosima::fastrtps::rtps::GUID_t;
 using eprosima::fastrtps::rtps::SerializedPayload_t;
 
@@ -150,7 +155,9 @@ class Context {
     qos.name("/");
     const char enclave[] = "enclave=/;";
     qos.user_data().setValue(std::vector<uint8_t>(enclave, enclave + sizeof enclave));
-    if (!options.default_transport) {
+    if (!options.tcp_listen.empty() || !options.tcp_peer.empty()) {
+      only_tcp(qos);
+    } else if (!options.default_transport) {
       auto udp = std::make_shared<UDPv4TransportDescriptor>();
       udp->receiveBufferSize = options.receive_buffer;
       qos.transport().use_builtin_transports = false;
@@ -224,6 +231,32 @@ class Context {
   }
 
  private:
+  static Locator_t tcp_locator(const std::string& address) {
+    const size_t colon = address.find(':');
+    if (colon == std::string::npos) peer::fail("a TCP address is IPV4:PORT");
+    Locator_t locator;
+    locator.kind = LOCATOR_KIND_TCPv4;
+    IPLocator::setIPv4(locator, address.substr(0, colon));
+    IPLocator::setPhysicalPort(locator, static_cast<uint16_t>(atoi(&address[colon + 1])));
+    return locator;
+  }
+
+  // As XML profiles configure it: the connecting side listens at no port.
+  void only_tcp(DomainParticipantQos& qos) const {
+    auto tcp = std::make_shared<TCPv4TransportDescriptor>();
+    qos.transport().use_builtin_transports = false;
+    auto& builtin = qos.wire_protocol().builtin;
+    if (!options_.tcp_listen.empty()) {
+      const Locator_t locator = tcp_locator(options_.tcp_listen);
+      tcp->add_listener_port(IPLocator::getPhysicalPort(locator));
+      builtin.metatrafficUnicastLocatorList.push_back(locator);
+      qos.wire_protocol().default_unicast_locator_list.push_back(locator);
+    } else {
+      builtin.initialPeersList.push_back(tcp_locator(options_.tcp_peer));
+    }
+    qos.transport().user_transports.push_back(tcp);
+  }
+
   struct Drain : DataReaderListener {
     void on_data_available(DataReader* reader) override {
       Payload sample;

@@ -31,7 +31,10 @@ impl Observer {
                 sender: prefix,
                 sequence_number: sample.sequence_number,
                 destination: envelope.destination,
-                port: envelope.destination_port,
+                port: match envelope.logical_port {
+                    0 => envelope.destination_port,
+                    logical => logical,
+                },
             };
             self.read(found, sample, vendor, &origin);
             self.follow_up(origin.at);
