@@ -68,6 +68,7 @@ export const PASSAGES = /** @type {Record<string, string>} */ ({
   data_sharing: 'data sharing (unseen)',
   same_process: 'same process (unseen)',
   iceoryx: 'iceoryx (unseen)',
+  tcp: 'TCP',
 });
 
 /** @param {{flags: string[]}} props */

@@ -58,6 +58,12 @@ pub struct Participant<'a> {
     pub last_seen_timestamp_seconds: f64,
     /// The participant announces DDS security: its messages may be encrypted.
     pub secured: bool,
+    /// It announces its endpoints by TCP and not by UDP (Fast DDS with `LARGE_DATA`, or with TCP
+    /// transports). `rp discover` cannot request them.
+    pub announces_by_tcp: bool,
+    /// It does so, and none of its messages by TCP was seen: the connections are encrypted, or they
+    /// do not pass this host.
+    pub announces_unseen: bool,
     /// Restored from saved state; no announcement has confirmed it since the agent started.
     pub restored: bool,
 }

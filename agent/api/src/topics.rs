@@ -100,7 +100,7 @@ pub struct TopicDetails<'a> {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Passage {
-    /// The transport. `network` is captured in full, `shared_memory` is sampled; `data_sharing`,
+    /// The transport. `network` and `tcp` are captured in full, `shared_memory` is sampled; `data_sharing`,
     /// `same_process` and `iceoryx` can be observed only inside the processes.
     pub passage: Cow<'static, str>,
     /// Number of pairs.

@@ -1,8 +1,9 @@
 //! Writers whose announcement the agent missed: the sentence about them, and the command that
 //! requests their announcements. All surfaces use this sentence and this command.
 
-use ros2probe_api::participants::UnknownWriter;
+use ros2probe_api::participants::{Participant, UnknownWriter};
 use ros2probe_model::report::snapshot::Snapshot;
+use ros2probe_wire::GuidPrefix;
 use ros2probe_wire::rtps::VendorId;
 
 /// Command that requests the announcements of all DDS participants. Without `--all`, it only lists
@@ -13,16 +14,44 @@ pub const DISCOVER_ROUTER: &str = "rp discover --router";
 /// Both commands in one.
 const DISCOVER_BOTH: &str = "sudo rp discover --all && rp discover --router";
 
-/// Returns the command that requests the announcements of participants or writers, each `true` for
-/// one of Zenoh; `None` without any.
-pub fn command(of_zenoh: impl IntoIterator<Item = bool>) -> Option<&'static str> {
-    let (mut has_zenoh, mut has_dds) = (false, false);
-    for is_zenoh in of_zenoh {
-        has_zenoh |= is_zenoh;
-        has_dds |= !is_zenoh;
+/// Command that makes participants repeat by TCP what they announce: it starts another participant
+/// with the same transports.
+const ANNOUNCE_BY_TCP: &str = "FASTDDS_BUILTIN_TRANSPORTS=LARGE_DATA ros2 node list --no-daemon";
+
+/// How a participant announces its endpoints.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Announces {
+    /// By UDP.
+    Udp,
+    /// By TCP. No command of `rp` can request it.
+    Tcp,
+    /// As tokens of Zenoh.
+    Zenoh,
+}
+
+impl Announces {
+    /// Returns how this participant does.
+    #[must_use]
+    pub fn of(participant: &Participant<'_>) -> Self {
+        match is_zenoh(&participant.vendor) {
+            true => Self::Zenoh,
+            false if participant.announces_by_tcp => Self::Tcp,
+            false => Self::Udp,
+        }
     }
-    match (has_zenoh, has_dds) {
-        (false, false) => None,
+}
+
+/// Returns the command that requests announcements; `None` without any. Announcements by TCP are
+/// omitted if there are others.
+pub fn command(announced: impl IntoIterator<Item = Announces>) -> Option<&'static str> {
+    let (mut has_zenoh, mut has_udp, mut has_tcp) = (false, false, false);
+    for each in announced {
+        has_zenoh |= each == Announces::Zenoh;
+        has_udp |= each == Announces::Udp;
+        has_tcp |= each == Announces::Tcp;
+    }
+    match (has_zenoh, has_udp) {
+        (false, false) => has_tcp.then_some(ANNOUNCE_BY_TCP),
         (false, true) => Some(DISCOVER),
         (true, false) => Some(DISCOVER_ROUTER),
         (true, true) => Some(DISCOVER_BOTH),
@@ -33,18 +62,39 @@ pub fn command(of_zenoh: impl IntoIterator<Item = bool>) -> Option<&'static str>
 /// writers, else of its participants if no topic is known.
 #[must_use]
 pub fn remedy(snapshot: &Snapshot) -> Option<&'static str> {
+    let announces = |prefix: GuidPrefix| {
+        let mut participants = snapshot.participants.iter();
+        let known = participants.find(|participant| participant.guid.prefix == prefix);
+        match prefix.is_zenoh() {
+            true => Announces::Zenoh,
+            false if known.is_some_and(|known| known.announces_by_tcp) => Announces::Tcp,
+            false => Announces::Udp,
+        }
+    };
     let writers = snapshot.unknown_writers.iter();
-    command(writers.map(|writer| writer.guid.prefix.is_zenoh())).or_else(|| {
+    command(writers.map(|writer| announces(writer.guid.prefix))).or_else(|| {
         let participants = snapshot.participants.iter();
         let participants = participants.filter(|_| snapshot.topics.is_empty());
-        command(participants.map(|participant| participant.guid.prefix.is_zenoh()))
+        command(participants.map(|participant| announces(participant.guid.prefix)))
     })
 }
 
-/// Returns the command for writers as the API lists them.
+/// Returns the command for writers as the API lists them, beside the participants.
 #[must_use]
-pub fn remedy_for(writers: &[UnknownWriter<'_>]) -> Option<&'static str> {
-    command(writers.iter().map(|writer| is_zenoh(&writer.vendor)))
+pub fn remedy_for(
+    writers: &[UnknownWriter<'_>],
+    participants: &[Participant<'_>],
+) -> Option<&'static str> {
+    command(writers.iter().map(|writer| {
+        // A GUID begins with the prefix of its participant.
+        let prefix = writer.guid.split('.').next();
+        let is_own = |participant: &&Participant<'_>| participant.guid.split('.').next() == prefix;
+        match (is_zenoh(&writer.vendor), participants.iter().find(is_own)) {
+            (true, _) => Announces::Zenoh,
+            (false, Some(participant)) => Announces::of(participant),
+            (false, None) => Announces::Udp,
+        }
+    }))
 }
 
 /// Returns whether `vendor` is the name of Zenoh in the API.
@@ -83,7 +133,7 @@ mod tests {
         let (dds, zenoh) = (writer("eProsima Fast DDS"), writer("Eclipse Zenoh"));
         let remedy = |writers: &[&UnknownWriter<'static>]| {
             let writers: Vec<_> = writers.iter().map(|writer| (*writer).clone()).collect();
-            remedy_for(&writers)
+            remedy_for(&writers, &[])
         };
         assert_eq!(remedy(&[]), None);
         assert_eq!(remedy(&[&dds]), Some("sudo rp discover --all"));
@@ -94,5 +144,24 @@ mod tests {
             both.contains(DISCOVER) && both.contains(DISCOVER_ROUTER),
             "{both}"
         );
+    }
+
+    #[test]
+    fn what_is_announced_by_tcp_is_not_requested_with_a_command_of_rp() {
+        let writer = UnknownWriter {
+            guid: "010f0d04ca2ab1e800000000.00001103".to_owned(),
+            vendor: "eProsima Fast DDS".into(),
+            ..UnknownWriter::default()
+        };
+        let participant = |announces_by_tcp| Participant {
+            guid: "010f0d04ca2ab1e800000000.000001c1".to_owned(),
+            announces_by_tcp,
+            ..Participant::default()
+        };
+        let remedy = |by_tcp| remedy_for(&[writer.clone()], &[participant(by_tcp)]);
+        assert_eq!(remedy(true), Some(ANNOUNCE_BY_TCP));
+        assert_eq!(remedy(false), Some(DISCOVER));
+        let both = [Announces::Tcp, Announces::Udp];
+        assert_eq!(command(both), Some(DISCOVER));
     }
 }

@@ -366,7 +366,7 @@ pub const TOPIC_PAIRS: Metric = Metric::gauge(
     "ros2_topic_pairs",
     &["domain_id", "topic", "passage"],
     "Pairs of writer and reader by the path of their messages, as both announce it: network, \
-     shared_memory (sampled), data_sharing, same_process, iceoryx (the last three are \
+     tcp, shared_memory (sampled), data_sharing, same_process, iceoryx (the last three are \
      visible only with capture.inside).",
 );
 

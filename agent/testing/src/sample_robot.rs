@@ -132,6 +132,8 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             last_seen: ModelTime::from_nanoseconds(2),
             lease: ros2probe_wire::RtpsDuration::Finite(Duration::from_secs(20)),
             secured: false,
+            announces_by_tcp: false,
+            announces_unseen: false,
             restored: false,
             addresses: Addresses::default(),
         }],

@@ -74,6 +74,14 @@ impl Locator {
         matches!(self.kind, LocatorKind::TCP_V4 | LocatorKind::TCP_V6)
     }
 
+    /// Returns whether these locators include TCP and not UDP. A sender then uses TCP, or shared
+    /// memory on the same host.
+    #[must_use]
+    pub fn are_tcp(locators: &[Self]) -> bool {
+        let is_udp = |locator: &Self| locator.udp().is_some();
+        locators.iter().any(Self::is_tcp) && !locators.iter().any(is_udp)
+    }
+
     /// Returns whether the transport is shared memory, in the numbering of any vendor.
     #[must_use]
     pub const fn is_shared_memory(&self) -> bool {

@@ -38,6 +38,7 @@ mod bounds;
 mod ends;
 mod processes;
 mod quic;
+mod rtps;
 mod tapped;
 mod verdicts;
 

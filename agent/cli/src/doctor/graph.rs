@@ -9,7 +9,7 @@ use crate::top::text::counted;
 use ros2probe_api::health::Health;
 use ros2probe_api::participants::Participant;
 use ros2probe_api::topics::Topic;
-use ros2probe_daemon::missed_announcements::{self, DISCOVER, is_zenoh};
+use ros2probe_daemon::missed_announcements::{self, Announces, DISCOVER};
 
 const AREA: Area = Area::Graph;
 /// Adds remedies to a finding.
@@ -29,6 +29,7 @@ pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
     findings.extend(restored(participants));
     findings.extend(unknown_writers(answers));
     findings.extend(secured(participants));
+    findings.extend(announced_unseen(participants));
     findings.extend(off_the_network(answers));
     findings.extend(mismatches(&answers.topics.topics));
     findings
@@ -102,7 +103,8 @@ fn is_alone(participant: &Participant<'_>, participants: &[Participant<'_>]) -> 
     let has_nothing = participant.writers == 0 && participant.readers == 0;
     let others = participants.iter();
     let neighbours = others.filter(|other| other.domain_id == participant.domain_id);
-    has_nothing && !participant.secured && neighbours.count() == 1
+    let is_silent = participant.secured || participant.announces_unseen;
+    has_nothing && !is_silent && neighbours.count() == 1
 }
 
 fn alone(participants: &[Participant<'_>]) -> Option<Finding> {
@@ -124,7 +126,7 @@ fn alone(participants: &[Participant<'_>]) -> Option<Finding> {
     let finding = Finding::new(AREA, "alone", Severity::Note, sentence);
     let finding = finding.seen(domains.len().to_string(), "GET /participants");
     let remedy = remedy_of(alone.into_iter());
-    Some(finding.remedy(format!("{remedy}    # requests them: a few packets")))
+    Some(finding.remedy(explained(remedy, "requests them: a few packets")))
 }
 
 /// Returns the finding for participants that started before the agent and whose names are unknown.
@@ -132,7 +134,8 @@ fn names(participants: &[Participant<'_>]) -> Option<Finding> {
     let is_nameless = |each: &&Participant<'_>| {
         let has_nothing = each.writers == 0 && each.readers == 0;
         let is_nameless = has_nothing || each.enclave.is_some() && each.nodes.is_empty();
-        !each.secured && is_nameless && !is_alone(each, participants)
+        let is_silent = each.secured || each.announces_unseen;
+        !is_silent && is_nameless && !is_alone(each, participants)
     };
     let nameless = participants.iter().filter(is_nameless);
     let count = nameless.clone().count();
@@ -145,16 +148,24 @@ fn names(participants: &[Participant<'_>]) -> Option<Finding> {
     );
     let finding = Finding::new(AREA, "names", Severity::Warning, sentence);
     let finding = finding.seen(count.to_string(), "GET /participants");
-    let remedy = remedy_of(nameless);
-    Some(finding.remedy(format!(
-        "{remedy}    # a few packets; with --dry-run it only prints them"
+    Some(finding.remedy(explained(
+        remedy_of(nameless),
+        "a few packets; with --dry-run it only prints them",
     )))
 }
 
 /// Returns the command that requests the announcements of these participants.
 fn remedy_of<'a>(participants: impl Iterator<Item = &'a Participant<'a>>) -> &'static str {
-    let of_zenoh = participants.map(|participant| is_zenoh(&participant.vendor));
-    missed_announcements::command(of_zenoh).unwrap_or(DISCOVER)
+    missed_announcements::command(participants.map(Announces::of)).unwrap_or(DISCOVER)
+}
+
+/// Returns a remedy with a comment. By TCP, another participant is needed.
+fn explained(remedy: &str, requested: &str) -> String {
+    let comment = match remedy.contains("rp discover") {
+        true => requested,
+        false => "joins the domain with the robot's transports, so that all announce to it",
+    };
+    format!("{remedy}    # {comment}")
 }
 
 fn restored(participants: &[Participant<'_>]) -> Option<Finding> {
@@ -179,8 +190,36 @@ fn unknown_writers(answers: &Answers) -> Option<Finding> {
         format!("{}: {}", writers.len(), first.guid),
         "GET /participants",
     );
-    let remedy = missed_announcements::remedy_for(writers)?;
-    Some(finding.remedy(format!("{remedy}    # requests the announcements")))
+    let participants = &answers.participants.participants;
+    let remedy = missed_announcements::remedy_for(writers, participants)?;
+    Some(finding.remedy(explained(remedy, "requests the announcements")))
+}
+
+/// Returns the finding for participants whose endpoints are announced by TCP connections that were
+/// not seen.
+fn announced_unseen(participants: &[Participant<'_>]) -> Option<Finding> {
+    let count = participants
+        .iter()
+        .filter(|each| each.announces_unseen)
+        .count();
+    if count == 0 {
+        return None;
+    }
+    let sentence = format!(
+        "{} announce topics and nodes by TCP, and no message by TCP was seen: the connections are \
+         encrypted, or pass between other hosts",
+        many(count, "participant")
+    );
+    let sentence = match count {
+        1 => sentence.replace(" announce ", " announces "),
+        _ => sentence,
+    };
+    let finding = Finding::new(AREA, "tcp_unseen", Severity::Warning, sentence);
+    let finding = finding.seen(count.to_string(), "GET /participants announces_unseen");
+    Some(
+        finding
+            .elsewhere("run an agent on the hosts of these participants; TLS hides their messages"),
+    )
 }
 
 fn secured(participants: &[Participant<'_>]) -> Option<Finding> {

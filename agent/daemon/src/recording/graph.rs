@@ -182,8 +182,12 @@ impl From<&TopicFacts> for PublishedTopic {
 fn other_transport<'a>(
     passages: impl Iterator<Item = (&'a str, usize)> + Clone,
 ) -> Option<&'a str> {
-    let network = Transport::Network.label();
-    if passages.clone().any(|(passage, _)| passage == network) {
+    let networks = Transport::ALL.into_iter().filter(|each| each.is_network());
+    let networks: Vec<_> = networks.map(Transport::label).collect();
+    if passages
+        .clone()
+        .any(|(passage, _)| networks.contains(&passage))
+    {
         return None;
     }
     let most = passages.max_by_key(|(_, pairs)| *pairs);

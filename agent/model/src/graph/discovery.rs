@@ -217,6 +217,13 @@ impl Discovery {
         priority.is_some_and(|priority| priority.or(evidence) != priority)
     }
 
+    /// Records that a message of this participant came by TCP.
+    pub fn came_by_tcp(&mut self, prefix: GuidPrefix) {
+        if let Some(participant) = self.participants.get_mut(&prefix) {
+            participant.came_by_tcp = true;
+        }
+    }
+
     /// Raises the priority of a participant. Returns whether the participant is thereby admitted.
     pub fn learn(
         &mut self,
@@ -292,6 +299,7 @@ impl Discovery {
             nodes: Vec::new(),
             watched: 0,
             local: false,
+            came_by_tcp: false,
             sends: false,
             domain_source: source,
             nodes_from: None,

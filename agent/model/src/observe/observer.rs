@@ -33,7 +33,7 @@ use std::time::Duration;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::record::Handover;
 use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
-use ros2probe_wire::{DomainId, Guid, Reason, Timestamp};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix, Reason, Timestamp};
 
 use crate::derive::chain::Chains;
 use crate::derive::examiner::Examiner;
@@ -333,7 +333,18 @@ impl Observer {
         });
     }
 
+    /// Records that the participant that sent this RTPS message uses TCP, if the message came so.
+    fn note_tcp(&mut self, envelope: &Envelope, payload: &[u8]) {
+        if envelope.logical_port != 0
+            && let Some(prefix) = payload.get(8..20)
+            && let Ok(prefix) = prefix.try_into()
+        {
+            self.graph.discovery.came_by_tcp(GuidPrefix(prefix));
+        }
+    }
+
     fn message_beginning(&mut self, envelope: &Envelope, payload: &[u8], length: u32) {
+        self.note_tcp(envelope, payload);
         let outcome = walk::beginning(payload, length, envelope, |found| {
             self.observe(&Observation::of(&found.record, self.graph.wall_clock));
         });
@@ -538,6 +549,7 @@ impl Observer {
 
     /// Reads the announcements and payloads of a datagram, and observes every submessage.
     fn walk(&mut self, captured: Captured<'_>, payload: &[u8], handover: Option<&Handover>) {
+        self.note_tcp(captured.envelope, payload);
         let outcome = walk::datagram(payload, captured.envelope, handover, |found| {
             self.submessage(captured, &found, UserData::Here);
         });

@@ -124,6 +124,10 @@ pub struct ParticipantFacts {
     pub lease: RtpsDuration,
     /// Whether it announces security: its user data may be encrypted.
     pub secured: bool,
+    /// Whether it announces its endpoints by TCP and not by UDP.
+    pub announces_by_tcp: bool,
+    /// Whether it does so, and none of its messages by TCP was seen.
+    pub announces_unseen: bool,
     /// Whether it is restored from saved state without a packet so far.
     pub restored: bool,
     /// UDP addresses of its discovery endpoints and of its other endpoints.
@@ -215,7 +219,7 @@ const REGULAR: u64 = 10;
 /// Transport between a writer and a reader, as both announce it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Transport {
-    /// The network, where all messages can be captured.
+    /// The network by UDP, or by TCP of Zenoh, where all messages can be captured.
     Network,
     /// Fast DDS's shared memory, which is sampled.
     SharedMemory,
@@ -225,6 +229,8 @@ pub enum Transport {
     SameProcess,
     /// Cyclone DDS's iceoryx, which cannot be observed.
     Iceoryx,
+    /// The network by TCP, where all messages can be captured.
+    Tcp,
 }
 
 /// Number of pairs with one transport.
@@ -238,13 +244,20 @@ pub struct TransportCount {
 
 impl Transport {
     /// All transports.
-    pub const ALL: [Self; 5] = [
+    pub const ALL: [Self; 6] = [
         Self::Network,
         Self::SharedMemory,
         Self::DataSharing,
         Self::SameProcess,
         Self::Iceoryx,
+        Self::Tcp,
     ];
+
+    /// Returns whether messages cross the network, where they are captured.
+    #[must_use]
+    pub const fn is_network(self) -> bool {
+        matches!(self, Self::Network | Self::Tcp)
+    }
 
     /// Returns the bit of the transport in a set.
     #[must_use]
@@ -261,6 +274,7 @@ impl Transport {
             Self::DataSharing => "data_sharing",
             Self::SameProcess => "same_process",
             Self::Iceoryx => "iceoryx",
+            Self::Tcp => "tcp",
         }
     }
 }

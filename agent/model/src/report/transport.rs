@@ -59,7 +59,7 @@ pub(crate) fn transports(
         }
     }
     let shown =
-        |counts: [TransportCount; 5]| counts.into_iter().filter(|count| count.pairs > 0).collect();
+        |counts: [TransportCount; 6]| counts.into_iter().filter(|count| count.pairs > 0).collect();
     (shown(counts), shown(observed))
 }
 
@@ -86,7 +86,7 @@ pub(crate) fn is_polled(discovery: &Discovery, writer: Guid, readers: &[Guid]) -
     for reader in readers.iter().take(MAX_PAIRS) {
         match transport(discovery, writer, *reader) {
             Some(Transport::SharedMemory) => is_shared = true,
-            Some(Transport::Network) => return false,
+            Some(transport) if transport.is_network() => return false,
             _ => {}
         }
     }
@@ -125,18 +125,28 @@ pub(crate) fn transport(discovery: &Discovery, writer: Guid, reader: Guid) -> Op
         vendor(discovery, writer.prefix),
         vendor(discovery, reader.prefix),
     );
+    let participants = discovery.participants();
+    let receives_by_tcp = || {
+        let participant = participants.get(&reader.prefix);
+        let default = participant.is_some_and(|known| known.proxy.tcp);
+        of_reader.tcp.unwrap_or(default)
+    };
+    let network = || match receives_by_tcp() {
+        true => Transport::Tcp,
+        false => Transport::Network,
+    };
     if vendor != other || !is_one_host(vendor, writer.prefix, reader.prefix) {
-        return Some(Transport::Network);
+        return Some(network());
     }
     let shared_memory = |guid: Guid, endpoint: &Endpoint| {
-        let participant = discovery.participants().get(&guid.prefix);
+        let participant = participants.get(&guid.prefix);
         let default = participant.is_some_and(|known| known.proxy.shared_memory);
         endpoint.shared_memory.unwrap_or(default)
     };
     Some(if of_writer.data_sharing && of_reader.data_sharing {
         Transport::DataSharing
     } else if !(shared_memory(writer, of_writer) && shared_memory(reader, of_reader)) {
-        Transport::Network
+        network()
     } else if vendor == VendorId::EPROSIMA {
         Transport::SharedMemory
     } else {

@@ -5,7 +5,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use ros2probe::client::Agent;
-use ros2probe_api::participants::{ParticipantList, UnknownWriter};
+use ros2probe_api::participants::ParticipantList;
 use ros2probe_api::topics::TopicList;
 use ros2probe_daemon::recording::{DiscoveredTopic, GraphSnapshot, by_name};
 
@@ -48,12 +48,13 @@ impl<'a> GraphCache<'a> {
         self.graph.clone()
     }
 
-    /// Returns writers whose announcement the agent missed; empty if the agent no longer answers.
-    pub(super) fn unknown_writers(&self) -> Vec<UnknownWriter<'static>> {
+    /// Returns the participants, with writers whose announcement the agent missed; empty if the agent
+    /// no longer answers.
+    pub(super) fn participants(&self) -> ParticipantList<'static> {
         let participants = self
             .agent
             .get_within::<ParticipantList<'_>>("/participants", GRAPH_TIMEOUT);
-        participants.map_or_else(|_| Vec::new(), |list| list.unknown_writers)
+        participants.unwrap_or_default()
     }
 
     /// Returns whether a topic of this name is known in the domain.

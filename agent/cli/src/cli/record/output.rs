@@ -76,8 +76,9 @@ impl<'a> UnknownWriters<'a> {
         if !may_record_more(options, |name| graph_cache.knows(name)) {
             return None;
         }
-        let writers = graph_cache.unknown_writers();
+        let list = graph_cache.participants();
         drop(graph_cache);
+        let writers = &list.unknown_writers;
         let is_first = self.reported.is_none();
         let count = |writer: &UnknownWriter<'_>| writer.measurement.messages;
         let sends = |writer: &&UnknownWriter<'_>| {
@@ -93,7 +94,7 @@ impl<'a> UnknownWriters<'a> {
             .iter()
             .map(|writer| (writer.guid.clone(), count(writer)));
         self.messages = counts.collect();
-        let remedy = explanation(remedy_for(&sending)?);
+        let remedy = explanation(remedy_for(&sending, &list.participants)?);
         Some(format!(
             "not recorded: {}: {remedy}",
             sentence(sending.len())

@@ -93,6 +93,8 @@ fn view<'a>(facts: &'a ParticipantFacts, counts: &Counts<'a>, clock: WallClock) 
         first_seen_timestamp_seconds: clock.wall_time(facts.first_seen).seconds(),
         last_seen_timestamp_seconds: clock.wall_time(facts.last_seen).seconds(),
         secured: facts.secured,
+        announces_by_tcp: facts.announces_by_tcp,
+        announces_unseen: facts.announces_unseen,
         restored: facts.restored,
     }
 }

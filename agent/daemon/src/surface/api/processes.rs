@@ -102,6 +102,8 @@ mod tests {
             last_seen: ModelTime::ZERO,
             lease: RtpsDuration::Infinite,
             secured: false,
+            announces_by_tcp: false,
+            announces_unseen: false,
             restored: false,
             addresses: Default::default(),
         }

@@ -163,10 +163,7 @@ impl<'a> Circumstances<'a> {
     fn off_network(&self, topic: &TopicFacts) -> Option<(ReasonCode, String)> {
         let passages = topic.transports.iter();
         let most = passages.clone().max_by_key(|count| count.pairs)?;
-        if passages
-            .clone()
-            .any(|count| count.transport == Transport::Network)
-        {
+        if passages.clone().any(|count| count.transport.is_network()) {
             return None;
         }
         let remedy = match self.lacks_inside {
@@ -175,7 +172,7 @@ impl<'a> Circumstances<'a> {
         };
         let detail = |how: &str| format!("{how}; nothing crosses the network{remedy}");
         Some(match most.transport {
-            Transport::Network => return None,
+            Transport::Network | Transport::Tcp => return None,
             Transport::SharedMemory if self.looks_at_memory => {
                 let how = "messages pass through shared memory; none was seen lately";
                 (ReasonCode::SharedMemory, detail(how))

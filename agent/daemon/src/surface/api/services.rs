@@ -123,7 +123,7 @@ fn with_calls<'a>(
     let exact = facts.is_some_and(|facts| facts.exact);
     let transports = halves.topics().flat_map(|topic| &topic.transports);
     let is_unseen = |transport: &Transport| match transport {
-        Transport::Network => false,
+        Transport::Network | Transport::Tcp => false,
         Transport::SharedMemory => !exact,
         Transport::DataSharing | Transport::SameProcess | Transport::Iceoryx => true,
     };

@@ -130,6 +130,7 @@ impl Discovery {
         let unicast = &announcement.unicast;
         let shared_memory =
             (!unicast.is_empty()).then(|| unicast.iter().any(Locator::is_shared_memory));
+        let tcp = (!unicast.is_empty()).then(|| Locator::are_tcp(unicast));
         let endpoint = Endpoint {
             gid: announcement.gid,
             role: announcement.role,
@@ -140,6 +141,7 @@ impl Discovery {
             qos: Arc::new(announcement.qos),
             first_seen: at,
             shared_memory,
+            tcp,
             data_sharing: announcement.datasharing,
             watched,
         };

@@ -71,6 +71,10 @@ pub struct ParticipantProxy {
     pub secured: bool,
     /// Whether its endpoints accept shared memory, unless they announce otherwise.
     pub shared_memory: bool,
+    /// Whether its endpoints receive by TCP and not by UDP, unless they announce otherwise.
+    pub tcp: bool,
+    /// Whether it announces its endpoints by TCP and not by UDP.
+    pub announces_by_tcp: bool,
 }
 
 /// Unicast UDP addresses of a participant.
@@ -105,6 +109,8 @@ pub struct Participant {
     pub(super) watched: usize,
     /// Whether a socket on this host sends for it.
     pub(super) local: bool,
+    /// Whether one of its messages came by TCP.
+    pub(super) came_by_tcp: bool,
     /// Whether it has sent user data.
     pub(super) sends: bool,
     pub(super) domain_source: DomainSource,
@@ -145,6 +151,8 @@ pub struct Endpoint {
     /// Whether it accepts shared memory. `None` if it announces nothing; its participant's value
     /// then applies.
     pub shared_memory: Option<bool>,
+    /// Whether it receives by TCP and not by UDP. `None` as above.
+    pub tcp: Option<bool>,
     /// Whether it supports data sharing with endpoints on its host.
     pub data_sharing: bool,
     /// Whether its topic is watched by exact name.
@@ -166,6 +174,8 @@ impl ParticipantProxy {
                 .default_unicast
                 .iter()
                 .any(Locator::is_shared_memory),
+            tcp: Locator::are_tcp(&announcement.default_unicast),
+            announces_by_tcp: Locator::are_tcp(&announcement.metatraffic_unicast),
         }
     }
 }
@@ -184,6 +194,12 @@ impl Addresses {
 }
 
 impl Participant {
+    /// Returns whether it announces its endpoints by TCP, and no message of it came by TCP.
+    #[must_use]
+    pub const fn announces_unseen(&self) -> bool {
+        self.proxy.announces_by_tcp && !self.came_by_tcp
+    }
+
     /// Records a packet of this participant.
     pub(super) fn seen(&mut self, at: ModelTime) {
         if self.restored.is_some_and(|restored| at > restored) {

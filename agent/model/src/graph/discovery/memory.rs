@@ -53,6 +53,10 @@ pub struct Remembered {
     secured: bool,
     #[serde(default)]
     shared_memory: bool,
+    #[serde(default)]
+    tcp: bool,
+    #[serde(default)]
+    announces_by_tcp: bool,
     addresses: Addresses,
     nodes: Vec<RememberedNode>,
     /// Writer and number of the sample that announced the nodes.
@@ -91,6 +95,8 @@ struct RememberedEndpoint {
     matching: Matching,
     #[serde(default)]
     shared_memory: Option<bool>,
+    #[serde(default)]
+    tcp: Option<bool>,
     #[serde(default)]
     data_sharing: bool,
 }
@@ -194,6 +200,8 @@ impl Remembered {
             lease: nanoseconds(proxy.lease),
             secured: proxy.secured,
             shared_memory: proxy.shared_memory,
+            tcp: proxy.tcp,
+            announces_by_tcp: proxy.announces_by_tcp,
             addresses: participant.addresses.clone(),
             nodes: participant.nodes.iter().map(RememberedNode::of).collect(),
             nodes_from: participant
@@ -223,6 +231,8 @@ impl Remembered {
                 lease: duration(self.lease),
                 secured: self.secured,
                 shared_memory: self.shared_memory,
+                tcp: self.tcp,
+                announces_by_tcp: self.announces_by_tcp,
             },
             addresses: self.addresses.clone(),
             restored: Some(now),
@@ -233,6 +243,7 @@ impl Remembered {
             nodes: self.nodes.iter().filter_map(RememberedNode::node).collect(),
             watched: 0,
             local: false,
+            came_by_tcp: false,
             sends: false,
             domain_source: self.domain_source,
             nodes_from: nodes_from.and_then(|(writer, number)| {
@@ -290,6 +301,7 @@ impl RememberedEndpoint {
             partitions: qos.partitions.iter().map(ToString::to_string).collect(),
             matching: Matching::of(qos),
             shared_memory: endpoint.shared_memory,
+            tcp: endpoint.tcp,
             data_sharing: endpoint.data_sharing,
         }
     }
@@ -350,6 +362,7 @@ impl RememberedEndpoint {
             }),
             first_seen: now,
             shared_memory: self.shared_memory,
+            tcp: self.tcp,
             data_sharing: self.data_sharing,
             watched: false,
         };
@@ -464,6 +477,7 @@ mod tests {
             qos: Arc::new(qos.clone()),
             first_seen: ModelTime::from_nanoseconds(1),
             shared_memory: None,
+            tcp: None,
             data_sharing: false,
             watched: false,
         };

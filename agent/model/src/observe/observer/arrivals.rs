@@ -111,7 +111,7 @@ fn arrived(
     participant: GuidPrefix,
     now: ModelTime,
 ) -> Option<(Option<ModelTime>, u64)> {
-    if !matches!(transport, Transport::Network | Transport::SharedMemory) {
+    if !transport.is_network() && transport != Transport::SharedMemory {
         return None;
     }
     let is_shared = transport == Transport::SharedMemory;

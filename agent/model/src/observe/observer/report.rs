@@ -76,6 +76,8 @@ fn participants(observer: &Observer) -> Vec<ParticipantFacts> {
                 last_seen: participant.last_seen,
                 lease: proxy.lease,
                 secured: proxy.secured,
+                announces_by_tcp: proxy.announces_by_tcp,
+                announces_unseen: participant.announces_unseen(),
                 restored: participant.restored.is_some(),
                 addresses: participant.addresses.clone(),
             }

@@ -143,7 +143,7 @@ impl Figures<'_> {
         let lost = known.and_then(|known| self.lost.get(&known));
         mark(Flag::Loss, lost.is_some_and(|lost| *lost > 0));
         let is_unseen = |passage| match passage {
-            Transport::Network => false,
+            Transport::Network | Transport::Tcp => false,
             Transport::SharedMemory => !self.sees_memory,
             Transport::DataSharing | Transport::SameProcess | Transport::Iceoryx => true,
         };
