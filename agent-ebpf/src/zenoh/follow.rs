@@ -86,7 +86,13 @@ extern "C" fn take(skb: *mut __sk_buff, slot: u32) -> u32 {
         this.len -= behind;
     } else if this.state.mode == mode::FOLLOWED && behind != 0 {
         let ahead = this.state.boundary.wrapping_sub(this.sequence_number);
-        if this.state.body == body::WHOLE || this.state.prefix != 0 || (ahead as i32) < 0 {
+        let needs_next = this.state.body == body::WHOLE
+            || this.state.prefix != 0
+            || this.state.body == body::HEAD && this.state.length != 0;
+        if needs_next || (ahead as i32) < 0 {
+            if this.state.body == body::HEAD {
+                cover(skb, slot);
+            }
             this.state.hole = this.state.next;
             this.state.hole_len = 0_u32.wrapping_sub(behind);
             lose(slot, this);
@@ -95,16 +101,24 @@ extern "C" fn take(skb: *mut __sk_buff, slot: u32) -> u32 {
         this.state.hole_len = this.sequence_number.wrapping_sub(this.state.hole);
     }
     let end = this.sequence_number.wrapping_add(this.len);
+    let is_rtps = this.state.protocol == protocol::RTPS;
     if this.state.mode == mode::GAP
-        && this.state.protocol == protocol::RTPS
+        && is_rtps
+        && this.state.body != body::SKIPPED
+        && behind as i32 <= 0
         && rtps::begins(skb, this.body, this.len)
     {
         this.state.mode = mode::FOLLOWED;
         this.state.boundary = this.sequence_number;
         this.state.prefix = 0;
+        this.state.length = 0;
     }
     if this.state.mode == mode::GAP {
-        chunk::whole(skb, slot, 0, this.len, 0);
+        if is_rtps && this.state.body == body::SKIPPED {
+            after_skipped(skb, slot);
+        } else {
+            chunk::whole(skb, slot, 0, this.len, 0);
+        }
         this.state.gap_bytes = this.state.gap_bytes.wrapping_add(this.len);
         if end.wrapping_sub(this.state.next) as i32 > 0 {
             this.state.next = end;
@@ -141,6 +155,42 @@ extern "C" fn take(skb: *mut __sk_buff, slot: u32) -> u32 {
     0
 }
 
+/// Passes on the bytes that were seen of a batch of which only the head is needed, without a copy.
+#[inline(always)]
+fn cover(skb: *mut __sk_buff, slot: u32) {
+    let Some(mut this) = current(slot) else {
+        return;
+    };
+    let covered = this.state.covered;
+    let seen = this.state.next.wrapping_sub(covered);
+    if seen as i32 > 0 {
+        let offset = covered.wrapping_sub(this.sequence_number);
+        chunk::head(skb, slot, offset, u64::from(seen), 0);
+        this.state.covered = this.state.next;
+    }
+}
+
+/// Passes on a segment after a hole that began in a frame of which nothing is needed. The end of
+/// that frame is known.
+#[inline(always)]
+fn after_skipped(skb: *mut __sk_buff, slot: u32) {
+    let Some(mut this) = current(slot) else {
+        return;
+    };
+    let left = this.state.boundary.wrapping_sub(this.sequence_number);
+    if (left as i32) < 0 {
+        // The end of the frame is in the hole, and the bytes up to it are still left out.
+        let pending = this.state.pending;
+        this.state.pending = 0;
+        chunk::whole(skb, slot, 0, this.len, 0);
+        this.state.pending |= pending;
+    } else if left < this.len {
+        let rest = this.len - left;
+        chunk::whole(skb, slot, left, rest, u32::from(part::BOUNDARY));
+        this.state.body = body::WHOLE;
+    }
+}
+
 /// Passes on the rest of a batch that an earlier segment began; `left` bytes of the batch remain.
 #[inline(always)]
 fn finish(skb: *mut __sk_buff, slot: u32, left: u32) {
@@ -150,6 +200,12 @@ fn finish(skb: *mut __sk_buff, slot: u32, left: u32) {
     let now = if left > this.len { this.len } else { left };
     if this.state.body == body::WHOLE {
         chunk::whole(skb, slot, 0, now, 0);
+    } else if this.state.body == body::HEAD && this.state.length != 0 {
+        // The previous segment had only a part of the head.
+        let wanted = this.state.length;
+        let copied = if wanted > now { now } else { wanted };
+        this.state.length = wanted - copied;
+        chunk::head(skb, slot, 0, u64::from(copied) << 32 | u64::from(now), 0);
     } else if this.state.body == body::HEAD && left <= this.len {
         let covered = this.state.covered;
         let rest = this.state.boundary.wrapping_sub(covered);
@@ -300,6 +356,7 @@ fn split_header(skb: *mut __sk_buff, slot: u32) -> u32 {
     }
     count(slot, Counter::TcpFrames, 1);
     this.state.prefix = 0;
+    this.state.length = 0;
     let rest = total.wrapping_sub(before);
     let now = if rest > this.len { this.len } else { rest };
     this.state.boundary = this.state.boundary.wrapping_add(total);
@@ -336,6 +393,11 @@ fn pass(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
     } else {
         let copied = if this.wanted > now { now } else { this.wanted };
         this.state.body = body::HEAD;
+        this.state.length = if this.state.protocol == protocol::RTPS && now < total {
+            this.wanted - copied
+        } else {
+            0
+        };
         let lengths = u64::from(copied) << 32 | u64::from(now);
         chunk::head(skb, slot, offset, lengths, boundary);
     }

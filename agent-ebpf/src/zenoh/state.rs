@@ -142,7 +142,8 @@ pub struct Direction {
     pub hole_len: u32,
     /// One of [`protocol`].
     pub protocol: u32,
-    /// The bytes of a frame's length that the last segment had.
+    /// Of RTPS, the bytes of a frame's length that the last segment had, if `prefix` is set. Otherwise
+    /// the number of bytes of the frame's head that it did not have.
     pub length: u32,
     pub unused: u32,
     pub guess: Guess,

@@ -192,6 +192,8 @@ impl Stream {
             let is_full = self.ahead.is_full() || self.ahead_bytes.is_exceeded();
             if is_full || self.has_waited(chunk.time) {
                 self.give_up(counters, report);
+            } else if chunk.before == Before::Skipped {
+                self.catch_up(counters, report);
             }
             return Took::Chunk;
         }

@@ -39,6 +39,8 @@ pub enum Refusal {
     Secured,
     /// The participant announces no IPv4 address for discovery.
     NoAddress,
+    /// The participant announces its endpoints by TCP.
+    ByTcp,
     /// The participant is another running `rp discover`.
     Asking,
 }
@@ -80,6 +82,9 @@ impl Target {
         if participant.guid.prefix.0.starts_with(&VENDOR.0) {
             return Err(Refusal::Asking);
         }
+        if participant.announces_by_tcp {
+            return Err(Refusal::ByTcp);
+        }
         let addresses = &participant.addresses;
         let metatraffic = reachable(&addresses.metatraffic).ok_or(Refusal::NoAddress)?;
         let default = &addresses.default;
@@ -103,6 +108,7 @@ impl Refusal {
         match self {
             Self::Secured => "uses DDS security: receives no requests",
             Self::NoAddress => "announces no IPv4 address for discovery",
+            Self::ByTcp => "announces by TCP: another participant with TCP makes it repeat that",
             Self::Asking => "is another rp discover",
         }
     }

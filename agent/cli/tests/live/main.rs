@@ -35,6 +35,7 @@ mod privilege;
 mod prometheus;
 mod rates;
 mod record;
+mod rtps_tcp;
 mod samples;
 mod shm;
 mod shm_exact;

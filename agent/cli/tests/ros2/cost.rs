@@ -11,7 +11,7 @@ use ros2probe_testing::harness::soak::median;
 use ros2probe_testing::harness::usage::Usage;
 
 use crate::host::{Host, Middleware};
-use crate::streams::{log, publish, publisher, subscription};
+use crate::zenoh::{log, publish, publisher, subscription};
 
 const SECONDS: u64 = 10;
 

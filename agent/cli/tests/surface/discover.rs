@@ -300,6 +300,8 @@ fn participants_with_dds_security_or_without_an_address_are_not_contacted() {
         last_seen: ModelTime::ZERO,
         lease: ros2probe_wire::RtpsDuration::Infinite,
         secured,
+        announces_by_tcp: false,
+        announces_unseen: false,
         restored: false,
         addresses: Addresses {
             metatraffic: metatraffic.iter().map(|it| it.parse().unwrap()).collect(),
@@ -320,6 +322,11 @@ fn participants_with_dds_security_or_without_an_address_are_not_contacted() {
     ] {
         assert_eq!(asked(false, nowhere), Err(Refusal::NoAddress));
     }
+    let by_tcp = ParticipantFacts {
+        announces_by_tcp: true,
+        ..participant(false, &[])
+    };
+    assert_eq!(Target::of(&by_tcp), Err(Refusal::ByTcp));
     let found = asked(false, &["[::1]:9", there]).unwrap();
     assert_eq!(found, (there.to_owned(), "127.0.0.1:7411".to_owned()));
     let mut asking = participant(false, &[there]);

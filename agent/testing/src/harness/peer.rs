@@ -1,6 +1,7 @@
 //! Real DDS participants and Zenoh sessions: one command line for four stacks (see
 //! `agent/cli/tests/peers/peer.hpp`).
 
+use std::net::SocketAddrV4;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
@@ -53,6 +54,8 @@ pub struct Stream {
     pub receive_buffer: u32,
     /// Fast DDS: whether it uses its default transports, which include shared memory.
     pub shares_memory: bool,
+    /// Fast DDS: the publisher's TCP address, at which it listens. Both peers use no other transport.
+    pub tcp: Option<SocketAddrV4>,
     /// Fast DDS: whether readers read the history of writers on their host.
     pub shares_history: bool,
 }
@@ -116,6 +119,7 @@ impl Stream {
             peers: 1,
             receive_buffer: 4 << 20,
             shares_memory: false,
+            tcp: None,
             shares_history: false,
         }
     }
@@ -224,6 +228,13 @@ impl Peer {
         option("--domain", stream.domain.to_string());
         option("--peers", stream.peers.to_string());
         option("--receive-buffer", stream.receive_buffer.to_string());
+        if let Some(address) = stream.tcp {
+            let name = match role {
+                Role::Publisher => "--tcp-listen",
+                Role::Subscriber => "--tcp-peer",
+            };
+            option(name, address.to_string());
+        }
         if stream.logged {
             option("--log", directory.path().join("log").display().to_string());
         }

@@ -15,8 +15,8 @@ use serde_json::Value;
 
 use super::clients::{Asker, Clients, Doors, answer};
 use super::memory::{Breathing, NOBODY};
-use super::streams_storm::ZenohStorm;
 use super::unit::{Allowance, Confined, mebibytes};
+use super::zenoh_storm::ZenohStorm;
 use super::{Scene, ask};
 use ros2probe_testing::forged::storm::{Storm, forgery};
 use ros2probe_testing::harness::agent::{ON_THE_WIRE, Scrape, at_the_sockets_of};

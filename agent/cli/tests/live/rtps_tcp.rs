@@ -1,0 +1,241 @@
+//! Fast DDS participants that use only TCP. Needs root.
+
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::loss::Loss;
+use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::run;
+use tempfile::TempDir;
+
+const PATIENCE: Duration = Duration::from_secs(60);
+/// A port that nothing else uses in the namespaces of a test.
+const PORT: u16 = 5100;
+
+/// An agent that watches everything.
+struct Observer<'a> {
+    agent: Agent<'a>,
+    _directory: TempDir,
+}
+
+impl<'a> Observer<'a> {
+    fn start(host: &'a Namespace, configuration: &str) -> Result<Self> {
+        let directory = tempfile::tempdir()?;
+        let file = directory.path().join("ros2probe.yaml");
+        std::fs::write(&file, format!("watch: [/**]\n{configuration}"))?;
+        let agent = Agent::start(host, env!("CARGO_BIN_EXE_rp"), &file)?;
+        Ok(Self {
+            agent,
+            _directory: directory,
+        })
+    }
+}
+
+/// Small messages at 200 Hz, and point clouds in several frames each.
+fn streams(address: Ipv4Addr) -> [Stream; 3] {
+    let tcp = Some(SocketAddrV4::new(address, PORT));
+    let reliable = Stream {
+        reliable: true,
+        ..Stream::point_cloud(700_000, 40)
+    };
+    [
+        Stream::small(400),
+        Stream::point_cloud(700_000, 40),
+        reliable,
+    ]
+    .map(|stream| Stream { tcp, ..stream })
+}
+
+/// Starts a publisher, then a subscriber that connects to it, and waits until they are matched.
+fn pair(from: &Namespace, to: &Namespace, stream: &Stream) -> Result<(Peer, Peer)> {
+    let mut publisher = Peer::start(from, Stack::Fast, Role::Publisher, stream, &["/sensor"])?;
+    let mut subscriber = Peer::start(to, Stack::Fast, Role::Subscriber, stream, &["/listener"])?;
+    publisher.wait_matched()?;
+    subscriber.wait_matched()?;
+    Ok((publisher, subscriber))
+}
+
+/// Returns the numbers of messages that both logs have.
+fn logged(publisher: &Peer, subscriber: &Peer) -> Result<(u64, u64)> {
+    let sent = publisher.log()?.sequences("pub").len() as u64;
+    let received = subscriber.log()?.sequences("sub").len() as u64;
+    Ok((sent, received))
+}
+
+fn count(page: &Scrape, what: &str, topic: &str) -> u64 {
+    let name = format!("ros2_topic_{what}_total");
+    page.sum(&name, &[("topic", topic)]) as u64
+}
+
+fn knows(page: &Scrape, topic: &str) -> bool {
+    page.value("ros2_topic_subscriptions", &[("topic", topic)]) == Some(1.0)
+        && page.value("ros2_topic_publishers", &[("topic", topic)]) == Some(1.0)
+}
+
+fn nothing_was_dropped(page: &Scrape) -> Result<()> {
+    for event in ["rtps_tcp_gaps", "rtps_tcp_chunks_lost"] {
+        let dropped = page.sum("ros2probe_filter_events_total", &[("event", event)]);
+        ensure!(dropped == 0.0, "{event}: {dropped}");
+    }
+    let errors = page.sum("ros2probe_decode_errors_total", &[]);
+    ensure!(errors == 0.0, "{errors} decode errors");
+    Ok(())
+}
+
+#[test]
+fn counts_and_deliveries_on_one_host_equal_the_logs() -> Result<()> {
+    for stream in streams(Ipv4Addr::LOCALHOST) {
+        let host = Namespace::alone()?;
+        let observer = Observer::start(&host, &at_the_sockets_of(&host))?;
+        let (mut publisher, mut subscriber) = pair(&host, &host, &stream)?;
+        let agent = &observer.agent;
+        let page = agent.scrape_until("both endpoints", |page| knows(page, &stream.topic))?;
+        let by_tcp = [("topic", stream.topic.as_str()), ("passage", "tcp")];
+        assert_eq!(page.value("ros2_topic_pairs", &by_tcp), Some(1.0));
+        publisher.go()?;
+        publisher.wait_sent(PATIENCE)?;
+        let page = agent.settled_scrape(&stream.topic, stream.count)?;
+        subscriber.process.terminate()?;
+        let (sent, received) = logged(&publisher, &subscriber)?;
+        assert_eq!((sent, received), (stream.count, stream.count));
+        let topic = &stream.topic;
+        let counted = ["messages", "delivered_messages", "lost_messages"];
+        let counted = counted.map(|what| count(&page, what, topic));
+        assert_eq!(counted, [sent, received, 0], "{} B", stream.size);
+        assert_eq!(count(&page, "bytes", topic), sent * stream.size as u64);
+        nothing_was_dropped(&page)?;
+    }
+    Ok(())
+}
+
+#[test]
+fn counts_on_two_hosts_equal_the_logs_at_either_end() -> Result<()> {
+    let link = Link::new()?;
+    for stream in streams(link.robot.address()) {
+        let robot = Observer::start(&link.robot, &at_the_sockets_of(&link.robot))?;
+        let monitor = Observer::start(&link.monitor, &at_the_sockets_of(&link.monitor))?;
+        let (mut publisher, mut subscriber) = pair(&link.robot, &link.monitor, &stream)?;
+        for observer in [&robot, &monitor] {
+            let agent = &observer.agent;
+            agent.scrape_until("both endpoints", |page| knows(page, &stream.topic))?;
+        }
+        publisher.go()?;
+        publisher.wait_sent(PATIENCE)?;
+        let pages = [&robot, &monitor].map(|observer| {
+            let agent = &observer.agent;
+            agent.settled_scrape(&stream.topic, stream.count)
+        });
+        subscriber.process.terminate()?;
+        let (sent, received) = logged(&publisher, &subscriber)?;
+        assert_eq!((sent, received), (stream.count, stream.count));
+        for (page, delivered) in pages.into_iter().zip([0, received]) {
+            let page = page?;
+            let counted = ["messages", "delivered_messages", "lost_messages"];
+            let counted = counted.map(|what| count(&page, what, &stream.topic));
+            nothing_was_dropped(&page)?;
+            let expected = [sent, delivered, 0];
+            assert_eq!(counted, expected, "{} B: {}", stream.size, page.0);
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn segments_that_tcp_sends_again_cost_no_message() -> Result<()> {
+    // Packets of up to 64 KB, and packets of one segment.
+    for most_segments in [64, 1] {
+        let link = Link::new()?;
+        let inside = link.robot.inside().join(" ");
+        run(&format!(
+            "{inside} ip link set {INTERFACE} gso_max_segs {most_segments}"
+        ))?;
+        let [small, _, large] = streams(link.robot.address());
+        for stream in [small, large] {
+            let monitor = Observer::start(&link.monitor, &at_the_sockets_of(&link.monitor))?;
+            let (mut publisher, mut subscriber) = pair(&link.robot, &link.monitor, &stream)?;
+            let agent = &monitor.agent;
+            agent.scrape_until("both endpoints", |page| knows(page, &stream.topic))?;
+            let packets = format!("ip daddr {} tcp sport {PORT}", link.monitor.address());
+            let loss = Loss::of(&link.robot, &packets, 20)?;
+            publisher.go()?;
+            publisher.wait_sent(PATIENCE)?;
+            let page = agent.settled_scrape(&stream.topic, stream.count)?;
+            let dropped = loss.counts()?.dropped;
+            drop(loss);
+            subscriber.process.terminate()?;
+            let (sent, received) = logged(&publisher, &subscriber)?;
+            let counted = ["messages", "delivered_messages", "lost_messages"];
+            let counted = counted.map(|what| count(&page, what, &stream.topic));
+            let expected = [sent, received, 0];
+            assert_eq!(counted, expected, "{} B: {}", stream.size, page.0);
+            ensure!(dropped > 0, "nothing was dropped");
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn counts_on_an_interface_equal_the_logs() -> Result<()> {
+    let link = Link::new()?;
+    let [small, ..] = streams(link.robot.address());
+    let observer = Observer::start(&link.robot, "capture: {source: wire}")?;
+    let (mut publisher, mut subscriber) = pair(&link.robot, &link.monitor, &small)?;
+    let agent = &observer.agent;
+    agent.scrape_until("both endpoints", |page| knows(page, &small.topic))?;
+    publisher.go()?;
+    publisher.wait_sent(PATIENCE)?;
+    let page = agent.settled_scrape(&small.topic, small.count)?;
+    subscriber.process.terminate()?;
+    let (sent, _) = logged(&publisher, &subscriber)?;
+    let counted = ["messages", "lost_messages"].map(|what| count(&page, what, &small.topic));
+    assert_eq!(counted, [sent, 0]);
+    Ok(())
+}
+
+#[test]
+fn an_agent_that_comes_second_learns_the_topics_when_another_participant_joins() -> Result<()> {
+    let host = Namespace::alone()?;
+    let [small, ..] = streams(Ipv4Addr::LOCALHOST);
+    let stream = Stream {
+        count: 100_000,
+        ..small
+    };
+    let (mut publisher, _subscriber) = pair(&host, &host, &stream)?;
+    publisher.go()?;
+    let socket = tempfile::tempdir()?;
+    let socket = socket.path().join("api.sock");
+    let api = format!("api: {{socket: {}}}\n", socket.display());
+    let configuration = format!("{api}{}", at_the_sockets_of(&host));
+    let observer = Observer::start(&host, &configuration)?;
+    let agent = &observer.agent;
+    agent.scrape_until("both participants and a writer", |page| {
+        page.sum("ros2_participants", &[]) == 2.0 && page.sum("ros2_unknown_writers", &[]) == 1.0
+    })?;
+    let doctor = crate::rp()
+        .args(["doctor", "--socket"])
+        .arg(&socket)
+        .output()?;
+    let doctor = String::from_utf8_lossy(&doctor.stdout).into_owned();
+    ensure!(!doctor.contains("rp discover"), "{doctor}");
+    ensure!(doctor.contains("ros2 node list --no-daemon"), "{doctor}");
+    let newcomer = Stream {
+        topic: "/other".to_owned(),
+        ..stream.clone()
+    };
+    let _newcomer = Peer::start(&host, Stack::Fast, Role::Subscriber, &newcomer, &["/late"])?;
+    let publishers = [("topic", stream.topic.as_str())];
+    let page = agent
+        .scrape_until("the topic", |page| {
+            page.value("ros2_topic_publishers", &publishers) == Some(1.0)
+        })
+        .context("announced to the newcomer")?;
+    assert_eq!(page.sum("ros2_unknown_writers", &[]), 0.0, "{}", page.0);
+    let before = count(&page, "messages", &stream.topic);
+    agent.scrape_until("messages of the topic", |page| {
+        count(page, "messages", &stream.topic) > before + 100
+    })?;
+    Ok(())
+}
