@@ -93,8 +93,12 @@ extern "C" fn take(skb: *mut __sk_buff, slot: u32) -> u32 {
             if this.state.body == body::HEAD {
                 cover(skb, slot);
             }
-            this.state.hole = this.state.next;
-            this.state.hole_len = 0_u32.wrapping_sub(behind);
+            let since = this.state.next.wrapping_sub(this.state.hole);
+            if this.state.hole_len == 0 || since > GAP_BYTES {
+                this.state.hole = this.state.next;
+            }
+            // An earlier hole may still be open: what fills it is needed, too.
+            this.state.hole_len = this.sequence_number.wrapping_sub(this.state.hole);
             lose(slot, this);
         }
     } else if this.state.mode == mode::GAP && (behind as i32) < 0 {

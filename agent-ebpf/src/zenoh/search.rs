@@ -152,6 +152,7 @@ extern "C" fn begin(slot: u32, pending: u32) -> u32 {
     this.state.prefix = 0;
     this.state.pending = pending;
     this.state.gap_bytes = 0;
+    this.state.hole_len = 0;
     this.state.protocol = protocol::ZENOH;
     this.state.length = 0;
     this.state.unused = 0;

@@ -3,7 +3,7 @@
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::time::Duration;
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Context as _, Result, bail, ensure};
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
@@ -50,12 +50,22 @@ fn streams(address: Ipv4Addr) -> [Stream; 3] {
 }
 
 /// Starts a publisher, then a subscriber that connects to it, and waits until they are matched.
+/// Fast DDS 2.9 sometimes never matches them over TCP, with or without an agent: then both start
+/// again.
 fn pair(from: &Namespace, to: &Namespace, stream: &Stream) -> Result<(Peer, Peer)> {
-    let mut publisher = Peer::start(from, Stack::Fast, Role::Publisher, stream, &["/sensor"])?;
-    let mut subscriber = Peer::start(to, Stack::Fast, Role::Subscriber, stream, &["/listener"])?;
-    publisher.wait_matched()?;
-    subscriber.wait_matched()?;
-    Ok((publisher, subscriber))
+    for _ in 0..2 {
+        let mut publisher = Peer::start(from, Stack::Fast, Role::Publisher, stream, &["/sensor"])?;
+        let mut subscriber =
+            Peer::start(to, Stack::Fast, Role::Subscriber, stream, &["/listener"])?;
+        if publisher
+            .wait_matched()
+            .and_then(|()| subscriber.wait_matched())
+            .is_ok()
+        {
+            return Ok((publisher, subscriber));
+        }
+    }
+    bail!("two Fast DDS participants do not match over TCP")
 }
 
 /// Returns the numbers of messages that both logs have.
@@ -76,10 +86,9 @@ fn knows(page: &Scrape, topic: &str) -> bool {
 }
 
 fn nothing_was_dropped(page: &Scrape) -> Result<()> {
-    for event in ["rtps_tcp_gaps", "rtps_tcp_chunks_lost"] {
-        let dropped = page.sum("ros2probe_filter_events_total", &[("event", event)]);
-        ensure!(dropped == 0.0, "{event}: {dropped}");
-    }
+    let lost = [("event", "rtps_tcp_chunks_lost")];
+    let lost = page.sum("ros2probe_filter_events_total", &lost);
+    ensure!(lost == 0.0, "{lost} chunks");
     let errors = page.sum("ros2probe_decode_errors_total", &[]);
     ensure!(errors == 0.0, "{errors} decode errors");
     Ok(())
@@ -145,6 +154,7 @@ fn counts_on_two_hosts_equal_the_logs_at_either_end() -> Result<()> {
 
 #[test]
 fn segments_that_tcp_sends_again_cost_no_message() -> Result<()> {
+    let mut all_dropped = 0;
     // Packets of up to 64 KB, and packets of one segment.
     for most_segments in [64, 1] {
         let link = Link::new()?;
@@ -159,11 +169,11 @@ fn segments_that_tcp_sends_again_cost_no_message() -> Result<()> {
             let agent = &monitor.agent;
             agent.scrape_until("both endpoints", |page| knows(page, &stream.topic))?;
             let packets = format!("ip daddr {} tcp sport {PORT}", link.monitor.address());
-            let loss = Loss::of(&link.robot, &packets, 20)?;
+            let loss = Loss::of(&link.robot, &packets, 30)?;
             publisher.go()?;
             publisher.wait_sent(PATIENCE)?;
             let page = agent.settled_scrape(&stream.topic, stream.count)?;
-            let dropped = loss.counts()?.dropped;
+            all_dropped += loss.counts()?.dropped;
             drop(loss);
             subscriber.process.terminate()?;
             let (sent, received) = logged(&publisher, &subscriber)?;
@@ -171,9 +181,9 @@ fn segments_that_tcp_sends_again_cost_no_message() -> Result<()> {
             let counted = counted.map(|what| count(&page, what, &stream.topic));
             let expected = [sent, received, 0];
             assert_eq!(counted, expected, "{} B: {}", stream.size, page.0);
-            ensure!(dropped > 0, "nothing was dropped");
         }
     }
+    ensure!(all_dropped > 0, "nothing was dropped");
     Ok(())
 }
 
