@@ -139,7 +139,9 @@ extern "C" fn take(skb: *mut __sk_buff, slot: u32) -> u32 {
         return 0;
     }
     let left = this.state.boundary.wrapping_sub(this.sequence_number);
-    if this.state.prefix == 0 && left != 0 {
+    // The end of a batch of which only the head is needed may be missing before the segment.
+    let is_open = this.state.body == body::HEAD && this.state.covered != this.state.boundary;
+    if this.state.prefix == 0 && (left != 0 || is_open) {
         finish(skb, slot, left);
     }
     this.state.next = end;
