@@ -201,7 +201,7 @@ impl FilterReader {
                     let seen = (chunk.time, chunk.stream);
                     self.streams
                         .datagram(seen, bytes, chunk.length, |streamed| {
-                            streamed.pass(observer)
+                            streamed.pass(observer);
                         });
                     continue;
                 }

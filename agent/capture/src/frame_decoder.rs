@@ -86,7 +86,7 @@ impl FrameDecoder {
                 let is_quic =
                     self.streams
                         .datagram((captured.time, stream), bytes, length, |streamed| {
-                            streamed.pass(observer)
+                            streamed.pass(observer);
                         });
                 if is_quic {
                     return;

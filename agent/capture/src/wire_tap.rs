@@ -502,7 +502,7 @@ impl FrameAssembly {
                 let is_quic =
                     self.streams
                         .datagram((time, stream), udp.payload, udp.length, |streamed| {
-                            streamed.pass(observer)
+                            streamed.pass(observer);
                         });
                 if is_quic {
                     return Ok(());

@@ -158,7 +158,7 @@ mod tests {
             announces_by_tcp,
             ..Participant::default()
         };
-        let remedy = |by_tcp| remedy_for(&[writer.clone()], &[participant(by_tcp)]);
+        let remedy = |by_tcp| remedy_for(std::slice::from_ref(&writer), &[participant(by_tcp)]);
         assert_eq!(remedy(true), Some(ANNOUNCE_BY_TCP));
         assert_eq!(remedy(false), Some(DISCOVER));
         let both = [Announces::Tcp, Announces::Udp];

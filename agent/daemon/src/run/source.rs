@@ -21,7 +21,7 @@ use ros2probe_capture::host_tap::HostTap;
 use ros2probe_capture::live::{CaptureError, LiveSource, Part};
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::shm;
-use ros2probe_capture::streams::Streams;
+use ros2probe_capture::streams::{Counters, Streams};
 use ros2probe_capture::tables::{ZenohStreamBytes, ZenohStreams};
 use ros2probe_model::facts::bounded::Declared as _;
 use ros2probe_model::observe::observer::Observer;
@@ -294,14 +294,27 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
     }
 }
 
-/// Returns the number of batches and gaps that were read in connections of Zenoh.
-fn streams(live: &LiveSource) -> [(&'static str, u64); 2] {
-    let (mut batches, mut gaps) = (0, 0);
+/// Returns the number of batches, frames and gaps that were read in connections of Zenoh and RTPS.
+fn streams(live: &LiveSource) -> [(&'static str, u64); 4] {
+    let mut events = [
+        ("zenoh_read_batches", 0),
+        ("zenoh_read_gaps", 0),
+        ("rtps_tcp_read_frames", 0),
+        ("rtps_tcp_read_gaps", 0),
+    ];
     for counters in live.streams().map(Streams::counters) {
-        batches += counters.batches;
-        gaps += counters.gaps;
+        let Counters {
+            batches,
+            gaps,
+            frames,
+            frame_gaps,
+            ..
+        } = counters;
+        for ((_, sum), count) in events.iter_mut().zip([batches, gaps, frames, frame_gaps]) {
+            *sum += count;
+        }
     }
-    [("zenoh_read_batches", batches), ("zenoh_read_gaps", gaps)]
+    events
 }
 
 /// Returns the state of the source inside processes; `None` if it is off.
