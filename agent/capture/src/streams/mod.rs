@@ -232,7 +232,7 @@ impl Streams {
         let is_zenoh = |stream: &Stream| stream.protocol() == Some(Protocol::Zenoh);
         let was_zenoh = is_zenoh(stream);
         let (counters, flows) = (&mut self.counters, &mut self.flows);
-        let mut pass = |event: Event<'_>| tell(flows, &id, chunk.time, &event, &mut report);
+        let mut pass = |event: Event<'_>| pass_on(flows, &id, chunk.time, &event, &mut report);
         let took = stream.take(chunk, counters, &mut pass);
         while chunk.end && stream.waits() {
             stream.give_up(counters, &mut pass);
@@ -301,7 +301,7 @@ impl Streams {
             }
             let before = stream.held();
             stream.give_up(counters, &mut |event| {
-                tell(flows, id, now, &event, &mut report);
+                pass_on(flows, id, now, &event, &mut report);
             });
             self.bytes.sub(before);
             self.bytes.add(stream.held());
@@ -379,7 +379,7 @@ impl Streams {
 
 /// Reports an event of a direction. A message of RTPS also shows which participant sends in the
 /// direction, and thus who receives in the opposite one.
-fn tell(
+fn pass_on(
     flows: &mut HashMap<Flow, Streaming>,
     id: &StreamId,
     time: Timestamp,

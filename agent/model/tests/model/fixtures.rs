@@ -510,7 +510,7 @@ fn witnessed_removals(name: &str, scenario: &Scenario, replayed: &Replayed) {
             removals += 1;
         }
     }
-    // Nobody leaves there.
+    // No participant leaves during that capture.
     let none_leaves = name.contains("manual-xml");
     assert!(none_leaves || removals >= 3, "{name}: {removals}");
 }
