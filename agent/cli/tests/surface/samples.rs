@@ -101,7 +101,7 @@ pub(crate) fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<S
 }
 
 /// Returns the numbers of samples and bytes by topic. Each sample must be unique, and the times
-/// must not decrease.
+/// must not decrease, except by some nanoseconds.
 fn counts(news: &[SampleOutcome], depth: Depth) -> BTreeMap<(DomainId, String), (u64, u64)> {
     let mut counts: BTreeMap<_, (u64, u64)> = BTreeMap::new();
     let mut seen = BTreeSet::new();
@@ -111,7 +111,8 @@ fn counts(news: &[SampleOutcome], depth: Depth) -> BTreeMap<(DomainId, String), 
             continue;
         };
         assert!(seen.insert((sample.writer, sample.sequence_number)));
-        assert!(sample.time.0 >= last);
+        // Samples of one writer that arrive at the same time are a nanosecond apart.
+        assert!(sample.time.0 + 64 >= last, "{last} {sample:?}");
         last = sample.time.0;
         let len = sample.payload.as_ref().map(Bytes::len);
         let expected = (depth == Depth::Payloads).then_some(sample.size as usize);
