@@ -76,6 +76,25 @@ END
         [ "$lost" -ge 75 ] && [ "$causes" = "before_host $lost" ]
 }
 
+# Fast DDS with TCP only, on one host. The publisher listens first.
+by_tcp() {
+    rm -f pub.jsonl sub.jsonl
+    timeout 60 ./fastdds --role pub --topic /tcp --size 100000 --rate 10 --count 60 --reliable --linger 5 \
+        --tcp-listen 127.0.0.1:5100 --log pub.jsonl >pub.log 2>&1 &
+    publisher=$!
+    sleep 2
+    ./fastdds --role sub --topic /tcp --size 100000 --reliable --tcp-peer 127.0.0.1:5100 --log sub.jsonl >sub.log 2>&1 &
+    subscriber=$!
+    wait $publisher
+    kill -INT $subscriber
+    wait $subscriber
+    published=$(grep -c '"ev":"pub"' pub.jsonl) received=$(grep -c '"ev":"sub"' sub.jsonl)
+    messages=$(sum ros2_topic_messages_total 'topic="/tcp"')
+    delivered=$(sum ros2_topic_delivered_messages_total 'topic="/tcp"')
+    figure="sent $published, counted $messages; received $received, delivered $delivered"
+    [ "$published" = 60 ] && [ "$messages" = 60 ] && [ "$received" = 60 ] && [ "$delivered" = 60 ]
+}
+
 # How many messages the recorder's report names as missing.
 named_as_missing() {
     sed -n 's/^.*: \([0-9]*\) of \([0-9]*\) messages recorded.*/\2 \1/p' record.log |
@@ -384,6 +403,7 @@ if [ "$source" = host ]; then
     check "Fast DDS, UDP" at_sockets ./fastdds fast 320 100 1000 --reliable --transport udp
     check "Cyclone DDS" at_sockets ./cyclonedds cyclone 320 100 1000 --reliable
     check "nothing missed at the sockets" complete
+    check "Fast DDS, TCP" by_tcp
     check "Fast DDS, shared memory, recorded" recorded exact 150000 10 100 --reliable
     check "Fast DDS, shared memory, 2.7 MB, recorded" recorded large_exact 2700000 5 50 --reliable
     check "Fast DDS by default, six topics, recorded" six_topics 1
