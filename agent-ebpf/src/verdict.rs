@@ -318,6 +318,30 @@ fn unknown(slot: u32, scratch: &mut Scratch, key: [u32; 4]) -> u32 {
     progress::ON
 }
 
+/// Charges bytes of an unclassified writer to its own budget and to the common one; returns whether
+/// any was left of both.
+#[inline(always)]
+pub fn charge_unknown(writer: &[u32; 4], len: u32) -> bool {
+    // SAFETY: as in `unknown`.
+    let used = match unsafe { UNKNOWN.get(writer) } {
+        Some(used) => used,
+        None => {
+            let _ = UNKNOWN.insert(writer, Shared::new(0), 0);
+            // SAFETY: as above.
+            match unsafe { UNKNOWN.get(writer) } {
+                Some(used) => used,
+                None => return false,
+            }
+        }
+    };
+    let so_far = used.get();
+    if so_far >= UNKNOWN_CAPTURE_BYTES || !charge(len) {
+        return false;
+    }
+    used.set(so_far + len);
+    true
+}
+
 /// Charges bytes of unclassified traffic to the capture budget; returns whether any budget was
 /// left.
 #[inline(always)]

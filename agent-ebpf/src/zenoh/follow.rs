@@ -77,7 +77,7 @@ extern "C" fn take(skb: *mut __sk_buff, slot: u32) -> u32 {
         if behind >= this.len {
             let into = this.sequence_number.wrapping_sub(this.state.hole);
             if into < this.state.hole_len {
-                chunk::whole(skb, slot, 0, this.len, 0);
+                fill(skb, slot);
             }
             return 0;
         }
@@ -114,12 +114,15 @@ extern "C" fn take(skb: *mut __sk_buff, slot: u32) -> u32 {
     {
         this.state.mode = mode::FOLLOWED;
         this.state.boundary = this.sequence_number;
+        this.state.covered = this.sequence_number;
         this.state.prefix = 0;
         this.state.length = 0;
     }
     if this.state.mode == mode::GAP {
         if is_rtps && this.state.body == body::SKIPPED {
             after_skipped(skb, slot);
+        } else if behind as i32 > 0 {
+            fill(skb, slot);
         } else {
             chunk::whole(skb, slot, 0, this.len, 0);
         }
@@ -155,6 +158,7 @@ extern "C" fn take(skb: *mut __sk_buff, slot: u32) -> u32 {
     let offset = this.state.boundary.wrapping_sub(this.sequence_number);
     if offset < this.len {
         lose(slot, this);
+        this.state.body = body::WHOLE;
         let rest = this.len - offset;
         chunk::whole(skb, slot, offset, rest, u32::from(part::BOUNDARY));
     }
@@ -174,6 +178,18 @@ fn cover(skb: *mut __sk_buff, slot: u32) {
         chunk::head(skb, slot, offset, u64::from(seen), 0);
         this.state.covered = this.state.next;
     }
+}
+
+/// Passes on a segment that fills a hole. The flags are for later bytes.
+#[inline(always)]
+fn fill(skb: *mut __sk_buff, slot: u32) {
+    let Some(mut this) = current(slot) else {
+        return;
+    };
+    let pending = this.state.pending;
+    this.state.pending = 0;
+    chunk::whole(skb, slot, 0, this.len, 0);
+    this.state.pending |= pending;
 }
 
 /// Passes on a segment after a hole that began in a frame of which nothing is needed. The end of
@@ -321,6 +337,8 @@ fn cut_header(skb: *mut __sk_buff, slot: u32, offset: u32, left: u32) -> u32 {
     };
     this.state.length = length_bytes(window, 0, left);
     this.state.prefix = left;
+    this.state.body = body::WHOLE;
+    this.state.covered = this.sequence_number.wrapping_add(this.len);
     let lengths = u64::from(left) << 32 | u64::from(left);
     chunk::head(skb, slot, offset, lengths, u32::from(part::BOUNDARY));
     0
@@ -382,7 +400,12 @@ fn pass(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
     let left = this.len.wrapping_sub(offset);
     let now = if total > left { left } else { total };
     this.state.boundary = this.state.boundary.wrapping_add(total);
-    if this.wanted == 0 && this.now.wrapping_sub(this.state.reported) > ALIVE_NANOSECONDS {
+    // While a hole may be open, each frame is named, so that user space waits for the hole.
+    let is_after_hole = this.state.protocol == protocol::RTPS
+        && this.state.hole_len != 0
+        && this.state.next.wrapping_sub(this.state.hole) < GAP_BYTES;
+    let is_silent = this.now.wrapping_sub(this.state.reported) > ALIVE_NANOSECONDS;
+    if this.wanted == 0 && (is_silent || is_after_hole) {
         this.wanted = ALIVE_BYTES;
     }
     let boundary = u32::from(part::BOUNDARY);
@@ -441,8 +464,9 @@ fn split(skb: *mut __sk_buff, slot: u32) -> u32 {
 /// Passes on the rest of a segment that has no readable batch at `offset`.
 #[inline(always)]
 fn unreadable(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
-    if let Some(this) = current(slot) {
+    if let Some(mut this) = current(slot) {
         lose(slot, this);
+        this.state.body = body::WHOLE;
         let rest = this.len.wrapping_sub(offset);
         chunk::whole(skb, slot, offset, rest, 0);
     }

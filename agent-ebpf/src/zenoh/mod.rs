@@ -206,6 +206,7 @@ pub extern "C" fn quic(skb: *mut __sk_buff, slot: u32) -> u32 {
         segment.len = len;
         segment.end = 0;
         segment.state.pending = 0;
+        segment.state.protocol = state::protocol::ZENOH;
         // SAFETY: no preconditions.
         segment.now = unsafe { bpf_ktime_get_ns() };
         let lengths = (initial::HEAD as u64) << 32 | u64::from(len);

@@ -15,7 +15,7 @@ use ros2probe_wire::{
 use crate::{
     maps::{INTEREST, count},
     packet::load,
-    verdict::spend,
+    verdict::{charge_unknown, spend},
 };
 
 use super::{
@@ -135,6 +135,8 @@ fn decide(slot: u32, writer: [u32; 4]) {
         Some(CAPTURE) => this.wakes = 1,
         Some(IGNORE) => this.wanted = 0,
         Some(METER) => this.wanted = WINDOW,
+        // Its announcement may still be on its way.
+        None if !is_repeated && charge_unknown(&writer, this.total) => this.wakes = 1,
         _ => {
             this.wanted = WINDOW;
             if !spend(Budget::CaptureBytes, WINDOW) {

@@ -61,8 +61,8 @@ pub struct Participant<'a> {
     /// It announces its endpoints by TCP and not by UDP (Fast DDS with `LARGE_DATA`, or with TCP
     /// transports). `rp discover` cannot request them.
     pub announces_by_tcp: bool,
-    /// It does so, and none of its messages by TCP was seen: the connections are encrypted, or they
-    /// do not pass this host.
+    /// It does so, and none of its messages by TCP was seen: it has no peer, the connections are
+    /// encrypted, or they do not pass this host.
     pub announces_unseen: bool,
     /// Restored from saved state; no announcement has confirmed it since the agent started.
     pub restored: bool,

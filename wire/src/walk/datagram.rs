@@ -202,7 +202,11 @@ fn walk<'a>(
         walk.begin(source, datagram_len);
         walk.destination = prefix_words(envelope.receiver);
     }
-    walk.record.datagram_len = u16::try_from(datagram_len).unwrap_or(u16::MAX);
+    // TCP has no fragments of IP, for which the length matters.
+    walk.record.datagram_len = match envelope.logical_port {
+        0 => u16::try_from(datagram_len).unwrap_or(u16::MAX),
+        _ => 0,
+    };
     loop {
         let start = walk.offset;
         let step = step(&mut walk, &payload, present);

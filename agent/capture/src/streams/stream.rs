@@ -178,7 +178,10 @@ impl Stream {
             self.next = start.wrapping_add(chunk.length);
             return Took::Other;
         }
+        // Flags are about the bytes before a later byte.
+        let is_old = start.wrapping_sub(self.next) >= WINDOW;
         match chunk.before {
+            _ if is_old => {}
             Before::Lost => self.lost(start, counters, report),
             Before::Skipped if self.ahead.is_empty() => self.skip_to(start),
             Before::Skipped | Before::Unknown => {}

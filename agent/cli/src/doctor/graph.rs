@@ -103,8 +103,7 @@ fn is_alone(participant: &Participant<'_>, participants: &[Participant<'_>]) -> 
     let has_nothing = participant.writers == 0 && participant.readers == 0;
     let others = participants.iter();
     let neighbours = others.filter(|other| other.domain_id == participant.domain_id);
-    let is_silent = participant.secured || participant.announces_unseen;
-    has_nothing && !is_silent && neighbours.count() == 1
+    has_nothing && !participant.secured && neighbours.count() == 1
 }
 
 fn alone(participants: &[Participant<'_>]) -> Option<Finding> {
@@ -198,10 +197,9 @@ fn unknown_writers(answers: &Answers) -> Option<Finding> {
 /// Returns the finding for participants whose endpoints are announced by TCP connections that were
 /// not seen.
 fn announced_unseen(participants: &[Participant<'_>]) -> Option<Finding> {
-    let count = participants
-        .iter()
-        .filter(|each| each.announces_unseen)
-        .count();
+    let is_unseen =
+        |each: &&Participant<'_>| each.announces_unseen && !is_alone(each, participants);
+    let count = participants.iter().filter(is_unseen).count();
     if count == 0 {
         return None;
     }
