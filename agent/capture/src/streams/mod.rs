@@ -19,6 +19,7 @@ use std::time::Duration;
 
 use crate::tables::{ZenohOrder, ZenohStreamBytes, ZenohStreams};
 use ros2probe_model::facts::bounded::{Bounded, Counted, Sum};
+use ros2probe_model::facts::route::Destination;
 use ros2probe_model::graph::zenoh::{Flow, StreamEvent, StreamId, StreamReport, Unseen};
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Observer;
@@ -98,6 +99,8 @@ pub enum Streamed<'a> {
         /// Length of the message in bytes.
         length: u32,
     },
+    /// Bytes of a connection of RTPS to this destination are missing before this time.
+    Gap(Destination, Timestamp),
 }
 
 impl Streamed<'_> {
@@ -105,6 +108,7 @@ impl Streamed<'_> {
     pub fn pass(&self, observer: &mut Observer) {
         match *self {
             Self::Zenoh(report) => observer.input(Input::Zenoh(report)),
+            Self::Gap(destination, time) => observer.input(Input::StreamGap(destination, time)),
             Self::Message {
                 envelope,
                 bytes: payload,
@@ -392,6 +396,7 @@ fn pass_on(
             stream: id,
             event,
         })),
+        Event::Gap => report(&Streamed::Gap(id.flow.destination, time)),
         Event::Message {
             bytes,
             length,

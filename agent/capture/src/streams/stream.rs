@@ -52,6 +52,9 @@ pub enum Event<'a> {
         /// The logical port of its frame.
         logical_port: u16,
     },
+    /// Bytes of a connection of RTPS are missing. TCP delivers all bytes, so only the agent misses
+    /// them.
+    Gap,
 }
 
 /// Position of the next byte.
@@ -239,7 +242,10 @@ impl Stream {
     /// Counts missing bytes.
     fn gap(&self, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
         match self.protocol {
-            Some(Protocol::Rtps) => counters.frame_gaps += 1,
+            Some(Protocol::Rtps) => {
+                counters.frame_gaps += 1;
+                report(Event::Gap);
+            }
             Some(Protocol::Zenoh) => {
                 counters.gaps += 1;
                 report(Event::Zenoh(StreamEvent::Gap));

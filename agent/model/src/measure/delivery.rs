@@ -211,6 +211,13 @@ impl Delivery {
         self.opened = self.opened.max(at);
     }
 
+    /// Records that bytes for the receiver were not captured: samples missing before `at` are
+    /// excused, also those of which some fragments arrived.
+    pub fn interrupt(&mut self, at: ModelTime) {
+        self.open(at);
+        self.reception.interrupt();
+    }
+
     /// Sets whether all readers are best effort.
     pub const fn learn(&mut self, best_effort: bool) {
         self.best_effort = best_effort;

@@ -285,6 +285,7 @@ impl Profiler {
                 && subscribers.missed(destination, at)
             {
                 measured.opened = at;
+                measured.writer.interrupt();
             }
         }
     }

@@ -125,6 +125,11 @@ impl Reception {
         self.samples.allow_incomplete(until);
     }
 
+    /// Records that bytes between fragments were not captured.
+    pub fn interrupt(&mut self) {
+        self.samples.interrupt();
+    }
+
     /// Processes a DATA or DATA_FRAG. `reliable` states whether the writer retransmits.
     pub fn sample(
         &mut self,

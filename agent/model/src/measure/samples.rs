@@ -52,8 +52,10 @@ pub struct Samples {
     partial: Bounded<PartialSamples, Vec<Partial>>,
     /// Samples that began before this time may lack fragments that were not captured.
     sure_from: ModelTime,
-    /// The highest number of a sample that began before `sure_from`.
+    /// The highest number of a sample that began before `sure_from`, or was interrupted.
     last_uncertain: SequenceNumber,
+    /// Whether bytes were missed since the last sample began, perhaps its next one's first fragments.
+    interrupted: bool,
 }
 
 /// An unfinished sample.
@@ -173,6 +175,14 @@ impl Samples {
         self.sure_from = until;
     }
 
+    /// Allows the unfinished samples, and a next one without its first fragment, to be incomplete:
+    /// bytes between their fragments were not captured.
+    pub fn interrupt(&mut self) {
+        self.interrupted = true;
+        let newest = self.partial.iter().map(|each| each.number).max();
+        self.last_uncertain = self.last_uncertain.max(newest.unwrap_or_default());
+    }
+
     /// Returns whether this sample is unfinished and may lack fragments without a loss.
     #[must_use]
     pub fn is_doubtful(&self, number: SequenceNumber) -> bool {
@@ -253,7 +263,8 @@ impl Samples {
         }
         budget.samples += 1;
         let began = sample.head.began();
-        if began < self.sure_from {
+        let was_interrupted = std::mem::take(&mut self.interrupted);
+        if began < self.sure_from || was_interrupted && fragments.starting > 1 {
             self.last_uncertain = self.last_uncertain.max(number);
         }
         self.partial.push(Partial {

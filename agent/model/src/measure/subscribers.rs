@@ -129,7 +129,7 @@ impl Subscribers {
         let mut is_affected = false;
         for delivery in &mut self.deliveries {
             if delivery.main().destination == destination {
-                delivery.open(at);
+                delivery.interrupt(at);
                 is_affected = true;
             }
         }

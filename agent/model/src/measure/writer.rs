@@ -250,6 +250,11 @@ impl Writer {
         self.last_message.is_none() && self.sampled.is_none() && self.exact.is_none()
     }
 
+    /// Records that bytes between fragments were not captured.
+    pub fn interrupt(&mut self) {
+        self.reception.interrupt();
+    }
+
     /// Records that samples in shared memory before `now` may have been missed.
     pub fn uncertain(&mut self, now: ModelTime) {
         if let Some(sampled) = self.sampled.as_mut().filter(|each| each.is_current(now)) {

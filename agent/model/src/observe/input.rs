@@ -16,6 +16,7 @@ use crate::facts::calls::report::Report;
 use crate::facts::dispatch::Dispatch;
 use crate::facts::event::Taken;
 use crate::facts::observation::Observation;
+use crate::facts::route::Destination;
 use crate::facts::selection::SampleRequest;
 use crate::facts::watch::Watchlist;
 use crate::graph::discovery::Memory;
@@ -62,6 +63,9 @@ pub enum Input<'a> {
         /// Length of the whole RTPS message in bytes.
         length: u32,
     },
+    /// Bytes of an RTPS connection over TCP were not captured: samples for this destination that are
+    /// missing before this time may have arrived.
+    StreamGap(Destination, Timestamp),
     /// A submessage of a captured datagram, which is read for discovery and payloads. The caller
     /// passes observations of user data separately, in their order. [`Self::DatagramEnd`] follows
     /// the last one.

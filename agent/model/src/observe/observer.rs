@@ -233,6 +233,10 @@ impl Observer {
                 .measure
                 .profiler
                 .uncertain(self.graph.wall_clock.model_time(now)),
+            Input::StreamGap(destination, at) => {
+                let at = self.graph.wall_clock.model_time(at);
+                self.measure.profiler.missed(destination, at);
+            }
             Input::ProbesDetached => self.measure.profiler.end_exact_view(),
             Input::Zenoh(report) => self.zenoh_report(report),
             Input::Observation(observation) => self.observe(observation),

@@ -177,13 +177,14 @@ fn missing_bytes_cost_the_messages_that_they_are_part_of() {
     connection.whole(true, &frame(&messages[1], PORT)[10..]);
     connection.whole(true, &frame(&messages[2], PORT));
     let late = Timestamp(20_000_000_000);
-    let mut found = Vec::new();
-    connection.streams.advance(late, |streamed| {
-        if let Streamed::Message { bytes, .. } = streamed {
-            found.push(bytes.to_vec());
-        }
+    let (mut found, mut gaps) = (Vec::new(), Vec::new());
+    connection.streams.advance(late, |streamed| match streamed {
+        Streamed::Message { bytes, .. } => found.push(bytes.to_vec()),
+        Streamed::Gap(destination, time) => gaps.push((*destination, *time)),
+        Streamed::Zenoh(_) => panic!("{streamed:?}"),
     });
     assert_eq!(found, [messages[2].clone()]);
+    assert_eq!(gaps, [(place_of(5100), late)]);
     assert_eq!(connection.streams.counters().frame_gaps, 1);
     connection.whole(true, &frame(&messages[3], PORT));
     assert_eq!(connection.read.len(), 2);

@@ -1,9 +1,11 @@
 //! At any time, every sample is delivered, lost or pending, even if the writer falls silent.
 
 use ros2probe_model::facts::loss::LossCause;
+use ros2probe_model::facts::route::Destination;
+use ros2probe_model::observe::input::Input;
 use ros2probe_testing::model::forge::{Message, SEDP_WRITERS};
 use ros2probe_testing::model::host::{ALICE, BOB, CapturePoint, Host, WRITER};
-use ros2probe_wire::Guid;
+use ros2probe_wire::{Guid, Timestamp};
 
 /// Adds Bob with a best-effort reader, and makes the writer best effort.
 fn best_effort(host: &mut Host) -> CapturePoint {
@@ -130,4 +132,56 @@ fn a_missing_sample_of_a_reliable_writer_is_pending_until_its_repair() {
     assert_eq!(states(&host), (19, 0, 1));
     host.data(bob, 7);
     assert_eq!(states(&host), (20, 0, 0));
+}
+
+/// Reports that bytes of the connection to Bob were not captured.
+fn miss_bytes(host: &mut Host, bob: CapturePoint) {
+    let destination = Destination {
+        address: bob.address.ip().to_ipv6_mapped().octets(),
+        port: bob.address.port(),
+    };
+    let at = Timestamp(host.now);
+    host.observer.input(Input::StreamGap(destination, at));
+}
+
+/// Bob's connection is TCP: bytes are missing in sample 4, those of 5, and the beginning of 6.
+#[test]
+fn samples_of_which_bytes_were_not_captured_are_not_lost_and_later_ones_are() {
+    let mut host = Host::new();
+    let bob = best_effort(&mut host);
+    for number in 1..=3 {
+        host.put(host.fragments(bob, number, 1, 10));
+        host.wait(100);
+    }
+    host.put(host.fragments(bob, 4, 1, 5));
+    host.wait(10);
+    miss_bytes(&mut host, bob);
+    host.put(host.fragments(bob, 6, 3, 8));
+    host.wait(100);
+    // The connection loses nothing, but its sender drops 8 and the end of 10.
+    for (number, count) in [(7, 10), (9, 10), (10, 5), (11, 10)] {
+        host.put(host.fragments(bob, number, 1, count));
+        host.wait(100);
+    }
+    host.wait(3000);
+    assert_eq!(states(&host), (6, 2, 0));
+    assert_eq!(host.losses(LossCause::BeforeHost), [8, 10]);
+    assert_eq!(host.measurement().loss.lost, 2);
+}
+
+#[test]
+fn a_gap_of_another_connection_excuses_nothing() {
+    let mut host = Host::new();
+    let bob = best_effort(&mut host);
+    for number in [1, 2, 5] {
+        if number == 5 {
+            let mut other = bob;
+            other.address.set_port(1);
+            miss_bytes(&mut host, other);
+        }
+        host.put(host.fragments(bob, number, 1, 10));
+        host.wait(100);
+    }
+    host.wait(3000);
+    assert_eq!(states(&host), (3, 2, 0));
 }
