@@ -136,9 +136,9 @@ fn open_installed(path: &Path, library: Library) -> Result<File, OpenError> {
     plain(openat(CWD, path, flags() | OFlags::NOFOLLOW, Mode::empty()))
 }
 
-/// Opens the file that a process maps, even if its path now names another one. Only root may use
-/// `map_files` of another user's process. Without root, the path in the process's file system must
-/// still name that file.
+/// Opens the file that a process maps, even if its path now names another one. `map_files` of
+/// another user's process needs CAP_CHECKPOINT_RESTORE and CAP_DAC_READ_SEARCH. Without them, the
+/// path in the process's file system must be readable, and still name that file.
 fn open_mapped(process: u32, mapped: &Mapped) -> Result<File, OpenError> {
     let file = format!("/proc/{process}/map_files/{}", mapped.range);
     match plain(openat(CWD, &file, flags(), Mode::empty())) {

@@ -73,12 +73,12 @@ fn needed() -> [(CapabilitySet, &'static str); 2] {
     [events, (CapabilitySet::SYS_PTRACE, "CAP_SYS_PTRACE")]
 }
 
-/// Returns the capabilities that the broker can use: the required ones, and one for opening a
-/// mapped file that was replaced.
+/// Returns the capabilities that the broker can use: the required ones, and two for opening a
+/// mapped file that was replaced, or that only its user may read.
 #[must_use]
 pub fn useful() -> CapabilitySet {
     let required: CapabilitySet = needed().iter().map(|(one, _)| *one).collect();
-    required | CapabilitySet::CHECKPOINT_RESTORE
+    required | CapabilitySet::CHECKPOINT_RESTORE | CapabilitySet::DAC_READ_SEARCH
 }
 
 /// Returns a client of the broker that listens at `socket`. If the socket does not exist, a process

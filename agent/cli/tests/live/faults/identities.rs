@@ -178,6 +178,46 @@ fn without_root_a_library_is_attached_by_its_path_unless_it_was_replaced() -> Re
     Ok(())
 }
 
+/// The directories of the libraries are for root only, as a home of mode 0750 is for its user.
+#[test]
+fn the_packaged_broker_attaches_libraries_of_private_directories_also_replaced_ones() -> Result<()>
+{
+    let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let programs = [
+        TracedProgram::build(248, &[])?,
+        TracedProgram::build(248, &[])?,
+    ];
+    let mut processes = Vec::new();
+    for (program, (topic, node)) in programs.iter().zip([("/kept", "one"), ("/gone", "two")]) {
+        let place = program.library();
+        let place = place.parent().context("directory")?;
+        fs::set_permissions(place, Permissions::from_mode(0o700))?;
+        let arguments = ["/in", topic, node];
+        let process = Process::start(&host.inside(), program.program(), arguments)?;
+        identity(process.pid())?;
+        processes.push(process);
+    }
+    fs::remove_file(programs[1].library())?;
+
+    let configuration = configured(&host, directory.path())?;
+    let mut capabilities = "-all,+net_admin,+bpf,+perfmon,+sys_ptrace".to_owned();
+    capabilities += ",+checkpoint_restore,+dac_read_search";
+    if matches!(Means::of_this_kernel(), Means::PerfEvents) {
+        capabilities += ",+sys_admin";
+    }
+    let start = start_as(UNPRIVILEGED, &capabilities, &directory)?;
+    let agent = Agent::start(&host, start, &configuration)?;
+    agent.scrape_until("both libraries are attached", |page| {
+        page.sum("ros2probe_inside_library_info", &[("state", "attached")]) == 2.0
+    })?;
+    for (process, topic) in processes.iter_mut().zip(["/kept", "/gone"]) {
+        publish(process, 10)?;
+        agent.scrape_until("all messages", |page| published(page, topic) == 10.0)?;
+    }
+    Ok(())
+}
+
 fn configured(host: &Namespace, directory: &Path) -> Result<PathBuf> {
     let configuration = directory.join("ros2probe.yaml");
     let text = format!(
