@@ -145,6 +145,14 @@ impl Guid {
         zerocopy::transmute!(bytes)
     }
 
+    /// Parses 32 hexadecimal digits in wire order.
+    #[must_use]
+    pub fn of_digits(digits: &str) -> Option<Self> {
+        let is_guid = digits.len() == 32 && !digits.starts_with('+');
+        let value = u128::from_str_radix(digits, 16).ok().filter(|_| is_guid)?;
+        Some(Self::from_bytes(value.to_be_bytes()))
+    }
+
     /// Returns the 16 bytes in wire order.
     #[must_use]
     pub fn to_bytes(self) -> [u8; 16] {

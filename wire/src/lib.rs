@@ -18,6 +18,8 @@ extern crate std;
 #[cfg(test)]
 extern crate self as ros2probe_wire;
 
+#[cfg(feature = "alloc")]
+pub mod backends;
 pub mod cursor;
 pub mod delivery;
 #[cfg(feature = "alloc")]

@@ -13,6 +13,7 @@ use core::borrow::Borrow;
 use core::fmt;
 
 use crate::cursor::{Cursor, Reason, WireError};
+use crate::guid::Guid;
 use crate::text;
 
 /// Maximum length of a name, in bytes. The mapping allows 256 characters; a name of more than four
@@ -169,6 +170,13 @@ impl DdsTopic {
             },
             _ => Demangled::NotRos,
         }
+    }
+
+    /// Returns the subscription for which a topic `<topic>/_buf/<subscription>` carries buffers.
+    #[must_use]
+    pub fn buffer_subscriber(&self) -> Option<Guid> {
+        let (_, digits) = self.as_str().rsplit_once("/_buf/")?;
+        Guid::of_digits(digits)
     }
 
     /// Returns the DDS topic of a ROS topic.

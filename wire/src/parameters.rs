@@ -60,6 +60,8 @@ impl ParameterId {
     pub const ENDPOINT_SECURITY_INFO: Self = Self(0x1004);
     pub const PARTICIPANT_SECURITY_INFO: Self = Self(0x1005);
 
+    /// Machine id of Fast DDS 3.2 and later.
+    pub const FAST_MACHINE_ID: Self = Self(0x8003);
     /// Data sharing of Fast DDS. Neither Cyclone DDS nor ADLINK's stack uses this number.
     pub const FAST_DATASHARING: Self = Self(0x8006);
     /// Related sample identity of Fast DDS. Cyclone DDS uses the same number for subscription keys.

@@ -11,6 +11,7 @@ use crate::{
     instructions::add,
     late,
     maps::{ANNOUNCEMENTS, Current, Thread, calendar, count, now, observe, read, steady},
+    messages, names,
 };
 
 const SECOND: u64 = 1_000_000_000;
@@ -93,8 +94,22 @@ pub fn started(callback: u64, within: bool) {
             (*figures).trigger = input;
             delay = waited_since_source(&current, figures, thread, now);
         } else if (*thread).executed != 0 {
-            (*figures).trigger = current.handle((*thread).executed, kind::TIMER);
-            delay = waited_since_due(&current, figures, (*thread).executed, now);
+            let executed = (*thread).executed;
+            // The schedule of a known timer was read before.
+            let is_timer = (*figures).period != 0;
+            let rmw = if is_timer {
+                0
+            } else {
+                names::rmw_handle(&current, executed)
+            };
+            if rmw == 0 {
+                (*figures).trigger = current.handle(executed, kind::TIMER);
+                delay = waited_since_due(&current, figures, executed, now);
+            } else {
+                // `rmw_fastrtps_cpp` takes messages of buffer topics without `rmw_take`.
+                (*figures).trigger = current.handle(rmw, kind::SUBSCRIPTION);
+                messages::taken_unseen(&current, rmw, now);
+            }
         } else {
             (*figures).trigger = current.handle(0, 0);
         }

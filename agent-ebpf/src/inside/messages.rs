@@ -87,6 +87,18 @@ pub fn taken(subscription: u64, source_timestamp: u64, taken: bool) {
     }
 }
 
+/// Counts a message that was taken without `rmw_take`, at the start of its callback. Its source
+/// timestamp is unknown.
+#[inline(always)]
+pub fn taken_unseen(current: &Current, subscription: u64, now: u64) {
+    let Some(figures) = current.figures(subscription, kind::SUBSCRIPTION) else {
+        return;
+    };
+    names::subscription(current, figures, subscription);
+    // SAFETY: a map value pointer checked against null.
+    unsafe { event(figures, now) };
+}
+
 /// Handles a message that enters a ring buffer. `size` is the number of messages in the buffer
 /// afterwards, one too many if a message is overwritten.
 #[inline(always)]

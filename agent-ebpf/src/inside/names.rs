@@ -163,10 +163,10 @@ fn is_to_be_announced(figures: *mut Figures) -> bool {
     true
 }
 
-/// Returns the middleware's handle of a publisher; 0 if no plausible one is found.
+/// Returns the middleware's handle of a publisher or subscription; 0 if no plausible one is found.
 #[inline(always)]
-fn rmw_handle(current: &Current, publisher: u64) -> u64 {
-    let structure = read::<u64>(publisher);
+pub fn rmw_handle(current: &Current, endpoint: u64) -> u64 {
+    let structure = read::<u64>(endpoint);
     let known = current.rmw_handle_at();
     if known != 0 {
         let rmw = read::<u64>(structure + u64::from(known));

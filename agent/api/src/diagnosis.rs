@@ -150,6 +150,23 @@ pub enum Diagnosis<'a> {
         /// The input, whose stamps are older.
         input: Cow<'a, str>,
     },
+    /// Publisher and subscription accept buffers of one backend, but messages travel as a whole, through
+    /// the CPU.
+    BuffersByCpu {
+        /// GUID of the writer.
+        writer: String,
+        /// GUID of the reader that takes no buffers, for which the publisher sends messages as a whole
+        /// to all; null if it does so because it is transient local.
+        reader: Option<String>,
+        /// Backends that the publisher shares with a subscription.
+        backends: Vec<Cow<'a, str>>,
+    },
+    /// Participants with different addresses announce one machine id: Fast DDS sends their messages
+    /// to shared memory only.
+    SharedMachineId {
+        /// GUID of one participant of each set of addresses.
+        participants: Vec<String>,
+    },
     /// A configured chain that ends with the topic exceeds its maximum latency.
     SlowChain {
         /// First topic of the chain.
@@ -182,6 +199,8 @@ impl Diagnosis<'_> {
             Self::ReaderQueueOverflow { .. } => "reader_queue_overflow",
             Self::ObservationSuspended { .. } => "observation_suspended",
             Self::RestampingNode { .. } => "restamping_node",
+            Self::BuffersByCpu { .. } => "buffers_by_cpu",
+            Self::SharedMachineId { .. } => "shared_machine_id",
             Self::SlowChain { .. } => "slow_chain",
         }
     }

@@ -40,6 +40,10 @@ pub struct Endpoint<'a> {
     pub qos: Qos<'a>,
     /// Unix time of the first announcement, in seconds.
     pub first_seen_timestamp_seconds: f64,
+    /// Backends of buffers that it accepts, from Lyrical on: `cpu`, and others for which messages carry
+    /// references, so that their data are not on the wire. Empty if its type has no buffers.
+    #[cfg_attr(feature = "openapi", schema(example = json!(["cpu", "cuda"])))]
+    pub backends: Vec<Cow<'a, str>>,
     /// Counts and times of this writer; null for readers and for topics that are not watched.
     pub measurement: Option<Measurement>,
     /// The last message of this writer, if it is transient local and the agent keeps such messages;

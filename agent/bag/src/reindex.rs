@@ -154,10 +154,27 @@ fn files(directory: &Path) -> Result<Vec<String>, ReindexError> {
     Ok(names)
 }
 
-/// Returns the number of a file, `12` for `bag_12.mcap`; files without a number are first.
+/// Returns the number of a file: `12` for `bag_12.mcap`, and for `12_bag_2026_05_22-10_11_58.mcap`, as
+/// Lyrical names it. Files without a number are first.
 fn number(name: &str) -> Option<u64> {
     let (stem, _) = name.split_once(".mcap")?;
-    stem.rsplit_once('_')?.1.parse().ok()
+    match stem.split_once('_') {
+        Some((first, rest)) if ends_with_time(rest) => first.parse().ok(),
+        _ => stem.rsplit_once('_')?.1.parse().ok(),
+    }
+}
+
+/// Returns whether a name ends with a time, `YYYY_MM_DD-HH_MM_SS`.
+fn ends_with_time(name: &str) -> bool {
+    const SHAPE: &[u8; 19] = b"0000_00_00-00_00_00";
+    let time = name.as_bytes().last_chunk::<19>();
+    time.is_some_and(|time| {
+        let mut pairs = SHAPE.iter().zip(time);
+        pairs.all(|(shape, byte)| match shape {
+            b'0' => byte.is_ascii_digit(),
+            _ => byte == shape,
+        })
+    })
 }
 
 fn complete(path: &Path, expansion: Expansion) -> Result<(Found, Option<Contents>), ReindexError> {

@@ -309,6 +309,16 @@ fn diagnoses() -> Diagnoses {
             node: "/lidar".into(),
             input: "/scan".into(),
         },
+        Diagnosis::BuffersByCpu {
+            topic: topic.clone(),
+            writer,
+            reader: Some(reader),
+            backends: vec!["cuda".into()],
+        },
+        Diagnosis::SharedMachineId {
+            domain_id: DomainId(0),
+            participants: vec![participant, writer],
+        },
         Diagnosis::SlowChain {
             topic: topic.clone(),
             from: "/scan".into(),
@@ -388,6 +398,8 @@ pub fn topic(name: &str) -> TopicFacts {
         measurement: Some(Box::new(measurement())),
         transports: 1,
         latched: None,
+        backends: None,
+        buffers: Box::default(),
     };
     TopicFacts {
         domain_id: DomainId(0),

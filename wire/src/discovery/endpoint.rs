@@ -3,6 +3,7 @@
 use alloc::vec::Vec;
 
 use super::{TypeHash, UserData, guid, push_locator, vendor};
+use crate::backends::Backends;
 use crate::cursor::{Cursor, Reason, WireError};
 use crate::guid::{EntityId, Guid};
 use crate::names::{DdsTopic, DdsType};
@@ -10,6 +11,10 @@ use crate::parameters::{ParameterId, ParameterList};
 use crate::qos::{Qos, Role};
 use crate::rtps::{Locator, VendorId};
 use crate::text;
+
+/// Mark in user data before the GUID of the publisher whose buffers a writer carries, as 32 digits
+/// (`rmw_fastrtps` of Lyrical, `rmw_publish.cpp`).
+const PUBLISHER: &str = "PGID:";
 
 /// The announcement of one endpoint.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -34,6 +39,10 @@ pub struct EndpointAnnouncement {
     pub type_hash: Option<TypeHash>,
     /// Hash of the service type, for a service's endpoint in Lyrical and later.
     pub service_type_hash: Option<TypeHash>,
+    /// Backends of buffers; `None` if it has none.
+    pub backends: Option<Backends>,
+    /// The endpoint of the base topic for which it carries buffers, if it announces one.
+    pub base: Option<Guid>,
     /// Unicast locators, if they differ from its participant's default ones.
     pub unicast: Vec<Locator>,
     /// Multicast locators, if they differ from its participant's default ones.
@@ -70,6 +79,8 @@ impl EndpointAnnouncement {
             qos: Qos::defaults(role, vendor),
             type_hash: None,
             service_type_hash: None,
+            backends: None,
+            base: None,
             unicast: Vec::new(),
             multicast: Vec::new(),
             datasharing: false,
@@ -111,7 +122,9 @@ impl EndpointAnnouncement {
         let vendor = vendor(parameters, sender)?;
         let topic = DdsTopic::read(&mut required(ParameterId::TOPIC_NAME, "PID_TOPIC_NAME")?)?;
         let type_name = DdsType::read(&mut required(ParameterId::TYPE_NAME, "PID_TYPE_NAME")?)?;
+        let subscriber = topic.buffer_subscriber();
         let mut endpoint = Self::new(guid, role, vendor, topic, type_name);
+        endpoint.base = subscriber.filter(|_| role == Role::Reader);
         for parameter in parameters {
             let parameter = parameter?;
             endpoint.apply(parameter.id.known(), parameter.value)?;
@@ -128,6 +141,11 @@ impl EndpointAnnouncement {
                 let user_data = UserData::new(text::octets(&mut value, "PID_USER_DATA")?);
                 self.type_hash = user_data.find("typehash").and_then(TypeHash::parse);
                 self.service_type_hash = user_data.find("sertypehash").and_then(TypeHash::parse);
+                self.backends = Backends::of_user_data(user_data);
+                if self.role == Role::Writer {
+                    let digits = user_data.after(PUBLISHER).and_then(|rest| rest.get(..32));
+                    self.base = digits.and_then(Guid::of_digits);
+                }
             }
             ParameterId::UNICAST_LOCATOR => {
                 push_locator(&mut self.unicast, value, &mut self.is_truncated)?;

@@ -24,6 +24,9 @@ const MAX_PROPERTY_LEN: usize = 256;
 /// Maximum length of an entity name, enclave or domain tag, in bytes.
 const MAX_NAME_LEN: usize = 256;
 
+/// Maximum length of a machine's id, in bytes; that of Linux has 32.
+const MAX_MACHINE_ID: usize = 64;
+
 /// Bit set of a participant's builtin endpoints (RTPS 2.5, 9.3.2.12).
 #[derive(Clone, Copy, Default, PartialEq, Eq, Hash, Debug)]
 pub struct BuiltinEndpoints(pub u32);
@@ -68,6 +71,8 @@ pub struct ParticipantAnnouncement {
     pub default_multicast: Vec<Locator>,
     /// Its builtin endpoints.
     pub builtin_endpoints: BuiltinEndpoints,
+    /// Fast DDS 3.2 and later: id of its machine (machine-id(5)), which decides who is on its host.
+    pub machine_id: Option<Box<str>>,
     /// Whether it authenticates its peers (DDS Security); its further discovery data may be
     /// encrypted.
     pub is_secured: bool,
@@ -94,6 +99,7 @@ impl ParticipantAnnouncement {
             default_unicast: Vec::new(),
             default_multicast: Vec::new(),
             builtin_endpoints: BuiltinEndpoints::default(),
+            machine_id: None,
             is_secured: false,
             is_truncated: false,
         }
@@ -166,6 +172,10 @@ impl ParticipantAnnouncement {
             }
             ParameterId::BUILTIN_ENDPOINT_SET => {
                 self.builtin_endpoints = BuiltinEndpoints(value.u32("PID_BUILTIN_ENDPOINT_SET")?);
+            }
+            ParameterId::FAST_MACHINE_ID if self.vendor == VendorId::EPROSIMA => {
+                let id = text::name(&mut value, "PID_MACHINE_ID", MAX_MACHINE_ID).ok();
+                self.machine_id = id.filter(|id| !id.is_empty()).map(Into::into);
             }
             ParameterId::IDENTITY_TOKEN
             | ParameterId::PERMISSIONS_TOKEN

@@ -27,6 +27,19 @@ impl<'a> UserData<'a> {
         )
     }
 
+    /// Returns the rest of each key that begins with `prefix`.
+    pub fn keys_after(self, prefix: &'a str) -> impl Iterator<Item = &'a str> {
+        self.0
+            .split(';')
+            .filter_map(move |pair| pair.split_once('=')?.0.strip_prefix(prefix))
+    }
+
+    /// Returns the text after the first occurrence of `mark`.
+    #[must_use]
+    pub fn after(self, mark: &str) -> Option<&'a str> {
+        self.0.split_once(mark).map(|(_, rest)| rest)
+    }
+
     /// Returns the value of the first pair with this key.
     #[must_use]
     pub fn find(self, key: &str) -> Option<&'a str> {
@@ -107,8 +120,10 @@ mod tests {
 
     #[test]
     fn the_type_hash_of_an_endpoint_with_buffers_is_found() {
-        let text = std::format!("BUFBE:cpu=;typehash={HASH};");
-        assert_eq!(UserData::new(text.as_bytes()).find("typehash"), Some(HASH));
+        for backends in ["BUFBE:cpu=", "bufbe.cpu=;"] {
+            let text = std::format!("typehash={HASH};{backends}");
+            assert_eq!(UserData::new(text.as_bytes()).find("typehash"), Some(HASH));
+        }
     }
 
     #[test]

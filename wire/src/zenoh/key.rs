@@ -6,6 +6,7 @@
 use crate::cursor::WireError;
 use crate::discovery::TypeHash;
 use crate::domain::DomainId;
+use crate::guid::Guid;
 use crate::names::{DdsType, RosName, RosType};
 
 use super::attachment::Gid;
@@ -110,9 +111,8 @@ fn buffer(key: &str) -> (&str, Option<Buffer>) {
         return (base, Some(Buffer::Cpu));
     }
     let subscriber = key.rsplit_once("/_buf/").and_then(|(base, digits)| {
-        let value = u128::from_str_radix(digits, 16).ok()?;
-        let is_gid = digits.len() == 32 && !digits.starts_with('+');
-        is_gid.then_some((base, Buffer::Subscriber(Gid(value.to_be_bytes()))))
+        let gid = Guid::of_digits(digits)?.to_bytes();
+        Some((base, Buffer::Subscriber(Gid(gid))))
     });
     match subscriber {
         Some((base, buffer)) => (base, Some(buffer)),

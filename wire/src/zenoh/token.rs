@@ -7,6 +7,7 @@ use alloc::boxed::Box;
 use alloc::format;
 use alloc::string::String;
 
+use crate::backends::Backends;
 use crate::cursor::{Reason, WireError};
 use crate::discovery::TypeHash;
 use crate::domain::DomainId;
@@ -93,7 +94,7 @@ pub struct EndpointToken {
     /// QoS; `None` if it has an unknown form.
     pub qos: Option<Qos>,
     /// Backends of buffers (rmw_zenoh of Lyrical and later).
-    pub backends: Option<Box<str>>,
+    pub backends: Option<Backends>,
     /// Identity of the endpoint in the attachments of its samples and requests.
     pub gid: Gid,
 }
@@ -198,7 +199,7 @@ fn ros(token: &str, rest: &str) -> Result<Token, WireError> {
         type_hash: key::type_hash(next()?).ok_or(bad)?,
         qos: token_qos::parse(next()?),
         backends: match chunks.next() {
-            Some(chunk) => Some(plain(chunk)?.into()),
+            Some(chunk) => Backends::of_token(plain(chunk)?),
             None => None,
         },
         gid: Gid::of_token(token),
@@ -255,6 +256,7 @@ fn bridge(token: &str) -> Option<BridgeToken> {
 mod tests {
     use std::format;
     use std::string::ToString;
+    use std::vec::Vec;
 
     use proptest::prelude::*;
 
@@ -309,9 +311,11 @@ mod tests {
             (EndpointKind::Client, None)
         );
         assert_eq!(client.name.as_str(), "/robot1/add_two_ints");
-        let server = endpoint(&format!("{}/cpu;cuda", token.replace("/SC/", "/SS/")));
-        assert_eq!(server.kind, EndpointKind::Server);
-        assert_eq!(server.backends.as_deref(), Some("cpu;cuda"));
+        let token_of_image = token.replace("/SC/", "/MS/");
+        let subscription = endpoint(&format!("{token_of_image}/backends:cuda:;cpu:"));
+        assert_eq!(subscription.kind, EndpointKind::Subscription);
+        let backends = subscription.backends.unwrap();
+        assert_eq!(backends.names().collect::<Vec<_>>(), ["cpu", "cuda"]);
         // An unknown QoS does not hide the endpoint.
         assert_eq!(endpoint(&token.replace("::,10:,", "x")).qos, None);
     }

@@ -357,3 +357,22 @@ fn a_small_file_is_refused_before_it_expands_to_gigabytes() {
     let scan = read::scan(&path, Expansion::Limited, &mut |_, _| {}).unwrap();
     assert_eq!((scan.chunks.len(), scan.unreadable_chunks), (8, 8));
 }
+
+#[test]
+fn files_with_a_number_first_and_a_time_last_are_in_the_order_of_their_numbers() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = written(directory.path(), Storage::default(), Form::Compatible);
+    let bag = directory.path().join("bag_7");
+    fs::create_dir(&bag).unwrap();
+    let names = [
+        "2_bag_7_2026_05_22-10_12_03.mcap",
+        "9_bag_7_2026_05_22-10_12_59.mcap",
+        "10_bag_7_2026_05_22-10_13_00.mcap",
+    ];
+    for name in names {
+        fs::copy(&file, bag.join(name)).unwrap();
+    }
+    let report = reindex(&bag, Expansion::Limited).unwrap();
+    let found: Vec<_> = report.files.iter().map(|file| &*file.name).collect();
+    assert_eq!(found, names);
+}

@@ -335,6 +335,35 @@ fn callbacks_have_triggers_durations_waits_and_effects() {
     assert_eq!(transition.node.as_deref(), Some("/robot1/filter"));
 }
 
+/// `rmw_fastrtps_cpp` of Lyrical takes messages of buffer topics without `rmw_take`. The process is
+/// older than the probes in one round, and younger in the other.
+#[test]
+fn messages_taken_without_rmw_take_count_for_their_subscription_and_not_as_timers() {
+    for is_older in [true, false] {
+        let mut robot = Robot::new(248, &[], true);
+        if !is_older {
+            robot.attach();
+        }
+        let mut process = robot.start();
+        if is_older {
+            robot.attach();
+        } else {
+            process.run("init");
+        }
+        process.run("compute 7 2000");
+        let report = robot.report(&process);
+        let [callback] = &report.callbacks[..] else {
+            panic!("{:?}", report.callbacks);
+        };
+        assert_eq!(callback.trigger, Trigger::Subscription("/in".into()));
+        assert_eq!(callback.calls, 7);
+        let [subscription] = &report.subscriptions[..] else {
+            panic!("{:?}", report.subscriptions);
+        };
+        assert_eq!((&*subscription.topic, subscription.taken), ("/in", 7));
+    }
+}
+
 #[test]
 fn causal_publications_beyond_the_rate_are_skipped_and_counted() {
     let mut robot = Robot::new(248, &[], true);

@@ -144,6 +144,18 @@ impl Processes {
                 ))
             },
         );
+        let easy_modes = self.differing(
+            "easy_mode",
+            "nodes in easy mode see only nodes with the same server",
+            "export ROS2_EASY_MODE=ADDRESS    # the same for all, or unset for all",
+            |process| {
+                let server = process.variables.shown("ROS2_EASY_MODE");
+                Some(server.map_or_else(
+                    || "no easy mode".to_owned(),
+                    |server| format!("easy mode {server}"),
+                ))
+            },
+        );
         let security = self.differing(
             "security",
             "secured and unsecured nodes do not communicate",
@@ -153,7 +165,14 @@ impl Processes {
                 Some(if is_secured { "secured" } else { "not secured" }.to_owned())
             },
         );
-        let all = [domains, implementations, ranges, servers, security];
+        let all = [
+            domains,
+            implementations,
+            ranges,
+            servers,
+            easy_modes,
+            security,
+        ];
         findings.extend(all.into_iter().flatten());
         findings.extend(self.unlike(&Variables::of(&host.environment)));
         findings

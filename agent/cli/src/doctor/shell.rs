@@ -30,6 +30,7 @@ pub fn check(host: &HostState) -> Vec<Finding> {
     if !is_zenoh(&variables) {
         findings.push(range(&variables));
         findings.extend(server(&variables));
+        findings.extend(easy_mode(&variables));
     }
     findings.extend(transports(&variables));
     findings.extend(profiles(host, &variables));
@@ -187,6 +188,19 @@ fn server(variables: &Variables) -> Option<Finding> {
     Some(finding.remedy("export ROS_SUPER_CLIENT=TRUE    # ros2 tools need it"))
 }
 
+/// Returns the finding for the easy mode of Kilted and later: nodes of a host use its discovery
+/// server, and send user data by shared memory and TCP.
+fn easy_mode(variables: &Variables) -> Option<Finding> {
+    let name = "ROS2_EASY_MODE";
+    let server = variables.shown(name)?;
+    let sentence = format!(
+        "easy mode with the server {server}: nodes without it do not see those of this shell; the \
+         agent reads their TCP, and announcements only on this host"
+    );
+    let finding = Finding::new(AREA, "easy_mode", Severity::Note, sentence);
+    Some(finding.seen(server, format!("{name}, {FROM}")))
+}
+
 /// Returns the finding for transports selected by Fast DDS variables.
 fn transports(variables: &Variables) -> Option<Finding> {
     let name = "FASTDDS_BUILTIN_TRANSPORTS";
@@ -195,10 +209,9 @@ fn transports(variables: &Variables) -> Option<Finding> {
     let kind = value.split(['?', '&']).next().unwrap_or_default();
     let finding = match kind {
         "LARGE_DATA" | "LARGE_DATAv6" | "P2P" => report(
-            Severity::Warning,
-            format!("with {kind}, Fast DDS uses TCP, which the agent does not read"),
-        )
-        .remedy("export FASTDDS_BUILTIN_TRANSPORTS=DEFAULT"),
+            Severity::Ok,
+            format!("with {kind}, Fast DDS uses TCP, which the agent reads except with TLS"),
+        ),
         "SHM" => report(
             Severity::Note,
             "nodes of this shell use only shared memory, which is sampled; other hosts do not \
@@ -232,12 +245,13 @@ fn profiles(host: &HostState, variables: &Variables) -> Vec<Finding> {
             .remedy(format!("unset {name}    # or fix it")),
             Ok(bytes) => {
                 let text = String::from_utf8_lossy(&bytes);
-                if text.contains("TCPv4") || text.contains("TCPv6") || text.contains("LARGE_DATA") {
+                if text.contains("<tls>") {
                     report(
                         Severity::Warning,
-                        "Fast DDS's profiles use TCP, which the agent does not read".to_owned(),
+                        "Fast DDS's profiles use TCP with TLS, which the agent does not read"
+                            .to_owned(),
                     )
-                    .elsewhere("<type>UDPv4</type>    # in the transport descriptors of that file")
+                    .elsewhere("<tls>    # remove it from the transport descriptors of that file")
                 } else {
                     report(Severity::Ok, "Fast DDS profiles found".to_owned())
                 }
@@ -343,7 +357,10 @@ mod tests {
             "<CycloneDDS><Domain><SharedMemory>\n <Enable>true</Enable>",
         ),
         ("/home/fast.xml", "<profiles/>"),
-        ("/home/tcp.xml", "<type>TCPv4</type>"),
+        (
+            "/home/tls.xml",
+            "<type>TCPv4</type><tls><password>x</password></tls>",
+        ),
     ];
 
     fn found(variables: &[(&str, &str)]) -> Vec<Finding> {
@@ -439,8 +456,9 @@ mod tests {
             "FASTDDS_BUILTIN_TRANSPORTS",
             "LARGE_DATA?max_msg_size=1MB",
             "transports",
-            warning,
+            Severity::Ok,
         );
+        gives("ROS2_EASY_MODE", "10.0.0.1", "easy_mode", note);
         gives(
             "FASTDDS_BUILTIN_TRANSPORTS",
             "UDPv4",
@@ -461,7 +479,7 @@ mod tests {
         );
         gives(
             "FASTDDS_DEFAULT_PROFILES_FILE",
-            "/home/tcp.xml",
+            "/home/tls.xml",
             "profiles",
             warning,
         );

@@ -15,7 +15,7 @@ const MAX_VALUE: usize = 120;
 pub struct InvalidDomain(String);
 
 /// Variables that affect the communication of ROS.
-const NAMES: [&str; 20] = [
+const NAMES: [&str; 21] = [
     "ROS_DISTRO",
     "RMW_IMPLEMENTATION",
     "ROS_DOMAIN_ID",
@@ -24,6 +24,7 @@ const NAMES: [&str; 20] = [
     "ROS_STATIC_PEERS",
     "ROS_DISCOVERY_SERVER",
     "ROS_SUPER_CLIENT",
+    "ROS2_EASY_MODE",
     "FASTRTPS_DEFAULT_PROFILES_FILE",
     "FASTDDS_DEFAULT_PROFILES_FILE",
     "FASTDDS_BUILTIN_TRANSPORTS",

@@ -285,6 +285,18 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
             safe(node),
             safe(input)
         ),
+        Open::Known(Diagnosis::BuffersByCpu {
+            writer,
+            reader,
+            backends,
+        }) => {
+            let why = match reader {
+                Some(reader) => format!("{} takes no buffers", name(reader)),
+                None => "it is transient local".to_owned(),
+            };
+            let (who, backends) = (name(writer), shown_list(backends));
+            format!("{who} sends through the CPU instead of {backends}: {why}")
+        }
         Open::Known(Diagnosis::SlowChain {
             from,
             max_latency_ms,

@@ -179,6 +179,7 @@ impl Occurrence {
                 Diagnosis::UnmatchedPublisher { .. }
                     | Diagnosis::UnmatchedSubscription { .. }
                     | Diagnosis::RestampingNode { .. }
+                    | Diagnosis::BuffersByCpu { .. }
             ),
             Self::Agent(
                 AgentEvent::RecordingEnded { reason, .. }
@@ -416,6 +417,24 @@ fn finding(finding: &Diagnosis) -> Values {
         Diagnosis::RestampingNode { node, input, .. } => {
             vec![("ros_node", Some(text(node))), ("from", Some(text(input)))]
         }
+        Diagnosis::BuffersByCpu { writer, reader, .. } => {
+            let reason = match reader {
+                Some(_) => "no_buffers",
+                None => "transient_local",
+            };
+            vec![
+                ("writer", written(writer)),
+                ("reader", reader.as_ref().and_then(written)),
+                ("reason", Some(text(reason))),
+            ]
+        }
+        Diagnosis::SharedMachineId {
+            domain_id,
+            participants,
+        } => vec![
+            ("domain_id", number(*domain_id)),
+            ("participants", list(participants)),
+        ],
         Diagnosis::SlowChain {
             from, max_latency, ..
         } => vec![

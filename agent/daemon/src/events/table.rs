@@ -165,8 +165,9 @@ pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
     FINDING,
     "Another fault of the graph, named by `diagnosis`: type_conflict, type_hash_conflict, \
      duplicate_node, node_in_several_domains, slow_callback, executor_wait, \
-     late_callback, intra_process_overflow, reader_queue_overflow, observation_suspended, slow_chain, or (INFO) \
-     unmatched_publisher, unmatched_subscription, restamping_node.",
+     late_callback, intra_process_overflow, reader_queue_overflow, observation_suspended, \
+     shared_machine_id, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
+     restamping_node, buffers_by_cpu.",
 )
 .relief(Severity::Info);
 pub(super) const GRAPH_RESOLVED: Definition = Definition::new(

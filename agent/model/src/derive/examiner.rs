@@ -119,6 +119,7 @@ impl Examiner {
             }
         }
         nodes::examine(discovery, &mut findings);
+        nodes::examine_machines(discovery, &mut findings);
         for (topic, writer) in services.hanging() {
             findings.add(Diagnosis::HangingCall { topic, writer });
         }

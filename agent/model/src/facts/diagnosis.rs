@@ -195,6 +195,26 @@ pub enum Diagnosis {
         /// Input with the same rate, whose stamps are older.
         input: TopicName,
     },
+    /// Publisher and subscription accept buffers of one backend, but messages travel as a whole.
+    BuffersByCpu {
+        /// Topic.
+        topic: TopicKey,
+        /// GUID of the writer.
+        writer: Guid,
+        /// GUID of the reader without buffers, for which the publisher sends messages as a whole to
+        /// all; `None` if it does so because it is transient local.
+        reader: Option<Guid>,
+        /// Backends that the publisher shares with a subscription, sorted.
+        backends: Vec<Box<str>>,
+    },
+    /// Participants with different addresses announce one machine id: Fast DDS sends their messages
+    /// to shared memory only.
+    SharedMachineId {
+        /// Domain.
+        domain_id: DomainId,
+        /// The first participant of each set of addresses, sorted.
+        participants: Vec<Guid>,
+    },
     /// A configured chain exceeds its maximum latency.
     SlowChain {
         /// Last topic of the chain.
@@ -256,7 +276,7 @@ pub enum Change<'a> {
 
 impl Diagnosis {
     /// All kinds, as label values.
-    pub const KINDS: [&'static str; 16] = [
+    pub const KINDS: [&'static str; 18] = [
         "qos_incompatible",
         "type_conflict",
         "type_hash_conflict",
@@ -272,6 +292,8 @@ impl Diagnosis {
         "reader_queue_overflow",
         "observation_suspended",
         "restamping_node",
+        "buffers_by_cpu",
+        "shared_machine_id",
         "slow_chain",
     ];
 
@@ -294,6 +316,8 @@ impl Diagnosis {
             Self::ReaderQueueOverflow { .. } => "reader_queue_overflow",
             Self::ObservationSuspended { .. } => "observation_suspended",
             Self::RestampingNode { .. } => "restamping_node",
+            Self::BuffersByCpu { .. } => "buffers_by_cpu",
+            Self::SharedMachineId { .. } => "shared_machine_id",
             Self::SlowChain { .. } => "slow_chain",
         }
     }
@@ -311,12 +335,14 @@ impl Diagnosis {
             | Self::IntraProcessOverflow { topic, .. }
             | Self::ReaderQueueOverflow { topic, .. }
             | Self::RestampingNode { topic, .. }
+            | Self::BuffersByCpu { topic, .. }
             | Self::SlowChain { topic, .. } => Some(topic),
             Self::SlowCallback { topic, .. }
             | Self::ExecutorWait { topic, .. }
             | Self::LateCallback { topic, .. } => topic.as_ref(),
             Self::DuplicateNode { .. }
             | Self::NodeInSeveralDomains { .. }
+            | Self::SharedMachineId { .. }
             | Self::ObservationSuspended { .. } => None,
         }
     }
@@ -370,14 +396,18 @@ impl Diagnosis {
             Self::DuplicateNode {
                 domain_id, node, ..
             } => (*domain_id, node, None, None),
-            Self::UnmatchedPublisher { writer, .. } | Self::HangingCall { writer, .. } => {
-                (DomainId(0), "", Some(*writer), None)
-            }
+            Self::UnmatchedPublisher { writer, .. }
+            | Self::HangingCall { writer, .. }
+            | Self::BuffersByCpu { writer, .. } => (DomainId(0), "", Some(*writer), None),
             Self::UnmatchedSubscription { reader, .. } => (DomainId(0), "", Some(*reader), None),
             Self::NodeInSeveralDomains {
                 node, participant, ..
             } => (DomainId(0), node, Some(*participant), None),
             Self::ObservationSuspended { domain_id, .. } => (*domain_id, "", None, None),
+            Self::SharedMachineId {
+                domain_id,
+                participants,
+            } => (*domain_id, "", participants.first().copied(), None),
             Self::SlowCallback { .. }
             | Self::ExecutorWait { .. }
             | Self::LateCallback { .. }

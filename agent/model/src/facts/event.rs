@@ -354,6 +354,7 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         Diagnosis::TypeHashConflict { hashes, .. } => hashes.truncate(LIST),
         Diagnosis::DuplicateNode { participants, .. } => participants.truncate(LIST),
         Diagnosis::NodeInSeveralDomains { domains, .. } => domains.truncate(LIST),
+        Diagnosis::SharedMachineId { participants, .. } => participants.truncate(LIST),
         Diagnosis::QosIncompatible { .. }
         | Diagnosis::UnmatchedPublisher { .. }
         | Diagnosis::UnmatchedSubscription { .. }
@@ -365,6 +366,7 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         | Diagnosis::ReaderQueueOverflow { .. }
         | Diagnosis::ObservationSuspended { .. }
         | Diagnosis::RestampingNode { .. }
+        | Diagnosis::BuffersByCpu { .. }
         | Diagnosis::SlowChain { .. } => {}
     }
     finding

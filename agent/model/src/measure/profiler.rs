@@ -357,6 +357,16 @@ impl Profiler {
         }
     }
 
+    /// Records that the numbers of this writer before its next sample may belong to other samples.
+    pub fn skip_numbers(&mut self, guid: Guid, at: ModelTime) {
+        if let Some(measured) = self.writers.get_mut(&guid) {
+            measured.opened = at;
+            if let Some(subscribers) = &mut measured.subscribers {
+                subscribers.skip_numbers(at);
+            }
+        }
+    }
+
     /// Stops measuring a writer; returns its counts if it belonged to a topic.
     pub fn stop(
         &mut self,

@@ -15,7 +15,7 @@ mod matched;
 use std::collections::VecDeque;
 
 use foldhash::{HashMap, HashMapExt as _, HashSet};
-use ros2probe_wire::{DomainId, GuidPrefix};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
 use addresses::AnnouncedAddresses;
 pub use matched::{Matched, MatchedReaders};
@@ -63,6 +63,21 @@ pub struct Graph {
     pub topics: Topics,
     /// Difference between model time and wall time, for timestamps of writers.
     pub wall_clock: WallClock,
+}
+
+impl Graph {
+    /// Returns the publisher or subscription of an endpoint: for a buffer endpoint that of its base
+    /// topic, otherwise the endpoint itself.
+    #[must_use]
+    pub fn base_of(&self, guid: Guid) -> Guid {
+        let base = || {
+            let endpoint = self.discovery.endpoints().get(&guid)?;
+            let naming = endpoint.naming().filter(|naming| naming.is_buffer)?;
+            let topic = self.topics.find(endpoint.domain_id, &naming)?;
+            self.topics.get(topic)?.base_of(guid, endpoint.base)
+        };
+        base().unwrap_or(guid)
+    }
 }
 
 /// Participants to which a socket may belong.

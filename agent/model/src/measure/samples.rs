@@ -52,8 +52,6 @@ pub struct Samples {
     partial: Bounded<PartialSamples, Vec<Partial>>,
     /// Samples that began before this time may lack fragments that were not captured.
     sure_from: ModelTime,
-    /// The highest number of a sample that began before `sure_from`, or was interrupted.
-    last_uncertain: SequenceNumber,
     /// Whether bytes were missed since the last sample began, perhaps its next one's first fragments.
     interrupted: bool,
 }
@@ -65,6 +63,8 @@ struct Partial {
     size: u32,
     fragment_size: u32,
     seen: u32,
+    /// Whether it may lack fragments that were not captured.
+    uncertain: bool,
     bitmap: Vec<u64>,
     /// Time at which the last fragment number was first seen.
     tail: Option<ModelTime>,
@@ -179,14 +179,16 @@ impl Samples {
     /// bytes between their fragments were not captured.
     pub fn interrupt(&mut self) {
         self.interrupted = true;
-        let newest = self.partial.iter().map(|each| each.number).max();
-        self.last_uncertain = self.last_uncertain.max(newest.unwrap_or_default());
+        for partial in self.partial.iter_mut() {
+            partial.uncertain = true;
+        }
     }
 
     /// Returns whether this sample is unfinished and may lack fragments without a loss.
     #[must_use]
     pub fn is_doubtful(&self, number: SequenceNumber) -> bool {
-        number <= self.last_uncertain && self.is_partial(number)
+        let partial = self.place(number).and_then(|index| self.partial.get(index));
+        partial.is_some_and(|partial| partial.uncertain)
     }
 
     /// Returns the lowest number, not below `first`, of a sample that still receives fragments.
@@ -264,14 +266,12 @@ impl Samples {
         budget.samples += 1;
         let began = sample.head.began();
         let was_interrupted = std::mem::take(&mut self.interrupted);
-        if began < self.sure_from || was_interrupted && fragments.starting > 1 {
-            self.last_uncertain = self.last_uncertain.max(number);
-        }
         self.partial.push(Partial {
             number,
             size: fragments.sample_size,
             fragment_size: fragments.fragment_size,
             seen: 0,
+            uncertain: began < self.sure_from || was_interrupted && fragments.starting > 1,
             bitmap: Vec::new(),
             tail: None,
             latest: sample.head.at,
@@ -345,6 +345,7 @@ mod tests {
             (0, 300),
         ] {
             let partial = || Partial {
+                uncertain: false,
                 number: SequenceNumber(1),
                 size: 0,
                 fragment_size: 0,

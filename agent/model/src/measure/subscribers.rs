@@ -136,6 +136,13 @@ impl Subscribers {
         is_affected
     }
 
+    /// Records that the writer's numbers before its next sample may belong to other samples.
+    pub fn skip_numbers(&mut self, at: ModelTime) {
+        for delivery in &mut self.deliveries {
+            delivery.open(at);
+        }
+    }
+
     /// Returns the sums over all deliveries, including former ones.
     #[must_use]
     pub const fn totals(&self) -> &Totals {

@@ -8,6 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use foldhash::HashMap;
+use ros2probe_wire::backends::Backends;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
@@ -18,6 +19,7 @@ use crate::facts::names::{DdsName, TypeName};
 use crate::facts::naming::Naming;
 use crate::facts::selection::{RequestIds, SampleRequest};
 use crate::facts::watch::Watchlist;
+use crate::graph::discovery::Discovery;
 use crate::measure::delivery::Totals;
 use crate::measure::expectation::Judgement;
 
@@ -76,6 +78,17 @@ pub struct Topic {
     pub is_held: bool,
 }
 
+/// The subscriptions of a topic that accept buffers of other backends than `cpu`.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Accelerated {
+    /// No subscription.
+    None,
+    /// Some subscriptions; others get messages as a whole.
+    Some,
+    /// All subscriptions. Holds the lowest gid of them.
+    All([u8; 16]),
+}
+
 /// All topics of all domains.
 ///
 /// Values are boxed: a hash table under churn allocates up to four slots per entry.
@@ -108,6 +121,89 @@ impl Topic {
             own.take_while(move |guid| guid.prefix == prefix)
         });
         own.filter(|guid| !guid.entity.is_writer())
+    }
+
+    /// Returns the publisher or subscription for which a buffer endpoint carries messages: the one
+    /// that it announces, otherwise the one that its participant created last before it
+    /// (`rmw_fastrtps_cpp` of Lyrical, `publisher.cpp`).
+    #[must_use]
+    pub fn base_of(&self, buffer: Guid, announced: Option<Guid>) -> Option<Guid> {
+        let list = match buffer.entity.is_writer() {
+            true => &self.writers,
+            false => &self.readers,
+        };
+        if let Some(announced) = announced {
+            let is_own = announced.prefix == buffer.prefix;
+            return list
+                .binary_search(&announced)
+                .ok()
+                .filter(|_| is_own)
+                .map(|_| announced);
+        }
+        let start = list.partition_point(|guid| guid.prefix < buffer.prefix);
+        let own = list.iter().skip(start).copied();
+        let mut own = own.take_while(|guid| guid.prefix == buffer.prefix);
+        let first = own.next()?;
+        Some(
+            own.take_while(|guid| *guid < buffer)
+                .last()
+                .unwrap_or(first),
+        )
+    }
+
+    /// Returns the buffer endpoints, each with the publisher or subscription to which it belongs.
+    pub fn buffers<'a>(
+        &'a self,
+        discovery: &'a Discovery,
+    ) -> impl Iterator<Item = (Guid, Guid)> + 'a {
+        self.buffer_endpoints.iter().filter_map(|guid| {
+            let announced = discovery.endpoints().get(guid)?.base;
+            Some((*guid, self.base_of(*guid, announced)?))
+        })
+    }
+
+    /// Returns who gets references to buffers instead of messages.
+    #[must_use]
+    pub fn accelerated(&self, discovery: &Discovery) -> Accelerated {
+        let (mut some, mut all, mut first) = (false, !self.readers.is_empty(), None);
+        for reader in &self.readers {
+            let endpoint = discovery.endpoints().get(reader);
+            let backends = endpoint.and_then(|endpoint| endpoint.backends.as_deref());
+            match backends.is_some_and(Backends::is_accelerated) {
+                true => some = true,
+                false => all = false,
+            }
+            first = first
+                .into_iter()
+                .chain(endpoint.map(|endpoint| endpoint.gid))
+                .min();
+        }
+        match (some, first.filter(|_| all)) {
+            (false, _) => Accelerated::None,
+            (true, None) => Accelerated::Some,
+            (true, Some(first)) => Accelerated::All(first),
+        }
+    }
+
+    /// Returns whether the samples of a buffer writer that carries references count as messages of
+    /// its publisher: the publisher sends no message as a whole, and this is its first such writer.
+    #[must_use]
+    pub fn counts_references(&self, writer: Guid, discovery: &Discovery) -> bool {
+        let is_reference = |guid: Guid| {
+            let endpoint = discovery.endpoints().get(&guid);
+            let naming = endpoint.and_then(|endpoint| endpoint.naming());
+            guid.entity.is_writer() && naming.is_some_and(|naming| !naming.counts)
+        };
+        let Some(base) = self.buffers(discovery).find(|(guid, _)| *guid == writer) else {
+            return false;
+        };
+        let mut own = self
+            .buffers(discovery)
+            .filter(|(_, other)| *other == base.1);
+        matches!(self.accelerated(discovery), Accelerated::All(_))
+            && own
+                .find(|(guid, _)| is_reference(*guid))
+                .is_some_and(|first| first == base)
     }
 
     /// Returns whether no endpoint is left.

@@ -589,7 +589,13 @@ impl Observer {
                     let Some(endpoint) = self.graph.discovery.endpoints().get(&guid) else {
                         continue;
                     };
+                    let topic = endpoint
+                        .naming()
+                        .and_then(|naming| self.graph.topics.find(endpoint.domain_id, &naming));
                     self.measure.profiler.learn(guid, traits(guid, endpoint));
+                    if let Some(topic) = topic {
+                        self.apply_to_buffers(topic, now);
+                    }
                 }
                 Change::Gone(guid, endpoint) => self.gone(guid, &endpoint, now),
             }
@@ -620,6 +626,7 @@ impl Observer {
             self.apply_lists(id, now);
         }
         self.apply(id, guid, now);
+        self.apply_to_buffers(id, now);
         let opened = self
             .graph
             .topics
@@ -646,6 +653,7 @@ impl Observer {
             .and_then(|naming| self.graph.topics.find(endpoint.domain_id, &naming));
         if let Some(id) = id {
             self.graph.topics.leave(id, guid, now);
+            self.apply_to_buffers(id, now);
         }
     }
 }

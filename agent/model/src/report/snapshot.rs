@@ -7,6 +7,7 @@ mod delivery;
 
 use std::sync::Arc;
 
+use ros2probe_wire::backends::Backends;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::rtps::VendorId;
@@ -302,6 +303,10 @@ pub struct EndpointFacts {
     pub transports: u8,
     /// The last message of a transient-local writer; `None` if none is kept.
     pub latched: Option<LatchedFacts>,
+    /// Backends of buffers that it accepts; `None` if it has none.
+    pub backends: Option<Arc<Backends>>,
+    /// Its endpoints on the buffer topics. `measurement` contains theirs.
+    pub buffers: Box<[Guid]>,
 }
 
 impl TopicFacts {
@@ -382,6 +387,13 @@ impl TopicFacts {
 }
 
 impl EndpointFacts {
+    /// Returns whether messages of this writer, or of its writers on the buffer topics, have this
+    /// GUID.
+    #[must_use]
+    pub fn writes_as(&self, guid: Guid) -> bool {
+        self.guid == guid || self.buffers.contains(&guid)
+    }
+
     /// Returns the history as text: `KEEP_LAST (10)`, `KEEP_ALL` or, if not announced, `UNKNOWN`.
     #[must_use]
     pub fn history(&self) -> String {

@@ -75,7 +75,7 @@ pub(crate) fn may_share_memory(discovery: &Discovery, writer: Guid) -> bool {
         && participants.iter().any(|(prefix, other)| {
             *prefix != writer.prefix
                 && other.proxy.shared_memory
-                && is_one_host(VendorId::EPROSIMA, *prefix, writer.prefix)
+                && is_one_host(discovery, VendorId::EPROSIMA, *prefix, writer.prefix)
         })
 }
 
@@ -135,7 +135,7 @@ pub(crate) fn transport(discovery: &Discovery, writer: Guid, reader: Guid) -> Op
         true => Transport::Tcp,
         false => Transport::Network,
     };
-    if vendor != other || !is_one_host(vendor, writer.prefix, reader.prefix) {
+    if vendor != other || !is_one_host(discovery, vendor, writer.prefix, reader.prefix) {
         return Some(network());
     }
     let shared_memory = |guid: Guid, endpoint: &Endpoint| {
@@ -171,10 +171,22 @@ fn is_one_process(discovery: &Discovery, one: GuidPrefix, other: GuidPrefix) -> 
             && one.0.first_chunk::<8>() == other.0.first_chunk::<8>()
 }
 
-/// Returns whether both prefixes belong to one host. Fast DDS stores vendor and host in the first
-/// four bytes; only participants that announce shared memory are compared.
-fn is_one_host(vendor: VendorId, one: GuidPrefix, other: GuidPrefix) -> bool {
-    vendor != VendorId::EPROSIMA || one.0.first_chunk::<4>() == other.0.first_chunk::<4>()
+/// Returns whether both participants consider each other to be on one host. Fast DDS 3.2 and later
+/// compares the ids of the machines, earlier ones the first four bytes of the prefixes, which hold
+/// vendor and host. Only participants that announce shared memory are compared.
+fn is_one_host(
+    discovery: &Discovery,
+    vendor: VendorId,
+    one: GuidPrefix,
+    other: GuidPrefix,
+) -> bool {
+    let participants = discovery.participants();
+    let machine = |prefix| participants.get(&prefix)?.proxy.machine_id.as_ref();
+    match (machine(one), machine(other)) {
+        _ if vendor != VendorId::EPROSIMA => true,
+        (Some(one), Some(other)) => one == other,
+        _ => one.0.first_chunk::<4>() == other.0.first_chunk::<4>(),
+    }
 }
 
 #[cfg(test)]
@@ -200,8 +212,9 @@ mod tests {
         assert!(is_one_process(&discovery, one, one));
         assert!(is_one_process(&discovery, one, sibling));
         assert!(!is_one_process(&discovery, one, neighbour));
-        assert!(is_one_host(VendorId::EPROSIMA, one, neighbour));
-        assert!(!is_one_host(VendorId::EPROSIMA, one, unknown_writer));
+        let is_one_host = |one, other| is_one_host(&discovery, VendorId::EPROSIMA, one, other);
+        assert!(is_one_host(one, neighbour));
+        assert!(!is_one_host(one, unknown_writer));
         let (cyclone, other) = (
             prefix([1, 16, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1]),
             prefix([1, 16, 0, 0, 1, 1, 1, 1, 2, 1, 1, 1]),

@@ -9,6 +9,7 @@
 
 mod allocator;
 mod bounds;
+mod buffers;
 mod chains;
 mod churn;
 mod deliveries;

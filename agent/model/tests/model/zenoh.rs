@@ -1,5 +1,6 @@
 //! Sessions of Zenoh: how they appear and end, and what hostile senders cannot do.
 
+mod buffers;
 mod processes;
 mod routers;
 
@@ -12,7 +13,7 @@ use ros2probe_model::graph::discovery::Memory;
 use ros2probe_model::graph::zenoh::{StreamEvent, Unseen, ZenohFacts};
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{Observer, Settings};
-use ros2probe_model::report::snapshot::{Snapshot, TableFacts, TopicFacts};
+use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot, TableFacts, TopicFacts};
 use ros2probe_testing::zenoh::{
     Role, connection, declare_key, declare_token, fragment, frame, init, open, publisher, push,
     report, response, send, undeclare_token,

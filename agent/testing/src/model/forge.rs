@@ -173,6 +173,21 @@ pub fn participant_at(
     encapsulated(&list)
 }
 
+/// Returns the SPDP payload of a participant of Fast DDS with shared memory on this machine.
+pub fn participant_on(prefix: GuidPrefix, machine_id: &str) -> Vec<u8> {
+    let guid = Guid::new(prefix, EntityId::PARTICIPANT);
+    let shared_memory = [&16u32.to_le_bytes()[..], &7412u32.to_le_bytes(), &[0; 16]].concat();
+    encapsulated(&[
+        (0x15, vec![2, 3]),
+        (0x16, vec![1, 0x0f]),
+        (0x50, guid.to_bytes().to_vec()),
+        (0x02, [1000u32.to_le_bytes(), [0; 4]].concat()),
+        (0x0f, 0u32.to_le_bytes().to_vec()),
+        (0x31, shared_memory),
+        (0x8003, text(machine_id)),
+    ])
+}
+
 /// Returns an SEDP payload.
 pub fn endpoint(guid: Guid, topic: &str, type_name: &str, reliable: bool) -> Vec<u8> {
     let reliability = if reliable { 2u32 } else { 1 };

@@ -38,6 +38,12 @@ pub(super) fn endpoint<'a>(
             ownership: Cow::Borrowed(qos.ownership.label()),
             partitions: texts(&qos.partitions),
         },
+        backends: facts
+            .backends
+            .iter()
+            .flat_map(|backends| backends.names())
+            .map(Cow::Borrowed)
+            .collect(),
         first_seen_timestamp_seconds: clock.wall_time(facts.first_seen).seconds(),
         measurement: measured.map(|facts| measurement(facts, clock)),
         latched: facts.latched.map(latched),

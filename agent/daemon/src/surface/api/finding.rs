@@ -136,6 +136,19 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
             node: Cow::Borrowed(node),
             input: Cow::Borrowed(input),
         },
+        diagnosis::Diagnosis::BuffersByCpu {
+            writer,
+            reader,
+            backends,
+            ..
+        } => Diagnosis::BuffersByCpu {
+            writer: writer.to_string(),
+            reader: reader.map(|reader| reader.to_string()),
+            backends: texts(backends),
+        },
+        diagnosis::Diagnosis::SharedMachineId { participants, .. } => Diagnosis::SharedMachineId {
+            participants: printed(participants),
+        },
         diagnosis::Diagnosis::SlowChain {
             from, max_latency, ..
         } => Diagnosis::SlowChain {

@@ -95,10 +95,13 @@ impl Graph {
                 }
             }
             if is_input {
-                for writer in &topic.writers {
-                    let owner = (writer.prefix, owners.get(writer).copied());
+                let own = topic.writers.iter().map(|writer| (*writer, *writer));
+                let buffers = topic.buffers(discovery);
+                let buffers = buffers.filter(|(buffer, _)| buffer.entity.is_writer());
+                for (writer, publisher) in own.chain(buffers) {
+                    let owner = (writer.prefix, owners.get(&publisher).copied());
                     domains.insert(owner, topic.domain_id);
-                    writers.push((*writer, owner, id));
+                    writers.push((writer, owner, id));
                 }
             }
         }

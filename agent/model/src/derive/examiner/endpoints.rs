@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::discovery::{Role, TypeHash};
+use ros2probe_wire::qos::Durability;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, Guid};
 
@@ -70,6 +71,7 @@ impl<'a> EndpointExaminer<'a> {
         let mut readers = self.groups(&topic.readers);
         self.types(topic, &key, findings);
         compare(&mut writers, &mut readers, &key, findings);
+        self.buffers(topic, &key, findings);
         if !is_about_hearing(topic) || self.half_known.contains(&topic.domain_id) {
             return Vec::new();
         }
@@ -101,6 +103,33 @@ impl<'a> EndpointExaminer<'a> {
             }
         }
         unmatched
+    }
+
+    /// Adds publishers that could send references to buffers, but send messages as a whole.
+    fn buffers(&self, topic: &Topic, key: &impl Fn() -> TopicKey, findings: &mut Findings) {
+        let endpoint = |guid: &Guid| Some((*guid, self.endpoint(*guid)?.0));
+        let mut readers = topic.readers.iter().filter_map(endpoint);
+        let plain = readers.find(|(_, reader)| reader.backends.is_none());
+        for (writer, of_writer) in topic.writers.iter().filter_map(endpoint) {
+            let Some(own) = of_writer.backends.as_deref() else {
+                continue;
+            };
+            if !findings.spend(topic.readers.len()) {
+                break;
+            }
+            let readers = topic.readers.iter().filter_map(endpoint);
+            let others = readers.filter_map(|(_, reader)| reader.backends.as_deref());
+            let shared: BTreeSet<_> = others.flat_map(|other| own.shared(other)).collect();
+            let is_latched = of_writer.qos.durability != Durability::VOLATILE;
+            if !shared.is_empty() && (is_latched || plain.is_some()) {
+                findings.add(Diagnosis::BuffersByCpu {
+                    topic: key(),
+                    writer,
+                    reader: plain.map(|(guid, _)| guid),
+                    backends: shared.into_iter().map(Into::into).collect(),
+                });
+            }
+        }
     }
 
     fn endpoint(&self, guid: Guid) -> Option<(&'a Endpoint, VendorId)> {

@@ -10,6 +10,9 @@ use crate::facts::diagnosis::Diagnosis;
 use crate::facts::names::NodeName;
 use crate::graph::discovery::{Discovery, Node, Participant};
 
+/// Maximum number of participants that a finding names.
+const MAX_HOSTS: usize = 16;
+
 /// A node with its participant.
 #[derive(Clone, Copy, Debug)]
 struct HostedNode<'a> {
@@ -50,6 +53,55 @@ pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
         }
         several_domains(name, nodes, discovery, findings);
     }
+}
+
+/// Adds participants of Fast DDS that consider each other to be on one host, although they have no
+/// address in common: cloned machines, or containers with the host's machine id.
+pub(super) fn examine_machines(discovery: &Discovery, findings: &mut Findings) {
+    let mut machines: BTreeMap<(DomainId, &str), BTreeMap<BTreeSet<IpAddr>, Guid>> =
+        BTreeMap::new();
+    for (prefix, participant) in discovery.participants() {
+        let (Some(id), true) = (
+            &participant.proxy.machine_id,
+            participant.proxy.shared_memory,
+        ) else {
+            continue;
+        };
+        let Some(addresses) = addresses(participant) else {
+            continue;
+        };
+        let guid = Guid::new(*prefix, EntityId::PARTICIPANT);
+        let of_id = machines.entry((participant.domain_id, id)).or_default();
+        let first = of_id.entry(addresses).or_insert(guid);
+        *first = guid.min(*first);
+    }
+    for ((domain_id, _), hosts) in machines {
+        // Interfaces come and go, so hosts with a common address are one.
+        let mut apart: Vec<(&BTreeSet<IpAddr>, Guid)> = Vec::new();
+        for (addresses, guid) in &hosts {
+            if apart.iter().all(|(other, _)| other.is_disjoint(addresses)) {
+                apart.push((addresses, *guid));
+            }
+        }
+        if apart.len() > 1 {
+            let mut participants: Vec<_> = apart.into_iter().map(|(_, guid)| guid).collect();
+            participants.sort_unstable();
+            participants.truncate(MAX_HOSTS);
+            findings.add(Diagnosis::SharedMachineId {
+                domain_id,
+                participants,
+            });
+        }
+    }
+}
+
+/// Returns the addresses of a participant other than those of loopback; `None` without one.
+fn addresses(participant: &Participant) -> Option<BTreeSet<IpAddr>> {
+    let addresses = &participant.addresses;
+    let all = addresses.default.iter().chain(&addresses.metatraffic);
+    let all = all.map(std::net::SocketAddr::ip);
+    let found: BTreeSet<_> = all.filter(|address| !address.is_loopback()).collect();
+    (!found.is_empty()).then_some(found)
 }
 
 /// Adds nodes in several domains: their endpoints are announced in several domains, or nodes of the

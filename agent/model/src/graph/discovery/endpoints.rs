@@ -97,6 +97,10 @@ impl Discovery {
                 if *known.qos != announcement.qos {
                     known.qos = Arc::new(announcement.qos.clone());
                 }
+                if known.backends.as_deref() != announcement.backends.as_ref() {
+                    known.backends = announcement.backends.clone().map(Arc::new);
+                }
+                known.base = announcement.base;
                 known.type_hash = announcement.type_hash;
                 known.message_type = announcement.type_name.message().as_str().into();
                 let unchanged = before.0 == known.type_hash
@@ -143,6 +147,8 @@ impl Discovery {
             shared_memory,
             tcp,
             data_sharing: announcement.datasharing,
+            backends: announcement.backends.map(Arc::new),
+            base: announcement.base,
             watched,
         };
         let entity = DiscoveredEntity::endpoint(guid, &endpoint);

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
+use ros2probe_wire::backends::Backends;
 use ros2probe_wire::discovery::{ParticipantAnnouncement, Role, TypeHash};
 use ros2probe_wire::entities::NodeEntities;
 use ros2probe_wire::names::DdsTopic;
@@ -75,6 +76,8 @@ pub struct ParticipantProxy {
     pub tcp: bool,
     /// Whether it announces its endpoints by TCP and not by UDP.
     pub announces_by_tcp: bool,
+    /// Id of its machine, which Fast DDS 3.2 and later announces.
+    pub machine_id: Option<Arc<str>>,
 }
 
 /// Unicast UDP addresses of a participant.
@@ -155,6 +158,10 @@ pub struct Endpoint {
     pub tcp: Option<bool>,
     /// Whether it supports data sharing with endpoints on its host.
     pub data_sharing: bool,
+    /// Backends of buffers; `None` if it has none.
+    pub backends: Option<Arc<Backends>>,
+    /// The endpoint of the base topic for which it carries buffers, if it announces one.
+    pub base: Option<Guid>,
     /// Whether its topic is watched by exact name.
     pub(super) watched: bool,
 }
@@ -176,6 +183,7 @@ impl ParticipantProxy {
                 .any(Locator::is_shared_memory),
             tcp: Locator::are_tcp(&announcement.default_unicast),
             announces_by_tcp: Locator::are_tcp(&announcement.metatraffic_unicast),
+            machine_id: announcement.machine_id.as_deref().map(Into::into),
         }
     }
 }

@@ -8,6 +8,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use ros2probe_wire::backends::Backends;
 use ros2probe_wire::discovery::{Role, TypeHash};
 use ros2probe_wire::names::{DdsTopic, RosType};
 use ros2probe_wire::qos::{
@@ -57,6 +58,8 @@ pub struct Remembered {
     tcp: bool,
     #[serde(default)]
     announces_by_tcp: bool,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    machine_id: Option<String>,
     addresses: Addresses,
     nodes: Vec<RememberedNode>,
     /// Writer and number of the sample that announced the nodes.
@@ -99,6 +102,10 @@ struct RememberedEndpoint {
     tcp: Option<bool>,
     #[serde(default)]
     data_sharing: bool,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    backends: Option<Vec<String>>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    base: Option<String>,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -202,6 +209,7 @@ impl Remembered {
             shared_memory: proxy.shared_memory,
             tcp: proxy.tcp,
             announces_by_tcp: proxy.announces_by_tcp,
+            machine_id: text(&proxy.machine_id),
             addresses: participant.addresses.clone(),
             nodes: participant.nodes.iter().map(RememberedNode::of).collect(),
             nodes_from: participant
@@ -213,7 +221,12 @@ impl Remembered {
 
     fn participant(&self, now: ModelTime) -> Option<(GuidPrefix, Participant)> {
         let prefix = GuidPrefix(hexadecimal(&self.prefix)?);
-        let texts = [&self.enclave, &self.host, &self.process_name];
+        let texts = [
+            &self.enclave,
+            &self.host,
+            &self.process_name,
+            &self.machine_id,
+        ];
         let all_plain = texts.into_iter().flatten().all(|text| is_plain(text));
         let domain_id = DomainId::try_from(self.domain_id).ok()?;
         if !all_plain {
@@ -233,6 +246,7 @@ impl Remembered {
                 shared_memory: self.shared_memory,
                 tcp: self.tcp,
                 announces_by_tcp: self.announces_by_tcp,
+                machine_id: text(&self.machine_id),
             },
             addresses: self.addresses.clone(),
             restored: Some(now),
@@ -303,6 +317,11 @@ impl RememberedEndpoint {
             shared_memory: endpoint.shared_memory,
             tcp: endpoint.tcp,
             data_sharing: endpoint.data_sharing,
+            backends: endpoint
+                .backends
+                .as_deref()
+                .map(|backends| backends.names().map(str::to_owned).collect()),
+            base: endpoint.base.map(digits),
         }
     }
 
@@ -364,6 +383,11 @@ impl RememberedEndpoint {
             shared_memory: self.shared_memory,
             tcp: self.tcp,
             data_sharing: self.data_sharing,
+            backends: self
+                .backends
+                .as_ref()
+                .map(|names| Arc::new(Backends::of(names.iter().map(String::as_str)))),
+            base: self.base.as_deref().and_then(Guid::of_digits),
             watched: false,
         };
         Some((guid, endpoint))
@@ -479,6 +503,8 @@ mod tests {
             shared_memory: None,
             tcp: None,
             data_sharing: false,
+            backends: None,
+            base: None,
             watched: false,
         };
         let back = |kept: &serde_json::Value| {

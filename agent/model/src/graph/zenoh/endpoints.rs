@@ -34,6 +34,7 @@ pub(super) fn announcements(token: &EndpointToken) -> Vec<EndpointAnnouncement> 
             gid: token.gid.0,
             qos: token.qos.clone().unwrap_or_else(|| announced.qos.clone()),
             type_hash: token.type_hash,
+            backends: token.backends.clone(),
             ..announced
         })
     });

@@ -15,7 +15,7 @@ use super::endpoints::unknown_guid;
 use super::graph::service_key;
 use super::routers::domain_of_graph;
 use super::stream::StreamId;
-use super::stream_state::{Alias, resolve};
+use super::stream_state::{Alias, Channel, resolve};
 
 impl Zenoh {
     pub(super) fn network(
@@ -74,7 +74,8 @@ impl Zenoh {
         show: &mut impl FnMut(Shown<'_>),
     ) {
         let alias = self.resolve(place.stream, key);
-        if alias.is_some_and(|alias| !alias.is_topic) {
+        let channel = alias.map_or(Channel::Messages, |alias| alias.channel);
+        if channel == Channel::Other {
             return;
         }
         let Some(attachment) = attachment(put) else {
@@ -85,7 +86,13 @@ impl Zenoh {
         let writer = writer.unwrap_or_else(|| unknown_guid(attachment.gid));
         self.note_source(place.stream, attachment.gid, show);
         let sample = self.arrived(place, writer, &attachment, put.payload);
-        show(Shown::Sample(&sample));
+        show(Shown::Sample(&ZenohSample {
+            referring: match channel {
+                Channel::References(subscription) => Some(subscription),
+                Channel::Messages | Channel::Other => None,
+            },
+            ..sample
+        }));
     }
 
     /// Passes the request of a service's client to `show`.
@@ -170,6 +177,7 @@ impl Zenoh {
             receiving_socket: self.receiving_socket(place.stream),
             began: place.began,
             call: None,
+            referring: None,
         }
     }
 

@@ -69,6 +69,8 @@ pub struct ZenohSample<'a> {
     pub began: ModelTime,
     /// For a request or reply: gid of the client, and the number of the request.
     pub call: Option<(Gid, SequenceNumber)>,
+    /// The gid of the subscription, if the sample contains references to buffers and no message.
+    pub referring: Option<Gid>,
 }
 
 /// A fact that a report shows.

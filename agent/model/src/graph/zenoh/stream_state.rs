@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use ros2probe_wire::DomainId;
 use ros2probe_wire::zenoh::{
-    Fragment, Key, Lane, PORT, Resolution, Side, WhatAmI, WireExpr, ZenohId,
+    Buffer, Fragment, Gid, Key, Lane, PORT, Resolution, Side, WhatAmI, WireExpr, ZenohId,
 };
 
 use super::stream::StreamId;
@@ -32,8 +32,18 @@ pub(super) type Aliases = ByOwner<ZenohAliases, DirectionNumber, u16, Alias>;
 #[derive(Clone, Debug)]
 pub(super) struct Alias {
     pub(super) key: Arc<str>,
-    /// Whether the key belongs to a topic or service of ROS.
-    pub(super) is_topic: bool,
+    pub(super) channel: Channel,
+}
+
+/// The samples with a key.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Channel {
+    /// Messages of a topic or service of ROS.
+    Messages,
+    /// References to buffers for the subscription with this gid.
+    References(Gid),
+    /// Samples that do not belong to a topic.
+    Other,
 }
 
 /// A message of which some FRAGMENTs have arrived.
@@ -123,13 +133,16 @@ impl HeapBytes for Alias {
 
 impl Alias {
     fn new(key: &str) -> Self {
-        let is_topic = match Key::parse(key) {
-            Ok(Key::Topic(topic)) => topic.buffer.is_none(),
-            _ => false,
+        let channel = match Key::parse(key) {
+            Ok(Key::Topic(topic)) => match topic.buffer {
+                Some(Buffer::Subscriber(gid)) => Channel::References(gid),
+                Some(Buffer::Cpu) | None => Channel::Messages,
+            },
+            _ => Channel::Other,
         };
         Self {
             key: key.into(),
-            is_topic,
+            channel,
         }
     }
 }

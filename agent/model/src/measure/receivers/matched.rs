@@ -122,9 +122,9 @@ impl<'a> MatchedReaders<'a> {
         else {
             return true;
         };
-        // The types of a buffer topic differ from those of its base topic.
-        let has_type = one.topic != other.topic || one.message_type == other.message_type;
-        has_type
+        // A topic and its buffer topics are several topics of DDS.
+        one.topic == other.topic
+            && one.message_type == other.message_type
             && writer.shares_protocol(reader)
             && (effort(writer.qos, reader.qos) > EFFORT
                 || verdict(writer, reader) == Verdict::Match)

@@ -43,7 +43,8 @@ fn arrivals(
 ) -> Option<Arrivals> {
     let (discovery, topics) = (&graph.discovery, &graph.topics);
     let topic = topics.get(topics.find(domain_id, naming)?)?;
-    if topic.watched != Watched::Yes {
+    // `rmw_fastrtps_cpp` takes messages of buffer topics without `rmw_take`.
+    if topic.watched != Watched::Yes || !topic.buffer_endpoints.is_empty() {
         return None;
     }
     let own = participants.iter();

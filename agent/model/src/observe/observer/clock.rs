@@ -110,14 +110,16 @@ impl Observer {
 
     /// Reports the losses of the last second.
     fn report_losses(&mut self) {
-        let discovery = &self.graph.discovery;
+        let graph = &self.graph;
+        let discovery = &graph.discovery;
         self.journal.events.end_bursts(|burst| {
             if let Some(endpoint) = discovery.endpoints().get(&burst.writer) {
                 burst.topic = Some((endpoint.domain_id, endpoint.topic.bounded(TEXT)));
             }
             let participant = discovery.participants().get(&burst.writer.prefix);
             let mut nodes = participant.into_iter().flat_map(|known| &known.nodes);
-            let node = nodes.find(|node| node.writers.contains(&burst.writer));
+            let publisher = graph.base_of(burst.writer);
+            let node = nodes.find(|node| node.writers.contains(&publisher));
             burst.node = node.map(|node| node.name.bounded(TEXT));
         });
     }

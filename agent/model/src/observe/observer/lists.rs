@@ -129,6 +129,16 @@ impl Observer {
         }
     }
 
+    /// Applies the decision about a topic to its buffer endpoints again: which of them counts messages
+    /// depends on all endpoints.
+    pub(super) fn apply_to_buffers(&mut self, id: TopicId, now: ModelTime) {
+        let topic = self.graph.topics.get(id);
+        let guids = topic.map(|topic| topic.buffer_endpoints.clone());
+        for guid in guids.unwrap_or_default() {
+            self.apply(id, guid, now);
+        }
+    }
+
     /// Applies the decision about a topic to one endpoint.
     pub(super) fn apply(&mut self, id: TopicId, guid: Guid, now: ModelTime) {
         let Some(topic) = self.graph.topics.get(id) else {
@@ -143,7 +153,8 @@ impl Observer {
             Role::Reader => self.requested.interest.remove(guid),
             Role::Writer => {
                 let counts = endpoint.naming().is_some_and(|naming| naming.counts);
-                let measured = is_watched && counts;
+                let measured =
+                    is_watched && (counts || topic.counts_references(guid, &self.graph.discovery));
                 let is_call = self
                     .derive
                     .services
@@ -155,14 +166,14 @@ impl Observer {
                 let latched = self.measure.latched.verdict(guid);
                 let verdict = match topic.naming.kind {
                     TopicKind::Discovery => Verdict::Capture,
-                    _ if measured && wants_bytes(topic) => Verdict::Capture,
+                    _ if measured && counts && wants_bytes(topic) => Verdict::Capture,
                     _ if is_call || latched == Some(Verdict::Capture) => Verdict::Capture,
                     _ if measured => Verdict::Meter,
                     _ => latched.unwrap_or(Verdict::Ignore),
                 };
                 self.requested.interest.set(guid, verdict);
                 match &topic.requested {
-                    Some(requested) if measured => {
+                    Some(requested) if measured && counts => {
                         let topic = published(topic, endpoint);
                         let known = self.measure.profiler.get(guid);
                         let next = known.map_or(SequenceNumber::ZERO, |known| known.writer.next());

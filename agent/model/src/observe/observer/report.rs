@@ -14,18 +14,19 @@ use crate::facts::measurement::Measurement;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{DdsName, NodeName};
 use crate::facts::watch::WatchState;
-use crate::graph::discovery::{Discovery, Endpoint, ParticipantProxy};
+use crate::graph::discovery::{Discovery, ParticipantProxy};
 use crate::graph::sockets::SocketFacts;
+use crate::measure::receivers::Graph;
 use crate::measure::topic::{Topic, Watched};
 use crate::report::snapshot::{
-    DecodeErrorCount, EndpointFacts, LatchedFacts, NodeFacts, ParticipantFacts, ProcessFacts,
-    Snapshot, TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchedTopicFacts,
+    DecodeErrorCount, EndpointFacts, NodeFacts, ParticipantFacts, ProcessFacts, Snapshot,
+    TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchedTopicFacts,
 };
 use crate::report::transport::transports;
 
 pub(super) fn snapshot(observer: &Observer, wall_time: Timestamp) -> Snapshot {
     let now = observer.graph.wall_clock.model_time(wall_time);
-    let nodes = nodes_of_endpoints(&observer.graph.discovery);
+    let nodes = nodes_of_endpoints(&observer.graph);
     Snapshot {
         at: now,
         wall_clock: observer.graph.wall_clock,
@@ -111,12 +112,20 @@ fn node_facts(discovery: &Discovery) -> Vec<NodeFacts> {
 }
 
 /// Returns the node of each endpoint.
-fn nodes_of_endpoints(discovery: &Discovery) -> HashMap<Guid, &NodeName> {
+fn nodes_of_endpoints(graph: &Graph) -> HashMap<Guid, &NodeName> {
+    let discovery = &graph.discovery;
     let mut nodes = HashMap::with_capacity(discovery.endpoints().len());
     for participant in discovery.participants().values() {
         for node in &participant.nodes {
             for guid in node.writers.iter().chain(&node.readers) {
                 nodes.insert(*guid, &node.name);
+            }
+        }
+    }
+    for (_, topic) in graph.topics.iter() {
+        for (buffer, base) in topic.buffers(discovery) {
+            if let Some(name) = nodes.get(&base).copied() {
+                nodes.insert(buffer, name);
             }
         }
     }
@@ -129,21 +138,34 @@ fn topic(
     nodes: &HashMap<Guid, &NodeName>,
     now: ModelTime,
 ) -> TopicFacts {
+    let measured = |guid: Guid| {
+        let measured = observer.measure.profiler.get(guid);
+        let measured = measured.filter(|measured| measured.topic.is_some())?;
+        Some(measured.writer.measurement(now))
+    };
+    let bases: Vec<_> = topic.buffers(&observer.graph.discovery).collect();
     let endpoint = |guid: &Guid| {
         let endpoint = observer.graph.discovery.endpoints().get(guid)?;
-        let measured = observer
-            .measure
-            .profiler
-            .get(*guid)
-            .filter(|measured| measured.topic.is_some());
-        let measurement = measured.map(|measured| Box::new(measured.writer.measurement(now)));
-        Some(endpoint_facts(
-            *guid,
-            endpoint,
-            nodes.get(guid).copied(),
+        let own = bases.iter().filter(|(_, base)| base == guid);
+        let buffers: Vec<Guid> = own.map(|(buffer, _)| *buffer).collect();
+        let mut measurement = measured(*guid).map(Box::new);
+        for other in buffers.iter().filter_map(|buffer| measured(*buffer)) {
+            measurement.get_or_insert_default().add(&other);
+        }
+        Some(EndpointFacts {
+            guid: *guid,
+            gid: endpoint.gid,
+            node: nodes.get(guid).copied().cloned(),
+            qos: Arc::clone(&endpoint.qos),
+            message_type: endpoint.message_type.clone(),
+            type_hash: endpoint.type_hash,
+            first_seen: endpoint.first_seen,
             measurement,
-            observer.measure.latched.facts(*guid),
-        ))
+            transports: 0,
+            latched: observer.measure.latched.facts(*guid),
+            backends: endpoint.backends.clone(),
+            buffers: buffers.into(),
+        })
     };
     let mut publishers = fitting(
         topic.writers.len(),
@@ -167,7 +189,8 @@ fn topic(
         message_types.extend(topic.last_type.clone());
     }
     let type_hashes: BTreeSet<_> = all().filter_map(|each| each.type_hash).collect();
-    let mut measurement = apart(observer, topic, now);
+    let is_apart = |guid: &Guid| !bases.iter().any(|(buffer, _)| buffer == guid);
+    let mut measurement = apart(observer, topic, is_apart, now);
     if let Some(sum) = &mut measurement {
         let own = publishers
             .iter()
@@ -216,7 +239,7 @@ pub(super) fn measured(
     let topics = observer.graph.topics.iter().map(|(_, topic)| topic);
     let topics = topics.filter(|topic| topic.watched == Watched::Yes);
     topics.filter_map(move |topic| {
-        let mut sum = *apart(observer, topic, now)?;
+        let mut sum = *apart(observer, topic, |_| true, now)?;
         for guid in &topic.writers {
             let measured = observer.measure.profiler.get(*guid);
             if let Some(own) = measured.filter(|measured| measured.topic.is_some()) {
@@ -230,11 +253,16 @@ pub(super) fn measured(
     })
 }
 
-/// Returns the counts of vanished writers and of buffer topics; `None` for a topic that is not
-/// measured.
-fn apart(observer: &Observer, topic: &Topic, now: ModelTime) -> Option<Box<Measurement>> {
+/// Returns the counts of vanished writers, and of those buffer endpoints that are meant; `None` for
+/// a topic that is not measured.
+fn apart(
+    observer: &Observer,
+    topic: &Topic,
+    is_meant: impl Fn(&Guid) -> bool,
+    now: ModelTime,
+) -> Option<Box<Measurement>> {
     let mut sum = topic.retired.clone()?;
-    for guid in &topic.buffer_endpoints {
+    for guid in topic.buffer_endpoints.iter().filter(|guid| is_meant(guid)) {
         if let Some(buffer_endpoints) = observer.measure.profiler.get(*guid) {
             sum.add(&buffer_endpoints.writer.measurement(now));
         }
@@ -247,27 +275,6 @@ fn fitting<T>(length: usize, items: impl Iterator<Item = T>) -> Vec<T> {
     let mut list = Vec::with_capacity(length);
     list.extend(items);
     list
-}
-
-fn endpoint_facts(
-    guid: Guid,
-    endpoint: &Endpoint,
-    node: Option<&NodeName>,
-    measurement: Option<Box<Measurement>>,
-    latched: Option<LatchedFacts>,
-) -> EndpointFacts {
-    EndpointFacts {
-        guid,
-        gid: endpoint.gid,
-        node: node.cloned(),
-        qos: Arc::clone(&endpoint.qos),
-        message_type: endpoint.message_type.clone(),
-        type_hash: endpoint.type_hash,
-        first_seen: endpoint.first_seen,
-        measurement,
-        transports: 0,
-        latched,
-    }
 }
 
 fn unknown_writers(observer: &Observer, now: ModelTime) -> Vec<UnknownWriterFacts> {

@@ -16,6 +16,7 @@ use crate::graph::discovery::{Origin, Priority};
 use crate::graph::zenoh::{
     GraphChange, Holder, Shown, StreamId, StreamReport, ZenohSample, unknown_guid,
 };
+use crate::measure::topic::Accelerated;
 
 /// Numbers of graph changes, and gids of writers, for Zenoh.
 #[derive(Debug)]
@@ -196,6 +197,9 @@ impl Observer {
 
     /// Counts a sample, request or reply.
     fn zenoh_sample(&mut self, stream: &StreamId, at: ModelTime, sample: &ZenohSample<'_>) {
+        if !self.counts_as_message(at, sample) {
+            return;
+        }
         let observed = observed(stream, at, sample);
         let writer = sample.writer;
         if let Some((client, number)) = sample.call {
@@ -208,7 +212,8 @@ impl Observer {
             let is_over = services.identified(writer, sample.number, call, captured, at);
             self.follow_call(writer, is_over);
         }
-        if let Some(payload) = sample.payload.whole() {
+        let payload = sample.payload.whole();
+        if let Some(payload) = payload.filter(|_| sample.referring.is_none()) {
             self.keep_payload(&observed, payload);
         }
         self.observe(&Observation::Sample(observed));
@@ -220,6 +225,30 @@ impl Observer {
                 ..observed.head
             };
             self.observe(&Observation::Sample(Sample { head, ..observed }));
+        }
+    }
+
+    /// Returns whether a sample counts as a message of its publisher. Of several samples for one
+    /// message, each with a number of its own, one counts: the message itself, otherwise the
+    /// references to buffers for the first subscription. Gaps between their numbers are no losses.
+    fn counts_as_message(&mut self, at: ModelTime, sample: &ZenohSample<'_>) -> bool {
+        let discovery = &self.graph.discovery;
+        let accelerated = || {
+            let endpoint = discovery.endpoints().get(&sample.writer)?;
+            endpoint.backends.as_ref()?;
+            let topic = self
+                .graph
+                .topics
+                .find(endpoint.domain_id, &endpoint.naming()?)?;
+            Some(self.graph.topics.get(topic)?.accelerated(discovery))
+        };
+        let accelerated = accelerated().unwrap_or(Accelerated::None);
+        if accelerated != Accelerated::None {
+            self.measure.profiler.skip_numbers(sample.writer, at);
+        }
+        match sample.referring {
+            None => true,
+            Some(gid) => accelerated == Accelerated::All(gid.0),
         }
     }
 }

@@ -303,6 +303,50 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             }
             .with_remedy("copy the stamp of the input into the header of the output")
         }
+        Diagnosis::BuffersByCpu {
+            topic,
+            writer,
+            reader,
+            backends,
+        } => {
+            let why = match reader {
+                Some(reader) => format!("{} takes no buffers", ends.who(*reader)),
+                None => "it is transient local".to_owned(),
+            };
+            let text = format!(
+                "{} sends {} through the CPU instead of {}: {why}",
+                ends.who(*writer),
+                topic.name,
+                backends.join(", ")
+            );
+            let about = format!("{}|{}|{writer}", topic.domain_id, topic.dds_name);
+            let found = Finding {
+                writer: Some(writer.to_string()),
+                reader: reader.map(|reader| reader.to_string()),
+                ..finding(kind, Severity::Note, &about, text)
+            };
+            found.with_remedy("end subscriptions of older distributions and of other middleware")
+        }
+        Diagnosis::SharedMachineId {
+            domain_id,
+            participants,
+        } => {
+            let listed: Vec<_> = participants.iter().map(|guid| ends.who(*guid)).collect();
+            let text = format!(
+                "Participants with different addresses have one machine id, so they use only shared \
+                 memory with each other: {}",
+                listed.join(", ")
+            );
+            let first = participants.first().map(Guid::to_string);
+            let about = format!("{domain_id}|{}", first.unwrap_or_default());
+            let found = Finding {
+                domain_id: Some(domain_id.0),
+                ..finding(kind, Severity::Warning, &about, text)
+            };
+            found.with_remedy(
+                "sudo rm /etc/machine-id && sudo systemd-machine-id-setup    # on each cloned machine",
+            )
+        }
         Diagnosis::SlowChain {
             topic,
             from,

@@ -126,6 +126,8 @@ impl Figures<'_> {
                 | Diagnosis::ReaderQueueOverflow { .. }
                 | Diagnosis::ObservationSuspended { .. }
                 | Diagnosis::RestampingNode { .. }
+                | Diagnosis::BuffersByCpu { .. }
+                | Diagnosis::SharedMachineId { .. }
                 | Diagnosis::SlowChain { .. } => {}
             }
         }

@@ -299,7 +299,7 @@ impl Stream {
         let mut topics = state.known().topics.iter();
         let node = topics.find_map(|topic| {
             let mut publishers = topic.publishers.iter();
-            let publisher = publishers.find(|publisher| publisher.guid == sample.writer)?;
+            let publisher = publishers.find(|publisher| publisher.writes_as(sample.writer))?;
             publisher.node.as_ref().map(ToString::to_string)
         });
         let line = Message {

@@ -37,6 +37,8 @@ fn endpoint(
         measurement: None,
         transports: 0,
         latched: None,
+        backends: None,
+        buffers: Box::default(),
     }
 }
 

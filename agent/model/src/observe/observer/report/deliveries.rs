@@ -135,7 +135,7 @@ pub(super) fn acknowledgements(
     now: ModelTime,
 ) -> Vec<AcknowledgementFacts> {
     let mut facts = Vec::new();
-    for writer in &topic.writers {
+    for writer in topic.writers.iter().chain(&topic.buffer_endpoints) {
         let Some(measured) = observer.measure.profiler.get(*writer) else {
             continue;
         };
