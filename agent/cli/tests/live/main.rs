@@ -11,6 +11,7 @@ mod api;
 mod attach;
 mod between_robots;
 mod browser;
+mod buffers;
 mod counts;
 mod dashboards;
 mod deploy;

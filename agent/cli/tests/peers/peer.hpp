@@ -84,11 +84,14 @@ struct Options {
   bool data_sharing = false;
   // Fast DDS: only TCP, with a listening address or an address to connect to (IPV4:PORT).
   std::string tcp_listen, tcp_peer;
+  // Fast DDS: a second topic for the messages, as rmw_fastrtps of Lyrical has.
+  bool buffers = false;
 
   static Options parse(int argc, char** argv) {
     enum { kRole = 1, kTopic, kSize, kRate, kCount, kReliable, kBestEffort, kTransientLocal, kDepth,
            kDomain, kGidSize, kNode, kLog, kPeers, kHold, kStretch, kLinger,
-           kReceiveBuffer, kTransport, kDataSharing, kTcpListen, kTcpPeer, kHelp };
+           kReceiveBuffer, kTransport, kDataSharing, kTcpListen, kTcpPeer, kBuffers,
+           kHelp };
     static const option names[] = {
         {"role", 1, nullptr, kRole},           {"topic", 1, nullptr, kTopic},
         {"size", 1, nullptr, kSize},           {"rate", 1, nullptr, kRate},
@@ -103,6 +106,7 @@ struct Options {
         {"stretch", 1, nullptr, kStretch},
         {"transport", 1, nullptr, kTransport}, {"data-sharing", 0, nullptr, kDataSharing},
         {"tcp-listen", 1, nullptr, kTcpListen}, {"tcp-peer", 1, nullptr, kTcpPeer},
+        {"buffers", 1, nullptr, kBuffers},
         {"help", 0, nullptr, kHelp},           {nullptr, 0, nullptr, 0}};
     Options options;
     bool role_given = false;
@@ -112,6 +116,10 @@ struct Options {
           role_given = true;
           options.publishes = strcmp(optarg, "pub") == 0;
           if (!options.publishes && strcmp(optarg, "sub") != 0) fail("--role is pub or sub");
+          break;
+        case kBuffers:
+          options.buffers = true;
+          if (strcmp(optarg, "cpu") != 0) fail("--buffers is cpu");
           break;
         case kTopic: options.topic = optarg; break;
         case kSize: options.size = strtoull(optarg, nullptr, 10); break;
@@ -145,7 +153,8 @@ struct Options {
                "  [--reliable|--best-effort] [--transient-local] [--depth N] [--domain D]\n"
                "  [--gid-size 24|16] [--node /ns/name]... [--log FILE] [--peers N] [--hold]\n"
                "  [--stretch SAMPLES] [--linger SECONDS] [--receive-buffer BYTES]\n"
-               "  [--transport default|udp] [--data-sharing] [--tcp-listen IPV4:PORT | --tcp-peer IPV4:PORT]");
+               "  [--transport default|udp] [--data-sharing] [--tcp-listen IPV4:PORT | --tcp-peer IPV4:PORT]\n"
+               "  [--buffers cpu]");
       }
     }
     if (!role_given) fail("--role pub|sub is missing");

@@ -58,6 +58,8 @@ pub struct Stream {
     pub tcp: Option<SocketAddrV4>,
     /// Fast DDS: whether readers read the history of writers on their host.
     pub shares_history: bool,
+    /// Whether the type has buffers, as in Lyrical, and the best backend that the peer accepts.
+    pub buffers: Option<&'static str>,
 }
 
 pub struct Peer {
@@ -121,6 +123,7 @@ impl Stream {
             shares_memory: false,
             tcp: None,
             shares_history: false,
+            buffers: None,
         }
     }
 
@@ -234,6 +237,9 @@ impl Peer {
                 Role::Subscriber => "--tcp-peer",
             };
             option(name, address.to_string());
+        }
+        if let Some(backend) = stream.buffers {
+            option("--buffers", backend.to_owned());
         }
         if stream.logged {
             option("--log", directory.path().join("log").display().to_string());

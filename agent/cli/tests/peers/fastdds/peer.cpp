@@ -193,6 +193,7 @@ class Context {
     return nodes_.size() - 1;
   }
 
+  // Returns the writer of the messages. With buffers, the node announces another one.
   DataWriter* add_writer(size_t node, const std::string& ros_topic) {
     DataWriterQos qos = DATAWRITER_QOS_DEFAULT;
     qos.reliability().kind =
@@ -200,10 +201,14 @@ class Context {
     qos.durability().kind = durability();
     qos.history().depth = options_.depth;
     common(qos, options_.data_sharing);
-    DataWriter* writer =
-        publisher_->create_datawriter(create_topic(peer::dds_topic(ros_topic), cloud_type_), qos);
-    if (!writer) peer::fail("cannot create a writer");
-    nodes_[node].writers.push_back(guid_of(writer->guid()));
+    if (options_.buffers) accept_buffers(qos);
+    DataWriter* writer = nullptr;
+    for (const std::string& topic : topics(ros_topic)) {
+      DataWriter* added = publisher_->create_datawriter(create_topic(topic, cloud_type_), qos);
+      if (!added) peer::fail("cannot create a writer");
+      if (!writer) nodes_[node].writers.push_back(guid_of(added->guid()));
+      writer = added;
+    }
     announce();
     return writer;
   }
@@ -215,10 +220,15 @@ class Context {
     qos.durability().kind = durability();
     qos.history().depth = options_.depth;
     common(qos, options_.data_sharing);
-    DataReader* reader = subscriber_->create_datareader(
-        create_topic(peer::dds_topic(ros_topic), cloud_type_), qos, listener);
-    if (!reader) peer::fail("cannot create a reader");
-    nodes_[node].readers.push_back(guid_of(reader->guid()));
+    if (options_.buffers) accept_buffers(qos);
+    DataReader* reader = nullptr;
+    for (const std::string& topic : topics(ros_topic)) {
+      DataReader* added =
+          subscriber_->create_datareader(create_topic(topic, cloud_type_), qos, listener);
+      if (!added) peer::fail("cannot create a reader");
+      if (!reader) nodes_[node].readers.push_back(guid_of(added->guid()));
+      reader = added;
+    }
     announce();
     return reader;
   }
@@ -231,6 +241,19 @@ class Context {
   }
 
  private:
+  // The topics of a ROS topic; the last one has the messages.
+  std::vector<std::string> topics(const std::string& ros_topic) const {
+    std::vector<std::string> all = {peer::dds_topic(ros_topic)};
+    if (options_.buffers) all.push_back(all.front() + "/_buf_cpu");
+    return all;
+  }
+
+  template <typename Qos>
+  static void accept_buffers(Qos& qos) {
+    const std::string text = "typehash=RIHS01_" + std::string(64, 'a') + ";bufbe.cpu=;";
+    qos.user_data().setValue(std::vector<uint8_t>(text.begin(), text.end()));
+  }
+
   static Locator_t tcp_locator(const std::string& address) {
     const size_t colon = address.find(':');
     if (colon == std::string::npos) peer::fail("a TCP address is IPV4:PORT");

@@ -6,7 +6,8 @@
 The command line and the log of `pub` and `sub` equal those of the DDS peers (../peer.hpp). Options
 that only DDS has are accepted and ignored. Each node is a separate session, which connects to the
 router of its host, and directly to the other sessions there. `--linger` keeps a publisher running
-after its last message.
+after its last message. With `--buffers` it announces backends of buffers, and uses further keys, as
+rmw_zenoh of Lyrical does.
 """
 
 import argparse
@@ -27,6 +28,9 @@ TYPE = "std_msgs::msg::dds_::UInt8MultiArray_/TypeHashNotSupported"
 # Bytes of the encapsulation, the layout without dimensions, and the length of the data.
 OVERHEAD = 16
 ROUTER = "tcp/localhost:7447"
+
+# The last chunk of a token.
+BACKENDS = {"cpu": ["backends:cpu:"], "cuda": ["backends:cuda:device=0;cpu:"]}
 
 stopped = threading.Event()
 
@@ -50,6 +54,7 @@ def options():
     parser.add_argument("--reliable", action="store_true")
     parser.add_argument("--best-effort", action="store_true")
     parser.add_argument("--receive-buffer", type=int)
+    parser.add_argument("--buffers", choices=["cpu", "cuda"])
     return parser.parse_args()
 
 
@@ -80,6 +85,11 @@ def config(mode, listen, connect):
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def gid_of(token):
+    hash = xxhash.xxh3_128_intdigest(token.encode())
+    return struct.pack("<QQ", hash & (1 << 64) - 1, hash >> 64)
 
 
 def say(line):
@@ -136,9 +146,8 @@ class Session:
             if number == 0:
                 qos = f"::,{self.options.depth}:,:,:,,"
                 topic = self.options.topic.replace("/", "%")
-                key = self.token("0", "10", kind, *where, topic, *TYPE.split("/"), qos)
-        hash = xxhash.xxh3_128_intdigest(key.encode())
-        gid = struct.pack("<QQ", hash & (1 << 64) - 1, hash >> 64)
+                backends = BACKENDS.get(self.options.buffers, [])
+                key = self.token("0", "10", kind, *where, topic, *TYPE.split("/"), qos, *backends)
         other = "MS" if kind == "MP" else "MP"
         pattern = f"@ros2_lv/{self.options.domain}/*/*/*/{other}/**"
         topic = f"/{self.options.topic.replace('/', '%')}/"
@@ -150,10 +159,22 @@ class Session:
                 (self.others.add if is_put else self.others.discard)(key)
 
         self.tokens.append(self.session.liveliness().declare_subscriber(pattern, seen, history=True))
-        return gid
+        return gid_of(key)
 
     def key(self):
         return f"{self.options.domain}{self.options.topic}/{TYPE}"
+
+    def keys_of_message(self):
+        """Returns the key of each sample for the next message, and whether it is the message."""
+        base = self.key()
+        tokens = list(self.others)
+        if not self.options.buffers or any("/backends:" not in token for token in tokens):
+            return [(base, True)]
+        accelerated = sorted(token for token in tokens if "cuda" in token)
+        keys = [(f"{base}/_buf/{gid_of(token).hex()}", False) for token in accelerated]
+        if len(accelerated) < len(tokens):
+            keys.insert(0, (f"{base}/_buf_cpu", True))
+        return keys
 
     def wait_matched(self):
         while not stopped.is_set() and len(self.others) < self.options.peers:
@@ -163,17 +184,24 @@ class Session:
 
 def publish(options, log):
     session = Session(options)
-    publisher = session.session.declare_publisher(
-        session.key(),
-        congestion_control=zenoh.CongestionControl.DROP,
-        reliability=zenoh.Reliability.RELIABLE,
-    )
+    publishers = {}
+
+    def publisher(key):
+        if key not in publishers:
+            publishers[key] = session.session.declare_publisher(
+                key,
+                congestion_control=zenoh.CongestionControl.DROP,
+                reliability=zenoh.Reliability.RELIABLE,
+            )
+        return publishers[key]
+
+    publisher(session.key())
     gid = session.announce("MP")
     say("ready")
     session.wait_matched()
     if options.hold:
         wait_for_line()
-    start, first, number = time.monotonic(), 0, 0
+    start, first, number, samples = time.monotonic(), 0, 0, 0
     data = bytearray(options.size - OVERHEAD)
     header = struct.pack("<BBBBIII", 0, 1, 0, 0, 0, 0, len(data))
     while not stopped.is_set() and (options.count == 0 or number < options.count):
@@ -185,8 +213,11 @@ def publish(options, log):
             break
         now = time.time_ns()
         data[:16] = struct.pack("<Qq", number, now)
-        attachment = struct.pack("<qqB", number + 1, now, 16) + gid
-        publisher.put(header + bytes(data), attachment=attachment)
+        for key, is_message in session.keys_of_message():
+            samples += 1
+            attachment = struct.pack("<qqB", samples, now, 16) + gid
+            payload = header + bytes(data if is_message else data[:16])
+            publisher(key).put(payload, attachment=attachment)
         log.write(ev="pub", seq=number, len=options.size)
         number += 1
     log.write(ev="stop")
@@ -202,12 +233,18 @@ def subscribe(options, log):
         number, stamp = struct.unpack_from("<Qq", payload, OVERHEAD)
         log.write(ev="sub", seq=number, len=len(payload), stamp_ns=stamp)
 
-    kept = session.session.declare_subscriber(session.key(), receive)
-    session.announce("MS")
+    gid = session.announce("MS")
+    keys = [session.key()]
+    if options.buffers == "cpu":
+        keys.append(f"{session.key()}/_buf_cpu")
+    elif options.buffers:
+        keys.append(f"{session.key()}/_buf/{gid.hex()}")
+    kept = [session.session.declare_subscriber(key, receive) for key in keys]
     say("ready")
     session.wait_matched()
     stopped.wait()
-    kept.undeclare()
+    for each in kept:
+        each.undeclare()
 
 
 def route(options):
