@@ -23,12 +23,15 @@ use ros2probe_capture::shm::cell::Cell;
 use ros2probe_capture::shm::classifier::MessageClassifier;
 use ros2probe_capture::shm::port::Port;
 use ros2probe_capture::shm::segment::{Buffer, Message};
+use ros2probe_capture::streams::{Before, Chunk, Streamed, Streams};
 use ros2probe_daemon::config::{Config, Watch, Watchlist};
 use ros2probe_daemon::surface::foxglove::protocol;
 use ros2probe_daemon::surface::ros2_daemon::call::{self, Argument, Call};
 use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::{Decoded, Definition, MessageType, Truncation, csv, decode, yaml};
+use ros2probe_model::facts::route::Destination;
 use ros2probe_model::facts::selection::{Depth, SampleRequest, Selection};
+use ros2probe_model::graph::zenoh::{Flow, StreamId};
 use ros2probe_model::observe::input::{Captured, Input};
 use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_wire::frame::{self, Packet, Payload};
@@ -61,6 +64,99 @@ pub fn capture(bytes: &[u8]) {
         }
     }
     assert!(matches!(reader.next_packet(), Ok(None)));
+}
+
+/// Reads segments of two TCP connections, and passes what they contain to the model. Each segment has
+/// flags, the distance of its first byte from the next one, the number of bytes that were not
+/// captured, and its length in bytes.
+pub fn stream(bytes: &[u8]) {
+    const START: u64 = 1_795_143_000_000_000_000;
+    let mut observer = small_observer();
+    let mut streams = Streams::default();
+    let mut next = [0x1000_u32; 4];
+    let mut now = START;
+    let mut rest = bytes;
+    while let Some(([flags, distance, cut, low, high], behind)) = rest.split_first_chunk::<5>() {
+        let length = usize::from(u16::from_le_bytes([*low, *high])).min(behind.len());
+        let (content, behind) = behind.split_at(length);
+        rest = behind;
+        now += 1_000_000 << (flags >> 6);
+        let direction = usize::from(flags & 3);
+        let length = content.len() as u32 + u32::from(*cut) * 64;
+        let syn = flags & 4 != 0;
+        let expected = next.get(direction).copied().unwrap_or_default();
+        let number = expected.wrapping_add_signed(i32::from(distance.cast_signed()) * 7);
+        if let Some(next) = next.get_mut(direction) {
+            *next = number.wrapping_add(length).wrapping_add(u32::from(syn));
+        }
+        let chunk = Chunk {
+            time: Timestamp(now),
+            stream: direction_of(flags & 3),
+            sequence_number: number,
+            syn,
+            end: flags & 8 != 0,
+            boundary: None,
+            before: match flags >> 4 & 3 {
+                1 => Before::Skipped,
+                2 => Before::Lost,
+                _ => Before::Unknown,
+            },
+            bytes: content,
+            length,
+        };
+        streams.chunk(&chunk, |streamed| {
+            check(streamed, now);
+            streamed.pass(&mut observer);
+        });
+        observer.drain();
+    }
+    // Segments that wait for missing ones are given up.
+    now += 60_000_000_000;
+    streams.advance(Timestamp(now), |streamed| {
+        check(streamed, now);
+        streamed.pass(&mut observer);
+    });
+    for table in streams.tables() {
+        assert!(table.size <= table.limit, "{table:?}");
+    }
+    observer.input(Input::End);
+    for table in &observer.snapshot(Timestamp(now)).tables {
+        assert!(table.size <= table.limit, "{table:?}");
+    }
+}
+
+fn check(streamed: &Streamed<'_>, now: u64) {
+    match streamed {
+        Streamed::Message {
+            envelope,
+            bytes,
+            length,
+        } => {
+            assert!(bytes.len() as u64 <= u64::from(*length));
+            assert!(envelope.time <= now);
+        }
+        Streamed::Zenoh(_) | Streamed::Gap(..) => {}
+    }
+}
+
+/// Returns one of the directions of two connections.
+fn direction_of(number: u8) -> StreamId {
+    let place = |port| Destination {
+        address: [9; 16],
+        port,
+    };
+    let flow = Flow {
+        source: place(40_000 + u16::from(number / 2)),
+        destination: place(7447),
+    };
+    StreamId {
+        flow: if number % 2 == 0 {
+            flow
+        } else {
+            flow.reversed()
+        },
+        ..StreamId::default()
+    }
 }
 
 /// Reads a message of a viewer. An accepted message has no more ids than fit into its text.

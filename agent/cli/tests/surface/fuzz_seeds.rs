@@ -100,6 +100,11 @@ fn seeds_of_library_trees_cause_no_panic() {
 }
 
 #[test]
+fn seeds_of_streams_cause_no_panic() {
+    run_up_to(700, "fuzz/seeds/stream", entry::stream);
+}
+
+#[test]
 fn seeds_of_the_model_cause_no_panic() {
     run_up_to(400, "fuzz/seeds/model", entry::model);
 }
