@@ -28,6 +28,24 @@ pub mod chunk {
     pub const QUIC: u16 = 1 << 5;
     /// The connection is one of RTPS over TCP, not of Zenoh.
     pub const RTPS: u16 = 1 << 6;
+    /// The bytes are not of the connection: they are a [`super::Link`] of it.
+    pub const LINK: u16 = 1 << 7;
+}
+
+/// The sender's state of a TCP connection (`struct bpf_tcp_sock` in `linux/bpf.h`).
+#[derive(
+    Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
+)]
+#[repr(C)]
+pub struct Link {
+    /// Smoothed round trip time in microseconds (RFC 6298).
+    pub smoothed_rtt: u32,
+    /// Number of retransmitted segments since the connection began.
+    pub retransmitted: u32,
+    /// Number of sent segments with data since the connection began, retransmitted ones included.
+    pub sent: u32,
+    /// Number of bytes that were sent and are not acknowledged.
+    pub unacknowledged: u32,
 }
 
 /// Header of one piece of a captured datagram; the bytes follow. Pieces of one datagram arrive in

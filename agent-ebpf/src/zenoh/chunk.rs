@@ -1,11 +1,14 @@
 //! Writes chunks for user space. A chunk covers consecutive bytes of a direction, of which possibly
 //! only the beginning is copied.
 
-use aya_ebpf::{bindings::__sk_buff, helpers::generated::bpf_skb_load_bytes};
-use core::mem::size_of;
+use aya_ebpf::{
+    bindings::__sk_buff,
+    helpers::generated::{bpf_sk_fullsock, bpf_skb_load_bytes, bpf_tcp_sock},
+};
+use core::{mem::size_of, ptr::read_volatile};
 use ros2probe_wire::{
     filter::Counter,
-    host::{PIECE_BYTES, Piece, chunk as part},
+    host::{Link, PIECE_BYTES, Piece, chunk as part},
     record::flag,
 };
 
@@ -17,7 +20,10 @@ use crate::{
     verdict::{AVAILABLE_DATA, FORCE_WAKEUP, NO_WAKEUP},
 };
 
-use super::state::{WINDOW, protocol, segment};
+use super::{
+    LOOPBACK,
+    state::{Segment, WINDOW, protocol, segment},
+};
 
 /// Maximum number of chunks of one packet, which cover 128 KB.
 const PARTS: u32 = 8;
@@ -117,35 +123,11 @@ pub extern "C" fn head(
             return lost(slot);
         }
     }
+    describe(&mut buffer.piece, &this, offset);
     let piece = &mut buffer.piece;
-    piece.time = this.now;
-    piece.socket = this.key.socket;
-    piece.source = this.source;
-    piece.destination = this.destination;
-    piece.source_port = this.source_port as u16;
-    piece.destination_port = this.destination_port as u16;
-    piece.interface = this.interface;
-    piece.datagram = this.sequence_number.wrapping_add(offset);
     piece.datagram_len = len;
-    piece.offset = 0;
     piece.len = copied;
-    let ipv6 = if this.source[2] == IPV4_MAPPED && this.source[0] | this.source[1] == 0 {
-        0
-    } else {
-        flag::IPV6
-    };
-    let outgoing = if this.key.outgoing == 0 {
-        0
-    } else {
-        flag::OUTGOING
-    };
-    piece.flags = flag::HOST | flag::STREAM | ipv6 | outgoing;
-    let protocol = if this.state.protocol == protocol::RTPS {
-        u32::from(part::RTPS)
-    } else {
-        0
-    };
-    piece.chunk = (flags | this.state.pending | protocol) as u16;
+    piece.chunk |= (flags | this.state.pending) as u16;
     let wake = if flags & WAKE != 0 || PIECES.query(AVAILABLE_DATA) > setting(&WAKE_PIECE_BYTES) {
         FORCE_WAKEUP
     } else {
@@ -165,6 +147,91 @@ pub extern "C" fn head(
     this.state.pending = 0;
     this.state.reported = this.now;
     1
+}
+
+/// Writes the fields of a piece that all chunks have.
+#[inline(always)]
+fn describe(piece: &mut Piece, this: &Segment, offset: u32) {
+    piece.time = this.now;
+    piece.socket = this.key.socket;
+    piece.source = this.source;
+    piece.destination = this.destination;
+    piece.source_port = this.source_port as u16;
+    piece.destination_port = this.destination_port as u16;
+    piece.interface = this.interface;
+    piece.datagram = this.sequence_number.wrapping_add(offset);
+    piece.offset = 0;
+    let ipv6 = if this.source[2] == IPV4_MAPPED && this.source[0] | this.source[1] == 0 {
+        0
+    } else {
+        flag::IPV6
+    };
+    let outgoing = if this.key.outgoing == 0 {
+        0
+    } else {
+        flag::OUTGOING
+    };
+    piece.flags = flag::HOST | flag::STREAM | ipv6 | outgoing;
+    piece.chunk = if this.state.protocol == protocol::RTPS {
+        part::RTPS
+    } else {
+        0
+    };
+}
+
+/// Passes on the sender's state of the connection, at most once in 2^30 nanoseconds. Within a host
+/// there is no link.
+#[unsafe(export_name = "zenoh_link")]
+#[inline(never)]
+pub extern "C" fn link(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let (Some(mut this), Some(mut buffer)) = (segment(slot), piece(slot)) else {
+        return 0;
+    };
+    let second = (this.now >> 30) as u32;
+    if this.key.outgoing != 1 || this.interface == LOOPBACK || this.state.linked == second {
+        return 0;
+    }
+    this.state.linked = second;
+    // SAFETY: the verifier rewrites reads of this field, and checks it against null.
+    let socket = unsafe { (*skb).__bindgen_anon_2.sk };
+    if socket.is_null() {
+        return 0;
+    }
+    // SAFETY: a socket of the context, checked against null.
+    let socket = unsafe { bpf_sk_fullsock(socket) };
+    if socket.is_null() {
+        return 0;
+    }
+    // SAFETY: as above.
+    let tcp = unsafe { bpf_tcp_sock(socket) };
+    if tcp.is_null() {
+        return 0;
+    }
+    // SAFETY: a socket of TCP, checked against null; the verifier rewrites each read.
+    let state = unsafe {
+        let next = read_volatile(&raw const (*tcp).snd_nxt);
+        let acknowledged = read_volatile(&raw const (*tcp).snd_una);
+        Link {
+            smoothed_rtt: read_volatile(&raw const (*tcp).srtt_us) >> 3,
+            retransmitted: read_volatile(&raw const (*tcp).total_retrans),
+            sent: read_volatile(&raw const (*tcp).data_segs_out),
+            unacknowledged: next.wrapping_sub(acknowledged),
+        }
+    };
+    // The window holds no bytes of the segment any more.
+    this.end = 0;
+    describe(&mut buffer.piece, &this, 0);
+    buffer.piece.datagram_len = 0;
+    buffer.piece.len = size_of::<Link>() as u32;
+    buffer.piece.chunk |= part::LINK;
+    // SAFETY: the buffer is longer than the state, and aligned.
+    unsafe { buffer.bytes.as_mut_ptr().cast::<Link>().write(state) };
+    let size = size_of::<Piece>() + size_of::<Link>();
+    // SAFETY: the buffer is that long.
+    let bytes = unsafe { core::slice::from_raw_parts((&raw const *buffer).cast::<u8>(), size) };
+    let _ = PIECES.output::<[u8]>(bytes, NO_WAKEUP);
+    buffer.piece.chunk = 0;
+    0
 }
 
 #[inline(always)]

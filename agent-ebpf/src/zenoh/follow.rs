@@ -49,6 +49,7 @@ pub fn segment(skb: *mut __sk_buff, slot: u32) -> u32 {
     // SAFETY: a map value pointer checked against null. Segments of one direction follow each
     // other; at worst, runs that race on two CPUs lose a boundary.
     copy(unsafe { &*state }, &mut this.state);
+    chunk::link(skb, slot);
     if this.len != 0 {
         take(skb, slot);
     }

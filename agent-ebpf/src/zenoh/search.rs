@@ -155,7 +155,7 @@ extern "C" fn begin(slot: u32, pending: u32) -> u32 {
     this.state.hole_len = 0;
     this.state.protocol = protocol::ZENOH;
     this.state.length = 0;
-    this.state.unused = 0;
+    this.state.linked = 0;
     close(slot)
 }
 

@@ -145,7 +145,8 @@ pub struct Direction {
     /// Of RTPS, the bytes of a frame's length that the last segment had, if `prefix` is set. Otherwise
     /// the number of bytes of the frame's head that it did not have.
     pub length: u32,
-    pub unused: u32,
+    /// Time at which the connection's state was last passed on, in units of 2^30 nanoseconds.
+    pub linked: u32,
     pub guess: Guess,
 }
 

@@ -1,6 +1,7 @@
 //! Problems of the ROS graph, found by comparing its endpoints and nodes.
 
 use std::borrow::Cow;
+use std::net::IpAddr;
 
 use serde::{Deserialize, Serialize};
 
@@ -167,6 +168,17 @@ pub enum Diagnosis<'a> {
         /// GUID of one participant of each set of addresses.
         participants: Vec<String>,
     },
+    /// TCP retransmits many segments on the way to another host.
+    LossyLink {
+        /// Address of the sender.
+        #[cfg_attr(feature = "openapi", schema(value_type = String))]
+        source: IpAddr,
+        /// Address of the receiver.
+        #[cfg_attr(feature = "openapi", schema(value_type = String))]
+        destination: IpAddr,
+        /// Share of segments retransmitted when the problem appeared.
+        retransmitted_ratio: f64,
+    },
     /// A configured chain that ends with the topic exceeds its maximum latency.
     SlowChain {
         /// First topic of the chain.
@@ -201,6 +213,7 @@ impl Diagnosis<'_> {
             Self::RestampingNode { .. } => "restamping_node",
             Self::BuffersByCpu { .. } => "buffers_by_cpu",
             Self::SharedMachineId { .. } => "shared_machine_id",
+            Self::LossyLink { .. } => "lossy_link",
             Self::SlowChain { .. } => "slow_chain",
         }
     }

@@ -19,6 +19,34 @@ pub struct ParticipantList<'a> {
     pub participants: Vec<Participant<'a>>,
     /// Active writers whose announcement was missed; their domain is unknown.
     pub unknown_writers: Vec<UnknownWriter<'a>>,
+    /// TCP connections that carry RTPS or Zenoh to other hosts, by pair of addresses.
+    pub links: Vec<Link<'a>>,
+}
+
+/// The TCP connections of one protocol from an address of this host to another host.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Link<'a> {
+    /// `rtps` or `zenoh`.
+    #[cfg_attr(feature = "openapi", schema(example = "zenoh"))]
+    pub protocol: Cow<'a, str>,
+    /// Address of this host.
+    #[cfg_attr(feature = "openapi", schema(example = "10.0.0.1"))]
+    pub source: String,
+    /// Address of the other host.
+    #[cfg_attr(feature = "openapi", schema(example = "10.0.0.2"))]
+    pub destination: String,
+    /// Number of current connections.
+    pub connections: u64,
+    /// Smoothed round trip time, the longest of the connections; null without one.
+    pub round_trip_seconds: Option<f64>,
+    /// Segments with data that this host sent while the agent ran, retransmitted ones included.
+    pub sent_segments: u64,
+    /// Segments that this host sent again.
+    pub retransmitted_segments: u64,
+    /// Bytes that were sent and are not acknowledged.
+    pub unacknowledged_bytes: u64,
 }
 
 /// A DDS participant or a Zenoh session.

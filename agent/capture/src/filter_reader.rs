@@ -8,7 +8,7 @@ use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::os::fd::BorrowedFd;
 
-use ros2probe_wire::host::{Piece, chunk};
+use ros2probe_wire::host::{self, Piece, chunk};
 use ros2probe_wire::record::flag;
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Reason, Record, Timestamp};
@@ -21,8 +21,11 @@ use super::streams::{Chunk, Streams};
 use super::system::Clocks;
 use crate::tables::FreshDatagrams;
 use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::facts::link::LinkProtocol;
+use ros2probe_model::measure::links::LinkReport;
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Observer;
+use zerocopy::FromBytes as _;
 
 /// Records younger than this wait for records held back in a run of fragments.
 pub const SETTLE_NANOSECONDS: u64 = 50_000_000;
@@ -195,6 +198,16 @@ impl FilterReader {
             };
             self.copied_bytes += (size_of::<Piece>() + bytes.len()) as u64;
             newest = piece.time;
+            if piece.flags & flag::STREAM != 0 && piece.chunk & chunk::LINK != 0 {
+                match link_report(&piece, bytes) {
+                    Some(report) => observer.input(Input::Link(&report)),
+                    None => observer.input(Input::DecodeError {
+                        stage: "piece",
+                        reason: Reason::BadLength,
+                    }),
+                }
+                continue;
+            }
             if piece.flags & flag::STREAM != 0 {
                 let chunk = Chunk::of_piece(&piece, bytes, clocks.calendar(piece.time));
                 if piece.chunk & chunk::QUIC != 0 {
@@ -250,6 +263,20 @@ fn deliver(
         }
     }
     false
+}
+
+/// Reads what TCP knows of a connection.
+fn link_report(piece: &Piece, bytes: &[u8]) -> Option<LinkReport> {
+    let (state, _) = host::Link::read_from_prefix(bytes).ok()?;
+    Some(LinkReport {
+        socket: piece.socket,
+        flow: Chunk::of_piece(piece, &[], Timestamp(0)).stream.flow,
+        protocol: match piece.chunk & chunk::RTPS {
+            0 => LinkProtocol::Zenoh,
+            _ => LinkProtocol::Rtps,
+        },
+        state,
+    })
 }
 
 /// Reads a segment of Zenoh, and passes the messages that it completes to the model.

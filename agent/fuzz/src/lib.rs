@@ -66,9 +66,9 @@ pub fn capture(bytes: &[u8]) {
     assert!(matches!(reader.next_packet(), Ok(None)));
 }
 
-/// Reads segments of two TCP connections, and passes what they contain to the model. Each segment has
-/// flags, the distance of its first byte from the next one, the number of bytes that were not
-/// captured, and its length in bytes.
+/// Reads segments of two TCP connections, and passes what they contain to the model. Five bytes
+/// precede each segment: flags, the distance from the next expected byte, how much was not captured,
+/// and the length.
 pub fn stream(bytes: &[u8]) {
     const START: u64 = 1_795_143_000_000_000_000;
     let mut observer = small_observer();

@@ -12,6 +12,7 @@ mod chain;
 mod delivery;
 mod diagnosis;
 mod inside;
+mod link;
 mod service;
 mod zenoh;
 
@@ -21,6 +22,7 @@ pub use chain::*;
 pub use delivery::*;
 pub use diagnosis::*;
 pub use inside::*;
+pub use link::*;
 pub use service::*;
 pub use zenoh::*;
 
@@ -526,6 +528,11 @@ pub const CATALOGUE: &[Metric] = &[
     READER_MISSING,
     READER_REQUESTED,
     SOCKET_DROPS,
+    LINK_CONNECTIONS,
+    LINK_SENT,
+    LINK_RETRANSMITTED,
+    LINK_UNACKNOWLEDGED,
+    LINK_ROUND_TRIP,
     WATCH_STATE,
     WATCH_VIOLATED,
     BUILD_INFO,

@@ -19,6 +19,7 @@ use ros2probe_model::facts::diagnosis::{
     Diagnoses, Diagnosis, Policies, Policy, QosPairs, TopicKey, Unmatched,
 };
 use ros2probe_model::facts::histogram::Histogram;
+use ros2probe_model::facts::link::{LinkKey, LinkProtocol};
 use ros2probe_model::facts::loss_share::LossShare;
 use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::facts::topic_kind::TopicKind;
@@ -26,6 +27,7 @@ use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::facts::watch::Watch;
 use ros2probe_model::graph::discovery::Addresses;
 use ros2probe_model::graph::zenoh::{Counters, ZenohFacts};
+use ros2probe_model::measure::links::LinkFacts;
 use ros2probe_model::report::snapshot::{
     AcknowledgementFacts, ActionFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered,
     DeliveryFacts, Direction, EarlierCounts, EndpointFacts, GoalCounts, LatencyFacts, Measurement,
@@ -179,6 +181,18 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             unseen: [1, 0, 0, 0, 0, 0],
         }),
         chains: chains(),
+        links: vec![LinkFacts {
+            key: LinkKey {
+                protocol: LinkProtocol::Zenoh,
+                source: [10, 0, 0, 1].into(),
+                destination: [10, 0, 0, 2].into(),
+            },
+            connections: 2,
+            sent: 1000,
+            retransmitted: 40,
+            round_trip: Some(Duration::from_micros(2500)),
+            unacknowledged: 1448,
+        }],
         diagnosed: Arc::new(vec![ModelTime::from_nanoseconds(5); diagnoses().list.len()]),
         diagnoses: Arc::new(diagnoses()),
         churn: vec![ChurnCount {
@@ -318,6 +332,14 @@ fn diagnoses() -> Diagnoses {
         Diagnosis::SharedMachineId {
             domain_id: DomainId(0),
             participants: vec![participant, writer],
+        },
+        Diagnosis::LossyLink {
+            link: LinkKey {
+                protocol: LinkProtocol::Zenoh,
+                source: [10, 0, 0, 1].into(),
+                destination: [10, 0, 0, 2].into(),
+            },
+            retransmitted_permille: 40,
         },
         Diagnosis::SlowChain {
             topic: topic.clone(),

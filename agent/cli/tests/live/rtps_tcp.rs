@@ -9,6 +9,7 @@ use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::run;
+use ros2probe_testing::harness::snmp::Snmp;
 use tempfile::TempDir;
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -189,6 +190,57 @@ fn segments_that_tcp_sends_again_cost_no_message() -> Result<()> {
         }
     }
     ensure!(all_dropped > 0, "nothing was dropped");
+    Ok(())
+}
+
+#[test]
+fn segments_that_a_link_sends_again_equal_those_of_the_kernel_and_are_a_finding() -> Result<()> {
+    let link = Link::new()?;
+    let [small, ..] = streams(link.robot.address());
+    let stream = Stream {
+        count: 3000,
+        reliable: true,
+        linger: 20.0,
+        ..small
+    };
+    let robot = Observer::start(&link.robot, &at_the_sockets_of(&link.robot))?;
+    let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, &stream)?;
+    let (source, destination) = (link.robot.address(), link.monitor.address());
+    let labels = [
+        ("protocol", "rtps"),
+        ("source", &*source.to_string()),
+        ("destination", &*destination.to_string()),
+    ]
+    .map(|(name, value)| (name, value.to_owned()));
+    let labels: Vec<_> = labels
+        .iter()
+        .map(|(name, value)| (*name, value.as_str()))
+        .collect();
+    let agent = &robot.agent;
+    agent.scrape_until("the link", |page| {
+        page.value("ros2_link_connections", &labels) == Some(1.0)
+    })?;
+    let retransmitted = || Snmp::of(publisher.process.pid())?.retransmitted();
+    let before = retransmitted()?;
+    let packets = format!("ip daddr {destination} tcp sport {PORT}");
+    let loss = Loss::of_arriving(&link.monitor, &packets, 100)?;
+    publisher.process.write_line("go")?;
+    let page = agent.scrape_until("the finding", |page| {
+        page.sum("ros2_diagnoses", &[("kind", "lossy_link")]) == 1.0
+    })?;
+    let round_trip = page.value("ros2_link_round_trip_seconds", &labels);
+    ensure!(
+        round_trip.is_some_and(|time| time > 0.0 && time < 1.0),
+        "{round_trip:?}"
+    );
+    publisher.wait_sent(PATIENCE)?;
+    drop(loss);
+    let all = Snmp::of(publisher.process.pid())?.retransmitted()? - before;
+    ensure!(all > 20, "{all} segments");
+    agent.scrape_until("all retransmissions", |page| {
+        let counted = page.value("ros2_link_retransmitted_segments_total", &labels);
+        counted == Some(all as f64)
+    })?;
     Ok(())
 }
 

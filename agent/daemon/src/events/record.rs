@@ -428,6 +428,17 @@ fn finding(finding: &Diagnosis) -> Values {
                 ("reason", Some(text(reason))),
             ]
         }
+        Diagnosis::LossyLink {
+            link,
+            retransmitted_permille,
+        } => vec![
+            ("source", written(&link.source)),
+            ("destination", written(&link.destination)),
+            (
+                "retransmitted_ratio",
+                Some(Value::Real(*retransmitted_permille as f64 / 1e3)),
+            ),
+        ],
         Diagnosis::SharedMachineId {
             domain_id,
             participants,

@@ -19,6 +19,7 @@ mod inside_metrics;
 mod inside_nodes;
 mod large_responses;
 mod limited_listener;
+mod link_metrics;
 mod listen;
 mod places;
 mod process;

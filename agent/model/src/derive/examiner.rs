@@ -18,6 +18,7 @@ use crate::derive::services::Services;
 use crate::facts::diagnosis::{Diagnoses, Diagnosis, QosPairs};
 use crate::facts::model_time::ModelTime;
 use crate::graph::discovery::Discovery;
+use crate::measure::links::Links;
 use crate::measure::topic::Topics;
 use endpoints::{EndpointExaminer, UnmatchedEndpoint};
 
@@ -34,9 +35,9 @@ const STEPS_PER_TOPIC: usize = 50_000;
 /// Examines the graph after each change.
 #[derive(Debug, Default)]
 pub struct Examiner {
-    /// Revisions of discovery, hanging calls, findings from inside processes, and chains at the
-    /// last examination.
-    revision: Option<(u64, u64, u64, u64)>,
+    /// Revisions of discovery, hanging calls, findings from inside processes, chains and links at
+    /// the last examination.
+    revision: Option<[u64; 5]>,
     /// Time at which the first unmatched endpoint becomes a finding.
     due: Option<ModelTime>,
     /// Time at which each unmatched endpoint was first found to be unmatched.
@@ -91,11 +92,16 @@ impl Examiner {
         discovery: &Discovery,
         topics: &Topics,
         services: &Services,
-        (inside, chains): (&Inside, &Chains),
+        (inside, chains, links): (&Inside, &Chains, &Links),
         now: ModelTime,
     ) {
-        let graph = (discovery.revision(), services.revision());
-        let revision = Some((graph.0, graph.1, inside.revision(), chains.revision()));
+        let revision = Some([
+            discovery.revision(),
+            services.revision(),
+            inside.revision(),
+            chains.revision(),
+            links.revision(),
+        ]);
         let is_due = self.due.is_some_and(|due| due <= now);
         if self.revision == revision && !is_due {
             return;
@@ -124,6 +130,9 @@ impl Examiner {
             findings.add(Diagnosis::HangingCall { topic, writer });
         }
         for finding in inside.findings() {
+            findings.add(finding);
+        }
+        for finding in links.findings() {
             findings.add(finding);
         }
         for finding in chains.findings() {

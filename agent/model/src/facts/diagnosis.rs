@@ -19,6 +19,7 @@ use crate::facts::calls::facts::Owner;
 use crate::facts::calls::late::{Cause, Stage};
 use crate::facts::calls::other_thread::Culprit;
 use crate::facts::calls::report::Trigger;
+use crate::facts::link::LinkKey;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
 use crate::facts::topic_kind::TopicKind;
 pub(crate) use matching::effort;
@@ -215,6 +216,13 @@ pub enum Diagnosis {
         /// The first participant of each set of addresses, sorted.
         participants: Vec<Guid>,
     },
+    /// TCP retransmits many segments on the way to another host.
+    LossyLink {
+        /// The link.
+        link: LinkKey,
+        /// Retransmitted segments per 1000.
+        retransmitted_permille: u64,
+    },
     /// A configured chain exceeds its maximum latency.
     SlowChain {
         /// Last topic of the chain.
@@ -276,7 +284,7 @@ pub enum Change<'a> {
 
 impl Diagnosis {
     /// All kinds, as label values.
-    pub const KINDS: [&'static str; 18] = [
+    pub const KINDS: [&'static str; 19] = [
         "qos_incompatible",
         "type_conflict",
         "type_hash_conflict",
@@ -294,6 +302,7 @@ impl Diagnosis {
         "restamping_node",
         "buffers_by_cpu",
         "shared_machine_id",
+        "lossy_link",
         "slow_chain",
     ];
 
@@ -318,6 +327,7 @@ impl Diagnosis {
             Self::RestampingNode { .. } => "restamping_node",
             Self::BuffersByCpu { .. } => "buffers_by_cpu",
             Self::SharedMachineId { .. } => "shared_machine_id",
+            Self::LossyLink { .. } => "lossy_link",
             Self::SlowChain { .. } => "slow_chain",
         }
     }
@@ -343,6 +353,7 @@ impl Diagnosis {
             Self::DuplicateNode { .. }
             | Self::NodeInSeveralDomains { .. }
             | Self::SharedMachineId { .. }
+            | Self::LossyLink { .. }
             | Self::ObservationSuspended { .. } => None,
         }
     }
@@ -361,6 +372,15 @@ impl Diagnosis {
             .then_with(topics)
             .then_with(|| self.within_topic().cmp(&other.within_topic()))
             .then_with(|| self.handle().cmp(&other.handle()))
+            .then_with(|| self.link().cmp(&other.link()))
+    }
+
+    /// Returns the link of the finding, if it concerns one.
+    const fn link(&self) -> Option<&LinkKey> {
+        match self {
+            Self::LossyLink { link, .. } => Some(link),
+            _ => None,
+        }
     }
 
     /// Returns the publisher, subscription or callback that the finding concerns, if any.
@@ -413,6 +433,7 @@ impl Diagnosis {
             | Self::LateCallback { .. }
             | Self::IntraProcessOverflow { .. }
             | Self::ReaderQueueOverflow { .. } => (DomainId(0), "", None, None),
+            Self::LossyLink { .. } => (DomainId(0), "", None, None),
             Self::RestampingNode { node, .. } => (DomainId(0), node, None, None),
             Self::SlowChain { from, .. } => (DomainId(0), from, None, None),
         }

@@ -367,6 +367,7 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         | Diagnosis::ObservationSuspended { .. }
         | Diagnosis::RestampingNode { .. }
         | Diagnosis::BuffersByCpu { .. }
+        | Diagnosis::LossyLink { .. }
         | Diagnosis::SlowChain { .. } => {}
     }
     finding

@@ -12,6 +12,7 @@ pub mod histogram;
 pub mod identity;
 pub mod journal;
 pub mod limits;
+pub mod link;
 pub mod loss;
 pub mod loss_share;
 pub mod measurement;

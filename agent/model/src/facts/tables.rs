@@ -109,6 +109,13 @@ crate::tables! {
     ZenohReplies { name: "zenoh.replies", entries: 4096, rule: Oldest }
     /// Writers of replies of Zenoh with numbers
     ZenohReplyWriters { name: "zenoh.replies.writers", entries: ZenohReplies::CAP, effect: "all numbers begin anew" }
+    /// Connections to other hosts that carry RTPS or Zenoh
+    LinkConnections {
+        name: "links.connections", entries: 4096, effect: "further ones do not count",
+        reported: "table `links`",
+    }
+    /// Pairs of addresses with such connections
+    TcpLinks { name: "links", entries: 256, effect: "further ones do not count" }
     /// Writers and readers with a verdict for the kernel, and removed ones that the kernel still has
     InterestEntries {
         name: "interest.entries", entries: CONFIGURED, effect: "treated as unclassified, within that budget",

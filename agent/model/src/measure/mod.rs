@@ -8,6 +8,7 @@ pub mod expectation;
 pub mod history;
 pub mod in_order;
 pub mod latched;
+pub mod links;
 pub mod loss_causes;
 pub mod payloads;
 pub mod profiler;

@@ -22,6 +22,7 @@ use crate::facts::watch::Watchlist;
 use crate::graph::discovery::Memory;
 use crate::graph::sockets::SocketFacts;
 use crate::graph::zenoh::StreamReport;
+use crate::measure::links::LinkReport;
 
 /// An input of the model. Times are in nanoseconds since the Unix epoch, except those of
 /// observations.
@@ -88,6 +89,8 @@ pub enum Input<'a> {
     SharedMemoryGap(Timestamp),
     /// Uprobes no longer observe writes to shared memory, so sampled messages count again.
     ProbesDetached,
+    /// The sender's state of a TCP connection to another host.
+    Link(&'a LinkReport),
     /// A report about one direction of a Zenoh connection.
     Zenoh(&'a StreamReport<'a>),
     /// A submessage that a source saw, with model time from [`Observer::wall_clock`].

@@ -53,6 +53,7 @@ use crate::graph::discovery::{Caps, Change, Discovery, Endpoint, Memory, Priorit
 use crate::graph::discovery_fragments::DiscoveryFragments;
 use crate::graph::zenoh::{RestoredEndpoint, Zenoh};
 use crate::measure::latched::Latched;
+use crate::measure::links::Links;
 use crate::measure::payloads::Payloads;
 use crate::measure::profiler::{ObservationOutcome, Profiler};
 use crate::measure::receivers::{Graph, Receivers};
@@ -122,6 +123,7 @@ pub(crate) struct Measure {
     pub(crate) discovery_fragments: DiscoveryFragments,
     pub(crate) payloads: Payloads,
     pub(crate) latched: Latched,
+    pub(crate) links: Links,
 }
 
 /// State derived from graph and samples.
@@ -184,6 +186,7 @@ impl Observer {
                 discovery_fragments: DiscoveryFragments::default(),
                 payloads: Payloads::new(settings.payload_bytes, settings.payload_delay),
                 latched: Latched::default(),
+                links: Links::default(),
             },
             derive: Derive {
                 services: Services::default(),
@@ -238,6 +241,10 @@ impl Observer {
                 self.measure.profiler.missed(destination, at);
             }
             Input::ProbesDetached => self.measure.profiler.end_exact_view(),
+            Input::Link(report) => {
+                let now = self.clock;
+                self.measure.links.report(report, now);
+            }
             Input::Zenoh(report) => self.zenoh_report(report),
             Input::Observation(observation) => self.observe(observation),
             Input::ParticipantAlive(prefix, at) => {

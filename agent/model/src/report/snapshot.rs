@@ -38,6 +38,7 @@ pub use crate::graph::sockets::SocketFacts;
 pub use crate::graph::zenoh::ZenohFacts;
 pub use crate::measure::acknowledgement::AcknowledgementFacts;
 pub use crate::measure::latched::LatchedFacts;
+use crate::measure::links::LinkFacts;
 pub use delivery::{DeliveryFacts, Subscriber};
 
 /// All facts at the time `at`. Lists are sorted by identity.
@@ -70,6 +71,8 @@ pub struct Snapshot {
     pub zenoh: Option<ZenohFacts>,
     /// Chains of messages.
     pub chains: ChainsFacts,
+    /// TCP connections to other hosts, by pair of addresses.
+    pub links: Vec<LinkFacts>,
     /// Problems of the graph; the same value while nothing changes.
     pub diagnoses: Arc<Diagnoses>,
     /// Time at which each problem appeared, in the same order.

@@ -74,6 +74,16 @@ impl<'a> Loss<'a> {
     /// Drops `per_mille` of the packets that an nftables expression such as `meta l4proto udp`
     /// matches.
     pub fn of(host: &'a Namespace, matches: &str, per_mille: u16) -> Result<Loss<'a>> {
+        Loss::at("egress", host, matches, per_mille)
+    }
+
+    /// Drops packets that arrive at `host`. TCP does not count packets as lost that its own host
+    /// drops.
+    pub fn of_arriving(host: &'a Namespace, matches: &str, per_mille: u16) -> Result<Loss<'a>> {
+        Loss::at("ingress", host, matches, per_mille)
+    }
+
+    fn at(hook: &str, host: &'a Namespace, matches: &str, per_mille: u16) -> Result<Loss<'a>> {
         // nftables rejects a limit that is never reached.
         let chance = if per_mille < 1000 {
             format!("numgen random mod 1000 < {per_mille}")
@@ -84,8 +94,8 @@ impl<'a> Loss<'a> {
             "table netdev loss {{
                 counter matched {{ }}
                 counter dropped {{ }}
-                chain egress {{
-                    type filter hook egress device {INTERFACE} priority 0;
+                chain lossy {{
+                    type filter hook {hook} device {INTERFACE} priority 0;
                     {matches} counter name matched
                     {matches} {chance} counter name dropped drop
                 }}

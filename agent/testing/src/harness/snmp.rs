@@ -28,6 +28,11 @@ impl Snmp {
         self.value("Udp:", "OutDatagrams")
     }
 
+    /// Returns the number of segments of TCP that were sent again.
+    pub fn retransmitted(&self) -> Result<u64> {
+        self.value("Tcp:", "RetransSegs")
+    }
+
     fn value(&self, protocol: &str, name: &str) -> Result<u64> {
         let mut lines = self.0.lines().filter(|line| line.starts_with(protocol));
         let names = lines.next().unwrap_or_default().split_whitespace();

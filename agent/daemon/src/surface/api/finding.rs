@@ -146,6 +146,14 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
             reader: reader.map(|reader| reader.to_string()),
             backends: texts(backends),
         },
+        diagnosis::Diagnosis::LossyLink {
+            link,
+            retransmitted_permille,
+        } => Diagnosis::LossyLink {
+            source: link.source,
+            destination: link.destination,
+            retransmitted_ratio: thousandths(*retransmitted_permille),
+        },
         diagnosis::Diagnosis::SharedMachineId { participants, .. } => Diagnosis::SharedMachineId {
             participants: printed(participants),
         },

@@ -17,8 +17,9 @@ use super::measured::measurement;
 use super::parameters::Parameters;
 use super::problem::Problem;
 use super::scope::Domain;
-use ros2probe_api::participants::{Participant, ParticipantList, UnknownWriter};
+use ros2probe_api::participants::{Link, Participant, ParticipantList, UnknownWriter};
 use ros2probe_model::facts::wall_clock::WallClock;
+use ros2probe_model::measure::links::LinkFacts;
 use ros2probe_model::report::snapshot::{ParticipantFacts, Snapshot, UnknownWriterFacts};
 
 /// Nodes, writers and readers of each participant.
@@ -55,8 +56,22 @@ async fn list(
         unknown_writers: unknown_writers
             .map(|each| unknown_writer(each, clock))
             .collect(),
+        links: snapshot.links.iter().map(link).collect(),
     };
     Ok(Json(answer).into_response())
+}
+
+fn link(facts: &LinkFacts) -> Link<'static> {
+    Link {
+        protocol: Cow::Borrowed(facts.key.protocol.label()),
+        source: facts.key.source.to_string(),
+        destination: facts.key.destination.to_string(),
+        connections: facts.connections,
+        round_trip_seconds: facts.round_trip.map(|time| time.as_secs_f64()),
+        sent_segments: facts.sent,
+        retransmitted_segments: facts.retransmitted,
+        unacknowledged_bytes: facts.unacknowledged,
+    }
 }
 
 fn counts(snapshot: &Snapshot) -> Counts<'_> {

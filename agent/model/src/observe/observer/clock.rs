@@ -140,6 +140,7 @@ impl Observer {
             self.turn(writer, now);
         }
         if now.nanoseconds().is_multiple_of(SECOND) {
+            self.measure.links.end_second(now);
             self.measure.payloads.expire(now);
             for writer in self.measure.latched.advance(now) {
                 self.apply_again(writer, now);
@@ -174,7 +175,11 @@ impl Observer {
             &self.graph.discovery,
             &self.graph.topics,
             &self.derive.services,
-            (&self.derive.inside, &self.derive.chains),
+            (
+                &self.derive.inside,
+                &self.derive.chains,
+                &self.measure.links,
+            ),
             now,
         );
         let after = self.derive.examiner.current();

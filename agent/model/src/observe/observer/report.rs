@@ -46,6 +46,7 @@ pub(super) fn snapshot(observer: &Observer, wall_time: Timestamp) -> Snapshot {
         inside: observer.derive.inside.facts().map(Arc::new),
         zenoh: observer.zenoh.is_used().then(|| observer.zenoh.facts()),
         chains: observer.derive.chains.facts(wall_time),
+        links: observer.measure.links.facts(),
         diagnoses: Arc::clone(observer.derive.examiner.current()),
         diagnosed: Arc::clone(observer.derive.examiner.since()),
         churn: observer.graph.discovery.churn.facts(),
@@ -448,5 +449,6 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     ];
     tables.extend(observer.measure.latched.tables());
     tables.extend(observer.zenoh.tables());
+    tables.push(observer.measure.links.tables());
     tables
 }

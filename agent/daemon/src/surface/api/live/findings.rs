@@ -327,6 +327,22 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             };
             found.with_remedy("end subscriptions of older distributions and of other middleware")
         }
+        Diagnosis::LossyLink { link, .. } => {
+            let text = format!(
+                "TCP repeats many segments from {} to {} ({}): the network between them loses packets",
+                link.source,
+                link.destination,
+                link.protocol.label()
+            );
+            let about = format!(
+                "{}|{}|{}",
+                link.protocol.label(),
+                link.source,
+                link.destination
+            );
+            finding(kind, Severity::Warning, &about, text)
+                .with_remedy("look at the radio, the cable or the load of that link")
+        }
         Diagnosis::SharedMachineId {
             domain_id,
             participants,

@@ -128,6 +128,7 @@ impl Figures<'_> {
                 | Diagnosis::RestampingNode { .. }
                 | Diagnosis::BuffersByCpu { .. }
                 | Diagnosis::SharedMachineId { .. }
+                | Diagnosis::LossyLink { .. }
                 | Diagnosis::SlowChain { .. } => {}
             }
         }
