@@ -54,7 +54,10 @@ ros2probe_model::tables! {
     /// Directions of TCP connections of Zenoh and RTPS
     ZenohStreams { name: "zenoh_streams", entries: 4096, effect: "the oldest is dropped, other protocols first" }
     /// Bytes of their unfinished batches, and of waiting segments
-    ZenohStreamBytes { name: "zenoh_stream_bytes", entries: 12 << 20, effect: "the oldest direction is dropped" }
+    ZenohStreamBytes {
+        name: "zenoh_stream_bytes", entries: 12 << 20,
+        effect: "the longest frame loses its payload; without a long one, the oldest direction is dropped",
+    }
     /// Directions of TCP connections in the order of their beginnings, with some that ended
     ZenohOrder { name: "zenoh.order", entries: 2 * ZenohStreams::CAP, effect: "those that ended are removed" }
     /// TCP segments of a direction that wait for missing ones

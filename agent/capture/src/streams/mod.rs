@@ -253,7 +253,9 @@ impl Streams {
             self.forget(&id);
         }
         while self.bytes.is_exceeded() {
-            self.evict();
+            if !self.shorten_longest() {
+                self.evict();
+            }
         }
     }
 
@@ -358,6 +360,21 @@ impl Streams {
             let streams = &self.streams;
             self.order.retain(|id| streams.contains_key(id));
         }
+    }
+
+    /// Shortens the direction that holds most. Returns whether many bytes were dropped.
+    fn shorten_longest(&mut self) -> bool {
+        let streams = self.streams.values_mut();
+        let Some(longest) = streams.max_by_key(|stream| stream.held()) else {
+            return false;
+        };
+        let before = longest.held();
+        let is_shorter = longest.shorten();
+        if is_shorter {
+            self.bytes.sub(before - longest.held());
+            self.bytes.refuse();
+        }
+        is_shorter
     }
 
     /// Drops a connection: the oldest one whose protocol is not known, otherwise the oldest one of

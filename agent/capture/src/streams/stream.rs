@@ -21,6 +21,9 @@ const WAIT: Duration = Duration::from_secs(10);
 const PREFIX: usize = 2;
 /// Maximum number of bytes kept of a frame of RTPS. Payloads of a longer one are not read.
 pub const MAX_FRAME: usize = 4 << 20;
+/// Number of held bytes from which a frame may be shortened, and number of bytes that then remain.
+const MANY: usize = 256 << 10;
+const KEPT: usize = 4 << 10;
 /// Maximum number of consecutive batches without a message. Zenoh sends one when it drops the rest
 /// of a message. More of them are zeros of other data.
 const MAX_EMPTY: usize = 64;
@@ -154,6 +157,19 @@ impl Stream {
             Position::Other => 0,
         };
         partial + self.ahead_bytes.used()
+    }
+
+    /// Drops most of the held bytes of an unfinished batch or frame. Its boundary stays known, so only
+    /// its payload is not read. Returns whether many bytes were dropped.
+    pub fn shorten(&mut self) -> bool {
+        match &mut self.position {
+            Position::Batch(partial) if partial.captured.capacity() > MANY => {
+                partial.captured.truncate(KEPT);
+                partial.captured.shrink_to_fit();
+                true
+            }
+            _ => false,
+        }
     }
 
     /// Returns whether segments wait for missing ones.

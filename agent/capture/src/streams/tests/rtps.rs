@@ -233,3 +233,54 @@ fn a_header_in_a_payload_begins_no_frame_of_a_known_direction() {
     let outer = read(&outer, GuidPrefix::UNKNOWN);
     assert_eq!(connection.read, [outer.clone(), outer]);
 }
+
+/// Many directions begin a large frame at the same time.
+#[test]
+fn frames_beyond_the_byte_cap_lose_their_payload_and_no_direction_its_place() {
+    const HALF: usize = 3 << 20;
+    let mut streams = Streams::default();
+    let mut large = frame(&message(ONE, &[]), PORT);
+    large[4..8].copy_from_slice(&(2 * HALF as u32).to_le_bytes());
+    large.resize(2 * HALF, 3);
+    let next = message(ONE, b"next");
+    let (mut lengths, mut last) = (Vec::new(), 0);
+    for step in 0..3 {
+        for port in 0..20_u16 {
+            let flow = Flow {
+                source: place_of(40_000 + port),
+                destination: place_of(5100),
+            };
+            let (from, bytes) = match step {
+                0 => (0, &large[..HALF]),
+                1 => (HALF, &large[HALF..]),
+                _ => (2 * HALF, &frame(&next, PORT)[..]),
+            };
+            let chunk = Chunk {
+                time: Timestamp(1),
+                stream: StreamId {
+                    flow,
+                    ..StreamId::default()
+                },
+                sequence_number: from as u32,
+                syn: false,
+                end: false,
+                boundary: None,
+                before: Before::Unknown,
+                bytes,
+                length: bytes.len() as u32,
+            };
+            streams.chunk(&chunk, |streamed| {
+                if let Streamed::Message { bytes, length, .. } = streamed {
+                    match **bytes == *next {
+                        true => last += 1,
+                        false => lengths.push(*length),
+                    }
+                }
+            });
+            let [_, held] = streams.tables();
+            assert!(held.size <= held.limit, "{held:?}");
+        }
+    }
+    assert_eq!(lengths, vec![2 * HALF as u32 - 14; 20]);
+    assert_eq!((last, streams.counters().frame_gaps), (20, 0));
+}
