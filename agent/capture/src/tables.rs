@@ -56,7 +56,7 @@ ros2probe_model::tables! {
     /// Bytes of their unfinished batches, and of waiting segments
     ZenohStreamBytes {
         name: "zenoh_stream_bytes", entries: 12 << 20,
-        effect: "the longest frame loses its payload; without a long one, the oldest direction is dropped",
+        effect: "a frame or direction is dropped",
     }
     /// Directions of TCP connections in the order of their beginnings, with some that ended
     ZenohOrder { name: "zenoh.order", entries: 2 * ZenohStreams::CAP, effect: "those that ended are removed" }

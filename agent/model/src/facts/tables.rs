@@ -109,6 +109,10 @@ crate::tables! {
     ZenohReplies { name: "zenoh.replies", entries: 4096, rule: Oldest }
     /// Writers of replies of Zenoh with numbers
     ZenohReplyWriters { name: "zenoh.replies.writers", entries: ZenohReplies::CAP, effect: "all numbers begin anew" }
+    /// Writers of references to buffers
+    ReferenceWriters { name: "references.writers", entries: 4096, effect: "further ones count all copies" }
+    /// Publishers of references to buffers
+    ReferenceLeads { name: "references.leads", entries: 4096, effect: "references of further ones do not count" }
     /// Connections to other hosts that carry RTPS or Zenoh
     LinkConnections {
         name: "links.connections", entries: 4096, effect: "further ones do not count",

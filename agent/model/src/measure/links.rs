@@ -15,8 +15,9 @@ use crate::graph::zenoh::Flow;
 
 /// Number of seconds over which the share of retransmitted segments is measured.
 const WINDOW: usize = 10;
-/// Time without a report after which a connection is forgotten, and the state of a link unknown.
-const SILENCE: Duration = Duration::from_secs(15);
+/// Time without a report after which a connection is forgotten: longer than the pause between two
+/// retransmissions (TCP_RTO_MAX of Linux), and than that between two KEEP_ALIVEs.
+const SILENCE: Duration = Duration::from_secs(130);
 /// Time without a report after which a link is forgotten.
 const FORGOTTEN: Duration = Duration::from_secs(600);
 /// Segments of 1000 that are retransmitted: from the first number on the link is a finding, and below
@@ -25,6 +26,8 @@ const LOSSY: u64 = 20;
 const SOUND: u64 = 10;
 /// Minimum number of retransmitted segments of a finding.
 const FEW: u64 = 5;
+/// Number of seconds in which a link of a finding has sent new segments.
+const PROGRESS: usize = 3;
 
 /// A report about one connection.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -88,6 +91,13 @@ impl Link {
         (self.again() * 1000).checked_div(sent).unwrap_or(0)
     }
 
+    /// Returns whether new segments were sent in the last seconds. A peer that is gone acknowledges
+    /// nothing, and then TCP only retransmits.
+    fn makes_progress(&self) -> bool {
+        let last = self.recent.iter().rev().take(PROGRESS);
+        last.fold(0, |new, (sent, again)| new + sent.saturating_sub(*again)) > 0
+    }
+
     /// Returns the number of segments that were retransmitted lately.
     fn again(&self) -> u64 {
         self.recent.iter().map(|(_, again)| again).sum()
@@ -109,7 +119,8 @@ impl Links {
         let id = (report.socket, report.flow);
         let before = self.connections.get(&id).map(|known| known.state);
         if before.is_none() && self.connections.is_full() {
-            self.connections.refuse();
+            // The table of links reports it.
+            self.links.refuse();
             return;
         }
         let Some(link) = self.links.get_or_insert_with(key, Link::default) else {
@@ -143,7 +154,7 @@ impl Links {
             let share = link.permille();
             let is_lossy = match link.is_lossy {
                 true => share >= SOUND,
-                false => share >= LOSSY && link.again() >= FEW,
+                false => share >= LOSSY && link.again() >= FEW && link.makes_progress(),
             };
             self.revision += u64::from(is_lossy != link.is_lossy);
             link.is_lossy = is_lossy;
@@ -275,10 +286,27 @@ mod tests {
     }
 
     #[test]
+    fn a_peer_that_is_gone_is_no_lossy_link() {
+        let mut links = Links::default();
+        let (mut sent, mut again) = (0, 0);
+        for second in 0..60 {
+            match second {
+                0..10 => sent += 30,
+                // TCP only retransmits, ever more seldom.
+                10..13 => (sent, again) = (sent + 2, again + 2),
+                _ => (sent, again) = (sent + second % 2, again + second % 2),
+            }
+            links.report(&report(1, 2, sent, again), at(second.into()));
+            links.end_second(at(second.into()));
+            assert_eq!(links.findings().count(), 0, "{second}");
+        }
+    }
+
+    #[test]
     fn silent_connections_and_links_are_forgotten_and_both_tables_are_bounded() {
         let mut links = Links::default();
         links.report(&report(1, 2, 1, 0), at(0));
-        links.end_second(at(16));
+        links.end_second(at(131));
         assert_eq!(
             (links.facts()[0].connections, links.facts()[0].round_trip),
             (0, None)
@@ -289,6 +317,8 @@ mod tests {
             links.report(&report(number, 2, 1, 0), at(700));
         }
         assert_eq!(links.facts()[0].connections, LinkConnections::CAP as u64);
+        let beyond = u64::from(u16::MAX) + 1 - LinkConnections::CAP as u64;
+        assert_eq!(links.tables().evictions, beyond);
         let mut links = Links::default();
         for peer in 0..=u8::MAX {
             let mut each = report(1, peer, 1, 0);

@@ -309,9 +309,9 @@ impl Profiler {
     ) {
         if let Some(known) = self.writers.get_mut(&guid) {
             known.writer.learn(traits);
-            known.opened = opened;
+            known.opened = known.opened.max(opened);
             if known.topic.is_none() {
-                known.opened = opened.max(now);
+                known.opened = known.opened.max(now);
                 known.writer.begin_window(now);
                 // The other budget accounts for its unfinished samples from now on.
                 known.writer.transfer(

@@ -8,7 +8,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use foldhash::HashMap;
-use ros2probe_wire::backends::Backends;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
@@ -78,15 +77,15 @@ pub struct Topic {
     pub is_held: bool,
 }
 
-/// The subscriptions of a topic that accept buffers of other backends than `cpu`.
+/// The subscriptions of a publisher that accept buffers of other backends than `cpu`.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Accelerated {
     /// No subscription.
     None,
     /// Some subscriptions; others get messages as a whole.
     Some,
-    /// All subscriptions. Holds the lowest gid of them.
-    All([u8; 16]),
+    /// All subscriptions.
+    All,
 }
 
 /// All topics of all domains.
@@ -160,50 +159,6 @@ impl Topic {
             let announced = discovery.endpoints().get(guid)?.base;
             Some((*guid, self.base_of(*guid, announced)?))
         })
-    }
-
-    /// Returns who gets references to buffers instead of messages.
-    #[must_use]
-    pub fn accelerated(&self, discovery: &Discovery) -> Accelerated {
-        let (mut some, mut all, mut first) = (false, !self.readers.is_empty(), None);
-        for reader in &self.readers {
-            let endpoint = discovery.endpoints().get(reader);
-            let backends = endpoint.and_then(|endpoint| endpoint.backends.as_deref());
-            match backends.is_some_and(Backends::is_accelerated) {
-                true => some = true,
-                false => all = false,
-            }
-            first = first
-                .into_iter()
-                .chain(endpoint.map(|endpoint| endpoint.gid))
-                .min();
-        }
-        match (some, first.filter(|_| all)) {
-            (false, _) => Accelerated::None,
-            (true, None) => Accelerated::Some,
-            (true, Some(first)) => Accelerated::All(first),
-        }
-    }
-
-    /// Returns whether the samples of a buffer writer that carries references count as messages of
-    /// its publisher: the publisher sends no message as a whole, and this is its first such writer.
-    #[must_use]
-    pub fn counts_references(&self, writer: Guid, discovery: &Discovery) -> bool {
-        let is_reference = |guid: Guid| {
-            let endpoint = discovery.endpoints().get(&guid);
-            let naming = endpoint.and_then(|endpoint| endpoint.naming());
-            guid.entity.is_writer() && naming.is_some_and(|naming| !naming.counts)
-        };
-        let Some(base) = self.buffers(discovery).find(|(guid, _)| *guid == writer) else {
-            return false;
-        };
-        let mut own = self
-            .buffers(discovery)
-            .filter(|(_, other)| *other == base.1);
-        matches!(self.accelerated(discovery), Accelerated::All(_))
-            && own
-                .find(|(guid, _)| is_reference(*guid))
-                .is_some_and(|first| first == base)
     }
 
     /// Returns whether no endpoint is left.

@@ -21,6 +21,7 @@ mod chains;
 mod clock;
 mod inside;
 mod lists;
+mod references;
 mod report;
 mod samples;
 mod settings;
@@ -57,12 +58,13 @@ use crate::measure::links::Links;
 use crate::measure::payloads::Payloads;
 use crate::measure::profiler::{ObservationOutcome, Profiler};
 use crate::measure::receivers::{Graph, Receivers};
-use crate::measure::topic::{TopicId, Topics, Watched};
+use crate::measure::topic::{Accelerated, TopicId, Topics, Watched};
 use crate::observe::input::{Captured, Input, Output};
 use crate::observe::interest::Interest;
 use crate::report::snapshot::Snapshot;
 use crate::report::transport::{lacks_names, may_share_memory};
 use lists::{traced_share, traits};
+use references::{CountedAs, References};
 pub use settings::Settings;
 use zenoh::ZenohNames;
 
@@ -96,6 +98,7 @@ pub struct Observer {
     pub(crate) derive: Derive,
     pub(crate) zenoh: Zenoh,
     zenoh_names: ZenohNames,
+    references: References,
     pub(crate) counts: Counts,
     journal: Journal,
     /// Time of the latest decisions.
@@ -196,6 +199,7 @@ impl Observer {
                 examiner: Examiner::default(),
             },
             zenoh: Zenoh::default(),
+            references: References::default(),
             zenoh_names: ZenohNames::default(),
             counts: Counts::default(),
             journal: Journal::default(),
@@ -484,9 +488,34 @@ impl Observer {
         }
     }
 
+    /// Returns whether an observation of a writer counts, if it sends references to buffers. With
+    /// Zenoh, this is decided before.
+    fn counts_reference(&mut self, observation: &Observation) -> bool {
+        let head = observation.head();
+        let reference = self.references.get(head.writer);
+        let Some(reference) = reference.filter(|_| !head.writer.prefix.is_zenoh()) else {
+            return true;
+        };
+        let (publisher, channel) = (reference.publisher, head.writer.to_bytes());
+        if reference.accelerated != Accelerated::All {
+            return false;
+        }
+        if observation.sample().is_none() {
+            return self.references.leads(publisher, channel);
+        }
+        let counted = self.references.count(publisher, channel, head.at);
+        if counted == CountedAs::FirstMessage {
+            self.measure.profiler.skip_numbers(head.writer, head.at);
+        }
+        counted != CountedAs::Copy
+    }
+
     /// Measures user data of a measured topic, or of an unknown writer.
     fn measure_user_data(&mut self, observation: &Observation) {
         let (writer, sample) = (observation.head().writer, observation.sample());
+        if !self.counts_reference(observation) {
+            return;
+        }
         // The profiler needs to know calls first. Requests and replies are seldom measured, so
         // ordinary topics skip this lookup.
         let measures_calls = self.derive.services.has_measured();
@@ -601,7 +630,7 @@ impl Observer {
                         .and_then(|naming| self.graph.topics.find(endpoint.domain_id, &naming));
                     self.measure.profiler.learn(guid, traits(guid, endpoint));
                     if let Some(topic) = topic {
-                        self.apply_to_buffers(topic, now);
+                        self.find_references(topic);
                     }
                 }
                 Change::Gone(guid, endpoint) => self.gone(guid, &endpoint, now),
@@ -633,7 +662,7 @@ impl Observer {
             self.apply_lists(id, now);
         }
         self.apply(id, guid, now);
-        self.apply_to_buffers(id, now);
+        self.find_references(id);
         let opened = self
             .graph
             .topics
@@ -653,6 +682,7 @@ impl Observer {
         self.retire(guid, now);
         self.measure.payloads.release(guid, now);
         self.measure.latched.forget(guid);
+        self.references.remove(guid);
         let (domain_id, topic) = (endpoint.domain_id, endpoint.topic.bounded(TEXT));
         self.journal.events.name(guid, domain_id, &topic);
         let id = endpoint
@@ -660,7 +690,7 @@ impl Observer {
             .and_then(|naming| self.graph.topics.find(endpoint.domain_id, &naming));
         if let Some(id) = id {
             self.graph.topics.leave(id, guid, now);
-            self.apply_to_buffers(id, now);
+            self.find_references(id);
         }
     }
 }

@@ -180,10 +180,12 @@ fn is_one_host(
     one: GuidPrefix,
     other: GuidPrefix,
 ) -> bool {
+    if vendor != VendorId::EPROSIMA {
+        return true;
+    }
     let participants = discovery.participants();
     let machine = |prefix| participants.get(&prefix)?.proxy.machine_id.as_ref();
     match (machine(one), machine(other)) {
-        _ if vendor != VendorId::EPROSIMA => true,
         (Some(one), Some(other)) => one == other,
         _ => one.0.first_chunk::<4>() == other.0.first_chunk::<4>(),
     }

@@ -2,6 +2,7 @@
 //! `rmw_publish.cpp`): a second writer and reader carry the messages, and nodes announce only the
 //! first ones.
 
+use ros2probe_model::facts::diagnosis::Diagnosis;
 use ros2probe_model::report::snapshot::{EndpointFacts, TopicFacts};
 use ros2probe_testing::model::forge::{self, AnnouncedNode, Message, SEDP_READERS, SEDP_WRITERS};
 use ros2probe_testing::model::host::{ALICE, BOB, CapturePoint, Host, READER, WRITER};
@@ -183,12 +184,14 @@ fn references_count_only_while_no_subscription_gets_messages() {
     publish(&mut host, bob, writer(0x33), 11..=20);
     let topic = image(&host);
     assert_eq!(topic.measurement.as_ref().unwrap().messages, 20);
+    assert_eq!(messages(&topic.publishers[0]), 20);
+    assert_eq!(topic.measurement.as_ref().unwrap().loss.lost, 0);
 }
 
 #[test]
 fn participants_with_one_machine_id_are_on_one_host_whatever_their_guids_say() {
     let machine = |host: &mut Host, prefix: GuidPrefix, number, id: &str| {
-        let list = forge::participant_on(prefix, id);
+        let list = forge::participant_on(prefix, id, [10, 0, 0, 1]);
         host.announce(Message::from_fast(prefix).data(forge::SPDP, number, &list));
     };
     for (of_bob, passage) in [("a", "shared_memory"), ("b", "network")] {
@@ -209,4 +212,77 @@ fn participants_with_one_machine_id_are_on_one_host_whatever_their_guids_say() {
             .collect();
         assert_eq!(labels, [passage]);
     }
+}
+
+/// A subscription in the publisher's process gets its references there, so that only those to another
+/// one are visible.
+#[test]
+fn references_count_whichever_subscription_gets_them_and_once() {
+    let (mut host, bob) = robot(CUDA);
+    let others = [0x34, 0x35].map(writer);
+    for (place, other) in others.into_iter().enumerate() {
+        let suffix = format!("/_buf/{}", digits(reader(BOB, 0x61 + place as u8)));
+        let with_publisher = format!("{CUDA}PGID:{}", digits(writer(0x21)));
+        announce(
+            &mut host,
+            20 + place as u64,
+            other,
+            &suffix,
+            &with_publisher,
+        );
+    }
+    let [second, third] = others;
+    // Nothing of the first writer is seen.
+    publish(&mut host, bob, second, 1..=10);
+    assert_eq!(messages(&image(&host).publishers[0]), 10);
+    host.wait(1000);
+    for number in 11..=20 {
+        for other in [third, second] {
+            let sample = host.record(bob, kind::DATA, number);
+            host.put(Record {
+                writer: guid_words(other),
+                ..sample
+            });
+        }
+        host.wait(100);
+    }
+    host.wait(3000);
+    let topic = image(&host);
+    assert_eq!(messages(&topic.publishers[0]), 20);
+    assert_eq!(topic.measurement.as_ref().unwrap().loss.lost, 0);
+}
+
+/// Announces a participant with this machine id, host in its GUID, and address.
+fn on_machine(host: &mut Host, number: u8, in_guid: u8, id: &str, address: [u8; 4]) {
+    let prefix = GuidPrefix([1, 15, in_guid, 0, number, 0, 1, 0, 0, 0, 0, 0]);
+    let list = forge::participant_on(prefix, id, address);
+    host.announce(Message::from_fast(prefix).data(forge::SPDP, 1, &list));
+}
+
+#[test]
+fn cloned_machines_are_a_finding_and_participants_of_one_host_are_none() {
+    let apart = |participants: &[(u8, &str, [u8; 4])]| {
+        let mut host = Host::new();
+        for (number, (in_guid, id, address)) in participants.iter().enumerate() {
+            on_machine(&mut host, number as u8, *in_guid, id, *address);
+        }
+        host.wait(1000);
+        let list = host.snapshot().diagnoses.list.clone();
+        let found = list.iter().find_map(|finding| match finding {
+            Diagnosis::SharedMachineId { participants, .. } => Some(participants.len()),
+            _ => None,
+        });
+        found.unwrap_or(0)
+    };
+    let (one, two, three) = ([10, 0, 0, 1], [10, 0, 0, 2], [10, 0, 0, 3]);
+    assert_eq!(apart(&[(1, "a", one), (2, "a", two), (3, "a", three)]), 3);
+    // Other ids, one address, or one host in the GUIDs.
+    assert_eq!(apart(&[(1, "a", one), (2, "b", two)]), 0);
+    assert_eq!(apart(&[(1, "a", one), (2, "a", one)]), 0);
+    assert_eq!(apart(&[(1, "a", one), (1, "a", two)]), 0);
+    // The second participant connects the others.
+    assert_eq!(
+        apart(&[(1, "a", one), (2, "a", one), (2, "a", two), (3, "a", two)]),
+        0
+    );
 }

@@ -173,11 +173,20 @@ pub fn participant_at(
     encapsulated(&list)
 }
 
-/// Returns the SPDP payload of a participant of Fast DDS with shared memory on this machine.
-pub fn participant_on(prefix: GuidPrefix, machine_id: &str) -> Vec<u8> {
+/// Returns the SPDP payload of a participant of Fast DDS with shared memory on this machine, and with
+/// this address.
+pub fn participant_on(prefix: GuidPrefix, machine_id: &str, address: [u8; 4]) -> Vec<u8> {
     let guid = Guid::new(prefix, EntityId::PARTICIPANT);
     let shared_memory = [&16u32.to_le_bytes()[..], &7412u32.to_le_bytes(), &[0; 16]].concat();
+    let udp = [
+        &1u32.to_le_bytes()[..],
+        &7411u32.to_le_bytes(),
+        &[0; 12],
+        &address,
+    ]
+    .concat();
     encapsulated(&[
+        (0x31, udp),
         (0x15, vec![2, 3]),
         (0x16, vec![1, 0x0f]),
         (0x50, guid.to_bytes().to_vec()),

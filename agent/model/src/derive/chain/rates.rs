@@ -33,7 +33,8 @@ impl<'a> Rates<'a> {
 
     fn messages(&self, id: TopicId) -> u64 {
         let topic = self.topics.get(id);
-        let writers = topic.into_iter().flat_map(|topic| &topic.writers);
+        let lists = topic.map(|topic| [&topic.writers, &topic.buffer_endpoints]);
+        let writers = lists.into_iter().flatten().flatten();
         let measured = writers.filter_map(|writer| self.profiler.get(*writer));
         let recent = measured.map(|each| each.writer.recent(self.now, SECONDS));
         let mut sum = Slot::default();

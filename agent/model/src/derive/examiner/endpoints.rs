@@ -107,25 +107,45 @@ impl<'a> EndpointExaminer<'a> {
 
     /// Adds publishers that could send references to buffers, but send messages as a whole.
     fn buffers(&self, topic: &Topic, key: &impl Fn() -> TopicKey, findings: &mut Findings) {
-        let endpoint = |guid: &Guid| Some((*guid, self.endpoint(*guid)?.0));
-        let mut readers = topic.readers.iter().filter_map(endpoint);
-        let plain = readers.find(|(_, reader)| reader.backends.is_none());
-        for (writer, of_writer) in topic.writers.iter().filter_map(endpoint) {
+        for writer in &topic.writers {
+            let Some((of_writer, vendor)) = self.endpoint(*writer) else {
+                continue;
+            };
             let Some(own) = of_writer.backends.as_deref() else {
                 continue;
             };
-            if !findings.spend(topic.readers.len()) {
-                break;
+            let offer = Offer {
+                qos: &of_writer.qos,
+                vendor,
+            };
+            let (mut plain, mut shared) = (None, BTreeSet::new());
+            for reader in &topic.readers {
+                let Some((of_reader, vendor)) = self.endpoint(*reader) else {
+                    continue;
+                };
+                let request = Offer {
+                    qos: &of_reader.qos,
+                    vendor,
+                };
+                if !findings.spend(diagnosis::effort(offer.qos, request.qos)) {
+                    findings.unexamined += 1;
+                    return;
+                }
+                let is_matched = of_writer.message_type == of_reader.message_type
+                    && offer.shares_protocol(request)
+                    && diagnosis::verdict(offer, request) == Verdict::Match;
+                match of_reader.backends.as_deref().filter(|_| is_matched) {
+                    Some(other) => shared.extend(own.shared(other)),
+                    None if is_matched => plain = plain.or(Some(*reader)),
+                    None => {}
+                }
             }
-            let readers = topic.readers.iter().filter_map(endpoint);
-            let others = readers.filter_map(|(_, reader)| reader.backends.as_deref());
-            let shared: BTreeSet<_> = others.flat_map(|other| own.shared(other)).collect();
             let is_latched = of_writer.qos.durability != Durability::VOLATILE;
             if !shared.is_empty() && (is_latched || plain.is_some()) {
                 findings.add(Diagnosis::BuffersByCpu {
                     topic: key(),
-                    writer,
-                    reader: plain.map(|(guid, _)| guid),
+                    writer: *writer,
+                    reader: plain,
                     backends: shared.into_iter().map(Into::into).collect(),
                 });
             }

@@ -11,6 +11,7 @@ use ros2probe_wire::{DomainId, GuidPrefix};
 
 use super::tracked::{Kind, Tracked};
 use crate::facts::names::{NodeName, TopicName};
+use crate::facts::naming::Naming;
 use crate::graph::discovery::{Discovery, Participant};
 use crate::measure::receivers::Receivers;
 
@@ -98,7 +99,9 @@ impl Attribution {
             let Some(endpoint) = discovery.endpoints().get(guid) else {
                 continue;
             };
-            let Some(naming) = endpoint.naming().filter(|naming| !naming.kind.is_service()) else {
+            // Nodes announce no buffer endpoints.
+            let is_named = |naming: &Naming| !naming.kind.is_service() && !naming.is_buffer;
+            let Some(naming) = endpoint.naming().filter(is_named) else {
                 continue;
             };
             let endpoints = match endpoint.role {

@@ -93,6 +93,7 @@ impl Discovery {
                     known.type_hash,
                     Arc::clone(&known.qos),
                     known.message_type.clone(),
+                    (known.backends.clone(), known.base),
                 );
                 if *known.qos != announcement.qos {
                     known.qos = Arc::new(announcement.qos.clone());
@@ -105,7 +106,8 @@ impl Discovery {
                 known.message_type = announcement.type_name.message().as_str().into();
                 let unchanged = before.0 == known.type_hash
                     && before.1 == known.qos
-                    && before.2 == known.message_type;
+                    && before.2 == known.message_type
+                    && before.3 == (known.backends.clone(), known.base);
                 if !unchanged {
                     let entity = DiscoveredEntity::endpoint(guid, known);
                     self.changes.push(Change::Changed(guid));

@@ -111,7 +111,7 @@ pub struct Participant {
     /// Number of its endpoints whose topics are watched by exact name.
     pub(super) watched: usize,
     /// Whether a socket on this host sends for it.
-    pub(super) local: bool,
+    pub(crate) local: bool,
     /// Whether one of its messages came by TCP.
     pub(super) came_by_tcp: bool,
     /// Whether it has sent user data.

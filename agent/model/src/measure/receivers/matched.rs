@@ -3,6 +3,7 @@
 //! A process that shares a multicast group or a port with a reader receives the samples, too. It
 //! counts as a subscriber only if it has a reader that matches the writer.
 
+use ros2probe_wire::backends::Backends;
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::{Guid, GuidPrefix};
 
@@ -10,7 +11,7 @@ use super::Graph;
 use crate::facts::diagnosis::{Offer, Verdict, effort, verdict};
 use crate::facts::model_time::ModelTime;
 use crate::graph::discovery::Endpoint;
-use crate::measure::topic::Topic;
+use crate::measure::topic::{Accelerated, Topic};
 
 /// Maximum effort of one comparison. Endpoints whose lists of partitions exceed it count as a
 /// match.
@@ -110,6 +111,27 @@ impl<'a> MatchedReaders<'a> {
         let known = self.of(prefix).filter_map(|guid| endpoints.get(&guid));
         let mut known = known.map(|endpoint| endpoint.qos.reliability == Reliability::RELIABLE);
         known.next() == Some(false) && !known.any(|is_reliable| is_reliable)
+    }
+
+    /// Returns who of the readers gets references to buffers instead of messages. If there are too
+    /// many readers, some of them may get messages.
+    #[must_use]
+    pub fn accelerated(self) -> Accelerated {
+        let endpoints = self.graph.discovery.endpoints();
+        let readers = self.topic.map(|topic| &topic.readers);
+        let (mut some, mut whole) = (false, false);
+        for (place, reader) in readers.into_iter().flatten().enumerate() {
+            let endpoint = endpoints.get(reader);
+            let backends = endpoint.and_then(|endpoint| endpoint.backends.as_deref());
+            let is_accelerated = backends.is_some_and(Backends::is_accelerated);
+            some |= is_accelerated;
+            whole |= place >= COMPARED || !is_accelerated && self.matches(*reader);
+        }
+        match (some, whole) {
+            (false, _) => Accelerated::None,
+            (true, true) => Accelerated::Some,
+            (true, false) => Accelerated::All,
+        }
     }
 
     fn matches(self, reader: Guid) -> bool {

@@ -1,5 +1,6 @@
 //! Applies the watchlist and the sample requests: the topics that they select are measured.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use ros2probe_wire::discovery::Role;
@@ -9,6 +10,7 @@ use ros2probe_wire::{Guid, RtpsDuration, SequenceNumber};
 
 use super::MAX_MATCHES_PER_ROUND;
 use super::Observer;
+use super::references::Reference;
 use crate::derive::trace::share::Share;
 use crate::facts::dispatch::{self, Offered};
 use crate::facts::header::begins_with_header;
@@ -18,8 +20,12 @@ use crate::facts::topic_kind::TopicKind;
 use crate::facts::watch::{Retain, Watch, Watchlist};
 use crate::graph::discovery::Endpoint;
 use crate::measure::latched::LatchedTopic;
-use crate::measure::topic::{Topic, TopicId, Watched};
+use crate::measure::receivers::MatchedReaders;
+use crate::measure::topic::{Accelerated, Topic, TopicId, Watched};
 use crate::measure::writer::Traits;
+
+/// Maximum number of publishers of a topic whose references to buffers may count.
+const MAX_PUBLISHERS: usize = 64;
 
 impl Observer {
     /// Replaces the watchlist. It takes effect once `Input::MoreLists` has visited all
@@ -129,13 +135,37 @@ impl Observer {
         }
     }
 
-    /// Applies the decision about a topic to its buffer endpoints again: which of them counts messages
-    /// depends on all endpoints.
-    pub(super) fn apply_to_buffers(&mut self, id: TopicId, now: ModelTime) {
-        let topic = self.graph.topics.get(id);
-        let guids = topic.map(|topic| topic.buffer_endpoints.clone());
-        for guid in guids.unwrap_or_default() {
-            self.apply(id, guid, now);
+    /// Determines again which writers of a topic send references to buffers, after a change of its
+    /// endpoints.
+    pub(super) fn find_references(&mut self, id: TopicId) {
+        let (graph, discovery) = (&self.graph, &self.graph.discovery);
+        let Some(topic) = graph.topics.get(id) else {
+            return;
+        };
+        let backends = |guid: &Guid| discovery.endpoints().get(guid)?.backends.as_ref();
+        let publishers = topic.writers.iter().filter(|guid| backends(guid).is_some());
+        let publishers = publishers.take(MAX_PUBLISHERS).map(|guid| {
+            let readers = MatchedReaders::new(graph, Some(topic), *guid);
+            (*guid, readers.accelerated())
+        });
+        let publishers: BTreeMap<_, _> = publishers.collect();
+        // With Zenoh, a publisher itself sends references.
+        let own = publishers.keys().filter(|guid| guid.prefix.is_zenoh());
+        let mut senders: Vec<_> = own.map(|guid| (*guid, *guid)).collect();
+        for (buffer, publisher) in topic.buffers(discovery) {
+            let endpoint = discovery.endpoints().get(&buffer);
+            let naming = endpoint.and_then(|endpoint| endpoint.naming());
+            if buffer.entity.is_writer() && naming.is_some_and(|naming| !naming.counts) {
+                senders.push((buffer, publisher));
+            }
+        }
+        for (writer, publisher) in senders {
+            let accelerated = publishers.get(&publisher).copied();
+            let reference = Reference {
+                publisher,
+                accelerated: accelerated.unwrap_or(Accelerated::Some),
+            };
+            self.references.set(writer, reference);
         }
     }
 
@@ -153,8 +183,7 @@ impl Observer {
             Role::Reader => self.requested.interest.remove(guid),
             Role::Writer => {
                 let counts = endpoint.naming().is_some_and(|naming| naming.counts);
-                let measured =
-                    is_watched && (counts || topic.counts_references(guid, &self.graph.discovery));
+                let measured = is_watched;
                 let is_call = self
                     .derive
                     .services

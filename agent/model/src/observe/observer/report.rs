@@ -2,7 +2,7 @@
 
 mod deliveries;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use foldhash::{HashMap, HashMapExt as _};
@@ -144,11 +144,15 @@ fn topic(
         let measured = measured.filter(|measured| measured.topic.is_some())?;
         Some(measured.writer.measurement(now))
     };
-    let bases: Vec<_> = topic.buffers(&observer.graph.discovery).collect();
+    let mut buffers: BTreeMap<Guid, Vec<Guid>> = BTreeMap::new();
+    let mut owned = BTreeSet::new();
+    for (buffer, base) in topic.buffers(&observer.graph.discovery) {
+        buffers.entry(base).or_default().push(buffer);
+        owned.insert(buffer);
+    }
     let endpoint = |guid: &Guid| {
         let endpoint = observer.graph.discovery.endpoints().get(guid)?;
-        let own = bases.iter().filter(|(_, base)| base == guid);
-        let buffers: Vec<Guid> = own.map(|(buffer, _)| *buffer).collect();
+        let buffers = buffers.get(guid).cloned().unwrap_or_default();
         let mut measurement = measured(*guid).map(Box::new);
         for other in buffers.iter().filter_map(|buffer| measured(*buffer)) {
             measurement.get_or_insert_default().add(&other);
@@ -190,7 +194,7 @@ fn topic(
         message_types.extend(topic.last_type.clone());
     }
     let type_hashes: BTreeSet<_> = all().filter_map(|each| each.type_hash).collect();
-    let is_apart = |guid: &Guid| !bases.iter().any(|(buffer, _)| buffer == guid);
+    let is_apart = |guid: &Guid| !owned.contains(guid);
     let mut measurement = apart(observer, topic, is_apart, now);
     if let Some(sum) = &mut measurement {
         let own = publishers

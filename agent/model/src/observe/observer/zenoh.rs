@@ -8,6 +8,7 @@ use ros2probe_wire::zenoh::Gid;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, RtpsTime, SequenceNumber};
 
 use super::Observer;
+use super::references::CountedAs;
 use crate::derive::services::service::CallId;
 use crate::facts::model_time::ModelTime;
 use crate::facts::observation::{Content, DatagramFate, Head, Observation, Path, Sample};
@@ -232,24 +233,16 @@ impl Observer {
     /// message, each with a number of its own, one counts: the message itself, otherwise the
     /// references to buffers for the first subscription. Gaps between their numbers are no losses.
     fn counts_as_message(&mut self, at: ModelTime, sample: &ZenohSample<'_>) -> bool {
-        let discovery = &self.graph.discovery;
-        let accelerated = || {
-            let endpoint = discovery.endpoints().get(&sample.writer)?;
-            endpoint.backends.as_ref()?;
-            let topic = self
-                .graph
-                .topics
-                .find(endpoint.domain_id, &endpoint.naming()?)?;
-            Some(self.graph.topics.get(topic)?.accelerated(discovery))
-        };
-        let accelerated = accelerated().unwrap_or(Accelerated::None);
-        if accelerated != Accelerated::None {
+        let reference = self.references.get(sample.writer);
+        let accelerated = reference.map_or(Accelerated::None, |known| known.accelerated);
+        if accelerated != Accelerated::None || sample.referring.is_some() {
             self.measure.profiler.skip_numbers(sample.writer, at);
         }
-        match sample.referring {
-            None => true,
-            Some(gid) => accelerated == Accelerated::All(gid.0),
-        }
+        let Some(gid) = sample.referring else {
+            return true;
+        };
+        accelerated == Accelerated::All
+            && self.references.count(sample.writer, gid.0, at) != CountedAs::Copy
     }
 }
 
