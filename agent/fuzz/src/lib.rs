@@ -150,7 +150,7 @@ fn direction_of(number: u8) -> StreamId {
         destination: place(7447),
     };
     StreamId {
-        flow: if number % 2 == 0 {
+        flow: if number.is_multiple_of(2) {
             flow
         } else {
             flow.reversed()
