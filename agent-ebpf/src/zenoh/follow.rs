@@ -75,11 +75,17 @@ extern "C" fn take(skb: *mut __sk_buff, slot: u32) -> u32 {
         return 0;
     }
     if this.state.mode == mode::FOLLOWED && behind as i32 > 0 {
+        // A retransmitted segment may begin before the hole, and end after it.
+        let end = this.sequence_number.wrapping_add(this.len);
+        let hole_end = this.state.hole.wrapping_add(this.state.hole_len);
+        let is_for_hole = this.state.hole_len != 0
+            && end.wrapping_sub(this.state.hole) as i32 > 0
+            && this.sequence_number.wrapping_sub(hole_end) as i32 <= -1;
+        let repeated = if behind >= this.len { this.len } else { behind };
+        if is_for_hole {
+            fill(skb, slot, repeated);
+        }
         if behind >= this.len {
-            let into = this.sequence_number.wrapping_sub(this.state.hole);
-            if into < this.state.hole_len {
-                fill(skb, slot);
-            }
             return 0;
         }
         this.sequence_number = this.state.next;
@@ -123,7 +129,8 @@ extern "C" fn take(skb: *mut __sk_buff, slot: u32) -> u32 {
         if is_rtps && this.state.body == body::SKIPPED {
             after_skipped(skb, slot);
         } else if behind as i32 > 0 {
-            fill(skb, slot);
+            let len = this.len;
+            fill(skb, slot, len);
         } else {
             chunk::whole(skb, slot, 0, this.len, 0);
         }
@@ -181,15 +188,15 @@ fn cover(skb: *mut __sk_buff, slot: u32) {
     }
 }
 
-/// Passes on a segment that fills a hole. The flags are for later bytes.
+/// Passes on the first bytes of a segment that fill a hole. The flags are for later bytes.
 #[inline(always)]
-fn fill(skb: *mut __sk_buff, slot: u32) {
+fn fill(skb: *mut __sk_buff, slot: u32, len: u32) {
     let Some(mut this) = current(slot) else {
         return;
     };
     let pending = this.state.pending;
     this.state.pending = 0;
-    chunk::whole(skb, slot, 0, this.len, 0);
+    chunk::whole(skb, slot, 0, len, 0);
     this.state.pending |= pending;
 }
 

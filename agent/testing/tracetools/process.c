@@ -77,6 +77,9 @@ static void add_schedstat(long long sums[2], int sign) {
 static struct rmw out_rmw, in_rmw;
 static struct impl out_impl, in_impl;
 static struct handle out = { &out_impl }, in = { &in_impl };
+/* A handle whose structure shows nothing. */
+static struct impl unnamed_impl;
+static struct handle unnamed = { &unnamed_impl };
 static struct timer_impl timer_impl;
 static struct timer timer = { &timer_impl };
 static char node, object, machine, owner;
@@ -317,7 +320,7 @@ int main(int argc, char **argv) {
             long long sums[2] = { 0, 0 };
             for (long i = 0; i < n; i++) {
                 ros_trace_rclcpp_executor_get_next_ready();
-                ros_trace_rclcpp_executor_execute(&in);
+                ros_trace_rclcpp_executor_execute(&unnamed);
                 add_schedstat(sums, -1);
                 ros_trace_callback_start(callback, false);
                 be_late(what, us, path);
@@ -325,6 +328,15 @@ int main(int argc, char **argv) {
                 add_schedstat(sums, 1);
             }
             printf("%lld %lld ", sums[0], sums[1]);
+        } else if (!strcmp(what, "buffers")) {
+            /* Takes messages of a buffer topic, as rmw_fastrtps of Lyrical does: without rmw_take. */
+            for (long i = 0; i < n; i++) {
+                ros_trace_rclcpp_executor_get_next_ready();
+                ros_trace_rclcpp_executor_execute(&in);
+                ros_trace_callback_start(callback, false);
+                pass(us);
+                ros_trace_callback_end(callback);
+            }
         } else if (!strcmp(what, "relay")) {
             /* Takes a message with the source timestamp `n`. The callback publishes after `us`
                microseconds. Prints the source timestamp of its output, and the nanoseconds. */

@@ -350,7 +350,7 @@ fn messages_taken_without_rmw_take_count_for_their_subscription_and_not_as_timer
         } else {
             process.run("init");
         }
-        process.run("compute 7 2000");
+        process.run("buffers 7 2000");
         let report = robot.report(&process);
         let [callback] = &report.callbacks[..] else {
             panic!("{:?}", report.callbacks);

@@ -8,11 +8,14 @@ use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
-use ros2probe_testing::harness::run;
 use ros2probe_testing::harness::snmp::Snmp;
+use ros2probe_testing::harness::{run, wait_until};
 use tempfile::TempDir;
 
 const PATIENCE: Duration = Duration::from_secs(60);
+/// Time in which two participants match on a busy machine, usually 3 s.
+const MATCHED_WITHIN: Duration = Duration::from_secs(25);
+const ATTEMPTS: usize = 5;
 /// A port that nothing else uses in the namespaces of a test.
 const PORT: u16 = 5100;
 
@@ -53,13 +56,13 @@ fn streams(address: Ipv4Addr) -> [Stream; 3] {
 /// Starts a publisher, then a subscriber that connects to it, and waits until they are matched.
 /// Rarely, Fast DDS 2.9 exchanges the first control messages and nothing more: then both start again.
 fn pair(from: &Namespace, to: &Namespace, stream: &Stream) -> Result<(Peer, Peer)> {
-    for _ in 0..2 {
+    for _ in 0..ATTEMPTS {
         let mut publisher = Peer::start(from, Stack::Fast, Role::Publisher, stream, &["/sensor"])?;
         let mut subscriber =
             Peer::start(to, Stack::Fast, Role::Subscriber, stream, &["/listener"])?;
-        if publisher
-            .wait_matched()
-            .and_then(|()| subscriber.wait_matched())
+        let matched = |peer: &mut Peer| peer.process.wait_for("matched", MATCHED_WITHIN);
+        if matched(&mut publisher)
+            .and_then(|()| matched(&mut subscriber))
             .is_ok()
         {
             return Ok((publisher, subscriber));
@@ -200,7 +203,7 @@ fn segments_that_a_link_sends_again_equal_those_of_the_kernel_and_are_a_finding(
     let stream = Stream {
         count: 3000,
         reliable: true,
-        linger: 20.0,
+        linger: 60.0,
         ..small
     };
     let robot = Observer::start(&link.robot, &at_the_sockets_of(&link.robot))?;
@@ -218,7 +221,8 @@ fn segments_that_a_link_sends_again_equal_those_of_the_kernel_and_are_a_finding(
         .collect();
     let agent = &robot.agent;
     agent.scrape_until("the link", |page| {
-        page.value("ros2_link_connections", &labels) == Some(1.0)
+        page.value("ros2_link_connections", &labels)
+            .is_some_and(|count| count >= 1.0)
     })?;
     let retransmitted = || Snmp::of(publisher.process.pid())?.retransmitted();
     let before = retransmitted()?;
@@ -235,13 +239,13 @@ fn segments_that_a_link_sends_again_equal_those_of_the_kernel_and_are_a_finding(
     );
     publisher.wait_sent(PATIENCE)?;
     drop(loss);
-    let all = Snmp::of(publisher.process.pid())?.retransmitted()? - before;
-    ensure!(all > 20, "{all} segments");
-    agent.scrape_until("all retransmissions", |page| {
+    // Segments may be under way, and heartbeats follow.
+    wait_until("all retransmissions are counted", || {
+        let all = Snmp::of(publisher.process.pid())?.retransmitted()? - before;
+        let page = agent.scrape()?;
         let counted = page.value("ros2_link_retransmitted_segments_total", &labels);
-        counted == Some(all as f64)
-    })?;
-    Ok(())
+        Ok(all > 20 && counted == Some(all as f64))
+    })
 }
 
 #[test]

@@ -16,7 +16,7 @@ use crate::graph::zenoh::Flow;
 /// Number of seconds over which the share of retransmitted segments is measured.
 const WINDOW: usize = 10;
 /// Time without a report after which a connection is forgotten: longer than the pause between two
-/// retransmissions (TCP_RTO_MAX of Linux), and than that between two KEEP_ALIVEs.
+/// retransmissions, at most 120 s on Linux, and than that between two KEEP_ALIVEs.
 const SILENCE: Duration = Duration::from_secs(130);
 /// Time without a report after which a link is forgotten.
 const FORGOTTEN: Duration = Duration::from_secs(600);

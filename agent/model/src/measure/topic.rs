@@ -75,6 +75,8 @@ pub struct Topic {
     /// Whether an observed process has a publisher or subscription of it, even without an announced
     /// endpoint.
     pub is_held: bool,
+    /// Whether one of its endpoints accepted buffers.
+    pub has_buffers: bool,
 }
 
 /// The subscriptions of a publisher that accept buffers of other backends than `cpu`.
@@ -140,14 +142,8 @@ impl Topic {
                 .map(|_| announced);
         }
         let start = list.partition_point(|guid| guid.prefix < buffer.prefix);
-        let own = list.iter().skip(start).copied();
-        let mut own = own.take_while(|guid| guid.prefix == buffer.prefix);
-        let first = own.next()?;
-        Some(
-            own.take_while(|guid| *guid < buffer)
-                .last()
-                .unwrap_or(first),
-        )
+        let before = list.partition_point(|guid| *guid < buffer);
+        list.get(start..before)?.last().copied()
     }
 
     /// Returns the buffer endpoints, each with the publisher or subscription to which it belongs.
@@ -485,6 +481,7 @@ impl Topics {
                 published: ModelTime::ZERO,
                 vanished: None,
                 is_held: false,
+                has_buffers: false,
             }),
         );
         id

@@ -625,11 +625,15 @@ impl Observer {
                     let Some(endpoint) = self.graph.discovery.endpoints().get(&guid) else {
                         continue;
                     };
+                    let has_buffers = endpoint.backends.is_some();
                     let topic = endpoint
                         .naming()
                         .and_then(|naming| self.graph.topics.find(endpoint.domain_id, &naming));
                     self.measure.profiler.learn(guid, traits(guid, endpoint));
                     if let Some(topic) = topic {
+                        if let Some(topic) = self.graph.topics.get_mut(topic) {
+                            topic.has_buffers |= has_buffers;
+                        }
                         self.find_references(topic);
                     }
                 }
@@ -650,12 +654,14 @@ impl Observer {
             naming.dds_name = endpoint.topic.clone();
         }
         let (role, message_type) = (endpoint.role, endpoint.message_type.clone());
+        let has_buffers = endpoint.backends.is_some() || naming.is_buffer;
         let (id, is_new) = self
             .graph
             .topics
             .join(endpoint.domain_id, &naming, guid, role, now);
         if let Some(topic) = self.graph.topics.get_mut(id) {
             topic.last_type = Some(message_type);
+            topic.has_buffers |= has_buffers;
         }
         if is_new {
             self.graph.topics.shrink(self.settings.endpoints);

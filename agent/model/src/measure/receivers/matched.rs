@@ -121,11 +121,15 @@ impl<'a> MatchedReaders<'a> {
         let readers = self.topic.map(|topic| &topic.readers);
         let (mut some, mut whole) = (false, false);
         for (place, reader) in readers.into_iter().flatten().enumerate() {
+            if place == COMPARED {
+                whole = true;
+                break;
+            }
             let endpoint = endpoints.get(reader);
             let backends = endpoint.and_then(|endpoint| endpoint.backends.as_deref());
             let is_accelerated = backends.is_some_and(Backends::is_accelerated);
             some |= is_accelerated;
-            whole |= place >= COMPARED || !is_accelerated && self.matches(*reader);
+            whole |= !is_accelerated && self.matches(*reader);
         }
         match (some, whole) {
             (false, _) => Accelerated::None,

@@ -26,6 +26,8 @@ use crate::measure::writer::Traits;
 
 /// Maximum number of publishers of a topic whose references to buffers may count.
 const MAX_PUBLISHERS: usize = 64;
+/// End of the name of a buffer topic with whole messages; the others have references.
+const CPU_TOPIC: &str = "/_buf_cpu";
 
 impl Observer {
     /// Replaces the watchlist. It takes effect once `Input::MoreLists` has visited all
@@ -139,7 +141,7 @@ impl Observer {
     /// endpoints.
     pub(super) fn find_references(&mut self, id: TopicId) {
         let (graph, discovery) = (&self.graph, &self.graph.discovery);
-        let Some(topic) = graph.topics.get(id) else {
+        let Some(topic) = graph.topics.get(id).filter(|topic| topic.has_buffers) else {
             return;
         };
         let backends = |guid: &Guid| discovery.endpoints().get(guid)?.backends.as_ref();
@@ -154,8 +156,8 @@ impl Observer {
         let mut senders: Vec<_> = own.map(|guid| (*guid, *guid)).collect();
         for (buffer, publisher) in topic.buffers(discovery) {
             let endpoint = discovery.endpoints().get(&buffer);
-            let naming = endpoint.and_then(|endpoint| endpoint.naming());
-            if buffer.entity.is_writer() && naming.is_some_and(|naming| !naming.counts) {
+            let is_whole = endpoint.is_none_or(|endpoint| endpoint.topic.ends_with(CPU_TOPIC));
+            if buffer.entity.is_writer() && !is_whole {
                 senders.push((buffer, publisher));
             }
         }
