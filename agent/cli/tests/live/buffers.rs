@@ -1,16 +1,14 @@
 //! Peers that send images as Lyrical does: on topics of their own, which the nodes do not announce.
 //! Needs root.
 
-use std::time::Duration;
-
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of, get};
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::peer::{self, Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::wait_until;
 use serde_json::Value;
 use tempfile::TempDir;
 
-const PATIENCE: Duration = Duration::from_secs(60);
 const TOPIC: &str = "/points";
 
 fn start<'a>(host: &'a Namespace, directory: &TempDir) -> Result<Agent<'a>> {
@@ -52,12 +50,14 @@ fn topic(host: &Namespace) -> Result<Value> {
 /// Lets the publisher send a stretch, and waits until this subscriber has all of it.
 fn send(publisher: &mut Peer, subscriber: &Peer, all: usize) -> Result<()> {
     publisher.go()?;
-    let deadline = std::time::Instant::now() + PATIENCE;
-    while subscriber.log()?.sequences("sub").len() < all {
-        ensure!(std::time::Instant::now() < deadline, "messages are missing");
-        std::thread::sleep(Duration::from_millis(50));
-    }
-    Ok(())
+    received(subscriber, all)
+}
+
+/// Waits until a subscriber has this many messages or references.
+fn received(subscriber: &Peer, all: usize) -> Result<()> {
+    wait_until("all messages arrived", || {
+        Ok(subscriber.log()?.sequences("sub").len() == all)
+    })
 }
 
 #[test]
@@ -113,10 +113,7 @@ fn messages_of_zenoh_with_buffers_count_once_whatever_its_subscriptions_accept()
         |page: &Scrape| page.value("ros2_topic_subscriptions", &[("topic", TOPIC)]) == Some(2.0);
     agent.scrape_until("both subscriptions", knows)?;
     send(&mut publisher, &receiver, 80)?;
-    ensure!(
-        accelerated.log()?.sequences("sub").len() == 40,
-        "no references"
-    );
+    received(&accelerated, 40)?;
     let page = agent.settled_scrape(TOPIC, 80)?;
     assert_eq!(counts(&page), [80, 80, 0]);
     assert_eq!(topic(&host)?["publishers"][0]["node"], "/camera");
@@ -146,7 +143,7 @@ fn references_alone_count_and_a_subscription_without_buffers_is_named() -> Resul
     let found = |page: &Scrape| page.sum("ros2_diagnoses", &[("kind", "buffers_by_cpu")]) == 1.0;
     agent.scrape_until("the finding", found)?;
     send(&mut publisher, &accelerated, 80)?;
-    ensure!(plain.log()?.sequences("sub").len() == 40, "no messages");
+    received(&plain, 40)?;
     let page = agent.settled_scrape(TOPIC, 80)?;
     assert_eq!(counts(&page), [80, 120, 0]);
     Ok(())

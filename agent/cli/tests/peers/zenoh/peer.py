@@ -132,22 +132,29 @@ class Session:
         self.others = set()
 
     def token(self, *chunks):
-        key = "/".join(["@ros2_lv", str(self.options.domain), self.zid, *chunks])
-        self.tokens.append(self.session.liveliness().declare_token(key))
-        return key
+        return "/".join(["@ros2_lv", str(self.options.domain), self.zid, *chunks])
+
+    def nodes(self, kind):
+        """Returns the names of the nodes, and for each the last chunks of its token."""
+        names = self.options.node or ["/publisher" if kind == "MP" else "/subscriber"]
+        for name in names:
+            namespace, _, base = name.rpartition("/")
+            yield ["%", namespace.replace("/", "%") or "%", base]
+
+    def endpoint(self, kind):
+        """Returns the token of the endpoint, which the first node has."""
+        where = next(self.nodes(kind))
+        qos = f"::,{self.options.depth}:,:,:,,"
+        topic = self.options.topic.replace("/", "%")
+        backends = BACKENDS.get(self.options.buffers, [])
+        return self.token("0", "10", kind, *where, topic, *TYPE.split("/"), qos, *backends)
 
     def announce(self, kind):
         """Announces the nodes. Returns the GID of the endpoint, which the first node has."""
-        names = self.options.node or ["/publisher" if kind == "MP" else "/subscriber"]
-        for number, name in enumerate(names):
-            namespace, _, base = name.rpartition("/")
-            where = ["%", namespace.replace("/", "%") or "%", base]
-            self.token(str(number), str(number), "NN", *where)
-            if number == 0:
-                qos = f"::,{self.options.depth}:,:,:,,"
-                topic = self.options.topic.replace("/", "%")
-                backends = BACKENDS.get(self.options.buffers, [])
-                key = self.token("0", "10", kind, *where, topic, *TYPE.split("/"), qos, *backends)
+        key = self.endpoint(kind)
+        tokens = [self.token(str(n), str(n), "NN", *where) for n, where in enumerate(self.nodes(kind))]
+        for token in [tokens[0], key, *tokens[1:]]:
+            self.tokens.append(self.session.liveliness().declare_token(token))
         other = "MS" if kind == "MP" else "MP"
         pattern = f"@ros2_lv/{self.options.domain}/*/*/*/{other}/**"
         topic = f"/{self.options.topic.replace('/', '%')}/"
@@ -233,13 +240,13 @@ def subscribe(options, log):
         number, stamp = struct.unpack_from("<Qq", payload, OVERHEAD)
         log.write(ev="sub", seq=number, len=len(payload), stamp_ns=stamp)
 
-    gid = session.announce("MS")
     keys = [session.key()]
     if options.buffers == "cpu":
         keys.append(f"{session.key()}/_buf_cpu")
     elif options.buffers:
-        keys.append(f"{session.key()}/_buf/{gid.hex()}")
+        keys.append(f"{session.key()}/_buf/{gid_of(session.endpoint('MS')).hex()}")
     kept = [session.session.declare_subscriber(key, receive) for key in keys]
+    session.announce("MS")
     say("ready")
     session.wait_matched()
     stopped.wait()
