@@ -3,6 +3,7 @@
 mod calls;
 mod chains;
 mod inside;
+mod links;
 mod zenoh;
 
 use std::net::{Ipv4Addr, SocketAddrV4};
@@ -459,6 +460,10 @@ fn forged_input_fills_no_table_beyond_its_cap() {
 
     let whole = drive(MESSAGES, 1_000_000, &mut zenoh::batches);
     assert_filled(&["zenoh_directions"]);
+    assert!(whole < 96 << 20, "{whole} bytes");
+
+    let whole = drive(20_000, 1_000_000, &mut links::reports);
+    assert_filled(&["links"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
     inside::of_a_queue();
