@@ -18,19 +18,19 @@ pub(super) fn reports(observer: &mut Observer, dice: &mut Dice, now: u64) {
         port: (number >> 8) as u16,
     };
     observer.input(Input::Link(&LinkReport {
-        socket: (dice.roll() % (6000)),
+        socket: dice.roll() % 6000,
         flow: Flow {
-            source: place((dice.roll() % (1 << 20))),
-            destination: place((dice.roll() % (1 << 20))),
+            source: place(dice.roll() % (1 << 20)),
+            destination: place(dice.roll() % (1 << 20)),
         },
         protocol: LinkProtocol::Zenoh,
         state: host::Link {
-            sent: (dice.roll() % (1 << 32)) as u32,
+            sent: dice.roll() as u32,
             ..host::Link::default()
         },
     }));
     let prefix = GuidPrefix([7; 12]);
-    let number = (dice.roll() % (200));
+    let number = dice.roll() % 200;
     let guid = |number: u64, kind| Guid::new(prefix, EntityId([0, 0x10, number as u8, kind]));
     let (publisher, writer) = (guid(0, 0x03), guid(1 + number, 0x03));
     let hexadecimal: String = publisher
