@@ -89,19 +89,18 @@ fn messages_of_a_cpu_topic_of_fast_dds_have_publisher_node_and_receiver() -> Res
     Ok(())
 }
 
+/// Starts a publisher of Zenoh with buffers of the backend `cuda`.
+fn camera(host: &Namespace) -> Result<Peer> {
+    let stream = stream(Some("cuda"));
+    Peer::start(host, Stack::Zenoh, Role::Publisher, &stream, &["/camera"])
+}
+
 #[test]
 fn messages_of_zenoh_with_buffers_count_once_whatever_its_subscriptions_accept() -> Result<()> {
     let (host, directory) = (Namespace::alone()?, tempfile::tempdir()?);
     let agent = start(&host, &directory)?;
     let _router = peer::router(&host, &[])?;
-    let of_publisher = stream(Some("cuda"));
-    let mut publisher = Peer::start(
-        &host,
-        Stack::Zenoh,
-        Role::Publisher,
-        &of_publisher,
-        &["/camera"],
-    )?;
+    let mut publisher = camera(&host)?;
     let receiver = subscriber(&host, Stack::Zenoh, "/detector", &stream(Some("cpu")))?;
     publisher.wait_matched()?;
     send(&mut publisher, &receiver, 40)?;
@@ -125,21 +124,13 @@ fn references_alone_count_and_a_subscription_without_buffers_is_named() -> Resul
     let (host, directory) = (Namespace::alone()?, tempfile::tempdir()?);
     let agent = start(&host, &directory)?;
     let _router = peer::router(&host, &[])?;
-    let stream_of = stream;
-    let of_publisher = stream_of(Some("cuda"));
-    let mut publisher = Peer::start(
-        &host,
-        Stack::Zenoh,
-        Role::Publisher,
-        &of_publisher,
-        &["/camera"],
-    )?;
-    let accelerated = subscriber(&host, Stack::Zenoh, "/tracker", &of_publisher)?;
+    let mut publisher = camera(&host)?;
+    let accelerated = subscriber(&host, Stack::Zenoh, "/tracker", &stream(Some("cuda")))?;
     publisher.wait_matched()?;
     send(&mut publisher, &accelerated, 40)?;
     let page = agent.settled_scrape(TOPIC, 40)?;
     assert_eq!(counts(&page), [40, 40, 0]);
-    let plain = subscriber(&host, Stack::Zenoh, "/viewer", &stream_of(None))?;
+    let plain = subscriber(&host, Stack::Zenoh, "/viewer", &stream(None))?;
     let found = |page: &Scrape| page.sum("ros2_diagnoses", &[("kind", "buffers_by_cpu")]) == 1.0;
     agent.scrape_until("the finding", found)?;
     send(&mut publisher, &accelerated, 80)?;

@@ -130,6 +130,21 @@ fn libraries_and_processes_with_equal_identities_are_distinguished() -> Result<(
     Ok(())
 }
 
+/// Starts the publishers of `/kept` and `/gone`. The directories of their libraries get this mode.
+fn started(host: &Namespace, programs: &[TracedProgram; 2], mode: u32) -> Result<Vec<Process>> {
+    let mut processes = Vec::new();
+    for (program, (topic, node)) in programs.iter().zip([("/kept", "one"), ("/gone", "two")]) {
+        let place = program.library();
+        let place = place.parent().context("directory")?;
+        fs::set_permissions(place, Permissions::from_mode(mode))?;
+        let arguments = ["/in", topic, node];
+        let process = Process::start(&host.inside(), program.program(), arguments)?;
+        identity(process.pid())?;
+        processes.push(process);
+    }
+    Ok(processes)
+}
+
 #[test]
 fn without_root_a_library_is_attached_by_its_path_unless_it_was_replaced() -> Result<()> {
     let host = Namespace::alone()?;
@@ -138,16 +153,7 @@ fn without_root_a_library_is_attached_by_its_path_unless_it_was_replaced() -> Re
         TracedProgram::build(248, &[])?,
         TracedProgram::build(248, &[])?,
     ];
-    let mut processes = Vec::new();
-    for (program, (topic, node)) in programs.iter().zip([("/kept", "one"), ("/gone", "two")]) {
-        let place = program.library();
-        let place = place.parent().context("directory")?;
-        fs::set_permissions(place, Permissions::from_mode(0o755))?;
-        let arguments = ["/in", topic, node];
-        let process = Process::start(&host.inside(), program.program(), arguments)?;
-        identity(process.pid())?;
-        processes.push(process);
-    }
+    let mut processes = started(&host, &programs, 0o755)?;
     let gone = programs[1].library();
     fs::remove_file(&gone)?;
     std::os::unix::fs::symlink(programs[0].library(), &gone)?;
@@ -188,16 +194,7 @@ fn the_packaged_broker_attaches_libraries_of_private_directories_also_replaced_o
         TracedProgram::build(248, &[])?,
         TracedProgram::build(248, &[])?,
     ];
-    let mut processes = Vec::new();
-    for (program, (topic, node)) in programs.iter().zip([("/kept", "one"), ("/gone", "two")]) {
-        let place = program.library();
-        let place = place.parent().context("directory")?;
-        fs::set_permissions(place, Permissions::from_mode(0o700))?;
-        let arguments = ["/in", topic, node];
-        let process = Process::start(&host.inside(), program.program(), arguments)?;
-        identity(process.pid())?;
-        processes.push(process);
-    }
+    let mut processes = started(&host, &programs, 0o700)?;
     fs::remove_file(programs[1].library())?;
 
     let configuration = configured(&host, directory.path())?;
