@@ -91,13 +91,6 @@ impl Backends {
         self.names()
             .filter(|name| *name != CPU && other.names().any(|each| each == *name))
     }
-
-    /// Returns the memory of the names in bytes.
-    #[must_use]
-    pub fn heap_bytes(&self) -> usize {
-        let names: usize = self.0.iter().map(|name| name.len()).sum();
-        names + size_of_val(&*self.0)
-    }
 }
 
 /// Replaces `%` and two hexadecimal digits by their character.
