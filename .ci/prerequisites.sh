@@ -151,6 +151,9 @@ rotel() {
 # Real sessions and routers of Zenoh, and the hash of rmw_zenoh's GIDs.
 zenoh() { python_packages zenoh "eclipse-zenoh==1.10.2" "xxhash==4.1.0"; }
 
+# A second decoder of RTPS.
+scapy() { python_packages scapy "scapy==2.8.0"; }
+
 # Generates requests to the control API; installed in a separate Python environment.
 schemathesis() {
     local place=$tools/schemathesis version=4.32.5
@@ -409,6 +412,7 @@ for need; do
         schemathesis
         rotel
         zenoh
+        scapy
         bags
         types
         page

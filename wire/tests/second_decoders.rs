@@ -1,0 +1,345 @@
+//! Compares the oracle with two decoders that others wrote, on every capture of RTPS over UDP in
+//! the project: tshark and scapy.
+//!
+//! `captures.rs` compares the oracle with the walk and with recorded facts. Here each message is
+//! decoded anew. Both decoders reassemble IP fragments themselves. They do not decode everything:
+//!
+//! - scapy leaves DATA_FRAG, HEARTBEAT_FRAG, NACK_FRAG and GAP undecoded, and with them the rest of
+//!   the message;
+//! - scapy ends a payload too early if inline QoS precede it;
+//! - tshark prints no payload of builtin writers, whose parameters it decodes;
+//! - neither reads Zenoh, or RTPS over TCP as Fast DDS frames it.
+
+#![expect(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a failed expectation may panic here"
+)]
+
+#[expect(dead_code, reason = "only the oracle is needed here")]
+#[path = "../fuzz/src/lib.rs"]
+mod entry;
+mod pcap;
+
+use std::collections::{BTreeMap, HashSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use flate2::Crc;
+use ros2probe_wire::{Endianness, Guid, SequenceNumber};
+
+use entry::oracle::submessage::{Data, DataFrag};
+use entry::oracle::{Body, Message, Submessage};
+use pcap::{datagrams, read};
+
+/// Captures of the project; directories whose traffic neither decoder reads are left out.
+fn captures() -> Vec<PathBuf> {
+    fn add(directory: &Path, found: &mut Vec<PathBuf>) {
+        for entry in fs::read_dir(directory).unwrap() {
+            let path = entry.unwrap().path();
+            if path.ends_with("zenoh") || path.ends_with("fastrtps-tcp") {
+                continue;
+            }
+            if path.is_dir() {
+                add(&path, found);
+            } else if path.to_str().unwrap().ends_with(".pcap.gz") {
+                found.push(path);
+            }
+        }
+    }
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut all = Vec::new();
+    for directory in [
+        "tests/data",
+        "../agent/testing/data",
+        "../agent/cli/tests/fixtures",
+    ] {
+        add(&root.join(directory), &mut all);
+    }
+    // A clone of a capture elsewhere has nothing to add.
+    let mut seen = HashSet::new();
+    all.retain(|path| seen.insert(read(path)));
+    assert!(all.len() >= 15, "{all:?}");
+    all
+}
+
+/// Writes a capture without compression beside the build's other temporary files.
+fn unpacked(path: &Path) -> tempfile::NamedTempFile {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    fs::write(file.path(), read(path)).unwrap();
+    file
+}
+
+fn output(command: &mut Command) -> String {
+    let output = command
+        .output()
+        .expect("`.ci/prerequisites.sh test` installs it");
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{command:?}: {errors}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn entity(guid: Guid) -> String {
+    hex(&guid.entity.0)
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn digest(bytes: &[u8]) -> String {
+    let mut crc = Crc::new();
+    crc.update(bytes);
+    format!("{:08x}", crc.sum())
+}
+
+/// Returns a submessage's octetsToNextHeader.
+fn octets(message: &[u8], submessage: &Submessage<'_>) -> u16 {
+    let octets = message[submessage.offset + 2..][..2].try_into().unwrap();
+    match submessage.flags.endianness() {
+        Endianness::Big => u16::from_be_bytes(octets),
+        Endianness::Little => u16::from_le_bytes(octets),
+    }
+}
+
+/// Returns the lines of all messages in a capture.
+fn ours(capture: &Path, line: impl Fn(&[u8], &[Submessage<'_>]) -> String) -> Vec<String> {
+    let mut lines = Vec::new();
+    datagrams(&read(capture), |bytes| {
+        if let Ok(message) = Message::parse(bytes) {
+            let submessages: Vec<_> = message.map(Result::unwrap).collect();
+            lines.push(line(bytes, &submessages));
+        }
+    });
+    lines
+}
+
+/// Asserts that both decoders saw the same messages equally often. Their order may differ where
+/// fragments of two datagrams alternate.
+fn assert_equal(capture: &Path, ours: &[String], theirs: &[String]) {
+    let mut balance: BTreeMap<&str, i64> = BTreeMap::new();
+    for line in ours {
+        *balance.entry(line).or_default() += 1;
+    }
+    for line in theirs {
+        *balance.entry(line).or_default() -= 1;
+    }
+    balance.retain(|_, count| *count != 0);
+    let first: Vec<_> = balance.iter().take(6).collect();
+    assert!(
+        balance.is_empty(),
+        "{}: {} of ours, {} of theirs, {} differ: {first:#?}",
+        capture.display(),
+        ours.len(),
+        theirs.len(),
+        balance.len()
+    );
+}
+
+/// Returns length and digest of a payload that scapy decodes.
+fn scapy_payload(data: &Data<'_>) -> String {
+    let bytes = data.payload.bytes();
+    match data.inline_qos {
+        None => format!(" {} {}", bytes.len(), digest(bytes)),
+        Some(_) => String::new(),
+    }
+}
+
+/// Returns a message as `second_decoders/scapy_lines.py` prints it.
+fn as_scapy(bytes: &[u8], submessages: &[Submessage<'_>]) -> String {
+    let mut parts = vec![hex(&bytes[8..20])];
+    for submessage in submessages {
+        let content = match submessage.body {
+            Body::DataFrag(_) | Body::HeartbeatFrag(_) | Body::NackFrag(_) | Body::Gap(_) => break,
+            Body::InfoTimestamp => format!(" {}", submessage.receiver.timestamp.0),
+            Body::InfoDestination => format!(" {}", hex(&submessage.receiver.destination.0)),
+            Body::AckNack(acknack) => format!(
+                " {} {} {}",
+                entity(acknack.reader),
+                entity(acknack.writer),
+                acknack.count
+            ),
+            Body::Heartbeat(heartbeat) => format!(
+                " {} {} {} {} {}",
+                entity(heartbeat.reader),
+                entity(heartbeat.writer),
+                heartbeat.first.0,
+                heartbeat.last.0,
+                heartbeat.count
+            ),
+            Body::Data(data) => format!(
+                " {} {} {}{}",
+                entity(data.reader),
+                entity(data.writer),
+                data.sequence_number.0,
+                scapy_payload(&data)
+            ),
+            _ => String::new(),
+        };
+        let (flags, length) = (submessage.flags.0, octets(bytes, submessage));
+        parts.push(format!(
+            "{:02x} {flags:02x} {length}{content}",
+            submessage.id.0
+        ));
+    }
+    parts.join(";")
+}
+
+#[test]
+fn scapy_decodes_the_same_submessages() {
+    let python = Path::new(env!("CARGO_TARGET_TMPDIR")).join("../tools/scapy/bin/python");
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/second_decoders/scapy_lines.py");
+    for capture in captures() {
+        let file = unpacked(&capture);
+        let text = output(Command::new(&python).arg(&script).arg(file.path()));
+        let theirs: Vec<String> = text.lines().map(str::to_owned).collect();
+        assert_equal(&capture, &ours(&capture, as_scapy), &theirs);
+    }
+}
+
+/// Returns the values that a submessage of a message contributes to a column.
+type Values = fn(&[u8], &Submessage<'_>) -> Vec<String>;
+
+/// Fields that tshark prints.
+const COLUMNS: [(&str, Values); 14] = [
+    ("rtps.sm.id", |_, each| vec![format!("0x{:02x}", each.id.0)]),
+    ("rtps.sm.flags", |_, each| {
+        vec![format!("0x{:02x}", each.flags.0)]
+    }),
+    ("rtps.sm.octetsToNextHeader", |bytes, each| {
+        vec![octets(bytes, each).to_string()]
+    }),
+    ("rtps.guidPrefix.dst", |_, each| match each.body {
+        Body::InfoDestination => vec![hex(&each.receiver.destination.0)],
+        _ => Vec::new(),
+    }),
+    ("rtps.sm.rdEntityId", |_, each| {
+        ends(each).map_or_else(Vec::new, |(reader, _)| {
+            vec![format!("0x{}", entity(reader))]
+        })
+    }),
+    ("rtps.sm.wrEntityId", |_, each| {
+        ends(each).map_or_else(Vec::new, |(_, writer)| {
+            vec![format!("0x{}", entity(writer))]
+        })
+    }),
+    ("rtps.sm.seqNumber", |_, each| {
+        texts(numbers(each).map(|number| number.0))
+    }),
+    ("rtps.bitmap.num_bits", |_, each| match each.body {
+        Body::AckNack(acknack) => vec![acknack.missing.num_bits().to_string()],
+        Body::Gap(gap) => vec![gap.list.num_bits().to_string()],
+        _ => Vec::new(),
+    }),
+    ("rtps.acknack.count", |_, each| match each.body {
+        Body::AckNack(acknack) => vec![acknack.count.to_string()],
+        _ => Vec::new(),
+    }),
+    ("rtps.heartbeat_count", |_, each| match each.body {
+        Body::Heartbeat(heartbeat) => vec![heartbeat.count.to_string()],
+        _ => Vec::new(),
+    }),
+    ("rtps.data_frag.number", |_, each| {
+        texts(fragments(each).map(|each| each.starting))
+    }),
+    ("rtps.data_frag.num_fragments", |_, each| {
+        texts(fragments(each).map(|each| each.count))
+    }),
+    ("rtps.data_frag.size", |_, each| {
+        texts(fragments(each).map(|each| each.fragment_size))
+    }),
+    ("rtps.data_frag.sample_size", |_, each| {
+        texts(fragments(each).map(|each| each.sample_size))
+    }),
+];
+
+fn texts<T: ToString>(values: impl IntoIterator<Item = T>) -> Vec<String> {
+    values.into_iter().map(|value| value.to_string()).collect()
+}
+
+fn fragments<'a>(submessage: &Submessage<'a>) -> Option<DataFrag<'a>> {
+    match submessage.body {
+        Body::DataFrag(fragments) => Some(fragments),
+        _ => None,
+    }
+}
+
+/// Returns the reader and the writer of a submessage of endpoints.
+fn ends(submessage: &Submessage<'_>) -> Option<(Guid, Guid)> {
+    Some(match submessage.body {
+        Body::AckNack(each) => (each.reader, each.writer),
+        Body::Heartbeat(each) => (each.reader, each.writer),
+        Body::HeartbeatFrag(each) => (each.reader, each.writer),
+        Body::Gap(each) => (each.reader, each.writer),
+        Body::NackFrag(each) => (each.reader, each.writer),
+        Body::Data(each) => (each.reader, each.writer),
+        Body::DataFrag(each) => (each.reader, each.writer),
+        _ => return None,
+    })
+}
+
+fn numbers(submessage: &Submessage<'_>) -> impl Iterator<Item = SequenceNumber> {
+    let (first, second) = match submessage.body {
+        Body::AckNack(each) => (Some(each.missing.base), None),
+        Body::Heartbeat(each) => (Some(each.first), Some(each.last)),
+        Body::HeartbeatFrag(each) => (Some(each.sequence_number), None),
+        Body::Gap(each) => (Some(each.start), Some(each.list.base)),
+        Body::NackFrag(each) => (Some(each.sequence_number), None),
+        Body::Data(each) => (Some(each.sequence_number), None),
+        Body::DataFrag(each) => (Some(each.sequence_number), None),
+        _ => (None, None),
+    };
+    first.into_iter().chain(second)
+}
+
+/// Returns the payloads of a message's user writers as tshark prints them: fragment by fragment,
+/// without the encapsulation header at the begin of a sample.
+fn payloads(submessages: &[Submessage<'_>]) -> String {
+    let payloads = submessages.iter().flat_map(|each| match each.body {
+        Body::Data(data) if !data.writer.entity.is_builtin() => vec![(1, data.payload.bytes())],
+        Body::DataFrag(each) => each.fragments().collect(),
+        _ => Vec::new(),
+    });
+    let payloads = payloads.filter_map(|(number, bytes)| match number {
+        1 => bytes.get(4..),
+        _ => Some(bytes),
+    });
+    payloads.map(hex).collect::<Vec<_>>().join(",")
+}
+
+/// Returns a message as tshark prints the columns.
+fn as_tshark(bytes: &[u8], submessages: &[Submessage<'_>]) -> String {
+    let mut cells = vec![hex(&bytes[8..20])];
+    for (_, values) in COLUMNS {
+        let values: Vec<_> = submessages
+            .iter()
+            .flat_map(|submessage| values(bytes, submessage))
+            .collect();
+        cells.push(values.join(","));
+    }
+    cells.push(digest(payloads(submessages).as_bytes()));
+    cells.join("\t")
+}
+
+#[test]
+fn tshark_decodes_the_same_submessages_and_payloads() {
+    for capture in captures() {
+        let file = unpacked(&capture);
+        let mut tshark = Command::new("tshark");
+        tshark.args(["-n", "-T", "fields", "-Y", "rtps && udp && !icmp", "-r"]);
+        tshark.arg(file.path()).args(["-e", "rtps.guidPrefix.src"]);
+        for (column, _) in COLUMNS {
+            tshark.args(["-e", column]);
+        }
+        tshark.args(["-e", "rtps.issueData"]);
+        let text = output(&mut tshark);
+        let theirs = text.lines().map(|line| {
+            let (cells, payload) = line.rsplit_once('\t').unwrap();
+            format!("{cells}\t{}", digest(payload.as_bytes()))
+        });
+        let theirs: Vec<_> = theirs.collect();
+        assert_equal(&capture, &ours(&capture, as_tshark), &theirs);
+    }
+}
