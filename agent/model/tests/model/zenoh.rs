@@ -112,6 +112,63 @@ fn a_message_on_two_connections_counts_once_and_reaches_only_the_peer() {
     assert_eq!(snapshot.participants.len(), 2);
 }
 
+/// The talker and a listener open a connection to each other at the same time. They keep both.
+fn twice_connected() -> (Observer, [u8; 16]) {
+    let mut observer = observer();
+    connect(&mut observer, 1001, TALKER, (LISTENER, Role::Peer));
+    connect(&mut observer, 1002, LISTENER, (TALKER, Role::Peer));
+    subscribe(&mut observer, 1001, LISTENER);
+    let token = publisher(TALKER, 10, "/chatter");
+    let [there, _] = connection(1001);
+    let declared = [declare_key(3, KEY), declare_token(1, &token)];
+    send(&mut observer, &there, START, &frame(7, &declared));
+    (observer, Gid::of_token(&token).0)
+}
+
+#[test]
+fn aliases_apply_to_both_connections_of_two_sessions() {
+    let (mut observer, gid) = twice_connected();
+    // Samples with an unknown alias count as messages.
+    let [there, _] = connection(1001);
+    send(
+        &mut observer,
+        &there,
+        START,
+        &frame(8, &[declare_key(5, "not/of/ros")]),
+    );
+    let [_, there] = connection(1002);
+    for number in 1..=10 {
+        let pushes = [
+            push(3, gid, number, b"\0\x01\0\0"),
+            push(5, gid, 100 + number, b"\0\x01\0\0"),
+        ];
+        send(&mut observer, &there, START + number, &frame(9, &pushes));
+    }
+    assert_eq!(messages(&observer), 10);
+}
+
+#[test]
+fn declarations_outlive_one_of_two_connections() {
+    for (ending, rest) in [(1001, 1002), (1002, 1001)] {
+        let (mut observer, gid) = twice_connected();
+        for stream in connection(ending) {
+            report(&mut observer, &stream, START, StreamEvent::End);
+        }
+        assert_eq!(participants(&observer, START), 2);
+        assert!(chatter(&observer.snapshot(Timestamp(START))).is_some());
+        let [one, other] = connection(rest);
+        let there = if rest == 1001 { one } else { other };
+        let batch = frame(8, &[push(3, gid, 1, b"\0\x01\0\0")]);
+        send(&mut observer, &there, START + 1, &batch);
+        assert_eq!(messages(&observer), 1);
+        for stream in connection(rest) {
+            report(&mut observer, &stream, START + 2, StreamEvent::End);
+        }
+        // The end that leaves the last connection first has ended.
+        assert_eq!(participants(&observer, START + 2), 1);
+    }
+}
+
 /// Returns the losses of the topic and of its receivers, after the talker has sent ten messages per
 /// second. Messages with a `missing` number did not arrive. `gap` precedes the message after them.
 fn lost(missing: Range<u64>, gap: Option<StreamEvent<'_>>) -> (u64, u64) {

@@ -5,8 +5,9 @@
 
 The command line and the log of `pub` and `sub` equal those of the DDS peers (../peer.hpp). Options
 that only DDS has are accepted and ignored. Each node is a separate session, which connects to the
-router of its host, and directly to the other sessions there. `--linger` keeps a publisher running
-after its last message. With `--buffers` it announces backends of buffers, and uses further keys, as
+router of its host, and directly to the other sessions there. A busy machine makes Zenoh drop
+messages before they are sent, except with `--reliable`. `--linger` keeps a publisher running after
+its last message. With `--buffers` it announces backends of buffers, and uses further keys, as
 rmw_zenoh of Lyrical does.
 """
 
@@ -192,12 +193,13 @@ class Session:
 def publish(options, log):
     session = Session(options)
     publishers = {}
+    control = zenoh.CongestionControl
 
     def publisher(key):
         if key not in publishers:
             publishers[key] = session.session.declare_publisher(
                 key,
-                congestion_control=zenoh.CongestionControl.DROP,
+                congestion_control=control.BLOCK if options.reliable else control.DROP,
                 reliability=zenoh.Reliability.RELIABLE,
             )
         return publishers[key]

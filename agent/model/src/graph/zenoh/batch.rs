@@ -93,10 +93,11 @@ impl Zenoh {
             return;
         };
         let before = direction.sender.replace(side);
-        let (number, owner) = (direction.number, direction.owner(stream));
+        let owner = direction.owner(stream);
         if before.is_some_and(|before| before != side) {
-            drop(self.aliases.remove_owner(number));
+            self.renumber(stream, None);
         }
+        self.join_transport(stream);
         if let Some(owner) = owner {
             show(Shown::Owner(stream.socket, owner.guid_prefix()));
             self.has_begun = true;

@@ -8,7 +8,7 @@ use ros2probe_wire::zenoh::ZenohId;
 
 use super::Zenoh;
 use super::stream::{Flow, StreamId, Unseen};
-use super::stream_state::StreamState;
+use super::stream_state::{DirectionNumber, StreamState};
 use crate::facts::model_time::ModelTime;
 
 /// Lease that rmw_zenoh configures.
@@ -24,6 +24,15 @@ impl Zenoh {
         let known = self.directions.get(&stream.reversed());
         let known = known.map(|direction| &**direction);
         known.or_else(|| self.elsewhere(stream).map(|(_, direction)| direction))
+    }
+
+    /// Returns the stream of [`Self::opposite`].
+    fn opposite_place(&self, stream: &StreamId) -> Option<StreamId> {
+        let reversed = stream.reversed();
+        match self.directions.contains_key(&reversed) {
+            true => Some(reversed),
+            false => self.elsewhere(stream).map(|(place, _)| *place),
+        }
     }
 
     /// Returns the opposite direction, and the stream in which it was last seen.
@@ -118,8 +127,67 @@ impl Zenoh {
                 self.graph.end(session);
             }
         }
-        if let Some(direction) = self.directions.get(stream) {
-            self.graph.leave(direction.number);
+        if let Some(number) = self.directions.get(stream).map(|known| known.number)
+            && !self.has_direction(|direction| direction.number == number && !direction.has_left)
+        {
+            self.graph.leave(number);
+        }
+    }
+
+    fn has_direction(&self, is_meant: impl Fn(&StreamState) -> bool) -> bool {
+        self.directions
+            .values()
+            .any(|direction| is_meant(direction))
+    }
+
+    /// Gives the declarations of a connection to the transport that its two sessions have already,
+    /// once both are known.
+    pub(super) fn join_transport(&mut self, stream: &StreamId) {
+        let Some(opposite) = self.opposite_place(stream) else {
+            return;
+        };
+        for (stream, opposite) in [(*stream, opposite), (opposite, *stream)] {
+            let sender = |id| self.directions.get(id)?.sender;
+            let Some(ends) = sender(&stream).zip(sender(&opposite)) else {
+                return;
+            };
+            let Some(direction) = self.directions.get_mut(&stream) else {
+                return;
+            };
+            // The search passes all connections, so each connection has one.
+            if std::mem::replace(&mut direction.is_begun, true) {
+                continue;
+            }
+            let mut others = self.directions.iter().filter(|(id, other)| {
+                id.flow != stream.flow && other.sender == Some(ends.0) && !other.has_left
+            });
+            let twin = others.find(|(id, _)| {
+                let back = self.opposite(id).filter(|back| !back.has_left);
+                back.is_some_and(|back| back.sender == Some(ends.1))
+            });
+            if let Some(number) = twin.map(|(_, twin)| twin.number) {
+                self.renumber(&stream, Some(number));
+            }
+        }
+    }
+
+    /// Gives a direction another number, by default one of its own. Its declarations end.
+    pub(super) fn renumber(&mut self, stream: &StreamId, number: Option<DirectionNumber>) {
+        let number = number.unwrap_or_else(|| {
+            self.numbered += 1;
+            self.numbered
+        });
+        if let Some(direction) = self.directions.get_mut(stream) {
+            let before = std::mem::replace(&mut direction.number, number);
+            self.forget_declarations(before);
+        }
+    }
+
+    /// Forgets the declarations of a transport that has no connection.
+    fn forget_declarations(&mut self, number: DirectionNumber) {
+        if !self.has_direction(|direction| direction.number == number) {
+            drop(self.aliases.remove_owner(number));
+            self.graph.disconnect(number);
         }
     }
 
@@ -171,8 +239,7 @@ impl Zenoh {
         if self.flows.get(&stream.flow) == Some(stream) {
             self.flows.remove(&stream.flow);
         }
-        drop(self.aliases.remove_owner(known.number));
-        self.graph.disconnect(known.number);
+        self.forget_declarations(known.number);
     }
 }
 

@@ -1,5 +1,9 @@
-//! State of one direction of a connection: its sender and the messages in FRAGMENTs. The aliases of
-//! keys belong to a direction.
+//! State of one direction of a connection: its sender and the messages in FRAGMENTs.
+//!
+//! The aliases of keys and the declarations belong to the transport between two sessions. A
+//! transport has two connections if both sessions open one at the same time: declarations and the
+//! messages that use them may then be on different connections. The directions of a transport with
+//! the same sender share one [`DirectionNumber`].
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -23,7 +27,7 @@ const HEAD: usize = 8192;
 /// Number of publications of one source after which it is considered the sender.
 const PRESUMED: u32 = 3;
 
-/// Number of a direction, never reused.
+/// Number of a direction of a transport, never reused.
 pub(super) type DirectionNumber = u64;
 /// Aliases by direction and number.
 pub(super) type Aliases = ByOwner<ZenohAliases, DirectionNumber, u16, Alias>;
@@ -67,6 +71,8 @@ pub(super) struct Chain {
 #[derive(Debug, Default)]
 pub(super) struct StreamState {
     pub(super) number: DirectionNumber,
+    /// Whether the INITs of both ends were seen.
+    pub(super) is_begun: bool,
     /// The sender, from its INIT.
     pub(super) sender: Option<Side>,
     /// The session of the process that sends, if the INIT was missed.
