@@ -154,6 +154,9 @@ zenoh() { python_packages zenoh "eclipse-zenoh==1.10.2" "xxhash==4.1.0"; }
 # A second decoder of RTPS.
 scapy() { python_packages scapy "scapy==2.8.0"; }
 
+# The newest Cyclone DDS, for the peers of the interoperability matrix.
+cyclonedds() { python_packages cyclonedds "cyclonedds==11.0.1"; }
+
 # Generates requests to the control API; installed in a separate Python environment.
 schemathesis() {
     local place=$tools/schemathesis version=4.32.5
@@ -413,6 +416,7 @@ for need; do
         rotel
         zenoh
         scapy
+        cyclonedds
         bags
         types
         page
