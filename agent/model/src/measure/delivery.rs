@@ -96,6 +96,9 @@ pub struct Delivery {
     uses_network: bool,
     /// The latest losses, while the delivery is withheld.
     withheld: Option<Bounded<WithheldLosses, VecDeque<DeliveryLoss>>>,
+    /// Number of samples that the writer's totals contain twice. Totals never decrease, so this many
+    /// further samples are not added to them.
+    counted_twice: u64,
 }
 
 impl Delivery {
@@ -119,6 +122,7 @@ impl Delivery {
             best_effort: false,
             uses_network: false,
             withheld: None,
+            counted_twice: 0,
         }
     }
 
@@ -373,6 +377,7 @@ impl Delivery {
             .flat_map(|(first, last)| first.until(last.next()))
             .filter(|number| !self.has(*number) && !other.has(*number))
             .collect();
+        self.counted_twice += other.counted_twice;
         self.tally.add(&other.tally);
         self.recent.absorb(&other.recent);
         let total = &mut context.totals.received.pending;
@@ -401,6 +406,32 @@ impl Delivery {
             .settled()
             .until(settled)
             .for_each(|number| sequence.know(number));
+    }
+
+    /// Returns how many remembered samples have arrived both here and at `other`.
+    #[must_use]
+    pub fn common_with(&self, other: &Self) -> u64 {
+        let sequence = self.reception.sequence();
+        sequence.common_with(other.reception.sequence())
+    }
+
+    /// Counts this many messages as duplicates, because another delivery of the same receiver
+    /// contains them.
+    pub fn drop_common(&mut self, common: u64, context: &mut DeliveryContext<'_>) {
+        let tally = &mut self.tally;
+        let common = common.min(tally.messages);
+        if common == 0 {
+            return;
+        }
+        // The sizes of single samples are not kept.
+        tally.bytes -= tally.bytes / tally.messages * common;
+        tally.messages -= common;
+        tally.recovered = tally.recovered.min(tally.messages);
+        tally.history = tally.history.min(tally.messages);
+        self.count(context, |tally| tally.duplicates += common);
+        if self.withheld.is_none() {
+            self.counted_twice += common;
+        }
     }
 
     const fn is_reliable(&self, context: &DeliveryContext<'_>) -> bool {
@@ -468,13 +499,19 @@ impl Delivery {
                 breakdown.retransmission.observe(waited);
             }
         }
-        self.count(context, |tally| {
+        let is_in_totals = self.counted_twice > 0;
+        self.counted_twice = self.counted_twice.saturating_sub(1);
+        let add = |tally: &mut Delivered| {
             tally.messages += 1;
             tally.bytes += whole.bytes;
             tally.history += u64::from(is_history);
             tally.recovered += u64::from(recovered);
             tally.recovery_seconds += waited;
-        });
+        };
+        match is_in_totals {
+            true => add(&mut self.tally),
+            false => self.count(context, add),
+        }
     }
 
     /// Handles a sample that arrives after it was settled as lost. A whole sample whose loss cause is

@@ -70,6 +70,8 @@ pub struct Sequence {
     incarnation: u32,
     received: Bitmap,
     excused: Bitmap,
+    /// The numbers in `received` that only arrived by another route, if any did.
+    elsewhere: Option<Box<Bitmap>>,
     /// Earlier values of `next` with their times, oldest first.
     checkpoints: Bounded<Checkpoints, VecDeque<(ModelTime, SequenceNumber)>>,
     gaps: Bounded<SequenceGaps, VecDeque<Gap>>,
@@ -284,9 +286,30 @@ impl Sequence {
     /// Records that this number arrived by another route: here it counts neither as lost nor as
     /// received.
     pub fn know(&mut self, number: SequenceNumber) {
-        if self.started() && number >= self.floor() && number < self.next {
+        if self.started() && number >= self.floor() && number < self.next && !self.has(number) {
+            let len = self.received.len();
+            let new = || Box::new(Bitmap::with_len(len));
+            self.elsewhere.get_or_insert_with(new).set(number);
             self.received.set(number);
         }
+    }
+
+    fn arrived_here(&self, number: SequenceNumber) -> bool {
+        let elsewhere = self.elsewhere.as_ref();
+        self.received.get(number) && elsewhere.is_none_or(|elsewhere| !elsewhere.get(number))
+    }
+
+    /// Returns how many remembered numbers arrived both here and at `other`.
+    #[must_use]
+    pub fn common_with(&self, other: &Self) -> u64 {
+        if !self.started() || !other.started() {
+            return 0;
+        }
+        let first = self.floor().max(other.floor());
+        let common = first
+            .until(self.next.min(other.next))
+            .filter(|number| self.arrived_here(*number) && other.arrived_here(*number));
+        common.count() as u64
     }
 
     /// Merges the numbers of the same writer that `other` received. `self` keeps its first number.
@@ -304,6 +327,11 @@ impl Sequence {
         {
             if other.received.get(number) {
                 self.received.set(number);
+            }
+            if let Some(elsewhere) = &mut self.elsewhere
+                && other.arrived_here(number)
+            {
+                elsewhere.clear(number, number.next());
             }
         }
     }
@@ -431,6 +459,10 @@ impl Sequence {
             let len = undecided.next_power_of_two().min(MAX_WINDOW);
             self.received.grow(len, self.floor(), self.next);
             self.excused.grow(len, self.floor(), self.next);
+            if let Some(mut elsewhere) = self.elsewhere.take() {
+                elsewhere.grow(len, self.floor(), self.next);
+                self.elsewhere = Some(elsewhere);
+            }
         }
         let keep = end.saturating_sub(self.received.len());
         if keep > self.settled {
@@ -443,6 +475,9 @@ impl Sequence {
         }
         self.received.clear(self.next, end);
         self.excused.clear(self.next, end);
+        if let Some(elsewhere) = &mut self.elsewhere {
+            elsewhere.clear(self.next, end);
+        }
         self.next = end;
         self.last_advance = now;
     }

@@ -5,13 +5,13 @@ use ros2probe_wire::SequenceNumber;
 /// A ring of bits, addressed by sequence number. Its length is a power of two.
 #[derive(Debug, Default)]
 pub(super) struct Bitmap {
-    pub(super) words: Vec<u64>,
+    pub(super) words: Box<[u64]>,
 }
 
 impl Bitmap {
     pub(super) fn with_len(bits: u64) -> Self {
         Self {
-            words: vec![0; usize::try_from(bits / 64).unwrap_or(0)],
+            words: vec![0; usize::try_from(bits / 64).unwrap_or(0)].into(),
         }
     }
 

@@ -239,7 +239,6 @@ impl Subscribers {
                     index = 0;
                     continue;
                 }
-                delivery.publish(context.journal, &mut self.totals);
             }
             if self.name_delivery(place, owner, context) {
                 index = 0;
@@ -248,8 +247,8 @@ impl Subscribers {
         self.count_open();
     }
 
-    /// Records the participant of a delivery, and merges it with another one of that participant.
-    /// Returns whether they were merged.
+    /// Records the participant of a delivery, merges it with another one of that participant, and
+    /// publishes its counts. Returns whether they were merged.
     fn name_delivery(
         &mut self,
         place: usize,
@@ -259,9 +258,20 @@ impl Subscribers {
         let Some(other) = self.find(Receiver::Participant(owner)) else {
             if let Some(delivery) = self.deliveries.get_mut(place) {
                 delivery.identify(owner);
+                delivery.publish(context.journal, &mut self.totals);
             }
             return false;
         };
+        // Before both were known as one receiver, a sample may have arrived by either route.
+        let of_both = self.deliveries.get(place).zip(self.deliveries.get(other));
+        let common = of_both.map_or(0, |(one, other)| one.common_with(other));
+        if let Some(delivery) = self.deliveries.get_mut(place) {
+            delivery.drop_common(
+                common,
+                &mut delivery_context(&mut self.totals, self.reassembled, context),
+            );
+            delivery.publish(context.journal, &mut self.totals);
+        }
         let messages = |place: usize| {
             let delivery = self.deliveries.get(place);
             delivery.map_or(0, |delivery| delivery.tally().messages)

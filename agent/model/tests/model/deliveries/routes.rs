@@ -71,6 +71,49 @@ fn routes_are_merged_when_their_socket_is_identified_late() {
 }
 
 #[test]
+fn samples_on_both_routes_before_they_are_merged_count_once() {
+    // The owner of the multicast socket is known late, or that of the unicast socket.
+    for is_group_late in [true, false] {
+        let mut host = Host::new();
+        let bob = host.reader(BOB, 7411);
+        let (group, other) = (bob.multicast(101), bob.multicast(102));
+        let repairs = if is_group_late {
+            bob.directed(BOB)
+        } else {
+            other
+        };
+        if !is_group_late {
+            host.owner(group, BOB);
+        }
+        // RustDDS announces samples before it sends them, so that readers request them at once.
+        for number in 1..=20 {
+            if number % 5 == 0 {
+                host.data(repairs, number);
+            }
+            host.data(group, number);
+            host.wait(1);
+        }
+        host.wait(1000);
+        host.owner(if is_group_late { group } else { other }, BOB);
+        host.wait(100);
+        assert_eq!(host.topic().received.unwrap().messages, 20);
+        for number in 21..=30 {
+            host.data(group, number);
+            host.wait(1);
+        }
+        host.wait(12_000);
+        let [delivery] = &host.deliveries()[..] else {
+            panic!("one receiver: {:#?}", host.deliveries())
+        };
+        let facts = delivery.delivered;
+        assert_eq!((facts.messages, facts.duplicates, facts.lost()), (30, 4, 0));
+        let total = host.topic().received.unwrap();
+        let sums = (total.messages, total.bytes, total.duplicates);
+        assert_eq!(sums, (30, facts.bytes, 4));
+    }
+}
+
+#[test]
 fn a_receiver_whose_socket_is_identified_late_has_one_delivery() {
     for names in [&[false, true][..], &[true, true], &[false, false, true]] {
         let mut host = Host::new();
