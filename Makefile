@@ -103,8 +103,8 @@ screenshots: ## the pictures of README and docs, from the demo, in target/screen
 	cargo build --workspace --bin rp --example robot --example demo
 	$(SUDO) env PATH=$(PATH) node agent/cli/tests/page/screenshots.mjs $(TARGET)/debug/examples/demo $(TARGET)/screenshots
 
-peers: ## build the Fast DDS and Cyclone DDS test peers into target/peers
-	@$(MAKE) --no-print-directory -C agent/cli/tests/peers OUT=$(TARGET)/peers
+peers: ## build the test peers into target/peers: Fast DDS, Cyclone DDS, dust_dds, RustDDS and HDDS
+	@$(MAKE) --no-print-directory -C agent/cli/tests/peers OUT=$(TARGET)/peers all shapes
 
 arm: ## build rp for aarch64, static and unoptimized, which the tests run under qemu
 	CARGO_PROFILE_DEV_DEBUG=0 cargo build --package ros2probe --bin rp --target aarch64-unknown-linux-musl

@@ -26,6 +26,7 @@ mod foxglove;
 mod host;
 mod hostile;
 mod inside;
+mod interoperability;
 mod late_start;
 mod learn;
 mod links;

@@ -10,6 +10,7 @@ use serde::Deserialize;
 #[derive(Clone, Debug, Deserialize)]
 pub struct Event {
     /// Kind of event: `start`, `endpoint`, `pub`, `pub_failed`, `sub`, `error`, `stop` or `exit`.
+    /// Peers of shapes also log `matched` and `incompatible`.
     pub ev: String,
     /// Unix time in nanoseconds.
     pub t: u64,
@@ -25,6 +26,14 @@ pub struct Event {
     pub guid: Option<String>,
     pub topic: Option<String>,
     pub node: Option<String>,
+    /// Process, in `start`.
+    pub pid: Option<u64>,
+    /// Key of a shape, in `sub`.
+    pub color: Option<String>,
+    /// Name of the incompatible policy.
+    pub policy: Option<String>,
+    /// Number of matched endpoints, in `matched`.
+    pub total: Option<u64>,
 }
 
 pub struct EventLog(pub Vec<Event>);

@@ -18,6 +18,7 @@ pub mod network;
 pub mod peer;
 pub mod process;
 pub mod prometheus;
+pub mod shape;
 pub mod shared_memory;
 pub mod snmp;
 pub mod soak;

@@ -76,10 +76,7 @@ impl Stack {
             Stack::Fast => built("fastdds"),
             Stack::Cyclone => built("cyclonedds"),
             Stack::Rust => is_there(robot()?, "cargo build --example robot"),
-            Stack::Zenoh => {
-                let python = target_directory()?.join("tools/zenoh/bin/python");
-                is_there(python, ".ci/prerequisites.sh test")
-            }
+            Stack::Zenoh => python("zenoh"),
         }
     }
 
@@ -314,6 +311,12 @@ fn profile_directory() -> Result<PathBuf> {
         .nth(2)
         .context("this program is not in a target directory")?;
     Ok(directory.to_owned())
+}
+
+/// Returns the interpreter of a Python environment of this name.
+pub fn python(name: &str) -> Result<PathBuf> {
+    let program = target_directory()?.join(format!("tools/{name}/bin/python"));
+    is_there(program, ".ci/prerequisites.sh test")
 }
 
 /// Returns a program built by `make peers`.

@@ -79,8 +79,8 @@ pub struct Options {
 }
 
 impl Options {
-    /// Parses the command line. `supports` tells what the library does in a role, and larger
-    /// payloads than `largest` make fragments.
+    /// Parses the command line. `supports` returns whether the library has a capability in a
+    /// role. Larger payloads than `largest` make fragments.
     pub fn parse(largest: usize, supports: fn(Role, Capability) -> bool) -> Options {
         let mut options = Options {
             role: Role::Publisher,

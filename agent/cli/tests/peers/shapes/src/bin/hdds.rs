@@ -42,7 +42,7 @@ impl Peer for Hdds {
     const LARGEST_SIZE: usize = 8_000;
 
     /// A writer announces neither its lease nor its strength, and hears of no incompatible reader.
-    /// A reader asks only writers of this library for old samples.
+    /// A reader requests old samples only from writers of this library.
     fn supports(role: Role, capability: Capability) -> bool {
         match capability {
             Capability::LateJoiner => role == Role::Publisher,
@@ -143,7 +143,7 @@ impl Peer for Hdds {
     }
 }
 
-/// What the listeners were told since the last poll.
+/// Events of the listeners since the last poll.
 #[derive(Default)]
 struct Events(Mutex<Vec<Event>>);
 

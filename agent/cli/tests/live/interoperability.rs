@@ -1,0 +1,353 @@
+//! Six implementations of DDS publish to each other, in the manner of OMG's suite `dds-rtps`. What
+//! the agent shows equals what the peers logged: endpoints, matches, messages, deliveries, and
+//! reasons of incompatibility. Needs root.
+//!
+//! Each pair has a domain of its own, so that a library does not disturb others: Fast DDS 2.9 may
+//! fail an assertion in the presence of five other libraries.
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of, get};
+use ros2probe_testing::harness::network::Link;
+use ros2probe_testing::harness::peer::Role;
+use ros2probe_testing::harness::shape::{Library, Shape};
+use ros2probe_testing::harness::wait_until;
+use serde_json::Value;
+use tempfile::TempDir;
+
+const TOPIC: &str = "/square";
+/// Samples of each publisher.
+const COUNT: u64 = 20;
+/// Options of peers that match: dust_dds takes an announced infinite deadline for a finite one.
+const FINITE: &str = "--deadline 10000";
+
+/// What the peers of a round have in common.
+struct Case {
+    /// Place of each publisher's subscriber after its own in the list of libraries.
+    offset: usize,
+    /// What both libraries of a pair must support.
+    capabilities: &'static [&'static str],
+    offered: String,
+    requested: String,
+}
+
+/// A publisher and a subscriber in a domain.
+struct Pair {
+    domain: String,
+    publisher: Shape,
+    subscriber: Shape,
+}
+
+/// A publisher of each library with a subscriber of another one, under observation.
+struct Round {
+    link: Link,
+    config: TempDir,
+}
+
+impl Round {
+    fn new() -> Result<Round> {
+        let (link, config) = (Link::new()?, tempfile::tempdir()?);
+        let source = at_the_sockets_of(&link.monitor);
+        let text = format!("watch: [/**]\n{source}");
+        std::fs::write(config.path().join("ros2probe.yaml"), text)?;
+        Ok(Round { link, config })
+    }
+
+    fn agent(&self) -> Result<Agent<'_>> {
+        let file = self.config.path().join("ros2probe.yaml");
+        Agent::start(&self.link.monitor, env!("CARGO_BIN_EXE_rp"), &file)
+    }
+
+    /// Starts the peers of all pairs that support the case.
+    fn pairs(&self, case: &Case) -> Result<Vec<Pair>> {
+        let libraries = Library::ALL.into_iter().cycle().skip(case.offset);
+        let mut pairs = Vec::new();
+        for (domain, (publisher, subscriber)) in Library::ALL.into_iter().zip(libraries).enumerate()
+        {
+            let mut is_able = !is_mistaken(publisher, subscriber);
+            for capability in case.capabilities {
+                is_able &= publisher.can(Role::Publisher, capability)?
+                    && subscriber.can(Role::Subscriber, capability)?;
+            }
+            if !is_able {
+                println!("{publisher:?} to {subscriber:?}: not supported");
+                continue;
+            }
+            // The lease of Fast DDS is infinite by default.
+            let lease = match (publisher, subscriber) {
+                (Library::Fast, Library::Dust) => "--liveliness-lease 10000",
+                _ => "",
+            };
+            let start = |library, role, options: &str| {
+                let common = format!("--domain {domain} --topic rt{TOPIC} {lease}");
+                let options = format!("{common} {options}");
+                Shape::start(&self.link.monitor, library, role, &options)
+            };
+            pairs.push(Pair {
+                domain: domain.to_string(),
+                subscriber: start(subscriber, Role::Subscriber, &case.requested)?,
+                publisher: start(publisher, Role::Publisher, &case.offered)?,
+            });
+        }
+        ensure!(pairs.len() >= 3, "{} pairs", pairs.len());
+        Ok(pairs)
+    }
+
+    /// Runs pairs that match, and compares the agent's facts with their logs.
+    fn match_all(&self, case: &Case) -> Result<()> {
+        let agent = self.agent()?;
+        let mut pairs = self.pairs(case)?;
+        for pair in &mut pairs {
+            pair.publisher.wait_matched()?;
+            pair.subscriber.wait_matched()?;
+        }
+        for pair in &mut pairs {
+            pair.publisher.go()?;
+        }
+        for pair in &mut pairs {
+            pair.publisher.wait_sent()?;
+            let color = pair.publisher.library.color();
+            let subscriber = &pair.subscriber;
+            wait_until(&format!("samples of {}", pair.name()), || {
+                Ok(subscriber.received(&color)? == COUNT)
+            })?;
+        }
+        // HDDS never stops repeating its samples, so that its counters do not stand still.
+        let page = agent.scrape_until("all messages", |page| {
+            let messages = |pair: &Pair| pair.sum(page, "ros2_topic_messages_total");
+            pairs.iter().all(|pair| messages(pair) >= COUNT as f64)
+        })?;
+        for pair in &pairs {
+            let what = pair.name();
+            for name in [
+                "ros2_qos_incompatible_pairs",
+                "ros2_topic_lost_messages_total",
+            ] {
+                assert_eq!(pair.sum(&page, name), 0.0, "{what}: {name}");
+            }
+            let topic = self.topic(pair)?;
+            let publisher = only(&topic["publishers"]).context(what.clone())?;
+            assert_eq!(publisher["guid"], pair.publisher.guid()?, "{what}");
+            assert_eq!(
+                publisher["measurement"]["messages"], COUNT,
+                "{what}: {topic}"
+            );
+            let subscription = only(&topic["subscriptions"]).context(what.clone())?;
+            assert_eq!(subscription["guid"], pair.subscriber.guid()?, "{what}");
+            // The process of a socket may be looked up later.
+            wait_until(&format!("{what}: deliveries equal the log"), || {
+                self.are_delivered(pair)
+            })?;
+        }
+        Ok(())
+    }
+
+    /// Runs pairs that do not match because of this policy.
+    fn match_none(&self, case: &Case, policy: &str) -> Result<()> {
+        let agent = self.agent()?;
+        let pairs = self.pairs(case)?;
+        let name = policy.to_lowercase();
+        let metric = "ros2_qos_incompatible_pairs";
+        let page = agent.scrape_until("all pairs are incompatible", |page| {
+            pairs.iter().all(|pair| pair.sum(page, metric) == 1.0)
+        })?;
+        for pair in &pairs {
+            let labels = [("domain_id", &*pair.domain), ("policy", &*name)];
+            assert_eq!(page.sum(metric, &labels), 1.0, "{}", pair.name());
+            for (peer, role) in [
+                (&pair.publisher, Role::Publisher),
+                (&pair.subscriber, Role::Subscriber),
+            ] {
+                if peer.library.can(role, "incompatible_qos")? {
+                    wait_until(&format!("{role:?} of {} reports", pair.name()), || {
+                        let log = peer.log()?.0;
+                        let mut reported = log.iter().filter_map(|event| event.policy.as_deref());
+                        Ok(reported.any(|reported| reported == policy))
+                    })?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns whether the subscriber has every sample of its publisher once.
+    fn are_delivered(&self, pair: &Pair) -> Result<bool> {
+        let topic = self.topic(pair)?;
+        let deliveries = topic["deliveries"].as_array().context("no deliveries")?;
+        let process = pair.subscriber.process()?;
+        let mut received = deliveries
+            .iter()
+            .filter(|each| each["direction"] == "received" && each["process_id"] == process);
+        let delivered = received.next().map(|each| &each["delivered"]["messages"]);
+        Ok(delivered == Some(&Value::from(COUNT)) && received.next().is_none())
+    }
+
+    fn topic(&self, pair: &Pair) -> Result<Value> {
+        let path = format!("/topics{TOPIC}?domain_id={}", pair.domain);
+        let text = get(&self.link.monitor, &format!("http://127.0.0.1:17401{path}"))?;
+        Ok(serde_json::from_str(&text)?)
+    }
+}
+
+impl Pair {
+    fn name(&self) -> String {
+        let (publisher, subscriber) = (self.publisher.library, self.subscriber.library);
+        format!("{publisher:?} to {subscriber:?}")
+    }
+
+    fn sum(&self, page: &Scrape, name: &str) -> f64 {
+        page.sum(name, &[("topic", TOPIC), ("domain_id", &self.domain)])
+    }
+}
+
+/// Returns whether the libraries do not match though their QoS do: dust_dds takes the infinite lease
+/// of HDDS, which announces none, for a finite one.
+fn is_mistaken(publisher: Library, subscriber: Library) -> bool {
+    (publisher, subscriber) == (Library::Hdds, Library::Dust)
+}
+
+/// Returns the only endpoint of a list.
+fn only(list: &Value) -> Result<&Value> {
+    match list.as_array().map(Vec::as_slice) {
+        Some([only]) => Ok(only),
+        _ => anyhow::bail!("not one endpoint: {list}"),
+    }
+}
+
+fn match_all(offset: usize, capabilities: &'static [&'static str], qos: [&str; 2]) -> Result<()> {
+    let [offered, requested] = qos;
+    Round::new()?.match_all(&Case {
+        offset,
+        capabilities,
+        offered: format!("{FINITE} --count {COUNT} --linger 60 {offered}"),
+        requested: format!("{FINITE} {requested}"),
+    })
+}
+
+#[test]
+fn reliable_samples_reach_the_same_library() -> Result<()> {
+    match_all(0, &[], ["--reliable"; 2])
+}
+
+#[test]
+fn reliable_samples_reach_the_next_library() -> Result<()> {
+    match_all(1, &[], ["--reliable"; 2])
+}
+
+#[test]
+fn reliable_samples_reach_the_library_after_the_next() -> Result<()> {
+    match_all(2, &[], ["--reliable"; 2])
+}
+
+#[test]
+fn reliable_samples_reach_the_opposite_library() -> Result<()> {
+    match_all(3, &[], ["--reliable"; 2])
+}
+
+#[test]
+fn reliable_samples_reach_the_library_before_the_last() -> Result<()> {
+    match_all(4, &[], ["--reliable"; 2])
+}
+
+#[test]
+fn reliable_samples_reach_the_last_library() -> Result<()> {
+    match_all(5, &[], ["--reliable"; 2])
+}
+
+#[test]
+fn best_effort_samples_reach_another_library() -> Result<()> {
+    match_all(1, &[], ["--best-effort"; 2])
+}
+
+#[test]
+fn fragments_reach_another_library() -> Result<()> {
+    match_all(5, &["fragments"], ["--size 70000", ""])
+}
+
+#[test]
+fn endpoints_in_the_same_partition_match() -> Result<()> {
+    match_all(
+        4,
+        &["partition"],
+        ["--partition left --partition middle", "--partition middle"],
+    )
+}
+
+fn match_none(
+    offset: usize,
+    capabilities: &'static [&'static str],
+    [offered, requested]: [&str; 2],
+    policy: &str,
+) -> Result<()> {
+    let case = Case {
+        offset,
+        capabilities,
+        offered: offered.to_owned(),
+        requested: requested.to_owned(),
+    };
+    Round::new()?.match_none(&case, policy)
+}
+
+#[test]
+fn a_best_effort_publisher_is_the_reported_reason() -> Result<()> {
+    let qos = [
+        "--deadline 10000 --best-effort",
+        "--deadline 10000 --reliable",
+    ];
+    match_none(2, &[], qos, "RELIABILITY")
+}
+
+#[test]
+fn a_volatile_publisher_is_the_reported_reason() -> Result<()> {
+    let qos = [
+        "--deadline 10000 --durability volatile",
+        "--deadline 10000 --durability transient-local",
+    ];
+    match_none(4, &[], qos, "DURABILITY")
+}
+
+#[test]
+fn a_longer_deadline_of_a_publisher_is_the_reported_reason() -> Result<()> {
+    let qos = ["--deadline 20000", "--deadline 10000"];
+    match_none(5, &["deadline"], qos, "DEADLINE")
+}
+
+#[test]
+fn an_exclusive_publisher_is_the_reported_reason() -> Result<()> {
+    let qos = [
+        "--deadline 10000 --ownership-strength 5",
+        "--deadline 10000",
+    ];
+    match_none(1, &["ownership"], qos, "OWNERSHIP")
+}
+
+#[test]
+fn endpoints_in_different_partitions_do_not_match() -> Result<()> {
+    let round = Round::new()?;
+    let agent = round.agent()?;
+    let pairs = round.pairs(&Case {
+        offset: 2,
+        capabilities: &["partition"],
+        offered: "--partition left".to_owned(),
+        requested: "--partition right --partition far".to_owned(),
+    })?;
+    agent.scrape_until("every endpoint is alone", |page| {
+        pairs.iter().all(|pair| {
+            let sides = ["publishers", "subscriptions"];
+            sides
+                .iter()
+                .all(|side| pair.sum(page, &format!("ros2_topic_unmatched_{side}")) == 1.0)
+        })
+    })?;
+    for pair in &pairs {
+        for peer in [&pair.publisher, &pair.subscriber] {
+            let log = peer.log()?.0;
+            let mut matched = log.iter().filter(|event| event.ev == "matched");
+            ensure!(
+                matched.all(|event| event.total == Some(0)),
+                "{}",
+                pair.name()
+            );
+        }
+    }
+    Ok(())
+}
