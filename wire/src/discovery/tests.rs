@@ -401,6 +401,7 @@ fn the_vendor_of_the_payload_decides_the_meaning_of_vendor_parameters() {
     );
 }
 
+// Coverage: DDS security | - | - | named
 #[test]
 fn security_content_filters_and_domain_tags_are_recognized() {
     let mut payload = participant_list();

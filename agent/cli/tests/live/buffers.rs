@@ -60,6 +60,7 @@ fn received(subscriber: &Peer, all: usize) -> Result<()> {
     })
 }
 
+// Coverage: buffer topics, cpu | Fast DDS 2.9 | as Lyrical | exact
 #[test]
 fn messages_of_a_cpu_topic_of_fast_dds_have_publisher_node_and_receiver() -> Result<()> {
     let (host, directory) = (Namespace::alone()?, tempfile::tempdir()?);
@@ -95,6 +96,7 @@ fn camera(host: &Namespace) -> Result<Peer> {
     Peer::start(host, Stack::Zenoh, Role::Publisher, &stream, &["/camera"])
 }
 
+// Coverage: buffer topics, cpu | Zenoh 1.10 | as Lyrical | exact
 #[test]
 fn messages_of_zenoh_with_buffers_count_once_whatever_its_subscriptions_accept() -> Result<()> {
     let (host, directory) = (Namespace::alone()?, tempfile::tempdir()?);
@@ -119,6 +121,7 @@ fn messages_of_zenoh_with_buffers_count_once_whatever_its_subscriptions_accept()
     Ok(())
 }
 
+// Coverage: buffer topics, references | Zenoh 1.10 | as Lyrical | counted
 #[test]
 fn references_alone_count_and_a_subscription_without_buffers_is_named() -> Result<()> {
     let (host, directory) = (Namespace::alone()?, tempfile::tempdir()?);

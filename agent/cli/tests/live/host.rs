@@ -49,16 +49,19 @@ fn the_demo_robot_is_seen_completely_at_its_sockets() -> Result<()> {
     nothing_was_dropped(&page)
 }
 
+// Coverage: UDP | Fast DDS 2.9 | - | exact
 #[test]
 fn counts_of_fast_dds_equal_its_logs_at_either_end() -> Result<()> {
     counted_as_logged(Stack::Fast)
 }
 
+// Coverage: UDP | Cyclone DDS 0.10 | - | exact
 #[test]
 fn counts_of_cyclone_dds_equal_its_logs_at_either_end() -> Result<()> {
     counted_as_logged(Stack::Cyclone)
 }
 
+// Coverage: UDP | RustDDS 0.15 | - | exact
 #[test]
 fn counts_of_rust_dds_equal_its_logs_at_either_end() -> Result<()> {
     counted_as_logged(Stack::Rust)

@@ -228,6 +228,9 @@ fn reliable_samples_reach_the_same_library() -> Result<()> {
     match_all(0, &[], ["--reliable"; 2])
 }
 
+// Coverage: UDP | dust_dds 0.16 | - | exact
+// Coverage: UDP | HDDS 1.1 | - | exact
+// Coverage: UDP | Cyclone DDS 11.0 | - | exact
 #[test]
 fn reliable_samples_reach_the_next_library() -> Result<()> {
     match_all(1, &[], ["--reliable"; 2])
@@ -258,6 +261,8 @@ fn best_effort_samples_reach_another_library() -> Result<()> {
     match_all(1, &[], ["--best-effort"; 2])
 }
 
+// Coverage: UDP, samples in fragments | dust_dds 0.16 | - | exact
+// Coverage: UDP, samples in fragments | Cyclone DDS 11.0 | - | exact
 #[test]
 fn fragments_reach_another_library() -> Result<()> {
     match_all(5, &["fragments"], ["--size 70000", ""])

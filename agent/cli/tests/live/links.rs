@@ -20,6 +20,7 @@ const WATCH_ALL: &str = "watch: [/**]\ncapture:\n  source: wire\n";
 const SIZES: [usize; 6] = [320, 1300, 1440, 4000, 20_000, 60_000];
 const ROUNDS: usize = 20;
 
+// Coverage: UDP, IPv6 | Fast DDS 2.9 | - | exact
 #[test]
 fn samples_over_ipv6_count_once_in_fragments_for_an_mtu_of_1500_and_1280() -> Result<()> {
     for mtu in [1500, 1280] {
@@ -40,6 +41,7 @@ fn samples_over_ipv6_count_once_in_fragments_for_an_mtu_of_1500_and_1280() -> Re
     Ok(())
 }
 
+// Coverage: UDP, IPv6 | Cyclone DDS 0.10 | - | exact
 #[test]
 fn cyclone_dds_over_ipv6_is_counted_as_over_ipv4() -> Result<()> {
     let link = Link::new()?;

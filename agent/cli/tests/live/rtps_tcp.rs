@@ -97,6 +97,7 @@ fn nothing_was_dropped(page: &Scrape) -> Result<()> {
     Ok(())
 }
 
+// Coverage: TCP | Fast DDS 2.9 | - | exact
 #[test]
 fn counts_and_deliveries_on_one_host_equal_the_logs() -> Result<()> {
     for stream in streams(Ipv4Addr::LOCALHOST) {

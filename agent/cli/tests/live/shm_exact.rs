@@ -29,6 +29,7 @@ const RING: u64 = 4 << 20;
 const BURST: u64 = 50_000;
 const FASTER_THAN_IT_GOES: f64 = 1e6;
 
+// Coverage: shared memory, with uprobes | Fast DDS 2.9 | - | exact
 #[test]
 fn every_message_is_seen_and_breakpoints_end_with_a_killed_agent() -> Result<()> {
     let host = Host::new()?;

@@ -50,6 +50,7 @@ fn cyclone_dds_and_the_agent_start_in_every_order() -> Result<()> {
     every_order(Stack::Cyclone, &[A, P, S])
 }
 
+// Coverage: Zenoh over TCP | Zenoh 1.10 | - | exact
 #[test]
 fn zenoh_and_the_agent_start_in_every_order_after_the_router() -> Result<()> {
     every_order_from(Stack::Zenoh, &[R], &[A, P, S])

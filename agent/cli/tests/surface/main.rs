@@ -18,6 +18,7 @@ mod caps;
 mod chains;
 mod cli;
 mod config;
+mod coverage;
 mod dashboards;
 mod discover;
 mod discover_router;

@@ -368,6 +368,8 @@ fn fragments_become_one_message_unless_one_is_missing() {
     assert_eq!(measurement.unwrap().bytes, 200_000);
 }
 
+// Coverage: Zenoh with compression | - | - | named
+// Coverage: Zenoh, low-latency transport | - | - | named
 #[test]
 fn features_that_hide_messages_are_reported() {
     let mut observer = observer();

@@ -30,6 +30,7 @@ fn the_end_of_a_connection_is_reported_by_each_sender_and_a_reset_at_least_once(
     Ok(())
 }
 
+// Coverage: Zenoh over TLS | - | - | named
 #[test]
 fn tls_and_other_versions_are_reported_only_on_a_port_of_zenoh() -> Result<()> {
     let mut observed = Observed::new()?;

@@ -31,6 +31,7 @@ fn exchange(address: &str, port: u16, bytes: &[u8]) -> Result<()> {
     Ok(())
 }
 
+// Coverage: Zenoh over QUIC | - | - | named
 #[test]
 fn quic_at_sockets_is_reported_only_on_a_port_of_zenoh() -> Result<()> {
     let mut observed = Observed::new()?;

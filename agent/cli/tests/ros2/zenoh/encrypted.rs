@@ -63,6 +63,7 @@ impl Robot {
     }
 }
 
+// Coverage: Zenoh over TLS, with `capture.inside` | rmw_zenoh | installed | counted
 #[test]
 #[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn connections_over_tls_are_reported_and_their_messages_counted_inside() -> Result<()> {

@@ -58,6 +58,7 @@ fn without_a_datagram_the_counts_come_from_inside() {
     assert!((measured.rate_hz - 10.0).abs() < 0.01);
 }
 
+// Coverage: one process, with `capture.inside` | - | - | counted
 #[test]
 fn a_pair_in_one_observed_process_counts_as_observed() {
     let mut world = World::new();
