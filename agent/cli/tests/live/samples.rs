@@ -123,6 +123,11 @@ fn payloads_are_what_was_sent(
             ..Stream::point_cloud(size, 40)
         };
         let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, stack, &stream)?;
+        // Payloads of a publisher that the agent does not know yet are not captured.
+        wait_until("the agent knows the publisher", || {
+            let topic = observed.topic("/points");
+            Ok(topic.is_ok_and(|topic| topic["publishers"][0].is_object()))
+        })?;
         let client = observed.client()?;
         let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
         let pattern: Vec<u8> = (8..size).map(pattern).collect();
