@@ -29,4 +29,5 @@ mod restart;
 mod room;
 mod services;
 mod start_orders;
+mod transports;
 mod zenoh;

@@ -1,0 +1,45 @@
+//! Pairs whose messages are not on the network.
+
+use ros2probe_model::report::snapshot::{TopicFacts, Transport};
+use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS};
+use ros2probe_testing::model::host::{ALICE, BOB, Host, READER, WRITER};
+use ros2probe_wire::Guid;
+
+const IMAGE: &str = "sensor_msgs::msg::dds_::Image_";
+
+/// Announces a writer of Alice and a reader of Bob, both of Cyclone DDS. Kind 16 of a locator is
+/// iceoryx in version 0.10, and a PSMX plugin such as `psmx_iox2` in version 11.
+fn image(kinds: [u32; 2]) -> TopicFacts {
+    let mut host = Host::new();
+    host.bystander(BOB, 7411);
+    let ends = [
+        (Guid::new(ALICE, WRITER), SEDP_WRITERS),
+        (Guid::new(BOB, READER), SEDP_READERS),
+    ];
+    for ((guid, announcer), kind) in ends.into_iter().zip(kinds) {
+        let locator = [&kind.to_le_bytes()[..], &7411u32.to_le_bytes(), &[0; 16]].concat();
+        let reliability = [2u32.to_le_bytes(), [0; 4], [0; 4]].concat();
+        let others: [(u16, &[u8]); 2] = [(0x1a, &reliability), (0x2f, &locator)];
+        let payload = forge::endpoint_with(guid, "rt/image", IMAGE, &others);
+        host.announce(Message::from(guid.prefix).data(announcer, 20, &payload));
+    }
+    host.wait(5000);
+    let mut topics = host.snapshot().topics.into_iter();
+    topics.find(|topic| topic.name == "/image").unwrap()
+}
+
+// Coverage: iceoryx | Cyclone DDS 0.10 | - | named
+// Coverage: PSMX, such as `psmx_iox2` | Cyclone DDS 11.0 | - | named
+#[test]
+fn a_pair_of_cyclone_dds_in_shared_memory_is_named_and_has_no_rate() {
+    let topic = image([16, 16]);
+    let [pairs] = &topic.transports[..] else {
+        panic!("{:?}", topic.transports)
+    };
+    assert_eq!((pairs.transport, pairs.pairs), (Transport::Iceoryx, 1));
+    assert_eq!(topic.rate_hz(), None);
+    // One end without it uses the network.
+    let topic = image([16, 1]);
+    assert_eq!(topic.transports[0].transport, Transport::Network);
+    assert_eq!(topic.rate_hz(), Some(0.0));
+}
