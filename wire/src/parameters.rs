@@ -60,6 +60,11 @@ impl ParameterId {
     pub const ENDPOINT_SECURITY_INFO: Self = Self(0x1004);
     pub const PARTICIPANT_SECURITY_INFO: Self = Self(0x1005);
 
+    /// Version of Fast DDS 3.0 and later, or of RTI Connext, in four octets. Cyclone DDS uses the
+    /// same number for its builtin endpoints.
+    pub const PRODUCT_VERSION: Self = Self(0x8000);
+    /// Version of Cyclone DDS, host and system, as text.
+    pub const CYCLONE_VERSION_INFO: Self = Self(0x8007);
     /// Machine id of Fast DDS 3.2 and later.
     pub const FAST_MACHINE_ID: Self = Self(0x8003);
     /// Data sharing of Fast DDS. Neither Cyclone DDS nor ADLINK's stack uses this number.

@@ -61,6 +61,10 @@ pub struct Participant<'a> {
     /// Middleware: the DDS implementation, or `Eclipse Zenoh`.
     #[cfg_attr(feature = "openapi", schema(example = "eProsima Fast DDS"))]
     pub vendor: Cow<'a, str>,
+    /// Version of the middleware; null if the participant announces none. Cyclone DDS, Fast DDS 3.0
+    /// and later, and RTI Connext announce it.
+    #[cfg_attr(feature = "openapi", schema(example = "0.10.2"))]
+    pub product_version: Option<Cow<'a, str>>,
     /// ROS enclave; null if the participant does not use ROS.
     pub enclave: Option<Cow<'a, str>>,
     /// Host and process of the participant.

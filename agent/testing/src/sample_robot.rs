@@ -128,6 +128,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             guid,
             domain_id: DomainId(0),
             vendor: VendorId::EPROSIMA,
+            product_version: Some("3.2.5".into()),
             enclave: Some("/".into()),
             process: process(),
             first_seen: ModelTime::from_nanoseconds(1),

@@ -1,6 +1,7 @@
 //! SPDP: a participant announces itself (RTPS 2.5, 8.5.3.2 and 9.6.3.2).
 
 use alloc::boxed::Box;
+use alloc::format;
 use alloc::string::String;
 use alloc::vec::Vec;
 use core::time::Duration;
@@ -24,6 +25,8 @@ const MAX_PROPERTY_LEN: usize = 256;
 /// Maximum length of an entity name, enclave or domain tag, in bytes.
 const MAX_NAME_LEN: usize = 256;
 
+/// Maximum length of the version of Cyclone DDS, in bytes.
+const MAX_VERSION_LEN: usize = 32;
 /// Maximum length of a machine's id, in bytes; that of Linux has 32.
 const MAX_MACHINE_ID: usize = 64;
 
@@ -71,6 +74,9 @@ pub struct ParticipantAnnouncement {
     pub default_multicast: Vec<Locator>,
     /// Its builtin endpoints.
     pub builtin_endpoints: BuiltinEndpoints,
+    /// Version of its implementation, such as `0.10.2`: Cyclone DDS, Fast DDS 3.0 and later, and
+    /// RTI Connext announce it.
+    pub product_version: Option<Box<str>>,
     /// Fast DDS 3.2 and later: id of its machine (machine-id(5)), which decides who is on its host.
     pub machine_id: Option<Box<str>>,
     /// Whether it authenticates its peers (DDS Security); its further discovery data may be
@@ -78,6 +84,27 @@ pub struct ParticipantAnnouncement {
     pub is_secured: bool,
     /// Whether it announced more locators or properties than are kept, or unreadable ones.
     pub is_truncated: bool,
+}
+
+/// Returns a version without its last octet if that is zero.
+fn dotted([major, minor, release, revision]: [u8; 4]) -> Box<str> {
+    match revision {
+        0 => format!("{major}.{minor}.{release}"),
+        _ => format!("{major}.{minor}.{release}.{revision}"),
+    }
+    .into()
+}
+
+/// Returns the version in the text of Cyclone DDS, such as `host/0.10.2/Linux/Linux`, which follows
+/// five words (`wire/tests/data/datagrams/cyclone-spdp.bin`); `None` if it is not readable.
+fn version_info(mut value: Cursor<'_>) -> Option<&str> {
+    let what = "PID_ADLINK_PARTICIPANT_VERSION_INFO";
+    value.take(what, 20).ok()?;
+    let text = text::name(&mut value, what, MAX_NAME_LEN).ok()?;
+    let version = text.split('/').nth(1)?;
+    (1..=MAX_VERSION_LEN)
+        .contains(&version.len())
+        .then_some(version)
 }
 
 impl ParticipantAnnouncement {
@@ -99,6 +126,7 @@ impl ParticipantAnnouncement {
             default_unicast: Vec::new(),
             default_multicast: Vec::new(),
             builtin_endpoints: BuiltinEndpoints::default(),
+            product_version: None,
             machine_id: None,
             is_secured: false,
             is_truncated: false,
@@ -176,6 +204,15 @@ impl ParticipantAnnouncement {
             ParameterId::FAST_MACHINE_ID if self.vendor == VendorId::EPROSIMA => {
                 let id = text::name(&mut value, "PID_MACHINE_ID", MAX_MACHINE_ID).ok();
                 self.machine_id = id.filter(|id| !id.is_empty()).map(Into::into);
+            }
+            ParameterId::PRODUCT_VERSION
+                if [VendorId::EPROSIMA, VendorId::RTI_CONNEXT].contains(&self.vendor) =>
+            {
+                let version = value.array("PID_PRODUCT_VERSION").ok();
+                self.product_version = version.map(dotted);
+            }
+            ParameterId::CYCLONE_VERSION_INFO if self.vendor == VendorId::CYCLONE => {
+                self.product_version = version_info(value).map(Into::into);
             }
             ParameterId::IDENTITY_TOKEN
             | ParameterId::PERMISSIONS_TOKEN

@@ -1,3 +1,4 @@
+use std::format;
 use std::string::{String, ToString};
 use std::vec::Vec;
 
@@ -126,6 +127,42 @@ fn a_participant_of_cyclone_dds_is_parsed() {
         ["udp:239.255.0.1:7400"]
     );
     assert_eq!(participant.builtin_endpoints, BuiltinEndpoints(0xfc3f));
+    assert_eq!(participant.product_version.as_deref(), Some("0.10.2"));
+}
+
+#[test]
+fn the_version_of_an_implementation_depends_on_its_vendor_and_may_be_unreadable() {
+    let text = |text: &str| {
+        let mut value = Encoder::new(Endianness::Little);
+        (0..5).for_each(|_| drop(value.u32(0)));
+        value.string(text).bytes.clone()
+    };
+    let version = |vendor: VendorId, id: u16, value: &[u8]| {
+        let mut payload = participant_list();
+        payload.parameter(0x0016, &[vendor.0[0], vendor.0[1], 0, 0]);
+        payload.parameter(id, value);
+        let announced = announced(&payload.bytes).unwrap();
+        announced.product_version.map(String::from)
+    };
+    let (cyclone, fast, rti) = (VendorId::CYCLONE, VendorId::EPROSIMA, VendorId::RTI_CONNEXT);
+    assert_eq!(
+        version(fast, 0x8000, &[3, 2, 5, 0]).as_deref(),
+        Some("3.2.5")
+    );
+    assert_eq!(
+        version(rti, 0x8000, &[7, 3, 0, 5]).as_deref(),
+        Some("7.3.0.5")
+    );
+    let own = version(cyclone, 0x8007, &text("robot/11.0.1/Linux/Linux"));
+    assert_eq!(own.as_deref(), Some("11.0.1"));
+    // Numbers have another meaning for another vendor, and no value prevents an announcement.
+    assert_eq!(version(cyclone, 0x8000, &[63, 12, 0, 0]), None);
+    assert_eq!(version(fast, 0x8007, &text("robot/11.0.1/Linux")), None);
+    assert_eq!(version(cyclone, 0x8007, &[0; 8]), None);
+    assert_eq!(version(cyclone, 0x8007, &text("robot")), None);
+    assert_eq!(version(cyclone, 0x8007, &text("robot//Linux")), None);
+    let long = format!("robot/{}/Linux", "1".repeat(40));
+    assert_eq!(version(cyclone, 0x8007, &text(&long)), None);
 }
 
 #[test]

@@ -294,6 +294,7 @@ fn participants_with_dds_security_or_without_an_address_are_not_contacted() {
         guid: Guid::new(GuidPrefix([3; 12]), EntityId::PARTICIPANT),
         domain_id: DomainId(0),
         vendor: VendorId::UNKNOWN,
+        product_version: None,
         enclave: None,
         process: ProcessFacts::default(),
         first_seen: ModelTime::ZERO,

@@ -116,6 +116,8 @@ pub struct ParticipantFacts {
     pub domain_id: DomainId,
     /// Its implementation.
     pub vendor: VendorId,
+    /// Version of the implementation, if announced.
+    pub product_version: Option<Arc<str>>,
     /// ROS enclave; `None` if the participant does not use ROS.
     pub enclave: Option<Arc<str>>,
     /// Host and process of the participant.

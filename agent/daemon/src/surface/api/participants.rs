@@ -97,6 +97,7 @@ fn view<'a>(facts: &'a ParticipantFacts, counts: &Counts<'a>, clock: WallClock) 
         guid: facts.guid.to_string(),
         domain_id: facts.domain_id.0,
         vendor: vendor(facts.vendor),
+        product_version: facts.product_version.as_deref().map(Cow::Borrowed),
         enclave: facts.enclave.as_deref().map(Cow::Borrowed),
         process: process(&facts.process),
         nodes: counts.map_or_else(Vec::new, |(nodes, ..)| nodes.clone()),

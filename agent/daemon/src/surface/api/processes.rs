@@ -91,6 +91,7 @@ mod tests {
             guid: Guid::default(),
             domain_id: DomainId(0),
             vendor: VendorId::default(),
+            product_version: None,
             enclave: None,
             process: ProcessFacts {
                 host: None,

@@ -76,6 +76,8 @@ pub struct ParticipantProxy {
     pub tcp: bool,
     /// Whether it announces its endpoints by TCP and not by UDP.
     pub announces_by_tcp: bool,
+    /// Version of its implementation, if announced.
+    pub product_version: Option<Arc<str>>,
     /// Id of its machine, which Fast DDS 3.2 and later announces.
     pub machine_id: Option<Arc<str>>,
 }
@@ -183,6 +185,7 @@ impl ParticipantProxy {
                 .any(Locator::is_shared_memory),
             tcp: Locator::are_tcp(&announcement.default_unicast),
             announces_by_tcp: Locator::are_tcp(&announcement.metatraffic_unicast),
+            product_version: announcement.product_version.as_deref().map(Into::into),
             machine_id: announcement.machine_id.as_deref().map(Into::into),
         }
     }

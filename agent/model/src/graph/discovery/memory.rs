@@ -59,6 +59,8 @@ pub struct Remembered {
     #[serde(default)]
     announces_by_tcp: bool,
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    product_version: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     machine_id: Option<String>,
     addresses: Addresses,
     nodes: Vec<RememberedNode>,
@@ -209,6 +211,7 @@ impl Remembered {
             shared_memory: proxy.shared_memory,
             tcp: proxy.tcp,
             announces_by_tcp: proxy.announces_by_tcp,
+            product_version: text(&proxy.product_version),
             machine_id: text(&proxy.machine_id),
             addresses: participant.addresses.clone(),
             nodes: participant.nodes.iter().map(RememberedNode::of).collect(),
@@ -225,6 +228,7 @@ impl Remembered {
             &self.enclave,
             &self.host,
             &self.process_name,
+            &self.product_version,
             &self.machine_id,
         ];
         let all_plain = texts.into_iter().flatten().all(|text| is_plain(text));
@@ -246,6 +250,7 @@ impl Remembered {
                 shared_memory: self.shared_memory,
                 tcp: self.tcp,
                 announces_by_tcp: self.announces_by_tcp,
+                product_version: text(&self.product_version),
                 machine_id: text(&self.machine_id),
             },
             addresses: self.addresses.clone(),

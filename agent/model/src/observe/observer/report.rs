@@ -72,6 +72,7 @@ fn participants(observer: &Observer) -> Vec<ParticipantFacts> {
                 guid: Guid::new(*prefix, EntityId::PARTICIPANT),
                 domain_id: participant.domain_id,
                 vendor: proxy.vendor,
+                product_version: proxy.product_version.clone(),
                 enclave: proxy.enclave.clone(),
                 process: process(Some(proxy), holders.get(prefix).copied()),
                 first_seen: participant.first_seen,
