@@ -56,8 +56,11 @@ impl VendorId {
             [0x01, 0x10] => "Eclipse Cyclone DDS",
             [0x01, 0x11] => "GurumDDS",
             [0x01, 0x12] => "Atostek RustDDS",
+            [0x01, 0x14] => "S2E Dust DDS",
             [0x01, 0x15] => "SafeDDS",
             [0x01, 0x20] => "ADLINK Cloud",
+            // Not assigned by the OMG.
+            [0x01, 0xaa] => "HDDS",
             [b'Z', b'e'] => "Eclipse Zenoh",
             _ => return None,
         })

@@ -65,11 +65,19 @@ pub fn require() -> Result<()> {
 }
 
 /// Evaluates `holds` ten times per second until it is true, for at most a minute.
-pub fn wait_until(what: &str, mut holds: impl FnMut() -> Result<bool>) -> Result<()> {
-    const PATIENCE: Duration = Duration::from_secs(60);
-    let deadline = Instant::now() + PATIENCE;
+pub fn wait_until(what: &str, holds: impl FnMut() -> Result<bool>) -> Result<()> {
+    wait_within(Duration::from_secs(60), what, holds)
+}
+
+/// Waits as [`wait_until`] does, for a limited time.
+pub fn wait_within(
+    limit: Duration,
+    what: &str,
+    mut holds: impl FnMut() -> Result<bool>,
+) -> Result<()> {
+    let deadline = Instant::now() + limit;
     while !holds()? {
-        ensure!(Instant::now() < deadline, "{what}: not within {PATIENCE:?}");
+        ensure!(Instant::now() < deadline, "{what}: not within {limit:?}");
         std::thread::sleep(Duration::from_millis(100));
     }
     Ok(())

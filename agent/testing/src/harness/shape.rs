@@ -50,6 +50,17 @@ impl Library {
         format!("{self:?}").to_uppercase()
     }
 
+    /// Returns the name of its vendor as the agent prints it.
+    pub fn vendor(self) -> &'static str {
+        match self {
+            Library::Dust => "S2E Dust DDS",
+            Library::RustDds => "Atostek RustDDS",
+            Library::Hdds => "HDDS",
+            Library::Fast => "eProsima Fast DDS",
+            Library::Cyclone | Library::Cyclone11 => "Eclipse Cyclone DDS",
+        }
+    }
+
     /// Returns the program and its first arguments.
     fn command(self) -> Result<(PathBuf, &'static [&'static str])> {
         const SCRIPT: &str = concat!(
