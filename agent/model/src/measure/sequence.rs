@@ -4,8 +4,8 @@
 //! reordered or retransmitted samples can fill it. Numbers excused by a GAP, an ACKNACK or the
 //! start of observation are never lost. The firstSN of a HEARTBEAT excuses nothing: a missing
 //! sample that the writer no longer has is lost (RTPS 2.5, 8.4.10.4, `lost_changes_update`). Memory
-//! is two bitmaps that grow with the undecided numbers, up to [`MAX_WINDOW`]. The module reads
-//! neither payloads nor a clock; callers pass the times in.
+//! is two or three bitmaps that grow with the undecided numbers, up to [`MAX_WINDOW`]. The module
+//! reads neither payloads nor a clock; callers pass the times in.
 
 mod bitmap;
 mod runs;
@@ -26,8 +26,8 @@ use unconfirmed::{CONFIRMATIONS, UnconfirmedRun};
 
 /// Initial size of the window: the undecided and recently decided numbers that are remembered.
 const MIN_WINDOW: u64 = 512;
-/// Maximum size of the window: 8 KiB of bitmaps, or about 3000 messages per second over the
-/// reliable settle window.
+/// Maximum size of the window: 8 KiB of bitmaps (12 KiB with samples of other routes), or about
+/// 3000 messages per second over the reliable settle window.
 pub const MAX_WINDOW: u64 = 32_768;
 /// Maximum jump within an incarnation. A larger one is a restart or a forgery, not a million
 /// losses.

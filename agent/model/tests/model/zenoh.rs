@@ -169,6 +169,24 @@ fn declarations_outlive_one_of_two_connections() {
     }
 }
 
+#[test]
+fn declarations_outlive_a_new_session_on_one_of_two_connections() {
+    let (mut observer, gid) = twice_connected();
+    let [there, _] = connection(1001);
+    let foreign = declare_key(5, "not/of/ros");
+    send(&mut observer, &there, START, &frame(8, &[foreign]));
+    send(&mut observer, &there, START, &init(LATE, Role::Peer, None));
+    let [_, other] = connection(1002);
+    for number in 1..=10 {
+        let pushes = [3, 5].map(|alias| push(alias, gid, number, b"\0\x01\0\0"));
+        send(&mut observer, &other, START + number, &frame(9, &pushes));
+        // The new session has declared no alias, so its samples count as messages.
+        let pushes = [push(5, gid, 20 + number, b"\0\x01\0\0")];
+        send(&mut observer, &there, START + number, &frame(9, &pushes));
+    }
+    assert_eq!(messages(&observer), 20);
+}
+
 /// Returns the losses of the topic and of its receivers, after the talker has sent ten messages per
 /// second. Messages with a `missing` number did not arrive. `gap` precedes the message after them.
 fn lost(missing: Range<u64>, gap: Option<StreamEvent<'_>>) -> (u64, u64) {

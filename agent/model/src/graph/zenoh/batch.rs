@@ -95,7 +95,7 @@ impl Zenoh {
         let before = direction.sender.replace(side);
         let owner = direction.owner(stream);
         if before.is_some_and(|before| before != side) {
-            self.renumber(stream, None);
+            self.forget_aliases(stream);
         }
         self.join_transport(stream);
         if let Some(owner) = owner {

@@ -8,7 +8,7 @@ use ros2probe_wire::zenoh::ZenohId;
 
 use super::Zenoh;
 use super::stream::{Flow, StreamId, Unseen};
-use super::stream_state::{DirectionNumber, StreamState};
+use super::stream_state::StreamState;
 use crate::facts::model_time::ModelTime;
 
 /// Lease that rmw_zenoh configures.
@@ -21,17 +21,14 @@ impl Zenoh {
     /// Returns the opposite direction, seen at the same socket or interface or, on the loopback
     /// interface, at the other socket.
     pub(super) fn opposite(&self, stream: &StreamId) -> Option<&StreamState> {
-        let known = self.directions.get(&stream.reversed());
-        let known = known.map(|direction| &**direction);
-        known.or_else(|| self.elsewhere(stream).map(|(_, direction)| direction))
+        self.opposite_entry(stream).map(|(_, direction)| direction)
     }
 
-    /// Returns the stream of [`Self::opposite`].
-    fn opposite_place(&self, stream: &StreamId) -> Option<StreamId> {
-        let reversed = stream.reversed();
-        match self.directions.contains_key(&reversed) {
-            true => Some(reversed),
-            false => self.elsewhere(stream).map(|(place, _)| *place),
+    /// Returns the stream and the state of [`Self::opposite`].
+    fn opposite_entry(&self, stream: &StreamId) -> Option<(&StreamId, &StreamState)> {
+        match self.directions.get_key_value(&stream.reversed()) {
+            Some((place, direction)) => Some((place, &**direction)),
+            None => self.elsewhere(stream),
         }
     }
 
@@ -127,26 +124,27 @@ impl Zenoh {
                 self.graph.end(session);
             }
         }
-        if let Some(number) = self.directions.get(stream).map(|known| known.number)
-            && !self.has_direction(|direction| direction.number == number && !direction.has_left)
+        if let Some(direction) = self.directions.get(stream)
+            && !self.is_shared(direction, |other| !other.has_left)
         {
-            self.graph.leave(number);
+            self.graph.leave(direction.number);
         }
     }
 
-    fn has_direction(&self, is_meant: impl Fn(&StreamState) -> bool) -> bool {
-        self.directions
-            .values()
-            .any(|direction| is_meant(direction))
+    /// Returns whether a direction shares its declarations with such another one.
+    fn is_shared(&self, direction: &StreamState, is_meant: impl Fn(&StreamState) -> bool) -> bool {
+        let mut others = self.directions.values();
+        direction.is_shared
+            && others.any(|other| other.number == direction.number && is_meant(other))
     }
 
     /// Gives the declarations of a connection to the transport that its two sessions have already,
     /// once both are known.
     pub(super) fn join_transport(&mut self, stream: &StreamId) {
-        let Some(opposite) = self.opposite_place(stream) else {
+        let Some((opposite, _)) = self.opposite_entry(stream) else {
             return;
         };
-        for (stream, opposite) in [(*stream, opposite), (opposite, *stream)] {
+        for (stream, opposite) in [(*stream, *opposite), (*opposite, *stream)] {
             let sender = |id| self.directions.get(id)?.sender;
             let Some(ends) = sender(&stream).zip(sender(&opposite)) else {
                 return;
@@ -165,29 +163,36 @@ impl Zenoh {
                 let back = self.opposite(id).filter(|back| !back.has_left);
                 back.is_some_and(|back| back.sender == Some(ends.1))
             });
-            if let Some(number) = twin.map(|(_, twin)| twin.number) {
-                self.renumber(&stream, Some(number));
+            if let Some(twin) = twin.map(|(id, _)| *id) {
+                self.share(&twin, &stream);
             }
         }
     }
 
-    /// Gives a direction another number, by default one of its own. Its declarations end.
-    pub(super) fn renumber(&mut self, stream: &StreamId, number: Option<DirectionNumber>) {
-        let number = number.unwrap_or_else(|| {
-            self.numbered += 1;
-            self.numbered
-        });
+    /// Gives the declarations of `twin` to a direction that has none yet.
+    fn share(&mut self, twin: &StreamId, stream: &StreamId) {
+        let Some(twin) = self.directions.get_mut(twin) else {
+            return;
+        };
+        twin.is_shared = true;
+        let number = twin.number;
         if let Some(direction) = self.directions.get_mut(stream) {
-            let before = std::mem::replace(&mut direction.number, number);
-            self.forget_declarations(before);
+            direction.is_shared = true;
+            let own = std::mem::replace(&mut direction.number, number);
+            drop(self.aliases.remove_owner(own));
         }
     }
 
-    /// Forgets the declarations of a transport that has no connection.
-    fn forget_declarations(&mut self, number: DirectionNumber) {
-        if !self.has_direction(|direction| direction.number == number) {
-            drop(self.aliases.remove_owner(number));
-            self.graph.disconnect(number);
+    /// Forgets the aliases of a direction whose sender has changed.
+    pub(super) fn forget_aliases(&mut self, stream: &StreamId) {
+        let Some(direction) = self.directions.get_mut(stream) else {
+            return;
+        };
+        if std::mem::take(&mut direction.is_shared) {
+            self.numbered += 1;
+            direction.number = self.numbered;
+        } else {
+            drop(self.aliases.remove_owner(direction.number));
         }
     }
 
@@ -196,10 +201,7 @@ impl Zenoh {
         if self.directions.get(stream)?.has_left {
             return None;
         }
-        let (place, other) = match self.directions.get_key_value(&stream.reversed()) {
-            Some((place, other)) => (place, &**other),
-            None => self.elsewhere(stream)?,
-        };
+        let (place, other) = self.opposite_entry(stream)?;
         let lease = other.lease.unwrap_or(LEASE);
         let is_silent = other.last_seen + lease.mul_f64(SILENT) <= now;
         (is_silent && !other.has_left).then_some(*place)
@@ -239,7 +241,10 @@ impl Zenoh {
         if self.flows.get(&stream.flow) == Some(stream) {
             self.flows.remove(&stream.flow);
         }
-        self.forget_declarations(known.number);
+        if !self.is_shared(&known, |_| true) {
+            drop(self.aliases.remove_owner(known.number));
+            self.graph.disconnect(known.number);
+        }
     }
 }
 

@@ -73,6 +73,8 @@ pub(super) struct StreamState {
     pub(super) number: DirectionNumber,
     /// Whether the INITs of both ends were seen.
     pub(super) is_begun: bool,
+    /// Whether another connection of the transport has the same number, or had it.
+    pub(super) is_shared: bool,
     /// The sender, from its INIT.
     pub(super) sender: Option<Side>,
     /// The session of the process that sends, if the INIT was missed.
