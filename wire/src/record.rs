@@ -79,6 +79,8 @@ pub mod flag {
     pub const STREAM: u16 = 1 << 11;
     /// With [`STREAM`]: the sample was sent to a router, which forwards it and is not a subscriber.
     pub const RELAYED: u16 = 1 << 12;
+    /// The message came by a TCP connection that carries RTPS, from [`super::Record::source_port`].
+    pub const TCP: u16 = 1 << 13;
 }
 
 /// One submessage of one writer or reader. 136 bytes.

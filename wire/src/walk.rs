@@ -286,7 +286,7 @@ fn endpoint(walk: &mut Walk, id: u32, flags: u32, writer: u32, reader: u32) {
     record.reader = [destination[0], destination[1], destination[2], reader];
     record.kind = id as u8;
     record.submessage_flags = flags as u8;
-    record.flags &= flag::FRAGMENTED | flag::OUTGOING | flag::IPV6 | flag::HOST;
+    record.flags &= flag::FRAGMENTED | flag::OUTGOING | flag::IPV6 | flag::HOST | flag::TCP;
     let zero = zero();
     record.source_timestamp = u64::from(zero);
     record.payload_len = zero;

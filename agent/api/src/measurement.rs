@@ -120,6 +120,8 @@ pub struct Delivered {
     /// Messages that never arrived, by any known cause. The sum of delivered, lost and pending
     /// messages is the number that the receiver expected.
     pub lost_messages: u64,
+    /// Lost messages that the sender dropped before its TCP connection.
+    pub lost_at_sender_messages: u64,
     /// Lost messages that never reached this host.
     pub lost_before_host_messages: u64,
     /// Lost messages that failed IP reassembly on this host.

@@ -160,6 +160,7 @@ function Definition({ path }) {
 
 /** Places at which a message can be lost, in order of its path. */
 const STATIONS = /** @type {[string, string][]} */ ([
+  ['lost_at_sender_messages', 'at the sender'],
   ['lost_before_host_messages', 'before this host'],
   ['lost_in_reassembly_messages', 'in IP reassembly'],
   ['lost_in_socket_buffer_messages', 'in the socket buffer'],

@@ -500,6 +500,7 @@ fn delivered() -> Delivered {
         recovery_seconds: 0.25,
         unmatched: 4,
         irrelevant: 5,
+        lost_at_sender: 25,
         lost_before_host: 60,
         lost_in_reassembly: 20,
         lost_in_socket_buffer: 15,

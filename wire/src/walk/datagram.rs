@@ -72,6 +72,9 @@ impl Envelope {
         if self.host {
             flags |= flag::HOST;
         }
+        if self.logical_port != 0 {
+            flags |= flag::TCP;
+        }
         Record {
             time: self.time,
             destination: zerocopy::transmute!(self.destination),

@@ -226,6 +226,7 @@ fn delivered(it: &Delivered) -> String {
 /// Returns the causes of lost messages, as text.
 fn causes(it: &Delivered) -> String {
     let causes = [
+        ("at the sender", it.lost_at_sender_messages),
         ("before this host", it.lost_before_host_messages),
         ("in reassembly", it.lost_in_reassembly_messages),
         ("in full socket buffers", it.lost_in_socket_buffer_messages),
@@ -527,6 +528,7 @@ fn others(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>) {
 fn add(sum: &mut Delivered, one: &Delivered) {
     sum.messages += one.messages;
     sum.lost_messages += one.lost_messages;
+    sum.lost_at_sender_messages += one.lost_at_sender_messages;
     sum.lost_before_host_messages += one.lost_before_host_messages;
     sum.lost_in_reassembly_messages += one.lost_in_reassembly_messages;
     sum.lost_in_socket_buffer_messages += one.lost_in_socket_buffer_messages;

@@ -162,9 +162,9 @@ fn segments_that_tcp_sends_again_cost_no_message() -> Result<()> {
     // Packets of up to 64 KB, and packets of one segment.
     for most_segments in [64, 1] {
         let link = Link::new()?;
-        let inside = link.robot.inside().join(" ");
+        let outside = link.robot.outside().join(" ");
         run(&format!(
-            "{inside} ip link set {INTERFACE} gso_max_segs {most_segments}"
+            "{outside} ip link set {INTERFACE} gso_max_segs {most_segments}"
         ))?;
         let [small, _, large] = streams(link.robot.address());
         // One frame of this size is in a packet, and only its beginning leaves the kernel.
@@ -195,6 +195,45 @@ fn segments_that_tcp_sends_again_cost_no_message() -> Result<()> {
     }
     ensure!(all_dropped > 0, "nothing was dropped");
     Ok(())
+}
+
+/// Fast DDS overwrites samples that a slow connection has not taken.
+#[test]
+fn samples_that_the_sender_drops_are_lost_at_the_sender() -> Result<()> {
+    const SLOW: &str = "rate 40mbit burst 64kb latency 100ms";
+    let link = Link::new()?;
+    let outside = link.robot.outside().join(" ");
+    let [_, cloud, _] = streams(link.robot.address());
+    let stream = Stream {
+        size: 200_000,
+        rate: 100.0,
+        count: 300,
+        depth: 1,
+        asynchronous: true,
+        linger: 5.0,
+        ..cloud
+    };
+    let monitor = Observer::start(&link.monitor, &at_the_sockets_of(&link.monitor))?;
+    let (mut publisher, mut subscriber) = pair(&link.robot, &link.monitor, &stream)?;
+    let agent = &monitor.agent;
+    agent.scrape_until("both endpoints", |page| knows(page, &stream.topic))?;
+    run(&format!(
+        "{outside} tc qdisc add dev {INTERFACE} root tbf {SLOW}"
+    ))?;
+    publisher.go()?;
+    publisher.wait_sent(PATIENCE)?;
+    let page = agent.settled_scrape(&stream.topic, 1)?;
+    subscriber.process.terminate()?;
+    let log = subscriber.log()?;
+    let (received, missing) = (log.sequences("sub").len() as u64, log.missing());
+    ensure!(missing > 50, "only {missing} are missing");
+    let lost = |cause| {
+        let labels = [("topic", stream.topic.as_str()), ("cause", cause)];
+        page.sum("ros2_topic_delivery_lost_messages_total", &labels)
+    };
+    assert_eq!(count(&page, "delivered_messages", &stream.topic), received);
+    assert_eq!((lost("sender"), lost("before_host")), (missing as f64, 0.0));
+    nothing_was_dropped(&page)
 }
 
 #[test]

@@ -82,6 +82,8 @@ struct Options {
   // Fast DDS: use its default transports, and share histories.
   bool default_transport = false;
   bool data_sharing = false;
+  // Fast DDS: a thread sends the samples, and a write does not wait for it.
+  bool asynchronous = false;
   // Fast DDS: only TCP, with a listening address or an address to connect to (IPV4:PORT).
   std::string tcp_listen, tcp_peer;
   // Fast DDS: a second topic for the messages, as rmw_fastrtps of Lyrical has.
@@ -91,6 +93,7 @@ struct Options {
     enum { kRole = 1, kTopic, kSize, kRate, kCount, kReliable, kBestEffort, kTransientLocal, kDepth,
            kDomain, kGidSize, kNode, kLog, kPeers, kHold, kStretch, kLinger,
            kReceiveBuffer, kTransport, kDataSharing, kTcpListen, kTcpPeer, kBuffers,
+           kAsynchronous,
            kHelp };
     static const option names[] = {
         {"role", 1, nullptr, kRole},           {"topic", 1, nullptr, kTopic},
@@ -106,7 +109,7 @@ struct Options {
         {"stretch", 1, nullptr, kStretch},
         {"transport", 1, nullptr, kTransport}, {"data-sharing", 0, nullptr, kDataSharing},
         {"tcp-listen", 1, nullptr, kTcpListen}, {"tcp-peer", 1, nullptr, kTcpPeer},
-        {"buffers", 1, nullptr, kBuffers},
+        {"buffers", 1, nullptr, kBuffers},     {"asynchronous", 0, nullptr, kAsynchronous},
         {"help", 0, nullptr, kHelp},           {nullptr, 0, nullptr, 0}};
     Options options;
     bool role_given = false;
@@ -146,6 +149,7 @@ struct Options {
             fail("--transport is default or udp");
           break;
         case kDataSharing: options.data_sharing = true; break;
+        case kAsynchronous: options.asynchronous = true; break;
         case kTcpListen: options.tcp_listen = optarg; break;
         case kTcpPeer: options.tcp_peer = optarg; break;
         default:
@@ -154,7 +158,7 @@ struct Options {
                "  [--gid-size 24|16] [--node /ns/name]... [--log FILE] [--peers N] [--hold]\n"
                "  [--stretch SAMPLES] [--linger SECONDS] [--receive-buffer BYTES]\n"
                "  [--transport default|udp] [--data-sharing] [--tcp-listen IPV4:PORT | --tcp-peer IPV4:PORT]\n"
-               "  [--buffers cpu]");
+               "  [--buffers cpu] [--asynchronous]");
       }
     }
     if (!role_given) fail("--role pub|sub is missing");

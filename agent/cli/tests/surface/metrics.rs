@@ -256,9 +256,10 @@ fn metric_values_equal_the_snapshot() {
 }
 
 /// Name, cause and value of the sums by topic.
-const SUMS: [(&str, &str, &str); 13] = [
+const SUMS: [(&str, &str, &str); 14] = [
     ("ros2_topic_sent_messages_total", "", "1000"),
     ("ros2_topic_delivered_messages_total", "", "900"),
+    ("ros2_topic_delivery_lost_messages_total", "sender", "25"),
     (
         "ros2_topic_delivery_lost_messages_total",
         "before_host",
@@ -311,6 +312,12 @@ fn deliveries_are_summed_by_topic_and_shown_separately_if_a_watch_enables_it() {
             &received,
             "",
             "900",
+        ),
+        (
+            "ros2_subscriber_lost_messages_total",
+            &received,
+            "sender",
+            "25",
         ),
         (
             "ros2_subscriber_lost_messages_total",

@@ -44,9 +44,9 @@ pub const TOPIC_DELIVERED_BYTES: Metric = Metric::counter(
 pub const TOPIC_DELIVERY_LOST: Metric = Metric::counter(
     "ros2_topic_delivery_lost_messages_total",
     &["domain_id", "topic", "cause"],
-    "Messages that a subscriber on this host never received, by place of loss: before_host, \
-     reassembly or socket_buffer; and delivered ones that a process never took: reader_queue, if \
-     capture.inside observes its calls.",
+    "Messages that a subscriber on this host never received, by place of loss: sender (before its \
+     TCP connection), before_host, reassembly or socket_buffer; and delivered ones that a process \
+     never took: reader_queue, if capture.inside observes its calls.",
 );
 pub const TOPIC_DELIVERY_PENDING: Metric = Metric::gauge(
     "ros2_topic_delivery_pending_messages",

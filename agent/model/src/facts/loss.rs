@@ -11,6 +11,8 @@ use crate::facts::model_time::ModelTime;
 /// Where a sample was lost.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum LossCause {
+    /// The sender dropped the sample before its TCP connection, which loses and reorders nothing.
+    Sender,
     /// The sample did not reach this host: the network lost it, or it was sent elsewhere.
     BeforeHost,
     /// The kernel gave up reassembly, because some of its IP fragments did not arrive in time.
@@ -55,12 +57,18 @@ pub struct DeliveryLoss {
 
 impl LossCause {
     /// All causes, for exporting one series each.
-    pub const ALL: [Self; 3] = [Self::BeforeHost, Self::Reassembly, Self::SocketBuffer];
+    pub const ALL: [Self; 4] = [
+        Self::Sender,
+        Self::BeforeHost,
+        Self::Reassembly,
+        Self::SocketBuffer,
+    ];
 
     /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
+            Self::Sender => "sender",
             Self::BeforeHost => "before_host",
             Self::Reassembly => "reassembly",
             Self::SocketBuffer => "socket_buffer",

@@ -101,6 +101,8 @@ pub struct Delivered {
     /// Samples that the writer skipped (GAP), that were written while this receiver had no reader,
     /// or that its readers acknowledged although no copy was seen.
     pub irrelevant: u64,
+    /// Samples that the sender dropped before its TCP connection.
+    pub lost_at_sender: u64,
     /// Samples that never reached this host.
     pub lost_before_host: u64,
     /// Samples that failed IP reassembly on this host.
@@ -175,7 +177,11 @@ impl Delivered {
     /// Returns the number of samples that never arrived whole, for any cause. Never decreases.
     #[must_use]
     pub const fn lost(&self) -> u64 {
-        self.lost_before_host + self.lost_in_reassembly + self.lost_in_socket_buffer + self.pending
+        self.lost_at_sender
+            + self.lost_before_host
+            + self.lost_in_reassembly
+            + self.lost_in_socket_buffer
+            + self.pending
     }
 
     /// Returns the number of lost samples whose cause is known.
@@ -194,6 +200,7 @@ impl Delivered {
     #[must_use]
     pub const fn lost_by(&self, cause: LossCause) -> u64 {
         match cause {
+            LossCause::Sender => self.lost_at_sender,
             LossCause::BeforeHost => self.lost_before_host,
             LossCause::Reassembly => self.lost_in_reassembly,
             LossCause::SocketBuffer => self.lost_in_socket_buffer,
@@ -203,6 +210,7 @@ impl Delivered {
     /// Adds losses by this cause.
     pub const fn lose(&mut self, cause: LossCause, count: u64) {
         match cause {
+            LossCause::Sender => self.lost_at_sender += count,
             LossCause::BeforeHost => self.lost_before_host += count,
             LossCause::Reassembly => self.lost_in_reassembly += count,
             LossCause::SocketBuffer => self.lost_in_socket_buffer += count,
@@ -219,6 +227,7 @@ impl Delivered {
         self.unmatched += other.unmatched;
         self.duplicates += other.duplicates;
         self.irrelevant += other.irrelevant;
+        self.lost_at_sender += other.lost_at_sender;
         self.lost_before_host += other.lost_before_host;
         self.lost_in_reassembly += other.lost_in_reassembly;
         self.lost_in_socket_buffer += other.lost_in_socket_buffer;

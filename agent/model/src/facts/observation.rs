@@ -51,6 +51,8 @@ pub struct Head {
     pub socket: u64,
     /// Destination of the datagram.
     pub destination: Destination,
+    /// Source port of the TCP connection that carried it as RTPS; 0 for a datagram.
+    pub tcp_source_port: u16,
     /// Index of the interface; 0 = unknown.
     pub interface: u32,
     /// Bytes of the datagram's UDP payload, at most 65,535; 0 = unknown.

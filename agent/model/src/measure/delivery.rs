@@ -66,6 +66,9 @@ pub struct DeliveryContext<'a> {
     pub totals: &'a mut Totals,
 }
 
+/// A TCP connection that carries RTPS: the source port, and the route to the receiver.
+type Connection = (u16, Route);
+
 /// One delivery.
 #[derive(Debug)]
 pub struct Delivery {
@@ -96,6 +99,8 @@ pub struct Delivery {
     uses_network: bool,
     /// The latest losses, while the delivery is withheld.
     withheld: Option<Bounded<WithheldLosses, VecDeque<DeliveryLoss>>>,
+    /// The TCP connection of the newest sample, and the first number that only it carries.
+    connection: Option<(Connection, SequenceNumber)>,
     /// Number of samples that the writer's totals contain twice. Totals never decrease, so this many
     /// further samples are not added to them.
     counted_twice: u64,
@@ -122,6 +127,7 @@ impl Delivery {
             best_effort: false,
             uses_network: false,
             withheld: None,
+            connection: None,
             counted_twice: 0,
         }
     }
@@ -248,6 +254,7 @@ impl Delivery {
     ) -> (bool, Option<CompleteSample>) {
         self.touch(context.now);
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
+        self.connect(sample);
         if self.undelivered.is_empty() {
             return self.take(sample, context);
         }
@@ -434,6 +441,19 @@ impl Delivery {
         }
     }
 
+    /// Notes the TCP connection of this sample, if it has one. Samples of an earlier connection may
+    /// have been under way when it ended.
+    fn connect(&mut self, sample: &Sample) {
+        let head = &sample.head;
+        let connection = (head.tcp_source_port, head.route());
+        if head.tcp_source_port == 0 {
+            self.connection = None;
+        } else if self.connection.is_none_or(|(known, _)| known != connection) {
+            let from = self.next().max(sample.sequence_number);
+            self.connection = Some((connection, from));
+        }
+    }
+
     const fn is_reliable(&self, context: &DeliveryContext<'_>) -> bool {
         context.reliable && !self.best_effort
     }
@@ -611,6 +631,9 @@ impl Delivery {
             main: self.main,
             at: context.now,
             until,
+            in_order_from: self
+                .connection
+                .map_or(SequenceNumber::MAX, |(_, from)| from),
         };
         (&mut self.reception, context.budget, accounting)
     }

@@ -191,7 +191,8 @@ fn discovery_in_every_order_gives_the_same_figures() {
 }
 
 fn lost(delivered: &Delivered) -> u64 {
-    delivered.lost_before_host
+    delivered.lost_at_sender
+        + delivered.lost_before_host
         + delivered.lost_in_reassembly
         + delivered.lost_in_socket_buffer
         + delivered.pending

@@ -58,6 +58,8 @@ pub struct Stream {
     pub tcp: Option<SocketAddrV4>,
     /// Fast DDS: whether readers read the history of writers on their host.
     pub shares_history: bool,
+    /// Whether a thread of Fast DDS sends the samples, so that a slow connection delays no write.
+    pub asynchronous: bool,
     /// Whether the type has buffers, as in Lyrical, and the best backend that the peer accepts.
     pub buffers: Option<&'static str>,
 }
@@ -120,6 +122,7 @@ impl Stream {
             shares_memory: false,
             tcp: None,
             shares_history: false,
+            asynchronous: false,
             buffers: None,
         }
     }
@@ -262,6 +265,9 @@ impl Peer {
         }
         if stream.shares_history {
             words.push("--data-sharing".to_owned());
+        }
+        if stream.asynchronous {
+            words.push("--asynchronous".to_owned());
         }
         if stream.transient_local {
             words.push("--transient-local".to_owned());

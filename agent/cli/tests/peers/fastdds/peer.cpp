@@ -202,6 +202,7 @@ class Context {
     qos.history().depth = options_.depth;
     common(qos, options_.data_sharing);
     if (options_.buffers) accept_buffers(qos);
+    if (options_.asynchronous) qos.publish_mode().kind = ASYNCHRONOUS_PUBLISH_MODE;
     DataWriter* writer = nullptr;
     for (const std::string& topic : topics(ros_topic)) {
       DataWriter* added = publisher_->create_datawriter(create_topic(topic, cloud_type_), qos);

@@ -68,6 +68,7 @@ pub(super) fn delivered(facts: &snapshot::Delivered) -> Delivered {
         bytes: facts.bytes,
         recovered_messages: facts.recovered,
         lost_messages: facts.lost_by_any(),
+        lost_at_sender_messages: facts.lost_at_sender,
         lost_before_host_messages: facts.lost_before_host,
         lost_in_reassembly_messages: facts.lost_in_reassembly,
         lost_in_socket_buffer_messages: facts.lost_in_socket_buffer,

@@ -77,6 +77,10 @@ impl Head {
                 address: bytes(record.destination),
                 port: record.destination_port,
             },
+            tcp_source_port: match has(flag::TCP) {
+                true => record.source_port,
+                false => 0,
+            },
             interface: record.interface,
             datagram_len: record.datagram_len,
         }

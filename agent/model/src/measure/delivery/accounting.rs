@@ -66,6 +66,8 @@ pub(super) struct Accounting<'a> {
     pub(super) at: ModelTime,
     /// End of the time for which a new loss stays pending.
     pub(super) until: Option<ModelTime>,
+    /// Samples from this number on have one TCP connection; [`SequenceNumber::MAX`] without one.
+    pub(super) in_order_from: SequenceNumber,
 }
 
 impl Accounting<'_> {
@@ -92,8 +94,19 @@ impl Accounting<'_> {
             }
             match cause {
                 Some(cause) => self.lose(cause, first, last),
-                None => self.wait(first, last),
+                None => self.locate(first, last),
             }
+        }
+    }
+
+    /// Counts samples without a known cause. A gap within one TCP connection was left by the sender.
+    fn locate(&mut self, first: SequenceNumber, last: SequenceNumber) {
+        let from = self.in_order_from.max(first);
+        if from > first {
+            self.wait(first, last.min(from.previous()));
+        }
+        if from <= last {
+            self.lose(LossCause::Sender, from, last);
         }
     }
 

@@ -33,6 +33,7 @@ impl Delivery {
         let due = left_by(context.now - UNDER_WAY).filter(|_| !self.presumed_lost);
         let lost = left_by(until).filter(|number| *number >= self.next());
         if let Some(number) = lost.filter(|_| until >= since) {
+            self.connection = None;
             self.exists(number, context);
         }
         self.under_way = due.map_or(0, |due| due.next().steps_since(self.next()));
@@ -41,6 +42,7 @@ impl Delivery {
     /// Settles samples up to `newest`, which have left for this receiver and will not arrive.
     pub fn expect_no_more(&mut self, newest: SequenceNumber, context: &mut DeliveryContext<'_>) {
         if self.reception.sequence().started() && !self.presumed_lost {
+            self.connection = None;
             self.exists(newest, context);
         }
     }

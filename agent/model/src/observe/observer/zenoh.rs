@@ -265,6 +265,7 @@ fn observed(stream: &StreamId, at: ModelTime, sample: &ZenohSample<'_>) -> Sampl
             },
             socket: stream.socket,
             destination: stream.flow.destination,
+            tcp_source_port: 0,
             interface: stream.interface,
             datagram_len: 0,
         },

@@ -2,7 +2,7 @@
 
 use ros2probe_model::facts::loss::LossCause;
 use ros2probe_model::observe::input::Input;
-use ros2probe_testing::model::host::{BOB, Host};
+use ros2probe_testing::model::host::{BOB, CapturePoint, Host};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{flag, kind};
 
@@ -224,4 +224,69 @@ fn a_sample_that_never_arrives_at_a_live_receiver_is_lost_within_seconds() {
         host.wait(1000);
     }
     assert_eq!(host.losses(LossCause::BeforeHost), [18, 19, 20]);
+}
+
+/// Puts a sample of the TCP connection with this source port.
+fn by_tcp(host: &mut Host, seen: CapturePoint, source_port: u16, number: u64) {
+    let record = host.record(seen, kind::DATA, number);
+    host.put(Record {
+        flags: seen.flags | flag::TCP,
+        source_port,
+        ..record
+    });
+    host.wait(5);
+}
+
+#[test]
+fn a_gap_within_one_tcp_connection_is_the_senders() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    for number in [1, 2, 4, 5, 9, 10] {
+        by_tcp(&mut host, bob, 5100, number);
+    }
+    host.wait(12_000);
+    assert_eq!(host.losses(LossCause::Sender), [3, 6, 7, 8]);
+    assert!(host.losses(LossCause::BeforeHost).is_empty());
+    assert_eq!(host.deliveries()[0].delivered.lost_at_sender, 4);
+    // Datagrams may be lost on the network.
+    for number in [11, 13] {
+        host.data(bob, number);
+    }
+    host.wait(12_000);
+    assert_eq!(host.losses(LossCause::Sender), [3, 6, 7, 8]);
+    assert_eq!(host.losses(LossCause::BeforeHost), [12]);
+}
+
+#[test]
+fn a_sample_missing_between_two_tcp_connections_may_have_been_under_way() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    for (source_port, number) in [(5100, 1), (5100, 2), (5101, 5), (5101, 7)] {
+        by_tcp(&mut host, bob, source_port, number);
+    }
+    host.wait(12_000);
+    assert_eq!(host.losses(LossCause::BeforeHost), [3, 4]);
+    assert_eq!(host.losses(LossCause::Sender), [6]);
+}
+
+#[test]
+fn a_sample_that_entered_the_connection_was_not_dropped_before_it() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    let sent = bob.leaving();
+    for number in 1..=20 {
+        by_tcp(&mut host, sent, 5100, number);
+        if number <= 10 {
+            by_tcp(&mut host, bob, 5100, number);
+        }
+    }
+    for _ in 0..40 {
+        host.wait(1000);
+        host.acknack(bob, 11);
+    }
+    assert!(host.losses(LossCause::Sender).is_empty());
+    assert_eq!(
+        host.losses(LossCause::BeforeHost),
+        (11..=20).collect::<Vec<_>>()
+    );
 }

@@ -504,19 +504,25 @@ fn losses(all: &Circumstances<'_>) -> Vec<Finding> {
 /// Returns where most of a topic's messages were lost, if known, and the remedy.
 fn died(topic: &TopicFacts) -> (&'static str, &'static str) {
     let received = topic.received.as_deref();
-    let at = received.map_or([0; 3], |received| {
+    let at = received.map_or([0; 4], |received| {
         [
+            received.lost_at_sender,
             received.lost_before_host,
             received.lost_in_reassembly,
             received.lost_in_socket_buffer,
         ]
     });
     let most = at.iter().copied().max().unwrap_or_default();
-    let [before, reassembly, _] = at;
+    let [sender, before, reassembly, _] = at;
     if most == 0 {
         (
             "",
             "compare the loss of each subscriber on the topic's page; `rp doctor` checks buffers",
+        )
+    } else if most == sender {
+        (
+            ", most of them at the sender, before its TCP connection",
+            "send less over this link, or raise the publisher's history depth and TCP send buffer",
         )
     } else if most == before {
         (
