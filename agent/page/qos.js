@@ -32,6 +32,8 @@ function Owner({ endpoint }) {
 
 /** @param {{details: any, topic: import('./state.js').Topic}} props */
 export function Endpoints({ details, topic }) {
+  const hasBuffers = [...details.publishers, ...details.subscriptions].some(
+    (/** @type {any} */ each) => each.backends.length);
   const latches = details.publishers.some((/** @type {any} */ each) => each.latched);
   const row = (/** @type {any} */ endpoint, /** @type {boolean} */ publishes) => {
     const own = (publishes ? topic.publishers : topic.subscriptions)
@@ -42,6 +44,7 @@ export function Endpoints({ details, topic }) {
       <td><${Name} text=${[participant?.host, place].filter(Boolean).join(', ') || 'unknown'} /></td>
       <td>${endpoint.vendor ?? ''}</td>
       <td><${Name} text=${endpoint.message_type} /></td>
+      ${hasBuffers && html`<td><${Name} text=${endpoint.backends.join(', ')} /></td>`}
       ${publishes && html`<td class="number">${rate(endpoint.measurement?.rate_hertz)}</td>`}
       ${publishes && latches && html`<td>${endpoint.latched && lastMessage(endpoint.latched)}</td>`}
       <td><${Name} text=${endpoint.guid} /></td></tr>`;
@@ -52,6 +55,7 @@ export function Endpoints({ details, topic }) {
     <caption>${publishes ? 'Publishers' : 'Subscriptions'} (${count(list.length)})</caption>
     <thead><tr><th scope="col">Node</th><th scope="col">Where</th>
       <th scope="col">Implementation</th><th scope="col">Type</th>
+      ${hasBuffers && html`<th scope="col">Buffers in</th>`}
       ${publishes && html`<th scope="col" class="number">Rate</th>`}
       ${publishes && latches && html`<th scope="col">Last message</th>`}
       <th scope="col">GUID</th></tr></thead>

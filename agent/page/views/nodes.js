@@ -2,7 +2,7 @@
 
 import { useRef } from '../vendor/hooks.mjs';
 import { named } from '../api.js';
-import { bytes, calls, count, date, percent, several } from '../format.js';
+import { bytes, calls, count, date, duration, percent, several } from '../format.js';
 import { nodeKey } from '../graph-model.js';
 import { address } from '../router.js';
 import { replaceAddress, state, useLive, usePoll } from '../store.js';
@@ -14,6 +14,7 @@ import { Findings } from './overview.js';
 import { Incomplete } from './overview.js';
 
 const EVERY_MS = 2000;
+const LINKS_EVERY_MS = 5000;
 
 /** Services that identify a node with parameters. */
 const PARAMETER_SERVICES = ['list_parameters', 'get_parameters'];
@@ -131,7 +132,33 @@ export function Nodes({ query }) {
       onSort=${(/** @type {string} */ next) => change({ sort: next })} />
     ${!rows.length && html`<p class="empty">${state.nodes.size ? 'No node matches.'
       : 'No node is known.'}</p>`}
-    <${Incomplete} missing="their nodes may be missing here" />`;
+    <${Incomplete} missing="their nodes may be missing here" />
+    <${Links} />`;
+}
+
+/** TCP connections to other hosts that carry RTPS or Zenoh, the worst first. */
+function Links() {
+  const { data } = usePoll('participants', LINKS_EVERY_MS);
+  if (!data?.links.length) return null;
+  const again = (/** @type {any} */ link) =>
+    (link.sent_segments ? link.retransmitted_segments / link.sent_segments : 0);
+  const links = [...data.links].sort((one, other) => again(other) - again(one));
+  return html`<section aria-labelledby="links"><h2 id="links">TCP links to other hosts</h2>
+    <div class="scroll" tabindex="0" role="group" aria-labelledby="links"><table>
+    <thead><tr><th scope="col">From → to</th><th scope="col">Protocol</th>
+      <th scope="col" class="number">Connections</th><th scope="col" class="number">Round trip</th>
+      <th scope="col" class="number">Unacknowledged</th><th scope="col" class="number">Segments</th>
+      <th scope="col" class="number">Sent again</th></tr></thead>
+    <tbody>${links.map((/** @type {any} */ link) => html`
+      <tr key=${`${link.protocol} ${link.source} ${link.destination}`}>
+      <th scope="row">${link.source} → ${link.destination}</th>
+      <td>${link.protocol === 'rtps' ? 'RTPS' : 'Zenoh'}</td>
+      <td class="number">${count(link.connections)}</td>
+      <td class="number">${duration(link.round_trip_seconds)}</td>
+      <td class="number">${bytes(link.unacknowledged_bytes)}</td>
+      <td class="number">${count(link.sent_segments)}</td>
+      <td class="number">${count(link.retransmitted_segments)} (${percent(again(link))})</td></tr>`)}
+    </tbody></table></div></section>`;
 }
 
 /** @param {{name: string, query: Record<string, string>}} props */

@@ -159,12 +159,12 @@ function Definition({ path }) {
 }
 
 /** Places at which a message can be lost, in order of its path. */
-const STATIONS = /** @type {[string, string][]} */ ([
-  ['lost_at_sender_messages', 'at the sender'],
-  ['lost_before_host_messages', 'before this host'],
-  ['lost_in_reassembly_messages', 'in IP reassembly'],
-  ['lost_in_socket_buffer_messages', 'in the socket buffer'],
-  ['pending_messages', 'or late, not known so far'],
+const STATIONS = /** @type {[string, string, string][]} */ ([
+  ['lost_at_sender_messages', 'at the sender', 'lost-4'],
+  ['lost_before_host_messages', 'before this host', 'lost-0'],
+  ['lost_in_reassembly_messages', 'in IP reassembly', 'lost-1'],
+  ['lost_in_socket_buffer_messages', 'in the socket buffer', 'lost-2'],
+  ['pending_messages', 'or late, not known so far', 'lost-3'],
 ]);
 /** The last place: a message is delivered there, and then dropped. */
 const QUEUE = 'in the reader’s queue';
@@ -185,10 +185,13 @@ function Waterfall({ details }) {
         ? `${count(out)} messages left this host; what arrives elsewhere is seen there.`
         : 'No delivery to a subscriber’s socket has been seen yet.'}</p></section>`;
   }
+  // Only TCP shows what a sender drops.
+  const stations = STATIONS.filter(([key]) => key !== 'lost_at_sender_messages'
+    || received.some((/** @type {any} */ each) => each.delivered[key] > 0));
   return html`<section aria-labelledby="waterfall">${title}
     <div class="scroll" tabindex="0" role="group" aria-labelledby="waterfall"><table>
     <thead><tr><th scope="col">Publisher → subscriber</th><th scope="col" class="number">Sent</th>
-      ${[...STATIONS.map(([, name]) => name), QUEUE].map((name) => html`<th scope="col"
+      ${[...stations.map(([, name]) => name), QUEUE].map((name) => html`<th scope="col"
         class="number">Lost ${name}</th>`)}
       <th scope="col" class="number">Delivered</th><th scope="col">Share</th></tr></thead>
     <tbody>${received.map((/** @type {any} */ each) => {
@@ -203,7 +206,7 @@ function Waterfall({ details }) {
         <th scope="row"><${Name} text=${owners.get(each.writer) ?? each.writer} /> → <${Name}
           text=${who} /></th>
         <td class="number">${count(total)}</td>
-        ${STATIONS.map(([key]) => cell(delivered[key]))}
+        ${stations.map(([key]) => cell(delivered[key]))}
         ${cell(queue)}
         <td class="number">${count(delivered.messages - (queue ?? 0))}</td>
         <td><${Bar} delivered=${delivered} queue=${queue ?? 0} total=${total} /></td></tr>`;
@@ -226,7 +229,7 @@ function Bar({ delivered, queue, total }) {
   };
   return html`<svg class="bar" viewBox="0 0 160 12" aria-hidden="true">
     ${part(delivered.messages - queue, 'delivered')}
-    ${STATIONS.map(([key], at) => part(delivered[key], `lost-${at}`))}
+    ${STATIONS.map(([key, , kind]) => part(delivered[key], kind))}
     ${part(queue, 'lost-2')}</svg>
     ${' '}${percent((delivered.messages - queue) / total)}`;
 }

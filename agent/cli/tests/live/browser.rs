@@ -34,7 +34,7 @@ const CHAINS: &str = "chains:
   - {from: /camera, to: /steering, max_latency_ms: 100}
 ";
 /// Address of the page of an agent with a network namespace of its own.
-const PAGE: &str = "http://127.0.0.1:17401/";
+pub(crate) const PAGE: &str = "http://127.0.0.1:17401/";
 
 /// Configuration of the topics that are measured from the start.
 const SENSORS: &str = "watch: [/imu, /points, /scan]\n";

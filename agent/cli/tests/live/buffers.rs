@@ -1,6 +1,8 @@
 //! Peers that send images as Lyrical does: on topics of their own, which the nodes do not announce.
 //! Needs root.
 
+use crate::browser::PAGE;
+use crate::browser::player::watch;
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of, get};
 use ros2probe_testing::harness::network::Namespace;
@@ -118,7 +120,7 @@ fn messages_of_zenoh_with_buffers_count_once_whatever_its_subscriptions_accept()
     let page = agent.settled_scrape(TOPIC, 80)?;
     assert_eq!(counts(&page), [80, 80, 0]);
     assert_eq!(topic(&host)?["publishers"][0]["node"], "/camera");
-    Ok(())
+    watch(&host.outside(), "buffers", &[PAGE])
 }
 
 // Coverage: buffer topics, references | Zenoh 1.10 | as Lyrical | counted

@@ -3,6 +3,8 @@
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::time::Duration;
 
+use crate::browser::PAGE;
+use crate::browser::player::watch;
 use anyhow::{Context as _, Result, bail, ensure};
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::loss::Loss;
@@ -210,11 +212,11 @@ fn samples_that_the_sender_drops_are_lost_at_the_sender() -> Result<()> {
         count: 300,
         depth: 1,
         asynchronous: true,
-        linger: 5.0,
+        linger: 90.0,
         ..cloud
     };
     let monitor = Observer::start(&link.monitor, &at_the_sockets_of(&link.monitor))?;
-    let (mut publisher, mut subscriber) = pair(&link.robot, &link.monitor, &stream)?;
+    let (mut publisher, subscriber) = pair(&link.robot, &link.monitor, &stream)?;
     let agent = &monitor.agent;
     agent.scrape_until("both endpoints", |page| knows(page, &stream.topic))?;
     run(&format!(
@@ -223,7 +225,6 @@ fn samples_that_the_sender_drops_are_lost_at_the_sender() -> Result<()> {
     publisher.go()?;
     publisher.wait_sent(PATIENCE)?;
     let page = agent.settled_scrape(&stream.topic, 1)?;
-    subscriber.process.terminate()?;
     let log = subscriber.log()?;
     let (received, missing) = (log.sequences("sub").len() as u64, log.missing());
     ensure!(missing > 50, "only {missing} are missing");
@@ -233,7 +234,12 @@ fn samples_that_the_sender_drops_are_lost_at_the_sender() -> Result<()> {
     };
     assert_eq!(count(&page, "delivered_messages", &stream.topic), received);
     assert_eq!((lost("sender"), lost("before_host")), (missing as f64, 0.0));
-    nothing_was_dropped(&page)
+    nothing_was_dropped(&page)?;
+    watch(
+        &link.monitor.outside(),
+        "sender",
+        &[PAGE, &missing.to_string()],
+    )
 }
 
 #[test]
@@ -279,6 +285,8 @@ fn segments_that_a_link_sends_again_are_those_of_the_kernel_and_a_finding() -> R
     );
     publisher.wait_sent(PATIENCE)?;
     drop(loss);
+    let [from, to] = [source, destination].map(|address| address.to_string());
+    watch(&link.robot.outside(), "links", &[PAGE, &from, &to])?;
     // Segments may be under way, and heartbeats follow.
     wait_until("all retransmissions are counted", || {
         let all = Snmp::of(publisher.process.pid())?.retransmitted()? - before;
