@@ -24,6 +24,8 @@ const MAX_COMMAND: usize = 40;
 const NAMED: usize = 4;
 /// Name of the daemon of the `ros2` command line.
 const ROS2_DAEMON: &str = "ros2 daemon";
+/// Implementations whose messages pass only through shared memory that the agent does not read.
+const UNREAD: [&str; 2] = ["iceoryx", "iceoryx2"];
 /// Maximum number of ROS processes inspected.
 const MAX_PROCESSES: usize = 2000;
 
@@ -34,6 +36,8 @@ struct Process {
     command: String,
     variables: Variables,
     implementation: Option<&'static str>,
+    /// Whether it can exchange messages by Agnocast, beside its RMW.
+    has_agnocast: bool,
     /// Domain of its participant.
     domain_id: Option<u32>,
 }
@@ -114,6 +118,8 @@ impl Processes {
     pub fn check(&self, host: &HostState) -> Vec<Finding> {
         let mut findings = vec![self.overview()];
         findings.extend(self.unseen(host.is_root()));
+        findings.extend(self.unread_implementations());
+        findings.extend(self.agnocast());
         let domains = self.differing(
             "domain",
             "nodes in different domains do not see each other",
@@ -197,6 +203,36 @@ impl Processes {
             true => finding,
             false => finding.remedy("sudo rp doctor"),
         })
+    }
+
+    /// Warns if the messages of a process are never visible.
+    fn unread_implementations(&self) -> Option<Finding> {
+        let unread = |process: &&Process| {
+            let own = process.implementation;
+            own.is_some_and(|implementation| UNREAD.contains(&implementation))
+        };
+        let unread: Vec<_> = self.found.iter().filter(unread).collect();
+        let implementation = unread.first()?.implementation?;
+        let sentence = format!(
+            "messages of {implementation} stay in shared memory that the agent does not read: {}",
+            names(&unread)
+        );
+        let finding = Finding::new(AREA, "unread_rmw", Severity::Warning, sentence);
+        let finding = finding.seen(implementation, format!("/proc/{}/maps", unread.first()?.id));
+        Some(finding.remedy("rp inside    # counts their callbacks, with capture.inside"))
+    }
+
+    /// Notes the processes that may exchange messages by Agnocast.
+    fn agnocast(&self) -> Option<Finding> {
+        let found = self.found.iter().filter(|process| process.has_agnocast);
+        let found: Vec<_> = found.collect();
+        let first = found.first()?;
+        let sentence = format!(
+            "of messages by Agnocast, only those that its bridge passes on are visible: {}",
+            names(&found)
+        );
+        let finding = Finding::new(AREA, "agnocast", Severity::Note, sentence);
+        Some(finding.seen("libagnocast", format!("/proc/{}/maps", first.id)))
     }
 
     fn overview(&self) -> Finding {
@@ -309,7 +345,8 @@ fn read_process(
     domain_id: Option<u32>,
 ) -> Result<Option<Process>, Unread> {
     let map = host.files.bytes(&format!("/proc/{id}/maps"), MAX_MAP)?;
-    let implementation = implementation(&String::from_utf8_lossy(&map));
+    let map = String::from_utf8_lossy(&map);
+    let implementation = implementation(&map);
     if implementation.is_none() && domain_id.is_none() {
         return Ok(None);
     }
@@ -319,13 +356,22 @@ fn read_process(
         command,
         variables: Variables::parse(&variables),
         implementation,
+        has_agnocast: names_of_files(&map).any(|name| name.starts_with("libagnocast")),
         domain_id,
     }))
 }
 
+/// Returns the names of the files in a memory map.
+fn names_of_files(map: &str) -> impl Iterator<Item = &str> {
+    map.lines().filter_map(|line| {
+        let path = line.find('/').and_then(|at| line.get(at..))?;
+        path.rsplit('/').next()
+    })
+}
+
 /// Returns the RMW implementation of the mapped libraries; `None` if no library belongs to one.
 fn implementation(map: &str) -> Option<&'static str> {
-    const LIBRARIES: [(&str, &str); 7] = [
+    const LIBRARIES: [(&str, &str); 9] = [
         ("librmw_zenoh_cpp.so", "Zenoh"),
         ("libddsc.so", "Cyclone DDS"),
         ("librmw_cyclonedds_cpp.so", "Cyclone DDS"),
@@ -333,12 +379,10 @@ fn implementation(map: &str) -> Option<&'static str> {
         ("libnddsc.so", "Connext"),
         ("librmw_connextdds.so", "Connext"),
         ("librmw_gurumdds_cpp.so", "GurumDDS"),
+        ("librmw_iceoryx_cpp.so", "iceoryx"),
+        ("librmw_iceoryx2_cxx.so", "iceoryx2"),
     ];
-    let names = map.lines().filter_map(|line| {
-        let path = line.find('/').and_then(|at| line.get(at..))?;
-        path.rsplit('/').next()
-    });
-    let mut found: Vec<_> = names
+    let mut found: Vec<_> = names_of_files(map)
         .filter_map(|name| {
             let by_name = LIBRARIES.iter().find(|(library, _)| {
                 let rest = name.strip_prefix(library);
@@ -564,6 +608,45 @@ mod tests {
             (finding.severity, finding.remedies.len()),
             (Severity::Note, 0)
         );
+    }
+
+    // Coverage: iceoryx2 | rmw_iceoryx2 | - | named
+    #[test]
+    fn processes_whose_messages_stay_in_unread_shared_memory_are_named() {
+        const ICEORYX2: &str = "7f00-7f01 r-xp 0 fe:00 12 /ws/lib/librmw_iceoryx2_cxx.so\n";
+        let findings = found(
+            &[
+                (11, "talker", "ROS_DOMAIN_ID=3", ICEORYX2),
+                (12, "listener", "ROS_DOMAIN_ID=3", ICEORYX2),
+            ],
+            &[],
+        );
+        assert_eq!(
+            sentence(&findings, "unread_rmw"),
+            Some(
+                "messages of iceoryx2 stay in shared memory that the agent does not read: \
+                 talker (11), listener (12)"
+            )
+        );
+        let dds = found(&[(11, "talker", "ROS_DOMAIN_ID=3", FAST)], &[]);
+        assert_eq!(sentence(&dds, "unread_rmw"), None);
+        assert_eq!(sentence(&dds, "agnocast"), None);
+    }
+
+    // Coverage: Agnocast | Agnocast 2 | - | named
+    #[test]
+    fn processes_with_agnocast_are_named() {
+        let map = format!("{FAST}7f02-7f03 r-xp 0 fe:00 13 /ws/lib/libagnocast_heaphook.so\n");
+        let findings = found(
+            &[
+                (11, "camera", "ROS_DOMAIN_ID=3", &map),
+                (12, "listener", "ROS_DOMAIN_ID=3", FAST),
+            ],
+            &[],
+        );
+        let named = sentence(&findings, "agnocast").unwrap();
+        assert!(named.ends_with("are visible: camera (11)"), "{named}");
+        assert_eq!(sentence(&findings, "unread_rmw"), None);
     }
 
     #[test]
