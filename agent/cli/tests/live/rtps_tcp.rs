@@ -1,17 +1,21 @@
 //! Fast DDS participants that use only TCP. Needs root.
 
-use std::net::{Ipv4Addr, SocketAddrV4};
+use std::io::Write as _;
+use std::net::{Ipv4Addr, SocketAddrV4, TcpListener, TcpStream};
 use std::time::Duration;
 
 use crate::browser::PAGE;
 use crate::browser::player::watch;
 use anyhow::{Context as _, Result, bail, ensure};
+use ros2probe_capture::netns;
+use ros2probe_testing::forged::{Carrier, Talker, introduce, talk};
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::snmp::Snmp;
 use ros2probe_testing::harness::{run, wait_until};
+use ros2probe_wire::rtps_tcp::{HEADER_LEN, MAGIC};
 use tempfile::TempDir;
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -314,6 +318,70 @@ fn counts_on_an_interface_equal_the_logs() -> Result<()> {
     let counted = ["messages", "lost_messages"].map(|what| count(&page, what, &small.topic));
     assert_eq!(counted, [sent, 0]);
     Ok(())
+}
+
+/// Connections that carry the messages of one participant in turn, as frames of RTPS.
+struct Connections {
+    /// Both ends of each. Nobody reads what arrives; it fits the buffers.
+    ends: Vec<[TcpStream; 2]>,
+    turn: usize,
+}
+
+impl Connections {
+    fn open(host: &Namespace, count: usize) -> Result<Self> {
+        let connect = || -> Result<_> {
+            let listener = TcpListener::bind("127.0.0.1:0")?;
+            let pair = |_| {
+                let client = TcpStream::connect(listener.local_addr()?)?;
+                client.set_nodelay(true)?;
+                Ok([client, listener.accept()?.0])
+            };
+            (0..count).map(pair).collect()
+        };
+        let ends = host.hold(|| netns::within(&host.network(), connect))???;
+        Ok(Self { ends, turn: 0 })
+    }
+}
+
+impl Carrier for Connections {
+    fn carry(&mut self, payload: &[u8]) -> Result<()> {
+        const USER_DATA: [u8; 2] = 7411_u16.to_le_bytes();
+        let length = u32::try_from(HEADER_LEN + payload.len())?;
+        let frame = [
+            &MAGIC[..],
+            &length.to_le_bytes(),
+            &[0; 4],
+            &USER_DATA,
+            payload,
+        ];
+        self.turn = (self.turn + 1) % self.ends.len();
+        let [client, _] = &mut self.ends[self.turn];
+        client.write_all(&frame.concat())?;
+        Ok(())
+    }
+}
+
+#[test]
+fn a_thousand_connections_are_read() -> Result<()> {
+    const CONNECTIONS: usize = 1000;
+    const ROUNDS: usize = 5;
+    let host = Namespace::alone()?;
+    let observer = Observer::start(&host, &at_the_sockets_of(&host))?;
+    let mut connections = Connections::open(&host, CONNECTIONS)?;
+    let mut talker = Talker::new(1, "/crowd");
+    introduce(&talker, &mut connections)?;
+    let agent = &observer.agent;
+    agent.scrape_until("the writer", |page| {
+        page.value("ros2_topic_publishers", &[("topic", "/crowd")]) == Some(1.0)
+    })?;
+    let sent = CONNECTIONS * ROUNDS;
+    talk(&mut talker, &mut connections, vec![100; sent])?;
+    let page = agent.settled_scrape("/crowd", sent as u64)?;
+    let counted = ["messages", "lost_messages", "duplicate_messages"];
+    let counted = counted.map(|what| count(&page, what, "/crowd"));
+    // Each one is seen where it is sent and where it arrives.
+    assert_eq!(counted, [sent as u64, 0, 0], "{}", page.0);
+    nothing_was_dropped(&page)
 }
 
 #[test]
