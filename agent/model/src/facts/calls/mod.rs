@@ -4,4 +4,5 @@ pub mod durations;
 pub mod facts;
 pub mod late;
 pub mod other_thread;
+mod parts;
 pub mod report;
