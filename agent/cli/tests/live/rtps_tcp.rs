@@ -322,7 +322,7 @@ fn counts_on_an_interface_equal_the_logs() -> Result<()> {
 
 /// Connections that carry the messages of one participant in turn, as frames of RTPS.
 struct Connections {
-    /// Both ends of each. Nobody reads what arrives; it fits the buffers.
+    /// Both ends of each. The test reads no end: the bytes fit the buffers.
     ends: Vec<[TcpStream; 2]>,
     turn: usize,
 }
