@@ -31,6 +31,16 @@ pub enum Role {
     Subscriber,
 }
 
+impl Role {
+    /// Returns the value of `--role`.
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Role::Publisher => "pub",
+            Role::Subscriber => "sub",
+        }
+    }
+}
+
 /// Samples that the publisher sends and the subscriber expects.
 #[derive(Clone, Debug)]
 pub struct Stream {
@@ -212,11 +222,7 @@ impl Peer {
         nodes: &[&str],
     ) -> Result<Peer> {
         let directory = tempfile::tempdir().context("cannot create a directory for the log")?;
-        let role_name = match role {
-            Role::Publisher => "pub",
-            Role::Subscriber => "sub",
-        };
-        let options = ["--role", role_name, "--topic", &stream.topic, "--hold"];
+        let options = ["--role", role.name(), "--topic", &stream.topic, "--hold"];
         let options = options.into_iter();
         let mut words: Vec<String> = stack
             .script()

@@ -84,19 +84,12 @@ impl Library {
         let mut command = Command::new(program);
         command
             .args(words)
-            .args(["--capabilities", "--role", name(role)]);
+            .args(["--capabilities", "--role", role.name()]);
         let output = command.output().context("cannot run a peer")?;
         let all: Value = serde_json::from_slice(&output.stdout)
             .with_context(|| format!("{command:?} printed no capabilities"))?;
         let capability = all[capability].as_bool();
         capability.with_context(|| format!("{command:?}: {all}"))
-    }
-}
-
-fn name(role: Role) -> &'static str {
-    match role {
-        Role::Publisher => "pub",
-        Role::Subscriber => "sub",
     }
 }
 
@@ -107,7 +100,7 @@ impl Shape {
         let directory = tempfile::tempdir().context("cannot create a directory for the log")?;
         let (program, words) = library.command()?;
         let mut words: Vec<String> = words.iter().map(|word| (*word).to_owned()).collect();
-        words.extend(["--role".to_owned(), name(role).to_owned()]);
+        words.extend(["--role".to_owned(), role.name().to_owned()]);
         if role == Role::Publisher {
             words.extend(["--hold", "--color"].map(str::to_owned));
             words.push(library.color());
