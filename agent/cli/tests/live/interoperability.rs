@@ -304,43 +304,37 @@ fn match_none(
     let case = Case {
         offset,
         capabilities,
-        offered: offered.to_owned(),
-        requested: requested.to_owned(),
+        offered: format!("{FINITE} {offered}"),
+        requested: format!("{FINITE} {requested}"),
     };
     Round::new()?.match_none(&case, policy)
 }
 
 #[test]
 fn a_best_effort_publisher_is_the_reported_reason() -> Result<()> {
-    let qos = [
-        "--deadline 10000 --best-effort",
-        "--deadline 10000 --reliable",
-    ];
-    match_none(2, &[], qos, "RELIABILITY")
+    match_none(2, &[], ["--best-effort", "--reliable"], "RELIABILITY")
 }
 
 #[test]
 fn a_volatile_publisher_is_the_reported_reason() -> Result<()> {
-    let qos = [
-        "--deadline 10000 --durability volatile",
-        "--deadline 10000 --durability transient-local",
-    ];
+    let qos = ["--durability volatile", "--durability transient-local"];
     match_none(4, &[], qos, "DURABILITY")
 }
 
 #[test]
 fn a_longer_deadline_of_a_publisher_is_the_reported_reason() -> Result<()> {
-    let qos = ["--deadline 20000", "--deadline 10000"];
+    let qos = ["--deadline 20000", ""];
     match_none(5, &["deadline"], qos, "DEADLINE")
 }
 
 #[test]
 fn an_exclusive_publisher_is_the_reported_reason() -> Result<()> {
-    let qos = [
-        "--deadline 10000 --ownership-strength 5",
-        "--deadline 10000",
-    ];
-    match_none(1, &["ownership"], qos, "OWNERSHIP")
+    match_none(
+        1,
+        &["ownership"],
+        ["--ownership-strength 5", ""],
+        "OWNERSHIP",
+    )
 }
 
 #[test]
