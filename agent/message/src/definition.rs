@@ -124,14 +124,7 @@ impl Definition {
     }
 
     pub(super) fn new(name: TypeName, text: Arc<str>, written: Vec<Structure>) -> Self {
-        let uses = written
-            .iter()
-            .flat_map(|structure| &structure.fields)
-            .filter_map(|field| match &field.element {
-                Element::Nested(nested) if nested.kind() == Kind::Message => Some(nested.clone()),
-                _ => None,
-            })
-            .collect();
+        let uses = uses(&written);
         let implied = implicit_types(&name);
         let structures = written.into_iter().chain(implied).map(Arc::new).collect();
         Self {
@@ -141,6 +134,28 @@ impl Definition {
             uses,
         }
     }
+
+    /// Returns the definition of one structure, without the types that its name implies.
+    pub(super) fn of_structure(text: Arc<str>, structure: Structure) -> Self {
+        let name = structure.name.clone();
+        let uses = uses(std::slice::from_ref(&structure));
+        Self {
+            name,
+            text,
+            structures: vec![Arc::new(structure)],
+            uses,
+        }
+    }
+}
+
+/// Returns the message types that these structures name.
+fn uses(written: &[Structure]) -> BTreeSet<TypeName> {
+    let fields = written.iter().flat_map(|structure| &structure.fields);
+    let nested = fields.filter_map(|field| match &field.element {
+        Element::Nested(nested) if nested.kind() == Kind::Message => Some(nested.clone()),
+        _ => None,
+    });
+    nested.collect()
 }
 
 /// A type and all types nested in it.

@@ -11,9 +11,9 @@ use crate::definition::{Element, MessageType, Shape, Structure};
 
 /// `type_description_interfaces/msg/FieldType`: offset of an array type's number from its
 /// element's.
-const ARRAY: u8 = 48;
-const BOUNDED: u8 = 96;
-const UNBOUNDED: u8 = 144;
+pub(crate) const ARRAY: u8 = 48;
+pub(crate) const BOUNDED: u8 = 96;
+pub(crate) const UNBOUNDED: u8 = 144;
 
 impl MessageType {
     /// Returns `RIHS01_` and 64 hexadecimal digits, as discovery announces it.

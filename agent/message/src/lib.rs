@@ -36,6 +36,7 @@ pub mod library;
 mod name;
 pub mod python;
 pub mod truncation;
+pub mod type_description;
 pub mod value;
 pub mod yaml;
 

@@ -1,21 +1,26 @@
-//! Sources of definitions, in order: named directories, an installed ROS, embedded definitions.
+//! Sources of definitions, in order: named directories, an installed ROS, embedded definitions,
+//! descriptions from nodes.
 //!
 //! Two machines may have different definitions of one name. If discovery announces a type's hash,
 //! the definition must match it, whichever source has it; a mismatching one is never used.
 
-mod definition_source;
-mod search;
+pub(crate) mod definition_source;
+mod described;
+pub(crate) mod search;
 
 use std::collections::HashMap;
 use std::ffi::OsStr;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use crate::definition::parse::ParseError;
 use crate::definition::{MessageType, NotClosed, TypeName};
 use crate::dialect::Dialect;
 use crate::library::definition_source::DefinitionSource;
+use crate::library::described::Described;
+pub use crate::library::described::DescribedFigures;
 use crate::library::search::Search;
 
 /// Directory of ROS installations, one subdirectory per distribution.
@@ -87,6 +92,9 @@ fn installed(directory: &Path, dialect: Dialect) -> Vec<PathBuf> {
 pub struct Library {
     definition_sources: Vec<DefinitionSource>,
     kept: Mutex<CachedDefinition>,
+    described: Described,
+    /// Number of descriptions so far.
+    revision: AtomicU64,
 }
 
 #[derive(Debug, Default)]
@@ -198,6 +206,8 @@ impl Library {
         Self {
             definition_sources,
             kept: Mutex::default(),
+            described: Described::default(),
+            revision: AtomicU64::new(0),
         }
     }
 
@@ -225,9 +235,58 @@ impl Library {
         if let Some(found) = kept {
             return Ok(found);
         }
-        let found = Arc::new(Search::new(&self.definition_sources, &key.0).run(key.1.as_deref())?);
-        self.keep(key, found.clone());
-        Ok(found)
+        match Search::new(&self.definition_sources, &key.0).run(key.1.as_deref()) {
+            Ok(found) => {
+                let found = Arc::new(found);
+                self.keep(key, found.clone());
+                Ok(found)
+            }
+            Err(reason) => self.find_described(key, reason),
+        }
+    }
+
+    /// Returns the type as a node described it. Fails with `reason` if no source has the type.
+    fn find_described(
+        &self,
+        key: (TypeName, Option<String>),
+        reason: NotFound,
+    ) -> Result<Arc<MessageType>, NotFound> {
+        let (name, announced) = key;
+        match self.described.find(&name, announced.as_deref()) {
+            Ok(found) => Ok(found),
+            Err(Some(found)) if matches!(reason, NotFound::Nowhere { .. }) => {
+                Err(NotFound::Another {
+                    name,
+                    location: "that a node described".to_owned(),
+                    found,
+                    announced: announced.unwrap_or_default(),
+                })
+            }
+            Err(_) => Err(reason),
+        }
+    }
+
+    /// Offers the response of a node's service `get_type_description`, a payload that begins with
+    /// its encapsulation header. It is read when a lookup finds no definition elsewhere.
+    pub fn offer(&self, response: Arc<[u8]>) {
+        self.described.offer(response);
+        self.revision.fetch_add(1, Ordering::Release);
+    }
+
+    /// Adds a type from another library.
+    pub fn add(&self, message_type: MessageType) {
+        self.described.add(message_type);
+        self.revision.fetch_add(1, Ordering::Release);
+    }
+
+    /// Returns a number that increases when a lookup that failed may succeed.
+    pub fn revision(&self) -> u64 {
+        self.revision.load(Ordering::Acquire)
+    }
+
+    /// Returns the counts of descriptions.
+    pub fn described_figures(&self) -> DescribedFigures {
+        self.described.figures()
     }
 
     fn keep(&self, key: (TypeName, Option<String>), found: Arc<MessageType>) {

@@ -29,6 +29,7 @@ pub mod pseudo_terminal;
 pub mod rotel;
 pub mod sample_robot;
 pub mod truth;
+pub mod type_description;
 pub mod viewer;
 pub mod zenoh;
 
