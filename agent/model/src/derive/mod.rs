@@ -5,3 +5,4 @@ pub mod examiner;
 pub mod inside;
 pub mod services;
 pub mod trace;
+pub mod type_descriptions;

@@ -43,6 +43,9 @@ const MAX_BYTES_PER_SECOND: usize = 4 << 20;
 /// Time for which a writer above the maximum is not captured.
 const SUSPENDED: Duration = Duration::from_secs(10);
 
+/// End of the name of a node's service for descriptions of types (REP-2016).
+const TYPE_DESCRIPTION: &str = "/get_type_description";
+
 /// Domain and ROS name of a service or action.
 type Key = (DomainId, TopicName);
 
@@ -65,6 +68,8 @@ pub struct Services {
 struct ServiceWriter {
     half: Half,
     service: Arc<ServiceName>,
+    /// Whether it sends responses of `get_type_description`.
+    describes_types: bool,
     /// Second of the source's clock in which `bytes` were captured.
     second: u64,
     bytes: usize,
@@ -126,6 +131,7 @@ impl Services {
         };
         let writer = ServiceWriter {
             half,
+            describes_types: half == Half::Replies && naming.name.ends_with(TYPE_DESCRIPTION),
             service: Arc::new(service),
             second: 0,
             bytes: 0,
@@ -165,6 +171,13 @@ impl Services {
     #[must_use]
     pub fn follows(&self, guid: Guid) -> bool {
         self.writers.contains_key(&guid)
+    }
+
+    /// Returns whether this writer sends responses of `get_type_description`.
+    #[must_use]
+    pub fn describes_types(&self, guid: Guid) -> bool {
+        let writer = self.writers.get(&guid);
+        writer.is_some_and(|writer| writer.describes_types)
     }
 
     /// Reads the identity of a captured request or reply. Returns whether its writer has exceeded

@@ -184,4 +184,6 @@ pub struct Output {
     pub chain_spans: ChainSpans,
     /// Late calls of callbacks.
     pub late_calls: NewLateCalls,
+    /// Responses of `get_type_description`, each with its encapsulation header.
+    pub type_descriptions: Vec<Arc<[u8]>>,
 }

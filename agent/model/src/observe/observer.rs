@@ -41,6 +41,7 @@ use crate::derive::examiner::Examiner;
 use crate::derive::inside::Inside;
 use crate::derive::services::Services;
 use crate::derive::trace::{Tracer, WriterDescription};
+use crate::derive::type_descriptions::TypeDescriptions;
 use crate::facts::event::TEXT;
 use crate::facts::journal::Journal;
 use crate::facts::measurement::Measurement;
@@ -137,6 +138,7 @@ pub(crate) struct Derive {
     pub(crate) chains: Chains,
     pub(crate) tracer: Tracer,
     pub(crate) examiner: Examiner,
+    type_descriptions: TypeDescriptions,
 }
 
 /// Counts of the input.
@@ -197,6 +199,7 @@ impl Observer {
                 chains: Chains::default(),
                 tracer: Tracer::new(settings.directed),
                 examiner: Examiner::default(),
+                type_descriptions: TypeDescriptions::default(),
             },
             zenoh: Zenoh::default(),
             references: References::default(),
@@ -283,6 +286,7 @@ impl Observer {
             spans: self.derive.tracer.take(self.graph.wall_clock),
             chain_spans: self.derive.chains.take_spans(),
             late_calls: self.derive.inside.take_late_calls(),
+            type_descriptions: self.derive.type_descriptions.take(),
         };
         self.keep_dispatched(&output.samples);
         self.zenoh_interest(&mut output.interest);
@@ -304,7 +308,9 @@ impl Observer {
     /// Returns whether so much output waits that it should be drained before further input.
     #[must_use]
     pub fn has_much_output(&self) -> bool {
-        self.measure.payloads.is_full() || self.journal.events.are_many()
+        self.measure.payloads.is_full()
+            || self.journal.events.are_many()
+            || self.derive.type_descriptions.are_many()
     }
 
     /// Returns which content of shared memory the model needs at present.

@@ -448,9 +448,10 @@ pub struct WatchedTopicFacts {
 /// Number of parse failures of one kind.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DecodeErrorCount {
-    /// Stage of parsing: `frame`, `rtps`, `spdp`, `sedp`, `entities`, `request`.
+    /// Stage of parsing: `frame`, `rtps`, `spdp`, `sedp`, `entities`, `request`,
+    /// `type_description`.
     pub stage: &'static str,
-    /// Reason, from [`ros2probe_wire::Reason::label`].
+    /// Reason, from [`ros2probe_wire::Reason::label`], or `hash_mismatch`.
     pub reason: &'static str,
     /// Number of failures.
     pub count: u64,

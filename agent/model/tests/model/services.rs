@@ -1,6 +1,7 @@
 //! Calls of services and goals of actions, in virtual time.
 
 mod caps;
+mod descriptions;
 mod fixtures;
 mod paths;
 

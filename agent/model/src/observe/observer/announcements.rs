@@ -39,6 +39,7 @@ impl Observer {
             self.read(found, sample, vendor, &origin);
             self.follow_up(origin.at);
             self.identify_call(found, sample, vendor);
+            self.keep_description(found, sample, vendor);
             self.keep_payload(sample, found.payload);
         }
     }

@@ -7,7 +7,7 @@ use ros2probe_wire::walk::Found;
 
 use super::Observer;
 use crate::facts::model_time::ModelTime;
-use crate::facts::observation::Sample;
+use crate::facts::observation::{Content, Sample};
 
 impl Observer {
     /// Reads the identity of a captured request or reply.
@@ -17,6 +17,36 @@ impl Observer {
             Ok(is_over_budget) => self.follow_call(writer, is_over_budget),
             Err(error) => self.decode_error("request", error.reason),
         }
+    }
+
+    /// Keeps a captured response of `get_type_description` once it is whole.
+    pub(super) fn keep_description(
+        &mut self,
+        found: &Found<'_>,
+        sample: &Sample,
+        vendor: VendorId,
+    ) {
+        let (writer, number) = (sample.head.writer, sample.sequence_number);
+        if !self.derive.services.describes_types(writer)
+            || !sample.is_message()
+            || self.derive.type_descriptions.has(writer, number)
+        {
+            return;
+        }
+        let whole;
+        let payload = match sample.content {
+            Content::Data { .. } => found.payload,
+            Content::DataFrag(fragments) => {
+                let fragmented = &mut self.measure.discovery_fragments;
+                let Some(bytes) = fragmented.put(sample, fragments, found.payload) else {
+                    return;
+                };
+                whole = bytes;
+                &whole
+            }
+        };
+        let descriptions = &mut self.derive.type_descriptions;
+        descriptions.add(writer, number, Some(vendor), payload);
     }
 
     /// Stops capturing a writer of requests or replies that has exceeded its budget.

@@ -214,6 +214,10 @@ impl Observer {
             self.follow_call(writer, is_over);
         }
         let payload = sample.payload.whole();
+        if let Some(payload) = payload.filter(|_| self.derive.services.describes_types(writer)) {
+            let descriptions = &mut self.derive.type_descriptions;
+            descriptions.add(writer, sample.number, None, payload);
+        }
         if let Some(payload) = payload.filter(|_| sample.referring.is_none()) {
             self.keep_payload(&observed, payload);
         }
