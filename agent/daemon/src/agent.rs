@@ -158,6 +158,7 @@ impl Components<'_> {
                 exports: sources.exports,
                 exports_late_calls: config.otlp.late_calls,
             },
+            library: Arc::clone(&library),
         };
         let run = Run::new(
             self.source,

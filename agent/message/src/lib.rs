@@ -2,6 +2,7 @@
 //!
 //! - [`Library`] finds a type's definition by name and announced hash, in directories, an installed
 //!   ROS or the embedded definitions, and returns a [`MessageType`].
+//!   [`Library::offer`] takes descriptions of types from nodes.
 //! - [`decode()`] decodes a CDR payload of that type into a [`Value`] tree that borrows from it.
 //! - [`yaml`], [`csv`] and [`python`] print values as `ros2 topic echo` prints them; [`Truncation`]
 //!   limits their length. [`filter`] evaluates an expression over a message.

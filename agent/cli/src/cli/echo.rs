@@ -103,8 +103,8 @@ impl Echo {
             known.map_err(|_| UserError("The passed message type is invalid".to_owned()))?;
         }
         let domain_id = self.target.domain()?;
-        let types = Types::new(self.printing.library(&self.target));
         let agent = Agent::reach_stream(&self.target)?;
+        let types = Types::with_agent(self.printing.library(&self.target), &agent, domain_id);
         let mut output = Output::new();
 
         // A capture's topics are complete only after its end.
@@ -125,7 +125,7 @@ impl Echo {
         if let Some(expected) = expected.as_deref().filter(|_| !options.raw) {
             let publishers = known.as_ref().map(|known| known.publishers.as_slice());
             let hash = publishers.and_then(|publishers| publishers.first()?.type_hash.as_deref());
-            types.find(expected, hash)?;
+            types.find_for(&name, expected, hash)?;
         }
         if let Some(known) = &known {
             hint(&name, known, expected.as_deref());
@@ -208,7 +208,7 @@ struct Printer<'a> {
     domain_id: u32,
     name: &'a str,
     is_raw: bool,
-    types: Types,
+    types: Types<'a>,
     echo: echo::Echo,
     lost: Lost,
     output: Output,

@@ -4,11 +4,13 @@ use std::collections::HashMap;
 use std::io::IsTerminal as _;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use bytes::Bytes;
 use clap::Args;
 use ros2probe::client::{Agent, ClientError, Target};
+use ros2probe_api::messages::Definition;
 use ros2probe_api::path::encoded;
 use ros2probe_api::problem::Code;
 use ros2probe_api::samples::{Line, Missed, Sample};
@@ -25,6 +27,8 @@ use super::notes::Notes;
 pub(crate) const AGENT_ENDED: &str = "the agent has ended: `systemctl status ros2probe` shows why, `rp run` starts one in a terminal";
 /// Note at the end of a replay.
 pub(crate) const END_OF_CAPTURE: &str = "end of capture";
+/// Minimum interval of requests for a definition that the agent does not have.
+const RETRY: Duration = Duration::from_secs(1);
 /// Maximum number of writers with a remembered type.
 const MAX_WRITERS: usize = 1024;
 
@@ -181,19 +185,66 @@ pub(crate) fn topic(agent: &Agent, domain_id: u32, name: &str) -> Result<Option<
 }
 
 /// Definitions for the messages of each writer.
-pub(crate) struct Types {
+pub(crate) struct Types<'a> {
     library: Library,
+    /// The agent that may have other definitions, and the domain of the topics.
+    agent: Option<(&'a Agent, u32)>,
+    /// When the agent last had no definition.
+    failed: Option<Instant>,
     writers: HashMap<String, Option<Arc<MessageType>>>,
     /// Types without a definition; each is reported once.
     undefined: Vec<String>,
 }
 
-impl Types {
+impl<'a> Types<'a> {
     pub(crate) fn new(library: Library) -> Self {
         Self {
             library,
+            agent: None,
+            failed: None,
             writers: HashMap::new(),
             undefined: Vec::new(),
+        }
+    }
+
+    /// Returns definitions that also come from the agent. It has those that nodes described, and
+    /// may have other packages installed.
+    pub(crate) fn with_agent(library: Library, agent: &'a Agent, domain_id: u32) -> Self {
+        Self {
+            agent: Some((agent, domain_id)),
+            ..Self::new(library)
+        }
+    }
+
+    /// Returns the definition of a topic's type.
+    pub(crate) fn find_for(
+        &self,
+        topic: &str,
+        name: &str,
+        hash: Option<&str>,
+    ) -> Result<Arc<MessageType>> {
+        if self.library.find(name, hash).is_err() {
+            self.learn(topic);
+        }
+        self.find(name, hash)
+    }
+
+    /// Adds the agent's definition of a topic's type. The library returns it only for its hash.
+    fn learn(&self, topic: &str) {
+        let Some((agent, domain_id)) = self.agent else {
+            return;
+        };
+        let topic = encoded(topic.strip_prefix('/').unwrap_or(topic));
+        let path = format!("/topics/{topic}/definition?domain_id={domain_id}");
+        if let Ok(Definition {
+            name,
+            definition: Some(text),
+            ..
+        }) = agent.get(&path)
+            && let Ok(root) = name.parse()
+            && let Ok(found) = MessageType::parse(&root, &text)
+        {
+            self.library.add(found);
         }
     }
 
@@ -211,7 +262,16 @@ impl Types {
         }
         let offered = sample.offered.as_ref();
         let hash = offered.and_then(|offered| offered.type_hash.as_deref());
-        let found = match self.library.find(&sample.message_type, hash) {
+        let mut found = self.library.find(&sample.message_type, hash);
+        if found.is_err() && self.agent.is_some() {
+            // A node may describe the type at any time.
+            if self.failed.is_some_and(|at| at.elapsed() < RETRY) {
+                return None;
+            }
+            self.learn(&sample.topic);
+            found = self.library.find(&sample.message_type, hash);
+        }
+        let found = match found {
             Ok(found) => Some(found),
             Err(error) => {
                 let text = error_chain(&error);
@@ -225,6 +285,10 @@ impl Types {
                 None
             }
         };
+        if found.is_none() && self.agent.is_some() {
+            self.failed = Some(Instant::now());
+            return None;
+        }
         if self.writers.len() < MAX_WRITERS {
             self.writers.insert(sample.writer.clone(), found.clone());
         }
@@ -236,7 +300,7 @@ impl Types {
 /// type, do not pass; stderr reports each such type once.
 pub(crate) struct MessageFilter {
     filter: Filter,
-    types: Types,
+    types: Types<'static>,
     is_reported: bool,
 }
 

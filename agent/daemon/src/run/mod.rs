@@ -26,12 +26,13 @@ pub use capture_time::CaptureTime;
 use ros2probe_capture::live::{CaptureError, LiveSource};
 use ros2probe_capture::pcap::PcapError;
 use ros2probe_capture::system::give_back_memory;
+use ros2probe_message::library::{DescribedFigures, Library};
 use ros2probe_metrics::otlp::SpanSink;
 use ros2probe_model::facts::selection::SampleRequest;
 use ros2probe_model::measure::history::History;
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Observer;
-use ros2probe_model::report::snapshot::Snapshot;
+use ros2probe_model::report::snapshot::{DecodeErrorCount, Snapshot, TableFacts};
 pub use source::{Source, probe};
 
 /// Maximum time for which a replay runs without checking commands.
@@ -103,6 +104,8 @@ pub struct Outputs {
     pub limits: Arc<LimitFigures>,
     /// Receives spans of sampled messages.
     pub spans: SpanSink,
+    /// Receives descriptions of types.
+    pub library: Arc<Library>,
 }
 
 impl Run {
@@ -291,6 +294,9 @@ impl Run {
             live.want_late(&demand);
         }
         self.outputs.events.add(output.events, now);
+        for response in output.type_descriptions {
+            self.outputs.library.offer(response);
+        }
         let spans = &self.outputs.spans;
         spans.add(output.spans, output.chain_spans, &output.late_calls);
         let clock = self.observer.dispatched_until(now);
@@ -379,6 +385,9 @@ impl Run {
         let revision = self.observer.memory_revision();
         let mut snapshot = self.observer.snapshot(self.source.clock());
         snapshot.tables.extend(self.source.tables());
+        let described = self.outputs.library.described_figures();
+        snapshot.tables.push(table(&described));
+        snapshot.decode_errors.extend(decode_errors(&described));
         if let Some(history) = &self.history {
             snapshot.tables.push(history.table());
             // A reader that waits for this state may read the last seconds next.
@@ -429,6 +438,31 @@ impl Run {
         }
         facts
     }
+}
+
+/// Returns the use of the table of described types.
+const fn table(described: &DescribedFigures) -> TableFacts {
+    TableFacts {
+        table: "type_descriptions",
+        size: described.types as u64,
+        limit: DescribedFigures::MAX_TYPES as u64,
+        bytes: Some((described.bytes as u64, DescribedFigures::MAX_BYTES as u64)),
+        evictions: described.evicted,
+    }
+}
+
+/// Returns the number of descriptions that could not be used, by reason.
+fn decode_errors(described: &DescribedFigures) -> impl Iterator<Item = DecodeErrorCount> + use<> {
+    let counts = [
+        ("bad_value", described.refused),
+        ("hash_mismatch", described.mismatched),
+    ];
+    let counts = counts.into_iter().filter(|(_, count)| *count > 0);
+    counts.map(|(reason, count)| DecodeErrorCount {
+        stage: "type_description",
+        reason,
+        count,
+    })
 }
 
 /// Copies the model's list of participants to the kernel filter.

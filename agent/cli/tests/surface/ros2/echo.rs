@@ -2,6 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
+use ros2probe_message::MessageType;
+use ros2probe_testing::model::capture::{Capture, ETHERNET};
+use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
+use ros2probe_testing::type_description::{Response, described, field};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 use serde::Deserialize;
 
 use super::{fails_with, run, stderr, stdout};
@@ -233,4 +238,84 @@ fn action_echo_prints_feedback_and_states_with_every_middleware() {
             assert_eq!((stdout(&again), stderr(&again).as_str()), (said, ""));
         }
     }
+}
+
+const THING: &str = "my_msgs/msg/Thing";
+
+/// Writes a capture of Cyclone DDS: a node describes its type, then publishes a message. Discovery
+/// announces this hash of the type.
+fn described_capture(path: &Path, hash: &str) {
+    const START: u64 = 1_700_000_000_000_000_000;
+    const MILLISECOND: u64 = 1_000_000;
+    let talker = GuidPrefix([1, 0x10, 0, 0, 0, 0, 0, 0, 0, 0, 1, 1]);
+    let [things, replies] = [1, 2].map(|number| Guid::new(talker, EntityId([0, 0, number, 3])));
+    let mut capture = Capture::new(ETHERNET);
+    capture.participant(START, 0, talker);
+    let user_data = format!("typehash={hash};");
+    let length = u32::try_from(user_data.len()).unwrap().to_le_bytes();
+    let mut user_data = [&length[..], user_data.as_bytes()].concat();
+    user_data.resize(user_data.len().next_multiple_of(4), 0);
+    let announcements = [
+        (things, "rt/things", "my_msgs::msg::dds_::Thing_"),
+        (
+            replies,
+            "rr/talker/get_type_descriptionReply",
+            "type_description_interfaces::srv::dds_::GetTypeDescription_Response_",
+        ),
+    ];
+    for (number, (guid, topic, name)) in (1..).zip(announcements) {
+        let payload = forge::endpoint_with(guid, topic, name, &[(0x2c, &user_data)]);
+        let message = Message::from(talker).data(SEDP_WRITERS, number, &payload);
+        capture.put(START + number * MILLISECOND, 0, message);
+    }
+    let thing = described(THING, &[field("count", 6), field("label", 17)]);
+    let response = Response::of(&[thing]).payload();
+    // The identity of the request, as rmw_cyclonedds writes it.
+    let response = [&response[..4], &[7; 16], &response[4..]].concat();
+    let message = Message::from(talker).data(replies.entity, 1, &response);
+    capture.put(START + 100 * MILLISECOND, 0, message);
+    for number in 1..=3_u64 {
+        let payload = [
+            &[0, 1, 0, 0, number as u8, 0, 0, 0, 3, 0, 0, 0][..],
+            b"hi\0\0",
+        ]
+        .concat();
+        let message = Message::from(talker).data(things.entity, number, &payload);
+        capture.put(START + (1000 + number * 100) * MILLISECOND, 0, message);
+    }
+    capture.write(path);
+}
+
+#[test]
+fn a_type_without_an_installed_package_is_echoed_after_a_node_described_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("described.pcap");
+    let expected = MessageType::parse(&THING.parse().unwrap(), "int32 count\nstring label\n");
+    described_capture(&path, &expected.unwrap().type_hash());
+    let capture = path.to_str().unwrap();
+    let echoed = run(&["topic", "echo", "/things", "--replay", capture]);
+    let expected: String = (1..=3)
+        .map(|number| format!("count: {number}\nlabel: hi\n---\n"))
+        .collect();
+    assert_eq!(stdout(&echoed), expected, "{}", stderr(&echoed));
+}
+
+#[test]
+fn a_description_with_another_hash_than_the_announced_one_is_not_used() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("mismatched.pcap");
+    described_capture(&path, &format!("RIHS01_{}", "0".repeat(64)));
+    let echoed = run(&[
+        "topic",
+        "echo",
+        "/things",
+        "--replay",
+        path.to_str().unwrap(),
+    ]);
+    let text = stderr(&echoed);
+    assert!(stdout(&echoed).is_empty());
+    assert!(
+        text.contains("no definition of my_msgs/msg/Thing here"),
+        "{text}"
+    );
 }

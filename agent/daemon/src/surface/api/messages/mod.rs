@@ -94,6 +94,8 @@ struct Known {
     name: TypeName,
     hash: Option<TypeHash>,
     found: Option<Arc<MessageType>>,
+    /// Revision of the library. A node may describe the type later.
+    revision: u64,
 }
 
 /// The definition of a topic's type
@@ -118,7 +120,7 @@ pub(super) async fn definition(
     name: &str,
     domain: Domain,
 ) -> Result<Response, Problem> {
-    let state = context.latest.state();
+    let state = context.state().await;
     let topic = find(state.known(), name, domain.checked()?)?;
     let hash = topic.type_hashes.first().map(ToString::to_string);
     let name = topic.message_types.first().cloned().unwrap_or_default();
@@ -322,9 +324,11 @@ impl Stream {
         let name = &sample.topic.message_type;
         let offered = sample.topic.offered.as_ref();
         let hash = offered.and_then(|offered| offered.type_hash);
+        let revision = self.context.library.revision();
         if let Some(known) = &self.known
             && known.name == *name
             && known.hash == hash
+            && (known.found.is_some() || known.revision == revision)
         {
             return known.found.clone();
         }
@@ -340,6 +344,7 @@ impl Stream {
             name: name.clone(),
             hash,
             found: found.clone(),
+            revision,
         });
         found
     }
