@@ -4,14 +4,17 @@ use super::*;
 
 const ADD: [EntityId; 2] = [EntityId([0, 5, 1, 3]), EntityId([0, 5, 2, 3])];
 const GOALS: [EntityId; 2] = [EntityId([0, 5, 3, 3]), EntityId([0, 5, 4, 3])];
+const DESCRIPTIONS: [EntityId; 2] = [EntityId([0, 5, 5, 3]), EntityId([0, 5, 6, 3])];
 
-/// Announces the writers of requests and replies of one service and one action.
+/// Announces the writers of requests and replies of two services and one action.
 fn announce(observer: &mut Observer) {
     let topics = [
         (ADD[0], "rq/addRequest"),
         (ADD[1], "rr/addReply"),
         (GOALS[0], "rq/fib/_action/send_goalRequest"),
         (GOALS[1], "rr/fib/_action/send_goalReply"),
+        (DESCRIPTIONS[0], "rq/talker/get_type_descriptionRequest"),
+        (DESCRIPTIONS[1], "rr/talker/get_type_descriptionReply"),
     ];
     let payload = forge::participant(ALICE, 1_000_000, Some(0));
     let mut messages = vec![Message::from(ALICE).data(SPDP, 1, &payload)];
@@ -47,8 +50,9 @@ pub(super) fn calls(observer: &mut Observer, dice: &mut Dice, now: u64) {
         &[1; 3000],
     ]
     .concat();
-    let [requests, replies] = match dice.pick(4) {
-        0 => GOALS,
+    let [requests, replies] = match dice.pick(8) {
+        0 | 1 => GOALS,
+        2 => DESCRIPTIONS,
         _ => ADD,
     };
     let message = Message::from(ALICE);
