@@ -189,9 +189,8 @@ pub(crate) struct Types<'a> {
     library: Library,
     /// The agent that may have other definitions, and the domain of the topics.
     agent: Option<(&'a Agent, u32)>,
-    /// When the agent last had no definition.
-    failed: Option<Instant>,
-    writers: HashMap<String, Option<Arc<MessageType>>>,
+    /// The definition of each writer's type, or the time at which no source had one.
+    writers: HashMap<String, Result<Arc<MessageType>, Instant>>,
     /// Types without a definition; each is reported once.
     undefined: Vec<String>,
 }
@@ -201,7 +200,6 @@ impl<'a> Types<'a> {
         Self {
             library,
             agent: None,
-            failed: None,
             writers: HashMap::new(),
             undefined: Vec::new(),
         }
@@ -257,17 +255,16 @@ impl<'a> Types<'a> {
 
     /// Returns the definition for a message; `None` if there is no definition of its type.
     pub(crate) fn of(&mut self, sample: &Sample) -> Option<Arc<MessageType>> {
-        if let Some(known) = self.writers.get(&sample.writer) {
-            return known.clone();
+        match self.writers.get(&sample.writer) {
+            Some(Ok(known)) => return Some(Arc::clone(known)),
+            // A node may describe the type to the agent at any time.
+            Some(Err(at)) if self.agent.is_none() || at.elapsed() < RETRY => return None,
+            _ => {}
         }
         let offered = sample.offered.as_ref();
         let hash = offered.and_then(|offered| offered.type_hash.as_deref());
         let mut found = self.library.find(&sample.message_type, hash);
-        if found.is_err() && self.agent.is_some() {
-            // A node may describe the type at any time.
-            if self.failed.is_some_and(|at| at.elapsed() < RETRY) {
-                return None;
-            }
+        if found.is_err() {
             self.learn(&sample.topic);
             found = self.library.find(&sample.message_type, hash);
         }
@@ -285,12 +282,9 @@ impl<'a> Types<'a> {
                 None
             }
         };
-        if found.is_none() && self.agent.is_some() {
-            self.failed = Some(Instant::now());
-            return None;
-        }
-        if self.writers.len() < MAX_WRITERS {
-            self.writers.insert(sample.writer.clone(), found.clone());
+        if self.writers.len() < MAX_WRITERS || self.writers.contains_key(&sample.writer) {
+            let known = found.clone().ok_or_else(Instant::now);
+            self.writers.insert(sample.writer.clone(), known);
         }
         found
     }
