@@ -8,14 +8,13 @@ use crate::browser::PAGE;
 use crate::browser::player::watch;
 use anyhow::{Context as _, Result, bail, ensure};
 use ros2probe_capture::netns;
-use ros2probe_testing::forged::{Carrier, Talker, introduce, talk};
+use ros2probe_testing::forged::{Carrier, Talker, framed, introduce, talk};
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::snmp::Snmp;
 use ros2probe_testing::harness::{run, wait_until};
-use ros2probe_wire::rtps_tcp::{HEADER_LEN, MAGIC};
 use tempfile::TempDir;
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -345,18 +344,9 @@ impl Connections {
 
 impl Carrier for Connections {
     fn carry(&mut self, payload: &[u8]) -> Result<()> {
-        const USER_DATA: [u8; 2] = 7411_u16.to_le_bytes();
-        let length = u32::try_from(HEADER_LEN + payload.len())?;
-        let frame = [
-            &MAGIC[..],
-            &length.to_le_bytes(),
-            &[0; 4],
-            &USER_DATA,
-            payload,
-        ];
         self.turn = (self.turn + 1) % self.ends.len();
         let [client, _] = &mut self.ends[self.turn];
-        client.write_all(&frame.concat())?;
+        client.write_all(&framed(payload))?;
         Ok(())
     }
 }

@@ -216,6 +216,16 @@ pub fn talk(
     Ok(())
 }
 
+/// Returns the frame in which Fast DDS sends a message of user data by TCP, without a checksum.
+pub fn framed(message: &[u8]) -> Vec<u8> {
+    let mut frame = b"RTCP".to_vec();
+    frame.extend((message.len() as u32 + 14).to_le_bytes());
+    frame.extend([0; 4]);
+    frame.extend(7411_u16.to_le_bytes());
+    frame.extend(message);
+    frame
+}
+
 /// Appends a DATA submessage (RTPS 2.5, 9.4.5.3).
 pub fn data(bytes: &mut Vec<u8>, writer: [u8; 4], number: u32, payload: &[u8]) {
     let length = u16::try_from(20 + payload.len()).unwrap_or(0);

@@ -1,5 +1,6 @@
 //! Connections of RTPS: each message is seen where it is sent and where it arrives.
 
+use ros2probe_testing::forged::framed;
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
@@ -81,15 +82,6 @@ fn frames(capture: &str) -> Result<Vec<Vec<Sent>>> {
         });
     }
     Ok(found.into_iter().map(|(_, sent)| sent).collect())
-}
-
-fn framed(message: &[u8]) -> Vec<u8> {
-    let mut frame = b"RTCP".to_vec();
-    frame.extend((message.len() as u32 + 14).to_le_bytes());
-    frame.extend([0; 4]);
-    frame.extend(7411_u16.to_le_bytes());
-    frame.extend(message);
-    frame
 }
 
 /// A DATA of a writer, with an INFO_TS before and a HEARTBEAT after it.
