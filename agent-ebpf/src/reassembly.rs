@@ -262,7 +262,8 @@ pub extern "C" fn lost(payload: u64, linear: u32) -> u32 {
         Step::Endpoint => {}
     }
     let record = &this.walk.record;
-    if record.kind != kind::DATA && record.kind != kind::DATA_FRAG {
+    if record.kind != kind::DATA && record.kind != kind::DATA_FRAG && record.kind != kind::DATA_BATCH
+    {
         return 1;
     }
     match walk::fate(record) {

@@ -14,7 +14,7 @@ use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 use crate::guid::{Guid, GuidPrefix};
 use crate::time::{RtpsTime, Timestamp};
 
-pub use body::{AckNack, Body, Data, DataFrag, Gap, Heartbeat, Sample, SequenceNumberSet};
+pub use body::{AckNack, Batch, Body, Data, DataFrag, Gap, Heartbeat, Sample, SequenceNumberSet};
 
 /// Submessage kinds (RTPS 2.5, 9.4.5.1.1) and those specific to this ABI.
 pub mod kind {
@@ -30,6 +30,8 @@ pub mod kind {
     pub const DATA: u8 = SubmessageId::DATA.0;
     /// DATA_FRAG: some fragments of one sample.
     pub const DATA_FRAG: u8 = SubmessageId::DATA_FRAG.0;
+    /// DATA_BATCH of RTI Connext: several samples.
+    pub const DATA_BATCH: u8 = SubmessageId::DATA_BATCH.0;
     /// Not a submessage: the fragmented datagram [`super::Record::datagram`] is complete, and all
     /// records written ahead for it are valid.
     pub const COMPLETE: u8 = 0xf0;
@@ -62,11 +64,11 @@ pub mod flag {
     /// [`super::Record::socket`].
     pub const HOST: u16 = 1 << 6;
     /// A copy of a record with the same time, because the datagram was dropped at the socket's full
-    /// buffer. DATA and DATA_FRAG only.
+    /// buffer. DATA, DATA_FRAG and DATA_BATCH only.
     pub const SOCKET_FULL: u16 = 1 << 7;
     /// The datagram never became complete: the kernel timed out waiting for IP fragments
     /// (`net.ipv4.ipfrag_time`, 30 s), or had no memory for them. The record is written then, for
-    /// the submessages in the first fragment. DATA and DATA_FRAG only; `socket` is 0.
+    /// the submessages in the first fragment. DATA, DATA_FRAG and DATA_BATCH only; `socket` is 0.
     pub const NOT_REASSEMBLED: u16 = 1 << 8;
     /// The message was read from shared memory between processes of this host, which is sampled.
     /// Missing samples may have been sent, unless [`EXACT`] is set.
@@ -100,7 +102,8 @@ pub struct Record {
     pub writer: [u32; 4],
     /// Reader GUID: INFO_DST's prefix and the submessage's reader id, both zero when unspecified.
     pub reader: [u32; 4],
-    /// DATA, DATA_FRAG: writer SN. HEARTBEAT: firstSN. GAP: gapStart. ACKNACK: base.
+    /// DATA, DATA_FRAG: writer SN. HEARTBEAT: firstSN. GAP: gapStart. ACKNACK: base. DATA_BATCH:
+    /// number of the first sample.
     pub sequence_number: u64,
     /// INFO_TS in force, `seconds << 32 | fraction`; 0 = none. See [`RtpsTime`].
     pub source_timestamp: u64,
@@ -122,7 +125,8 @@ pub struct Record {
     /// Bits of [`flag`].
     pub flags: u16,
     /// DATA, DATA_FRAG: bytes of serialized payload in this submessage, encapsulation included.
-    /// HEARTBEAT: lastSN high word. GAP: gapList base high word. HANDOVER: walk offset.
+    /// HEARTBEAT: lastSN high word. GAP: gapList base high word. HANDOVER: walk offset. DATA_BATCH:
+    /// bytes of all samples.
     pub payload_len: u32,
     /// DATA, DATA_FRAG: encapsulation identifier and options, as a big-endian number; 0 if the
     /// payload's first bytes are not in this submessage. HEARTBEAT: lastSN low. GAP: base low.
@@ -134,11 +138,13 @@ pub struct Record {
     /// Payload bytes 8..12 in the same byte order: `Header.stamp.nanosec`. GAP, ACKNACK: bitmap
     /// word 0.
     pub stamp_nanoseconds: u32,
-    /// DATA_FRAG: fragmentStartingNum, 1-based. GAP, ACKNACK: bitmap word 1.
+    /// DATA_FRAG: fragmentStartingNum, 1-based. GAP, ACKNACK: bitmap word 1. DATA_BATCH: number of
+    /// samples.
     pub fragment_start: u32,
     /// DATA_FRAG: fragmentsInSubmessage << 16 | fragmentSize. GAP, ACKNACK: bitmap word 2.
     pub fragments: u32,
-    /// DATA_FRAG: sampleSize. GAP, ACKNACK: bitmap word 3.
+    /// DATA_FRAG: sampleSize. GAP, ACKNACK: bitmap word 3. DATA_BATCH: distance of the last sample's
+    /// number from the first's.
     pub sample_size: u32,
     /// DATA, DATA_FRAG: PID_STATUS_INFO of the inline QoS, 0 = alive. GAP, ACKNACK: bitmap word 4.
     pub status_info: u32,

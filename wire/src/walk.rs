@@ -7,7 +7,8 @@
 //! order, no formatting.
 //!
 //! The walk follows the receiver state of RTPS 2.5, 8.3.4 (INFO_SRC, INFO_DST, INFO_TS) and skips
-//! unknown submessages by their length. It reads at most twelve bytes of a payload.
+//! unknown submessages by their length. It reads at most twelve bytes of a payload. DATA_BATCH of
+//! RTI Connext is in no specification; its fields are those that Wireshark's dissector names.
 
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
@@ -216,6 +217,8 @@ pub fn step<B: Bytes>(walk: &mut Walk, bytes: &B, present: u32) -> Step {
     }
     let found = if id == kind::DATA as u32 || id == kind::DATA_FRAG as u32 {
         data(walk, bytes, present, order, id, flags, body, end)
+    } else if id == kind::DATA_BATCH as u32 {
+        batch(walk, bytes, present, order, flags, body, end)
     } else if id == kind::HEARTBEAT as u32 {
         heartbeat(walk, bytes, present, order, flags, body, end)
     } else if id == kind::GAP as u32 || id == kind::ACKNACK as u32 {
@@ -403,6 +406,57 @@ fn data<B: Bytes>(
         walk.record.stamp_nanoseconds = contents.word(nanoseconds);
         walk.record.flags |= flag::STAMP;
     }
+    Step::Endpoint
+}
+
+/// Length of DATA_BATCH's fields before its inline QoS.
+const BATCH_FIXED: u32 = 36;
+/// Minimum length of a sample's entry in the list of DATA_BATCH: flags, octetsToInlineQos and the
+/// serialized length.
+const BATCH_ENTRY: u32 = 8;
+
+/// Reads DATA_BATCH, whose body has extraFlags and octetsToInlineQos, readerId, writerId, the
+/// batch's number, the first sample's number, the distance of the last sample's number, the number
+/// of samples, an inline QoS with flag Q, the length of the list of samples, that list, and the
+/// samples.
+#[inline(always)]
+fn batch<B: Bytes>(
+    walk: &mut Walk,
+    bytes: &B,
+    present: u32,
+    order: Order,
+    flags: u32,
+    body: u32,
+    end: u32,
+) -> Step {
+    if body + BATCH_FIXED > end {
+        return Step::Malformed;
+    }
+    let [reader, writer] = read!(walk, bytes, present, body + EXTRA_LEN, 2);
+    let [high, low, last, count] = read!(walk, bytes, present, body + 20, 4);
+    let (last, count) = (order.word(last), order.word(count));
+    let mut at = body + BATCH_FIXED;
+    if count > (end - at) / BATCH_ENTRY || count > 0 && last < count - 1 {
+        return Step::Malformed;
+    }
+    endpoint(walk, kind::DATA_BATCH as u32, flags, writer, reader);
+    walk.record.sequence_number = order.long(high, low);
+    walk.record.fragment_start = count;
+    walk.record.sample_size = last;
+    if flags & INLINE_QOS != 0 {
+        walk.record.flags |= flag::INLINE_QOS_UNREAD;
+    } else {
+        if at + 4 > end {
+            return Step::Malformed;
+        }
+        let [list] = read!(walk, bytes, present, at, 1);
+        at += 4;
+        if order.word(list) > end - at {
+            return Step::Malformed;
+        }
+        at += order.word(list);
+    }
+    walk.record.payload_len = end - at;
     Step::Endpoint
 }
 

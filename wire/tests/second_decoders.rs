@@ -28,7 +28,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use flate2::Crc;
-use ros2probe_wire::{Endianness, Guid, SequenceNumber};
+use ros2probe_wire::walk::{self, Envelope};
+use ros2probe_wire::{Endianness, Guid, SequenceNumber, record};
 
 use entry::oracle::submessage::{Data, DataFrag};
 use entry::oracle::{Body, Message, Submessage};
@@ -342,4 +343,64 @@ fn tshark_decodes_the_same_submessages_and_payloads() {
         let theirs: Vec<_> = theirs.collect();
         assert_equal(&capture, &ours(&capture, as_tshark), &theirs);
     }
+}
+
+/// Returns a capture file of one UDP datagram (libpcap, LINKTYPE_RAW).
+fn capture_of(payload: &[u8]) -> Vec<u8> {
+    let length = u16::try_from(payload.len()).unwrap();
+    let mut packet = vec![0x45, 0];
+    packet.extend((28 + length).to_be_bytes());
+    packet.extend([0, 1, 0, 0, 64, 17, 0, 0, 127, 0, 0, 1, 127, 0, 0, 1]);
+    for half in [7411, 7411, 8 + length, 0] {
+        packet.extend(half.to_be_bytes());
+    }
+    packet.extend(payload);
+    let mut file = 0xa1b2_c3d4_u32.to_le_bytes().to_vec();
+    file.extend([2, 0, 4, 0]);
+    let length = u32::try_from(packet.len()).unwrap();
+    for word in [0, 0, 65_535, 101, 1, 0, length, length] {
+        file.extend(u32::to_le_bytes(word));
+    }
+    file.extend(packet);
+    file
+}
+
+/// No implementation of DATA_BATCH is available here, so tshark alone confirms the fields.
+#[test]
+fn tshark_finds_the_same_samples_in_batches() {
+    let message = include_bytes!("data/rti-batches.bin");
+    let file = tempfile::NamedTempFile::new().unwrap();
+    fs::write(file.path(), capture_of(message)).unwrap();
+    let mut tshark = Command::new("tshark");
+    tshark.args(["-n", "-T", "fields", "-r"]).arg(file.path());
+    let columns = [
+        "rtps.sm.wrEntityId",
+        "rtps.sm.seqNumber",
+        "rtps.data_batch.offset_to_last_sample_sn",
+        "rtps.data_batch.sample_count",
+    ];
+    for column in columns {
+        tshark.args(["-e", column]);
+    }
+    let text = output(&mut tshark);
+    let theirs: Vec<Vec<_>> = text
+        .trim()
+        .split('\t')
+        .map(|cell| cell.split(',').map(str::to_owned).collect())
+        .collect();
+    let mut ours = vec![Vec::new(); 4];
+    walk::datagram(message, &Envelope::default(), None, |found| {
+        let record::Body::Batch(batch) = found.record.body() else {
+            panic!("{found:?}")
+        };
+        let distance = batch.last() - batch.first();
+        ours[0].push(format!("0x{}", entity(batch.record().writer())));
+        ours[1].push(batch.first().to_string());
+        ours[2].push(distance.to_string());
+        ours[3].push(batch.count().to_string());
+    });
+    // tshark prints the number of the batch before that of its first sample.
+    let firsts: Vec<_> = theirs[1].iter().skip(1).step_by(2).cloned().collect();
+    let theirs = [&theirs[0], &firsts, &theirs[2], &theirs[3]].map(Clone::clone);
+    assert_eq!(ours, theirs);
 }

@@ -7,6 +7,7 @@ use ros2probe_wire::Record;
 
 /// Passes a record of a complete datagram to the model. The record has wall-clock time.
 pub fn observe(observer: &mut Observer, record: &Record) {
-    let observation = Observation::of(record, observer.wall_clock());
-    observer.input(Input::Observation(&observation));
+    Observation::each(record, observer.wall_clock(), |observation| {
+        observer.input(Input::Observation(observation));
+    });
 }

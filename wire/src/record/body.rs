@@ -13,6 +13,8 @@ use crate::time::RtpsTime;
 pub enum Body<'a> {
     /// DATA or DATA_FRAG.
     Sample(Sample<'a>),
+    /// DATA_BATCH.
+    Batch(Batch<'a>),
     /// HEARTBEAT.
     Heartbeat(Heartbeat<'a>),
     /// GAP.
@@ -37,6 +39,7 @@ impl Record {
         match self.kind {
             kind::DATA => Body::Sample(Sample::Data(Data(self))),
             kind::DATA_FRAG => Body::Sample(Sample::DataFrag(DataFrag(self))),
+            kind::DATA_BATCH => Body::Batch(Batch(self)),
             kind::HEARTBEAT => Body::Heartbeat(Heartbeat(self)),
             kind::GAP => Body::Gap(Gap(self)),
             kind::ACKNACK => Body::AckNack(AckNack(self)),
@@ -183,6 +186,48 @@ impl Data<'_> {
     #[inline]
     #[must_use]
     pub const fn payload_len(self) -> u32 {
+        self.0.payload_len
+    }
+}
+
+/// DATA_BATCH of RTI Connext: several samples in one submessage. [`crate::walk`] describes it.
+#[derive(Clone, Copy, Debug)]
+pub struct Batch<'a>(&'a Record);
+
+impl<'a> Batch<'a> {
+    /// Returns the record of the view.
+    #[inline]
+    #[must_use]
+    pub const fn record(self) -> &'a Record {
+        self.0
+    }
+
+    /// Returns the number of the first sample.
+    #[inline]
+    #[must_use]
+    pub const fn first(self) -> SequenceNumber {
+        SequenceNumber(self.0.sequence_number)
+    }
+
+    /// Returns the number of the last sample. Numbers between the first and the last may be absent.
+    #[inline]
+    #[must_use]
+    pub const fn last(self) -> SequenceNumber {
+        self.first().saturating_add(self.0.sample_size as u64)
+    }
+
+    /// Returns the number of samples, at most 8,192.
+    #[inline]
+    #[must_use]
+    pub const fn count(self) -> u32 {
+        self.0.fragment_start
+    }
+
+    /// Returns the size of all samples in bytes, encapsulation included. It is an upper bound if
+    /// the record has [`flag::INLINE_QOS_UNREAD`].
+    #[inline]
+    #[must_use]
+    pub const fn size(self) -> u32 {
         self.0.payload_len
     }
 }
@@ -388,6 +433,17 @@ impl SequenceNumberSet {
                 record.sample_size,
                 record.status_info,
             ],
+        }
+    }
+
+    /// Returns a set without members.
+    #[inline]
+    #[must_use]
+    pub const fn empty(base: SequenceNumber) -> Self {
+        Self {
+            base,
+            num_bits: 0,
+            bitmap: [0; 5],
         }
     }
 

@@ -251,6 +251,8 @@ impl SubmessageId {
     pub const DATA: Self = Self(0x15);
     /// Fragments of one change.
     pub const DATA_FRAG: Self = Self(0x16);
+    /// Several changes of one writer, a submessage of RTI Connext that no specification has.
+    pub const DATA_BATCH: Self = Self(0x18);
     /// Encrypted submessage.
     pub const SEC_BODY: Self = Self(0x30);
     /// Precedes a protected submessage.
@@ -280,6 +282,7 @@ impl SubmessageId {
             Self::HEARTBEAT_FRAG => "HEARTBEAT_FRAG",
             Self::DATA => "DATA",
             Self::DATA_FRAG => "DATA_FRAG",
+            Self::DATA_BATCH => "DATA_BATCH",
             Self::SEC_BODY => "SEC_BODY",
             Self::SEC_PREFIX => "SEC_PREFIX",
             Self::SEC_POSTFIX => "SEC_POSTFIX",

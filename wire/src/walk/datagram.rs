@@ -6,7 +6,7 @@ use super::{
 use crate::cursor::{Cursor, Reason, WireError};
 use crate::guid::GuidPrefix;
 use crate::parameters::ParameterList;
-use crate::record::{Handover, Record, flag};
+use crate::record::{Handover, Record, flag, kind};
 use crate::rtps::{InlineQos, Payload, SubmessageFlags, VendorId};
 use crate::time::Timestamp;
 
@@ -100,6 +100,12 @@ pub struct Found<'a> {
 }
 
 impl<'a> Found<'a> {
+    /// Returns whether the submessage is a DATA_BATCH, whose samples are counted and not read.
+    #[must_use]
+    pub const fn is_batch(&self) -> bool {
+        self.record.kind == kind::DATA_BATCH
+    }
+
     /// Returns the flags octet of the submessage's header.
     #[must_use]
     pub const fn flags(&self) -> SubmessageFlags {

@@ -10,6 +10,7 @@ use crate::rtps::{InlineQos, Payload, SequenceNumber, VendorId};
 
 const SOURCE: [u8; 12] = *b"\x01\x0fsourcepref";
 const OTHER: [u8; 12] = *b"\x01\x10otherprefi";
+const PREFIX: [u8; 12] = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12];
 const READER: [u8; 4] = [0, 0, 0x12, 0x04];
 const WRITER: [u8; 4] = [0, 0, 0x11, 0x03];
 
@@ -406,4 +407,60 @@ proptest! {
         bytes.extend(tail);
         walk_all(&bytes);
     }
+}
+
+/// Three batches with the numbers 11 to 13, 14 and 19, and 20.
+const BATCHES: &[u8] = include_bytes!("../../tests/data/rti-batches.bin");
+
+#[test]
+fn a_batch_yields_the_numbers_and_the_sizes_of_its_samples() {
+    let (outcome, found) = walk_all(BATCHES);
+    assert_eq!(outcome, Outcome::Complete);
+    let seen: Vec<_> = found
+        .iter()
+        .map(|(record, payload)| {
+            assert!(payload.is_empty());
+            let Body::Batch(batch) = record.body() else {
+                panic!("{record:?}")
+            };
+            assert_eq!(batch.record().writer(), guid(PREFIX, [0, 0, 1, 3]));
+            (batch.first().0, batch.last().0, batch.count(), batch.size())
+        })
+        .collect();
+    // The inline QoS of the last batch is not read, so that the size includes it and the list.
+    assert_eq!(
+        seen,
+        [
+            (11, 13, 3, 32),
+            (14, 19, 2, 12),
+            (20, 20, 1, 12 + 4 + 8 + 20)
+        ]
+    );
+    let unread: Vec<_> = found
+        .iter()
+        .map(|(record, _)| record.flags & flag::INLINE_QOS_UNREAD != 0)
+        .collect();
+    assert_eq!(unread, [false, false, true]);
+}
+
+#[test]
+fn a_batch_that_contradicts_its_length_is_malformed() {
+    // Offsets of the first batch's distance of the last sample, number of samples, and length of the
+    // list.
+    let at = |offset: usize| 20 + 12 + 4 + offset;
+    for (offset, value) in [(28, 1), (32, 13), (36, 200)] {
+        let mut bytes = BATCHES.to_vec();
+        bytes[at(offset)..at(offset + 4)].copy_from_slice(&u32::to_le_bytes(value));
+        let (outcome, found) = walk_all(&bytes);
+        assert_eq!((outcome, found.len()), (Outcome::Malformed, 0), "{offset}");
+    }
+    crate::testing::hurt(BATCHES, |bytes| {
+        for (record, _) in walk_all(bytes).1 {
+            if let Body::Batch(batch) = record.body() {
+                assert!(batch.count() as usize <= bytes.len() / 8);
+                assert!(batch.size() as usize <= bytes.len());
+                assert!(batch.last().0 - batch.first().0 + 1 >= batch.count().into());
+            }
+        }
+    });
 }

@@ -128,6 +128,40 @@ fn up_to_32_samples_in_a_datagram_become_records_and_more_cause_a_capture() {
 }
 
 #[test]
+fn a_batch_becomes_the_record_of_the_walk() {
+    let message = include_bytes!("../../../../wire/tests/data/rti-batches.bin");
+    let writer = Guid::new(
+        GuidPrefix([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]),
+        EntityId([0, 0, 1, 3]),
+    );
+    let mut kernel = Kernel::load();
+    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+    let seen = kernel.frame(&program_run::datagram(message));
+    let mut walked = Vec::new();
+    walk::datagram(message, &Envelope::default(), None, |found| {
+        walked.push(found.record)
+    });
+    let fields = |record: &Record| {
+        (
+            record.kind,
+            record.writer,
+            record.sequence_number,
+            (
+                record.fragment_start,
+                record.sample_size,
+                record.payload_len,
+            ),
+            record.flags & flag::INLINE_QOS_UNREAD,
+        )
+    };
+    assert_eq!(
+        seen.records.iter().map(fields).collect::<Vec<_>>(),
+        walked.iter().map(fields).collect::<Vec<_>>()
+    );
+    assert_eq!((seen.kept, walked.len()), (false, 3));
+}
+
+#[test]
 fn any_number_of_consecutive_fragments_in_a_datagram_is_one_record() {
     let writer = Guid::new(GuidPrefix(*b"\x01\x10manyfrags "), EntityId([0, 0, 1, 3]));
     let reports = |kernel: &mut Kernel, number, starts: Vec<u32>, of| {

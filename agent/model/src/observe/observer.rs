@@ -350,7 +350,10 @@ impl Observer {
         let mut padded = payload.to_vec();
         padded.resize(payload.len().max(length), 0);
         walk::datagram(&padded, envelope, None, |found| {
-            self.observe(&Observation::of(&found.record, self.graph.wall_clock));
+            let clock = self.graph.wall_clock;
+            Observation::each(&found.record, clock, |observation| {
+                self.observe(observation)
+            });
         });
     }
 
@@ -367,7 +370,10 @@ impl Observer {
     fn message_beginning(&mut self, envelope: &Envelope, payload: &[u8], length: u32) {
         self.note_tcp(envelope, payload);
         let outcome = walk::beginning(payload, length, envelope, |found| {
-            self.observe(&Observation::of(&found.record, self.graph.wall_clock));
+            let clock = self.graph.wall_clock;
+            Observation::each(&found.record, clock, |observation| {
+                self.observe(observation)
+            });
         });
         self.datagram_end(outcome);
     }
@@ -604,13 +610,18 @@ impl Observer {
 
     /// Reads the announcement or payload in a submessage, and observes it.
     fn submessage(&mut self, captured: Captured<'_>, found: &Found<'_>, user_data: UserData) {
-        let observation = match captured.is_polled {
-            true => Observation::of_polled(&found.record, self.graph.wall_clock),
-            false => Observation::of(&found.record, self.graph.wall_clock),
+        let clock = self.graph.wall_clock;
+        let observe = |observation: &Observation| {
+            if !found.is_batch() {
+                self.announced(captured, found, observation);
+            }
+            if user_data == UserData::Here || observation.head().writer.entity.is_builtin() {
+                self.observe(observation);
+            }
         };
-        self.announced(captured, found, &observation);
-        if user_data == UserData::Here || observation.head().writer.entity.is_builtin() {
-            self.observe(&observation);
+        match captured.is_polled {
+            true => Observation::each_polled(&found.record, clock, observe),
+            false => Observation::each(&found.record, clock, observe),
         }
     }
 

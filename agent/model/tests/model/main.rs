@@ -8,6 +8,7 @@
 )]
 
 mod allocator;
+mod batches;
 mod bounds;
 mod buffers;
 mod chains;

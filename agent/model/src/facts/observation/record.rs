@@ -1,8 +1,8 @@
 //! Conversion from the kernel's record. No other file of the model uses that type.
 
-use ros2probe_wire::Timestamp;
-use ros2probe_wire::record::{self, Body, Record, flag};
-use ros2probe_wire::rtps::SubmessageFlags;
+use ros2probe_wire::record::{self, Body, Record, SequenceNumberSet, flag};
+use ros2probe_wire::rtps::{StatusInfo, SubmessageFlags};
+use ros2probe_wire::{RtpsTime, Timestamp};
 
 use super::{
     AckNack, Content, DataFrag, DatagramFate, Gap, Head, Heartbeat, Observation, Path, Sample,
@@ -11,7 +11,24 @@ use crate::facts::route::{Destination, Direction};
 use crate::facts::wall_clock::WallClock;
 
 impl Observation {
-    /// Converts a record of a complete datagram, whose time is wall time.
+    /// Calls `observe` with each observation of a record of a complete datagram, whose time is wall
+    /// time. Only a DATA_BATCH has several, or none.
+    pub fn each(record: &Record, clock: WallClock, mut observe: impl FnMut(&Self)) {
+        match record.body() {
+            Body::Batch(batch) => each_of_batch(batch, Head::of(record, clock), observe),
+            _ => observe(&Self::of(record, clock)),
+        }
+    }
+
+    /// Calls `observe` as [`Self::each`] does, with the record of a message that was polled in shared
+    /// memory.
+    pub fn each_polled(record: &Record, clock: WallClock, observe: impl FnMut(&Self)) {
+        let flags = record.flags | flag::SHM;
+        Self::each(&Record { flags, ..*record }, clock, observe);
+    }
+
+    /// Converts a record of a complete datagram, whose time is wall time. Of a DATA_BATCH, it only
+    /// shows that the sender is alive.
     #[must_use]
     pub fn of(record: &Record, clock: WallClock) -> Self {
         let head = Head::of(record, clock);
@@ -31,17 +48,60 @@ impl Observation {
                 head,
                 missing: acknack.missing(),
             }),
-            Body::Complete | Body::Handover | Body::Undelivered | Body::Unknown => {
-                Self::Presence(head)
-            }
+            Body::Batch(_)
+            | Body::Complete
+            | Body::Handover
+            | Body::Undelivered
+            | Body::Unknown => Self::Presence(head),
         }
     }
+}
 
-    /// Converts a record of a message that was polled in shared memory.
-    #[must_use]
-    pub fn of_polled(record: &Record, clock: WallClock) -> Self {
-        let flags = record.flags | flag::SHM;
-        Self::of(&Record { flags, ..*record }, clock)
+/// Calls `observe` with the samples of a batch. Numbers that no sample of the batch has will not be
+/// sent, as a GAP says. The size of each sample is their mean. The last sample has the last number, and all others follow each other.
+fn each_of_batch(batch: record::Batch<'_>, head: Head, mut observe: impl FnMut(&Observation)) {
+    let Some(others) = batch.count().checked_sub(1) else {
+        return;
+    };
+    let (size, rest) = (batch.size() / batch.count(), batch.size() % batch.count());
+    let fate = DatagramFate::of(batch.record());
+    let mut sample = |sequence_number, size| {
+        observe(&Observation::Sample(Sample {
+            head,
+            sequence_number,
+            // A batch has a time for each sample, which is not read.
+            source_timestamp: RtpsTime::default(),
+            status_info: StatusInfo::ALIVE,
+            has_value: true,
+            has_known_begin: false,
+            header_stamp: None,
+            fate,
+            content: Content::Data { size },
+        }));
+    };
+    let end = batch.first().saturating_add(others.into());
+    for number in batch.first().until(end) {
+        sample(number, size);
+    }
+    sample(batch.last(), size + rest);
+    if end < batch.last() {
+        observe(&Observation::Gap(Gap {
+            head,
+            start: end,
+            list: SequenceNumberSet::empty(batch.last()),
+        }));
+    }
+}
+
+impl DatagramFate {
+    const fn of(record: &Record) -> Self {
+        if record.flags & flag::NOT_REASSEMBLED != 0 {
+            Self::NotReassembled
+        } else if record.flags & flag::SOCKET_FULL != 0 {
+            Self::SocketFull
+        } else {
+            Self::Passed
+        }
     }
 }
 
@@ -114,13 +174,7 @@ impl Sample {
             has_value,
             has_known_begin: record.flags & flag::INLINE_QOS_UNREAD == 0,
             header_stamp: sample.header_stamp(),
-            fate: if record.flags & flag::NOT_REASSEMBLED != 0 {
-                DatagramFate::NotReassembled
-            } else if record.flags & flag::SOCKET_FULL != 0 {
-                DatagramFate::SocketFull
-            } else {
-                DatagramFate::Passed
-            },
+            fate: DatagramFate::of(record),
             content,
         }
     }

@@ -77,10 +77,47 @@ fn each_kind_of_record_converts_to_its_own_fields() {
     };
     let missing: Vec<_> = acknack.missing.iter().map(|number| number.0).collect();
     assert_eq!((acknack.base().0, missing), (7, vec![7, 9]));
-    for kind in [kind::HANDOVER, kind::UNDELIVERED, kind::COMPLETE, 0] {
+    for kind in [
+        kind::DATA_BATCH,
+        kind::HANDOVER,
+        kind::UNDELIVERED,
+        kind::COMPLETE,
+        0,
+    ] {
         let presence = observed(&of_kind(kind));
         assert!(matches!(presence, Observation::Presence(_)), "{kind}");
     }
+}
+
+#[test]
+fn a_batch_becomes_its_samples_and_a_gap_of_the_numbers_between_them() {
+    let each = |count, last, size| {
+        let record = Record {
+            fragment_start: count,
+            sample_size: last,
+            payload_len: size,
+            ..of_kind(kind::DATA_BATCH)
+        };
+        let mut seen = Vec::new();
+        Observation::each(&record, WallClock::default(), |each| {
+            seen.push(match each {
+                Observation::Sample(sample) => {
+                    assert!(sample.is_message() && sample.is_delivered());
+                    (sample.sequence_number.0, u64::from(sample.size()))
+                }
+                Observation::Gap(gap) => {
+                    assert_eq!(gap.list.iter().count(), 0);
+                    (gap.start.0, gap.list.base.0)
+                }
+                other => panic!("{other:?}"),
+            });
+        });
+        seen
+    };
+    assert_eq!(each(3, 2, 32), [(7, 10), (8, 10), (9, 12)]);
+    assert_eq!(each(2, 5, 8), [(7, 4), (12, 4), (8, 12)]);
+    assert_eq!(each(1, 0, 8), [(7, 8)]);
+    assert_eq!(each(0, 0, 8), []);
 }
 
 #[test]
@@ -110,8 +147,9 @@ fn flags_of_a_record_determine_one_path_and_one_fate() {
     ] {
         assert_eq!(sample(&of_data(flags)).head.path, path, "{flags:#x}");
     }
-    let polled = Observation::of_polled(&of_data(0), WallClock::default());
-    assert!(polled.head().is_polled());
+    Observation::each_polled(&of_data(0), WallClock::default(), |polled| {
+        assert!(polled.head().is_polled());
+    });
     for (flags, fate) in [
         (flag::HOST, DatagramFate::Passed),
         (flag::HOST | flag::SOCKET_FULL, DatagramFate::SocketFull),
