@@ -1,11 +1,12 @@
 //! Reads the first bytes of a frame of RTPS: its length, and which of its bytes are needed.
 //!
 //! The writer of the first sample decides. Frames without a sample are small and needed whole:
-//! control messages, acknowledgements, and the announcements of discovery.
+//! control messages, acknowledgements, and the announcements of discovery. What no known endpoint
+//! sends is charged to the budget of unclassified traffic.
 
 use aya_ebpf::bindings::__sk_buff;
 use ros2probe_wire::{
-    filter::{Budget, Counter},
+    filter::Counter,
     record::{Verdict, kind},
     rtps::SubmessageId,
     rtps_tcp::{FrameHeader, HEADER_LEN, RECOGNIZED},
@@ -15,7 +16,7 @@ use ros2probe_wire::{
 use crate::{
     maps::{INTEREST, count},
     packet::load,
-    verdict::{charge_unknown, spend},
+    verdict::{charge, charge_unknown},
 };
 
 use super::{
@@ -31,17 +32,19 @@ const SUBMESSAGES: u32 = HEADER_LEN as u32 + walk::HEADER_LEN;
 /// Maximum number of bytes after the first sample that are left out: INFO_DST, a HEARTBEAT and Fast
 /// DDS's own submessage for statistics.
 const REST: u32 = 128;
-/// Maximum length of a frame that is passed on as a whole, whatever it contains. It may have several
-/// samples.
+/// Maximum length of a frame of a known writer that is passed on as a whole, unless its topic is
+/// ignored. It may have several samples.
 const SMALL: u32 = 1024;
 /// The bits of an entity kind that mark a built-in entity (RTPS 2.5, 9.3.1.2).
 const BUILT_IN: u32 = 0xc0;
 const INFO_TS: u32 = SubmessageId::INFO_TS.0 as u32;
 const INFO_DST: u32 = SubmessageId::INFO_DST.0 as u32;
+const HEARTBEAT: u32 = kind::HEARTBEAT as u32;
+const GAP: u32 = kind::GAP as u32;
+const ACKNACK: u32 = kind::ACKNACK as u32;
 const DATA: u32 = kind::DATA as u32;
 const DATA_FRAG: u32 = kind::DATA_FRAG as u32;
 const IGNORE: u32 = Verdict::Ignore as u32;
-const METER: u32 = Verdict::Meter as u32;
 const CAPTURE: u32 = Verdict::Capture as u32;
 
 /// Returns whether a frame begins at `at` of a packet.
@@ -83,16 +86,13 @@ pub extern "C" fn read(slot: u32) -> u32 {
     this.wanted = WHOLE;
     this.wakes = 0;
     let [.., port] = window.words(0);
-    if port as u16 == 0 {
-        return 1;
-    }
     let [one, two, three, _] = window.words(HEADER_LEN as u32 + 8);
     let (mut at, mut number) = (SUBMESSAGES, 0);
-    while number < BEFORE {
+    while port as u16 != 0 && number < BEFORE {
         if at + 24 > this.end || at + 24 > WINDOW {
-            return 1;
+            break;
         }
-        let [header, _extra, _reader, writer] = window.words(at);
+        let [header, first, second, third] = window.words(at);
         let id = header & 0xff;
         let octets = if header >> 8 & 1 != 0 {
             header >> 16
@@ -100,49 +100,71 @@ pub extern "C" fn read(slot: u32) -> u32 {
             (header >> 16 & 0xff) << 8 | header >> 24
         };
         if id == DATA || id == DATA_FRAG {
-            let end = if octets == 0 {
-                this.total
-            } else {
-                at + 4 + octets
-            };
-            if writer >> 24 & BUILT_IN == BUILT_IN {
+            if third >> 24 & BUILT_IN == BUILT_IN {
                 this.wakes = 1;
-            } else if this.total > SMALL && end + REST >= this.total {
-                decide(slot, [one, two, three, writer]);
+                return 1;
             }
-            return 1;
+            let is_alone = octets == 0 || at + 4 + octets + REST >= this.total;
+            return sample(slot, [one, two, three, third], u32::from(is_alone));
+        }
+        if id == HEARTBEAT || id == GAP || id == ACKNACK {
+            let sender = if id == ACKNACK { first } else { second };
+            if INTEREST.get_ptr([one, two, three, sender]).is_some() {
+                return 1;
+            }
+            break;
         }
         if id != INFO_TS && id != INFO_DST || octets > 16 {
-            return 1;
+            break;
         }
         at += 4 + octets;
         number += 1;
     }
-    1
+    let total = this.total;
+    pay(slot, total)
 }
 
+/// Sets the number of bytes of a frame that begins with a sample of `writer`. Unless the sample
+/// `is_alone`, others follow it, which may be of other writers.
 #[inline(always)]
-fn decide(slot: u32, writer: [u32; 4]) {
+fn sample(slot: u32, writer: [u32; 4], is_alone: u32) -> u32 {
     let Some(mut this) = segment(slot) else {
-        return;
+        return 0;
     };
     // SAFETY: a map value pointer checked against null.
     let verdict = INTEREST.get_ptr(&writer).map(|verdict| unsafe { *verdict });
     // On the loopback interface, the payload was passed on where it was sent.
     let is_repeated = this.interface == LOOPBACK && this.key.outgoing == 0;
+    let is_needed = is_alone == 0 || this.total <= SMALL;
     match verdict {
-        Some(CAPTURE) if is_repeated => this.wanted = WINDOW,
-        Some(CAPTURE) => this.wakes = 1,
-        Some(IGNORE) => this.wanted = 0,
-        Some(METER) => this.wanted = WINDOW,
+        Some(IGNORE) if is_alone != 0 => this.wanted = 0,
+        Some(_) if is_needed => {}
+        Some(CAPTURE) if !is_repeated => this.wakes = 1,
+        Some(_) => this.wanted = WINDOW,
         // Its announcement may still be on its way.
         None if !is_repeated && charge_unknown(&writer, this.total) => this.wakes = 1,
-        _ => {
-            this.wanted = WINDOW;
-            if !spend(Budget::CaptureBytes, WINDOW) {
-                count(slot, Counter::UnknownOverBudget, 1);
-                this.wanted = 0;
-            }
+        None => {
+            this.wanted = if this.total < WINDOW {
+                this.total
+            } else {
+                WINDOW
+            };
+            let wanted = this.wanted;
+            return pay(slot, wanted);
         }
     }
+    1
+}
+
+/// Charges bytes of a frame that no known endpoint sent. Without a budget no byte is passed on, so
+/// that a peer with many such frames cannot fill the ring.
+#[inline(always)]
+fn pay(slot: u32, bytes: u32) -> u32 {
+    if !charge(bytes) {
+        count(slot, Counter::UnknownOverBudget, 1);
+        if let Some(mut this) = segment(slot) {
+            this.wanted = 0;
+        }
+    }
+    1
 }

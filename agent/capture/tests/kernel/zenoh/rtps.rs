@@ -287,6 +287,74 @@ fn verdicts_on_writers_decide_which_bytes_of_messages_are_passed_on() -> Result<
     Ok(())
 }
 
+/// An ACKNACK of a reader.
+fn acknack(prefix: GuidPrefix, reader: EntityId) -> Vec<u8> {
+    let mut message = b"RTPS\x02\x03\x01\x0f".to_vec();
+    message.extend(prefix.0);
+    message.extend([6, 1, 24, 0]);
+    message.extend(reader.0);
+    message.extend([0, 0, 1, 3]);
+    message.extend([0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0]);
+    message
+}
+
+#[test]
+fn small_frames_of_strangers_are_charged_and_those_of_known_readers_are_not() -> Result<()> {
+    const BUDGET: usize = 5_000;
+    const FRAMES: u8 = 100;
+    let mut observed = Observed::new()?;
+    let reader = EntityId([0, 0, 9, 4]);
+    let guid = Guid::new(PREFIXES[0], reader);
+    observed.filter.set_interest(guid, Some(Verdict::Meter))?;
+    let mut connection = observed.connect("127.0.0.1:0")?;
+    pass(
+        &mut connection,
+        true,
+        &framed(&acknack(PREFIXES[0], reader)),
+    )?;
+    assert_eq!(messages(&mut observed).len(), 2);
+    observed
+        .filter
+        .set_unknown_budget(Budget::CaptureBytes, BUDGET as u32)?;
+    for number in 0..FRAMES {
+        let stranger = EntityId([1, 0, number, 4]);
+        pass(
+            &mut connection,
+            true,
+            &framed(&acknack(PREFIXES[0], stranger)),
+        )?;
+        let writer = EntityId([1, 0, number, 3]);
+        pass(
+            &mut connection,
+            true,
+            &framed(&data(PREFIXES[0], writer, &[1; 300])),
+        )?;
+        pass(
+            &mut connection,
+            true,
+            &framed(&acknack(PREFIXES[0], reader)),
+        )?;
+    }
+    let known = acknack(PREFIXES[0], reader);
+    let (mut ours, mut of_strangers) = (0, 0);
+    for (bytes, length) in messages(&mut observed).into_values().flatten() {
+        match bytes == known {
+            true => ours += 1,
+            false => of_strangers += bytes.len(),
+        }
+        assert!(bytes.len() <= length as usize);
+    }
+    // Each frame is seen at both sockets. The last one may exceed the budget.
+    assert_eq!(ours, 2 * usize::from(FRAMES));
+    assert!(
+        (BUDGET / 2..BUDGET + 1000).contains(&of_strangers),
+        "{of_strangers}"
+    );
+    let refused = observed.counter(Counter::UnknownOverBudget)?;
+    assert!(refused > 300, "{refused}");
+    Ok(())
+}
+
 #[test]
 fn zenoh_is_still_read_only_at_its_sender_after_a_connection_of_rtps() -> Result<()> {
     let mut observed = Observed::new()?;
