@@ -6,8 +6,6 @@
 //! which shows whether the kept message is still the last. Messages, their bytes and the writers
 //! have caps.
 
-mod allowance;
-
 use std::sync::Arc;
 
 use foldhash::HashMap;
@@ -20,8 +18,8 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::observation::{self, Content};
 use crate::facts::tables::{RetainedBytes, RetainedWriters};
 use crate::facts::wall_clock::WallClock;
+use crate::measure::allowance::Allowance;
 use crate::measure::assembly::Assembly;
-use allowance::Allowance;
 
 /// State of the last message of a transient-local writer. Sizes are in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

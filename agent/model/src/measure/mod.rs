@@ -1,6 +1,7 @@
 //! Writers, deliveries, losses and rates.
 
 pub mod acknowledgement;
+pub(crate) mod allowance;
 pub mod assembly;
 pub mod delivery;
 pub mod departures;

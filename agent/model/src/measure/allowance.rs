@@ -8,7 +8,7 @@ const OVERHEAD: usize = 64;
 
 /// Bytes that may be captured: a burst of at most `most`, and `rate` per second on average.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Allowance {
+pub(crate) struct Allowance {
     most: u64,
     rate: u64,
     left: u64,
@@ -18,7 +18,7 @@ pub(super) struct Allowance {
 
 impl Allowance {
     /// Creates a full allowance.
-    pub(super) const fn new(most: u64, rate: u64) -> Self {
+    pub(crate) const fn new(most: u64, rate: u64) -> Self {
         Self {
             most,
             rate,
@@ -28,7 +28,7 @@ impl Allowance {
     }
 
     /// Returns the bytes that are left at `now`.
-    pub(super) fn left(&mut self, now: ModelTime) -> u64 {
+    pub(crate) fn left(&mut self, now: ModelTime) -> u64 {
         let elapsed = now - self.at;
         // An amount below one byte waits for the next call.
         let elapsed = u64::try_from(elapsed.as_nanos()).unwrap_or(u64::MAX);
@@ -42,7 +42,7 @@ impl Allowance {
     }
 
     /// Charges a datagram with this many bytes of payload. Returns whether the allowance covers it.
-    pub(super) fn spend(&mut self, payload: usize, now: ModelTime) -> bool {
+    pub(crate) fn spend(&mut self, payload: usize, now: ModelTime) -> bool {
         let cost = u64::try_from(payload.saturating_add(OVERHEAD)).unwrap_or(u64::MAX);
         let left = self.left(now).checked_sub(cost);
         self.left = left.unwrap_or(0);
@@ -50,7 +50,7 @@ impl Allowance {
     }
 
     /// Takes all bytes that are left.
-    pub(super) const fn exhaust(&mut self) {
+    pub(crate) const fn exhaust(&mut self) {
         self.left = 0;
     }
 }
