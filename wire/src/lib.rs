@@ -34,6 +34,8 @@ pub mod guid;
 pub mod host;
 pub mod inside;
 #[cfg(feature = "alloc")]
+pub mod log;
+#[cfg(feature = "alloc")]
 pub mod names;
 pub mod parameters;
 #[cfg(feature = "alloc")]

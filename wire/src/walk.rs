@@ -415,10 +415,10 @@ const BATCH_FIXED: u32 = 36;
 /// serialized length.
 const BATCH_ENTRY: u32 = 8;
 
-/// Reads DATA_BATCH, whose body has extraFlags and octetsToInlineQos, readerId, writerId, the
-/// batch's number, the first sample's number, the distance of the last sample's number, the number
-/// of samples, an inline QoS with flag Q, the length of the list of samples, that list, and the
-/// samples.
+/// Reads DATA_BATCH. Its body begins as that of DATA: extraFlags, octetsToInlineQos, readerId and
+/// writerId. The numbers of the batch and of its first sample follow, the distance of the last
+/// sample's number, and the number of samples. With flag Q there is an inline QoS. The rest is the
+/// length of the list of samples, that list, and the samples.
 #[inline(always)]
 fn batch<B: Bytes>(
     walk: &mut Walk,

@@ -1,8 +1,8 @@
 //! Reads the first bytes of a frame of RTPS: its length, and which of its bytes are needed.
 //!
 //! The writer of the first sample decides. Frames without a sample are small and needed whole:
-//! control messages, acknowledgements, and the announcements of discovery. What no known endpoint
-//! sends is charged to the budget of unclassified traffic.
+//! control messages, acknowledgements, and the announcements of discovery. The budget of unclassified
+//! traffic pays for frames that no known endpoint sends.
 
 use aya_ebpf::bindings::__sk_buff;
 use ros2probe_wire::{

@@ -179,6 +179,13 @@ pub enum Diagnosis<'a> {
         /// Share of segments retransmitted when the problem appeared.
         retransmitted_ratio: f64,
     },
+    /// A node logs errors in a burst: at least ten in a minute, or a fatal one.
+    LogErrors {
+        /// Errors of the last minute when the burst began.
+        errors: u64,
+        /// Text of the last one of these.
+        text: Cow<'a, str>,
+    },
     /// A configured chain that ends with the topic exceeds its maximum latency.
     SlowChain {
         /// First topic of the chain.
@@ -214,6 +221,7 @@ impl Diagnosis<'_> {
             Self::BuffersByCpu { .. } => "buffers_by_cpu",
             Self::SharedMachineId { .. } => "shared_machine_id",
             Self::LossyLink { .. } => "lossy_link",
+            Self::LogErrors { .. } => "log_errors",
             Self::SlowChain { .. } => "slow_chain",
         }
     }

@@ -27,6 +27,7 @@ pub mod health;
 pub mod inside;
 pub mod latched;
 pub mod live;
+pub mod logs;
 pub mod measurement;
 pub mod messages;
 pub mod names;

@@ -538,6 +538,7 @@ const SMALL: Settings = Settings {
     service_timeout: Duration::from_secs(1),
     payload_delay: Duration::from_millis(400),
     keeps_latched: true,
+    reads_logs: true,
     directed: true,
 };
 

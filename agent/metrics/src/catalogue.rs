@@ -13,6 +13,7 @@ mod delivery;
 mod diagnosis;
 mod inside;
 mod link;
+mod robot;
 mod service;
 mod zenoh;
 
@@ -23,6 +24,7 @@ pub use delivery::*;
 pub use diagnosis::*;
 pub use inside::*;
 pub use link::*;
+pub use robot::*;
 pub use service::*;
 pub use zenoh::*;
 
@@ -533,6 +535,7 @@ pub const CATALOGUE: &[Metric] = &[
     LINK_RETRANSMITTED,
     LINK_UNACKNOWLEDGED,
     LINK_ROUND_TRIP,
+    LOG_MESSAGES,
     WATCH_STATE,
     WATCH_VIOLATED,
     BUILD_INFO,

@@ -26,6 +26,7 @@ pub mod model;
 pub mod ports;
 pub mod program_run;
 pub mod pseudo_terminal;
+pub mod robot_log;
 pub mod rotel;
 pub mod sample_robot;
 pub mod truth;

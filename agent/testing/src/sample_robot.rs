@@ -30,12 +30,13 @@ use ros2probe_model::graph::zenoh::{Counters, ZenohFacts};
 use ros2probe_model::measure::links::LinkFacts;
 use ros2probe_model::report::snapshot::{
     AcknowledgementFacts, ActionFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered,
-    DeliveryFacts, Direction, EarlierCounts, EndpointFacts, GoalCounts, LatencyFacts, Measurement,
-    NodeFacts, ParticipantFacts, ProcessFacts, SampledFacts, ServiceFacts, Snapshot, SocketFacts,
-    Source, Subscriber, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts,
-    WatchFacts, WatchState, WatchedTopicFacts,
+    DeliveryFacts, Direction, EarlierCounts, EndpointFacts, GoalCounts, LatencyFacts, LogFacts,
+    LogMessage, Measurement, NodeFacts, NodeLogFacts, ParticipantFacts, ProcessFacts, SampledFacts,
+    ServiceFacts, Snapshot, SocketFacts, Source, Subscriber, TableFacts, TopicFacts, Transport,
+    TransportCount, UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
 };
 use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::log::LogLevel;
 use ros2probe_wire::qos::{History, HistoryKind, Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
@@ -111,6 +112,37 @@ fn chains() -> ChainsFacts {
     }
 }
 
+/// Returns the log of a node with one error.
+fn logs(writer: Guid) -> LogFacts {
+    let message = Arc::new(LogMessage {
+        at: ModelTime::from_nanoseconds(1_699_999_999_000_000_000),
+        stamp: (1_699_999_998, 5),
+        domain_id: DomainId(0),
+        writer,
+        number: SequenceNumber(7),
+        node: "/lidar".into(),
+        level: LogLevel::Error,
+        logger: "lidar".into(),
+        text: "no data".into(),
+        file: "lidar.cpp".into(),
+        function: "read".into(),
+        line: 81,
+    });
+    let level = |level| match level {
+        LogLevel::Error => (1, Some(Arc::clone(&message))),
+        _ => (0, None),
+    };
+    LogFacts {
+        are_read: true,
+        nodes: vec![NodeLogFacts {
+            domain_id: DomainId(0),
+            node: "/lidar".into(),
+            levels: LogLevel::ALL.map(level),
+        }],
+        latest: vec![message],
+    }
+}
+
 /// Returns an agent's full state for a robot with topics of these names, all watched by `/**`.
 pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
     let guid = Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 0xc1]));
@@ -167,6 +199,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             first_seen: ModelTime::from_nanoseconds(3),
             measurement: measurement(),
         }],
+        logs: logs(guid),
         services: vec![service()],
         actions: vec![action()],
         inside: Some(Arc::new(inside::inside())),
@@ -341,6 +374,12 @@ fn diagnoses() -> Diagnoses {
                 destination: [10, 0, 0, 2].into(),
             },
             retransmitted_permille: 40,
+        },
+        Diagnosis::LogErrors {
+            domain_id: DomainId(0),
+            node: "/lidar".into(),
+            errors: 10,
+            text: "no data".into(),
         },
         Diagnosis::SlowChain {
             topic: topic.clone(),

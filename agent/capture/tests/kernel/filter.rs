@@ -139,7 +139,7 @@ fn a_batch_becomes_the_record_of_the_walk() {
     let seen = kernel.frame(&program_run::datagram(message));
     let mut walked = Vec::new();
     walk::datagram(message, &Envelope::default(), None, |found| {
-        walked.push(found.record)
+        walked.push(found.record);
     });
     let fields = |record: &Record| {
         (

@@ -15,6 +15,7 @@ mod foxglove;
 mod inside;
 mod interrupt;
 mod learn;
+mod log;
 mod node;
 mod notes;
 mod output;
@@ -89,6 +90,8 @@ pub(crate) enum Question {
     Action(action::Action),
     /// Show chains of messages through nodes, with the time of each hop
     Chain(chain::Chain),
+    /// Print what nodes log, and follow it
+    Log(log::Log),
     /// Check what is visible on this host and what is not, with remedies
     Doctor(doctor::Doctor),
     /// Show a robot's topics live in the terminal: rates, losses, latencies, problems
@@ -118,6 +121,7 @@ impl Question {
             Self::Service(service) => service.ask(),
             Self::Action(action) => action.ask(),
             Self::Chain(chain) => chain.ask(),
+            Self::Log(log) => log.ask(),
             Self::Doctor(doctor) => doctor.ask(),
             Self::Top(top) => top.ask(),
             Self::Inside(inside) => inside.ask(),
@@ -137,6 +141,7 @@ impl Question {
             | Self::Service(_)
             | Self::Action(_)
             | Self::Chain(_)
+            | Self::Log(_)
             | Self::Doctor(_)
             | Self::Inside(_)
             | Self::Why(_)

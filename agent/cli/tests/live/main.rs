@@ -37,6 +37,7 @@ mod privilege;
 mod prometheus;
 mod rates;
 mod record;
+mod robot;
 mod rtps_tcp;
 mod samples;
 mod shm;

@@ -23,8 +23,8 @@ use super::watch::{
 };
 use super::{
     ApiSettings, CaptureSettings, Config, Endpoint, FoxgloveSettings, Level, Limits,
-    MetricsSettings, OtlpSettings, RecordingLimits, RecordingSettings, Ros2DaemonSettings,
-    ShmSettings, SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
+    MetricsSettings, OtlpSettings, RecordingLimits, RecordingSettings, RobotSettings,
+    Ros2DaemonSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
 };
 use crate::events::Trigger;
 use ros2probe_metrics::otlp::otlp_endpoint;
@@ -152,6 +152,9 @@ impl Reader {
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             service_timeout: Duration::from_secs_f64(shape.service_timeout_s),
             retain: shape.retain,
+            robot: RobotSettings {
+                logs: shape.robot.unwrap_or_default().logs == Switch::On,
+            },
             state_directory: state(&shape.state_directory),
             log: shape.log,
         }

@@ -70,6 +70,8 @@ pub struct Config {
     pub service_timeout: Duration,
     /// Last messages that are kept.
     pub retain: RetainChoice,
+    /// What the agent reads of what the robot says.
+    pub robot: RobotSettings,
     /// Directory of the saved discovery state.
     pub state_directory: StateChoice,
     /// Minimum severity that is logged.
@@ -128,6 +130,13 @@ pub enum RetainChoice {
     Latched,
     /// Only messages of watches with `retain: last`.
     Off,
+}
+
+/// What the agent reads of what the robot says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RobotSettings {
+    /// Whether it reads the logs of nodes.
+    pub logs: bool,
 }
 
 /// Directory of the saved state.
@@ -360,6 +369,7 @@ impl Config {
             ("recordings", self.recordings != new.recordings),
             ("topic_grace_s", self.topic_grace != new.topic_grace),
             ("retain", self.retain != new.retain),
+            ("robot", self.robot != new.robot),
             (
                 "service_timeout_s",
                 self.service_timeout != new.service_timeout,
@@ -432,6 +442,7 @@ impl Default for Config {
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
             service_timeout: Duration::from_secs_f64(defaults::service_timeout_s()),
             retain: RetainChoice::default(),
+            robot: RobotSettings { logs: true },
             state_directory: StateChoice::default(),
             log: Level::default(),
         }

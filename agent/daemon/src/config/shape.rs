@@ -50,6 +50,9 @@ pub(super) struct ConfigShape {
     /// Bags written by the agent: on request (`POST /recordings`), and of the last seconds before
     /// an incident.
     pub(super) recordings: Option<RecordingsShape>,
+    /// What the robot itself says, in topics of standard types. The agent reads it as it passes, on
+    /// watched and other topics.
+    pub(super) robot: Option<RobotShape>,
     /// Time for which a topic without endpoints is still reported, in seconds.
     #[schemars(range(min = 0, max = 604_800))]
     #[serde(default = "defaults::topic_grace_s")]
@@ -373,6 +376,22 @@ impl From<DistroShape> for Dialect {
 impl Default for Ros2DaemonShape {
     fn default() -> Self {
         Self::Choice(Switch::default())
+    }
+}
+
+/// What the robot itself says.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct RobotShape {
+    /// Logs of nodes (`/rosout`): counts by node and level, the latest messages, and bursts of
+    /// errors as findings.
+    pub(super) logs: Switch,
+}
+
+impl Default for RobotShape {
+    fn default() -> Self {
+        Self { logs: Switch::On }
     }
 }
 

@@ -428,6 +428,17 @@ fn finding(finding: &Diagnosis) -> Values {
                 ("reason", Some(text(reason))),
             ]
         }
+        Diagnosis::LogErrors {
+            domain_id,
+            node,
+            errors,
+            text: said,
+        } => vec![
+            ("domain_id", number(*domain_id)),
+            ("ros_node", Some(text(node))),
+            ("log_errors", number(*errors)),
+            ("log_text", Some(text(said))),
+        ],
         Diagnosis::LossyLink {
             link,
             retransmitted_permille,

@@ -61,6 +61,8 @@ const FINDING: &[&str] = &[
     "source",
     "destination",
     "retransmitted_ratio",
+    "log_errors",
+    "log_text",
     "from",
     "max_latency_ms",
 ];
@@ -169,7 +171,7 @@ pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
     "Another fault of the graph, named by `diagnosis`: type_conflict, type_hash_conflict, \
      duplicate_node, node_in_several_domains, slow_callback, executor_wait, \
      late_callback, intra_process_overflow, reader_queue_overflow, observation_suspended, \
-     shared_machine_id, lossy_link, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
+     shared_machine_id, lossy_link, log_errors, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
      restamping_node, buffers_by_cpu.",
 )
 .relief(Severity::Info);

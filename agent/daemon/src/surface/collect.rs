@@ -16,7 +16,7 @@ use super::inside_metrics::{self, Callbacks};
 use super::ros2_daemon::Ros2DaemonFigures;
 use super::ros2_metrics::{self, TopicRows};
 use super::service_metrics;
-use super::{link_metrics, zenoh_metrics};
+use super::{link_metrics, robot_metrics, zenoh_metrics};
 use crate::agent_facts::SourceKind;
 use crate::events::{AgentEvent, EventLog};
 use crate::limit_facts::LimitFigures;
@@ -101,6 +101,7 @@ impl MetricSource for MetricSources {
         deliveries.write(sink)?;
         delivery_metrics::sockets(sink, &snapshot.sockets)?;
         link_metrics::links(sink, snapshot)?;
+        robot_metrics::logs(sink, snapshot)?;
         ros2_metrics::watches(sink, snapshot, &settings.watches)?;
         agent_metrics::identity(sink, &state, now)?;
         agent_metrics::capture(sink, &state)?;

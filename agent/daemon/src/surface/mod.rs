@@ -23,6 +23,7 @@ mod link_metrics;
 mod listen;
 mod places;
 mod process;
+mod robot_metrics;
 pub mod ros2_daemon;
 mod ros2_metrics;
 mod service_metrics;

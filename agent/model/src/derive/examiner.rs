@@ -14,6 +14,7 @@ use ros2probe_wire::{DomainId, Guid};
 
 use crate::derive::chain::Chains;
 use crate::derive::inside::Inside;
+use crate::derive::robot::Robot;
 use crate::derive::services::Services;
 use crate::facts::diagnosis::{Diagnoses, Diagnosis, QosPairs};
 use crate::facts::model_time::ModelTime;
@@ -37,7 +38,7 @@ const STEPS_PER_TOPIC: usize = 50_000;
 pub struct Examiner {
     /// Revisions of discovery, hanging calls, findings from inside processes, chains and links at
     /// the last examination.
-    revision: Option<[u64; 5]>,
+    revision: Option<[u64; 6]>,
     /// Time at which the first unmatched endpoint becomes a finding.
     due: Option<ModelTime>,
     /// Time at which each unmatched endpoint was first found to be unmatched.
@@ -92,7 +93,7 @@ impl Examiner {
         discovery: &Discovery,
         topics: &Topics,
         services: &Services,
-        (inside, chains, links): (&Inside, &Chains, &Links),
+        (inside, chains, links, robot): (&Inside, &Chains, &Links, &Robot),
         now: ModelTime,
     ) {
         let revision = Some([
@@ -101,6 +102,7 @@ impl Examiner {
             inside.revision(),
             chains.revision(),
             links.revision(),
+            robot.revision(),
         ]);
         let is_due = self.due.is_some_and(|due| due <= now);
         if self.revision == revision && !is_due {
@@ -133,6 +135,9 @@ impl Examiner {
             findings.add(finding);
         }
         for finding in links.findings() {
+            findings.add(finding);
+        }
+        for finding in robot.findings() {
             findings.add(finding);
         }
         for finding in chains.findings() {

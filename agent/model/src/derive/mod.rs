@@ -3,6 +3,7 @@
 pub mod chain;
 pub mod examiner;
 pub mod inside;
+pub mod robot;
 pub mod services;
 pub mod trace;
 pub mod type_descriptions;

@@ -223,6 +223,17 @@ pub enum Diagnosis {
         /// Retransmitted segments per 1000.
         retransmitted_permille: u64,
     },
+    /// A node logs errors in a burst: at least ten in a minute, or a fatal one.
+    LogErrors {
+        /// Domain.
+        domain_id: DomainId,
+        /// Fully qualified name.
+        node: NodeName,
+        /// Errors of the last minute when the burst began.
+        errors: u64,
+        /// Text of the last one of these.
+        text: Arc<str>,
+    },
     /// A configured chain exceeds its maximum latency.
     SlowChain {
         /// Last topic of the chain.
@@ -284,7 +295,7 @@ pub enum Change<'a> {
 
 impl Diagnosis {
     /// All kinds, as label values.
-    pub const KINDS: [&'static str; 19] = [
+    pub const KINDS: [&'static str; 20] = [
         "qos_incompatible",
         "type_conflict",
         "type_hash_conflict",
@@ -303,6 +314,7 @@ impl Diagnosis {
         "buffers_by_cpu",
         "shared_machine_id",
         "lossy_link",
+        "log_errors",
         "slow_chain",
     ];
 
@@ -328,6 +340,7 @@ impl Diagnosis {
             Self::BuffersByCpu { .. } => "buffers_by_cpu",
             Self::SharedMachineId { .. } => "shared_machine_id",
             Self::LossyLink { .. } => "lossy_link",
+            Self::LogErrors { .. } => "log_errors",
             Self::SlowChain { .. } => "slow_chain",
         }
     }
@@ -354,6 +367,7 @@ impl Diagnosis {
             | Self::NodeInSeveralDomains { .. }
             | Self::SharedMachineId { .. }
             | Self::LossyLink { .. }
+            | Self::LogErrors { .. }
             | Self::ObservationSuspended { .. } => None,
         }
     }
@@ -414,6 +428,9 @@ impl Diagnosis {
             Self::TypeConflict { .. } => (DomainId(0), "", None, None),
             Self::TypeHashConflict { message_type, .. } => (DomainId(0), message_type, None, None),
             Self::DuplicateNode {
+                domain_id, node, ..
+            }
+            | Self::LogErrors {
                 domain_id, node, ..
             } => (*domain_id, node, None, None),
             Self::UnmatchedPublisher { writer, .. }

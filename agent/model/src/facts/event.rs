@@ -355,6 +355,7 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         Diagnosis::DuplicateNode { participants, .. } => participants.truncate(LIST),
         Diagnosis::NodeInSeveralDomains { domains, .. } => domains.truncate(LIST),
         Diagnosis::SharedMachineId { participants, .. } => participants.truncate(LIST),
+        Diagnosis::LogErrors { text, .. } => *text = bounded(text).into(),
         Diagnosis::QosIncompatible { .. }
         | Diagnosis::UnmatchedPublisher { .. }
         | Diagnosis::UnmatchedSubscription { .. }

@@ -148,6 +148,12 @@ crate::tables! {
         name: "retained_bytes", entries: 16 << 20,
         effect: "the participant with the most bytes loses its oldest message",
     }
+    /// Writers of standard types that the agent reads
+    RobotWriters { name: "robot_writers", entries: 1024, effect: "it is not read" }
+    /// Nodes with figures of their logs
+    LogNodes { name: "log_nodes", entries: 512, effect: "the one with the longest silence is dropped" }
+    /// Latest messages of logs, at most 1 KiB each
+    LogMessages { name: "log_messages", entries: 1000, rule: Oldest }
     /// Latest discovery events
     DiscoveryEvents { name: "journal.discovery", entries: 1024, rule: Oldest }
     /// Latest losses of writers

@@ -39,6 +39,7 @@ use ros2probe_wire::{DomainId, Guid, GuidPrefix, Reason, Timestamp};
 use crate::derive::chain::Chains;
 use crate::derive::examiner::Examiner;
 use crate::derive::inside::Inside;
+use crate::derive::robot::Robot;
 use crate::derive::services::Services;
 use crate::derive::trace::{Tracer, WriterDescription};
 use crate::derive::type_descriptions::TypeDescriptions;
@@ -138,6 +139,7 @@ pub(crate) struct Derive {
     pub(crate) chains: Chains,
     pub(crate) tracer: Tracer,
     pub(crate) examiner: Examiner,
+    pub(crate) robot: Robot,
     type_descriptions: TypeDescriptions,
 }
 
@@ -199,6 +201,7 @@ impl Observer {
                 chains: Chains::default(),
                 tracer: Tracer::new(settings.directed),
                 examiner: Examiner::default(),
+                robot: Robot::default(),
                 type_descriptions: TypeDescriptions::default(),
             },
             zenoh: Zenoh::default(),
@@ -352,7 +355,7 @@ impl Observer {
         walk::datagram(&padded, envelope, None, |found| {
             let clock = self.graph.wall_clock;
             Observation::each(&found.record, clock, |observation| {
-                self.observe(observation)
+                self.observe(observation);
             });
         });
     }
@@ -372,7 +375,7 @@ impl Observer {
         let outcome = walk::beginning(payload, length, envelope, |found| {
             let clock = self.graph.wall_clock;
             Observation::each(&found.record, clock, |observation| {
-                self.observe(observation)
+                self.observe(observation);
             });
         });
         self.datagram_end(outcome);
@@ -705,6 +708,7 @@ impl Observer {
         self.retire(guid, now);
         self.measure.payloads.release(guid, now);
         self.measure.latched.forget(guid);
+        self.derive.robot.forget(guid);
         self.references.remove(guid);
         let (domain_id, topic) = (endpoint.domain_id, endpoint.topic.bounded(TEXT));
         self.journal.events.name(guid, domain_id, &topic);

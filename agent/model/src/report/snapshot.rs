@@ -15,6 +15,7 @@ use ros2probe_wire::{DomainId, Guid, RtpsDuration, Timestamp};
 
 pub use crate::derive::chain::path::{ChainFacts, ChainsFacts};
 pub use crate::derive::inside::source::Source;
+pub use crate::derive::robot::logs::{LogFacts, LogMessage, NodeLogFacts};
 pub use crate::derive::services::action::GoalCounts;
 pub use crate::derive::services::facts::{ActionFacts, ServiceFacts};
 pub use crate::derive::services::latency::LatencyFacts;
@@ -73,6 +74,8 @@ pub struct Snapshot {
     pub chains: ChainsFacts,
     /// TCP connections to other hosts, by pair of addresses.
     pub links: Vec<LinkFacts>,
+    /// Logs of nodes.
+    pub logs: LogFacts,
     /// Problems of the graph; the same value while nothing changes.
     pub diagnoses: Arc<Diagnoses>,
     /// Time at which each problem appeared, in the same order.

@@ -4,6 +4,7 @@ mod calls;
 mod chains;
 mod inside;
 mod links;
+mod robot;
 mod zenoh;
 
 use std::net::{Ipv4Addr, SocketAddrV4};
@@ -464,6 +465,10 @@ fn forged_input_fills_no_table_beyond_its_cap() {
 
     let whole = drive(20_000, 1_000_000, &mut links::reports);
     assert_filled(&["links"]);
+    assert!(whole < 96 << 20, "{whole} bytes");
+
+    let whole = drive(MESSAGES / 3, 10_000_000, &mut robot::logs);
+    assert_filled(&["robot_writers", "log_nodes", "log_messages"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
     inside::of_a_queue();

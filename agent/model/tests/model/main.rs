@@ -27,6 +27,7 @@ mod observer;
 mod order;
 mod plain_collections;
 mod restart;
+mod robot;
 mod room;
 mod services;
 mod start_orders;

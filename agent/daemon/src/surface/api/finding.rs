@@ -157,6 +157,10 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
         diagnosis::Diagnosis::SharedMachineId { participants, .. } => Diagnosis::SharedMachineId {
             participants: printed(participants),
         },
+        diagnosis::Diagnosis::LogErrors { errors, text, .. } => Diagnosis::LogErrors {
+            errors: *errors,
+            text: Cow::Borrowed(text),
+        },
         diagnosis::Diagnosis::SlowChain {
             from, max_latency, ..
         } => Diagnosis::SlowChain {

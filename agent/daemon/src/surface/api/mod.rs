@@ -18,6 +18,7 @@ mod history;
 mod index;
 mod inside;
 pub mod live;
+mod logs;
 mod measured;
 mod messages;
 mod names;
@@ -184,6 +185,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(calls(turns(inside::routes())))
         .merge(calls(turns(why::routes())))
         .merge(processes::routes())
+        .merge(logs::routes())
         .merge(health::routes())
         .merge(needs(Access::All, Access::All, reload::routes()))
         .merge(needs(Access::All, Access::All, page::routes()))

@@ -54,6 +54,7 @@ const COMMON: [(&str, &str); 6] = [
         (name = "samples", description = "Messages of topics as they arrive."),
         (name = "recordings", description = "Bags that the agent writes."),
         (name = "graph", description = "The robot's graph and measurements."),
+        (name = "robot", description = "What the robot itself says."),
         (name = "agent", description = "The agent itself."),
     )
 )]

@@ -41,6 +41,7 @@ impl Observer {
             self.identify_call(found, sample, vendor);
             self.keep_description(found, sample, vendor);
             self.keep_payload(sample, found.payload);
+            self.hear_robot(sample, found.payload);
         }
     }
 

@@ -145,6 +145,9 @@ impl Observer {
             for writer in self.measure.latched.advance(now) {
                 self.apply_again(writer, now);
             }
+            for writer in self.derive.robot.end_second(now) {
+                self.apply_again(writer, now);
+            }
             let profiler = &self.measure.profiler;
             self.measure.payloads.retain_unknown_writers(|writer| {
                 let known = profiler.get(writer);
@@ -179,6 +182,7 @@ impl Observer {
                 &self.derive.inside,
                 &self.derive.chains,
                 &self.measure.links,
+                &self.derive.robot,
             ),
             now,
         );

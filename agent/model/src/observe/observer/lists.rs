@@ -11,6 +11,7 @@ use ros2probe_wire::{Guid, RtpsDuration, SequenceNumber};
 use super::MAX_MATCHES_PER_ROUND;
 use super::Observer;
 use super::references::Reference;
+use crate::derive::robot::Standard;
 use crate::derive::trace::share::Share;
 use crate::facts::dispatch::{self, Offered};
 use crate::facts::header::begins_with_header;
@@ -195,10 +196,18 @@ impl Observer {
                     _ => self.measure.latched.forget(guid),
                 }
                 let latched = self.measure.latched.verdict(guid);
+                let standard = Standard::of(&endpoint.message_type);
+                match standard.filter(|_| self.settings.reads_logs && counts) {
+                    Some(standard) => self.derive.robot.follow(guid, topic.domain_id, standard),
+                    None => self.derive.robot.forget(guid),
+                }
+                let is_read = self.derive.robot.is_captured(guid);
                 let verdict = match topic.naming.kind {
                     TopicKind::Discovery => Verdict::Capture,
                     _ if measured && counts && wants_bytes(topic) => Verdict::Capture,
-                    _ if is_call || latched == Some(Verdict::Capture) => Verdict::Capture,
+                    _ if is_call || is_read || latched == Some(Verdict::Capture) => {
+                        Verdict::Capture
+                    }
                     _ if measured => Verdict::Meter,
                     _ => latched.unwrap_or(Verdict::Ignore),
                 };

@@ -47,6 +47,7 @@ pub(super) fn snapshot(observer: &Observer, wall_time: Timestamp) -> Snapshot {
         zenoh: observer.zenoh.is_used().then(|| observer.zenoh.facts()),
         chains: observer.derive.chains.facts(wall_time),
         links: observer.measure.links.facts(),
+        logs: (observer.derive.robot.logs()).facts(observer.settings.reads_logs),
         diagnoses: Arc::clone(observer.derive.examiner.current()),
         diagnosed: Arc::clone(observer.derive.examiner.since()),
         churn: observer.graph.discovery.churn.facts(),
@@ -455,5 +456,6 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     tables.extend(observer.measure.latched.tables());
     tables.extend(observer.zenoh.tables());
     tables.push(observer.measure.links.tables());
+    tables.extend(observer.derive.robot.tables());
     tables
 }

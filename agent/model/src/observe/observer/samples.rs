@@ -7,6 +7,7 @@ use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 use ros2probe_wire::names::DdsTopic;
 
 use super::Observer;
+use crate::derive::robot::Heard;
 use crate::facts::dispatch::{self, Dispatch, SampleOutcome};
 use crate::facts::model_time::ModelTime;
 use crate::facts::naming::Naming;
@@ -143,6 +144,24 @@ impl Observer {
                 .put(sample, self.graph.wall_clock, payload)
         {
             self.apply_again(writer, sample.head.at);
+        }
+    }
+
+    /// Reads a sample of a standard type, in which the robot itself says something.
+    pub(super) fn hear_robot(&mut self, sample: &Sample, payload: &[u8]) {
+        let writer = sample.head.writer;
+        if !self.derive.robot.is_captured(writer) {
+            return;
+        }
+        let participants = self.graph.discovery.participants();
+        let nodes = participants.get(&writer.prefix).into_iter();
+        let mut nodes = nodes.flat_map(|participant| &participant.nodes);
+        let node = nodes.find(|node| node.writers.contains(&writer));
+        let node = node.map(|node| &node.name);
+        match self.derive.robot.hear(sample, payload, node) {
+            Heard::Nothing | Heard::Decoded(Ok(())) => {}
+            Heard::Paused => self.apply_again(writer, sample.head.at),
+            Heard::Decoded(Err(error)) => self.decode_error("log", error.reason),
         }
     }
 

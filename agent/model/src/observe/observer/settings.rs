@@ -35,6 +35,8 @@ pub struct Settings {
     /// Whether the last message of each transient-local writer is kept even if no watch requests
     /// it.
     pub keeps_latched: bool,
+    /// Whether the logs of nodes are read.
+    pub reads_logs: bool,
     /// Whether records contain the direction of datagrams; those of a capture file do not.
     pub directed: bool,
 }
@@ -55,6 +57,7 @@ impl Default for Settings {
             payload_delay: payloads::PAYLOAD_DELAY,
             service_timeout: Duration::from_secs(5),
             keeps_latched: true,
+            reads_logs: true,
             directed: true,
         }
     }

@@ -43,7 +43,9 @@ impl Observer {
         let mut zenoh = std::mem::take(&mut self.zenoh);
         let at = self.graph.wall_clock.model_time(report.time);
         let mut alive = None;
-        let wants_bytes = self.measure.payloads.wants_any_bytes() || self.measure.latched.is_used();
+        let wants_bytes = self.measure.payloads.wants_any_bytes()
+            || self.measure.latched.is_used()
+            || self.derive.robot.is_used();
         // A sample may precede its writer's announcement in a batch. It then has an unknown writer.
         zenoh.report(report, at, wants_bytes, &mut |shown| match shown {
             Shown::Sample(sample) => self.zenoh_sample(report.stream, at, sample),
@@ -220,6 +222,7 @@ impl Observer {
         }
         if let Some(payload) = payload.filter(|_| sample.referring.is_none()) {
             self.keep_payload(&observed, payload);
+            self.hear_robot(&observed, payload);
         }
         self.observe(&Observation::Sample(observed));
         if stream.outgoing && stream.is_loopback() {

@@ -327,6 +327,25 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             };
             found.with_remedy("end subscriptions of older distributions and of other middleware")
         }
+        Diagnosis::LogErrors {
+            domain_id,
+            node,
+            errors,
+            text,
+        } => {
+            let said = format!("{node} logged {errors} errors within a minute: {text}");
+            Finding {
+                domain_id: Some(domain_id.0),
+                node: all.ids.node(*domain_id, node),
+                ..finding(
+                    kind,
+                    Severity::Warning,
+                    &format!("{domain_id}|{node}"),
+                    said,
+                )
+            }
+            .with_remedy(format!("`rp log {node} --level error` prints them"))
+        }
         Diagnosis::LossyLink { link, .. } => {
             let text = format!(
                 "TCP repeats many segments from {} to {} ({}): the network between them loses packets",

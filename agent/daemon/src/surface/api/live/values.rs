@@ -129,6 +129,7 @@ impl Figures<'_> {
                 | Diagnosis::BuffersByCpu { .. }
                 | Diagnosis::SharedMachineId { .. }
                 | Diagnosis::LossyLink { .. }
+                | Diagnosis::LogErrors { .. }
                 | Diagnosis::SlowChain { .. } => {}
             }
         }

@@ -1,0 +1,282 @@
+//! What the robot itself says, in topics of standard types. The agent reads them as they pass,
+//! without a watch and without a subscription.
+//!
+//! A writer of such a type is captured within an allowance of its own and one for all writers. A
+//! writer that exceeds its allowance is paused for some seconds. Each message is decoded once,
+//! whichever copies of it were captured.
+
+pub mod logs;
+
+use foldhash::HashMap;
+use ros2probe_wire::{DomainId, Guid, SequenceNumber, WireError, log};
+
+use crate::facts::bounded::{Bounded, Counted, TableFacts};
+use crate::facts::diagnosis::Diagnosis;
+use crate::facts::model_time::ModelTime;
+use crate::facts::names::NodeName;
+use crate::facts::observation::Sample;
+use crate::facts::tables::RobotWriters;
+use crate::measure::allowance::Allowance;
+use crate::measure::assembly::Assembly;
+use logs::{Logs, Origin};
+
+/// Maximum size of a message that is decoded, in bytes.
+const MESSAGE_BYTES: usize = 64 << 10;
+/// Maximum size of all unfinished messages, in bytes.
+const ASSEMBLY_BYTES: usize = 1 << 20;
+/// Bytes of one writer that may be captured in a burst, and per second.
+const WRITER: Allowance = Allowance::new(1 << 20, 64 << 10);
+/// Bytes of all writers that may be captured in a burst, and per second.
+const ALL_WRITERS: Allowance = Allowance::new(8 << 20, 512 << 10);
+/// A paused writer is captured again once it is allowed this many bytes.
+const RESUME_BYTES: u64 = 256 << 10;
+
+/// Standard types that the agent reads.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Standard {
+    /// `rcl_interfaces/msg/Log`.
+    Log,
+}
+
+/// Writers of standard types, and what they said.
+#[derive(Debug)]
+pub struct Robot {
+    writers: Bounded<Counted<RobotWriters>, HashMap<Guid, RobotWriter>>,
+    assembly: Assembly,
+    allowance: Allowance,
+    /// Number of paused writers.
+    paused: usize,
+    logs: Logs,
+}
+
+#[derive(Debug)]
+struct RobotWriter {
+    domain_id: DomainId,
+    standard: Standard,
+    allowance: Allowance,
+    is_paused: bool,
+    read: ReadNumbers,
+}
+
+/// What a sample of a followed writer changed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Heard {
+    /// Nothing, or some of its bytes are still missing.
+    Nothing,
+    /// The writer is paused: its verdict has changed.
+    Paused,
+    /// It was decoded, or it is malformed.
+    Decoded(Result<(), WireError>),
+}
+
+/// The latest numbers of a writer that were decoded.
+#[derive(Clone, Copy, Debug, Default)]
+struct ReadNumbers {
+    newest: SequenceNumber,
+    /// Bit `n` stands for the number `newest - n`.
+    bits: u64,
+}
+
+impl Standard {
+    /// Returns the standard type of this name.
+    #[must_use]
+    pub fn of(message_type: &str) -> Option<Self> {
+        match message_type {
+            log::TYPE => Some(Self::Log),
+            _ => None,
+        }
+    }
+}
+
+impl Default for Robot {
+    fn default() -> Self {
+        Self {
+            writers: Bounded::default(),
+            assembly: Assembly::new(ASSEMBLY_BYTES),
+            allowance: ALL_WRITERS,
+            paused: 0,
+            logs: Logs::default(),
+        }
+    }
+}
+
+impl Robot {
+    /// Begins to read this writer, unless the table of writers is full.
+    pub fn follow(&mut self, writer: Guid, domain_id: DomainId, standard: Standard) {
+        let new = || RobotWriter {
+            domain_id,
+            standard,
+            allowance: WRITER,
+            is_paused: false,
+            read: ReadNumbers::default(),
+        };
+        self.writers.get_or_insert_with(writer, new);
+    }
+
+    /// Stops reading this writer.
+    pub fn forget(&mut self, writer: Guid) {
+        if let Some(known) = self.writers.remove(&writer) {
+            self.paused -= usize::from(known.is_paused);
+            self.assembly.release(writer);
+        }
+    }
+
+    /// Returns whether the kernel should capture this writer.
+    #[must_use]
+    pub fn is_captured(&self, writer: Guid) -> bool {
+        self.writers
+            .get(&writer)
+            .is_some_and(|known| !known.is_paused)
+    }
+
+    /// Returns whether a writer of a standard type is known.
+    #[must_use]
+    pub fn is_used(&self) -> bool {
+        !self.writers.is_empty()
+    }
+
+    /// Reads a DATA or DATA_FRAG of a followed writer. `node` is the node that has the writer.
+    pub fn hear(&mut self, sample: &Sample, payload: &[u8], node: Option<&NodeName>) -> Heard {
+        let (writer, now) = (sample.head.writer, sample.head.at);
+        let Some(known) = self.writers.get_mut(&writer) else {
+            return Heard::Nothing;
+        };
+        // Until the kernel knows of a pause, it captures more.
+        let own = known.allowance.spend(payload.len(), now);
+        let is_allowed = self.allowance.spend(payload.len(), now) && own;
+        if known.is_paused || !sample.is_message() {
+            return Heard::Nothing;
+        }
+        let bytes = usize::try_from(sample.size()).unwrap_or(usize::MAX);
+        if !is_allowed || bytes > MESSAGE_BYTES {
+            known.is_paused = true;
+            self.paused += 1;
+            self.assembly.release(writer);
+            return Heard::Paused;
+        }
+        let number = sample.sequence_number;
+        if known.read.has(number) {
+            return Heard::Nothing;
+        }
+        let (standard, domain_id) = (known.standard, known.domain_id);
+        let assembled;
+        let payload = match sample.is_start() && sample.is_end() {
+            true => payload,
+            false => {
+                self.assembly.put(sample, payload, 0);
+                if !self.assembly.is_whole(writer, number) {
+                    return Heard::Nothing;
+                }
+                let Some(bytes) = self.assembly.take(writer, number) else {
+                    return Heard::Nothing;
+                };
+                assembled = bytes;
+                &assembled
+            }
+        };
+        known.read.add(number);
+        let origin = Origin {
+            at: now,
+            domain_id,
+            writer,
+            number,
+            node,
+        };
+        let Standard::Log = standard;
+        Heard::Decoded(log::Log::parse(payload).map(|log| self.logs.add(&origin, &log)))
+    }
+
+    /// Ends a second: unfinished messages and old errors expire. Returns the writers that are
+    /// captured again.
+    pub fn end_second(&mut self, now: ModelTime) -> Vec<Guid> {
+        self.assembly.expire(now);
+        self.logs.end_second();
+        if self.paused == 0 || self.allowance.left(now) < RESUME_BYTES {
+            return Vec::new();
+        }
+        let mut resumed = Vec::new();
+        for (writer, known) in &mut self.writers {
+            if known.is_paused && known.allowance.left(now) >= RESUME_BYTES {
+                known.is_paused = false;
+                resumed.push(*writer);
+            }
+        }
+        self.paused -= resumed.len();
+        resumed
+    }
+
+    /// Returns the logs of all nodes.
+    #[must_use]
+    pub const fn logs(&self) -> &Logs {
+        &self.logs
+    }
+
+    /// Returns the number of changes of [`Self::findings`].
+    #[must_use]
+    pub const fn revision(&self) -> u64 {
+        self.logs.revision()
+    }
+
+    /// Returns what the robot says about problems of its own.
+    pub fn findings(&self) -> impl Iterator<Item = Diagnosis> {
+        self.logs.findings()
+    }
+
+    /// Returns the sizes and limits of the tables.
+    #[must_use]
+    pub fn tables(&self) -> Vec<TableFacts> {
+        let mut tables = vec![self.writers.facts()];
+        tables.extend(self.logs.tables());
+        tables
+    }
+}
+
+impl ReadNumbers {
+    /// Returns whether the number was added. Numbers far below the newest count as added, as copies
+    /// that a later subscriber requests.
+    fn has(&self, number: SequenceNumber) -> bool {
+        match self.newest.steps_since(number) {
+            _ if number > self.newest => false,
+            steps => steps >= 64 || self.bits >> steps & 1 != 0,
+        }
+    }
+
+    fn add(&mut self, number: SequenceNumber) {
+        match number.steps_since(self.newest) {
+            0 => self.bits |= 1_u64.checked_shl(steps(self.newest, number)).unwrap_or(0),
+            _ => {
+                let moved = steps(number, self.newest);
+                self.bits = self.bits.checked_shl(moved).unwrap_or(0) | 1;
+                self.newest = number;
+            }
+        }
+    }
+}
+
+/// Returns the steps from `lower` to `number`, as far as 32 bits hold them.
+fn steps(number: SequenceNumber, lower: SequenceNumber) -> u32 {
+    u32::try_from(number.steps_since(lower)).unwrap_or(u32::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_number_is_read_once_and_old_ones_are_copies() {
+        let mut read = ReadNumbers::default();
+        let mut is_new = |number| {
+            let number = SequenceNumber(number);
+            let is_new = !read.has(number);
+            if is_new {
+                read.add(number);
+            }
+            is_new
+        };
+        assert!(is_new(100) && !is_new(100));
+        assert!(is_new(102) && is_new(101) && !is_new(101) && !is_new(102));
+        assert!(is_new(40) && !is_new(40), "within the window");
+        assert!(!is_new(38), "before it");
+        assert!(is_new(1 << 40) && !is_new(102) && is_new((1 << 40) - 63));
+    }
+}

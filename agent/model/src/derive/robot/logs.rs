@@ -1,0 +1,266 @@
+//! The logs of nodes: counts by level, the last messages, and bursts of errors.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+
+use ros2probe_wire::log::{Log, LogLevel};
+use ros2probe_wire::{DomainId, Guid, SequenceNumber};
+
+use crate::facts::bounded::{Bounded, Counted, TableFacts};
+use crate::facts::diagnosis::Diagnosis;
+use crate::facts::model_time::ModelTime;
+use crate::facts::names::NodeName;
+use crate::facts::tables::{LogMessages, LogNodes};
+
+/// Maximum length of a message's text, in bytes.
+const TEXT: usize = 512;
+/// Maximum length of its other texts, in bytes.
+const NAME: usize = 128;
+/// Seconds in which errors are counted.
+const WINDOW: usize = 60;
+/// Errors within the window that are a burst. A fatal error is one.
+const BURST: u32 = 10;
+
+/// The logs of all nodes.
+#[derive(Debug, Default)]
+pub struct Logs {
+    nodes: Bounded<Counted<LogNodes>, BTreeMap<(DomainId, NodeName), NodeLog>>,
+    /// The latest messages of all nodes, oldest first.
+    latest: Bounded<Counted<LogMessages>, VecDeque<Arc<LogMessage>>>,
+    revision: u64,
+}
+
+/// Where and when a message was seen.
+#[derive(Clone, Copy, Debug)]
+pub struct Origin<'a> {
+    /// Time of its arrival.
+    pub at: ModelTime,
+    /// Domain of its writer.
+    pub domain_id: DomainId,
+    /// Its writer.
+    pub writer: Guid,
+    /// Its sequence number.
+    pub number: SequenceNumber,
+    /// The node that has the writer.
+    pub node: Option<&'a NodeName>,
+}
+
+/// A message of a log, with bounded texts.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LogMessage {
+    /// Time of its arrival.
+    pub at: ModelTime,
+    /// Seconds and nanoseconds of the node's clock, when it was logged.
+    pub stamp: (i32, u32),
+    /// Domain of its writer.
+    pub domain_id: DomainId,
+    /// Its writer.
+    pub writer: Guid,
+    /// Its sequence number.
+    pub number: SequenceNumber,
+    /// The node; if it is unknown, the name of the logger as that of a node.
+    pub node: NodeName,
+    /// Severity.
+    pub level: LogLevel,
+    /// Name of the logger.
+    pub logger: Box<str>,
+    /// The text, at most 512 bytes.
+    pub text: Box<str>,
+    /// Source file.
+    pub file: Box<str>,
+    /// Function.
+    pub function: Box<str>,
+    /// Line in the file.
+    pub line: u32,
+}
+
+/// The log of one node.
+#[derive(Debug)]
+struct NodeLog {
+    levels: [LevelLog; LogLevel::ALL.len()],
+    /// Time of the last message.
+    at: ModelTime,
+    /// Errors by second, the current one last.
+    errors: [u32; WINDOW],
+    burst: Option<Burst>,
+}
+
+/// Messages of one level.
+#[derive(Clone, Debug, Default)]
+struct LevelLog {
+    messages: u64,
+    last: Option<Arc<LogMessage>>,
+}
+
+/// A burst of errors, as it began.
+#[derive(Debug)]
+struct Burst {
+    errors: u64,
+    text: Arc<str>,
+}
+
+/// Figures of the log of one node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct NodeLogFacts {
+    /// Domain.
+    pub domain_id: DomainId,
+    /// The node.
+    pub node: NodeName,
+    /// Number of messages and last message of each level, in the order of [`LogLevel::ALL`].
+    pub levels: [(u64, Option<Arc<LogMessage>>); LogLevel::ALL.len()],
+}
+
+/// Figures of all logs.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct LogFacts {
+    /// Whether logs are read.
+    pub are_read: bool,
+    /// Nodes, sorted by domain and name.
+    pub nodes: Vec<NodeLogFacts>,
+    /// The latest messages of all nodes, oldest first.
+    pub latest: Vec<Arc<LogMessage>>,
+}
+
+impl Logs {
+    /// Adds a message.
+    pub fn add(&mut self, origin: &Origin<'_>, log: &Log<'_>) {
+        let logger = text(log.logger, NAME);
+        let node = match origin.node {
+            Some(node) => node.clone(),
+            None => NodeName::from(format!("/{}", logger.replace('.', "/"))),
+        };
+        let message = Arc::new(LogMessage {
+            at: origin.at,
+            stamp: log.stamp,
+            domain_id: origin.domain_id,
+            writer: origin.writer,
+            number: origin.number,
+            node: node.clone(),
+            level: log.level,
+            logger,
+            text: text(log.text, TEXT),
+            file: text(log.file, NAME),
+            function: text(log.function, NAME),
+            line: log.line,
+        });
+        self.latest.push_back(Arc::clone(&message));
+        let key = (origin.domain_id, node);
+        if self.nodes.is_full() && !self.nodes.contains_key(&key) {
+            self.nodes.refuse();
+            let silent = self.nodes.iter().min_by_key(|(_, log)| log.at);
+            if let Some(key) = silent.map(|(key, _)| key.clone()) {
+                self.nodes.remove(&key);
+                self.revision += 1;
+            }
+        }
+        if let Some(known) = self.nodes.get_or_insert_with(key, NodeLog::default) {
+            self.revision += u64::from(known.add(message));
+        }
+    }
+
+    /// Ends a second of the window in which errors are counted.
+    pub(super) fn end_second(&mut self) {
+        for log in self.nodes.values_mut() {
+            log.errors.rotate_left(1);
+            if let Some(current) = log.errors.last_mut() {
+                *current = 0;
+            }
+            if log.burst.is_some() && log.recent() == 0 {
+                log.burst = None;
+                self.revision += 1;
+            }
+        }
+    }
+
+    /// Returns the number of changes of [`Self::findings`].
+    pub(super) const fn revision(&self) -> u64 {
+        self.revision
+    }
+
+    /// Returns the bursts of errors.
+    pub(super) fn findings(&self) -> impl Iterator<Item = Diagnosis> {
+        self.nodes.iter().filter_map(|((domain_id, node), log)| {
+            let burst = log.burst.as_ref()?;
+            Some(Diagnosis::LogErrors {
+                domain_id: *domain_id,
+                node: node.clone(),
+                errors: burst.errors,
+                text: Arc::clone(&burst.text),
+            })
+        })
+    }
+
+    /// Returns the figures.
+    #[must_use]
+    pub fn facts(&self, are_read: bool) -> LogFacts {
+        let nodes = self.nodes.iter().map(|((domain_id, node), log)| {
+            let level = |level: &LevelLog| (level.messages, level.last.clone());
+            NodeLogFacts {
+                domain_id: *domain_id,
+                node: node.clone(),
+                levels: log.levels.each_ref().map(level),
+            }
+        });
+        LogFacts {
+            are_read,
+            nodes: nodes.collect(),
+            latest: self.latest.iter().cloned().collect(),
+        }
+    }
+
+    pub(super) fn tables(&self) -> [TableFacts; 2] {
+        [self.nodes.facts(), self.latest.facts()]
+    }
+}
+
+impl Default for NodeLog {
+    fn default() -> Self {
+        Self {
+            levels: Default::default(),
+            at: ModelTime::ZERO,
+            errors: [0; WINDOW],
+            burst: None,
+        }
+    }
+}
+
+impl NodeLog {
+    /// Adds a message. Returns whether a burst of errors begins.
+    fn add(&mut self, message: Arc<LogMessage>) -> bool {
+        self.at = message.at;
+        let level = message.level;
+        if let (true, Some(current)) = (level >= LogLevel::Error, self.errors.last_mut()) {
+            *current = current.saturating_add(1);
+        }
+        let begins = self.burst.is_none()
+            && level >= LogLevel::Error
+            && (level == LogLevel::Fatal || self.recent() >= BURST);
+        if begins {
+            self.burst = Some(Burst {
+                errors: self.recent().into(),
+                text: (&*message.text).into(),
+            });
+        }
+        if let Some(known) = self.levels.get_mut(level as usize) {
+            known.messages += 1;
+            known.last = Some(message);
+        }
+        begins
+    }
+
+    /// Returns the number of errors within the window.
+    fn recent(&self) -> u32 {
+        self.errors
+            .iter()
+            .fold(0, |sum, errors| sum.saturating_add(*errors))
+    }
+}
+
+/// Returns a text of at most `most` bytes. Bytes that are not UTF-8 become the replacement
+/// character.
+fn text(bytes: &[u8], most: usize) -> Box<str> {
+    let text = String::from_utf8_lossy(bytes.get(..most).unwrap_or(bytes));
+    // A replacement character is longer than the byte that it replaces.
+    let end = text.floor_char_boundary(most);
+    text.get(..end).unwrap_or_default().into()
+}
