@@ -80,8 +80,13 @@ pub struct Options {
 
 impl Options {
     /// Parses the command line. `supports` returns whether the library has a capability in a
-    /// role. Larger payloads than `largest` make fragments.
-    pub fn parse(largest: usize, supports: fn(Role, Capability) -> bool) -> Options {
+    /// role, and `announces` whether it takes the option. Larger payloads than `largest` make
+    /// fragments.
+    pub fn parse(
+        largest: usize,
+        supports: fn(Role, Capability) -> bool,
+        announces: fn(Role, Capability) -> bool,
+    ) -> Options {
         let mut options = Options {
             role: Role::Publisher,
             domain: 0,
@@ -182,7 +187,7 @@ impl Options {
         options.role = role.unwrap_or_else(|| usage("--role", "is missing"));
         if let Some((name, _)) = needs
             .iter()
-            .find(|(_, capability)| !supports(options.role, *capability))
+            .find(|(_, capability)| !announces(options.role, *capability))
         {
             usage(name, "is not supported by this library");
         }

@@ -37,6 +37,11 @@ pub trait Peer: Sized {
     const LARGEST_SIZE: usize = 65_000;
 
     fn supports(role: Role, capability: Capability) -> bool;
+    /// Returns whether the library announces a policy, even if it judges it otherwise than the
+    /// standard.
+    fn announces(role: Role, capability: Capability) -> bool {
+        Self::supports(role, capability)
+    }
     fn open(options: &Options) -> Result<Self>;
     fn guid(&self) -> Option<Guid>;
     fn write(&mut self, number: i32) -> Result<()>;
@@ -45,7 +50,7 @@ pub trait Peer: Sized {
 }
 
 pub fn run<P: Peer>() -> ExitCode {
-    let options = Options::parse(P::LARGEST_SIZE, P::supports);
+    let options = Options::parse(P::LARGEST_SIZE, P::supports, P::announces);
     match Course::<P>::run(&options) {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure(reason)) => {
