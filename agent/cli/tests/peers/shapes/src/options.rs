@@ -74,6 +74,9 @@ pub struct Options {
     pub count: u64,
     pub peers: i32,
     pub hold: bool,
+    /// A publisher waits for a line on standard input each time it has sent this many samples; 0
+    /// means that it does not wait.
+    pub stretch: u64,
     pub linger: Duration,
     pub log: Option<String>,
 }
@@ -107,6 +110,7 @@ impl Options {
             count: 0,
             peers: 1,
             hold: false,
+            stretch: 0,
             linger: Duration::from_secs(1),
             log: None,
         };
@@ -174,6 +178,7 @@ impl Options {
                 "--count" => options.count = number(&name, &text()),
                 "--peers" => options.peers = number(&name, &text()),
                 "--hold" => options.hold = true,
+                "--stretch" => options.stretch = number(&name, &text()),
                 "--linger" => options.linger = Duration::from_secs_f64(number(&name, &text())),
                 "--log" => options.log = Some(text()),
                 "--capabilities" => lists_capabilities = true,
