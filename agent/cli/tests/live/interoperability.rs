@@ -5,7 +5,10 @@
 //! Each pair has a domain of its own, so that a library does not disturb others: Fast DDS 2.9 may
 //! fail an assertion in the presence of five other libraries.
 
-use std::time::Duration;
+mod late_joiners;
+mod several_writers;
+
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of, get};
@@ -19,6 +22,8 @@ use tempfile::TempDir;
 const TOPIC: &str = "/square";
 /// Time within which samples arrive if some may get lost.
 const WITH_LOSSES: Duration = Duration::from_secs(10);
+/// Time after which a missing sample of a reliable writer counts as lost, and two seconds.
+const UNDECIDED: Duration = Duration::from_secs(12);
 /// Samples of each publisher.
 const COUNT: u64 = 20;
 /// Options of peers that match: dust_dds takes an announced infinite deadline for a finite one.
@@ -76,15 +81,9 @@ impl Round {
                 println!("{publisher:?} to {subscriber:?}: not supported");
                 continue;
             }
-            // The lease of Fast DDS is infinite by default.
-            let lease = match (publisher, subscriber) {
-                (Library::Fast, Library::Dust) => "--liveliness-lease 10000",
-                _ => "",
-            };
+            let lease = lease_between(publisher, subscriber);
             let start = |library, role, options: &str| {
-                let common = format!("--domain {domain} --topic rt{TOPIC} {lease}");
-                let options = format!("{common} {options}");
-                Shape::start(&self.link.monitor, library, role, &options)
+                self.start(domain, library, role, &format!("{lease} {options}"))
             };
             pairs.push(Pair {
                 domain: domain.to_string(),
@@ -94,6 +93,11 @@ impl Round {
         }
         ensure!(pairs.len() >= 3, "{} pairs", pairs.len());
         Ok(pairs)
+    }
+
+    fn start(&self, domain: usize, library: Library, role: Role, options: &str) -> Result<Shape> {
+        let options = format!("--domain {domain} --topic rt{TOPIC} {options}");
+        Shape::start(&self.link.monitor, library, role, &options)
     }
 
     /// Runs pairs that match, and compares the agent's facts with their logs.
@@ -130,7 +134,7 @@ impl Round {
             ] {
                 assert_eq!(pair.sum(&page, name), 0.0, "{what}: {name}");
             }
-            let topic = self.topic(pair)?;
+            let topic = self.topic(&pair.domain)?;
             let publisher = only(&topic["publishers"]).context(what.clone())?;
             assert_eq!(publisher["guid"], pair.publisher.guid()?, "{what}");
             assert_eq!(
@@ -145,8 +149,9 @@ impl Round {
             {
                 continue;
             }
+            let all = [(pair.publisher.guid()?, COUNT)];
             wait_until(&format!("{what}: deliveries equal the log"), || {
-                self.are_delivered(pair)
+                Ok(self.delivered(&pair.domain, &pair.subscriber)? == all)
             })?;
         }
         Ok(())
@@ -180,20 +185,36 @@ impl Round {
         Ok(())
     }
 
-    /// Returns whether the subscriber has every sample of its publisher once.
-    fn are_delivered(&self, pair: &Pair) -> Result<bool> {
-        let topic = self.topic(pair)?;
+    /// Returns the messages of each delivery to a subscriber's process, by their writer.
+    fn delivered(&self, domain: &str, subscriber: &Shape) -> Result<Vec<(String, u64)>> {
+        let topic = self.topic(domain)?;
         let deliveries = topic["deliveries"].as_array().context("no deliveries")?;
-        let process = pair.subscriber.process()?;
-        let mut received = deliveries
+        let process = subscriber.process()?;
+        let received = deliveries
             .iter()
             .filter(|each| each["direction"] == "received" && each["process_id"] == process);
-        let delivered = received.next().map(|each| &each["delivered"]["messages"]);
-        Ok(delivered == Some(&Value::from(COUNT)) && received.next().is_none())
+        let counts = received.map(|each| {
+            let writer = each["writer"].as_str().context("no writer")?;
+            let messages = each["delivered"]["messages"].as_u64();
+            Ok((writer.to_owned(), messages.context("no messages")?))
+        });
+        counts.collect()
     }
 
-    fn topic(&self, pair: &Pair) -> Result<Value> {
-        let path = format!("/topics{TOPIC}?domain_id={}", pair.domain);
+    /// Waits until every sample that was missed before now is decided: it is lost, or it is not.
+    fn wait_decided(&self) -> Result<()> {
+        let due = (SystemTime::now() + UNDECIDED).duration_since(UNIX_EPOCH)?;
+        wait_until("the end of the settle window", || {
+            let now = self.request("/graph")?["timestamp_seconds"].as_f64();
+            Ok(now.context("no time")? > due.as_secs_f64())
+        })
+    }
+
+    fn topic(&self, domain: &str) -> Result<Value> {
+        self.request(&format!("/topics{TOPIC}?domain_id={domain}"))
+    }
+
+    fn request(&self, path: &str) -> Result<Value> {
         let text = get(&self.link.monitor, &format!("http://127.0.0.1:17401{path}"))?;
         Ok(serde_json::from_str(&text)?)
     }
@@ -205,11 +226,8 @@ impl Pair {
         format!("{publisher:?} to {subscriber:?}")
     }
 
-    /// Returns whether reliable samples may get lost: HDDS loses some on a busy machine.
     fn is_lossy(&self) -> bool {
-        [&self.publisher, &self.subscriber]
-            .iter()
-            .any(|peer| peer.library == Library::Hdds)
+        is_lossy(&self.publisher) || is_lossy(&self.subscriber)
     }
 
     fn sum(&self, page: &Scrape, name: &str) -> f64 {
@@ -217,10 +235,24 @@ impl Pair {
     }
 }
 
+/// Returns the options with which a subscriber of dust_dds matches Fast DDS, whose lease is infinite
+/// by default.
+fn lease_between(publisher: Library, subscriber: Library) -> &'static str {
+    match (publisher, subscriber) {
+        (Library::Fast, Library::Dust) => "--liveliness-lease 10000",
+        _ => "",
+    }
+}
+
 /// Returns whether the libraries do not match though their QoS do: dust_dds takes the infinite lease
 /// of HDDS, which announces none, for a finite one.
 fn is_mistaken(publisher: Library, subscriber: Library) -> bool {
     (publisher, subscriber) == (Library::Hdds, Library::Dust)
+}
+
+/// Returns whether reliable samples may get lost: HDDS loses some on a busy machine.
+fn is_lossy(peer: &Shape) -> bool {
+    peer.library == Library::Hdds
 }
 
 /// Returns the only endpoint of a list.
