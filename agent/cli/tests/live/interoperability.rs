@@ -5,7 +5,10 @@
 //! Each pair has a domain of its own, so that a library does not disturb others: Fast DDS 2.9 may
 //! fail an assertion in the presence of five other libraries.
 
-use std::time::Duration;
+mod late_joiners;
+mod several_writers;
+
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of, get};
@@ -19,6 +22,8 @@ use tempfile::TempDir;
 const TOPIC: &str = "/square";
 /// Time within which samples arrive if some may get lost.
 const WITH_LOSSES: Duration = Duration::from_secs(10);
+/// Time after which a missing sample of a reliable writer counts as lost, and two seconds.
+const UNDECIDED: Duration = Duration::from_secs(12);
 /// Samples of each publisher.
 const COUNT: u64 = 20;
 /// Options of peers that match: dust_dds takes an announced infinite deadline for a finite one.
@@ -30,8 +35,6 @@ struct Case {
     offset: usize,
     /// What both libraries of a pair must support.
     capabilities: &'static [&'static str],
-    /// Libraries that judge the policy otherwise than the standard.
-    excluded: &'static [Library],
     offered: String,
     requested: String,
 }
@@ -69,10 +72,7 @@ impl Round {
         let mut pairs = Vec::new();
         for (domain, (publisher, subscriber)) in Library::ALL.into_iter().zip(libraries).enumerate()
         {
-            let is_excluded = |library| case.excluded.contains(&library);
-            let mut is_able = !is_mistaken(publisher, subscriber)
-                && !is_excluded(publisher)
-                && !is_excluded(subscriber);
+            let mut is_able = !is_mistaken(publisher, subscriber);
             for capability in case.capabilities {
                 is_able &= publisher.can(Role::Publisher, capability)?
                     && subscriber.can(Role::Subscriber, capability)?;
@@ -81,15 +81,9 @@ impl Round {
                 println!("{publisher:?} to {subscriber:?}: not supported");
                 continue;
             }
-            // The lease of Fast DDS is infinite by default.
-            let lease = match (publisher, subscriber) {
-                (Library::Fast, Library::Dust) => "--liveliness-lease 10000",
-                _ => "",
-            };
+            let lease = lease_between(publisher, subscriber);
             let start = |library, role, options: &str| {
-                let common = format!("--domain {domain} --topic rt{TOPIC} {lease}");
-                let options = format!("{common} {options}");
-                Shape::start(&self.link.monitor, library, role, &options)
+                self.start(domain, library, role, &format!("{lease} {options}"))
             };
             pairs.push(Pair {
                 domain: domain.to_string(),
@@ -99,6 +93,11 @@ impl Round {
         }
         ensure!(pairs.len() >= 3, "{} pairs", pairs.len());
         Ok(pairs)
+    }
+
+    fn start(&self, domain: usize, library: Library, role: Role, options: &str) -> Result<Shape> {
+        let options = format!("--domain {domain} --topic rt{TOPIC} {options}");
+        Shape::start(&self.link.monitor, library, role, &options)
     }
 
     /// Runs pairs that match, and compares the agent's facts with their logs.
@@ -135,7 +134,7 @@ impl Round {
             ] {
                 assert_eq!(pair.sum(&page, name), 0.0, "{what}: {name}");
             }
-            let topic = self.topic(pair)?;
+            let topic = self.topic(&pair.domain)?;
             let publisher = only(&topic["publishers"]).context(what.clone())?;
             assert_eq!(publisher["guid"], pair.publisher.guid()?, "{what}");
             assert_eq!(
@@ -150,8 +149,9 @@ impl Round {
             {
                 continue;
             }
+            let all = [(pair.publisher.guid()?, COUNT)];
             wait_until(&format!("{what}: deliveries equal the log"), || {
-                self.are_delivered(pair)
+                Ok(self.delivered(&pair.domain, &pair.subscriber)? == all)
             })?;
         }
         Ok(())
@@ -185,20 +185,36 @@ impl Round {
         Ok(())
     }
 
-    /// Returns whether the subscriber has every sample of its publisher once.
-    fn are_delivered(&self, pair: &Pair) -> Result<bool> {
-        let topic = self.topic(pair)?;
+    /// Returns the messages of each delivery to a subscriber's process, by their writer.
+    fn delivered(&self, domain: &str, subscriber: &Shape) -> Result<Vec<(String, u64)>> {
+        let topic = self.topic(domain)?;
         let deliveries = topic["deliveries"].as_array().context("no deliveries")?;
-        let process = pair.subscriber.process()?;
-        let mut received = deliveries
+        let process = subscriber.process()?;
+        let received = deliveries
             .iter()
             .filter(|each| each["direction"] == "received" && each["process_id"] == process);
-        let delivered = received.next().map(|each| &each["delivered"]["messages"]);
-        Ok(delivered == Some(&Value::from(COUNT)) && received.next().is_none())
+        let counts = received.map(|each| {
+            let writer = each["writer"].as_str().context("no writer")?;
+            let messages = each["delivered"]["messages"].as_u64();
+            Ok((writer.to_owned(), messages.context("no messages")?))
+        });
+        counts.collect()
     }
 
-    fn topic(&self, pair: &Pair) -> Result<Value> {
-        let path = format!("/topics{TOPIC}?domain_id={}", pair.domain);
+    /// Waits until every sample that was missed before now is decided: it is lost, or it is not.
+    fn wait_decided(&self) -> Result<()> {
+        let due = (SystemTime::now() + UNDECIDED).duration_since(UNIX_EPOCH)?;
+        wait_until("the end of the settle window", || {
+            let now = self.request("/graph")?["timestamp_seconds"].as_f64();
+            Ok(now.context("no time")? > due.as_secs_f64())
+        })
+    }
+
+    fn topic(&self, domain: &str) -> Result<Value> {
+        self.request(&format!("/topics{TOPIC}?domain_id={domain}"))
+    }
+
+    fn request(&self, path: &str) -> Result<Value> {
         let text = get(&self.link.monitor, &format!("http://127.0.0.1:17401{path}"))?;
         Ok(serde_json::from_str(&text)?)
     }
@@ -210,11 +226,8 @@ impl Pair {
         format!("{publisher:?} to {subscriber:?}")
     }
 
-    /// Returns whether reliable samples may get lost: HDDS loses some on a busy machine.
     fn is_lossy(&self) -> bool {
-        [&self.publisher, &self.subscriber]
-            .iter()
-            .any(|peer| peer.library == Library::Hdds)
+        is_lossy(&self.publisher) || is_lossy(&self.subscriber)
     }
 
     fn sum(&self, page: &Scrape, name: &str) -> f64 {
@@ -222,10 +235,24 @@ impl Pair {
     }
 }
 
+/// Returns the options with which a subscriber of dust_dds matches Fast DDS, whose lease is infinite
+/// by default.
+fn lease_between(publisher: Library, subscriber: Library) -> &'static str {
+    match (publisher, subscriber) {
+        (Library::Fast, Library::Dust) => "--liveliness-lease 10000",
+        _ => "",
+    }
+}
+
 /// Returns whether the libraries do not match though their QoS do: dust_dds takes the infinite lease
 /// of HDDS, which announces none, for a finite one.
 fn is_mistaken(publisher: Library, subscriber: Library) -> bool {
     (publisher, subscriber) == (Library::Hdds, Library::Dust)
+}
+
+/// Returns whether reliable samples may get lost: HDDS loses some on a busy machine.
+fn is_lossy(peer: &Shape) -> bool {
+    peer.library == Library::Hdds
 }
 
 /// Returns the only endpoint of a list.
@@ -241,7 +268,6 @@ fn match_all(offset: usize, capabilities: &'static [&'static str], qos: [&str; 2
     Round::new()?.match_all(&Case {
         offset,
         capabilities,
-        excluded: &[],
         offered: format!("{FINITE} --count {COUNT} --linger 120 {offered}"),
         requested: format!("{FINITE} {requested}"),
     })
@@ -310,7 +336,6 @@ fn match_none(
     let case = Case {
         offset,
         capabilities,
-        excluded: &[],
         offered: format!("{FINITE} {offered}"),
         requested: format!("{FINITE} {requested}"),
     };
@@ -344,15 +369,13 @@ fn an_exclusive_publisher_is_the_reported_reason() -> Result<()> {
     )
 }
 
-/// HDDS announces no lease. dust_dds judges leases in reverse: it takes a publisher's longer one.
-/// All other libraries are in both roles, but Cyclone DDS 0.10 only with itself.
+/// All libraries but dust_dds and HDDS are in both roles, Cyclone DDS 0.10 only with itself.
 #[test]
 fn a_longer_lease_of_a_publisher_is_the_reported_reason() -> Result<()> {
     for offset in [0, 2] {
         let case = Case {
             offset,
             capabilities: &["liveliness"],
-            excluded: &[Library::Dust],
             offered: format!("{FINITE} --liveliness-lease 20000"),
             requested: format!("{FINITE} --liveliness-lease 10000"),
         };
@@ -368,7 +391,6 @@ fn endpoints_in_different_partitions_do_not_match() -> Result<()> {
     let pairs = round.pairs(&Case {
         offset: 2,
         capabilities: &["partition"],
-        excluded: &[],
         offered: "--partition left".to_owned(),
         requested: "--partition right --partition far".to_owned(),
     })?;

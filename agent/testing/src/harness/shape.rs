@@ -125,7 +125,7 @@ impl Shape {
         waited.with_context(|| format!("{:?}: {:?}", self.library, self.log().map(|log| log.0)))
     }
 
-    /// Lets a publisher send.
+    /// Lets a publisher send its first samples, or the next `--stretch` of them.
     pub fn go(&mut self) -> Result<()> {
         self.process.write_line("go")
     }

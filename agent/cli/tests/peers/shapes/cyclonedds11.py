@@ -108,6 +108,7 @@ def options():
     parser.add_argument("--count", type=int, default=0)
     parser.add_argument("--peers", type=int, default=1)
     parser.add_argument("--hold", action="store_true")
+    parser.add_argument("--stretch", type=int, default=0)
     parser.add_argument("--linger", type=float, default=1.0)
     parser.add_argument("--log")
     parser.add_argument("--capabilities", action="store_true")
@@ -231,21 +232,24 @@ class Peer:
         if not stopped.is_set():
             say("matched")
 
-    def wait_for_start(self):
-        if not self.options.hold:
-            self.pump_until(time.monotonic() + SETTLE_TIME)
-            return
+    def wait_for_line(self):
         self.pump(lambda: not select.select([sys.stdin], [], [], 0)[0])
         if not stopped.is_set() and not sys.stdin.readline():
-            sys.exit("standard input ended before the start")
+            sys.exit("standard input ended before the line")
 
     def publish(self):
-        self.wait_for_start()
+        if self.options.hold:
+            self.wait_for_line()
+        else:
+            self.pump_until(time.monotonic() + SETTLE_TIME)
         payload = bytes(place % 256 for place in range(self.options.size))
         shape = ShapeType(self.options.color, 0, 0, SHAPE_SIZE, payload)
-        start = time.monotonic()
+        start, first = time.monotonic(), 0
         while self.options.count == 0 or shape.x < self.options.count:
-            self.pump_until(start + shape.x / self.options.rate)
+            if 0 < self.options.stretch == shape.x - first:
+                self.wait_for_line()
+                start, first = time.monotonic(), shape.x
+            self.pump_until(start + (shape.x - first) / self.options.rate)
             if stopped.is_set():
                 break
             self.endpoint.write(shape)

@@ -100,7 +100,8 @@ class ShapeSupport : public TopicDataType {
 };
 
 #ifdef HAS_FILTERS
-// Registers the members of the type, among which a filter looks up its fields.
+// Registers the members of the type, among which a filter looks up its fields. A writer then
+// applies the filters of readers of this library.
 void describe_type() {
   using namespace eprosima::fastrtps::types;
   auto& types = *DynamicTypeBuilderFactory::get_instance();
@@ -208,6 +209,9 @@ class FastDds : public shapes::Peer {
     // Samples above one datagram need a writer that sends from a thread of its own.
     if (options.size > shapes::kDatagram)
       qos.publish_mode().kind = ASYNCHRONOUS_PUBLISH_MODE;
+#ifdef HAS_FILTERS
+    describe_type();
+#endif
     Publisher* publisher = checked(participant_->create_publisher(group), "no publisher");
     writer_ = checked(publisher->create_datawriter(topic, qos), "no writer");
   }

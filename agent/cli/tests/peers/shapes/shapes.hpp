@@ -34,13 +34,16 @@ struct Options {
   double rate = 20.0, linger = 1.0;
   // The number of samples to send, or to receive before the end; 0 means no limit.
   uint64_t count = 0;
+  // A publisher waits for a line on standard input each time it has sent this many samples; 0 means
+  // that it does not wait.
+  uint64_t stretch = 0;
   bool hold = false;
 
   // `missing` are the capabilities that the library lacks.
   static Options parse(int argc, char** argv, const std::set<std::string>& missing) {
     enum { kRole = 1, kDomain, kTopic, kColor, kReliable, kBestEffort, kDurability, kDepth,
            kKeepAll, kStrength, kExclusive, kDeadline, kLifespan, kLease, kPartition, kFilter, kSize, kRate,
-           kCount, kPeers, kHold, kLinger, kLog, kCapabilities };
+           kCount, kPeers, kHold, kStretch, kLinger, kLog, kCapabilities };
     static const option names[] = {
         {"role", 1, nullptr, kRole},
         {"domain", 1, nullptr, kDomain},
@@ -63,6 +66,7 @@ struct Options {
         {"count", 1, nullptr, kCount},
         {"peers", 1, nullptr, kPeers},
         {"hold", 0, nullptr, kHold},
+        {"stretch", 1, nullptr, kStretch},
         {"linger", 1, nullptr, kLinger},
         {"log", 1, nullptr, kLog},
         {"capabilities", 0, nullptr, kCapabilities},
@@ -113,6 +117,7 @@ struct Options {
         case kCount: options.count = strtoull(optarg, nullptr, 10); break;
         case kPeers: options.peers = atoi(optarg); break;
         case kHold: options.hold = true; break;
+        case kStretch: options.stretch = strtoull(optarg, nullptr, 10); break;
         case kLinger: options.linger = strtod(optarg, nullptr); break;
         case kLog: options.log = text; break;
         case kCapabilities: lists = true; break;
@@ -231,21 +236,31 @@ class Course {
  private:
   void publish() {
     if (options_.hold) {
-      pollfd input{0, POLLIN, 0};
-      pump([&] { return ::poll(&input, 1, 0) <= 0; });
-      peer::wait_for_line();
+      wait_for_line();
     } else {
       pump_until(peer::unix_ns() + kSettleNs);
     }
-    const int64_t start = peer::unix_ns();
+    int64_t start = peer::unix_ns();
+    uint64_t first = 0;
     for (uint64_t number = 0; options_.count == 0 || number < options_.count; number++) {
-      pump_until(start + static_cast<int64_t>(number * 1e9 / options_.rate));
+      if (options_.stretch > 0 && number == first + options_.stretch) {
+        wait_for_line();
+        start = peer::unix_ns();
+        first = number;
+      }
+      pump_until(start + static_cast<int64_t>((number - first) * 1e9 / options_.rate));
       if (peer::stopped) break;
       peer_.write(static_cast<int32_t>(number));
       log_.write("pub", ",\"seq\":%" PRIu64 ",\"len\":%zu", number, options_.size);
     }
     peer::say("done");
     pump_until(peer::unix_ns() + static_cast<int64_t>(options_.linger * 1e9));
+  }
+
+  void wait_for_line() {
+    pollfd input{0, POLLIN, 0};
+    pump([&] { return ::poll(&input, 1, 0) <= 0; });
+    peer::wait_for_line();
   }
 
   void pump_until(int64_t due) {

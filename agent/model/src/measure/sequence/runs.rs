@@ -76,7 +76,9 @@ impl Sequence {
         // The first samples may have been forged as well, so a lower number far away is
         // unconfirmed. A lower number within `FAR` is history.
         let is_young = self.followed < CONFIRMATIONS;
-        newer && (self.has(number) || continues()) || is_young && self.next - number > FAR
+        // The source time of a number above `newest` is unknown: it arrived by another route.
+        let is_repeated = || number <= self.newest && self.has(number);
+        newer && (is_repeated() || continues()) || is_young && self.next - number > FAR
     }
 
     /// Marks an unconfirmed sample as whole. Returns whether that is new.

@@ -114,6 +114,38 @@ fn samples_on_both_routes_before_they_are_merged_count_once() {
 }
 
 #[test]
+fn a_copy_of_a_sample_that_arrives_after_its_route_is_merged_is_a_duplicate() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    let group = bob.multicast(101);
+    for number in 1..=20 {
+        host.data(bob, number);
+        host.wait(1);
+    }
+    // Fast DDS changes to multicast at the second reader, and sends by each interface.
+    host.wait(1000);
+    host.data(group, 21);
+    host.owner(group, BOB);
+    host.data(group, 21);
+    for number in 22..=30 {
+        host.wait(1);
+        host.data(group, number);
+        host.data(group, number);
+    }
+    host.wait(12_000);
+    let [delivery] = &host.deliveries()[..] else {
+        panic!("one receiver: {:#?}", host.deliveries())
+    };
+    let facts = delivery.delivered;
+    assert_eq!(
+        (facts.messages, facts.duplicates, facts.lost()),
+        (30, 10, 0)
+    );
+    let total = host.topic().received.unwrap();
+    assert_eq!((total.messages, total.duplicates), (30, 10));
+}
+
+#[test]
 fn a_receiver_whose_socket_is_identified_late_has_one_delivery() {
     for names in [&[false, true][..], &[true, true], &[false, false, true]] {
         let mut host = Host::new();

@@ -74,14 +74,22 @@ pub struct Options {
     pub count: u64,
     pub peers: i32,
     pub hold: bool,
+    /// A publisher waits for a line on standard input each time it has sent this many samples; 0
+    /// means that it does not wait.
+    pub stretch: u64,
     pub linger: Duration,
     pub log: Option<String>,
 }
 
 impl Options {
     /// Parses the command line. `supports` returns whether the library has a capability in a
-    /// role. Larger payloads than `largest` make fragments.
-    pub fn parse(largest: usize, supports: fn(Role, Capability) -> bool) -> Options {
+    /// role, and `announces` whether it takes the option. Larger payloads than `largest` make
+    /// fragments.
+    pub fn parse(
+        largest: usize,
+        supports: fn(Role, Capability) -> bool,
+        announces: fn(Role, Capability) -> bool,
+    ) -> Options {
         let mut options = Options {
             role: Role::Publisher,
             domain: 0,
@@ -102,6 +110,7 @@ impl Options {
             count: 0,
             peers: 1,
             hold: false,
+            stretch: 0,
             linger: Duration::from_secs(1),
             log: None,
         };
@@ -169,6 +178,7 @@ impl Options {
                 "--count" => options.count = number(&name, &text()),
                 "--peers" => options.peers = number(&name, &text()),
                 "--hold" => options.hold = true,
+                "--stretch" => options.stretch = number(&name, &text()),
                 "--linger" => options.linger = Duration::from_secs_f64(number(&name, &text())),
                 "--log" => options.log = Some(text()),
                 "--capabilities" => lists_capabilities = true,
@@ -182,7 +192,7 @@ impl Options {
         options.role = role.unwrap_or_else(|| usage("--role", "is missing"));
         if let Some((name, _)) = needs
             .iter()
-            .find(|(_, capability)| !supports(options.role, *capability))
+            .find(|(_, capability)| !announces(options.role, *capability))
         {
             usage(name, "is not supported by this library");
         }

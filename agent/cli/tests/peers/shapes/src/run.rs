@@ -37,6 +37,11 @@ pub trait Peer: Sized {
     const LARGEST_SIZE: usize = 65_000;
 
     fn supports(role: Role, capability: Capability) -> bool;
+    /// Returns whether the library announces a policy, even if it judges it otherwise than the
+    /// standard.
+    fn announces(role: Role, capability: Capability) -> bool {
+        Self::supports(role, capability)
+    }
     fn open(options: &Options) -> Result<Self>;
     fn guid(&self) -> Option<Guid>;
     fn write(&mut self, number: i32) -> Result<()>;
@@ -45,7 +50,7 @@ pub trait Peer: Sized {
 }
 
 pub fn run<P: Peer>() -> ExitCode {
-    let options = Options::parse(P::LARGEST_SIZE, P::supports);
+    let options = Options::parse(P::LARGEST_SIZE, P::supports, P::announces);
     match Course::<P>::run(&options) {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure(reason)) => {
@@ -97,13 +102,22 @@ impl<P: Peer> Course<'_, P> {
     }
 
     fn publish(&mut self) -> Result<()> {
-        self.wait_for_start()?;
-        let start = Instant::now();
+        if self.options.hold {
+            self.wait_for_line()?;
+        } else {
+            self.pump_until(Instant::now() + SETTLE_TIME)?;
+        }
+        let (mut start, mut first) = (Instant::now(), 0);
         for number in 0.. {
             if self.options.count != 0 && number == self.options.count {
                 break;
             }
-            self.pump_until(start + Duration::from_secs_f64(number as f64 / self.options.rate))?;
+            if self.options.stretch != 0 && number == first + self.options.stretch {
+                self.wait_for_line()?;
+                (start, first) = (Instant::now(), number);
+            }
+            let due = Duration::from_secs_f64((number - first) as f64 / self.options.rate);
+            self.pump_until(start + due)?;
             if self.is_stopped() {
                 break;
             }
@@ -123,16 +137,13 @@ impl<P: Peer> Course<'_, P> {
         Ok(())
     }
 
-    fn wait_for_start(&mut self) -> Result<()> {
-        if !self.options.hold {
-            return self.pump_until(Instant::now() + SETTLE_TIME);
-        }
+    fn wait_for_line(&mut self) -> Result<()> {
         let line = line_of_standard_input();
         while !self.is_stopped() {
             match line.try_recv() {
                 Ok(()) => break,
                 Err(TryRecvError::Disconnected) => {
-                    return Err("standard input ended before the start".into());
+                    return Err("standard input ended before the line".into());
                 }
                 Err(TryRecvError::Empty) => self.pump_until(Instant::now() + POLL_INTERVAL)?,
             }

@@ -78,7 +78,12 @@ enum Endpoint {
 impl Peer for Dust {
     const STACK: &str = "dust";
 
-    fn supports(_: Role, _: Capability) -> bool {
+    /// A longer lease of a publisher matches, and a shorter one does not.
+    fn supports(_: Role, capability: Capability) -> bool {
+        capability != Capability::Liveliness
+    }
+
+    fn announces(_: Role, _: Capability) -> bool {
         true
     }
 
