@@ -79,6 +79,8 @@ impl EntityId {
     pub const SEDP_SUBSCRIPTIONS_WRITER: Self = Self([0x00, 0x00, 0x04, 0xc2]);
     /// Writer of participant messages (liveliness).
     pub const PARTICIPANT_MESSAGE_WRITER: Self = Self([0x00, 0x02, 0x00, 0xc2]);
+    /// Writer of replies of the TypeLookup service (DDS-XTypes 1.3, 7.6.3.3.3).
+    pub const TYPE_LOOKUP_REPLY_WRITER: Self = Self([0x00, 0x03, 0x01, 0xc3]);
     /// Secure variant of [`Self::SPDP_WRITER`].
     pub const SPDP_SECURE_WRITER: Self = Self([0xff, 0x01, 0x01, 0xc2]);
     /// Secure variant of [`Self::SEDP_PUBLICATIONS_WRITER`].

@@ -51,6 +51,8 @@ mod text;
 pub mod time;
 pub mod walk;
 #[cfg(feature = "alloc")]
+pub mod xcdr2;
+#[cfg(feature = "alloc")]
 pub mod zenoh;
 pub mod zenoh_stream;
 

@@ -54,6 +54,7 @@ impl ParameterId {
     pub const KEY_HASH: Self = Self(0x0070);
     pub const STATUS_INFO: Self = Self(0x0071);
     pub const DATA_REPRESENTATION: Self = Self(0x0073);
+    pub const TYPE_INFORMATION: Self = Self(0x0075);
     pub const RELATED_SAMPLE_IDENTITY: Self = Self(0x0083);
     pub const IDENTITY_TOKEN: Self = Self(0x1001);
     pub const PERMISSIONS_TOKEN: Self = Self(0x1002);

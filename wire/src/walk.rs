@@ -607,12 +607,14 @@ const fn is_discovery_writer(entity: u32) -> bool {
     const SPDP: u32 = word(EntityId::SPDP_WRITER);
     const PUBLICATIONS: u32 = word(EntityId::SEDP_PUBLICATIONS_WRITER);
     const SUBSCRIPTIONS: u32 = word(EntityId::SEDP_SUBSCRIPTIONS_WRITER);
+    const TYPE_LOOKUP_REPLIES: u32 = word(EntityId::TYPE_LOOKUP_REPLY_WRITER);
     const SPDP_SECURE: u32 = word(EntityId::SPDP_SECURE_WRITER);
     const PUBLICATIONS_SECURE: u32 = word(EntityId::SEDP_PUBLICATIONS_SECURE_WRITER);
     const SUBSCRIPTIONS_SECURE: u32 = word(EntityId::SEDP_SUBSCRIPTIONS_SECURE_WRITER);
     entity == SPDP
         || entity == PUBLICATIONS
         || entity == SUBSCRIPTIONS
+        || entity == TYPE_LOOKUP_REPLIES
         || entity == SPDP_SECURE
         || entity == PUBLICATIONS_SECURE
         || entity == SUBSCRIPTIONS_SECURE

@@ -33,6 +33,9 @@ pub struct Endpoint<'a> {
     pub message_type: Cow<'a, str>,
     /// RIHS01 hash of the type; null if the endpoint does not announce it (Humble).
     pub type_hash: Option<Cow<'a, str>>,
+    /// Hash of the complete type in XTypes (`XTYPES_` and 28 digits), which Cyclone DDS 11 and Fast DDS 3
+    /// announce; null if the endpoint does not announce it.
+    pub equivalence_hash: Option<Cow<'a, str>>,
     /// Middleware of the endpoint's participant: the DDS implementation, or `Eclipse Zenoh`; null
     /// when unknown.
     pub vendor: Option<Cow<'a, str>>,
@@ -49,6 +52,15 @@ pub struct Endpoint<'a> {
     /// The last message of this writer, if it is transient local and the agent keeps such messages;
     /// null for readers and for other writers.
     pub latched: Option<Latched>,
+}
+
+impl Endpoint<'_> {
+    /// Returns the hash by which a definition of the type is found.
+    #[must_use]
+    pub fn definition_hash(&self) -> Option<&str> {
+        let hash = self.type_hash.as_deref();
+        hash.or(self.equivalence_hash.as_deref())
+    }
 }
 
 /// Quality of service as announced. A null duration is infinite.

@@ -38,6 +38,10 @@ pub struct Definition {
     pub reason: Option<String>,
     /// The definition, followed by the definitions of its nested types, in the format of ROS bags.
     pub definition: Option<String>,
+    /// Hash of the complete type in XTypes by which the definition was found; null if it was found by
+    /// another hash or by its name.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub equivalence_hash: Option<String>,
 }
 
 /// A message.

@@ -98,8 +98,21 @@ pub struct Sample {
 pub struct Offered {
     /// RIHS01 hash of the type; null if the writer does not announce it (Humble).
     pub type_hash: Option<String>,
+    /// Hash of the complete type in XTypes (`XTYPES_` and 28 digits); null if the writer does not announce
+    /// it.
+    #[serde(default)]
+    pub equivalence_hash: Option<String>,
     /// Quality of service.
     pub qos: OfferedQos,
+}
+
+impl Offered {
+    /// Returns the hash by which a definition of the type is found.
+    #[must_use]
+    pub fn definition_hash(&self) -> Option<&str> {
+        let hash = self.type_hash.as_deref();
+        hash.or(self.equivalence_hash.as_deref())
+    }
 }
 
 /// Quality of service in ROS terms. A null duration is infinite.

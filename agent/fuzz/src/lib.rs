@@ -10,6 +10,7 @@ use std::path::Path;
 use std::sync::{Arc, LazyLock};
 use std::time::Duration;
 
+use md5::{Digest as _, Md5};
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::bag::{self, Sort};
 use ros2probe_attach::library;
@@ -28,12 +29,14 @@ use ros2probe_daemon::config::{Config, Watch, Watchlist};
 use ros2probe_daemon::surface::foxglove::protocol;
 use ros2probe_daemon::surface::ros2_daemon::call::{self, Argument, Call};
 use ros2probe_message::filter::{Filter, Subject};
+use ros2probe_message::library::{DescribedFigures, Library, Sources};
 use ros2probe_message::{Decoded, Definition, MessageType, Truncation, csv, decode, yaml};
 use ros2probe_model::facts::route::Destination;
 use ros2probe_model::facts::selection::{Depth, SampleRequest, Selection};
 use ros2probe_model::graph::zenoh::{Flow, StreamId};
 use ros2probe_model::observe::input::{Captured, Input};
 use ros2probe_model::observe::observer::{Observer, Settings};
+use ros2probe_wire::discovery::EquivalenceHash;
 use ros2probe_wire::frame::{self, Packet, Payload};
 use ros2probe_wire::record::Record;
 use ros2probe_wire::walk::{self, Envelope};
@@ -297,6 +300,42 @@ pub fn definition(bytes: &[u8]) {
         let again = MessageType::parse(&root, &written).expect("what was read");
         assert_eq!(again.type_hash(), read.type_hash());
     }
+}
+
+/// Reads a reply of the TypeLookup service, then one with the bytes as a TypeObject whose hash fits.
+pub fn type_objects(bytes: &[u8]) {
+    const NAME: &str = "my_robot_msgs/msg/Part";
+    let mut object = (bytes.len() as u32).to_le_bytes().to_vec();
+    object.extend(bytes);
+    let digest = Md5::digest(&object);
+    let hash = EquivalenceHash(*digest.first_chunk().expect("14 of 16 bytes"));
+    let library = Library::new(Sources::default());
+    library.offer_objects(bytes.into());
+    library.offer_objects(reply(hash, &object).into());
+    for announced in [Some(hash.to_string()), None] {
+        if let Ok(found) = library.find(NAME, announced.as_deref()) {
+            for structure in found.structures() {
+                assert!(structure.fields.len() <= bytes.len());
+            }
+            let root = NAME.parse().expect("a type's name");
+            let again = MessageType::parse(&root, &found.schema_text().1);
+            assert_eq!(again.expect("what was read").type_hash(), found.type_hash());
+        }
+    }
+    let figures = library.described_figures();
+    assert!(figures.objects <= DescribedFigures::MAX_OBJECTS);
+    assert!(figures.object_bytes <= DescribedFigures::MAX_OBJECT_BYTES);
+}
+
+/// Returns a reply with one TypeObject.
+fn reply(hash: EquivalenceHash, object: &[u8]) -> Vec<u8> {
+    let sized = |bytes: Vec<u8>| [&(bytes.len() as u32).to_le_bytes()[..], &bytes].concat();
+    let pair = [&[1, 0, 0, 0, 0xf2][..], &hash.0, &[0], object].concat();
+    // The member `types`, whose size is also that of the sequence.
+    let types = [&[0xd1, 0x4a, 0x80, 0x52][..], &sized(pair)].concat();
+    let result = [&[0; 4][..], &sized(types)].concat();
+    let returned = [&[0xd3, 0x52, 0x82, 0x01][..], &sized(result)].concat();
+    [&[0, 7, 0, 0][..], &[0; 28], &sized(returned)].concat()
 }
 
 /// Types with which payloads are decoded; the first byte selects one.

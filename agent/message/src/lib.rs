@@ -38,6 +38,7 @@ mod name;
 pub mod python;
 pub mod truncation;
 pub mod type_description;
+pub mod type_object;
 pub mod value;
 pub mod yaml;
 

@@ -6,6 +6,8 @@
 
 pub(crate) mod definition_source;
 mod described;
+mod kept;
+mod objects;
 pub(crate) mod search;
 
 use std::collections::HashMap;
@@ -15,13 +17,16 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
+use ros2probe_wire::discovery::EquivalenceHash;
+
 use crate::definition::parse::ParseError;
 use crate::definition::{MessageType, NotClosed, TypeName};
 use crate::dialect::Dialect;
 use crate::library::definition_source::DefinitionSource;
-use crate::library::described::Described;
 pub use crate::library::described::DescribedFigures;
+use crate::library::described::{Described, NotSent, TypeSource};
 use crate::library::search::Search;
+use crate::type_object::NotUsable;
 
 /// Directory of ROS installations, one subdirectory per distribution.
 const INSTALLED: &str = "/opt/ros";
@@ -164,6 +169,16 @@ pub enum NotFound {
         /// Why it is rejected.
         reason: NotClosed,
     },
+    /// The type has no definition here, and the one that nodes sent cannot be used.
+    #[error(
+        "no definition of {root} here, and the one that the nodes sent cannot be used: {reason}"
+    )]
+    NotUsable {
+        /// The requested type.
+        root: TypeName,
+        /// Why it cannot be used.
+        reason: NotUsable,
+    },
 }
 
 /// Returns ` (part of X)` unless the missing type is the requested one.
@@ -211,8 +226,9 @@ impl Library {
         }
     }
 
-    /// Returns the type of a name: with an announced hash, the first definition that matches it;
-    /// otherwise the first definition. A hash of an unknown version is ignored.
+    /// Returns the type of a name: with an announced RIHS01 hash, the first definition that matches
+    /// it; otherwise the first definition. With a hash of XTypes, only a type that nodes sent can be
+    /// compared: it is used if no file defines the type. Other hashes are ignored.
     pub fn find(
         &self,
         name: &str,
@@ -224,6 +240,7 @@ impl Library {
         let announced = announced_hash
             .filter(|hash| hash.starts_with(HASH))
             .map(str::to_owned);
+        let equivalence = announced_hash.filter(|hash| EquivalenceHash::parse(hash).is_some());
         let key = (root, announced);
         let kept = self
             .kept
@@ -241,41 +258,56 @@ impl Library {
                 self.keep(key, found.clone());
                 Ok(found)
             }
-            Err(reason) => self.find_described(key, reason),
+            Err(reason) => {
+                let announced = key.1.as_deref().or(equivalence);
+                self.find_described(&key.0, announced, reason)
+            }
         }
     }
 
     /// Returns the type as a node described it. Fails with `reason` if no source has the type.
     fn find_described(
         &self,
-        key: (TypeName, Option<String>),
+        name: &TypeName,
+        announced: Option<&str>,
         reason: NotFound,
     ) -> Result<Arc<MessageType>, NotFound> {
-        let (name, announced) = key;
-        match self.described.find(&name, announced.as_deref()) {
-            Ok(found) => Ok(found),
-            Err(Some(found)) if matches!(reason, NotFound::Nowhere { .. }) => {
-                Err(NotFound::Another {
-                    name,
-                    location: "that a node described".to_owned(),
-                    found,
-                    announced: announced.unwrap_or_default(),
-                })
-            }
-            Err(_) => Err(reason),
-        }
+        let failure = match self.described.find(name, announced) {
+            Ok(found) => return Ok(found),
+            Err(failure) => failure,
+        };
+        Err(match (failure, reason) {
+            (NotSent::Another(found), NotFound::Nowhere { .. }) => NotFound::Another {
+                name: name.clone(),
+                location: "that a node described".to_owned(),
+                found,
+                announced: announced.unwrap_or_default().to_owned(),
+            },
+            (NotSent::NotUsable(reason), NotFound::Nowhere { .. }) => NotFound::NotUsable {
+                root: name.clone(),
+                reason,
+            },
+            (_, reason) => reason,
+        })
     }
 
     /// Offers the response of a node's service `get_type_description`, a payload that begins with
     /// its encapsulation header. It is read when a lookup finds no definition elsewhere.
     pub fn offer(&self, response: Arc<[u8]>) {
-        self.described.offer(response);
+        self.described.offer(TypeSource::Description(response));
         self.revision.fetch_add(1, Ordering::Release);
     }
 
-    /// Adds a type from another library.
-    pub fn add(&self, message_type: MessageType) {
-        self.described.add(message_type);
+    /// Offers a reply of the TypeLookup service of XTypes, in the same form.
+    pub fn offer_objects(&self, reply: Arc<[u8]>) {
+        self.described.offer(TypeSource::TypeObjects(reply));
+        self.revision.fetch_add(1, Ordering::Release);
+    }
+
+    /// Adds a type from another library, under its hash of XTypes if the writer announces no RIHS01
+    /// hash.
+    pub fn add(&self, message_type: MessageType, hash: Option<EquivalenceHash>) {
+        self.described.add(message_type, hash);
         self.revision.fetch_add(1, Ordering::Release);
     }
 

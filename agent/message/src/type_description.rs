@@ -143,7 +143,7 @@ fn sources(response: &Message<'_>) -> Result<BTreeMap<TypeName, Arc<Definition>>
 }
 
 /// Returns the definition of one described type, with the text of an equivalent `.msg` file.
-fn definition(structure: Structure) -> Definition {
+pub(crate) fn definition(structure: Structure) -> Definition {
     let text = members(&structure);
     Definition::of_structure(text.into(), structure)
 }
@@ -164,12 +164,17 @@ fn structure(description: &Message<'_>) -> Result<Structure, NotDescribed> {
         }
         fields.push(field);
     }
+    Ok(structure_of(name, fields))
+}
+
+/// Returns the structure with these fields, of which the placeholder of rosidl is none.
+pub(crate) fn structure_of(name: TypeName, mut fields: Vec<Field>) -> Structure {
     if let [only] = &*fields
         && (&*only.name, &only.element, only.shape) == (PLACEHOLDER, &Element::UInt8, Shape::Single)
     {
         fields.clear();
     }
-    Ok(Structure { name, fields })
+    Structure { name, fields }
 }
 
 /// Reads a `Field`. Its default value is neither on the wire nor part of the hash.

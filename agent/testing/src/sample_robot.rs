@@ -456,6 +456,7 @@ pub fn topic(name: &str) -> TopicFacts {
         }),
         message_type: "sensor_msgs/msg/PointCloud2".into(),
         type_hash: None,
+        equivalence_hash: None,
         first_seen: ModelTime::from_nanoseconds(4),
         measurement: Some(Box::new(measurement())),
         transports: 1,

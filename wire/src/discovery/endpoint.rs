@@ -2,7 +2,7 @@
 
 use alloc::vec::Vec;
 
-use super::{TypeHash, UserData, guid, push_locator, vendor};
+use super::{EquivalenceHash, TypeHash, UserData, guid, push_locator, vendor};
 use crate::backends::Backends;
 use crate::cursor::{Cursor, Reason, WireError};
 use crate::guid::{EntityId, Guid};
@@ -37,6 +37,10 @@ pub struct EndpointAnnouncement {
     pub qos: Qos,
     /// Hash of its ROS type; `None` from Humble, which announces no hash.
     pub type_hash: Option<TypeHash>,
+    /// Hash of its complete type in XTypes, if announced.
+    pub equivalence_hash: Option<EquivalenceHash>,
+    /// Why the announced XTypes hash could not be read. The announcement is usable without it.
+    pub type_information_error: Option<WireError>,
     /// Hash of the service type, for a service's endpoint in Lyrical and later.
     pub service_type_hash: Option<TypeHash>,
     /// Backends of buffers; `None` if it has none.
@@ -78,6 +82,8 @@ impl EndpointAnnouncement {
             type_name,
             qos: Qos::defaults(role, vendor),
             type_hash: None,
+            equivalence_hash: None,
+            type_information_error: None,
             service_type_hash: None,
             backends: None,
             base: None,
@@ -147,6 +153,10 @@ impl EndpointAnnouncement {
                     self.base = digits.and_then(Guid::of_digits);
                 }
             }
+            ParameterId::TYPE_INFORMATION => match EquivalenceHash::read(value) {
+                Ok(hash) => self.equivalence_hash = hash,
+                Err(error) => self.type_information_error = Some(error),
+            },
             ParameterId::UNICAST_LOCATOR => {
                 push_locator(&mut self.unicast, value, &mut self.is_truncated)?;
             }

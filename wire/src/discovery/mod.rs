@@ -8,6 +8,7 @@
 
 mod endpoint;
 mod participant;
+mod type_information;
 mod user_data;
 
 use alloc::vec::Vec;
@@ -20,6 +21,7 @@ use crate::rtps::{InlineQos, Locator, Payload, StatusInfo, VendorId};
 pub use crate::qos::Role;
 pub use endpoint::EndpointAnnouncement;
 pub use participant::{BuiltinEndpoints, ParticipantAnnouncement, Property};
+pub use type_information::EquivalenceHash;
 pub use user_data::{TypeHash, UserData};
 
 /// Content of one discovery sample.

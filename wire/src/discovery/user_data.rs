@@ -58,20 +58,24 @@ impl TypeHash {
     /// Parses `RIHS01_` and 64 hexadecimal digits; returns `None` for other versions.
     #[must_use]
     pub fn parse(text: &str) -> Option<Self> {
-        let digits = text.strip_prefix("RIHS01_")?.as_bytes();
-        let (pairs, []) = digits.as_chunks::<2>() else {
-            return None;
-        };
-        let pairs: &[[u8; 2]; 32] = pairs.try_into().ok()?;
-        let mut hash = [0; 32];
-        for (byte, [high, low]) in hash.iter_mut().zip(pairs) {
-            *byte = hexadecimal(*high)? << 4 | hexadecimal(*low)?;
-        }
-        Some(Self(hash))
+        hexadecimal(text.strip_prefix("RIHS01_")?).map(Self)
     }
 }
 
-fn hexadecimal(digit: u8) -> Option<u8> {
+/// Parses `N` bytes from exactly `2 * N` hexadecimal digits.
+pub(super) fn hexadecimal<const N: usize>(text: &str) -> Option<[u8; N]> {
+    let (pairs, []) = text.as_bytes().as_chunks::<2>() else {
+        return None;
+    };
+    let pairs: &[[u8; 2]; N] = pairs.try_into().ok()?;
+    let mut bytes = [0; N];
+    for (byte, [high, low]) in bytes.iter_mut().zip(pairs) {
+        *byte = value(*high)? << 4 | value(*low)?;
+    }
+    Some(bytes)
+}
+
+fn value(digit: u8) -> Option<u8> {
     match digit {
         b'0'..=b'9' => Some(digit - b'0'),
         b'a'..=b'f' => Some(digit - b'a' + 10),

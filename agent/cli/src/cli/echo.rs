@@ -124,7 +124,8 @@ impl Echo {
         };
         if let Some(expected) = expected.as_deref().filter(|_| !options.raw) {
             let publishers = known.as_ref().map(|known| known.publishers.as_slice());
-            let hash = publishers.and_then(|publishers| publishers.first()?.type_hash.as_deref());
+            let publisher = publishers.and_then(|publishers| publishers.first());
+            let hash = publisher.and_then(|publisher| publisher.definition_hash());
             types.find_for(&name, expected, hash)?;
         }
         if let Some(known) = &known {

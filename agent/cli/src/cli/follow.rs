@@ -19,6 +19,7 @@ use ros2probe_daemon::escape::{visible, visible_lines};
 use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::yaml::Style;
 use ros2probe_message::{Library, Limits, MessageType, Sources, Truncation, decode};
+use ros2probe_wire::discovery::EquivalenceHash;
 
 use super::UserError;
 use super::notes::Notes;
@@ -237,12 +238,14 @@ impl<'a> Types<'a> {
         if let Ok(Definition {
             name,
             definition: Some(text),
+            equivalence_hash,
             ..
         }) = agent.get(&path)
             && let Ok(root) = name.parse()
             && let Ok(found) = MessageType::parse(&root, &text)
         {
-            self.library.add(found);
+            let hash = equivalence_hash.as_deref().and_then(EquivalenceHash::parse);
+            self.library.add(found, hash);
         }
     }
 
@@ -262,7 +265,7 @@ impl<'a> Types<'a> {
             _ => {}
         }
         let offered = sample.offered.as_ref();
-        let hash = offered.and_then(|offered| offered.type_hash.as_deref());
+        let hash = offered.and_then(|offered| offered.definition_hash());
         let mut found = self.library.find(&sample.message_type, hash);
         if found.is_err() {
             self.learn(&sample.topic);

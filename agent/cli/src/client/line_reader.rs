@@ -10,7 +10,7 @@ use ros2probe_daemon::subscriptions::line::qos;
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::dispatch::{Missed, MissedReason, Offered, Sample, Topic};
 use ros2probe_model::graph::discovery::hexadecimal;
-use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::discovery::{EquivalenceHash, TypeHash};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
@@ -133,6 +133,10 @@ fn sample(topic: Arc<Topic>, facts: &samples::Sample, payload: Bytes) -> Sample 
 fn announced(offered: &samples::Offered) -> Offered {
     Offered {
         type_hash: offered.type_hash.as_deref().and_then(TypeHash::parse),
+        equivalence_hash: offered
+            .equivalence_hash
+            .as_deref()
+            .and_then(EquivalenceHash::parse),
         qos: Arc::new(qos(&offered.qos)),
     }
 }

@@ -97,6 +97,7 @@ mod tests {
             enclave: Some("/".into()),
             message_type: "std_msgs/msg/String".into(),
             type_hash: Some("RIHS01_df".into()),
+            equivalence_hash: None,
             qos: Qos {
                 reliability: "RELIABLE".into(),
                 durability: "TRANSIENT_LOCAL".into(),
@@ -131,6 +132,7 @@ mod tests {
         }
         let unhashed = Endpoint {
             type_hash: None,
+            equivalence_hash: None,
             ..endpoint()
         };
         assert!(

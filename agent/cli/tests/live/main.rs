@@ -44,6 +44,7 @@ mod shm;
 mod shm_exact;
 mod sources;
 mod start_orders;
+mod type_objects;
 mod unnoticed;
 
 use std::process::Command;

@@ -74,6 +74,11 @@ fn seeds_of_messages_cause_no_panic() {
 }
 
 #[test]
+fn seeds_of_type_objects_cause_no_panic() {
+    run("fuzz/seeds/type_objects", entry::type_objects);
+}
+
+#[test]
 fn seeds_of_filters_cause_no_panic() {
     run("fuzz/seeds/filter", entry::filter);
 }

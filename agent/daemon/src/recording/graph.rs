@@ -212,6 +212,8 @@ pub struct DiscoveredTopic {
 pub struct Publisher {
     /// GUID as in the metrics.
     pub guid: String,
+    /// Hash of its complete type in XTypes, if announced.
+    pub equivalence_hash: Option<String>,
     /// Offered QoS.
     pub qos: OfferedQos,
 }
@@ -252,6 +254,7 @@ impl From<&Endpoint<'_>> for Publisher {
         let qos = &endpoint.qos;
         Self {
             guid: endpoint.guid.clone(),
+            equivalence_hash: endpoint.equivalence_hash.as_deref().map(str::to_owned),
             qos: OfferedQos {
                 reliability: qos.reliability.to_string(),
                 durability: qos.durability.to_string(),
@@ -270,6 +273,7 @@ impl From<&EndpointFacts> for Publisher {
         let qos = &facts.qos;
         Self {
             guid: facts.guid.to_string(),
+            equivalence_hash: facts.equivalence_hash.map(|hash| hash.to_string()),
             qos: OfferedQos {
                 reliability: qos.reliability.to_string(),
                 durability: qos.durability.to_string(),

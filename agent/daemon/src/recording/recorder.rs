@@ -549,6 +549,10 @@ impl<'a> Recorder<'a> {
         let type_hash = offered.and_then(|offered| offered.type_hash.as_ref());
         let type_hash = type_hash.map(ToString::to_string);
         let type_hash = type_hash.or_else(|| announced.type_hashes.first().cloned());
+        let definition_hash = type_hash.clone().or_else(|| match offered {
+            Some(offered) => offered.equivalence_hash.map(|hash| hash.to_string()),
+            None => announced.publishers.first()?.equivalence_hash.clone(),
+        });
         let publishers = announced.publishers.iter().take(self.writers.room());
         let mut offered: Vec<_> = publishers
             .map(|publisher| (publisher.guid.clone(), qos(&publisher.qos)))
@@ -559,7 +563,7 @@ impl<'a> Recorder<'a> {
         let mut description = TopicDescription {
             name: name.to_owned(),
             type_name: message_type.to_owned(),
-            schema: (self.sources.schema)(message_type, type_hash.as_deref()),
+            schema: (self.sources.schema)(message_type, definition_hash.as_deref()),
             type_hash,
             publishers: offered.iter().map(|(_, qos)| qos.clone()).collect(),
         };

@@ -28,6 +28,7 @@ use ros2probe_capture::pcap::PcapError;
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::library::{DescribedFigures, Library};
 use ros2probe_metrics::otlp::SpanSink;
+use ros2probe_model::derive::type_descriptions::TypeSource;
 use ros2probe_model::facts::selection::SampleRequest;
 use ros2probe_model::measure::history::History;
 use ros2probe_model::observe::input::Input;
@@ -294,8 +295,11 @@ impl Run {
             live.want_late(&demand);
         }
         self.outputs.events.add(output.events, now);
-        for response in output.type_descriptions {
-            self.outputs.library.offer(response);
+        for source in output.type_sources {
+            match source {
+                TypeSource::Description(response) => self.outputs.library.offer(response),
+                TypeSource::TypeObjects(reply) => self.outputs.library.offer_objects(reply),
+            }
         }
         let spans = &self.outputs.spans;
         spans.add(output.spans, output.chain_spans, &output.late_calls);
@@ -386,7 +390,7 @@ impl Run {
         let mut snapshot = self.observer.snapshot(self.source.clock());
         snapshot.tables.extend(self.source.tables());
         let described = self.outputs.library.described_figures();
-        snapshot.tables.push(table(&described));
+        snapshot.tables.extend(tables(&described));
         snapshot.decode_errors.extend(decode_errors(&described));
         if let Some(history) = &self.history {
             snapshot.tables.push(history.table());
@@ -440,26 +444,36 @@ impl Run {
     }
 }
 
-/// Returns the use of the table of described types.
-const fn table(described: &DescribedFigures) -> TableFacts {
-    TableFacts {
+/// Returns the use of the tables of described types and of TypeObjects.
+const fn tables(described: &DescribedFigures) -> [TableFacts; 2] {
+    let types = TableFacts {
         table: "type_descriptions",
         size: described.types as u64,
         limit: DescribedFigures::MAX_TYPES as u64,
         bytes: Some((described.bytes as u64, DescribedFigures::MAX_BYTES as u64)),
         evictions: described.evicted,
-    }
+    };
+    let max_bytes = DescribedFigures::MAX_OBJECT_BYTES as u64;
+    let objects = TableFacts {
+        table: "type_objects",
+        size: described.objects as u64,
+        limit: DescribedFigures::MAX_OBJECTS as u64,
+        bytes: Some((described.object_bytes as u64, max_bytes)),
+        evictions: described.objects_evicted,
+    };
+    [types, objects]
 }
 
 /// Returns the number of descriptions that could not be used, by reason.
 fn decode_errors(described: &DescribedFigures) -> impl Iterator<Item = DecodeErrorCount> + use<> {
     let counts = [
-        ("bad_value", described.refused),
-        ("hash_mismatch", described.mismatched),
+        ("type_description", "bad_value", described.refused),
+        ("type_description", "hash_mismatch", described.mismatched),
+        ("type_object", "bad_value", described.objects_refused),
     ];
-    let counts = counts.into_iter().filter(|(_, count)| *count > 0);
-    counts.map(|(reason, count)| DecodeErrorCount {
-        stage: "type_description",
+    let counts = counts.into_iter().filter(|(_, _, count)| *count > 0);
+    counts.map(|(stage, reason, count)| DecodeErrorCount {
+        stage,
         reason,
         count,
     })

@@ -74,6 +74,7 @@ fn missed(missed: &Missed) -> samples::Missed {
 pub fn offered(offered: &Offered) -> samples::Offered {
     samples::Offered {
         type_hash: offered.type_hash.as_ref().map(ToString::to_string),
+        equivalence_hash: offered.equivalence_hash.map(|hash| hash.to_string()),
         qos: offered_qos(&offered.qos),
     }
 }

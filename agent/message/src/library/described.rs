@@ -1,16 +1,23 @@
-//! Types that nodes described, for types without an installed package.
+//! Types that nodes sent, for types without an installed package: responses of
+//! `get_type_description`, and replies of the TypeLookup service of XTypes.
 //!
-//! Responses wait until a lookup needs them, so receiving one costs nothing but its bytes. Every
-//! type is filed under its name and its computed hash. A lookup with an announced hash therefore
-//! never returns another type, even if a response is forged.
+//! Both wait until a lookup needs them, so receiving one costs nothing but its bytes. Every type is
+//! filed under its name and its computed hash. A lookup with an announced hash therefore never
+//! returns another type, even if a response is forged.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use crate::definition::{MessageType, TypeName};
-use crate::type_description::{MAX_RESPONSE, described_type};
+use ros2probe_wire::discovery::EquivalenceHash;
 
-/// Maximum number of responses that wait, and of their bytes.
+use crate::definition::{MessageType, TypeName};
+use crate::library::HASH;
+use crate::library::kept::Kept;
+use crate::library::objects::Objects;
+use crate::type_description::{MAX_RESPONSE, described_type};
+use crate::type_object::{self, NotUsable};
+
+/// Maximum number of responses and replies that wait, and of their bytes.
 pub(super) const MAX_WAITING: usize = 128;
 pub(super) const MAX_WAITING_BYTES: usize = 2 << 20;
 /// Maximum number of described types, and of the bytes of their definitions.
@@ -25,37 +32,50 @@ const OVERHEAD: usize = 160;
 pub(super) struct Described {
     waiting: Mutex<Waiting>,
     /// Held by the lookup that reads responses; others wait for it.
-    reading: Mutex<()>,
+    reading: Mutex<Objects>,
     types: Mutex<Types>,
 }
 
-/// Responses that no lookup has read, the oldest first.
-#[derive(Debug, Default)]
-struct Waiting {
-    responses: VecDeque<Arc<[u8]>>,
-    bytes: usize,
-    refused: u64,
-    evicted: u64,
+/// What a node sent about its types.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum TypeSource {
+    /// A response of `get_type_description`, with its encapsulation header.
+    Description(Arc<[u8]>),
+    /// A reply of the TypeLookup service of XTypes, with its encapsulation header.
+    TypeObjects(Arc<[u8]>),
 }
 
+/// Responses and replies that no lookup has read, the oldest first.
 #[derive(Debug, Default)]
-struct Types {
-    entries: BTreeMap<(TypeName, String), Entry>,
+struct Waiting {
+    sources: VecDeque<TypeSource>,
     bytes: usize,
-    learned: u64,
     refused: u64,
-    mismatched: u64,
+    refused_objects: u64,
     evicted: u64,
 }
 
 #[derive(Debug)]
-struct Entry {
-    message_type: Arc<MessageType>,
-    bytes: usize,
-    /// Place in the order of arrival.
-    number: u64,
-    /// Whether a lookup with an announced hash returned it.
-    is_used: bool,
+struct Types {
+    kept: Kept<(TypeName, String), Arc<MessageType>>,
+    refused: u64,
+    mismatched: u64,
+    /// Figures of the type objects, as of the last lookup.
+    objects: usize,
+    object_bytes: usize,
+    objects_refused: u64,
+    objects_evicted: u64,
+}
+
+/// Why no node described a type.
+#[derive(Debug)]
+pub(super) enum NotSent {
+    /// No node sent the type.
+    Nothing,
+    /// Nodes described types of this name with other hashes, such as this one.
+    Another(String),
+    /// The announced type is not usable, or a part of it was not sent.
+    NotUsable(NotUsable),
 }
 
 /// Counts of responses and described types.
@@ -63,16 +83,24 @@ struct Entry {
 pub struct DescribedFigures {
     /// Described types that are kept.
     pub types: usize,
-    /// Bytes of their definitions, and of responses that wait.
+    /// Bytes of their definitions, and of responses and replies that wait.
     pub bytes: usize,
-    /// Responses that describe a type for the first time.
+    /// Types that were described for the first time.
     pub learned: u64,
     /// Responses that cannot be used.
     pub refused: u64,
     /// Lookups for which only descriptions with another hash than the announced one exist.
     pub mismatched: u64,
-    /// Responses and types dropped because of a cap.
+    /// Responses, replies and types dropped because of a cap.
     pub evicted: u64,
+    /// TypeObjects that are kept.
+    pub objects: usize,
+    /// Bytes of these objects.
+    pub object_bytes: usize,
+    /// Replies and TypeObjects that cannot be used.
+    pub objects_refused: u64,
+    /// TypeObjects dropped because of a cap.
+    pub objects_evicted: u64,
 }
 
 impl DescribedFigures {
@@ -80,131 +108,179 @@ impl DescribedFigures {
     pub const MAX_TYPES: usize = MAX_TYPES;
     /// Maximum of `bytes`.
     pub const MAX_BYTES: usize = MAX_BYTES + MAX_WAITING_BYTES;
+    /// Maximum of `objects`.
+    pub const MAX_OBJECTS: usize = Objects::MAX;
+    /// Maximum of `object_bytes`.
+    pub const MAX_OBJECT_BYTES: usize = Objects::MAX_BYTES;
+}
+
+impl TypeSource {
+    const fn bytes(&self) -> &Arc<[u8]> {
+        match self {
+            Self::Description(bytes) | Self::TypeObjects(bytes) => bytes,
+        }
+    }
 }
 
 impl Described {
-    /// Keeps a response until the next lookup; the oldest ones make room.
-    pub(super) fn offer(&self, response: Arc<[u8]>) {
+    /// Keeps a response or reply until the next lookup; the oldest ones make room.
+    pub(super) fn offer(&self, source: TypeSource) {
         let mut waiting = locked(&self.waiting);
-        if response.len() > MAX_RESPONSE {
-            waiting.refused += 1;
-            return;
+        let length = source.bytes().len();
+        match &source {
+            TypeSource::Description(_) if length > MAX_RESPONSE => {
+                waiting.refused += 1;
+                return;
+            }
+            TypeSource::TypeObjects(_) if length > type_object::MAX_REPLY => {
+                waiting.refused_objects += 1;
+                return;
+            }
+            _ if waiting.sources.contains(&source) => return,
+            _ => {}
         }
-        if waiting.responses.contains(&response) {
-            return;
-        }
-        waiting.bytes += response.len();
-        waiting.responses.push_back(response);
-        while waiting.responses.len() > MAX_WAITING || waiting.bytes > MAX_WAITING_BYTES {
-            let Some(oldest) = waiting.responses.pop_front() else {
+        waiting.bytes += length;
+        waiting.sources.push_back(source);
+        while waiting.sources.len() > MAX_WAITING || waiting.bytes > MAX_WAITING_BYTES {
+            let Some(oldest) = waiting.sources.pop_front() else {
                 break;
             };
-            waiting.bytes -= oldest.len();
+            waiting.bytes -= oldest.bytes().len();
             waiting.evicted += 1;
         }
     }
 
-    /// Returns the type with the announced hash, or the latest one if no hash is announced. Fails
-    /// with the hash of another description of this name, if one exists.
+    /// Returns the type with the announced hash, RIHS01 or that of XTypes. Returns the latest one if
+    /// no hash is announced.
     pub(super) fn find(
         &self,
         name: &TypeName,
         announced: Option<&str>,
-    ) -> Result<Arc<MessageType>, Option<String>> {
-        self.read();
-        locked(&self.types).find(name, announced)
+    ) -> Result<Arc<MessageType>, NotSent> {
+        let mut objects = locked(&self.reading);
+        self.read(&mut objects);
+        let equivalence = announced.and_then(EquivalenceHash::parse);
+        let mut failure = None;
+        match equivalence {
+            Some(hash) if locked(&self.types).has(name, hash) => {}
+            Some(hash) => match objects.message_type(hash) {
+                Some(Ok(found)) => self.add(found, Some(hash)),
+                Some(Err(reason)) => failure = Some(reason),
+                None => {}
+            },
+            None => {
+                for found in objects.of_name(name) {
+                    self.add(found, None);
+                }
+            }
+        }
+        let mut types = locked(&self.types);
+        types
+            .find(name, announced)
+            .map_err(|other| match (failure, other) {
+                (Some(reason), _) => NotSent::NotUsable(reason),
+                (None, Some(other)) => NotSent::Another(other),
+                (None, None) => NotSent::Nothing,
+            })
     }
 
-    /// Adds a type.
-    pub(super) fn add(&self, message_type: MessageType) {
-        let (hash, bytes) = (message_type.type_hash(), size(&message_type));
-        locked(&self.types).add(message_type, hash, bytes);
+    /// Adds a type, under its hash of XTypes or else of ROS.
+    pub(super) fn add(&self, message_type: MessageType, hash: Option<EquivalenceHash>) {
+        let hash = match hash {
+            Some(hash) => hash.to_string(),
+            None => message_type.type_hash(),
+        };
+        let bytes = size(&message_type);
+        let key = (message_type.root.clone(), hash);
+        let mut types = locked(&self.types);
+        types.kept.add(key, Arc::new(message_type), bytes);
     }
 
     pub(super) fn figures(&self) -> DescribedFigures {
         let (waiting, types) = (locked(&self.waiting), locked(&self.types));
         DescribedFigures {
-            types: types.entries.len(),
-            bytes: types.bytes + waiting.bytes,
-            learned: types.learned,
+            types: types.kept.entries.len(),
+            bytes: types.kept.bytes + waiting.bytes,
+            learned: types.kept.added,
             refused: types.refused + waiting.refused,
             mismatched: types.mismatched,
-            evicted: types.evicted + waiting.evicted,
+            evicted: types.kept.evicted + waiting.evicted,
+            objects: types.objects,
+            object_bytes: types.object_bytes,
+            objects_refused: types.objects_refused + waiting.refused_objects,
+            objects_evicted: types.objects_evicted,
         }
     }
 
-    /// Reads the responses that wait.
-    fn read(&self) {
-        let _reading = locked(&self.reading);
-        let responses = {
+    /// Reads the responses and replies that wait.
+    fn read(&self, objects: &mut Objects) {
+        let sources = {
             let mut waiting = locked(&self.waiting);
             waiting.bytes = 0;
-            std::mem::take(&mut waiting.responses)
+            std::mem::take(&mut waiting.sources)
         };
-        for response in responses {
-            match described_type(&response) {
-                Ok(message_type) => self.add(message_type),
-                Err(_) => locked(&self.types).refused += 1,
+        for source in sources {
+            match source {
+                TypeSource::Description(response) => match described_type(&response) {
+                    Ok(message_type) => self.add(message_type, None),
+                    Err(_) => locked(&self.types).refused += 1,
+                },
+                TypeSource::TypeObjects(reply) => objects.read(&reply),
             }
+        }
+        let mut types = locked(&self.types);
+        (types.objects, types.object_bytes) = (objects.kept.entries.len(), objects.kept.bytes);
+        (types.objects_refused, types.objects_evicted) = (objects.refused, objects.kept.evicted);
+    }
+}
+
+impl Default for Types {
+    fn default() -> Self {
+        Self {
+            kept: Kept::new(MAX_TYPES, MAX_BYTES),
+            refused: 0,
+            mismatched: 0,
+            objects: 0,
+            object_bytes: 0,
+            objects_refused: 0,
+            objects_evicted: 0,
         }
     }
 }
 
 impl Types {
+    fn has(&self, name: &TypeName, hash: EquivalenceHash) -> bool {
+        let key = (name.clone(), hash.to_string());
+        self.kept.entries.contains_key(&key)
+    }
+
+    /// Fails with another hash of the same kind, if a type of this name has one.
     fn find(
         &mut self,
         name: &TypeName,
         announced: Option<&str>,
     ) -> Result<Arc<MessageType>, Option<String>> {
+        let from = (name.clone(), String::new());
+        let entries = self.kept.entries.range(from..);
+        let mut of_name = entries.take_while(|((known, _), _)| known == name);
         let Some(announced) = announced else {
-            let latest = self.of_name(name).max_by_key(|(_, entry)| entry.number);
-            let found = latest.map(|(_, entry)| Arc::clone(&entry.message_type));
+            let latest = of_name.max_by_key(|(_, entry)| entry.number);
+            let found = latest.map(|(_, entry)| Arc::clone(&entry.value));
             return found.ok_or(None);
         };
-        if let Some(entry) = self.entries.get_mut(&(name.clone(), announced.to_owned())) {
+        let is_same_kind = |hash: &str| hash.starts_with(HASH) == announced.starts_with(HASH);
+        let other = of_name.find(|((_, hash), _)| is_same_kind(hash));
+        let other = other.map(|((_, hash), _)| hash.clone());
+        if let Some(entry) = self
+            .kept
+            .entries
+            .get_mut(&(name.clone(), announced.to_owned()))
+        {
             entry.is_used = true;
-            return Ok(Arc::clone(&entry.message_type));
+            return Ok(Arc::clone(&entry.value));
         }
-        let other = self.of_name(name).next().map(|((_, hash), _)| hash.clone());
         self.mismatched += u64::from(other.is_some());
         Err(other)
-    }
-
-    /// Adds a type. If there is no room, the oldest types that no lookup returned are dropped.
-    /// Forged descriptions thus do not displace those of announced types.
-    fn add(&mut self, message_type: MessageType, hash: String, bytes: usize) {
-        let key = (message_type.root.clone(), hash);
-        if self.entries.contains_key(&key) {
-            return;
-        }
-        while self.entries.len() >= MAX_TYPES || self.bytes + bytes > MAX_BYTES {
-            self.evicted += 1;
-            let unused = self.entries.iter().filter(|(_, entry)| !entry.is_used);
-            let oldest = unused.min_by_key(|(_, entry)| entry.number);
-            let Some(oldest) = oldest.map(|(key, _)| key.clone()) else {
-                return;
-            };
-            if let Some(dropped) = self.entries.remove(&oldest) {
-                self.bytes -= dropped.bytes;
-            }
-        }
-        self.learned += 1;
-        self.bytes += bytes;
-        let entry = Entry {
-            message_type: Arc::new(message_type),
-            bytes,
-            number: self.learned,
-            is_used: false,
-        };
-        self.entries.insert(key, entry);
-    }
-
-    fn of_name<'a>(
-        &'a self,
-        name: &'a TypeName,
-    ) -> impl Iterator<Item = (&'a (TypeName, String), &'a Entry)> {
-        let from = self.entries.range((name.clone(), String::new())..);
-        from.take_while(move |((known, _), _)| known == name)
     }
 }
 

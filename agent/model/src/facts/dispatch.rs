@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::discovery::{EquivalenceHash, TypeHash};
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
 
@@ -31,8 +31,27 @@ pub struct Topic {
 pub struct Offered {
     /// RIHS01 hash of its type; announced since Iron.
     pub type_hash: Option<TypeHash>,
+    /// Hash of its complete type in XTypes.
+    pub equivalence_hash: Option<EquivalenceHash>,
     /// Quality of service.
     pub qos: Arc<Qos>,
+}
+
+impl Offered {
+    /// Returns the hash by which a definition of its type is found.
+    #[must_use]
+    pub fn definition_hash(&self) -> Option<String> {
+        definition_hash(self.type_hash, self.equivalence_hash)
+    }
+}
+
+/// Returns the announced hash by which a definition is found: RIHS01, otherwise that of XTypes.
+pub(crate) fn definition_hash(
+    type_hash: Option<TypeHash>,
+    equivalence_hash: Option<EquivalenceHash>,
+) -> Option<String> {
+    let type_hash = type_hash.map(|hash| hash.to_string());
+    type_hash.or_else(|| equivalence_hash.map(|hash| hash.to_string()))
 }
 
 /// A message. It is immutable and shared by all subscriptions. Its time is a [`ModelTime`] until it

@@ -244,7 +244,7 @@ crate::tables! {
     ActionGoals {
         name: "services.goals", entries: 64, effect: "the oldest is dropped", reported: "table `calls`",
     }
-    /// Responses of `get_type_description` that wait to be taken, 256 KiB each; they are taken when 8 wait
+    /// Responses of `get_type_description` and replies with TypeObjects that wait to be taken, 256 KiB each; they are taken when 8 wait
     WaitingDescriptions { name: "type_descriptions.waiting", entries: 16, rule: Oldest }
     /// Times of one service or action from which quantiles are computed
     RecentDurations { name: "services.recent", entries: 1024, rule: Oldest }

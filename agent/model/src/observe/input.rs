@@ -11,6 +11,7 @@ use crate::derive::chain::causality::CausalPublication;
 use crate::derive::chain::expected::ExpectedChain;
 use crate::derive::chain::spans::ChainSpans;
 use crate::derive::trace::Spans;
+use crate::derive::type_descriptions::TypeSource;
 use crate::facts::calls::facts::NewLateCalls;
 use crate::facts::calls::report::Report;
 use crate::facts::dispatch::Dispatch;
@@ -184,6 +185,6 @@ pub struct Output {
     pub chain_spans: ChainSpans,
     /// Late calls of callbacks.
     pub late_calls: NewLateCalls,
-    /// Responses of `get_type_description`, each with its encapsulation header.
-    pub type_descriptions: Vec<Arc<[u8]>>,
+    /// What nodes sent about their types.
+    pub type_sources: Vec<TypeSource>,
 }

@@ -289,7 +289,7 @@ impl Observer {
             spans: self.derive.tracer.take(self.graph.wall_clock),
             chain_spans: self.derive.chains.take_spans(),
             late_calls: self.derive.inside.take_late_calls(),
-            type_descriptions: self.derive.type_descriptions.take(),
+            type_sources: self.derive.type_descriptions.take(),
         };
         self.keep_dispatched(&output.samples);
         self.zenoh_interest(&mut output.interest);

@@ -8,7 +8,7 @@ mod delivery;
 use std::sync::Arc;
 
 use ros2probe_wire::backends::Backends;
-use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::discovery::{EquivalenceHash, TypeHash};
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, Guid, RtpsDuration, Timestamp};
@@ -23,6 +23,7 @@ pub use crate::facts::bounded::TableFacts;
 use crate::facts::calls::facts::{InsideFacts, TopicInside};
 pub use crate::facts::churn::ChurnCount;
 use crate::facts::diagnosis::Diagnoses;
+use crate::facts::dispatch::definition_hash;
 pub use crate::facts::measurement::{
     Breakdown, Delivered, EarlierCounts, Measurement, SampledFacts,
 };
@@ -303,6 +304,8 @@ pub struct EndpointFacts {
     pub message_type: TypeName,
     /// RIHS01 hash.
     pub type_hash: Option<TypeHash>,
+    /// Hash of its complete type in XTypes.
+    pub equivalence_hash: Option<EquivalenceHash>,
     /// Time of its first announcement.
     pub first_seen: ModelTime,
     /// Counts and times of this writer while its topic was watched.
@@ -395,6 +398,12 @@ impl TopicFacts {
 }
 
 impl EndpointFacts {
+    /// Returns the hash by which a definition of its type is found.
+    #[must_use]
+    pub fn definition_hash(&self) -> Option<String> {
+        definition_hash(self.type_hash, self.equivalence_hash)
+    }
+
     /// Returns whether messages of this writer, or of its writers on the buffer topics, have this
     /// GUID.
     #[must_use]
@@ -452,7 +461,7 @@ pub struct WatchedTopicFacts {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DecodeErrorCount {
     /// Stage of parsing: `frame`, `rtps`, `spdp`, `sedp`, `entities`, `request`,
-    /// `type_description`.
+    /// `type_description`, `type_information`, `type_object`.
     pub stage: &'static str,
     /// Reason, from [`ros2probe_wire::Reason::label`], or `hash_mismatch`.
     pub reason: &'static str,

@@ -32,4 +32,5 @@ mod room;
 mod services;
 mod start_orders;
 mod transports;
+mod type_objects;
 mod zenoh;

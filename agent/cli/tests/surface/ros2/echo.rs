@@ -319,3 +319,42 @@ fn a_description_with_another_hash_than_the_announced_one_is_not_used() {
         "{text}"
     );
 }
+
+/// Returns what `rp topic echo` prints of a topic in the capture of Cyclone DDS 11.
+fn of_type_lookup(topic: &str, arguments: &[&str]) -> std::process::Output {
+    let capture = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../testing/data/cyclonedds11/type-lookup.pcap.gz");
+    let capture = capture.to_str().unwrap();
+    let first = ["topic", "echo", topic, "--replay", capture];
+    run(&[&first[..], arguments].concat())
+}
+
+#[test]
+fn a_type_without_an_installed_package_is_echoed_after_another_participant_requested_it() {
+    let echoed = of_type_lookup("/things", &["--once"]);
+    let text = stdout(&echoed);
+    let rest = text.strip_prefix("label: hello\nok: true\nparts:\n- count: ");
+    let rest = rest.unwrap_or_else(|| panic!("{text}{}", stderr(&echoed)));
+    let (number, rest) = rest.split_once('\n').unwrap();
+    assert!(number.parse::<i32>().unwrap() > 0);
+    let expected = "  values:\n  - 1.5\n  - 2.5\ngrid:\n- 1\n- 2\n- 3\none:\n  count: 7\n  \
+        values: []\nnames:\n- a\n- b\nname: n\nb: \"\\t\"\ni8: -1\nu16: 2\ni16: -3\n\
+        u32: 4\nu64: 5\ni64: -6\nf32: 0.5\n---\n";
+    assert_eq!(rest, expected);
+    // A base type, an enumeration, an alias of a sequence, and an array of two dimensions.
+    let echoed = of_type_lookup("/derived", &["--once"]);
+    let text = stdout(&echoed);
+    let (number, rest) = text.split_once('\n').unwrap();
+    assert!(number.starts_with("id: "), "{text}{}", stderr(&echoed));
+    let expected = "mode: 1\nticks:\n- 1\n- 2\ntable:\n- 1\n- 2\n- 3\n- 4\n- 5\n- 6\n---\n";
+    assert_eq!(rest, expected);
+}
+
+#[test]
+fn a_type_with_a_union_is_not_echoed() {
+    let echoed = of_type_lookup("/odd", &[]);
+    let text = stderr(&echoed);
+    assert!(stdout(&echoed).is_empty());
+    let reason = "no definition of my_robot_msgs/msg/Odd here";
+    assert!(text.contains(reason), "{text}");
+}

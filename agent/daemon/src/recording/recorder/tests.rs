@@ -300,6 +300,7 @@ fn sample_of(name: &str, number: u32) -> Item {
     };
     let offered = Offered {
         type_hash: None,
+        equivalence_hash: None,
         qos: Qos::defaults(Role::Writer, VendorId::CYCLONE).into(),
     };
     let mut sample = Sample::clone(&sample);

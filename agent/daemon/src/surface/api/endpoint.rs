@@ -26,6 +26,9 @@ pub(super) fn endpoint<'a>(
         enclave: enclave.map(Cow::Borrowed),
         message_type: Cow::Borrowed(&facts.message_type),
         type_hash: facts.type_hash.map(|hash| Cow::Owned(hash.to_string())),
+        equivalence_hash: facts
+            .equivalence_hash
+            .map(|hash| Cow::Owned(hash.to_string())),
         vendor: participant.map(|participant| vendor(participant.vendor)),
         qos: Qos {
             reliability: Cow::Borrowed(qos.reliability.label()),

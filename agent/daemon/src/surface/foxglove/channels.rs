@@ -8,7 +8,7 @@ use std::sync::Arc;
 use ros2probe_message::Library;
 use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::names::{DdsName, TypeName};
-use ros2probe_model::report::snapshot::{Snapshot, TopicFacts};
+use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot, TopicFacts};
 use ros2probe_wire::DomainId;
 use tokio::task::spawn_blocking;
 
@@ -323,8 +323,8 @@ fn definition(content: &Content, topic: &TopicFacts) -> Option<Definition> {
     };
     let mut endpoints = topic.publishers.iter().chain(&topic.subscriptions);
     let of_type = endpoints.find(|endpoint| endpoint.message_type == *message_type);
-    let hash = of_type.and_then(|endpoint| endpoint.type_hash.as_ref());
-    Some((message_type.clone(), hash.map(ToString::to_string)))
+    let hash = of_type.and_then(EndpointFacts::definition_hash);
+    Some((message_type.clone(), hash))
 }
 
 #[cfg(test)]

@@ -90,7 +90,7 @@ impl Discovery {
         if let Some(known) = self.endpoints.get_mut(&guid) {
             if *known.topic == *announcement.topic.as_str() {
                 let before = (
-                    known.type_hash,
+                    (known.type_hash, known.equivalence_hash),
                     Arc::clone(&known.qos),
                     known.message_type.clone(),
                     (known.backends.clone(), known.base),
@@ -103,8 +103,9 @@ impl Discovery {
                 }
                 known.base = announcement.base;
                 known.type_hash = announcement.type_hash;
+                known.equivalence_hash = announcement.equivalence_hash;
                 known.message_type = announcement.type_name.message().as_str().into();
-                let unchanged = before.0 == known.type_hash
+                let unchanged = before.0 == (known.type_hash, known.equivalence_hash)
                     && before.1 == known.qos
                     && before.2 == known.message_type
                     && before.3 == (known.backends.clone(), known.base);
@@ -144,6 +145,7 @@ impl Discovery {
             topic: announcement.topic.as_str().into(),
             message_type: announcement.type_name.message().as_str().into(),
             type_hash: announcement.type_hash,
+            equivalence_hash: announcement.equivalence_hash,
             qos: Arc::new(announcement.qos),
             first_seen: at,
             shared_memory,

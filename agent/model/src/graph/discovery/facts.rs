@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ros2probe_wire::backends::Backends;
-use ros2probe_wire::discovery::{ParticipantAnnouncement, Role, TypeHash};
+use ros2probe_wire::discovery::{EquivalenceHash, ParticipantAnnouncement, Role, TypeHash};
 use ros2probe_wire::entities::NodeEntities;
 use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::qos::Qos;
@@ -149,6 +149,8 @@ pub struct Endpoint {
     pub message_type: TypeName,
     /// RIHS01 hash.
     pub type_hash: Option<TypeHash>,
+    /// Hash of its complete type in XTypes.
+    pub equivalence_hash: Option<EquivalenceHash>,
     /// Quality of service.
     pub qos: Arc<Qos>,
     /// Time of the first announcement.

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_wire::backends::Backends;
-use ros2probe_wire::discovery::{Role, TypeHash};
+use ros2probe_wire::discovery::{EquivalenceHash, Role, TypeHash};
 use ros2probe_wire::names::{DdsTopic, RosType};
 use ros2probe_wire::qos::{
     AccessScope, DataRepresentation, DestinationOrder, Durability, History, HistoryKind,
@@ -85,6 +85,8 @@ struct RememberedEndpoint {
     topic: String,
     message_type: String,
     type_hash: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    equivalence_hash: Option<String>,
     reliability: u32,
     durability: u32,
     history: Option<(u32, i32)>,
@@ -308,6 +310,7 @@ impl RememberedEndpoint {
             topic: endpoint.topic.to_string(),
             message_type: endpoint.message_type.to_string(),
             type_hash: endpoint.type_hash.as_ref().map(TypeHash::to_string),
+            equivalence_hash: endpoint.equivalence_hash.map(|hash| hash.to_string()),
             reliability: qos.reliability.0,
             durability: qos.durability.0,
             history: qos.history.map(|history| (history.kind.0, history.depth)),
@@ -364,6 +367,10 @@ impl RememberedEndpoint {
             topic: topic.as_str().into(),
             message_type: message_type.as_str().into(),
             type_hash: self.type_hash.as_deref().and_then(TypeHash::parse),
+            equivalence_hash: self
+                .equivalence_hash
+                .as_deref()
+                .and_then(EquivalenceHash::parse),
             qos: Arc::new(Qos {
                 reliability: Reliability(self.reliability),
                 durability: Durability(self.durability),
@@ -487,7 +494,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn qos_for_matching_is_restored_and_may_be_missing_in_older_files() {
+    fn hash_and_qos_for_matching_are_restored_and_may_be_missing_in_older_files() {
         let prefix = GuidPrefix([1; 12]);
         let guid = Guid::new(prefix, EntityId([0, 0, 1, 3]));
         let defaults = Qos::defaults(Role::Writer, VendorId::CYCLONE);
@@ -503,6 +510,7 @@ mod tests {
             topic: "rt/points".into(),
             message_type: "std_msgs/msg/String".into(),
             type_hash: None,
+            equivalence_hash: Some(EquivalenceHash([7; 14])),
             qos: Arc::new(qos.clone()),
             first_seen: ModelTime::from_nanoseconds(1),
             shared_memory: None,
@@ -517,12 +525,19 @@ mod tests {
             kept.endpoint(prefix, DomainId(0), ModelTime::from_nanoseconds(2))
                 .unwrap()
                 .1
-                .qos
         };
         let mut kept = serde_json::to_value(RememberedEndpoint::of(guid, &endpoint)).unwrap();
-        assert_eq!(*back(&kept), qos);
-        kept.as_object_mut().unwrap().remove("matching");
-        assert_eq!(*back(&kept), defaults);
+        let restored = back(&kept);
+        assert_eq!(*restored.qos, qos);
+        assert_eq!(restored.equivalence_hash, endpoint.equivalence_hash);
+        for key in ["matching", "equivalence_hash"] {
+            kept.as_object_mut().unwrap().remove(key).unwrap();
+        }
+        let restored = back(&kept);
+        assert_eq!(
+            (&*restored.qos, restored.equivalence_hash),
+            (&defaults, None)
+        );
     }
 
     #[test]

@@ -39,7 +39,7 @@ impl Observer {
             self.read(found, sample, vendor, &origin);
             self.follow_up(origin.at);
             self.identify_call(found, sample, vendor);
-            self.keep_description(found, sample, vendor);
+            self.keep_type_source(found, sample, vendor);
             self.keep_payload(sample, found.payload);
             self.hear_robot(sample, found.payload);
         }
@@ -142,6 +142,9 @@ impl Observer {
         };
         match discovery::endpoint(role, vendor, payload, inline_qos)? {
             discovery::Discovery::Alive(announcement) => {
+                if let Some(error) = announcement.type_information_error {
+                    self.decode_error("type_information", error.reason);
+                }
                 let prefix = announcement.guid.prefix;
                 if self.learn_endpoint(announcement, origin) {
                     self.announce(prefix);

@@ -1,9 +1,9 @@
 //! Calls of services: captured requests and replies, and their further copies.
 
-use ros2probe_wire::Guid;
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::walk::Found;
+use ros2probe_wire::{EntityId, Guid};
 
 use super::Observer;
 use crate::facts::model_time::ModelTime;
@@ -19,15 +19,17 @@ impl Observer {
         }
     }
 
-    /// Keeps a captured response of `get_type_description` once it is whole.
-    pub(super) fn keep_description(
+    /// Keeps a captured response of `get_type_description`, or a reply of the TypeLookup service, once
+    /// it is whole.
+    pub(super) fn keep_type_source(
         &mut self,
         found: &Found<'_>,
         sample: &Sample,
         vendor: VendorId,
     ) {
         let (writer, number) = (sample.head.writer, sample.sequence_number);
-        if !self.derive.services.describes_types(writer)
+        let has_objects = writer.entity == EntityId::TYPE_LOOKUP_REPLY_WRITER;
+        if !has_objects && !self.derive.services.describes_types(writer)
             || !sample.is_message()
             || self.derive.type_descriptions.has(writer, number)
         {
@@ -46,7 +48,10 @@ impl Observer {
             }
         };
         let descriptions = &mut self.derive.type_descriptions;
-        descriptions.add(writer, number, Some(vendor), payload);
+        match has_objects {
+            true => descriptions.add_objects(writer, number, payload),
+            false => descriptions.add(writer, number, Some(vendor), payload),
+        }
     }
 
     /// Stops capturing a writer of requests or replies that has exceeded its budget.

@@ -343,6 +343,7 @@ fn published(topic: &Topic, endpoint: &Endpoint) -> dispatch::Topic {
         message_type: endpoint.message_type.clone(),
         offered: Some(Arc::new(Offered {
             type_hash: endpoint.type_hash,
+            equivalence_hash: endpoint.equivalence_hash,
             qos: endpoint.qos.clone(),
         })),
     }

@@ -166,6 +166,7 @@ fn topic(
             qos: Arc::clone(&endpoint.qos),
             message_type: endpoint.message_type.clone(),
             type_hash: endpoint.type_hash,
+            equivalence_hash: endpoint.equivalence_hash,
             first_seen: endpoint.first_seen,
             measurement,
             transports: 0,

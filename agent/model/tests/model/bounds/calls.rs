@@ -32,7 +32,7 @@ fn announce(observer: &mut Observer) {
     }
 }
 
-/// Sends a request, a reply, or a fragment of a reply. Half of the identities repeat.
+/// Sends a request, a reply, a fragment of a reply, or a reply with TypeObjects. Half of the identities repeat.
 pub(super) fn calls(observer: &mut Observer, dice: &mut Dice, now: u64) {
     let step = (now - START) / 1_000_000;
     if step == 1 {
@@ -56,7 +56,8 @@ pub(super) fn calls(observer: &mut Observer, dice: &mut Dice, now: u64) {
         _ => ADD,
     };
     let message = Message::from(ALICE);
-    let message = match dice.pick(5) {
+    let message = match dice.pick(6) {
+        5 => message.data(EntityId::TYPE_LOOKUP_REPLY_WRITER, step, &payload),
         0..3 => {
             payload.truncate(40);
             message.data(requests, step, &payload)

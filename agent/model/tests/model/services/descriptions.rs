@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use ros2probe_model::derive::type_descriptions::TypeSource;
 use ros2probe_model::facts::bounded::{Declared as _, ledger};
 use ros2probe_model::facts::tables::WaitingDescriptions;
 
@@ -9,8 +10,14 @@ use super::*;
 
 const DESCRIBE: &str = "/talker/get_type_description";
 
+/// Returns the responses that were passed on.
 fn taken(robot: &mut Robot) -> Vec<Arc<[u8]>> {
-    robot.domain.observer.drain().type_descriptions
+    let sources = robot.domain.observer.drain().type_sources;
+    let responses = sources.into_iter().map(|source| match source {
+        TypeSource::Description(response) => response,
+        TypeSource::TypeObjects(reply) => panic!("{reply:?} is no response"),
+    });
+    responses.collect()
 }
 
 /// Returns the payload of a response with this body.

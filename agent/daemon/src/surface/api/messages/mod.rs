@@ -33,8 +33,9 @@ use ros2probe_api::messages::{self, Beat, Definition, End, Message, Missed};
 use ros2probe_message::{DecodeError, Library, Limits, MessageType, decode};
 use ros2probe_model::facts::dispatch::Sample;
 use ros2probe_model::facts::names::{DdsName, TypeName};
+use ros2probe_model::report::snapshot::EndpointFacts;
 use ros2probe_wire::DomainId;
-use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::discovery::{EquivalenceHash, TypeHash};
 use tree::{ELEMENTS, Tree};
 
 /// Slots for streams of all listeners. Each stream makes the agent capture all payloads of its
@@ -92,7 +93,7 @@ struct Stream {
 #[derive(Clone)]
 struct Known {
     name: TypeName,
-    hash: Option<TypeHash>,
+    hashes: (Option<TypeHash>, Option<EquivalenceHash>),
     found: Option<Arc<MessageType>>,
     /// Revision of the library. A node may describe the type later.
     revision: u64,
@@ -123,6 +124,12 @@ pub(super) async fn definition(
     let state = context.state().await;
     let topic = find(state.known(), name, domain.checked()?)?;
     let hash = topic.type_hashes.first().map(ToString::to_string);
+    let hash = hash.or_else(|| {
+        topic
+            .publishers
+            .iter()
+            .find_map(EndpointFacts::definition_hash)
+    });
     let name = topic.message_types.first().cloned().unwrap_or_default();
     let library = Arc::clone(&context.library);
     let found = spawn_blocking(move || look_up(&library, &name, hash.as_deref()).0).await;
@@ -323,17 +330,19 @@ impl Stream {
     async fn find(&mut self, sample: &Sample, lines: &mut Vec<u8>) -> Option<Arc<MessageType>> {
         let name = &sample.topic.message_type;
         let offered = sample.topic.offered.as_ref();
-        let hash = offered.and_then(|offered| offered.type_hash);
+        let hashes = offered.map_or((None, None), |offered| {
+            (offered.type_hash, offered.equivalence_hash)
+        });
         let revision = self.context.library.revision();
         if let Some(known) = &self.known
             && known.name == *name
-            && known.hash == hash
+            && known.hashes == hashes
             && (known.found.is_some() || known.revision == revision)
         {
             return known.found.clone();
         }
         let library = Arc::clone(&self.context.library);
-        let (wanted, announced) = (name.clone(), hash.map(|hash| hash.to_string()));
+        let (wanted, announced) = (name.clone(), offered.and_then(|it| it.definition_hash()));
         let found = spawn_blocking(move || look_up(&library, &wanted, announced.as_deref())).await;
         let (line, found) = found.unwrap_or_else(|_| {
             let reason = "looking for its definition failed".to_owned();
@@ -342,7 +351,7 @@ impl Stream {
         write_line(lines, &Line::Type(line));
         self.known = Some(Known {
             name: name.clone(),
-            hash,
+            hashes,
             found: found.clone(),
             revision,
         });
@@ -362,6 +371,9 @@ fn look_up(
                 known: true,
                 reason: None,
                 definition: Some(found.schema_text().1),
+                equivalence_hash: hash
+                    .filter(|hash| EquivalenceHash::parse(hash).is_some())
+                    .map(str::to_owned),
             };
             (line, Some(found))
         }
@@ -375,6 +387,7 @@ fn unknown(name: &str, reason: String) -> Definition {
         known: false,
         reason: Some(reason),
         definition: None,
+        equivalence_hash: None,
     }
 }
 

@@ -33,6 +33,7 @@ fn endpoint(
         }),
         message_type: message_type.into(),
         type_hash: None,
+        equivalence_hash: None,
         first_seen: ModelTime::ZERO,
         measurement: None,
         transports: 0,
