@@ -108,7 +108,7 @@ const ENDPOINTS: Row = Row {
               priority for a newcomer with a higher one; otherwise the newcomer waits for a free \
               entry",
     metric: "ros2probe_table_evictions_total",
-    bytes: 5_632,
+    bytes: 5_696,
 };
 const TOPICS: Row = Row {
     key: "topics",
@@ -340,6 +340,14 @@ impl Limits {
     /// handles, with late calls and copies in snapshots and pages, take 83 MiB, and the kernel's
     /// tables 12 MiB.
     pub const INSIDE: usize = 95 << 20;
+
+    /// Memory of types that nodes described, and of TypeObjects, in bytes: their definitions (8 MiB
+    /// each), and responses that wait (2 MiB).
+    pub const TYPES: usize = 18 << 20;
+
+    /// Memory of the logs of nodes, in bytes: 3560 messages, the nodes, and incomplete messages (1
+    /// MiB).
+    pub const LOGS: usize = 6 << 20;
 
     /// Returns the memory in bytes that all limits together allow.
     #[must_use]

@@ -185,7 +185,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(calls(turns(inside::routes())))
         .merge(calls(turns(why::routes())))
         .merge(processes::routes())
-        .merge(logs::routes())
+        .merge(needs(Access::All, Access::All, logs::routes()))
         .merge(health::routes())
         .merge(needs(Access::All, Access::All, reload::routes()))
         .merge(needs(Access::All, Access::All, page::routes()))
