@@ -16,7 +16,7 @@ use aya_ebpf::{
 use ros2probe_wire::{
     filter::{Budget, Counter},
     host::Layout,
-    record::{Record, Verdict, flag, kind},
+    record::{Record, Verdict, flag},
     walk::{self, Fate, MAGIC, Step, Walk},
 };
 
@@ -262,8 +262,7 @@ pub extern "C" fn lost(payload: u64, linear: u32) -> u32 {
         Step::Endpoint => {}
     }
     let record = &this.walk.record;
-    if record.kind != kind::DATA && record.kind != kind::DATA_FRAG && record.kind != kind::DATA_BATCH
-    {
+    if !record.has_samples() {
         return 1;
     }
     match walk::fate(record) {

@@ -164,9 +164,7 @@ pub extern "C" fn undelivered(slot: u32, token: u32, captured: u32) -> u32 {
             break;
         }
         if let Some(record) = scratch.records.get_mut(index as usize)
-            && (record.kind == kind::DATA
-                || record.kind == kind::DATA_FRAG
-                || record.kind == kind::DATA_BATCH)
+            && record.has_samples()
         {
             record.flags |= flag::SOCKET_FULL;
             write(slot, record);

@@ -8,7 +8,7 @@
 use alloc::string::String;
 use alloc::vec::Vec;
 
-use crate::cursor::{Cursor, Endianness, Reason, WireError};
+use crate::cursor::{Cursor, Reason, WireError};
 use crate::guid::{EntityId, Guid};
 use crate::text;
 
@@ -60,17 +60,7 @@ impl ParticipantEntities {
     /// Returns [`Reason::BadMarker`] if the payload is not plain CDR, and the error of the likelier
     /// layout if neither layout fits.
     pub fn parse(payload: &[u8]) -> Result<Self, WireError> {
-        let mut cursor = Cursor::new(payload, Endianness::Big);
-        let error = cursor.error("encapsulation", Reason::BadMarker);
-        let endianness = match cursor.u16("encapsulation")? {
-            // CDR and plain CDR2 differ in the alignment of 64-bit values, which this type does not
-            // contain.
-            0x0000 | 0x0006 => Endianness::Big,
-            0x0001 | 0x0007 => Endianness::Little,
-            _ => return Err(error),
-        };
-        cursor.u16("encapsulation options")?;
-        let cursor = cursor.with_endianness(endianness);
+        let cursor = text::plain_cdr(payload)?;
         // The last eight bytes of a long gid are zero. In the layout with short gids, these bytes
         // are the number of nodes and the first namespace's length, which are zero only if nothing
         // follows.
@@ -143,6 +133,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::cursor::Endianness;
     use crate::guid::GuidPrefix;
     use crate::testing::{self, Encoder, hurt};
 

@@ -3,7 +3,7 @@
 //! The layout is the same in all distributions since Foxy: stamp, level, name of the logger, text,
 //! file, function, and line.
 
-use crate::cursor::{Cursor, Endianness, Reason, WireError};
+use crate::cursor::{Cursor, WireError};
 use crate::text;
 
 /// Name of the type, as ROS writes it.
@@ -67,6 +67,12 @@ impl LogLevel {
         }
     }
 
+    /// Returns the level with this label.
+    #[must_use]
+    pub fn named(label: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|level| level.label() == label)
+    }
+
     /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
@@ -84,9 +90,9 @@ impl<'a> Log<'a> {
     /// Parses a sample's payload, encapsulation header included.
     ///
     /// # Errors
-    /// Returns [`Reason::BadMarker`] if the payload is not plain CDR.
+    /// Returns [`Reason::BadMarker`](crate::cursor::Reason::BadMarker) if the payload is not plain CDR.
     pub fn parse(payload: &'a [u8]) -> Result<Self, WireError> {
-        let mut cursor = plain(payload)?;
+        let mut cursor = text::plain_cdr(payload)?;
         let stamp = (cursor.u32("stamp.sec")?, cursor.u32("stamp.nanosec")?);
         let level = cursor.u8("level")?;
         Ok(Self {
@@ -104,20 +110,6 @@ impl<'a> Log<'a> {
     }
 }
 
-/// Returns a cursor after the encapsulation header of plain CDR. Its offsets count from there, as
-/// alignment does (RTPS 2.5, 10.2). Plain CDR2 is accepted, too: it differs in 64-bit values only.
-fn plain(payload: &[u8]) -> Result<Cursor<'_>, WireError> {
-    let mut header = Cursor::new(payload, Endianness::Big);
-    let error = header.error("encapsulation", Reason::BadMarker);
-    let endianness = match header.u16("encapsulation")? {
-        0x0000 | 0x0006 => Endianness::Big,
-        0x0001 | 0x0007 => Endianness::Little,
-        _ => return Err(error),
-    };
-    header.u16("encapsulation options")?;
-    Ok(Cursor::new(header.rest(), endianness))
-}
-
 /// Reads a string without its terminator.
 fn octets<'a>(cursor: &mut Cursor<'a>, what: &'static str) -> Result<&'a [u8], WireError> {
     let bytes = text::octets(cursor, what)?;
@@ -129,6 +121,7 @@ mod tests {
     use std::vec::Vec;
 
     use super::*;
+    use crate::cursor::{Endianness, Reason};
     use crate::testing::{Encoder, hurt};
 
     fn encoded(endianness: Endianness) -> Vec<u8> {

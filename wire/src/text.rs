@@ -1,7 +1,21 @@
 //! Reads untrusted text within a limit. Refuses names that could break out of a log line, a label
 //! or a terminal.
 
-use crate::cursor::{Cursor, Reason, WireError};
+use crate::cursor::{Cursor, Endianness, Reason, WireError};
+
+/// Returns a cursor after the encapsulation header of plain CDR (RTPS 2.5, 10.2). Plain CDR2 is
+/// accepted, too: it differs in the alignment of 64-bit values, which the callers' types do not have.
+pub(crate) fn plain_cdr(payload: &[u8]) -> Result<Cursor<'_>, WireError> {
+    let mut cursor = Cursor::new(payload, Endianness::Big);
+    let error = cursor.error("encapsulation", Reason::BadMarker);
+    let endianness = match cursor.u16("encapsulation")? {
+        0x0000 | 0x0006 => Endianness::Big,
+        0x0001 | 0x0007 => Endianness::Little,
+        _ => return Err(error),
+    };
+    cursor.u16("encapsulation options")?;
+    Ok(cursor.with_endianness(endianness))
+}
 
 /// Reads a CDR string: a `u32` length that includes the terminating NUL, the bytes, and padding to
 /// four. Does not check the characters, unlike [`name`].
@@ -70,7 +84,6 @@ pub(crate) fn name<'a>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cursor::Endianness;
 
     fn read(bytes: &[u8]) -> Result<&str, Reason> {
         name(&mut Cursor::new(bytes, Endianness::Little), "name", 8).map_err(|error| error.reason)

@@ -283,7 +283,7 @@ impl ReorderBuffer {
         let record = walked.record;
         if !walked.no_room_reported && self.undelivered_tokens.contains(&record.datagram) {
             walked.no_room_reported = true;
-            if record.is_sample() {
+            if record.has_samples() {
                 let flags = record.flags | flag::SOCKET_FULL;
                 return Some(Next::Walked(Record { flags, ..record }));
             }
@@ -452,13 +452,7 @@ mod tests {
     fn samples_of_an_undelivered_datagram_are_first_reported_as_not_delivered() {
         for pieces_first in [true, false] {
             let mut order = ReorderBuffer::default();
-            let heartbeat = |(at, record)| {
-                let record = Record {
-                    kind: kind::HEARTBEAT,
-                    ..record
-                };
-                (at, record)
-            };
+            let of_kind = |kind, (at, record)| (at, Record { kind, ..record });
             let of = |token, (at, record)| {
                 let record = Record {
                     datagram: token,
@@ -471,8 +465,11 @@ mod tests {
             }
             walked(&mut order, of(7, captured(1, 9)));
             walked(&mut order, of(8, captured(2, 10)));
-            walked(&mut order, of(8, captured(3, 10)));
-            walked(&mut order, of(8, heartbeat(captured(4, 10))));
+            walked(
+                &mut order,
+                of(8, of_kind(kind::DATA_BATCH, captured(3, 10))),
+            );
+            walked(&mut order, of(8, of_kind(kind::HEARTBEAT, captured(4, 10))));
             walked(&mut order, of(9, captured(5, 11)));
             if pieces_first {
                 order.kernel(undelivered(8, 10));

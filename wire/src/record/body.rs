@@ -67,6 +67,13 @@ impl Record {
         matches!(self.kind, kind::DATA | kind::DATA_FRAG)
     }
 
+    /// Returns whether the record reports a sample, a part of one, or several in a batch.
+    #[inline]
+    #[must_use]
+    pub const fn has_samples(&self) -> bool {
+        self.is_sample() || self.kind == kind::DATA_BATCH
+    }
+
     /// Returns whether the record reports an ACKNACK, which a reader sends to a writer.
     #[inline]
     #[must_use]

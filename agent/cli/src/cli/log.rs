@@ -171,7 +171,9 @@ impl Printer<'_> {
             below.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
         });
         let pattern = self.pattern.as_ref();
-        severity(&line.level) >= severity(&self.command.level)
+        // A level that only a newer agent knows passes.
+        let level = LogLevel::named(&line.level).unwrap_or(LogLevel::Fatal);
+        Some(level) >= LogLevel::named(&self.command.level)
             && is_of_node
             && pattern.is_none_or(|pattern| pattern.is_match(line.text.as_bytes()))
     }
@@ -193,12 +195,4 @@ impl Printer<'_> {
         text.push('\n');
         Ok(self.output.write(&text)?)
     }
-}
-
-/// Returns the place of a level among all levels. A level that only a newer agent knows has the
-/// last place.
-fn severity(level: &str) -> usize {
-    let mut levels = LogLevel::ALL.iter();
-    let place = levels.position(|known| known.label() == level);
-    place.unwrap_or(LogLevel::ALL.len())
 }

@@ -105,10 +105,7 @@ async fn logs(
 /// # Errors
 /// Fails if no level has this name.
 fn level(name: &str) -> Result<LogLevel, Problem> {
-    let level = LogLevel::ALL
-        .into_iter()
-        .find(|level| level.label() == name);
-    level.ok_or_else(|| {
+    LogLevel::named(name).ok_or_else(|| {
         let detail = format!(
             "the level `{}` is none of {}",
             name.chars().take(32).collect::<String>(),
