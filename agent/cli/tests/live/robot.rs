@@ -102,7 +102,7 @@ fn logs_are_counted_kept_printed_and_judged_without_a_watch() -> Result<()> {
     );
     assert_eq!((all.is_on, all.messages.len()), (true, 12));
     assert_eq!(logs(&link, "?level=warn&limit=3")?.messages.len(), 3);
-    assert!(logs(&link, "?node=/nobody")?.messages.is_empty());
+    assert!(logs(&link, "?node=/absent")?.messages.is_empty());
     ensure!(get(&link.monitor, "http://127.0.0.1:17401/logs?level=loud").is_err());
 
     let [enter, words @ ..] = &link.monitor.outside()[..] else {

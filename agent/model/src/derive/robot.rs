@@ -16,7 +16,7 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::names::NodeName;
 use crate::facts::observation::Sample;
 use crate::facts::tables::RobotWriters;
-use crate::measure::allowance::Allowance;
+use crate::measure::allowance::{Allowance, CommonAllowance, WriterAllowance};
 use crate::measure::assembly::Assembly;
 use logs::{Logs, Origin};
 
@@ -43,9 +43,7 @@ pub enum Standard {
 pub struct Robot {
     writers: Bounded<Counted<RobotWriters>, HashMap<Guid, RobotWriter>>,
     assembly: Assembly,
-    allowance: Allowance,
-    /// Number of paused writers.
-    paused: usize,
+    allowance: CommonAllowance,
     logs: Logs,
 }
 
@@ -53,8 +51,7 @@ pub struct Robot {
 struct RobotWriter {
     domain_id: DomainId,
     standard: Standard,
-    allowance: Allowance,
-    is_paused: bool,
+    allowance: WriterAllowance,
     read: ReadNumbers,
 }
 
@@ -93,8 +90,7 @@ impl Default for Robot {
         Self {
             writers: Bounded::default(),
             assembly: Assembly::new(ASSEMBLY_BYTES),
-            allowance: ALL_WRITERS,
-            paused: 0,
+            allowance: CommonAllowance::new(ALL_WRITERS, RESUME_BYTES),
             logs: Logs::default(),
         }
     }
@@ -106,8 +102,7 @@ impl Robot {
         let new = || RobotWriter {
             domain_id,
             standard,
-            allowance: WRITER,
-            is_paused: false,
+            allowance: WriterAllowance::new(WRITER),
             read: ReadNumbers::default(),
         };
         self.writers.get_or_insert_with(writer, new);
@@ -116,7 +111,7 @@ impl Robot {
     /// Stops reading this writer.
     pub fn forget(&mut self, writer: Guid) {
         if let Some(known) = self.writers.remove(&writer) {
-            self.paused -= usize::from(known.is_paused);
+            self.allowance.forget(&known.allowance);
             self.assembly.release(writer);
         }
     }
@@ -126,7 +121,7 @@ impl Robot {
     pub fn is_captured(&self, writer: Guid) -> bool {
         self.writers
             .get(&writer)
-            .is_some_and(|known| !known.is_paused)
+            .is_some_and(|known| !known.allowance.is_paused())
     }
 
     /// Returns whether a writer of a standard type is known.
@@ -142,15 +137,15 @@ impl Robot {
             return Heard::Nothing;
         };
         // Until the kernel knows of a pause, it captures more.
-        let own = known.allowance.spend(payload.len(), now);
-        let is_allowed = self.allowance.spend(payload.len(), now) && own;
-        if known.is_paused || !sample.is_message() {
+        let is_allowed = self
+            .allowance
+            .spend(&mut known.allowance, payload.len(), now);
+        if known.allowance.is_paused() || !sample.is_message() {
             return Heard::Nothing;
         }
         let bytes = usize::try_from(sample.size()).unwrap_or(usize::MAX);
         if !is_allowed || bytes > MESSAGE_BYTES {
-            known.is_paused = true;
-            self.paused += 1;
+            self.allowance.pause(&mut known.allowance);
             self.assembly.release(writer);
             return Heard::Paused;
         }
@@ -191,18 +186,9 @@ impl Robot {
     pub fn end_second(&mut self, now: ModelTime) -> Vec<Guid> {
         self.assembly.expire(now);
         self.logs.end_second();
-        if self.paused == 0 || self.allowance.left(now) < RESUME_BYTES {
-            return Vec::new();
-        }
-        let mut resumed = Vec::new();
-        for (writer, known) in &mut self.writers {
-            if known.is_paused && known.allowance.left(now) >= RESUME_BYTES {
-                known.is_paused = false;
-                resumed.push(*writer);
-            }
-        }
-        self.paused -= resumed.len();
-        resumed
+        let writers = self.writers.iter_mut();
+        let writers = writers.map(|(writer, known)| (writer, &mut known.allowance));
+        self.allowance.resume(writers, now)
     }
 
     /// Returns the logs of all nodes.

@@ -150,6 +150,13 @@ impl Discovery {
         &self.participants
     }
 
+    /// Returns the node that has this writer.
+    #[must_use]
+    pub fn node_of(&self, writer: Guid) -> Option<&Node> {
+        let mut nodes = self.participants.get(&writer.prefix)?.nodes.iter();
+        nodes.find(|node| node.writers.contains(&writer))
+    }
+
     /// Returns all endpoints of known participants.
     #[must_use]
     pub fn endpoints(&self) -> &HashMap<Guid, Box<Endpoint>> {

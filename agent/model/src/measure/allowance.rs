@@ -1,8 +1,10 @@
 //! Token bucket for the bytes of messages that are captured before any client requests them.
 
+use ros2probe_wire::Guid;
 use ros2probe_wire::time::SECOND;
 
 use crate::facts::model_time::ModelTime;
+
 /// Bytes charged per datagram in addition to its payload, so that small datagrams are not free.
 const OVERHEAD: usize = 64;
 
@@ -52,6 +54,92 @@ impl Allowance {
     /// Takes all bytes that are left.
     pub(crate) const fn exhaust(&mut self) {
         self.left = 0;
+    }
+}
+
+/// The allowance of all writers together, and the number of paused ones.
+#[derive(Debug)]
+pub(crate) struct CommonAllowance {
+    allowance: Allowance,
+    /// A paused writer is captured again once it is allowed this many bytes.
+    resume_bytes: u64,
+    paused: usize,
+}
+
+/// The allowance of one writer. A paused writer is not captured.
+#[derive(Debug)]
+pub(crate) struct WriterAllowance {
+    pub(crate) allowance: Allowance,
+    is_paused: bool,
+}
+
+impl CommonAllowance {
+    pub(crate) const fn new(allowance: Allowance, resume_bytes: u64) -> Self {
+        Self {
+            allowance,
+            resume_bytes,
+            paused: 0,
+        }
+    }
+
+    /// Returns whether any writer is paused.
+    pub(crate) const fn has_paused(&self) -> bool {
+        self.paused > 0
+    }
+
+    /// Charges a datagram of a writer to both allowances. Returns whether they cover it.
+    pub(crate) fn spend(
+        &mut self,
+        own: &mut WriterAllowance,
+        payload: usize,
+        now: ModelTime,
+    ) -> bool {
+        let is_own = own.allowance.spend(payload, now);
+        self.allowance.spend(payload, now) && is_own
+    }
+
+    /// Pauses a writer.
+    pub(crate) const fn pause(&mut self, own: &mut WriterAllowance) {
+        own.is_paused = true;
+        self.paused += 1;
+    }
+
+    /// Forgets a writer.
+    pub(crate) fn forget(&mut self, own: &WriterAllowance) {
+        self.paused -= usize::from(own.is_paused);
+    }
+
+    /// Ends the pause of writers that are allowed enough bytes again. Returns these writers.
+    pub(crate) fn resume<'a>(
+        &mut self,
+        writers: impl Iterator<Item = (&'a Guid, &'a mut WriterAllowance)>,
+        now: ModelTime,
+    ) -> Vec<Guid> {
+        if self.paused == 0 || self.allowance.left(now) < self.resume_bytes {
+            return Vec::new();
+        }
+        let mut resumed = Vec::new();
+        for (writer, own) in writers {
+            if own.is_paused && own.allowance.left(now) >= self.resume_bytes {
+                own.is_paused = false;
+                resumed.push(*writer);
+            }
+        }
+        self.paused -= resumed.len();
+        resumed
+    }
+}
+
+impl WriterAllowance {
+    pub(crate) const fn new(allowance: Allowance) -> Self {
+        Self {
+            allowance,
+            is_paused: false,
+        }
+    }
+
+    pub(crate) const fn is_paused(&self) -> bool {
+        self.is_paused
     }
 }
 

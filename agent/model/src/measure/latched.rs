@@ -18,7 +18,7 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::observation::{self, Content};
 use crate::facts::tables::{RetainedBytes, RetainedWriters};
 use crate::facts::wall_clock::WallClock;
-use crate::measure::allowance::Allowance;
+use crate::measure::allowance::{Allowance, CommonAllowance, WriterAllowance};
 use crate::measure::assembly::Assembly;
 
 /// State of the last message of a transient-local writer. Sizes are in bytes.
@@ -53,9 +53,7 @@ pub struct Latched {
     writers: Bounded<Counted<RetainedWriters>, HashMap<Guid, LatchedWriter>>,
     bytes: Sum<Counted<RetainedBytes>>,
     assembly: Assembly,
-    allowance: Allowance,
-    /// Number of paused writers.
-    paused: usize,
+    allowance: CommonAllowance,
 }
 
 /// Properties of a writer that its kept message needs.
@@ -72,8 +70,7 @@ pub struct LatchedTopic {
 #[derive(Debug)]
 struct LatchedWriter {
     about: LatchedTopic,
-    allowance: Allowance,
-    is_paused: bool,
+    allowance: WriterAllowance,
     /// Number and source timestamp of the last message.
     newest: Option<(SequenceNumber, Option<Timestamp>)>,
     last: Last,
@@ -98,8 +95,7 @@ impl Default for Latched {
             writers: Bounded::default(),
             bytes: Sum::default(),
             assembly: Assembly::new(ASSEMBLY_BYTES),
-            allowance: ALL_WRITERS,
-            paused: 0,
+            allowance: CommonAllowance::new(ALL_WRITERS, RESUME_BYTES),
         }
     }
 }
@@ -109,8 +105,7 @@ impl Latched {
     pub fn follow(&mut self, writer: Guid, about: LatchedTopic) {
         let new = || LatchedWriter {
             about: about.clone(),
-            allowance: WRITER,
-            is_paused: false,
+            allowance: WriterAllowance::new(WRITER),
             newest: None,
             last: Last::Unseen,
         };
@@ -131,7 +126,7 @@ impl Latched {
     pub fn forget(&mut self, writer: Guid) {
         self.replace(writer, Last::Unseen);
         if let Some(known) = self.writers.remove(&writer) {
-            self.paused -= usize::from(known.is_paused);
+            self.allowance.forget(&known.allowance);
             self.assembly.release(writer);
         }
     }
@@ -141,7 +136,7 @@ impl Latched {
     #[must_use]
     pub fn verdict(&self, writer: Guid) -> Option<Verdict> {
         let known = self.writers.get(&writer)?;
-        Some(match known.is_paused {
+        Some(match known.allowance.is_paused() {
             true => Verdict::Meter,
             false => Verdict::Capture,
         })
@@ -165,15 +160,16 @@ impl Latched {
             return false;
         };
         // Until the kernel knows of a pause, it captures more.
-        let own = known.allowance.spend(payload.len(), now);
-        let is_allowed = self.allowance.spend(payload.len(), now) && own;
-        if known.is_paused || !sample.is_message() {
+        let is_allowed = self
+            .allowance
+            .spend(&mut known.allowance, payload.len(), now);
+        if known.allowance.is_paused() || !sample.is_message() {
             return false;
         }
         let bytes = usize::try_from(sample.size()).unwrap_or(usize::MAX);
         if bytes > known.most() {
             // Its next message may be as large.
-            known.allowance.exhaust();
+            known.allowance.allowance.exhaust();
         }
         if !is_allowed || bytes > known.most() {
             self.pause(writer);
@@ -237,12 +233,12 @@ impl Latched {
 
     /// Drops the kept message of a paused writer if `sample` shows that it is no longer the last.
     pub fn seen(&mut self, sample: &observation::Sample) {
-        if self.paused == 0 || !sample.is_message() {
+        if !self.allowance.has_paused() || !sample.is_message() {
             return;
         }
         let writer = sample.head.writer;
         let known = self.writers.get_mut(&writer);
-        let Some(known) = known.filter(|known| known.is_paused) else {
+        let Some(known) = known.filter(|known| known.allowance.is_paused()) else {
             return;
         };
         let source = sample.source_timestamp.timestamp();
@@ -263,18 +259,9 @@ impl Latched {
     /// again.
     pub fn advance(&mut self, now: ModelTime) -> Vec<Guid> {
         self.assembly.expire(now);
-        if self.paused == 0 || self.allowance.left(now) < RESUME_BYTES {
-            return Vec::new();
-        }
-        let mut resumed = Vec::new();
-        for (writer, known) in &mut self.writers {
-            if known.is_paused && known.allowance.left(now) >= RESUME_BYTES {
-                known.is_paused = false;
-                resumed.push(*writer);
-            }
-        }
-        self.paused -= resumed.len();
-        resumed
+        let writers = self.writers.iter_mut();
+        let writers = writers.map(|(writer, known)| (writer, &mut known.allowance));
+        self.allowance.resume(writers, now)
     }
 
     /// Returns the kept messages with the times of their arrival, oldest first.
@@ -316,8 +303,7 @@ impl Latched {
 
     fn pause(&mut self, writer: Guid) {
         if let Some(known) = self.writers.get_mut(&writer) {
-            known.is_paused = true;
-            self.paused += 1;
+            self.allowance.pause(&mut known.allowance);
             self.assembly.release(writer);
         }
     }

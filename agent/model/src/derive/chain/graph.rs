@@ -170,12 +170,7 @@ pub(crate) fn publisher(
     topic: &Topic,
     is_meant: impl Fn(&NodeName) -> bool,
 ) -> Option<NodeName> {
-    let node = |writer: &Guid| {
-        let participant = discovery.participants().get(&writer.prefix)?;
-        let mut nodes = participant.nodes.iter();
-        let node = nodes.find(|node| node.writers.contains(writer))?;
-        Some(node.name.clone())
-    };
+    let node = |writer: &Guid| Some(discovery.node_of(*writer)?.name.clone());
     let nodes: BTreeSet<Option<NodeName>> = topic.writers.iter().map(node).collect();
     let nodes: Vec<Option<NodeName>> = match nodes.len() {
         0 | 1 => nodes.into_iter().collect(),

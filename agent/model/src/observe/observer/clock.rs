@@ -116,10 +116,7 @@ impl Observer {
             if let Some(endpoint) = discovery.endpoints().get(&burst.writer) {
                 burst.topic = Some((endpoint.domain_id, endpoint.topic.bounded(TEXT)));
             }
-            let participant = discovery.participants().get(&burst.writer.prefix);
-            let mut nodes = participant.into_iter().flat_map(|known| &known.nodes);
-            let publisher = graph.base_of(burst.writer);
-            let node = nodes.find(|node| node.writers.contains(&publisher));
+            let node = discovery.node_of(graph.base_of(burst.writer));
             burst.node = node.map(|node| node.name.bounded(TEXT));
         });
     }

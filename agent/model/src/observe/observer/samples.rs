@@ -153,11 +153,7 @@ impl Observer {
         if !self.derive.robot.is_captured(writer) {
             return;
         }
-        let participants = self.graph.discovery.participants();
-        let nodes = participants.get(&writer.prefix).into_iter();
-        let mut nodes = nodes.flat_map(|participant| &participant.nodes);
-        let node = nodes.find(|node| node.writers.contains(&writer));
-        let node = node.map(|node| &node.name);
+        let node = self.graph.discovery.node_of(writer).map(|node| &node.name);
         match self.derive.robot.hear(sample, payload, node) {
             Heard::Nothing | Heard::Decoded(Ok(())) => {}
             Heard::Paused => self.apply_again(writer, sample.head.at),

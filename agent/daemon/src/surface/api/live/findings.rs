@@ -12,6 +12,7 @@ use crate::agent_facts::{Ability, AgentFacts, SourceKind};
 use crate::missed_announcements;
 use ros2probe_api::live::{Finding, Severity};
 use ros2probe_model::facts::diagnosis::{Diagnosis, Policies, Policy, TopicKey};
+use ros2probe_model::facts::names::NodeName;
 use ros2probe_model::graph::zenoh::Unseen;
 use ros2probe_model::measure::history::Past;
 use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot, TopicFacts, WatchState};
@@ -40,6 +41,21 @@ pub(super) fn findings(circumstances: &Circumstances<'_>) -> Vec<Finding> {
     });
     list.truncate(MOST);
     list
+}
+
+/// Returns a warning about a node.
+fn of_node(
+    kind: &'static str,
+    ids: &Ids,
+    (domain_id, node): (DomainId, &NodeName),
+    text: String,
+) -> Finding {
+    let about = format!("{domain_id}|{node}");
+    Finding {
+        domain_id: Some(domain_id.0),
+        node: ids.node(domain_id, node),
+        ..finding(kind, Severity::Warning, &about, text)
+    }
 }
 
 pub(super) fn finding(
@@ -234,17 +250,8 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             domain_id, node, ..
         } => {
             let text = format!("Several nodes have the name {node}");
-            Finding {
-                domain_id: Some(domain_id.0),
-                node: all.ids.node(*domain_id, node),
-                ..finding(
-                    kind,
-                    Severity::Warning,
-                    &format!("{domain_id}|{node}"),
-                    text,
-                )
-            }
-            .with_remedy("give each node a name or a namespace of its own")
+            let found = of_node(kind, all.ids, (*domain_id, node), text);
+            found.with_remedy("give each node a name or a namespace of its own")
         }
         Diagnosis::UnmatchedPublisher {
             topic,
@@ -334,17 +341,8 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             text,
         } => {
             let said = format!("{node} logged {errors} errors within a minute: {text}");
-            Finding {
-                domain_id: Some(domain_id.0),
-                node: all.ids.node(*domain_id, node),
-                ..finding(
-                    kind,
-                    Severity::Warning,
-                    &format!("{domain_id}|{node}"),
-                    said,
-                )
-            }
-            .with_remedy(format!("`rp log {node} --level error` prints them"))
+            let found = of_node(kind, all.ids, (*domain_id, node), said);
+            found.with_remedy(format!("`rp log {node} --level error` prints them"))
         }
         Diagnosis::LossyLink { link, .. } => {
             let text = format!(
