@@ -95,8 +95,11 @@ struct Printer<'a> {
 
 impl Log {
     pub(crate) fn ask(self) -> Result<ExitCode> {
-        let pattern = self.grep.as_deref().map(expression).transpose();
-        let pattern = pattern.map_err(|error| UserError(error.to_string()))?;
+        let compile = |pattern| {
+            let refused = format!("--grep: `{pattern}` is not a supported regular expression");
+            expression(pattern).map_err(|_| UserError(refused))
+        };
+        let pattern = self.grep.as_deref().map(compile).transpose()?;
         let domain_id = self.target.domain()?;
         let agent = Agent::reach_stream(&self.target)?;
         let mut printer = Printer {
