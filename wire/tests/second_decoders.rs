@@ -7,6 +7,7 @@
 //! - scapy leaves DATA_FRAG, HEARTBEAT_FRAG, NACK_FRAG and GAP undecoded, and with them the rest of
 //!   the message;
 //! - scapy ends a payload too early if inline QoS precede it;
+//! - scapy takes the submessages after an announcement of a participant as a part of it;
 //! - tshark prints no payload of builtin writers, whose parameters it decodes;
 //! - neither reads Zenoh, or RTPS over TCP as Fast DDS frames it.
 
@@ -29,7 +30,7 @@ use std::process::Command;
 
 use flate2::Crc;
 use ros2probe_wire::walk::{self, Envelope};
-use ros2probe_wire::{Endianness, Guid, SequenceNumber, record};
+use ros2probe_wire::{Endianness, EntityId, Guid, SequenceNumber, record};
 
 use entry::oracle::submessage::{Data, DataFrag};
 use entry::oracle::{Body, Message, Submessage};
@@ -151,7 +152,8 @@ fn scapy_payload(data: &Data<'_>) -> String {
 /// Returns a message as `second_decoders/scapy_lines.py` prints it.
 fn as_scapy(bytes: &[u8], submessages: &[Submessage<'_>]) -> String {
     let mut parts = vec![hex(&bytes[8..20])];
-    for submessage in submessages {
+    let mut rest = submessages.iter();
+    while let Some(submessage) = rest.next() {
         let content = match submessage.body {
             Body::DataFrag(_) | Body::HeartbeatFrag(_) | Body::NackFrag(_) | Body::Gap(_) => break,
             Body::InfoTimestamp => format!(" {}", submessage.receiver.timestamp.0),
@@ -170,13 +172,21 @@ fn as_scapy(bytes: &[u8], submessages: &[Submessage<'_>]) -> String {
                 heartbeat.last.0,
                 heartbeat.count
             ),
-            Body::Data(data) => format!(
-                " {} {} {}{}",
-                entity(data.reader),
-                entity(data.writer),
-                data.sequence_number.0,
-                scapy_payload(&data)
-            ),
+            Body::Data(data) => {
+                let payload = match rest.len() {
+                    1.. if data.writer.entity == EntityId::SPDP_WRITER => {
+                        rest = [].iter();
+                        " ...".to_owned()
+                    }
+                    _ => scapy_payload(&data),
+                };
+                format!(
+                    " {} {} {}{payload}",
+                    entity(data.reader),
+                    entity(data.writer),
+                    data.sequence_number.0,
+                )
+            }
             _ => String::new(),
         };
         let (flags, length) = (submessage.flags.0, octets(bytes, submessage));

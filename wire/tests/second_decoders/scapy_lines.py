@@ -15,6 +15,9 @@ from scapy.contrib.rtps import rtps
 # Messages with more than 100 submessages are rare, but valid.
 conf.max_list_count = 10_000
 
+# Bytes of a DATA before its payload, if it has no inline QoS.
+HEADER = 20
+
 
 def entity(value):
     return value if isinstance(value, str) else value.hex()
@@ -49,7 +52,11 @@ def submessage(part):
         if part.submessageFlags & 2 == 0:
             content = part.fields.get("data") or part.fields.get("key")
             content = bytes(content) if content else b""
-            fields += [len(content), f"{zlib.crc32(content):08x}"]
+            # scapy takes what follows an announcement of a participant as a part of it.
+            if len(content) + HEADER > part.octetsToNextHeader:
+                fields.append("...")
+            else:
+                fields += [len(content), f"{zlib.crc32(content):08x}"]
     return " ".join(map(str, fields))
 
 
