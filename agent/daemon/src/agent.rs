@@ -522,7 +522,7 @@ fn settings(config: &Config, is_live: bool) -> observer::Settings {
         topic_grace: config.topic_grace,
         service_timeout: config.service_timeout,
         keeps_latched: config.retain == RetainChoice::Latched,
-        reads_logs: config.robot.logs,
+        robot: config.robot,
         directed: is_live,
         ..observer::Settings::default().with_limits(&config.limits)
     }

@@ -31,6 +31,7 @@ use ros2probe_daemon::surface::ros2_daemon::call::{self, Argument, Call};
 use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::library::{DescribedFigures, Library, Sources};
 use ros2probe_message::{Decoded, Definition, MessageType, Truncation, csv, decode, yaml};
+use ros2probe_model::derive::robot::Parts;
 use ros2probe_model::facts::route::Destination;
 use ros2probe_model::facts::selection::{Depth, SampleRequest, Selection};
 use ros2probe_model::graph::zenoh::{Flow, StreamId};
@@ -577,7 +578,7 @@ const SMALL: Settings = Settings {
     service_timeout: Duration::from_secs(1),
     payload_delay: Duration::from_millis(400),
     keeps_latched: true,
-    reads_logs: true,
+    robot: Parts::ALL,
     directed: true,
 };
 

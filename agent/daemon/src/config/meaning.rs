@@ -16,18 +16,19 @@ use super::document::Node;
 use super::mistake::{Mistakes, Position};
 use super::shape::{
     ApiShape, CaptureShape, ConfigShape, FoxgloveShape, MetricsShape, OtlpShape, RecordingsShape,
-    Ros2DaemonShape, SnapshotShape, Switch, WatchEntryShape, WatchShape,
+    RobotShape, Ros2DaemonShape, SnapshotShape, Switch, WatchEntryShape, WatchShape,
 };
 use super::watch::{
     ExpectationValues, Expectations, PatternError, Retain, Watch, check_globs, check_pattern,
 };
 use super::{
     ApiSettings, CaptureSettings, Config, Endpoint, FoxgloveSettings, Level, Limits,
-    MetricsSettings, OtlpSettings, RecordingLimits, RecordingSettings, RobotSettings,
-    Ros2DaemonSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
+    MetricsSettings, OtlpSettings, RecordingLimits, RecordingSettings, Ros2DaemonSettings,
+    ShmSettings, SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
 };
 use crate::events::Trigger;
 use ros2probe_metrics::otlp::otlp_endpoint;
+use ros2probe_model::derive::robot::{Part, Parts};
 
 /// Maximum number of configured snapshots; each needs memory and a thread.
 const MAX_SNAPSHOTS: usize = 8;
@@ -152,9 +153,7 @@ impl Reader {
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             service_timeout: Duration::from_secs_f64(shape.service_timeout_s),
             retain: shape.retain,
-            robot: RobotSettings {
-                logs: shape.robot.unwrap_or_default().logs == Switch::On,
-            },
+            robot: robot(&shape.robot.unwrap_or_default()),
             state_directory: state(&shape.state_directory),
             log: shape.log,
         }
@@ -567,6 +566,14 @@ fn metrics(shape: MetricsShape) -> MetricsSettings {
         per_writer: shape.per_writer,
         web_config: shape.web_config.map(PathBuf::from),
     }
+}
+
+fn robot(shape: &RobotShape) -> Parts {
+    let parts = [(Part::Logs, shape.logs)];
+    let on = parts
+        .into_iter()
+        .filter(|(_, switch)| *switch == Switch::On);
+    on.map(|(part, _)| part).collect()
 }
 
 fn otlp(shape: OtlpShape) -> OtlpSettings {

@@ -15,6 +15,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use ros2probe_model::derive::robot::Parts;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
@@ -71,7 +72,7 @@ pub struct Config {
     /// Last messages that are kept.
     pub retain: RetainChoice,
     /// What the agent reads of what the robot says.
-    pub robot: RobotSettings,
+    pub robot: Parts,
     /// Directory of the saved discovery state.
     pub state_directory: StateChoice,
     /// Minimum severity that is logged.
@@ -130,13 +131,6 @@ pub enum RetainChoice {
     Latched,
     /// Only messages of watches with `retain: last`.
     Off,
-}
-
-/// What the agent reads of what the robot says.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct RobotSettings {
-    /// Whether it reads the logs of nodes.
-    pub logs: bool,
 }
 
 /// Directory of the saved state.
@@ -442,7 +436,7 @@ impl Default for Config {
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
             service_timeout: Duration::from_secs_f64(defaults::service_timeout_s()),
             retain: RetainChoice::default(),
-            robot: RobotSettings { logs: true },
+            robot: Parts::ALL,
             state_directory: StateChoice::default(),
             log: Level::default(),
         }

@@ -31,6 +31,17 @@ const ALL_WRITERS: Allowance = Allowance::new(8 << 20, 512 << 10);
 /// A paused writer is captured again once it is allowed this many bytes.
 const RESUME_BYTES: u64 = 256 << 10;
 
+/// What the agent may read of what the robot says; each can be switched off.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// Logs of nodes.
+    Logs,
+}
+
+/// A set of parts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Parts(u8);
+
 /// Standard types that the agent reads.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Standard {
@@ -62,8 +73,10 @@ pub enum Heard {
     Nothing,
     /// The writer is paused: its verdict has changed.
     Paused,
-    /// It was decoded, or it is malformed.
-    Decoded(Result<(), WireError>),
+    /// It was decoded.
+    Decoded,
+    /// It is malformed.
+    Malformed(Standard, WireError),
 }
 
 /// The latest numbers of a writer that were decoded.
@@ -82,6 +95,43 @@ impl Standard {
             log::TYPE => Some(Self::Log),
             _ => None,
         }
+    }
+
+    /// Returns its name as a stage of decoding.
+    #[must_use]
+    pub const fn stage(self) -> &'static str {
+        match self {
+            Self::Log => "log",
+        }
+    }
+
+    /// Returns the part that reads it.
+    #[must_use]
+    pub const fn part(self) -> Part {
+        match self {
+            Self::Log => Part::Logs,
+        }
+    }
+}
+
+impl Parts {
+    /// All parts.
+    pub const ALL: Self = Self(1 << Part::Logs as u8);
+
+    /// Returns whether it contains this part.
+    #[must_use]
+    pub const fn has(self, part: Part) -> bool {
+        self.0 >> part as u8 & 1 != 0
+    }
+}
+
+impl FromIterator<Part> for Parts {
+    fn from_iter<T: IntoIterator<Item = Part>>(parts: T) -> Self {
+        Self(
+            parts
+                .into_iter()
+                .fold(0, |bits, part| bits | 1 << part as u8),
+        )
     }
 }
 
@@ -177,8 +227,13 @@ impl Robot {
             number,
             node,
         };
-        let Standard::Log = standard;
-        Heard::Decoded(log::Log::parse(payload).map(|log| self.logs.add(&origin, &log)))
+        let decoded = match standard {
+            Standard::Log => log::Log::parse(payload).map(|log| self.logs.add(&origin, &log)),
+        };
+        match decoded {
+            Ok(()) => Heard::Decoded,
+            Err(error) => Heard::Malformed(standard, error),
+        }
     }
 
     /// Ends a second: unfinished messages and old errors expire. Returns the writers that are

@@ -1,5 +1,6 @@
 //! What the robot itself says: its logs.
 
+use ros2probe_model::derive::robot::Parts;
 use ros2probe_model::facts::bounded::ledger;
 use ros2probe_model::facts::diagnosis::Diagnosis;
 use ros2probe_model::facts::event::EventKind;
@@ -189,7 +190,7 @@ fn a_writer_beyond_its_allowance_is_paused_and_read_again_later() {
 #[test]
 fn logs_are_not_read_if_they_are_switched_off() {
     let mut node = Node::with(Settings {
-        reads_logs: false,
+        robot: Parts::default(),
         ..Settings::default()
     });
     node.log(20, "text");

@@ -197,9 +197,11 @@ impl Observer {
                 }
                 let latched = self.measure.latched.verdict(guid);
                 let standard = Standard::of(&endpoint.message_type);
-                match standard.filter(|_| self.settings.reads_logs && counts) {
-                    Some(standard) => self.derive.robot.follow(guid, topic.domain_id, standard),
-                    None => self.derive.robot.forget(guid),
+                match standard {
+                    Some(standard) if counts && self.settings.robot.has(standard.part()) => {
+                        self.derive.robot.follow(guid, topic.domain_id, standard);
+                    }
+                    _ => self.derive.robot.forget(guid),
                 }
                 let is_read = self.derive.robot.is_captured(guid);
                 let verdict = match topic.naming.kind {

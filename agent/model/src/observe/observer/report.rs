@@ -10,6 +10,7 @@ use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, EntityId, Guid, Timestamp};
 
 use super::Observer;
+use crate::derive::robot::Part;
 use crate::facts::measurement::Measurement;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{DdsName, NodeName};
@@ -47,7 +48,7 @@ pub(super) fn snapshot(observer: &Observer, wall_time: Timestamp) -> Snapshot {
         zenoh: observer.zenoh.is_used().then(|| observer.zenoh.facts()),
         chains: observer.derive.chains.facts(wall_time),
         links: observer.measure.links.facts(),
-        logs: (observer.derive.robot.logs()).facts(observer.settings.reads_logs),
+        logs: (observer.derive.robot.logs()).facts(observer.settings.robot.has(Part::Logs)),
         diagnoses: Arc::clone(observer.derive.examiner.current()),
         diagnosed: Arc::clone(observer.derive.examiner.since()),
         churn: observer.graph.discovery.churn.facts(),

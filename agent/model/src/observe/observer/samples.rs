@@ -155,9 +155,9 @@ impl Observer {
         }
         let node = self.graph.discovery.node_of(writer).map(|node| &node.name);
         match self.derive.robot.hear(sample, payload, node) {
-            Heard::Nothing | Heard::Decoded(Ok(())) => {}
+            Heard::Nothing | Heard::Decoded => {}
             Heard::Paused => self.apply_again(writer, sample.head.at),
-            Heard::Decoded(Err(error)) => self.decode_error("log", error.reason),
+            Heard::Malformed(standard, error) => self.decode_error(standard.stage(), error.reason),
         }
     }
 

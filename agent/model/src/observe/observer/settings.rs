@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use crate::derive::robot::Parts;
 use crate::facts::limits::Limits;
 use crate::measure::payloads;
 
@@ -35,8 +36,8 @@ pub struct Settings {
     /// Whether the last message of each transient-local writer is kept even if no watch requests
     /// it.
     pub keeps_latched: bool,
-    /// Whether the logs of nodes are read.
-    pub reads_logs: bool,
+    /// What is read of what the robot itself says.
+    pub robot: Parts,
     /// Whether records contain the direction of datagrams; those of a capture file do not.
     pub directed: bool,
 }
@@ -57,7 +58,7 @@ impl Default for Settings {
             payload_delay: payloads::PAYLOAD_DELAY,
             service_timeout: Duration::from_secs(5),
             keeps_latched: true,
-            reads_logs: true,
+            robot: Parts::ALL,
             directed: true,
         }
     }
