@@ -186,6 +186,15 @@ pub enum Diagnosis<'a> {
         /// Text of the last one of these.
         text: Cow<'a, str>,
     },
+    /// The clock of another host differs much from this host's.
+    ClocksApart {
+        /// Name or address of the other host.
+        peer: Cow<'a, str>,
+        /// Seconds by which its clock was ahead when the problem appeared; negative if behind.
+        offset_seconds: f64,
+        /// The offset was wrong by at most this time.
+        uncertainty_seconds: f64,
+    },
     /// A configured chain that ends with the topic exceeds its maximum latency.
     SlowChain {
         /// First topic of the chain.
@@ -222,6 +231,7 @@ impl Diagnosis<'_> {
             Self::SharedMachineId { .. } => "shared_machine_id",
             Self::LossyLink { .. } => "lossy_link",
             Self::LogErrors { .. } => "log_errors",
+            Self::ClocksApart { .. } => "clocks_apart",
             Self::SlowChain { .. } => "slow_chain",
         }
     }

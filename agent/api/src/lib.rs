@@ -19,6 +19,7 @@
 
 pub mod attributes;
 pub mod chains;
+pub mod clocks;
 pub mod diagnosis;
 pub mod endpoints;
 pub mod events;

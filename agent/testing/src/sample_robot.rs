@@ -14,6 +14,7 @@ use ros2probe_model::derive::chain::exemplar::Exemplars;
 use ros2probe_model::derive::chain::expected::{ChainState, ExpectedChain, ExpectedFacts};
 use ros2probe_model::derive::chain::path::{ChainFacts, ChainsFacts, HopHistograms, Quantiles};
 use ros2probe_model::derive::chain::trace::{HopTimes, Method, Path, Point};
+use ros2probe_model::derive::clocks::Source as ClockSource;
 use ros2probe_model::derive::services::latency::Latencies;
 use ros2probe_model::facts::diagnosis::{
     Diagnoses, Diagnosis, Policies, Policy, QosPairs, TopicKey, Unmatched,
@@ -29,11 +30,12 @@ use ros2probe_model::graph::discovery::Addresses;
 use ros2probe_model::graph::zenoh::{Counters, ZenohFacts};
 use ros2probe_model::measure::links::LinkFacts;
 use ros2probe_model::report::snapshot::{
-    AcknowledgementFacts, ActionFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered,
-    DeliveryFacts, Direction, EarlierCounts, EndpointFacts, GoalCounts, LatencyFacts, LogFacts,
-    LogMessage, Measurement, NodeFacts, NodeLogFacts, ParticipantFacts, ProcessFacts, SampledFacts,
-    ServiceFacts, Snapshot, SocketFacts, Source, Subscriber, TableFacts, TopicFacts, Transport,
-    TransportCount, UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
+    AcknowledgementFacts, ActionFacts, Breakdown, ChurnCount, ClockFacts, ClockOffset,
+    DecodeErrorCount, Delivered, DeliveryFacts, Direction, EarlierCounts, EndpointFacts,
+    GoalCounts, LatencyFacts, LogFacts, LogMessage, Measurement, NodeFacts, NodeLogFacts,
+    ParticipantFacts, PeerClock, ProcessFacts, SampledFacts, ServiceFacts, Snapshot, SocketFacts,
+    Source, Subscriber, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts,
+    WatchFacts, WatchState, WatchedTopicFacts,
 };
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::log::LogLevel;
@@ -113,6 +115,29 @@ fn chains() -> ChainsFacts {
 }
 
 /// Returns the log of a node with one error.
+fn clocks() -> ClockFacts {
+    let offset = |host: Option<&str>, peer: &str| ClockOffset {
+        host: host.map(Into::into),
+        peer: peer.into(),
+        offset: -20_000_000,
+        uncertainty: 300_000,
+    };
+    ClockFacts {
+        are_compared: true,
+        peers: vec![PeerClock {
+            peer: "camera-pc".into(),
+            address: [10, 0, 0, 2].into(),
+            ahead: (Some(-20_300_000), Some(-19_700_000)),
+            source: Some(ClockSource::Reply),
+            steps: 1,
+        }],
+        offsets: vec![
+            offset(None, "camera-pc"),
+            offset(Some("camera-pc"), "arm-pc"),
+        ],
+    }
+}
+
 fn logs(writer: Guid) -> LogFacts {
     let message = Arc::new(LogMessage {
         at: ModelTime::from_nanoseconds(1_699_999_999_000_000_000),
@@ -200,6 +225,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             measurement: measurement(),
         }],
         logs: logs(guid),
+        clocks: clocks(),
         services: vec![service()],
         actions: vec![action()],
         inside: Some(Arc::new(inside::inside())),
@@ -380,6 +406,11 @@ fn diagnoses() -> Diagnoses {
             node: "/lidar".into(),
             errors: 10,
             text: "no data".into(),
+        },
+        Diagnosis::ClocksApart {
+            peer: "camera-pc".into(),
+            offset: -20_000_000,
+            uncertainty: 300_000,
         },
         Diagnosis::SlowChain {
             topic: topic.clone(),

@@ -569,7 +569,7 @@ fn metrics(shape: MetricsShape) -> MetricsSettings {
 }
 
 fn robot(shape: &RobotShape) -> Parts {
-    let parts = [(Part::Logs, shape.logs)];
+    let parts = [(Part::Logs, shape.logs), (Part::Clocks, shape.clocks)];
     let on = parts
         .into_iter()
         .filter(|(_, switch)| *switch == Switch::On);

@@ -387,11 +387,16 @@ pub(super) struct RobotShape {
     /// Logs of nodes (`/rosout`): counts by node and level, the latest messages, and bursts of
     /// errors as findings.
     pub(super) logs: Switch,
+    /// Offsets between the clocks of hosts, from stamps, replies and acknowledgements.
+    pub(super) clocks: Switch,
 }
 
 impl Default for RobotShape {
     fn default() -> Self {
-        Self { logs: Switch::On }
+        Self {
+            logs: Switch::On,
+            clocks: Switch::On,
+        }
     }
 }
 

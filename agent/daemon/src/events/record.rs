@@ -13,6 +13,7 @@ use super::table;
 use crate::agent_facts::SourceKind;
 use ros2probe_metrics::event::{Definition, Severity, Value};
 use ros2probe_metrics::series_name::series_name;
+use ros2probe_model::derive::clocks;
 use ros2probe_model::facts::churn;
 use ros2probe_model::facts::diagnosis::{Diagnosis, Policy};
 use ros2probe_model::facts::event::{EventKind, LossBurst, bounded};
@@ -438,6 +439,21 @@ fn finding(finding: &Diagnosis) -> Values {
             ("ros_node", Some(text(node))),
             ("log_errors", number(*errors)),
             ("log_text", Some(text(said))),
+        ],
+        Diagnosis::ClocksApart {
+            peer,
+            offset,
+            uncertainty,
+        } => vec![
+            ("peer", Some(text(peer))),
+            (
+                "offset_seconds",
+                Some(Value::Real(clocks::seconds(*offset))),
+            ),
+            (
+                "uncertainty_seconds",
+                Some(Value::Real(clocks::seconds(*uncertainty))),
+            ),
         ],
         Diagnosis::LossyLink {
             link,

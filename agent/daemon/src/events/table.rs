@@ -63,6 +63,9 @@ const FINDING: &[&str] = &[
     "retransmitted_ratio",
     "log_errors",
     "log_text",
+    "peer",
+    "offset_seconds",
+    "uncertainty_seconds",
     "from",
     "max_latency_ms",
 ];
@@ -171,7 +174,7 @@ pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
     "Another fault of the graph, named by `diagnosis`: type_conflict, type_hash_conflict, \
      duplicate_node, node_in_several_domains, slow_callback, executor_wait, \
      late_callback, intra_process_overflow, reader_queue_overflow, observation_suspended, \
-     shared_machine_id, lossy_link, log_errors, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
+     shared_machine_id, lossy_link, log_errors, clocks_apart, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
      restamping_node, buffers_by_cpu.",
 )
 .relief(Severity::Info);

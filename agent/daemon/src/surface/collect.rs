@@ -101,6 +101,7 @@ impl MetricSource for MetricSources {
         deliveries.write(sink)?;
         delivery_metrics::sockets(sink, &snapshot.sockets)?;
         link_metrics::links(sink, snapshot)?;
+        robot_metrics::clocks(sink, snapshot)?;
         robot_metrics::logs(sink, snapshot)?;
         ros2_metrics::watches(sink, snapshot, &settings.watches)?;
         agent_metrics::identity(sink, &state, now)?;

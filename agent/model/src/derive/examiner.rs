@@ -13,6 +13,7 @@ use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::{DomainId, Guid};
 
 use crate::derive::chain::Chains;
+use crate::derive::clocks::Clocks;
 use crate::derive::inside::Inside;
 use crate::derive::robot::Robot;
 use crate::derive::services::Services;
@@ -36,9 +37,9 @@ const STEPS_PER_TOPIC: usize = 50_000;
 /// Examines the graph after each change.
 #[derive(Debug, Default)]
 pub struct Examiner {
-    /// Revisions of discovery, hanging calls, findings from inside processes, chains and links at
-    /// the last examination.
-    revision: Option<[u64; 6]>,
+    /// Revisions of discovery, hanging calls, findings from inside processes, chains, links,
+    /// robot and clocks at the last examination.
+    revision: Option<[u64; 7]>,
     /// Time at which the first unmatched endpoint becomes a finding.
     due: Option<ModelTime>,
     /// Time at which each unmatched endpoint was first found to be unmatched.
@@ -93,7 +94,7 @@ impl Examiner {
         discovery: &Discovery,
         topics: &Topics,
         services: &Services,
-        (inside, chains, links, robot): (&Inside, &Chains, &Links, &Robot),
+        (inside, chains, links, robot, clocks): (&Inside, &Chains, &Links, &Robot, &Clocks),
         now: ModelTime,
     ) {
         let revision = Some([
@@ -103,6 +104,7 @@ impl Examiner {
             chains.revision(),
             links.revision(),
             robot.revision(),
+            clocks.revision(),
         ]);
         let is_due = self.due.is_some_and(|due| due <= now);
         if self.revision == revision && !is_due {
@@ -135,6 +137,9 @@ impl Examiner {
             findings.add(finding);
         }
         for finding in links.findings() {
+            findings.add(finding);
+        }
+        for finding in clocks.findings() {
             findings.add(finding);
         }
         for finding in robot.findings() {

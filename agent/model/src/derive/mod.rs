@@ -1,6 +1,7 @@
 //! Facts derived from measurements: chains, services, calls inside processes, findings.
 
 pub mod chain;
+pub mod clocks;
 pub mod examiner;
 pub mod inside;
 pub mod robot;

@@ -36,6 +36,8 @@ const RESUME_BYTES: u64 = 256 << 10;
 pub enum Part {
     /// Logs of nodes.
     Logs,
+    /// Clocks of hosts.
+    Clocks,
 }
 
 /// A set of parts.
@@ -116,7 +118,7 @@ impl Standard {
 
 impl Parts {
     /// All parts.
-    pub const ALL: Self = Self(1 << Part::Logs as u8);
+    pub const ALL: Self = Self(1 << Part::Logs as u8 | 1 << Part::Clocks as u8);
 
     /// Returns whether it contains this part.
     #[must_use]

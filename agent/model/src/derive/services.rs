@@ -246,19 +246,20 @@ impl Services {
     }
 
     /// Records a copy of a request or reply; `receiver` determines which participant receives it.
-    pub fn seen(&mut self, sample: &Sample, receiver: impl FnOnce() -> Option<GuidPrefix>) {
+    /// If a reply ends its call, returns the time of the request and the writer that sent it.
+    pub fn seen(
+        &mut self,
+        sample: &Sample,
+        receiver: impl FnOnce() -> Option<GuidPrefix>,
+    ) -> Option<(ModelTime, Guid)> {
         let head = &sample.head;
         let guid = head.writer;
         let message = (guid, sample.sequence_number);
         if head.is_polled() {
-            return;
+            return None;
         }
-        let Some(writer) = self.writers.get(&guid) else {
-            return;
-        };
-        let Some(identity) = self.identities.known.get(&message).copied() else {
-            return;
-        };
+        let writer = self.writers.get(&guid)?;
+        let identity = self.identities.known.get(&message).copied()?;
         let service = Arc::clone(&writer.service);
         let position = position(sample);
         let mut sighting = Sighting {
@@ -277,12 +278,13 @@ impl Services {
                 {
                     service.is_exact = true;
                 }
+                None
             }
             Half::Replies => {
                 if position == Position::Arriving {
                     sighting.receiver = receiver();
                 }
-                self.replied(&service, guid, identity, sample, sighting);
+                self.replied(&service, guid, identity, sample, sighting)
             }
         }
     }
@@ -422,22 +424,19 @@ impl Services {
         identity: Identity,
         sample: &Sample,
         sighting: Sighting,
-    ) {
-        let Some(service) = self.services.get_mut(&name.key) else {
-            return;
-        };
-        let Some(answered) = service.reply(identity.call, writer, sample, sighting) else {
-            return;
-        };
+    ) -> Option<(ModelTime, Guid)> {
+        let service = self.services.get_mut(&name.key)?;
+        let answered = service.reply(identity.call, writer, sample, sighting)?;
+        let request = Some((answered.sent, answered.client));
         self.open.sub(1);
         self.revision += u64::from(answered.was_hanging);
         let (Some((key, part)), Some(goal)) = (&name.action, answered.goal) else {
-            return;
+            return request;
         };
         if !self.actions.contains_key(key) && self.actions.is_full() {
             self.actions.refuse();
             self.open.refuse();
-            return;
+            return request;
         }
         match part {
             ActionPart::SendGoal => {
@@ -453,6 +452,7 @@ impl Services {
             }
             ActionPart::CancelGoal | ActionPart::Feedback | ActionPart::Status => {}
         }
+        request
     }
 
     /// Returns whether one more service can be added. If necessary, the service without open calls

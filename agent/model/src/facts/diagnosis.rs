@@ -234,6 +234,15 @@ pub enum Diagnosis {
         /// Text of the last one of these.
         text: Arc<str>,
     },
+    /// The clock of another host differs much from this host's.
+    ClocksApart {
+        /// The other host: its name or address.
+        peer: Arc<str>,
+        /// Nanoseconds by which its clock was ahead when the finding began; negative if behind.
+        offset: i64,
+        /// The offset was wrong by at most this number of nanoseconds.
+        uncertainty: i64,
+    },
     /// A configured chain exceeds its maximum latency.
     SlowChain {
         /// Last topic of the chain.
@@ -295,7 +304,7 @@ pub enum Change<'a> {
 
 impl Diagnosis {
     /// All kinds, as label values.
-    pub const KINDS: [&'static str; 20] = [
+    pub const KINDS: [&'static str; 21] = [
         "qos_incompatible",
         "type_conflict",
         "type_hash_conflict",
@@ -315,6 +324,7 @@ impl Diagnosis {
         "shared_machine_id",
         "lossy_link",
         "log_errors",
+        "clocks_apart",
         "slow_chain",
     ];
 
@@ -341,6 +351,7 @@ impl Diagnosis {
             Self::SharedMachineId { .. } => "shared_machine_id",
             Self::LossyLink { .. } => "lossy_link",
             Self::LogErrors { .. } => "log_errors",
+            Self::ClocksApart { .. } => "clocks_apart",
             Self::SlowChain { .. } => "slow_chain",
         }
     }
@@ -368,6 +379,7 @@ impl Diagnosis {
             | Self::SharedMachineId { .. }
             | Self::LossyLink { .. }
             | Self::LogErrors { .. }
+            | Self::ClocksApart { .. }
             | Self::ObservationSuspended { .. } => None,
         }
     }
@@ -451,6 +463,7 @@ impl Diagnosis {
             | Self::IntraProcessOverflow { .. }
             | Self::ReaderQueueOverflow { .. } => (DomainId(0), "", None, None),
             Self::LossyLink { .. } => (DomainId(0), "", None, None),
+            Self::ClocksApart { peer, .. } => (DomainId(0), peer, None, None),
             Self::RestampingNode { node, .. } => (DomainId(0), node, None, None),
             Self::SlowChain { from, .. } => (DomainId(0), from, None, None),
         }

@@ -356,6 +356,7 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         Diagnosis::NodeInSeveralDomains { domains, .. } => domains.truncate(LIST),
         Diagnosis::SharedMachineId { participants, .. } => participants.truncate(LIST),
         Diagnosis::LogErrors { text, .. } => *text = bounded(text).into(),
+        Diagnosis::ClocksApart { peer, .. } => *peer = bounded(peer).into(),
         Diagnosis::QosIncompatible { .. }
         | Diagnosis::UnmatchedPublisher { .. }
         | Diagnosis::UnmatchedSubscription { .. }

@@ -336,4 +336,8 @@ crate::tables! {
         name: "assembly.parts", entries: 16_384, effect: "the oldest is not captured",
         reported: "table `payloads`",
     }
+    /// Hosts whose clocks are compared
+    ClockPeers { name: "clock_peers", entries: 32, effect: "its clock is not compared" }
+    /// Writers of this host that other hosts acknowledge
+    ClockWriters { name: "clock_writers", entries: 256, effect: "it gives no round trips" }
 }

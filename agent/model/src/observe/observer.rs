@@ -7,6 +7,7 @@
 //! Its parts, and when they run:
 //! - This module: leases, and a submessage's numbers at its writer and receivers; per observation.
 //! - `announcements`: SPDP, SEDP, `ros_discovery_info`; per captured sample.
+//! - `clocks`: stamps beside arrivals; per observation.
 //! - `samples`, `calls`, `chains`: payloads, requests and replies, stamps; per sample.
 //! - `zenoh`: connections of Zenoh; per report.
 //! - `inside`, `arrivals`: calls inside processes, and their queues; per report.
@@ -19,6 +20,7 @@ mod arrivals;
 mod calls;
 mod chains;
 mod clock;
+mod clocks;
 mod inside;
 mod lists;
 mod references;
@@ -37,6 +39,7 @@ use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
 use ros2probe_wire::{DomainId, Guid, GuidPrefix, Reason, Timestamp};
 
 use crate::derive::chain::Chains;
+use crate::derive::clocks::Clocks;
 use crate::derive::examiner::Examiner;
 use crate::derive::inside::Inside;
 use crate::derive::robot::Robot;
@@ -137,6 +140,7 @@ pub(crate) struct Derive {
     pub(crate) services: Services,
     pub(crate) inside: Inside,
     pub(crate) chains: Chains,
+    pub(crate) clocks: Clocks,
     pub(crate) tracer: Tracer,
     pub(crate) examiner: Examiner,
     pub(crate) robot: Robot,
@@ -199,6 +203,7 @@ impl Observer {
                 services: Services::default(),
                 inside: Inside::default(),
                 chains: Chains::default(),
+                clocks: Clocks::default(),
                 tracer: Tracer::new(settings.directed),
                 examiner: Examiner::default(),
                 robot: Robot::default(),
@@ -463,6 +468,7 @@ impl Observer {
             return;
         }
         self.renew_lease(observation);
+        self.compare_clocks(observation);
         if writer.entity.is_builtin() {
             return;
         }
@@ -709,6 +715,7 @@ impl Observer {
         self.measure.payloads.release(guid, now);
         self.measure.latched.forget(guid);
         self.derive.robot.forget(guid);
+        self.derive.clocks.forget(guid);
         self.references.remove(guid);
         let (domain_id, topic) = (endpoint.domain_id, endpoint.topic.bounded(TEXT));
         self.journal.events.name(guid, domain_id, &topic);

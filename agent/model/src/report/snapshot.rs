@@ -14,6 +14,7 @@ use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, Guid, RtpsDuration, Timestamp};
 
 pub use crate::derive::chain::path::{ChainFacts, ChainsFacts};
+pub use crate::derive::clocks::{ClockFacts, ClockOffset, PeerClock};
 pub use crate::derive::inside::source::Source;
 pub use crate::derive::robot::logs::{LogFacts, LogMessage, NodeLogFacts};
 pub use crate::derive::services::action::GoalCounts;
@@ -77,6 +78,8 @@ pub struct Snapshot {
     pub links: Vec<LinkFacts>,
     /// Logs of nodes.
     pub logs: LogFacts,
+    /// Clocks of hosts.
+    pub clocks: ClockFacts,
     /// Problems of the graph; the same value while nothing changes.
     pub diagnoses: Arc<Diagnoses>,
     /// Time at which each problem appeared, in the same order.

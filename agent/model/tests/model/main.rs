@@ -13,6 +13,7 @@ mod bounds;
 mod buffers;
 mod chains;
 mod churn;
+mod clocks;
 mod deliveries;
 mod diagnosis;
 mod fixtures;

@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use super::endpoint::{printed, texts};
 use super::inside::trigger;
 use ros2probe_api::diagnosis::{Diagnosis, Finding};
+use ros2probe_model::derive::clocks::seconds;
 use ros2probe_model::facts::diagnosis;
 
 /// Returns the API representation of a problem.
@@ -160,6 +161,15 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
         diagnosis::Diagnosis::LogErrors { errors, text, .. } => Diagnosis::LogErrors {
             errors: *errors,
             text: Cow::Borrowed(text),
+        },
+        diagnosis::Diagnosis::ClocksApart {
+            peer,
+            offset,
+            uncertainty,
+        } => Diagnosis::ClocksApart {
+            peer: Cow::Borrowed(peer),
+            offset_seconds: seconds(*offset),
+            uncertainty_seconds: seconds(*uncertainty),
         },
         diagnosis::Diagnosis::SlowChain {
             from, max_latency, ..

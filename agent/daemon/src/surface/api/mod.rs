@@ -8,6 +8,7 @@ mod actions;
 mod body;
 mod body_stream;
 pub mod chains;
+mod clocks;
 mod downloads;
 mod endpoint;
 mod events;
@@ -203,6 +204,7 @@ fn views() -> OpenApiRouter<Context> {
         .merge(participants::routes())
         .merge(graph::routes())
         .merge(names::routes())
+        .merge(clocks::routes())
 }
 
 /// Starts the on-demand observation of calls inside processes before the answer.

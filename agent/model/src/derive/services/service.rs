@@ -81,6 +81,8 @@ pub struct Service {
 pub struct Answered {
     /// Time of the request.
     pub sent: ModelTime,
+    /// Writer of the request.
+    pub client: Guid,
     /// Goal that the request names.
     pub goal: Option<[u8; 16]>,
     /// Whether it was reported as hanging.
@@ -189,6 +191,7 @@ impl Service {
         self.latencies.observe(sighting.at - call.sent);
         Some(Answered {
             sent: call.sent,
+            client: call.writer,
             goal: call.goal,
             was_hanging: call.is_hanging,
         })

@@ -70,9 +70,12 @@ impl Observer {
     pub(super) fn call_seen(&mut self, sample: &Sample) {
         if self.derive.services.follows(sample.head.writer) {
             let (receivers, discovery) = (&self.graph.receivers, &self.graph.discovery);
-            self.derive
-                .services
-                .seen(sample, || receivers.owner(&sample.head.route(), discovery));
+            let services = &mut self.derive.services;
+            let request =
+                services.seen(sample, || receivers.owner(&sample.head.route(), discovery));
+            if let Some((sent, client)) = request {
+                self.clock_of_reply(sample, sent, client);
+            }
         }
     }
 

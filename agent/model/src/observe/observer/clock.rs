@@ -142,6 +142,7 @@ impl Observer {
             for writer in self.measure.latched.advance(now) {
                 self.apply_again(writer, now);
             }
+            self.end_second_of_clocks(now);
             for writer in self.derive.robot.end_second(now) {
                 self.apply_again(writer, now);
             }
@@ -180,6 +181,7 @@ impl Observer {
                 &self.derive.chains,
                 &self.measure.links,
                 &self.derive.robot,
+                &self.derive.clocks,
             ),
             now,
         );

@@ -49,6 +49,11 @@ pub(super) fn snapshot(observer: &Observer, wall_time: Timestamp) -> Snapshot {
         chains: observer.derive.chains.facts(wall_time),
         links: observer.measure.links.facts(),
         logs: (observer.derive.robot.logs()).facts(observer.settings.robot.has(Part::Logs)),
+        clocks: observer.derive.clocks.facts(
+            observer.settings.robot.has(Part::Clocks),
+            now,
+            observer.graph.wall_clock,
+        ),
         diagnoses: Arc::clone(observer.derive.examiner.current()),
         diagnosed: Arc::clone(observer.derive.examiner.since()),
         churn: observer.graph.discovery.churn.facts(),
@@ -459,5 +464,6 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     tables.extend(observer.zenoh.tables());
     tables.push(observer.measure.links.tables());
     tables.extend(observer.derive.robot.tables());
+    tables.extend(observer.derive.clocks.tables());
     tables
 }

@@ -43,6 +43,14 @@ pub(super) fn findings(circumstances: &Circumstances<'_>) -> Vec<Finding> {
     list
 }
 
+/// Returns nanoseconds of a clock in words.
+fn of_clock(nanoseconds: u64) -> String {
+    match std::time::Duration::from_nanos(nanoseconds).as_secs_f64() {
+        seconds if seconds < 1.0 => format!("{:.1} ms", seconds * 1e3),
+        seconds => format!("{seconds:.3} s"),
+    }
+}
+
 /// Returns a warning about a node.
 fn of_node(
     kind: &'static str,
@@ -343,6 +351,21 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             let said = format!("{node} logged {errors} errors within a minute: {text}");
             let found = of_node(kind, all.ids, (*domain_id, node), said);
             found.with_remedy(format!("`rp log {node} --level error` prints them"))
+        }
+        Diagnosis::ClocksApart {
+            peer,
+            offset,
+            uncertainty,
+        } => {
+            let ahead = if *offset < 0 { "behind" } else { "ahead of" };
+            let text = format!(
+                "the clock of {peer} is {} {ahead} the clock of this host (± {}): latencies between \
+                 them are wrong by that, and transforms may be refused",
+                of_clock(offset.unsigned_abs()),
+                of_clock(uncertainty.unsigned_abs()),
+            );
+            finding(kind, Severity::Warning, peer, text)
+                .with_remedy("synchronise both clocks (NTP, PTP): `chronyc tracking` on each host")
         }
         Diagnosis::LossyLink { link, .. } => {
             let text = format!(

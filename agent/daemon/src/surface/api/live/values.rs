@@ -130,6 +130,7 @@ impl Figures<'_> {
                 | Diagnosis::SharedMachineId { .. }
                 | Diagnosis::LossyLink { .. }
                 | Diagnosis::LogErrors { .. }
+                | Diagnosis::ClocksApart { .. }
                 | Diagnosis::SlowChain { .. } => {}
             }
         }

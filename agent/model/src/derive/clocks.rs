@@ -1,0 +1,313 @@
+//! Offsets between the clocks of hosts, with bounds, from traffic alone.
+//!
+//! A message that a peer stamps at `s` arrives at `a`. The peer's clock was at least `s` then, so it
+//! is ahead of this host's clock by at least `s - a`. Most messages are late, so the greatest of
+//! these values counts. The other bound needs a message of this host that reached the peer:
+//!
+//! - A reply follows its request. A request that left at `d` and a reply stamped `s` show that the
+//!   peer is ahead by at most `s - d`. This holds whatever the network does.
+//! - An ACKNACK has no stamp, but it follows the message that it acknowledges. The time between them
+//!   is a round trip. The peer is ahead by at most the lower bound and the fastest round trip. This
+//!   assumes that the fastest of many messages took no longer than that.
+//!
+//! Each bound widens with its age, because clocks drift. Without the second bound the offset is
+//! unknown. All values refer to model time, so a step of this host's clock changes none of them.
+
+mod bounds;
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::net::IpAddr;
+use std::sync::Arc;
+
+use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
+
+use crate::facts::bounded::{Bounded, Counted, TableFacts};
+use crate::facts::diagnosis::Diagnosis;
+use crate::facts::model_time::ModelTime;
+use crate::facts::tables::{ClockPeers, ClockWriters};
+use crate::facts::wall_clock::WallClock;
+use bounds::Evidence;
+pub use bounds::{Range, Source};
+
+/// Name of the agent's host in answers if no participant announces it.
+pub const THIS_HOST: &str = "localhost";
+/// Latest messages of one writer whose acknowledgement gives a round trip.
+const SENT: usize = 16;
+/// Nanoseconds between two clocks, beyond the uncertainty: from the first number on the offset is a
+/// finding, and below the second it is none any longer.
+const APART: i64 = 10_000_000;
+const TOGETHER: i64 = 5_000_000;
+
+/// The clocks of all hosts whose messages arrive here.
+#[derive(Debug, Default)]
+pub struct Clocks {
+    /// Peers by their first announced address.
+    peers: Bounded<Counted<ClockPeers>, BTreeMap<IpAddr, Peer>>,
+    /// Writers of this host with readers on a peer that acknowledge.
+    writers: Bounded<Counted<ClockWriters>, HashMap<Guid, Sent>>,
+    /// Name that participants of this host announce.
+    name: Option<Arc<str>>,
+    revision: u64,
+}
+
+#[derive(Debug, Default)]
+struct Peer {
+    name: Option<Arc<str>>,
+    evidence: Evidence,
+    /// The finding, as it began.
+    apart: Option<Range>,
+}
+
+/// Latest messages of a writer and the times at which they first left.
+#[derive(Debug, Default)]
+struct Sent {
+    newest: SequenceNumber,
+    times: [(SequenceNumber, ModelTime); SENT],
+}
+
+/// Offset between two clocks.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ClockOffset {
+    /// The host whose clock is compared with: its name, or its address. `None` stands for this host
+    /// if no participant announces its name.
+    pub host: Option<Arc<str>>,
+    /// The other host.
+    pub peer: Arc<str>,
+    /// Nanoseconds by which the peer's clock is ahead; negative if it is behind.
+    pub offset: i64,
+    /// The offset is wrong by at most this number of nanoseconds.
+    pub uncertainty: i64,
+}
+
+/// What is known of the clock of one peer.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PeerClock {
+    /// Name of the peer, or its address.
+    pub peer: Arc<str>,
+    /// Its first announced address.
+    pub address: IpAddr,
+    /// Nanoseconds by which it is ahead at least and at most; negative values mean that it is
+    /// behind. A bound without evidence is `None`.
+    pub ahead: (Option<i64>, Option<i64>),
+    /// Evidence for the upper bound.
+    pub source: Option<Source>,
+    /// Steps of its clock that were noticed.
+    pub steps: u64,
+}
+
+/// Clocks as a snapshot shows them.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ClockFacts {
+    /// Whether clocks are compared.
+    pub are_compared: bool,
+    /// Peers, sorted by address.
+    pub peers: Vec<PeerClock>,
+    /// Pairs of hosts with both bounds: first those of this host.
+    pub offsets: Vec<ClockOffset>,
+}
+
+impl Clocks {
+    /// Records that a message of a peer, stamped by its clock, arrived.
+    pub fn arrived(
+        &mut self,
+        (peer, name): (IpAddr, Option<&Arc<str>>),
+        stamp: Timestamp,
+        at: ModelTime,
+    ) {
+        if let Some(peer) = self.peer(peer, name) {
+            peer.evidence.arrived(ahead(stamp, at), at);
+        }
+    }
+
+    /// Records that a peer stamped a reply to a request that left this host at `sent`.
+    pub fn replied(&mut self, peer: IpAddr, stamp: Timestamp, sent: ModelTime, now: ModelTime) {
+        if let Some(peer) = self.peers.get_mut(&peer) {
+            peer.evidence.replied(ahead(stamp, sent), now);
+        }
+    }
+
+    /// Records that a message of this host left for the first time or again.
+    pub fn left(&mut self, writer: Guid, number: SequenceNumber, at: ModelTime) {
+        if let Some(sent) = self.writers.get_mut(&writer) {
+            sent.put(number, at);
+        }
+    }
+
+    /// Records that a reader on a peer acknowledged all messages up to this number.
+    pub fn acknowledged(
+        &mut self,
+        peer: IpAddr,
+        writer: Guid,
+        number: SequenceNumber,
+        at: ModelTime,
+    ) {
+        let Some(sent) = self.writers.get_or_insert_with(writer, Sent::default) else {
+            return;
+        };
+        if let Some(left) = sent.time(number)
+            && let Some(peer) = self.peers.get_mut(&peer)
+        {
+            peer.evidence.round_trip(at - left, at);
+        }
+    }
+
+    /// Records the name of this host.
+    pub fn name(&mut self, name: Option<&Arc<str>>) {
+        if self.name.as_ref() != name {
+            self.name = name.cloned();
+        }
+    }
+
+    /// Returns whether a message of a peer has arrived.
+    #[must_use]
+    pub fn is_used(&self) -> bool {
+        !self.peers.is_empty()
+    }
+
+    /// Forgets a writer.
+    pub fn forget(&mut self, writer: Guid) {
+        self.writers.remove(&writer);
+    }
+
+    /// Ends a second: old evidence expires, steps of clocks are noticed, findings come and go.
+    pub fn end_second(&mut self, now: ModelTime, clock: WallClock) {
+        let before = self.peers.len();
+        self.peers.retain(|_, peer| peer.evidence.end_second(now));
+        let mut changes = u64::from(self.peers.len() < before);
+        for peer in self.peers.values_mut() {
+            let range = peer.evidence.range(now, clock);
+            let least = range.map_or(0, |range| range.least_distance());
+            let is_apart = match peer.apart {
+                Some(_) => least > TOGETHER,
+                None => least > APART,
+            };
+            if is_apart != peer.apart.is_some() {
+                peer.apart = range.filter(|_| is_apart);
+                changes += 1;
+            }
+        }
+        self.revision += changes;
+    }
+
+    /// Returns the number of changes of [`Self::findings`].
+    #[must_use]
+    pub const fn revision(&self) -> u64 {
+        self.revision
+    }
+
+    /// Returns the peers whose clocks differ much from this host's.
+    pub fn findings(&self) -> impl Iterator<Item = Diagnosis> {
+        let labels = self.labels();
+        self.peers.iter().filter_map(move |(address, peer)| {
+            let range = peer.apart?;
+            Some(Diagnosis::ClocksApart {
+                peer: labels.get(address).cloned()?,
+                offset: range.middle(),
+                uncertainty: range.uncertainty(),
+            })
+        })
+    }
+
+    /// Returns what is known at `now`.
+    #[must_use]
+    pub fn facts(&self, are_compared: bool, now: ModelTime, clock: WallClock) -> ClockFacts {
+        let labels = self.labels();
+        let label = |address| labels.get(address).cloned().unwrap_or_else(|| "".into());
+        let peers = self.peers.iter().map(|(address, peer)| PeerClock {
+            peer: label(address),
+            address: *address,
+            ahead: peer.evidence.bounds(now, clock),
+            source: peer.evidence.source(now),
+            steps: peer.evidence.steps(),
+        });
+        let ranges = self
+            .peers
+            .iter()
+            .filter_map(|(address, peer)| Some((label(address), peer.evidence.range(now, clock)?)));
+        let known: Vec<_> = ranges.collect();
+        let offset = |host: Option<&Arc<str>>, peer: &Arc<str>, range: Range| ClockOffset {
+            host: host.cloned(),
+            peer: Arc::clone(peer),
+            offset: range.middle(),
+            uncertainty: range.uncertainty(),
+        };
+        let own = known.iter();
+        let own = own.map(|(peer, range)| offset(self.name.as_ref(), peer, *range));
+        let mut offsets: Vec<_> = own.collect();
+        for (index, (host, from)) in known.iter().enumerate() {
+            for (peer, to) in known.iter().skip(index + 1) {
+                offsets.push(offset(Some(host), peer, to.since(*from)));
+            }
+        }
+        ClockFacts {
+            are_compared,
+            peers: peers.collect(),
+            offsets,
+        }
+    }
+
+    /// Returns the sizes and limits of the tables.
+    #[must_use]
+    pub fn tables(&self) -> [TableFacts; 2] {
+        [self.peers.facts(), self.writers.facts()]
+    }
+
+    fn peer(&mut self, address: IpAddr, name: Option<&Arc<str>>) -> Option<&mut Peer> {
+        let peer = self.peers.get_or_insert_with(address, Peer::default)?;
+        if let Some(name) = name.filter(|name| peer.name.as_ref() != Some(*name)) {
+            peer.name = Some(Arc::clone(name));
+        }
+        Some(peer)
+    }
+
+    /// Returns the label of each peer: its name, or its address if another host has the same name.
+    fn labels(&self) -> BTreeMap<IpAddr, Arc<str>> {
+        let mut names: BTreeSet<&str> = self.name.as_deref().into_iter().collect();
+        let named = self.peers.values().filter_map(|peer| peer.name.as_deref());
+        let twice: BTreeSet<&str> = named.filter(|name| !names.insert(name)).collect();
+        let label = |(address, peer): (&IpAddr, &Peer)| {
+            let name = peer.name.clone();
+            let name = name.filter(|name| !name.is_empty() && !twice.contains(&**name));
+            (*address, name.unwrap_or_else(|| address.to_string().into()))
+        };
+        self.peers.iter().map(label).collect()
+    }
+}
+
+impl Sent {
+    fn put(&mut self, number: SequenceNumber, at: ModelTime) {
+        // An acknowledgement may be for the first transmission, so a repetition gives no time.
+        if number > self.newest {
+            self.newest = number;
+            if let Some(slot) = self.times.get_mut(slot(number)) {
+                *slot = (number, at);
+            }
+        }
+    }
+
+    fn time(&self, number: SequenceNumber) -> Option<ModelTime> {
+        let known = self.times.get(slot(number));
+        let known = known.filter(|(known, _)| *known == number && number != SequenceNumber::ZERO);
+        known.map(|(_, at)| *at)
+    }
+}
+
+/// Returns nanoseconds as seconds.
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "nanoseconds of an offset stay exact to 104 days"
+)]
+#[must_use]
+pub fn seconds(nanoseconds: i64) -> f64 {
+    nanoseconds as f64 / 1e9
+}
+
+/// Returns the slot of a number.
+fn slot(number: SequenceNumber) -> usize {
+    usize::try_from(number.0 % SENT as u64).unwrap_or(0)
+}
+
+/// Returns by how many nanoseconds a stamp is ahead of a time.
+const fn ahead(stamp: Timestamp, at: ModelTime) -> i64 {
+    stamp.0.wrapping_sub(at.nanoseconds()).cast_signed()
+}

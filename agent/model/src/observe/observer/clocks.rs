@@ -1,0 +1,104 @@
+//! Evidence for the offsets between hosts' clocks.
+
+use std::net::IpAddr;
+
+use ros2probe_wire::{Guid, GuidPrefix};
+
+use super::Observer;
+use crate::derive::robot::Part;
+use crate::facts::model_time::ModelTime;
+use crate::facts::observation::{AckNack, Observation, Sample};
+use crate::graph::discovery::Participant;
+
+impl Observer {
+    /// Passes the times in an observation on to the clocks.
+    pub(super) fn compare_clocks(&mut self, observation: &Observation) {
+        if !self.settings.robot.has(Part::Clocks) || observation.head().is_in_shared_memory() {
+            return;
+        }
+        match observation {
+            Observation::Sample(sample) => self.clock_of_sample(sample),
+            Observation::AckNack(acknack) => self.clock_of_acknack(acknack),
+            Observation::Heartbeat(_) | Observation::Gap(_) | Observation::Presence(_) => {}
+        }
+    }
+
+    /// Ends a second of the clocks.
+    pub(super) fn end_second_of_clocks(&mut self, now: ModelTime) {
+        let (clocks, graph) = (&mut self.derive.clocks, &self.graph);
+        if clocks.is_used() {
+            let participants = graph.discovery.participants().values();
+            let mut own = participants.filter(|participant| participant.local);
+            clocks.name(own.find_map(|participant| participant.proxy.host.as_ref()));
+        }
+        clocks.end_second(now, graph.wall_clock);
+    }
+
+    fn clock_of_sample(&mut self, sample: &Sample) {
+        let head = &sample.head;
+        if head.leaves() {
+            let number = sample.sequence_number;
+            self.derive.clocks.left(head.writer, number, head.at);
+            return;
+        }
+        // Announcements are repeated with old stamps.
+        if head.writer.entity.is_builtin() {
+            return;
+        }
+        let Some(participant) = self.graph.discovery.participants().get(&head.writer.prefix) else {
+            return;
+        };
+        let name = participant.proxy.host.as_ref();
+        if !participant.local
+            && let Some(stamp) = sample.source_timestamp.timestamp()
+            && let Some(address) = address(participant)
+        {
+            // The first of several datagrams already follows the stamp.
+            self.derive
+                .clocks
+                .arrived((address, name), stamp, head.began());
+        }
+    }
+
+    fn clock_of_acknack(&mut self, acknack: &AckNack) {
+        let head = &acknack.head;
+        let participants = self.graph.discovery.participants();
+        let writer = participants.get(&head.writer.prefix);
+        if !head.leaves()
+            && writer.is_some_and(|writer| writer.local)
+            && let Some(address) = self.remote_address(&head.reader.prefix)
+        {
+            let number = acknack.base().previous();
+            self.derive
+                .clocks
+                .acknowledged(address, head.writer, number, head.at);
+        }
+    }
+
+    /// Records a reply to a request that `client` sent at `sent`.
+    pub(super) fn clock_of_reply(&mut self, sample: &Sample, sent: ModelTime, client: Guid) {
+        let participants = self.graph.discovery.participants();
+        let client = participants.get(&client.prefix);
+        if self.settings.robot.has(Part::Clocks)
+            && client.is_some_and(|client| client.local)
+            && let Some(stamp) = sample.source_timestamp.timestamp()
+            && let Some(address) = self.remote_address(&sample.head.writer.prefix)
+        {
+            let now = sample.head.at;
+            self.derive.clocks.replied(address, stamp, sent, now);
+        }
+    }
+
+    fn remote_address(&self, prefix: &GuidPrefix) -> Option<IpAddr> {
+        let participant = self.graph.discovery.participants().get(prefix)?;
+        address(participant).filter(|_| !participant.local)
+    }
+}
+
+/// Returns the first announced address that other hosts can reach.
+fn address(participant: &Participant) -> Option<IpAddr> {
+    let addresses = &participant.addresses;
+    let mut all = addresses.metatraffic.iter().chain(&addresses.default);
+    let first = all.find(|address| !address.ip().is_loopback());
+    first.map(std::net::SocketAddr::ip)
+}

@@ -1,0 +1,420 @@
+//! Offsets between the clocks of hosts, with forged stamps in virtual time.
+
+use std::net::SocketAddrV4;
+
+use ros2probe_capture::border::observe;
+use ros2probe_model::derive::clocks::Source;
+use ros2probe_model::derive::robot::Parts;
+use ros2probe_model::facts::diagnosis::Diagnosis;
+use ros2probe_model::facts::tables::{ClockPeers, ClockWriters};
+use ros2probe_model::observe::input::Input;
+use ros2probe_model::observe::observer::Settings;
+use ros2probe_model::report::snapshot::{ClockOffset, PeerClock};
+use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
+use ros2probe_testing::model::host::{ALICE, BOB, CapturePoint, Host, READER, START, WRITER};
+use ros2probe_wire::record::{guid_words, kind};
+use ros2probe_wire::walk::Envelope;
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
+
+const MICROSECOND: u64 = 1_000;
+const MILLISECOND: u64 = 1_000_000;
+const SECOND: u64 = 1_000_000_000;
+/// Fastest way of a datagram between the hosts.
+const WAY: u64 = 150 * MICROSECOND;
+
+/// Alice's clock beside that of this host, on which Bob is.
+#[derive(Clone, Copy)]
+struct Clock {
+    ahead: i64,
+    parts_per_million: i64,
+}
+
+impl Clock {
+    const fn ahead(ahead: i64) -> Self {
+        Self {
+            ahead,
+            parts_per_million: 0,
+        }
+    }
+
+    /// Returns the true offset at a time of this host.
+    fn at(self, now: u64) -> i64 {
+        let elapsed = i64::try_from(now - START).unwrap();
+        self.ahead + elapsed / 1_000_000 * self.parts_per_million
+    }
+}
+
+/// Two hosts: Alice's messages arrive here, and Bob's leave.
+struct Pair {
+    host: Host,
+    bob: CapturePoint,
+    alice: GuidPrefix,
+    number: u64,
+    dice: u64,
+}
+
+impl Pair {
+    fn with(settings: Settings) -> Self {
+        let mut host = Host::with(settings);
+        let bob = host.reader(BOB, 7411);
+        host.owner(bob, BOB);
+        Self {
+            host,
+            bob,
+            alice: ALICE,
+            number: 0,
+            dice: 1,
+        }
+    }
+
+    fn new() -> Self {
+        Self::with(Settings::default())
+    }
+
+    /// Returns nanoseconds below a limit, most of them far below.
+    fn jitter(&mut self, below: u64) -> u64 {
+        self.dice = self.dice.wrapping_mul(6_364_136_223_846_793_005) + 1;
+        let part = (self.dice >> 40) as f64 / (1_u64 << 24) as f64;
+        (part.powi(4) * below as f64) as u64
+    }
+
+    fn until(&mut self, now: u64) {
+        self.host.now = now;
+        self.host.observer.input(Input::Time(Timestamp(now)));
+    }
+
+    /// A message of Alice's leaves now by its stamp, and arrives.
+    fn hear(&mut self, clock: Clock) {
+        let sent = self.host.now;
+        self.number += 1;
+        let stamp = sent.checked_add_signed(clock.at(sent)).unwrap();
+        let late = WAY + self.jitter(2 * MILLISECOND);
+        let record = Record {
+            writer: guid_words(Guid::new(self.alice, WRITER)),
+            source_timestamp: wire_time(stamp),
+            time: sent + late,
+            ..self.host.record(self.bob, kind::DATA, self.number)
+        };
+        self.host.put(record);
+    }
+
+    /// A message of Bob's leaves, and Alice acknowledges it.
+    fn speak(&mut self) {
+        let sent = self.host.now;
+        self.number += 1;
+        let writer = guid_words(Guid::new(BOB, WRITER));
+        let message = Record {
+            writer,
+            ..(self.host).record(self.bob.leaving(), kind::DATA, self.number)
+        };
+        self.host.put(message);
+        let later = 2 * WAY + 20 * MICROSECOND + self.jitter(5 * MILLISECOND);
+        let acknack = Record {
+            writer,
+            reader: guid_words(Guid::new(self.alice, READER)),
+            time: sent + later,
+            ..(self.host).record(self.bob, kind::ACKNACK, self.number + 1)
+        };
+        self.host.put(acknack);
+    }
+
+    /// Both speak for some seconds. At the end of each second after the fifth, `check` runs.
+    fn talk(&mut self, clock: Clock, seconds: u64, mut check: impl FnMut(&Self)) {
+        for second in 0..seconds {
+            for _ in 0..50 {
+                self.hear(clock);
+                self.speak();
+                self.until(self.host.now + 20 * MILLISECOND);
+            }
+            if second >= 5 {
+                check(self);
+            }
+        }
+    }
+
+    fn offsets(&self) -> Vec<ClockOffset> {
+        self.host.snapshot().clocks.offsets
+    }
+
+    fn peer(&self) -> PeerClock {
+        let peers = self.host.snapshot().clocks.peers;
+        let [peer] = &peers[..] else {
+            panic!("{peers:?}")
+        };
+        peer.clone()
+    }
+
+    /// Returns the offset and its uncertainty.
+    fn offset(&self) -> (i64, i64) {
+        let offsets = self.offsets();
+        let [offset] = &offsets[..] else {
+            panic!("{offsets:?}")
+        };
+        (offset.offset, offset.uncertainty)
+    }
+
+    fn check(&self, clock: Clock) {
+        let (offset, uncertainty) = self.offset();
+        let truth = clock.at(self.host.now);
+        let wrong = offset.abs_diff(truth);
+        assert!(
+            wrong <= uncertainty.unsigned_abs(),
+            "{offset} {uncertainty} {truth}"
+        );
+        assert!(uncertainty < MILLISECOND.cast_signed(), "{uncertainty}");
+    }
+
+    fn finding(&self) -> Option<i64> {
+        let diagnoses = &self.host.snapshot().diagnoses;
+        diagnoses.list.iter().find_map(|each| match each {
+            Diagnosis::ClocksApart { offset, .. } => Some(*offset),
+            _ => None,
+        })
+    }
+}
+
+fn wire_time(nanoseconds: u64) -> u64 {
+    nanoseconds / SECOND << 32 | (nanoseconds % SECOND << 32) / SECOND
+}
+
+#[test]
+fn an_offset_lies_within_its_bound_also_while_clocks_drift() {
+    for ahead in [0, 500_000, 20_000_000, 3_000_000_000, -20_000_000] {
+        for parts_per_million in [0, 50, -50] {
+            let clock = Clock {
+                ahead,
+                parts_per_million,
+            };
+            let mut pair = Pair::new();
+            let mut checks = 0;
+            pair.talk(clock, 90, |pair| {
+                pair.check(clock);
+                checks += 1;
+            });
+            let peer = pair.peer();
+            assert_eq!((checks, peer.steps), (85, 0));
+            assert_eq!(
+                (&*peer.peer, peer.source),
+                ("10.0.0.1", Some(Source::RoundTrip))
+            );
+        }
+    }
+}
+
+#[test]
+fn one_direction_gives_one_bound_and_no_offset() {
+    let mut pair = Pair::new();
+    let clock = Clock::ahead(20_000_000);
+    for _ in 0..500 {
+        pair.hear(clock);
+        pair.until(pair.host.now + 20 * MILLISECOND);
+    }
+    let peer = pair.peer();
+    let least = peer.ahead.0.unwrap();
+    assert!(
+        (19_000_000..=20_000_000 - 150_000).contains(&least),
+        "{least}"
+    );
+    assert_eq!((peer.ahead.1, peer.source), (None, None));
+    assert!(pair.offsets().is_empty() && pair.finding().is_none());
+    // Acknowledgements without stamps give none, either.
+    let mut pair = Pair::new();
+    (0..500).for_each(|_| pair.speak());
+    assert_eq!(pair.host.snapshot().clocks.peers, []);
+}
+
+#[test]
+fn few_messages_and_repetitions_are_no_evidence_for_a_round_trip() {
+    let mut pair = Pair::new();
+    pair.speak();
+    for _ in 0..10 {
+        pair.hear(Clock::ahead(0));
+        pair.speak();
+    }
+    assert_eq!(
+        pair.peer().ahead.1,
+        None,
+        "one of ten may not be as fast as a round trip"
+    );
+    (0..20).for_each(|_| pair.hear(Clock::ahead(0)));
+    let (_, uncertainty) = pair.offset();
+    // The last message is sent again just before an acknowledgement of its first transmission.
+    pair.number -= 1;
+    pair.speak();
+    pair.until(pair.host.now + SECOND);
+    assert!(pair.offset().1 >= uncertainty);
+}
+
+#[test]
+fn the_bounds_widen_in_silence_and_expire() {
+    let mut pair = Pair::new();
+    pair.talk(Clock::ahead(0), 10, |_| {});
+    let before = pair.offset().1;
+    pair.until(pair.host.now + 50 * SECOND);
+    let after = pair.offset().1;
+    // 100 ppm of 50 s.
+    assert!(
+        (after - before - 5_000_000).abs() < 200_000,
+        "{before} {after}"
+    );
+    for _ in 0..80 {
+        pair.until(pair.host.now + SECOND);
+    }
+    assert!(pair.offsets().is_empty());
+    assert_eq!(pair.host.snapshot().clocks.peers, []);
+}
+
+#[test]
+fn a_step_of_the_peers_clock_is_noticed_within_ten_seconds() {
+    for step in [3_000_000_000, -3_000_000_000, -200_000_000] {
+        let mut pair = Pair::new();
+        pair.talk(Clock::ahead(0), 20, |pair| pair.check(Clock::ahead(0)));
+        assert_eq!(pair.finding(), None);
+        let clock = Clock::ahead(step);
+        pair.talk(clock, 30, |pair| pair.check(clock));
+        assert_eq!(pair.finding().map(i64::signum), Some(step.signum()));
+        let back = Clock::ahead(0);
+        pair.talk(back, 30, |pair| pair.check(back));
+        assert_eq!(pair.finding(), None);
+        assert!(pair.peer().steps >= 1);
+    }
+}
+
+#[test]
+fn a_step_of_this_hosts_clock_moves_the_offset_at_once() {
+    let mut pair = Pair::new();
+    pair.talk(Clock::ahead(0), 10, |_| {});
+    let (before, uncertainty) = pair.offset();
+    let step = 2 * SECOND;
+    pair.host
+        .observer
+        .input(Input::ClockSet(step.cast_signed()));
+    pair.until(pair.host.now + step);
+    assert_eq!(pair.offset(), (before - step.cast_signed(), uncertainty));
+    pair.until(pair.host.now + 2 * SECOND);
+    assert!(pair.finding().is_some_and(|offset| offset < -1_900_000_000));
+}
+
+#[test]
+fn pairs_of_peers_follow_from_differences() {
+    let carol = GuidPrefix(*b"\x01\x10carol-host");
+    let mut pair = Pair::new();
+    pair.host
+        .participant(carol, "10.0.0.3:7411".parse().unwrap());
+    for (prefix, ahead) in [(ALICE, 20_000_000), (carol, -3_000_000)] {
+        pair.alice = prefix;
+        pair.talk(Clock::ahead(ahead), 8, |_| {});
+    }
+    let offsets = pair.offsets();
+    let names: Vec<_> = offsets
+        .iter()
+        .map(|each| (each.host.as_deref(), &*each.peer))
+        .collect();
+    let expected = [
+        (None, "10.0.0.1"),
+        (None, "10.0.0.3"),
+        (Some("10.0.0.1"), "10.0.0.3"),
+    ];
+    assert_eq!(names, expected);
+    let last = &offsets[2];
+    assert!(last.offset.abs_diff(-23_000_000) <= last.uncertainty.unsigned_abs());
+    let sum = offsets[0].uncertainty + offsets[1].uncertainty;
+    assert!(last.uncertainty.abs_diff(sum) <= 2, "{offsets:?}");
+}
+
+/// Alice's server replies to requests of Bob's client. The reply is stamped when it is written.
+#[test]
+fn replies_bound_the_offset_whatever_the_network_does() {
+    const REQUESTS: EntityId = EntityId([0, 0, 0x21, 0x03]);
+    const REPLIES: EntityId = EntityId([0, 0, 0x22, 0x03]);
+    const TYPE: &str = "example_interfaces::srv::dds_::AddTwoInts_Request_";
+    let clock = Clock::ahead(20_000_000);
+    let mut pair = Pair::new();
+    for (prefix, entity, topic) in [
+        (BOB, REQUESTS, "rq/addRequest"),
+        (ALICE, REPLIES, "rr/addReply"),
+    ] {
+        let payload = forge::endpoint(Guid::new(prefix, entity), topic, TYPE, true);
+        let message = Message::from(prefix).data(SEDP_WRITERS, 2, &payload);
+        pair.host.announce(message);
+    }
+    let body = |number: u64| [&[0, 1, 0, 0][..], &[7; 8], &number.to_le_bytes(), &[1; 8]].concat();
+    for number in 1..=30 {
+        let mut send = |entity, outgoing, time, message: Message| {
+            let envelope = Envelope {
+                outgoing,
+                host: true,
+                socket: 9,
+                ..forge::multicast(time, 0)
+            };
+            let message = message.data(entity, number, &body(number));
+            pair.host.observer.input(Input::Datagram {
+                envelope: &envelope,
+                payload: &message.bytes(),
+                handover: None,
+            });
+        };
+        let sent = pair.host.now;
+        let request = Message::from(BOB);
+        send(REQUESTS, true, sent, request);
+        // The way there is fast, the way back slow.
+        let replied = sent + WAY + 300 * MICROSECOND;
+        let stamp = replied.checked_add_signed(clock.at(replied)).unwrap();
+        let reply = Message::from(ALICE).info_ts(stamp);
+        send(REPLIES, false, replied + 3 * MILLISECOND, reply);
+        pair.until(pair.host.now + 100 * MILLISECOND);
+    }
+    assert_eq!(pair.peer().source, Some(Source::Reply));
+    let (least, most) = pair.peer().ahead;
+    assert!(least.unwrap() <= 20_000_000 && least.unwrap() > 16_900_000);
+    assert!(
+        (20_000_000..20_800_000).contains(&most.unwrap()),
+        "{most:?}"
+    );
+}
+
+#[test]
+fn clocks_off_compares_nothing() {
+    let mut pair = Pair::with(Settings {
+        robot: Parts::default(),
+        ..Settings::default()
+    });
+    pair.talk(Clock::ahead(SECOND.cast_signed()), 10, |_| {});
+    let facts = pair.host.snapshot().clocks;
+    assert!(!facts.are_compared && facts.peers.is_empty() && facts.offsets.is_empty());
+}
+
+#[test]
+fn tables_of_peers_and_writers_are_bounded() {
+    let mut pair = Pair::new();
+    for number in 0..3 * ClockPeers::CAP as u8 {
+        let mut prefix = *b"\x01\x10forged-host";
+        prefix[2] = number;
+        pair.alice = GuidPrefix(prefix[..12].try_into().unwrap());
+        let address = SocketAddrV4::new([10, 0, 1, number].into(), 7411);
+        pair.host.participant(pair.alice, address);
+        pair.hear(Clock::ahead(0));
+    }
+    assert_eq!(pair.host.snapshot().clocks.peers.len(), ClockPeers::CAP);
+    for number in 0..2 * ClockWriters::CAP as u32 {
+        let [a, b, c, _] = (number << 8).to_be_bytes();
+        let acknack = Record {
+            writer: guid_words(Guid::new(BOB, EntityId([a, b, c, 3]))),
+            reader: guid_words(Guid::new(ALICE, READER)),
+            ..pair.host.record(pair.bob, kind::ACKNACK, 1)
+        };
+        observe(&mut pair.host.observer, &acknack);
+    }
+    let snapshot = pair.host.snapshot();
+    let table = |name| {
+        snapshot
+            .tables
+            .iter()
+            .find(|table| table.table == name)
+            .unwrap()
+    };
+    assert_eq!(table("clock_peers").size, ClockPeers::CAP as u64);
+    assert!(table("clock_peers").evictions > 0);
+    assert_eq!(table("clock_writers").size, ClockWriters::CAP as u64);
+    assert!(table("clock_writers").evictions > 0);
+}
