@@ -23,6 +23,8 @@ pub mod backends;
 pub mod cursor;
 pub mod delivery;
 #[cfg(feature = "alloc")]
+pub mod diagnostics;
+#[cfg(feature = "alloc")]
 pub mod discovery;
 mod domain;
 #[cfg(feature = "alloc")]
@@ -42,6 +44,8 @@ pub mod parameters;
 pub mod qos;
 pub mod quic;
 pub mod record;
+#[cfg(feature = "alloc")]
+pub mod ros_parameters;
 pub mod rtps;
 pub mod rtps_tcp;
 #[cfg(test)]

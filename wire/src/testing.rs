@@ -135,8 +135,13 @@ impl Encoder {
     }
 
     pub(crate) fn string(&mut self, text: &str) -> &mut Self {
+        self.unpadded(text).align()
+    }
+
+    /// Writes a string without the padding before the next field.
+    pub(crate) fn unpadded(&mut self, text: &str) -> &mut Self {
         self.u32(u32::try_from(text.len() + 1).unwrap());
-        self.raw((text.to_string() + "\0").as_bytes()).align()
+        self.raw((text.to_string() + "\0").as_bytes())
     }
 
     /// Writes one parameter and pads its value.

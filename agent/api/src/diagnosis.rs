@@ -186,6 +186,19 @@ pub enum Diagnosis<'a> {
         /// Text of the last one of these.
         text: Cow<'a, str>,
     },
+    /// A part of the robot has been in error, or without a new status, for at least 5 s.
+    DiagnosticError {
+        /// Node that publishes its diagnostics.
+        ros_node: Option<Cow<'a, str>>,
+        /// Name of the part.
+        name: Cow<'a, str>,
+        /// Id of its hardware; often empty.
+        hardware_id: Cow<'a, str>,
+        /// `error` or `stale`.
+        level: Cow<'static, str>,
+        /// Message when it was reported.
+        message: Cow<'a, str>,
+    },
     /// A configured chain that ends with the topic exceeds its maximum latency.
     SlowChain {
         /// First topic of the chain.
@@ -222,6 +235,7 @@ impl Diagnosis<'_> {
             Self::SharedMachineId { .. } => "shared_machine_id",
             Self::LossyLink { .. } => "lossy_link",
             Self::LogErrors { .. } => "log_errors",
+            Self::DiagnosticError { .. } => "diagnostic_error",
             Self::SlowChain { .. } => "slow_chain",
         }
     }

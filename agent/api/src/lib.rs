@@ -20,6 +20,7 @@
 pub mod attributes;
 pub mod chains;
 pub mod diagnosis;
+pub mod diagnostics;
 pub mod endpoints;
 pub mod events;
 pub mod graph;
@@ -33,6 +34,7 @@ pub mod messages;
 pub mod names;
 pub mod nodes;
 mod open;
+pub mod parameters;
 pub mod participants;
 pub mod path;
 pub mod problem;

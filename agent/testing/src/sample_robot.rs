@@ -22,6 +22,7 @@ use ros2probe_model::facts::histogram::Histogram;
 use ros2probe_model::facts::link::{LinkKey, LinkProtocol};
 use ros2probe_model::facts::loss_share::LossShare;
 use ros2probe_model::facts::model_time::ModelTime;
+use ros2probe_model::facts::names::NodeName;
 use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::facts::watch::Watch;
@@ -30,11 +31,13 @@ use ros2probe_model::graph::zenoh::{Counters, ZenohFacts};
 use ros2probe_model::measure::links::LinkFacts;
 use ros2probe_model::report::snapshot::{
     AcknowledgementFacts, ActionFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered,
-    DeliveryFacts, Direction, EarlierCounts, EndpointFacts, GoalCounts, LatencyFacts, LogFacts,
-    LogMessage, Measurement, NodeFacts, NodeLogFacts, ParticipantFacts, ProcessFacts, SampledFacts,
-    ServiceFacts, Snapshot, SocketFacts, Source, Subscriber, TableFacts, TopicFacts, Transport,
-    TransportCount, UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
+    DeliveryFacts, DiagnosticFacts, DiagnosticStatus, Direction, EarlierCounts, EndpointFacts,
+    GoalCounts, LatencyFacts, LogFacts, LogMessage, Measurement, NodeFacts, NodeLogFacts,
+    ParameterChange, ParameterFacts, ParametersFacts, ParticipantFacts, ProcessFacts, Requester,
+    SampledFacts, ServiceFacts, Snapshot, SocketFacts, Source, Subscriber, TableFacts, TopicFacts,
+    Transport, TransportCount, UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
 };
+use ros2probe_wire::diagnostics::DiagnosticLevel;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::log::LogLevel;
 use ros2probe_wire::qos::{History, HistoryKind, Qos, Reliability, Role};
@@ -109,6 +112,56 @@ fn chains() -> ChainsFacts {
             exemplars,
             hops,
         }],
+    }
+}
+
+/// Returns the diagnostics of one part, which is in error.
+fn diagnostics(writer: Guid) -> DiagnosticFacts {
+    let at = ModelTime::from_nanoseconds(1_699_999_999_000_000_000);
+    DiagnosticFacts {
+        are_read: true,
+        statuses: vec![Arc::new(DiagnosticStatus {
+            domain_id: DomainId(0),
+            topic: "/diagnostics".into(),
+            name: "lidar: connection".into(),
+            hardware_id: "vlp16".into(),
+            node: Some("/lidar".into()),
+            writer,
+            level: DiagnosticLevel::Error,
+            message: "no data".into(),
+            values: vec![("packet rate (Hz)".into(), "0.5".into())],
+            at,
+            since: at,
+        })],
+    }
+}
+
+/// Returns one parameter, which a client changed.
+fn parameters(writer: Guid) -> ParametersFacts {
+    let at = ModelTime::from_nanoseconds(1_699_999_999_000_000_000);
+    let (domain_id, node) = (DomainId(0), NodeName::from("/lidar"));
+    ParametersFacts {
+        are_read: true,
+        known: vec![ParameterFacts {
+            domain_id,
+            node: node.clone(),
+            name: "rpm".into(),
+            value: "600".into(),
+            at,
+        }],
+        changes: vec![Arc::new(ParameterChange {
+            at,
+            domain_id,
+            node: node.clone(),
+            name: "rpm".into(),
+            before: Some("300".into()),
+            value: Some("600".into()),
+            requested_by: Some(Requester {
+                node: Some("/tuner".into()),
+                writer,
+            }),
+        })],
+        counts: vec![(domain_id, node, 1)],
     }
 }
 
@@ -200,6 +253,8 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             measurement: measurement(),
         }],
         logs: logs(guid),
+        diagnostics: diagnostics(guid),
+        parameters: parameters(guid),
         services: vec![service()],
         actions: vec![action()],
         inside: Some(Arc::new(inside::inside())),
@@ -380,6 +435,15 @@ fn diagnoses() -> Diagnoses {
             node: "/lidar".into(),
             errors: 10,
             text: "no data".into(),
+        },
+        Diagnosis::DiagnosticError {
+            domain_id: DomainId(0),
+            topic: "/diagnostics".into(),
+            node: Some("/lidar".into()),
+            name: "lidar: connection".into(),
+            hardware_id: "vlp16".into(),
+            level: DiagnosticLevel::Error,
+            message: "no data".into(),
         },
         Diagnosis::SlowChain {
             topic: topic.clone(),

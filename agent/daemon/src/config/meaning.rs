@@ -138,6 +138,7 @@ impl Reader {
         let limits = Limits::from(shape.limits.unwrap_or_default());
         let api = self.api(shape.api.unwrap_or_default());
         let has_token = api.token_file.is_some();
+        let robot = shape.robot.unwrap_or_default();
         Config {
             watches: self.watches(shape.watch.unwrap_or_default(), limits.watches),
             chains: self.chains(shape.chains.unwrap_or_default()),
@@ -153,7 +154,8 @@ impl Reader {
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             service_timeout: Duration::from_secs_f64(shape.service_timeout_s),
             retain: shape.retain,
-            robot: robot(&shape.robot.unwrap_or_default()),
+            robot: parts(&robot),
+            diagnostic_values: robot.diagnostic_values.unwrap_or_default(),
             state_directory: state(&shape.state_directory),
             log: shape.log,
         }
@@ -466,6 +468,11 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
         "state_directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => Err(
             InvalidText::RelativePath("`/var/lib/ros2probe`, `auto` or `off`"),
         ),
+        "robot.diagnostic_values[]" if text.len() > 256 || !text.contains('/') => {
+            Err(InvalidText::Unfit(
+                "name, slash and key, as in `battery*/Voltage*`, in at most 256 bytes",
+            ))
+        }
         "recordings.snapshots[].name" if !is_plain(text) => Err(InvalidText::Unfit(
             "1 to 64 letters, digits, `_` or `-`: it names directories",
         )),
@@ -568,8 +575,12 @@ fn metrics(shape: MetricsShape) -> MetricsSettings {
     }
 }
 
-fn robot(shape: &RobotShape) -> Parts {
-    let parts = [(Part::Logs, shape.logs)];
+fn parts(shape: &RobotShape) -> Parts {
+    let parts = [
+        (Part::Logs, shape.logs),
+        (Part::Diagnostics, shape.diagnostics),
+        (Part::Parameters, shape.parameters),
+    ];
     let on = parts
         .into_iter()
         .filter(|(_, switch)| *switch == Switch::On);

@@ -387,11 +387,26 @@ pub(super) struct RobotShape {
     /// Logs of nodes (`/rosout`): counts by node and level, the latest messages, and bursts of
     /// errors as findings.
     pub(super) logs: Switch,
+    /// Diagnostics (`/diagnostics`): the level of each part of the robot, and those in error as
+    /// findings.
+    pub(super) diagnostics: Switch,
+    /// Values in diagnostics that have a metric: patterns of name, slash and key, as in
+    /// `battery*/Voltage*`; `*` matches any characters. Applied on reload.
+    #[schemars(length(max = 64))]
+    pub(super) diagnostic_values: Option<Vec<String>>,
+    /// Parameters of nodes (`/parameter_events`): last known values, changes, and who requested
+    /// them.
+    pub(super) parameters: Switch,
 }
 
 impl Default for RobotShape {
     fn default() -> Self {
-        Self { logs: Switch::On }
+        Self {
+            logs: Switch::On,
+            diagnostics: Switch::On,
+            diagnostic_values: None,
+            parameters: Switch::On,
+        }
     }
 }
 

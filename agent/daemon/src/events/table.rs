@@ -63,6 +63,10 @@ const FINDING: &[&str] = &[
     "retransmitted_ratio",
     "log_errors",
     "log_text",
+    "name",
+    "hardware_id",
+    "level",
+    "message",
     "from",
     "max_latency_ms",
 ];
@@ -124,6 +128,37 @@ pub(super) const LIFECYCLE_TRANSITION: Definition = Definition::new(
      errorprocessing now.",
 )
 .relief(Severity::Info);
+pub(super) const DIAGNOSTIC_CHANGED: Definition = Definition::new(
+    "ros2.robot.diagnostic_changed",
+    Severity::Warn,
+    &[
+        "domain_id",
+        "topic",
+        "name",
+        "hardware_id",
+        "ros_node",
+        "from",
+        "to",
+        "message",
+    ],
+    "A part of the robot has another level in its diagnostics, or ceased to publish them (`stale`); \
+     INFO if it is `ok` now.",
+)
+.relief(Severity::Info);
+pub(super) const PARAMETER_CHANGED: Definition = Definition::new(
+    "ros2.robot.parameter_changed",
+    Severity::Info,
+    &[
+        "domain_id",
+        "ros_node",
+        "parameter",
+        "from",
+        "to",
+        "requested_by",
+    ],
+    "A parameter of a node has another value; `requested_by` is the node of the client, if its \
+     request was seen.",
+);
 pub(super) const MESSAGE_LOST: Definition = Definition::new(
     "ros2.message.lost",
     Severity::Warn,
@@ -171,7 +206,7 @@ pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
     "Another fault of the graph, named by `diagnosis`: type_conflict, type_hash_conflict, \
      duplicate_node, node_in_several_domains, slow_callback, executor_wait, \
      late_callback, intra_process_overflow, reader_queue_overflow, observation_suspended, \
-     shared_machine_id, lossy_link, log_errors, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
+     shared_machine_id, lossy_link, log_errors, diagnostic_error, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
      restamping_node, buffers_by_cpu.",
 )
 .relief(Severity::Info);
@@ -289,6 +324,8 @@ pub const EVENTS: &[Definition] = &[
     NODE_DISCOVERED,
     NODE_LOST,
     LIFECYCLE_TRANSITION,
+    DIAGNOSTIC_CHANGED,
+    PARAMETER_CHANGED,
     MESSAGE_LOST,
     EXPECTATION_CHANGED,
     TOPIC_SILENT,

@@ -102,6 +102,8 @@ impl MetricSource for MetricSources {
         delivery_metrics::sockets(sink, &snapshot.sockets)?;
         link_metrics::links(sink, snapshot)?;
         robot_metrics::logs(sink, snapshot)?;
+        robot_metrics::diagnostics(sink, snapshot, &settings.diagnostic_values)?;
+        robot_metrics::parameters(sink, snapshot)?;
         ros2_metrics::watches(sink, snapshot, &settings.watches)?;
         agent_metrics::identity(sink, &state, now)?;
         agent_metrics::capture(sink, &state)?;

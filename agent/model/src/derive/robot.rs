@@ -5,20 +5,29 @@
 //! writer that exceeds its allowance is paused for some seconds. Each message is decoded once,
 //! whichever copies of it were captured.
 
+pub mod diagnostics;
 pub mod logs;
+pub mod parameters;
+mod text;
 
 use foldhash::HashMap;
+use ros2probe_wire::diagnostics::{self as wire, DiagnosticStatuses};
+use ros2probe_wire::ros_parameters::{self, ParameterEvent};
+use ros2probe_wire::rtps::{RequestHeader, VendorId};
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, WireError, log};
 
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
+use crate::facts::event::Events;
 use crate::facts::model_time::ModelTime;
-use crate::facts::names::NodeName;
+use crate::facts::names::{NodeName, TopicName};
 use crate::facts::observation::Sample;
 use crate::facts::tables::RobotWriters;
 use crate::measure::allowance::{Allowance, CommonAllowance, WriterAllowance};
 use crate::measure::assembly::Assembly;
-use logs::{Logs, Origin};
+use diagnostics::Diagnostics;
+use logs::Logs;
+use parameters::Parameters;
 
 /// Maximum size of a message that is decoded, in bytes.
 const MESSAGE_BYTES: usize = 64 << 10;
@@ -36,6 +45,10 @@ const RESUME_BYTES: u64 = 256 << 10;
 pub enum Part {
     /// Logs of nodes.
     Logs,
+    /// Diagnostics.
+    Diagnostics,
+    /// Parameters of nodes.
+    Parameters,
 }
 
 /// A set of parts.
@@ -47,6 +60,12 @@ pub struct Parts(u8);
 pub enum Standard {
     /// `rcl_interfaces/msg/Log`.
     Log,
+    /// `diagnostic_msgs/msg/DiagnosticArray`.
+    Diagnostics,
+    /// `rcl_interfaces/msg/ParameterEvent`.
+    ParameterEvent,
+    /// Request of `rcl_interfaces/srv/SetParameters` or of its atomic variant.
+    SetParameters,
 }
 
 /// Writers of standard types, and what they said.
@@ -56,11 +75,14 @@ pub struct Robot {
     assembly: Assembly,
     allowance: CommonAllowance,
     logs: Logs,
+    diagnostics: Diagnostics,
+    parameters: Parameters,
 }
 
 #[derive(Debug)]
 struct RobotWriter {
     domain_id: DomainId,
+    topic: TopicName,
     standard: Standard,
     allowance: WriterAllowance,
     read: ReadNumbers,
@@ -79,6 +101,23 @@ pub enum Heard {
     Malformed(Standard, WireError),
 }
 
+/// Where and when a message was seen.
+#[derive(Clone, Copy, Debug)]
+pub struct Origin<'a> {
+    /// Time of its arrival.
+    pub at: ModelTime,
+    /// Domain of its writer.
+    pub domain_id: DomainId,
+    /// Topic.
+    pub topic: &'a TopicName,
+    /// Its writer.
+    pub writer: Guid,
+    /// Its sequence number.
+    pub number: SequenceNumber,
+    /// The node that has the writer.
+    pub node: Option<&'a NodeName>,
+}
+
 /// The latest numbers of a writer that were decoded.
 #[derive(Clone, Copy, Debug, Default)]
 struct ReadNumbers {
@@ -93,6 +132,10 @@ impl Standard {
     pub fn of(message_type: &str) -> Option<Self> {
         match message_type {
             log::TYPE => Some(Self::Log),
+            wire::TYPE => Some(Self::Diagnostics),
+            ros_parameters::EVENT => Some(Self::ParameterEvent),
+            "rcl_interfaces/srv/SetParameters_Request"
+            | "rcl_interfaces/srv/SetParametersAtomically_Request" => Some(Self::SetParameters),
             _ => None,
         }
     }
@@ -102,6 +145,9 @@ impl Standard {
     pub const fn stage(self) -> &'static str {
         match self {
             Self::Log => "log",
+            Self::Diagnostics => "diagnostics",
+            Self::ParameterEvent => "parameter_event",
+            Self::SetParameters => "set_parameters",
         }
     }
 
@@ -110,13 +156,16 @@ impl Standard {
     pub const fn part(self) -> Part {
         match self {
             Self::Log => Part::Logs,
+            Self::Diagnostics => Part::Diagnostics,
+            Self::ParameterEvent | Self::SetParameters => Part::Parameters,
         }
     }
 }
 
 impl Parts {
     /// All parts.
-    pub const ALL: Self = Self(1 << Part::Logs as u8);
+    pub const ALL: Self =
+        Self(1 << Part::Logs as u8 | 1 << Part::Diagnostics as u8 | 1 << Part::Parameters as u8);
 
     /// Returns whether it contains this part.
     #[must_use]
@@ -142,15 +191,23 @@ impl Default for Robot {
             assembly: Assembly::new(ASSEMBLY_BYTES),
             allowance: CommonAllowance::new(ALL_WRITERS, RESUME_BYTES),
             logs: Logs::default(),
+            diagnostics: Diagnostics::default(),
+            parameters: Parameters::default(),
         }
     }
 }
 
 impl Robot {
     /// Begins to read this writer, unless the table of writers is full.
-    pub fn follow(&mut self, writer: Guid, domain_id: DomainId, standard: Standard) {
+    pub fn follow(
+        &mut self,
+        writer: Guid,
+        (domain_id, topic): (DomainId, &TopicName),
+        standard: Standard,
+    ) {
         let new = || RobotWriter {
             domain_id,
+            topic: topic.clone(),
             standard,
             allowance: WriterAllowance::new(WRITER),
             read: ReadNumbers::default(),
@@ -163,6 +220,11 @@ impl Robot {
         if let Some(known) = self.writers.remove(&writer) {
             self.allowance.forget(&known.allowance);
             self.assembly.release(writer);
+            match known.standard.part() {
+                Part::Logs => {}
+                Part::Diagnostics => self.diagnostics.forget(writer),
+                Part::Parameters => self.parameters.forget(writer),
+            }
         }
     }
 
@@ -181,7 +243,14 @@ impl Robot {
     }
 
     /// Reads a DATA or DATA_FRAG of a followed writer. `node` is the node that has the writer.
-    pub fn hear(&mut self, sample: &Sample, payload: &[u8], node: Option<&NodeName>) -> Heard {
+    /// `vendor` is its implementation.
+    pub fn hear(
+        &mut self,
+        sample: &Sample,
+        payload: &[u8],
+        (node, vendor): (Option<&NodeName>, VendorId),
+        events: &mut Events,
+    ) -> Heard {
         let (writer, now) = (sample.head.writer, sample.head.at);
         let Some(known) = self.writers.get_mut(&writer) else {
             return Heard::Nothing;
@@ -203,7 +272,7 @@ impl Robot {
         if known.read.has(number) {
             return Heard::Nothing;
         }
-        let (standard, domain_id) = (known.standard, known.domain_id);
+        let standard = known.standard;
         let assembled;
         let payload = match sample.is_start() && sample.is_end() {
             true => payload,
@@ -222,13 +291,26 @@ impl Robot {
         known.read.add(number);
         let origin = Origin {
             at: now,
-            domain_id,
+            domain_id: known.domain_id,
+            topic: &known.topic,
             writer,
             number,
             node,
         };
         let decoded = match standard {
             Standard::Log => log::Log::parse(payload).map(|log| self.logs.add(&origin, &log)),
+            Standard::Diagnostics => DiagnosticStatuses::parse(payload)
+                .and_then(|statuses| self.diagnostics.add(&origin, statuses, events)),
+            Standard::ParameterEvent => ParameterEvent::parse(payload)
+                .and_then(|event| self.parameters.add(&origin, event, events)),
+            Standard::SetParameters => {
+                let header = match vendor {
+                    VendorId::CYCLONE => RequestHeader::LENGTH,
+                    _ => 0,
+                };
+                ros_parameters::Parameters::of_request(payload, header)
+                    .and_then(|parameters| self.parameters.request(&origin, parameters))
+            }
         };
         match decoded {
             Ok(()) => Heard::Decoded,
@@ -238,9 +320,14 @@ impl Robot {
 
     /// Ends a second: unfinished messages and old errors expire. Returns the writers that are
     /// captured again.
-    pub fn end_second(&mut self, now: ModelTime) -> Vec<Guid> {
+    pub fn end_second(&mut self, now: ModelTime, events: &mut Events) -> Vec<Guid> {
         self.assembly.expire(now);
         self.logs.end_second();
+        let is_paused = |writer| {
+            let known = self.writers.get(&writer);
+            known.is_some_and(|known: &RobotWriter| known.allowance.is_paused())
+        };
+        self.diagnostics.end_second(now, is_paused, events);
         let writers = self.writers.iter_mut();
         let writers = writers.map(|(writer, known)| (writer, &mut known.allowance));
         self.allowance.resume(writers, now)
@@ -252,15 +339,27 @@ impl Robot {
         &self.logs
     }
 
+    /// Returns the diagnostics of all robots.
+    #[must_use]
+    pub const fn diagnostics(&self) -> &Diagnostics {
+        &self.diagnostics
+    }
+
+    /// Returns the parameters of all nodes.
+    #[must_use]
+    pub const fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
     /// Returns the number of changes of [`Self::findings`].
     #[must_use]
     pub const fn revision(&self) -> u64 {
-        self.logs.revision()
+        self.logs.revision() + self.diagnostics.revision()
     }
 
     /// Returns what the robot says about problems of its own.
     pub fn findings(&self) -> impl Iterator<Item = Diagnosis> {
-        self.logs.findings()
+        self.logs.findings().chain(self.diagnostics.findings())
     }
 
     /// Returns the sizes and limits of the tables.
@@ -268,6 +367,8 @@ impl Robot {
     pub fn tables(&self) -> Vec<TableFacts> {
         let mut tables = vec![self.writers.facts()];
         tables.extend(self.logs.tables());
+        tables.extend(self.diagnostics.tables());
+        tables.extend(self.parameters.tables());
         tables
     }
 }

@@ -12,6 +12,7 @@ use std::cmp::Ordering;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ros2probe_wire::diagnostics::DiagnosticLevel;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{DomainId, Guid};
 
@@ -234,6 +235,23 @@ pub enum Diagnosis {
         /// Text of the last one of these.
         text: Arc<str>,
     },
+    /// A part of the robot has been in error, or without a new status, for at least 5 s.
+    DiagnosticError {
+        /// Domain.
+        domain_id: DomainId,
+        /// Topic of its diagnostics.
+        topic: TopicName,
+        /// Node that publishes them, if known.
+        node: Option<NodeName>,
+        /// Name of the part.
+        name: Arc<str>,
+        /// Id of its hardware; often empty.
+        hardware_id: Arc<str>,
+        /// Level when it was reported.
+        level: DiagnosticLevel,
+        /// Message when it was reported.
+        message: Arc<str>,
+    },
     /// A configured chain exceeds its maximum latency.
     SlowChain {
         /// Last topic of the chain.
@@ -295,7 +313,7 @@ pub enum Change<'a> {
 
 impl Diagnosis {
     /// All kinds, as label values.
-    pub const KINDS: [&'static str; 20] = [
+    pub const KINDS: [&'static str; 21] = [
         "qos_incompatible",
         "type_conflict",
         "type_hash_conflict",
@@ -315,6 +333,7 @@ impl Diagnosis {
         "shared_machine_id",
         "lossy_link",
         "log_errors",
+        "diagnostic_error",
         "slow_chain",
     ];
 
@@ -341,6 +360,7 @@ impl Diagnosis {
             Self::SharedMachineId { .. } => "shared_machine_id",
             Self::LossyLink { .. } => "lossy_link",
             Self::LogErrors { .. } => "log_errors",
+            Self::DiagnosticError { .. } => "diagnostic_error",
             Self::SlowChain { .. } => "slow_chain",
         }
     }
@@ -368,6 +388,7 @@ impl Diagnosis {
             | Self::SharedMachineId { .. }
             | Self::LossyLink { .. }
             | Self::LogErrors { .. }
+            | Self::DiagnosticError { .. }
             | Self::ObservationSuspended { .. } => None,
         }
     }
@@ -387,6 +408,20 @@ impl Diagnosis {
             .then_with(|| self.within_topic().cmp(&other.within_topic()))
             .then_with(|| self.handle().cmp(&other.handle()))
             .then_with(|| self.link().cmp(&other.link()))
+            .then_with(|| self.part().cmp(&other.part()))
+    }
+
+    /// Returns topic, name and hardware id of the part of the robot that is in error.
+    fn part(&self) -> Option<(&TopicName, &str, &str)> {
+        match self {
+            Self::DiagnosticError {
+                topic,
+                name,
+                hardware_id,
+                ..
+            } => Some((topic, name, hardware_id)),
+            _ => None,
+        }
     }
 
     /// Returns the link of the finding, if it concerns one.
@@ -440,7 +475,8 @@ impl Diagnosis {
             Self::NodeInSeveralDomains {
                 node, participant, ..
             } => (DomainId(0), node, Some(*participant), None),
-            Self::ObservationSuspended { domain_id, .. } => (*domain_id, "", None, None),
+            Self::ObservationSuspended { domain_id, .. }
+            | Self::DiagnosticError { domain_id, .. } => (*domain_id, "", None, None),
             Self::SharedMachineId {
                 domain_id,
                 participants,

@@ -150,6 +150,18 @@ crate::tables! {
     }
     /// Writers of standard types that the agent reads
     RobotWriters { name: "robot_writers", entries: 1024, effect: "it is not read" }
+    /// Parts of the robot with diagnostics
+    DiagnosticsTable { name: "diagnostics", entries: 1024, effect: "the one with the longest silence is dropped" }
+    /// Bytes of the values of diagnostics
+    DiagnosticValueBytes { name: "diagnostics.values", entries: 1 << 20, effect: "the values of a status are left out" }
+    /// Parameters of nodes with their last known values
+    KnownParameters { name: "parameters", entries: 4096, effect: "the one with the oldest value is dropped" }
+    /// Latest changes of parameters
+    ParameterChanges { name: "parameter_changes", entries: 1000, rule: Oldest }
+    /// Parameters in the latest requests to set them
+    ParameterRequests { name: "parameter_requests", entries: 256, rule: Oldest, effect: "its effect has no known requester" }
+    /// Nodes whose changes of parameters are counted
+    ChangedNodes { name: "changed_nodes", entries: 512, effect: "its changes are not counted" }
     /// Nodes with figures of their logs
     LogNodes { name: "log_nodes", entries: 512, effect: "the one with the longest silence is dropped" }
     /// Latest messages of logs, at most 1 KiB each

@@ -15,7 +15,9 @@ use ros2probe_wire::{DomainId, Guid, RtpsDuration, Timestamp};
 
 pub use crate::derive::chain::path::{ChainFacts, ChainsFacts};
 pub use crate::derive::inside::source::Source;
+pub use crate::derive::robot::diagnostics::DiagnosticFacts;
 pub use crate::derive::robot::logs::{LogFacts, LogMessage, NodeLogFacts};
+pub use crate::derive::robot::parameters::{ParameterFacts, ParametersFacts};
 pub use crate::derive::services::action::GoalCounts;
 pub use crate::derive::services::facts::{ActionFacts, ServiceFacts};
 pub use crate::derive::services::latency::LatencyFacts;
@@ -29,6 +31,7 @@ pub use crate::facts::measurement::{
 };
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
+pub use crate::facts::robot::{DiagnosticStatus, ParameterChange, Requester};
 pub use crate::facts::route::Direction;
 use crate::facts::selection::Candidate;
 use crate::facts::topic_kind::TopicKind;
@@ -77,6 +80,10 @@ pub struct Snapshot {
     pub links: Vec<LinkFacts>,
     /// Logs of nodes.
     pub logs: LogFacts,
+    /// Diagnostics.
+    pub diagnostics: DiagnosticFacts,
+    /// Parameters of nodes.
+    pub parameters: ParametersFacts,
     /// Problems of the graph; the same value while nothing changes.
     pub diagnoses: Arc<Diagnoses>,
     /// Time at which each problem appeared, in the same order.

@@ -161,6 +161,20 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
             errors: *errors,
             text: Cow::Borrowed(text),
         },
+        diagnosis::Diagnosis::DiagnosticError {
+            node,
+            name,
+            hardware_id,
+            level,
+            message,
+            ..
+        } => Diagnosis::DiagnosticError {
+            ros_node: node.as_deref().map(Cow::Borrowed),
+            name: Cow::Borrowed(name),
+            hardware_id: Cow::Borrowed(hardware_id),
+            level: level.label().into(),
+            message: Cow::Borrowed(message),
+        },
         diagnosis::Diagnosis::SlowChain {
             from, max_latency, ..
         } => Diagnosis::SlowChain {

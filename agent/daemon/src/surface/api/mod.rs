@@ -8,6 +8,7 @@ mod actions;
 mod body;
 mod body_stream;
 pub mod chains;
+mod diagnostics;
 mod downloads;
 mod endpoint;
 mod events;
@@ -35,6 +36,7 @@ mod processes;
 mod reasons;
 mod recordings;
 pub mod reload;
+mod ros_parameters;
 mod samples;
 mod scope;
 pub(in crate::surface) mod security;
@@ -186,6 +188,8 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(calls(turns(why::routes())))
         .merge(processes::routes())
         .merge(needs(Access::All, Access::All, logs::routes()))
+        .merge(needs(Access::All, Access::All, diagnostics::routes()))
+        .merge(needs(Access::All, Access::All, ros_parameters::routes()))
         .merge(health::routes())
         .merge(needs(Access::All, Access::All, reload::routes()))
         .merge(needs(Access::All, Access::All, page::routes()))

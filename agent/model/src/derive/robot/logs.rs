@@ -6,6 +6,8 @@ use std::sync::Arc;
 use ros2probe_wire::log::{Log, LogLevel};
 use ros2probe_wire::{DomainId, Guid, SequenceNumber};
 
+use super::Origin;
+use super::text::bounded;
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::model_time::ModelTime;
@@ -28,21 +30,6 @@ pub struct Logs {
     /// The latest messages of all nodes, oldest first.
     latest: Bounded<Counted<LogMessages>, VecDeque<Arc<LogMessage>>>,
     revision: u64,
-}
-
-/// Where and when a message was seen.
-#[derive(Clone, Copy, Debug)]
-pub struct Origin<'a> {
-    /// Time of its arrival.
-    pub at: ModelTime,
-    /// Domain of its writer.
-    pub domain_id: DomainId,
-    /// Its writer.
-    pub writer: Guid,
-    /// Its sequence number.
-    pub number: SequenceNumber,
-    /// The node that has the writer.
-    pub node: Option<&'a NodeName>,
 }
 
 /// A message of a log, with bounded texts.
@@ -124,7 +111,7 @@ pub struct LogFacts {
 impl Logs {
     /// Adds a message.
     pub fn add(&mut self, origin: &Origin<'_>, log: &Log<'_>) {
-        let logger = text(log.logger, NAME);
+        let logger = bounded(log.logger, NAME);
         let node = match origin.node {
             Some(node) => node.clone(),
             None => NodeName::from(format!("/{}", logger.replace('.', "/"))),
@@ -138,9 +125,9 @@ impl Logs {
             node: node.clone(),
             level: log.level,
             logger,
-            text: text(log.text, TEXT),
-            file: text(log.file, NAME),
-            function: text(log.function, NAME),
+            text: bounded(log.text, TEXT),
+            file: bounded(log.file, NAME),
+            function: bounded(log.function, NAME),
             line: log.line,
         });
         self.latest.push_back(Arc::clone(&message));
@@ -254,13 +241,4 @@ impl NodeLog {
             .iter()
             .fold(0, |sum, errors| sum.saturating_add(*errors))
     }
-}
-
-/// Returns a text of at most `most` bytes. Bytes that are not UTF-8 become the replacement
-/// character.
-fn text(bytes: &[u8], most: usize) -> Box<str> {
-    let text = String::from_utf8_lossy(bytes.get(..most).unwrap_or(bytes));
-    // A replacement character is longer than the byte that it replaces.
-    let end = text.floor_char_boundary(most);
-    text.get(..end).unwrap_or_default().into()
 }

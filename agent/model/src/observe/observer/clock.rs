@@ -142,7 +142,7 @@ impl Observer {
             for writer in self.measure.latched.advance(now) {
                 self.apply_again(writer, now);
             }
-            for writer in self.derive.robot.end_second(now) {
+            for writer in self.derive.robot.end_second(now, &mut self.journal.events) {
                 self.apply_again(writer, now);
             }
             let profiler = &self.measure.profiler;

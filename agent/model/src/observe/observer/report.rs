@@ -48,6 +48,10 @@ pub(super) fn snapshot(observer: &Observer, wall_time: Timestamp) -> Snapshot {
         zenoh: observer.zenoh.is_used().then(|| observer.zenoh.facts()),
         chains: observer.derive.chains.facts(wall_time),
         links: observer.measure.links.facts(),
+        diagnostics: (observer.derive.robot.diagnostics())
+            .facts(observer.settings.robot.has(Part::Diagnostics)),
+        parameters: (observer.derive.robot.parameters())
+            .facts(observer.settings.robot.has(Part::Parameters)),
         logs: (observer.derive.robot.logs()).facts(observer.settings.robot.has(Part::Logs)),
         diagnoses: Arc::clone(observer.derive.examiner.current()),
         diagnosed: Arc::clone(observer.derive.examiner.since()),

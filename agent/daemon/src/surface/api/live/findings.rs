@@ -3,6 +3,7 @@
 
 use std::collections::HashMap;
 
+use ros2probe_wire::diagnostics::DiagnosticLevel;
 use ros2probe_wire::{DomainId, Guid, RtpsDuration};
 
 use super::inside;
@@ -343,6 +344,31 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             let said = format!("{node} logged {errors} errors within a minute: {text}");
             let found = of_node(kind, all.ids, (*domain_id, node), said);
             found.with_remedy(format!("`rp log {node} --level error` prints them"))
+        }
+        Diagnosis::DiagnosticError {
+            domain_id,
+            topic,
+            node,
+            name,
+            hardware_id,
+            level,
+            message,
+        } => {
+            let text = match level {
+                DiagnosticLevel::Stale => {
+                    format!("`{name}` sends no new diagnostics; the last message is: {message}")
+                }
+                _ => format!("`{name}` is in error: {message}"),
+            };
+            let about = format!("{domain_id}|{topic}|{name}|{hardware_id}");
+            let found = Finding {
+                domain_id: Some(domain_id.0),
+                node: node
+                    .as_ref()
+                    .and_then(|node| all.ids.node(*domain_id, node)),
+                ..finding(kind, Severity::Warning, &about, text)
+            };
+            found.with_remedy("`rp diag --verbose` prints its values")
         }
         Diagnosis::LossyLink { link, .. } => {
             let text = format!(

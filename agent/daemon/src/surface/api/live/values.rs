@@ -130,6 +130,7 @@ impl Figures<'_> {
                 | Diagnosis::SharedMachineId { .. }
                 | Diagnosis::LossyLink { .. }
                 | Diagnosis::LogErrors { .. }
+                | Diagnosis::DiagnosticError { .. }
                 | Diagnosis::SlowChain { .. } => {}
             }
         }
