@@ -10,13 +10,15 @@ use std::time::Duration;
 use globset::Glob;
 use ros2probe_wire::DomainId;
 use ros2probe_wire::filter::PORT_CAPACITY;
+use ros2probe_wire::log::LogLevel;
 
 use super::check::check;
 use super::document::Node;
 use super::mistake::{Mistakes, Position};
 use super::shape::{
-    ApiShape, CaptureShape, ConfigShape, FoxgloveShape, MetricsShape, OtlpShape, RecordingsShape,
-    RobotShape, Ros2DaemonShape, SnapshotShape, Switch, WatchEntryShape, WatchShape,
+    ApiShape, CaptureShape, ConfigShape, FoxgloveShape, LogLevelShape, MetricsShape, OtlpShape,
+    RecordingsShape, RobotShape, Ros2DaemonShape, SnapshotShape, Switch, WatchEntryShape,
+    WatchShape,
 };
 use super::watch::{
     ExpectationValues, Expectations, PatternError, Retain, Watch, check_globs, check_pattern,
@@ -605,6 +607,13 @@ fn otlp(shape: OtlpShape) -> OtlpSettings {
         traces: shape.traces,
         late_calls: shape.late_calls.unwrap_or(false),
         log: shape.log.map(Level::filter),
+        node_logs: shape.node_logs.map(|level| match level {
+            LogLevelShape::Debug => LogLevel::Debug,
+            LogLevelShape::Info => LogLevel::Info,
+            LogLevelShape::Warn => LogLevel::Warn,
+            LogLevelShape::Error => LogLevel::Error,
+            LogLevelShape::Fatal => LogLevel::Fatal,
+        }),
         robot: shape.robot,
         attributes: shape.attributes.unwrap_or_default(),
     }

@@ -343,6 +343,23 @@ pub(super) enum Switch {
     Off,
 }
 
+/// A level of a node's log.
+#[derive(Clone, Copy, Debug, Deserialize, JsonSchema)]
+#[schemars(rename = "LogLevel")]
+#[serde(rename_all = "lowercase")]
+pub(super) enum LogLevelShape {
+    /// All messages.
+    Debug,
+    /// Without those of `debug`.
+    Info,
+    /// `warn`, `error` and `fatal`.
+    Warn,
+    /// `error` and `fatal`.
+    Error,
+    /// Only `fatal`.
+    Fatal,
+}
+
 /// A ROS distribution.
 #[derive(Clone, Copy, Debug, Deserialize, JsonSchema)]
 #[schemars(rename = "Distro")]
@@ -579,6 +596,9 @@ pub(super) struct OtlpShape {
     /// Minimum severity of lines of the agent's own log that are exported, e.g. `warn`. By default
     /// no line is exported.
     pub(super) log: Option<Level>,
+    /// Minimum level of messages of nodes' logs (`/rosout`) that are exported as log records, e.g.
+    /// `warn`. By default no message is exported. It needs `robot.logs`.
+    pub(super) node_logs: Option<LogLevelShape>,
     /// Name of this robot: the attribute `robot.name` of all exports.
     pub(super) robot: Option<String>,
     /// Additional attributes of the resource, names and values.

@@ -46,6 +46,8 @@ pub struct Inputs {
     pub spans: Arc<SpanQueue>,
     /// Lines of the agent's own log, if they are exported.
     pub log: Option<Arc<LogQueue>>,
+    /// Messages of the logs of nodes.
+    pub node_logs: Arc<LogQueue>,
     /// Counters of exports.
     pub exports: Arc<Exports>,
 }
@@ -125,6 +127,7 @@ struct Jobs {
     events: Option<(Reporter, Delivery<LogExport>)>,
     traces: Option<(Tracing, Delivery<SpanExport>)>,
     log: Option<(Arc<LogQueue>, Delivery<LogExport>)>,
+    node_logs: Option<(Arc<LogQueue>, Delivery<LogExport>)>,
 }
 
 impl Jobs {
@@ -156,6 +159,7 @@ impl Jobs {
         };
         let events = delivery(Signal::Events, settings.events, exports, stop, logs)?;
         let log = delivery(Signal::Log, settings.log, exports, stop, logs)?;
+        let node_logs = delivery(Signal::NodeLogs, settings.node_logs, exports, stop, logs)?;
         let traces = delivery(
             Signal::Traces,
             settings.traces,
@@ -175,6 +179,7 @@ impl Jobs {
             events: events.map(|delivery| (reporter(), delivery)),
             traces: traces.map(|delivery| (tracing, delivery)),
             log: inputs.log.zip(log),
+            node_logs: node_logs.map(|delivery| (inputs.node_logs, delivery)),
         })
     }
 
@@ -194,12 +199,18 @@ impl Jobs {
                 delivery.drain(tracing, traces::GATHER).await;
             }
         };
-        let log = async {
-            if let Some((queue, delivery)) = self.log {
+        let queued = async |queue: Option<(Arc<LogQueue>, Delivery<LogExport>)>| {
+            if let Some((queue, delivery)) = queue {
                 delivery.drain(&*queue, own_log::GATHER).await;
             }
         };
-        tokio::join!(metrics, events, traces, log);
+        tokio::join!(
+            metrics,
+            events,
+            traces,
+            queued(self.log),
+            queued(self.node_logs)
+        );
     }
 }
 

@@ -333,6 +333,11 @@ impl Robot {
         self.allowance.resume(writers, now)
     }
 
+    /// Removes and returns the messages of logs since the last call.
+    pub fn take_logs(&mut self) -> logs::NewLogs {
+        self.logs.take()
+    }
+
     /// Returns the logs of all nodes.
     #[must_use]
     pub const fn logs(&self) -> &Logs {

@@ -164,6 +164,8 @@ crate::tables! {
     ChangedNodes { name: "changed_nodes", entries: 512, effect: "its changes are not counted" }
     /// Nodes with figures of their logs
     LogNodes { name: "log_nodes", entries: 512, effect: "the one with the longest silence is dropped" }
+    /// Messages of logs that wait to be taken
+    FreshLogMessages { name: "log_messages.fresh", entries: 1000, effect: "it is not exported", reported: "`ros2probe_otlp_dropped_total`" }
     /// Latest messages of logs, at most 1 KiB each
     LogMessages { name: "log_messages", entries: 1000, rule: Oldest }
     /// Latest discovery events

@@ -10,6 +10,7 @@ use ros2probe_wire::{Guid, GuidPrefix, Reason, Timestamp};
 use crate::derive::chain::causality::CausalPublication;
 use crate::derive::chain::expected::ExpectedChain;
 use crate::derive::chain::spans::ChainSpans;
+use crate::derive::robot::logs::LogMessage;
 use crate::derive::trace::Spans;
 use crate::derive::type_descriptions::TypeSource;
 use crate::facts::calls::facts::NewLateCalls;
@@ -185,6 +186,10 @@ pub struct Output {
     pub chain_spans: ChainSpans,
     /// Late calls of callbacks.
     pub late_calls: NewLateCalls,
+    /// New messages of logs, each with its time and its trace id if it is traced.
+    pub logs: Vec<(Timestamp, Option<u128>, Arc<LogMessage>)>,
+    /// Number of messages of logs that were dropped because there were too many.
+    pub lost_logs: u64,
     /// What nodes sent about their types.
     pub type_sources: Vec<TypeSource>,
 }

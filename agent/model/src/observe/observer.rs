@@ -282,11 +282,20 @@ impl Observer {
 
     /// Removes and returns all output since the last call.
     pub fn drain(&mut self) -> Output {
+        let clock = self.graph.wall_clock;
+        let new = self.derive.robot.take_logs();
+        let tracer = &self.derive.tracer;
+        let logs = new.messages.into_iter().map(|message| {
+            let trace = tracer.trace_of(message.writer, message.number);
+            (clock.wall_time(message.at), trace, message)
+        });
         let mut output = Output {
+            logs: logs.collect(),
+            lost_logs: new.lost,
             interest: self.requested.interest.changes(),
-            events: self.journal.events.take(self.graph.wall_clock),
-            samples: self.measure.payloads.take(self.graph.wall_clock),
-            spans: self.derive.tracer.take(self.graph.wall_clock),
+            events: self.journal.events.take(clock),
+            samples: self.measure.payloads.take(clock),
+            spans: self.derive.tracer.take(clock),
             chain_spans: self.derive.chains.take_spans(),
             late_calls: self.derive.inside.take_late_calls(),
             type_sources: self.derive.type_descriptions.take(),

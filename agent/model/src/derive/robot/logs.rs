@@ -12,7 +12,7 @@ use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::NodeName;
-use crate::facts::tables::{LogMessages, LogNodes};
+use crate::facts::tables::{FreshLogMessages, LogMessages, LogNodes};
 
 /// Maximum length of a message's text, in bytes.
 const TEXT: usize = 512;
@@ -29,6 +29,10 @@ pub struct Logs {
     nodes: Bounded<Counted<LogNodes>, BTreeMap<(DomainId, NodeName), NodeLog>>,
     /// The latest messages of all nodes, oldest first.
     latest: Bounded<Counted<LogMessages>, VecDeque<Arc<LogMessage>>>,
+    /// Messages that are not yet taken.
+    fresh: Bounded<FreshLogMessages, Vec<Arc<LogMessage>>>,
+    /// Messages that were not taken because there were too many.
+    lost: u64,
     revision: u64,
 }
 
@@ -86,6 +90,15 @@ struct Burst {
     text: Arc<str>,
 }
 
+/// Messages since the last call.
+#[derive(Debug, Default)]
+pub struct NewLogs {
+    /// The messages, oldest first.
+    pub messages: Vec<Arc<LogMessage>>,
+    /// Number of messages that were dropped because there were too many.
+    pub lost: u64,
+}
+
 /// Figures of the log of one node.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NodeLogFacts {
@@ -131,6 +144,7 @@ impl Logs {
             line: log.line,
         });
         self.latest.push_back(Arc::clone(&message));
+        self.lost += u64::from(self.fresh.push(Arc::clone(&message)).is_some());
         let key = (origin.domain_id, node);
         if self.nodes.is_full() && !self.nodes.contains_key(&key) {
             self.nodes.refuse();
@@ -142,6 +156,14 @@ impl Logs {
         }
         if let Some(known) = self.nodes.get_or_insert_with(key, NodeLog::default) {
             self.revision += u64::from(known.add(message));
+        }
+    }
+
+    /// Removes and returns the messages since the last call.
+    pub fn take(&mut self) -> NewLogs {
+        NewLogs {
+            messages: self.fresh.take(),
+            lost: std::mem::take(&mut self.lost),
         }
     }
 
