@@ -41,6 +41,8 @@ pub mod log;
 pub mod names;
 pub mod parameters;
 #[cfg(feature = "alloc")]
+mod plain;
+#[cfg(feature = "alloc")]
 pub mod qos;
 pub mod quic;
 pub mod record;
@@ -53,6 +55,8 @@ mod testing;
 #[cfg(feature = "alloc")]
 mod text;
 pub mod time;
+#[cfg(feature = "alloc")]
+pub mod transforms;
 pub mod walk;
 #[cfg(feature = "alloc")]
 pub mod xcdr2;

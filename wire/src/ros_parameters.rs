@@ -6,14 +6,11 @@
 
 use core::fmt;
 
-use crate::cursor::{Cursor, Reason, WireError};
-use crate::text;
+use crate::cursor::{Reason, WireError};
+use crate::plain::PlainCursor;
 
 /// Name of the type of events, as ROS writes it.
 pub const EVENT: &str = "rcl_interfaces/msg/ParameterEvent";
-
-/// Length of the encapsulation header.
-const ENCAPSULATION: usize = 4;
 
 /// One event: what changed in a node.
 #[derive(Clone, Debug)]
@@ -101,39 +98,7 @@ pub struct ParameterChanges<'a> {
     kind: ChangeKind,
 }
 
-/// A cursor that begins after the encapsulation header, as alignment does.
-#[derive(Clone, Copy, Debug)]
-struct PlainCursor<'a> {
-    cursor: Cursor<'a>,
-    /// Alignment of values of eight bytes: 8 in CDR, 4 in CDR2.
-    wide: usize,
-}
-
 impl<'a> PlainCursor<'a> {
-    fn of(payload: &'a [u8]) -> Result<Self, WireError> {
-        let endianness = text::plain_cdr(payload)?.endianness();
-        let body = payload.get(ENCAPSULATION..).unwrap_or_default();
-        let is_cdr2 = payload.get(1).is_some_and(|kind| *kind >= 6);
-        Ok(Self {
-            cursor: Cursor::new(body, endianness),
-            wide: if is_cdr2 { 4 } else { 8 },
-        })
-    }
-
-    fn count(&mut self, what: &'static str) -> Result<u32, WireError> {
-        self.cursor.align(4);
-        self.cursor.u32(what)
-    }
-
-    fn text(&mut self, what: &'static str) -> Result<&'a [u8], WireError> {
-        text::unterminated(&mut self.cursor, what)
-    }
-
-    fn wide(&mut self, what: &'static str) -> Result<u64, WireError> {
-        self.cursor.align(self.wide);
-        self.cursor.u64(what)
-    }
-
     /// Reads an array, and goes on after it.
     fn array(&mut self, of: Element, what: &'static str) -> Result<ParameterArray<'a>, WireError> {
         let count = self.count(what)?;
@@ -173,7 +138,7 @@ impl<'a> PlainCursor<'a> {
         let kind = self.cursor.u8("value.type")?;
         let boolean = self.cursor.u8("value.bool_value")? != 0;
         let integer = self.wide("value.integer_value")?.cast_signed();
-        let double = f64::from_bits(self.wide("value.double_value")?);
+        let double = self.double("value.double_value")?;
         let string = self.text("value.string_value")?;
         let bytes = self.array(Element::Byte, "value.byte_array_value")?;
         let booleans = self.array(Element::Bool, "value.bool_array_value")?;
@@ -304,11 +269,7 @@ impl fmt::Display for ParameterArray<'_> {
                     write!(f, "{}", cursor.wide("").unwrap_or_default().cast_signed())?;
                 }
                 Element::Double => {
-                    write!(
-                        f,
-                        "{:?}",
-                        f64::from_bits(cursor.wide("").unwrap_or_default())
-                    )?;
+                    write!(f, "{:?}", cursor.double("").unwrap_or_default())?;
                 }
                 Element::String => write_text(f, cursor.text("").unwrap_or_default())?,
             }
@@ -337,27 +298,16 @@ mod tests {
     use crate::cursor::Endianness;
     use crate::testing::{Encoder, hurt};
 
-    /// Writes eight bytes, aligned.
-    fn wide(encoder: &mut Encoder, value: u64, alignment: usize) {
-        let length = encoder.bytes.len().next_multiple_of(alignment);
-        encoder.bytes.resize(length, 0);
-        match encoder.endianness {
-            Endianness::Big => encoder.raw(&value.to_be_bytes()),
-            Endianness::Little => encoder.raw(&value.to_le_bytes()),
-        };
-    }
-
     /// Writes a parameter whose fields all have a value.
     fn parameter(encoder: &mut Encoder, name: &str, kind: u8, alignment: usize) {
         encoder.unpadded(name).raw(&[kind, 1]);
-        wide(encoder, (-5_i64).cast_unsigned(), alignment);
-        wide(encoder, 0.5_f64.to_bits(), alignment);
+        encoder.wide((-5_i64).cast_unsigned(), alignment);
+        encoder.wide(0.5_f64.to_bits(), alignment);
         encoder.unpadded("text");
         encoder.u32(3).raw(&[1, 2, 255]);
         encoder.u32(2).raw(&[0, 1]);
         for value in [7, 0.25_f64.to_bits()] {
-            encoder.u32(1);
-            wide(encoder, value, alignment);
+            encoder.u32(1).wide(value, alignment);
         }
         encoder.u32(2).unpadded("a").unpadded("bc");
     }

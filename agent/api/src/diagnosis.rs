@@ -199,6 +199,19 @@ pub enum Diagnosis<'a> {
         /// Message when it was reported.
         message: Cow<'a, str>,
     },
+    /// Transforms between frames are missing, contradict each other, or are in several trees.
+    TransformFault {
+        /// Namespace of the topics; empty for `/tf`.
+        namespace: Cow<'a, str>,
+        /// `silent`, `several_broadcasters`, `time_went_back` or `apart`.
+        fault: Cow<'static, str>,
+        /// Parent frame of the edge; empty if the fault is `apart`.
+        parent: Cow<'a, str>,
+        /// Child frame of the edge; empty if the fault is `apart`.
+        child: Cow<'a, str>,
+        /// Nodes that broadcast the edge, or the roots of the trees.
+        names: Vec<Cow<'a, str>>,
+    },
     /// A configured chain that ends with the topic exceeds its maximum latency.
     SlowChain {
         /// First topic of the chain.
@@ -236,6 +249,7 @@ impl Diagnosis<'_> {
             Self::LossyLink { .. } => "lossy_link",
             Self::LogErrors { .. } => "log_errors",
             Self::DiagnosticError { .. } => "diagnostic_error",
+            Self::TransformFault { .. } => "transform_fault",
             Self::SlowChain { .. } => "slow_chain",
         }
     }

@@ -44,6 +44,7 @@ pub mod samples;
 pub mod services;
 pub mod snapshots;
 pub mod topics;
+pub mod transforms;
 pub mod watches;
 pub mod why;
 

@@ -38,7 +38,7 @@ use crate::surface::{Exposition, Format, MetricSources};
 use crate::watches::Watches;
 use crate::{control, file, memory};
 use ros2probe_metrics::otlp::{
-    self, Exporter, Host, Inputs, LogQueue, NodeLogSink, SpanQueue, SpanSink,
+    self, Exporter, Host, Inputs, NodeLogQueue, NodeLogSink, SpanQueue, SpanSink,
 };
 
 /// Default configuration file.
@@ -86,7 +86,7 @@ pub struct Components<'a> {
     /// Spans of sampled messages that wait for export.
     pub spans: Arc<SpanQueue>,
     /// Messages of nodes' logs for the exporter.
-    pub node_logs: Arc<LogQueue>,
+    pub node_logs: Arc<NodeLogQueue>,
     /// Watched topics.
     pub watches: Arc<Watches>,
     /// Writer of the discovery state.
@@ -157,11 +157,11 @@ impl Components<'_> {
             latest: Arc::clone(&sources.latest),
             events: Arc::clone(&sources.events),
             limits: Arc::clone(&sources.limits),
-            node_logs: NodeLogSink::new(
-                self.node_logs,
-                Arc::clone(&sources.exports),
-                config.otlp.node_logs,
-            ),
+            node_logs: NodeLogSink {
+                queue: self.node_logs,
+                exports: Arc::clone(&sources.exports),
+                level: config.otlp.node_logs,
+            },
             spans: SpanSink {
                 queue: self.spans,
                 exports: sources.exports,
@@ -236,7 +236,7 @@ pub fn run(options: Options) -> Result<()> {
     let worker = worker(&mut source)?;
     let responder = Responder::start().context("cannot start the thread that answers requests")?;
     let spans = Arc::<SpanQueue>::default();
-    let node_logs = Arc::<LogQueue>::default();
+    let node_logs = Arc::<NodeLogQueue>::default();
     let ros2_daemon = ros2_daemon(&config, options.report)?;
     let inputs = Inputs {
         metrics: Arc::new(sources.clone()),

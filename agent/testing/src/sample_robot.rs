@@ -23,6 +23,7 @@ use ros2probe_model::facts::link::{LinkKey, LinkProtocol};
 use ros2probe_model::facts::loss_share::LossShare;
 use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::facts::names::NodeName;
+use ros2probe_model::facts::robot::{TransformFault, TransformFaultKind};
 use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::facts::watch::Watch;
@@ -30,18 +31,20 @@ use ros2probe_model::graph::discovery::Addresses;
 use ros2probe_model::graph::zenoh::{Counters, ZenohFacts};
 use ros2probe_model::measure::links::LinkFacts;
 use ros2probe_model::report::snapshot::{
-    AcknowledgementFacts, ActionFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered,
-    DeliveryFacts, DiagnosticFacts, DiagnosticStatus, Direction, EarlierCounts, EndpointFacts,
-    GoalCounts, LatencyFacts, LogFacts, LogMessage, Measurement, NodeFacts, NodeLogFacts,
-    ParameterChange, ParameterFacts, ParametersFacts, ParticipantFacts, ProcessFacts, Requester,
-    SampledFacts, ServiceFacts, Snapshot, SocketFacts, Source, Subscriber, TableFacts, TopicFacts,
-    Transport, TransportCount, UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
+    AcknowledgementFacts, ActionFacts, Breakdown, Broadcaster, ChurnCount, DecodeErrorCount,
+    Delivered, DeliveryFacts, DiagnosticFacts, DiagnosticStatus, Direction, EarlierCounts,
+    EdgeFacts, EndpointFacts, GoalCounts, Jumps, LatencyFacts, LogFacts, LogMessage, Measurement,
+    NodeFacts, NodeLogFacts, ParameterChange, ParameterFacts, ParametersFacts, ParticipantFacts,
+    ProcessFacts, Requester, SampledFacts, ServiceFacts, Snapshot, SocketFacts, Source, Subscriber,
+    TableFacts, TopicFacts, TransformFacts, Transport, TransportCount, TreeFacts,
+    UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
 };
 use ros2probe_wire::diagnostics::DiagnosticLevel;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::log::LogLevel;
 use ros2probe_wire::qos::{History, HistoryKind, Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::transforms::Pose;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 /// Returns a chain of 100 messages from /points to /cmd_vel, configured with a limit of 15 ms.
@@ -133,6 +136,40 @@ fn diagnostics(writer: Guid) -> DiagnosticFacts {
             at,
             since: at,
         })],
+    }
+}
+
+/// Returns a tree with one edge at 50 Hz.
+fn transforms(writer: Guid) -> TransformFacts {
+    TransformFacts {
+        are_read: true,
+        trees: vec![TreeFacts {
+            domain_id: DomainId(0),
+            namespace: "".into(),
+            edges: vec![EdgeFacts {
+                parent: "odom".into(),
+                child: "base_link".into(),
+                is_static: false,
+                broadcasters: vec![Broadcaster {
+                    writer,
+                    node: Some("/ekf".into()),
+                }],
+                count: 500,
+                rate: Some(50.0),
+                at: ModelTime::from_nanoseconds(1_699_999_999_000_000_000),
+                stamp: (1_699_999_999, 0),
+                pose: Pose {
+                    translation: [1.0, 0.0, 0.0],
+                    rotation: [0.0, 0.0, 0.0, 1.0],
+                },
+                jumps: Jumps {
+                    translation: 1,
+                    rotation: 0,
+                    time: 0,
+                },
+            }],
+            unread_static: 1,
+        }],
     }
 }
 
@@ -255,6 +292,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
         logs: logs(guid),
         diagnostics: diagnostics(guid),
         parameters: parameters(guid),
+        transforms: transforms(guid),
         services: vec![service()],
         actions: vec![action()],
         inside: Some(Arc::new(inside::inside())),
@@ -444,6 +482,16 @@ fn diagnoses() -> Diagnoses {
             hardware_id: "vlp16".into(),
             level: DiagnosticLevel::Error,
             message: "no data".into(),
+        },
+        Diagnosis::TransformFault {
+            domain_id: DomainId(0),
+            namespace: "".into(),
+            fault: TransformFault {
+                child: "base_link".into(),
+                parent: "odom".into(),
+                kind: TransformFaultKind::Silent,
+                names: vec!["/ekf".into()],
+            },
         },
         Diagnosis::SlowChain {
             topic: topic.clone(),

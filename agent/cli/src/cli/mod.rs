@@ -28,6 +28,7 @@ mod reference;
 mod run;
 mod service;
 mod shared;
+mod tf;
 mod top;
 mod topic;
 mod why;
@@ -98,6 +99,8 @@ pub(crate) enum Question {
     Diag(diag::Diag),
     /// Print parameters of nodes and their changes
     Param(param::Param),
+    /// Print the trees of frames, or the transform between two of them
+    Tf(tf::Tf),
     /// Check what is visible on this host and what is not, with remedies
     Doctor(doctor::Doctor),
     /// Show a robot's topics live in the terminal: rates, losses, latencies, problems
@@ -130,6 +133,7 @@ impl Question {
             Self::Log(log) => log.ask(),
             Self::Diag(diag) => diag.ask(),
             Self::Param(param) => param.ask(),
+            Self::Tf(tf) => tf.ask(),
             Self::Doctor(doctor) => doctor.ask(),
             Self::Top(top) => top.ask(),
             Self::Inside(inside) => inside.ask(),
@@ -152,6 +156,7 @@ impl Question {
             | Self::Log(_)
             | Self::Diag(_)
             | Self::Param(_)
+            | Self::Tf(_)
             | Self::Doctor(_)
             | Self::Inside(_)
             | Self::Why(_)

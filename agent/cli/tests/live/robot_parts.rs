@@ -1,4 +1,4 @@
-//! What the robot itself says: diagnostics and parameters in metrics, API, findings and commands,
+//! What the robot itself says: diagnostics, parameters and transforms in metrics, API, findings and commands,
 //! without a watch. Needs root.
 
 use std::process::{Command, Stdio};
@@ -11,6 +11,7 @@ use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::robot_diagnostics::{self, Status, diagnostics};
 use ros2probe_testing::robot_parameters::{self, event, request};
+use ros2probe_testing::robot_transforms::{self, Transform, transforms};
 
 const PATIENCE: Duration = Duration::from_secs(30);
 const RP: &str = env!("CARGO_BIN_EXE_rp");
@@ -184,5 +185,91 @@ fn changes_of_parameters_name_the_node_that_requested_them() -> Result<()> {
         rp(&link.monitor, &["param", "dump"])?,
         "/planner:\n  speed: 9\n"
     );
+    Ok(())
+}
+
+#[test]
+fn transforms_make_a_tree_with_rates_poses_and_faults() -> Result<()> {
+    let link = Link::new()?;
+    let config = tempfile::tempdir()?;
+    let agent = agent(&link, &config, "")?;
+    let none = rp(&link.monitor, &["tf"])?;
+    assert!(none.contains("no transforms were seen"), "{none}");
+
+    let dds_type = robot_transforms::DDS_TYPE;
+    let mut ekf = Node::start(&link, 1, "ekf", ("rt/tf", dds_type))?;
+    let mut model = Node::start(
+        &link,
+        2,
+        "robot_state_publisher",
+        ("rt/tf_static", dds_type),
+    )?;
+    agent.scrape_until("both nodes", |page| page.sum("ros2_nodes", &[]) == 2.0)?;
+    let note = rp(&link.monitor, &["tf"])?;
+    assert!(
+        note.contains("the static transforms of 1 publisher are missing"),
+        "{note}"
+    );
+    let transform = |parent, child, stamp, x, yaw| Transform {
+        parent,
+        child,
+        stamp,
+        x,
+        yaw,
+    };
+    model.send(&transforms(&[transform("base_link", "lidar", 0, 0.5, 0.0)]))?;
+    let quarter = std::f64::consts::FRAC_PI_2;
+    for step in 0..40 {
+        let stamp = 1000 + 50 * step;
+        ekf.send(&transforms(&[
+            transform("map", "odom", stamp, 10.0, 0.0),
+            transform("odom", "base_link", stamp, 2.0, quarter),
+        ]))?;
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    let edge = [
+        ("domain_id", "0"),
+        ("namespace", ""),
+        ("parent", "odom"),
+        ("child", "base_link"),
+    ];
+    let page = agent.scrape_until("the transforms", |page| {
+        page.sum("ros2_transform_messages_total", &edge) == 40.0
+    })?;
+    assert_eq!(page.sum("ros2_transform_broadcasters", &[]), 3.0);
+    let tree = rp(&link.monitor, &["tf"])?;
+    let parts: Vec<_> = tree.lines().map(|line| line.split("  ").next()).collect();
+    assert_eq!(tree.lines().next(), Some("map"), "{parts:?}");
+    assert!(
+        tree.contains("      └─ lidar  static  /robot_state_publisher\n"),
+        "{tree}"
+    );
+    assert!(tree.contains(" s ago  /ekf\n"), "{tree}");
+    assert_eq!(
+        rp(&link.monitor, &["tf", "map", "lidar", "--once"])?,
+        "At time 2.950000000\n\
+         - Translation: [12.000, 0.500, 0.000]\n\
+         - Rotation: in Quaternion [0.000, 0.000, 0.707, 0.707]\n\
+         - Rotation: in RPY (radian) [0.000, -0.000, 1.571]\n\
+         - Rotation: in RPY (degree) [0.000, -0.000, 90.000]\n\
+         - Matrix:\n\
+         \x20 0.000 -1.000  0.000 12.000\n\
+         \x20 1.000  0.000  0.000  0.500\n\
+         \x20 0.000  0.000  1.000  0.000\n\
+         \x20 0.000  0.000  0.000  1.000\n"
+    );
+    let dot = rp(&link.monitor, &["tf", "--dot"])?;
+    assert!(dot.contains("\"map\" -> \"odom\""), "{dot}");
+    let unknown = rp(&link.monitor, &["tf", "map", "nose", "--once"]).unwrap_err();
+    assert!(
+        unknown
+            .to_string()
+            .contains("no transform has the frame `nose`"),
+        "{unknown}"
+    );
+    // Nothing is sent any more, although the node is announced.
+    agent.scrape_until("the silence of both edges", |page| {
+        page.sum("ros2_diagnoses", &[("kind", "transform_fault")]) == 2.0
+    })?;
     Ok(())
 }

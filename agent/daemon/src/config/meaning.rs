@@ -582,6 +582,7 @@ fn parts(shape: &RobotShape) -> Parts {
         (Part::Logs, shape.logs),
         (Part::Diagnostics, shape.diagnostics),
         (Part::Parameters, shape.parameters),
+        (Part::Transforms, shape.transforms),
     ];
     let on = parts
         .into_iter()

@@ -414,6 +414,8 @@ pub(super) struct RobotShape {
     /// Parameters of nodes (`/parameter_events`): last known values, changes, and who requested
     /// them.
     pub(super) parameters: Switch,
+    /// Transforms (`/tf`, `/tf_static`): trees of frames, their broadcasters, and faults.
+    pub(super) transforms: Switch,
 }
 
 impl Default for RobotShape {
@@ -423,6 +425,7 @@ impl Default for RobotShape {
             diagnostics: Switch::On,
             diagnostic_values: None,
             parameters: Switch::On,
+            transforms: Switch::On,
         }
     }
 }

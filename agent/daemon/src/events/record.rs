@@ -141,6 +141,7 @@ impl Occurrence {
             Self::Robot(EventKind::Lifecycle(_)) => &table::LIFECYCLE_TRANSITION,
             Self::Robot(EventKind::Diagnostic { .. }) => &table::DIAGNOSTIC_CHANGED,
             Self::Robot(EventKind::Parameter(_)) => &table::PARAMETER_CHANGED,
+            Self::Robot(EventKind::TransformJump { .. }) => &table::TRANSFORM_JUMPED,
             Self::Robot(EventKind::Loss(_)) => &table::MESSAGE_LOST,
             Self::Robot(EventKind::Expectation { .. }) => &table::EXPECTATION_CHANGED,
             Self::Robot(EventKind::Silence { .. }) => &table::TOPIC_SILENT,
@@ -292,6 +293,21 @@ fn robot(kind: &EventKind, at: Timestamp) -> Values {
             ("from", before.map(|level| text(level.label()))),
             ("to", Some(text(status.level.label()))),
             ("message", Some(text(&status.message))),
+        ],
+        EventKind::TransformJump {
+            domain_id,
+            namespace,
+            parent,
+            child,
+            node,
+            jump,
+        } => vec![
+            domain(*domain_id),
+            ("namespace", Some(text(namespace))),
+            ("parent", Some(text(parent))),
+            ("child", Some(text(child))),
+            ("ros_node", node.as_deref().map(text)),
+            ("kind", Some(text(jump.label()))),
         ],
         EventKind::Parameter(change) => {
             let client = change.requested_by.as_ref();
@@ -483,6 +499,18 @@ fn finding(finding: &Diagnosis) -> Values {
             ("hardware_id", Some(text(hardware_id))),
             ("level", Some(text(level.label()))),
             ("message", Some(text(message))),
+        ],
+        Diagnosis::TransformFault {
+            domain_id,
+            namespace,
+            fault,
+        } => vec![
+            ("domain_id", number(*domain_id)),
+            ("namespace", Some(text(namespace))),
+            ("fault", Some(text(fault.kind.label()))),
+            ("parent", Some(text(&fault.parent))),
+            ("child", Some(text(&fault.child))),
+            ("names", list(&fault.names)),
         ],
         Diagnosis::LossyLink {
             link,

@@ -67,6 +67,11 @@ const FINDING: &[&str] = &[
     "hardware_id",
     "level",
     "message",
+    "namespace",
+    "fault",
+    "parent",
+    "child",
+    "names",
     "from",
     "max_latency_ms",
 ];
@@ -145,6 +150,20 @@ pub(super) const DIAGNOSTIC_CHANGED: Definition = Definition::new(
      INFO if it is `ok` now.",
 )
 .relief(Severity::Info);
+pub(super) const TRANSFORM_JUMPED: Definition = Definition::new(
+    "ros2.robot.transform_jumped",
+    Severity::Warn,
+    &[
+        "domain_id",
+        "namespace",
+        "parent",
+        "child",
+        "ros_node",
+        "kind",
+    ],
+    "A transform differs suddenly from the last one of its edge: its translation, its rotation, or its \
+     time, which went back.",
+);
 pub(super) const PARAMETER_CHANGED: Definition = Definition::new(
     "ros2.robot.parameter_changed",
     Severity::Info,
@@ -206,7 +225,7 @@ pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
     "Another fault of the graph, named by `diagnosis`: type_conflict, type_hash_conflict, \
      duplicate_node, node_in_several_domains, slow_callback, executor_wait, \
      late_callback, intra_process_overflow, reader_queue_overflow, observation_suspended, \
-     shared_machine_id, lossy_link, log_errors, diagnostic_error, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
+     shared_machine_id, lossy_link, log_errors, diagnostic_error, transform_fault, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
      restamping_node, buffers_by_cpu.",
 )
 .relief(Severity::Info);
@@ -326,6 +345,7 @@ pub const EVENTS: &[Definition] = &[
     LIFECYCLE_TRANSITION,
     DIAGNOSTIC_CHANGED,
     PARAMETER_CHANGED,
+    TRANSFORM_JUMPED,
     MESSAGE_LOST,
     EXPECTATION_CHANGED,
     TOPIC_SILENT,

@@ -306,7 +306,7 @@ impl Run {
         let spans = &self.outputs.spans;
         spans.add(output.spans, output.chain_spans, &output.late_calls);
         let node_logs = &self.outputs.node_logs;
-        node_logs.add(&output.logs, output.lost_logs);
+        node_logs.add(output.logs, output.lost_logs);
         let clock = self.observer.dispatched_until(now);
         if clock + SET_BACK < self.published_until {
             self.published_until = clock;

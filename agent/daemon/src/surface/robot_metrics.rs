@@ -5,7 +5,8 @@ use std::fmt;
 use ros2probe_metrics::catalogue as metric;
 use ros2probe_metrics::metric_sink::{Label, MetricSink};
 use ros2probe_model::facts::glob::covers_text;
-use ros2probe_model::report::snapshot::{DiagnosticStatus, Snapshot};
+use ros2probe_model::facts::robot::TransformJump;
+use ros2probe_model::report::snapshot::{DiagnosticStatus, EdgeFacts, Jumps, Snapshot, TreeFacts};
 use ros2probe_wire::log::LogLevel;
 
 /// Writes the counts of log messages by node and level.
@@ -76,4 +77,58 @@ pub(super) fn parameters(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt:
         }
         Ok(())
     })
+}
+
+/// Writes counts, ages, broadcasters and jumps of transforms.
+pub(super) fn transforms(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
+    let edges = || {
+        let trees = snapshot.transforms.trees.iter();
+        trees.flat_map(|tree| {
+            tree.edges
+                .iter()
+                .map(move |edge| (labels(tree, edge), edge))
+        })
+    };
+    sink.family(&metric::TRANSFORM_MESSAGES, |family| {
+        edges().try_for_each(|(labels, edge)| family.sample(&labels, edge.count))
+    })?;
+    sink.family(&metric::TRANSFORM_AGE, |family| {
+        let mut moving = edges().filter(|(_, edge)| !edge.is_static);
+        moving.try_for_each(|(labels, edge)| {
+            let age = snapshot.at - edge.at;
+            family.sample(&labels, age.as_secs_f64())
+        })
+    })?;
+    sink.family(&metric::TRANSFORM_BROADCASTERS, |family| {
+        edges()
+            .try_for_each(|(labels, edge)| family.sample(&labels, edge.broadcasters.len() as u64))
+    })?;
+    sink.family(&metric::TRANSFORM_JUMPS, |family| {
+        for ([domain_id, namespace, parent, child], edge) in edges() {
+            let Jumps {
+                translation,
+                rotation,
+                time,
+            } = edge.jumps;
+            let kinds = [
+                (TransformJump::Translation, translation),
+                (TransformJump::Rotation, rotation),
+                (TransformJump::Time, time),
+            ];
+            for (kind, jumps) in kinds.into_iter().filter(|(_, jumps)| *jumps > 0) {
+                let kind = Label::Text(kind.label());
+                family.sample(&[domain_id, namespace, parent, child, kind], jumps)?;
+            }
+        }
+        Ok(())
+    })
+}
+
+fn labels<'a>(tree: &'a TreeFacts, edge: &'a EdgeFacts) -> [Label<'a>; 4] {
+    [
+        Label::Number(tree.domain_id.0.into()),
+        Label::Text(&tree.namespace),
+        Label::Text(&edge.parent),
+        Label::Text(&edge.child),
+    ]
 }

@@ -27,3 +27,29 @@ pub const PARAMETER_CHANGES: Metric = Metric::counter(
     "Changes of a node's parameters, without those that it declares; only those that were seen.",
 )
 .experimental();
+pub const TRANSFORM_MESSAGES: Metric = Metric::counter(
+    "ros2_transform_messages_total",
+    TRANSFORM,
+    "Transforms of an edge that were seen; its rate is that of its broadcasters together.",
+)
+.experimental();
+pub const TRANSFORM_AGE: Metric = Metric::gauge(
+    "ros2_transform_age_seconds",
+    TRANSFORM,
+    "Time since the last transform of an edge; absent for static ones.",
+)
+.experimental();
+pub const TRANSFORM_BROADCASTERS: Metric = Metric::gauge(
+    "ros2_transform_broadcasters",
+    TRANSFORM,
+    "Publishers that broadcast an edge, at most four.",
+)
+.experimental();
+pub const TRANSFORM_JUMPS: Metric = Metric::counter(
+    "ros2_transform_jumps_total",
+    &["domain_id", "namespace", "parent", "child", "kind"],
+    "Sudden changes of an edge: its translation, its rotation, or its time, which went back.",
+)
+.experimental();
+
+const TRANSFORM: &[&str] = &["domain_id", "namespace", "parent", "child"];

@@ -17,6 +17,7 @@ use super::delivery::{Delivery, Export};
 use super::events::{self, LogExport, Reporter};
 use super::exports::{Exports, Signal};
 use super::metrics::{Collector, MetricExport};
+use super::node_logs::{self, NodeLogQueue, NodeLogs};
 use super::own_log::{self, LogQueue};
 use super::points::scope;
 use super::reports::Reports;
@@ -47,7 +48,7 @@ pub struct Inputs {
     /// Lines of the agent's own log, if they are exported.
     pub log: Option<Arc<LogQueue>>,
     /// Messages of the logs of nodes.
-    pub node_logs: Arc<LogQueue>,
+    pub node_logs: Arc<NodeLogQueue>,
     /// Counters of exports.
     pub exports: Arc<Exports>,
 }
@@ -127,7 +128,7 @@ struct Jobs {
     events: Option<(Reporter, Delivery<LogExport>)>,
     traces: Option<(Tracing, Delivery<SpanExport>)>,
     log: Option<(Arc<LogQueue>, Delivery<LogExport>)>,
-    node_logs: Option<(Arc<LogQueue>, Delivery<LogExport>)>,
+    node_logs: Option<(NodeLogs, Delivery<LogExport>)>,
 }
 
 impl Jobs {
@@ -179,7 +180,7 @@ impl Jobs {
             events: events.map(|delivery| (reporter(), delivery)),
             traces: traces.map(|delivery| (tracing, delivery)),
             log: inputs.log.zip(log),
-            node_logs: node_logs.map(|delivery| (inputs.node_logs, delivery)),
+            node_logs: node_logs.map(|delivery| (NodeLogs::new(inputs.node_logs), delivery)),
         })
     }
 
@@ -199,18 +200,17 @@ impl Jobs {
                 delivery.drain(tracing, traces::GATHER).await;
             }
         };
-        let queued = async |queue: Option<(Arc<LogQueue>, Delivery<LogExport>)>| {
-            if let Some((queue, delivery)) = queue {
+        let log = async {
+            if let Some((queue, delivery)) = self.log {
                 delivery.drain(&*queue, own_log::GATHER).await;
             }
         };
-        tokio::join!(
-            metrics,
-            events,
-            traces,
-            queued(self.log),
-            queued(self.node_logs)
-        );
+        let node_logs = async {
+            if let Some((logs, delivery)) = self.node_logs {
+                delivery.drain(logs, node_logs::GATHER).await;
+            }
+        };
+        tokio::join!(metrics, events, traces, log, node_logs);
     }
 }
 

@@ -32,7 +32,7 @@ pub(super) const GATHER: Duration = Duration::from_millis(500);
 /// Estimated size of a record or an attribute without its texts.
 const OVERHEAD: usize = 64;
 
-/// The queue of log records between the threads that create them and the exporter.
+/// The queue of lines between the threads that log and the exporter.
 #[derive(Debug, Default)]
 pub struct LogQueue {
     waiting: Mutex<Waiting>,
@@ -60,7 +60,7 @@ impl LogQueue {
         OpenTelemetryTracingBridge::new(&provider).with_filter(own)
     }
 
-    pub(super) fn put(&self, line: SdkLogRecord) {
+    fn put(&self, line: SdkLogRecord) {
         let bytes = size(&line);
         let mut waiting = self.waiting();
         if waiting.lines.len() >= LINES || waiting.bytes + bytes > LINES_BYTES {
@@ -80,12 +80,6 @@ impl LogQueue {
         let lines: Vec<_> = waiting.lines.drain(..most).collect();
         waiting.bytes -= lines.iter().map(size).sum::<usize>().min(waiting.bytes);
         (!lines.is_empty()).then_some(lines)
-    }
-
-    /// Returns the number of waiting records.
-    #[cfg(test)]
-    pub(super) fn len(&self) -> usize {
-        self.waiting().lines.len()
     }
 
     async fn filled(&self) {

@@ -9,11 +9,13 @@ pub mod diagnostics;
 pub mod logs;
 pub mod parameters;
 mod text;
+pub mod transforms;
 
 use foldhash::HashMap;
 use ros2probe_wire::diagnostics::{self as wire, DiagnosticStatuses};
 use ros2probe_wire::ros_parameters::{self, ParameterEvent};
 use ros2probe_wire::rtps::{RequestHeader, VendorId};
+use ros2probe_wire::transforms as wire_transforms;
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, WireError, log};
 
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
@@ -28,6 +30,7 @@ use crate::measure::assembly::Assembly;
 use diagnostics::Diagnostics;
 use logs::Logs;
 use parameters::Parameters;
+use transforms::Transforms;
 
 /// Maximum size of a message that is decoded, in bytes.
 const MESSAGE_BYTES: usize = 64 << 10;
@@ -37,6 +40,9 @@ const ASSEMBLY_BYTES: usize = 1 << 20;
 const WRITER: Allowance = Allowance::new(1 << 20, 64 << 10);
 /// Bytes of all writers that may be captured in a burst, and per second.
 const ALL_WRITERS: Allowance = Allowance::new(8 << 20, 512 << 10);
+/// The same of transforms: a message each of thirty joints, 100 times a second, is 300 KB/s.
+const BROADCASTER: Allowance = Allowance::new(2 << 20, 512 << 10);
+const ALL_BROADCASTERS: Allowance = Allowance::new(8 << 20, 2 << 20);
 /// A paused writer is captured again once it is allowed this many bytes.
 const RESUME_BYTES: u64 = 256 << 10;
 
@@ -49,6 +55,8 @@ pub enum Part {
     Diagnostics,
     /// Parameters of nodes.
     Parameters,
+    /// Transforms between frames.
+    Transforms,
 }
 
 /// A set of parts.
@@ -66,6 +74,8 @@ pub enum Standard {
     ParameterEvent,
     /// Request of `rcl_interfaces/srv/SetParameters` or of its atomic variant.
     SetParameters,
+    /// `tf2_msgs/msg/TFMessage`.
+    Transforms,
 }
 
 /// Writers of standard types, and what they said.
@@ -77,6 +87,9 @@ pub struct Robot {
     logs: Logs,
     diagnostics: Diagnostics,
     parameters: Parameters,
+    transforms: Transforms,
+    /// Transforms have an allowance of their own: thirty of them at 100 Hz take 300 KB/s.
+    of_transforms: CommonAllowance,
 }
 
 #[derive(Debug)]
@@ -134,6 +147,7 @@ impl Standard {
             log::TYPE => Some(Self::Log),
             wire::TYPE => Some(Self::Diagnostics),
             ros_parameters::EVENT => Some(Self::ParameterEvent),
+            wire_transforms::TYPE => Some(Self::Transforms),
             "rcl_interfaces/srv/SetParameters_Request"
             | "rcl_interfaces/srv/SetParametersAtomically_Request" => Some(Self::SetParameters),
             _ => None,
@@ -148,6 +162,7 @@ impl Standard {
             Self::Diagnostics => "diagnostics",
             Self::ParameterEvent => "parameter_event",
             Self::SetParameters => "set_parameters",
+            Self::Transforms => "transforms",
         }
     }
 
@@ -158,14 +173,14 @@ impl Standard {
             Self::Log => Part::Logs,
             Self::Diagnostics => Part::Diagnostics,
             Self::ParameterEvent | Self::SetParameters => Part::Parameters,
+            Self::Transforms => Part::Transforms,
         }
     }
 }
 
 impl Parts {
-    /// All parts.
-    pub const ALL: Self =
-        Self(1 << Part::Logs as u8 | 1 << Part::Diagnostics as u8 | 1 << Part::Parameters as u8);
+    /// All parts, up to the last one.
+    pub const ALL: Self = Self((1 << (Part::Transforms as u8 + 1)) - 1);
 
     /// Returns whether it contains this part.
     #[must_use]
@@ -193,6 +208,8 @@ impl Default for Robot {
             logs: Logs::default(),
             diagnostics: Diagnostics::default(),
             parameters: Parameters::default(),
+            transforms: Transforms::default(),
+            of_transforms: CommonAllowance::new(ALL_BROADCASTERS, RESUME_BYTES),
         }
     }
 }
@@ -209,21 +226,32 @@ impl Robot {
             domain_id,
             topic: topic.clone(),
             standard,
-            allowance: WriterAllowance::new(WRITER),
+            allowance: WriterAllowance::new(match standard {
+                Standard::Transforms => BROADCASTER,
+                _ => WRITER,
+            }),
             read: ReadNumbers::default(),
         };
         self.writers.get_or_insert_with(writer, new);
+        if standard == Standard::Transforms {
+            self.transforms.follow(writer, domain_id, topic);
+        }
     }
 
     /// Stops reading this writer.
     pub fn forget(&mut self, writer: Guid) {
         if let Some(known) = self.writers.remove(&writer) {
-            self.allowance.forget(&known.allowance);
+            let allowance = match known.standard {
+                Standard::Transforms => &mut self.of_transforms,
+                _ => &mut self.allowance,
+            };
+            allowance.forget(&known.allowance);
             self.assembly.release(writer);
             match known.standard.part() {
                 Part::Logs => {}
                 Part::Diagnostics => self.diagnostics.forget(writer),
                 Part::Parameters => self.parameters.forget(writer),
+                Part::Transforms => self.transforms.forget(writer),
             }
         }
     }
@@ -256,15 +284,17 @@ impl Robot {
             return Heard::Nothing;
         };
         // Until the kernel knows of a pause, it captures more.
-        let is_allowed = self
-            .allowance
-            .spend(&mut known.allowance, payload.len(), now);
+        let allowance = match known.standard {
+            Standard::Transforms => &mut self.of_transforms,
+            _ => &mut self.allowance,
+        };
+        let is_allowed = allowance.spend(&mut known.allowance, payload.len(), now);
         if known.allowance.is_paused() || !sample.is_message() {
             return Heard::Nothing;
         }
         let bytes = usize::try_from(sample.size()).unwrap_or(usize::MAX);
         if !is_allowed || bytes > MESSAGE_BYTES {
-            self.allowance.pause(&mut known.allowance);
+            allowance.pause(&mut known.allowance);
             self.assembly.release(writer);
             return Heard::Paused;
         }
@@ -303,6 +333,8 @@ impl Robot {
                 .and_then(|statuses| self.diagnostics.add(&origin, statuses, events)),
             Standard::ParameterEvent => ParameterEvent::parse(payload)
                 .and_then(|event| self.parameters.add(&origin, event, events)),
+            Standard::Transforms => wire_transforms::Transforms::parse(payload)
+                .and_then(|transforms| self.transforms.add(&origin, transforms, events)),
             Standard::SetParameters => {
                 let header = match vendor {
                     VendorId::CYCLONE => RequestHeader::LENGTH,
@@ -328,9 +360,19 @@ impl Robot {
             known.is_some_and(|known: &RobotWriter| known.allowance.is_paused())
         };
         self.diagnostics.end_second(now, is_paused, events);
-        let writers = self.writers.iter_mut();
-        let writers = writers.map(|(writer, known)| (writer, &mut known.allowance));
-        self.allowance.resume(writers, now)
+        self.transforms.end_second(now, is_paused);
+        let mut resumed = Vec::new();
+        for (allowance, of_transforms) in [
+            (&mut self.allowance, false),
+            (&mut self.of_transforms, true),
+        ] {
+            let writers = self.writers.iter_mut().filter_map(|(writer, known)| {
+                let is_this = (known.standard == Standard::Transforms) == of_transforms;
+                is_this.then_some((writer, &mut known.allowance))
+            });
+            resumed.extend(allowance.resume(writers, now));
+        }
+        resumed
     }
 
     /// Removes and returns the messages of logs since the last call.
@@ -356,15 +398,24 @@ impl Robot {
         &self.parameters
     }
 
+    /// Returns the transforms of all robots.
+    #[must_use]
+    pub const fn transforms(&self) -> &Transforms {
+        &self.transforms
+    }
+
     /// Returns the number of changes of [`Self::findings`].
     #[must_use]
     pub const fn revision(&self) -> u64 {
-        self.logs.revision() + self.diagnostics.revision()
+        self.logs.revision() + self.diagnostics.revision() + self.transforms.revision()
     }
 
     /// Returns what the robot says about problems of its own.
     pub fn findings(&self) -> impl Iterator<Item = Diagnosis> {
-        self.logs.findings().chain(self.diagnostics.findings())
+        let logged = self.logs.findings();
+        logged
+            .chain(self.diagnostics.findings())
+            .chain(self.transforms.findings())
     }
 
     /// Returns the sizes and limits of the tables.
@@ -374,6 +425,7 @@ impl Robot {
         tables.extend(self.logs.tables());
         tables.extend(self.diagnostics.tables());
         tables.extend(self.parameters.tables());
+        tables.extend(self.transforms.tables());
         tables
     }
 }

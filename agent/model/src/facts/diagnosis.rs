@@ -22,6 +22,7 @@ use crate::facts::calls::other_thread::Culprit;
 use crate::facts::calls::report::Trigger;
 use crate::facts::link::LinkKey;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
+use crate::facts::robot::TransformFault;
 use crate::facts::topic_kind::TopicKind;
 pub(crate) use matching::effort;
 pub use matching::{Offer, Policies, Policy, Verdict, verdict};
@@ -252,6 +253,15 @@ pub enum Diagnosis {
         /// Message when it was reported.
         message: Arc<str>,
     },
+    /// Transforms between frames are missing, contradict each other, or are in several trees.
+    TransformFault {
+        /// Domain.
+        domain_id: DomainId,
+        /// Namespace of the topics; empty for `/tf`.
+        namespace: Arc<str>,
+        /// The fault.
+        fault: TransformFault,
+    },
     /// A configured chain exceeds its maximum latency.
     SlowChain {
         /// Last topic of the chain.
@@ -313,7 +323,7 @@ pub enum Change<'a> {
 
 impl Diagnosis {
     /// All kinds, as label values.
-    pub const KINDS: [&'static str; 21] = [
+    pub const KINDS: [&'static str; 22] = [
         "qos_incompatible",
         "type_conflict",
         "type_hash_conflict",
@@ -334,6 +344,7 @@ impl Diagnosis {
         "lossy_link",
         "log_errors",
         "diagnostic_error",
+        "transform_fault",
         "slow_chain",
     ];
 
@@ -361,6 +372,7 @@ impl Diagnosis {
             Self::LossyLink { .. } => "lossy_link",
             Self::LogErrors { .. } => "log_errors",
             Self::DiagnosticError { .. } => "diagnostic_error",
+            Self::TransformFault { .. } => "transform_fault",
             Self::SlowChain { .. } => "slow_chain",
         }
     }
@@ -389,6 +401,7 @@ impl Diagnosis {
             | Self::LossyLink { .. }
             | Self::LogErrors { .. }
             | Self::DiagnosticError { .. }
+            | Self::TransformFault { .. }
             | Self::ObservationSuspended { .. } => None,
         }
     }
@@ -409,6 +422,15 @@ impl Diagnosis {
             .then_with(|| self.handle().cmp(&other.handle()))
             .then_with(|| self.link().cmp(&other.link()))
             .then_with(|| self.part().cmp(&other.part()))
+            .then_with(|| self.frame().cmp(&other.frame()))
+    }
+
+    /// Returns the child frame and the kind of a fault of transforms.
+    fn frame(&self) -> Option<(&str, &'static str)> {
+        match self {
+            Self::TransformFault { fault, .. } => Some((&fault.child, fault.kind.label())),
+            _ => None,
+        }
     }
 
     /// Returns topic, name and hardware id of the part of the robot that is in error.
@@ -477,6 +499,11 @@ impl Diagnosis {
             } => (DomainId(0), node, Some(*participant), None),
             Self::ObservationSuspended { domain_id, .. }
             | Self::DiagnosticError { domain_id, .. } => (*domain_id, "", None, None),
+            Self::TransformFault {
+                domain_id,
+                namespace,
+                ..
+            } => (*domain_id, namespace, None, None),
             Self::SharedMachineId {
                 domain_id,
                 participants,

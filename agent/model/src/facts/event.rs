@@ -21,7 +21,7 @@ use crate::facts::diagnosis::Diagnosis;
 use crate::facts::loss::Loss;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
-use crate::facts::robot::{DiagnosticStatus, ParameterChange};
+use crate::facts::robot::{DiagnosticStatus, ParameterChange, TransformJump};
 use crate::facts::route::Receiver;
 use crate::facts::tables::{LosingReceivers, LossBursts, WaitingEvents};
 use crate::facts::wall_clock::WallClock;
@@ -125,6 +125,21 @@ pub enum EventKind {
         before: Option<DiagnosticLevel>,
         /// Its status.
         status: Arc<DiagnosticStatus>,
+    },
+    /// A transform differs suddenly from the last one of its edge.
+    TransformJump {
+        /// Domain.
+        domain_id: DomainId,
+        /// Namespace of the topic; empty for `/tf`.
+        namespace: Arc<str>,
+        /// Parent frame.
+        parent: Arc<str>,
+        /// Child frame.
+        child: Arc<str>,
+        /// Node of the broadcaster, if known.
+        node: Option<NodeName>,
+        /// What jumped.
+        jump: TransformJump,
     },
     /// A parameter of a node changed.
     Parameter(Arc<ParameterChange>),
@@ -231,7 +246,9 @@ impl EventKind {
             Self::Loss(_) => Class::Loss,
             Self::Expectation { .. } | Self::Silence { .. } => Class::Expectation,
             Self::Diagnosis { .. } => Class::Diagnosis,
-            Self::Diagnostic { .. } | Self::Parameter(_) => Class::Robot,
+            Self::Diagnostic { .. } | Self::TransformJump { .. } | Self::Parameter(_) => {
+                Class::Robot
+            }
         }
     }
 }
@@ -386,6 +403,7 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         | Diagnosis::BuffersByCpu { .. }
         | Diagnosis::LossyLink { .. }
         | Diagnosis::DiagnosticError { .. }
+        | Diagnosis::TransformFault { .. }
         | Diagnosis::SlowChain { .. } => {}
     }
     finding

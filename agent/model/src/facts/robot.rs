@@ -80,3 +80,65 @@ pub struct ParameterChange {
     /// Who requested it; `None` if no request was seen.
     pub requested_by: Option<Requester>,
 }
+
+/// A sudden change between two transforms of one edge.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TransformJump {
+    /// The position is far from the last one.
+    Translation,
+    /// The orientation is far from the last one.
+    Rotation,
+    /// The stamp is before that of the same broadcaster's last transform.
+    Time,
+}
+
+impl TransformJump {
+    /// Returns the label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Translation => "translation",
+            Self::Rotation => "rotation",
+            Self::Time => "time",
+        }
+    }
+}
+
+/// What is wrong with the transforms of a robot.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct TransformFault {
+    /// Child frame of the edge; empty if the fault concerns the whole tree.
+    pub child: Arc<str>,
+    /// Parent frame of the edge.
+    pub parent: Arc<str>,
+    /// Kind of the fault.
+    pub kind: TransformFaultKind,
+    /// Nodes that broadcast the edge, or the roots of the trees; at most four.
+    pub names: Vec<Arc<str>>,
+}
+
+/// Kind of a fault of transforms.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum TransformFaultKind {
+    /// The broadcaster of the edge lives and is silent.
+    Silent,
+    /// Several nodes broadcast the edge.
+    SeveralBroadcasters,
+    /// Stamps of its broadcaster went back within the last minute.
+    TimeWentBack,
+    /// The frames belong to several trees.
+    Apart,
+}
+
+impl TransformFaultKind {
+    /// Returns the label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Silent => "silent",
+            Self::SeveralBroadcasters => "several_broadcasters",
+            Self::TimeWentBack => "time_went_back",
+            Self::Apart => "apart",
+        }
+    }
+}

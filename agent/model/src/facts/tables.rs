@@ -160,6 +160,14 @@ crate::tables! {
     ParameterChanges { name: "parameter_changes", entries: 1000, rule: Oldest }
     /// Parameters in the latest requests to set them
     ParameterRequests { name: "parameter_requests", entries: 256, rule: Oldest, effect: "its effect has no known requester" }
+    /// Domains and namespaces with transforms
+    TransformTrees { name: "transform_trees", entries: 64, effect: "its transforms are not shown" }
+    /// Edges of all trees of transforms
+    TransformEdges { name: "transforms", entries: 2048, effect: "it is not shown" }
+    /// Broadcasters of one edge
+    EdgeBroadcasters { name: "transforms.broadcasters", entries: 4, effect: "the one with the longest silence is dropped" }
+    /// Publishers of static transforms
+    StaticBroadcasters { name: "transforms.static", entries: 1024, effect: "it counts as read" }
     /// Nodes whose changes of parameters are counted
     ChangedNodes { name: "changed_nodes", entries: 512, effect: "its changes are not counted" }
     /// Nodes with figures of their logs

@@ -171,6 +171,17 @@ impl<'a> Captured<'a> {
     }
 }
 
+/// A new message of a log.
+#[derive(Clone, Debug)]
+pub struct NewLog {
+    /// Time of its arrival.
+    pub arrival: Timestamp,
+    /// Its trace id, if it is traced.
+    pub trace_id: Option<u128>,
+    /// The message.
+    pub message: Arc<LogMessage>,
+}
+
 /// Outputs of the model since they were last drained.
 #[derive(Debug, Default)]
 pub struct Output {
@@ -186,8 +197,8 @@ pub struct Output {
     pub chain_spans: ChainSpans,
     /// Late calls of callbacks.
     pub late_calls: NewLateCalls,
-    /// New messages of logs, each with its time and its trace id if it is traced.
-    pub logs: Vec<(Timestamp, Option<u128>, Arc<LogMessage>)>,
+    /// New messages of logs.
+    pub logs: Vec<NewLog>,
     /// Number of messages of logs that were dropped because there were too many.
     pub lost_logs: u64,
     /// What nodes sent about their types.

@@ -61,7 +61,7 @@ use crate::measure::payloads::Payloads;
 use crate::measure::profiler::{ObservationOutcome, Profiler};
 use crate::measure::receivers::{Graph, Receivers};
 use crate::measure::topic::{Accelerated, TopicId, Topics, Watched};
-use crate::observe::input::{Captured, Input, Output};
+use crate::observe::input::{Captured, Input, NewLog, Output};
 use crate::observe::interest::Interest;
 use crate::report::snapshot::Snapshot;
 use crate::report::transport::{lacks_names, may_share_memory};
@@ -285,9 +285,10 @@ impl Observer {
         let clock = self.graph.wall_clock;
         let new = self.derive.robot.take_logs();
         let tracer = &self.derive.tracer;
-        let logs = new.messages.into_iter().map(|message| {
-            let trace = tracer.trace_of(message.writer, message.number);
-            (clock.wall_time(message.at), trace, message)
+        let logs = new.messages.into_iter().map(|message| NewLog {
+            arrival: clock.wall_time(message.at),
+            trace_id: tracer.trace_of(message.writer, message.number),
+            message,
         });
         let mut output = Output {
             logs: logs.collect(),

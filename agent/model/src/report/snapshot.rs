@@ -18,6 +18,9 @@ pub use crate::derive::inside::source::Source;
 pub use crate::derive::robot::diagnostics::DiagnosticFacts;
 pub use crate::derive::robot::logs::{LogFacts, LogMessage, NodeLogFacts};
 pub use crate::derive::robot::parameters::{ParameterFacts, ParametersFacts};
+pub use crate::derive::robot::transforms::{
+    Broadcaster, EdgeFacts, Jumps, TransformFacts, TreeFacts,
+};
 pub use crate::derive::services::action::GoalCounts;
 pub use crate::derive::services::facts::{ActionFacts, ServiceFacts};
 pub use crate::derive::services::latency::LatencyFacts;
@@ -82,6 +85,8 @@ pub struct Snapshot {
     pub logs: LogFacts,
     /// Diagnostics.
     pub diagnostics: DiagnosticFacts,
+    /// Transforms.
+    pub transforms: TransformFacts,
     /// Parameters of nodes.
     pub parameters: ParametersFacts,
     /// Problems of the graph; the same value while nothing changes.

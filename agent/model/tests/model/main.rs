@@ -33,6 +33,7 @@ mod robot;
 mod room;
 mod services;
 mod start_orders;
+mod transforms;
 mod transports;
 mod type_objects;
 mod zenoh;

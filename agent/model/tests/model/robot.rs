@@ -223,7 +223,7 @@ fn messages_that_are_not_taken_in_time_are_counted() {
     }
     let output = node.domain.observer.drain();
     assert_eq!((output.logs.len(), output.lost_logs), (1000, 5));
-    assert_eq!(&*output.logs[0].2.text, "message 0");
+    assert_eq!(&*output.logs[0].message.text, "message 0");
     node.log(20, "later");
     let output = node.domain.observer.drain();
     assert_eq!((output.logs.len(), output.lost_logs), (1, 0));

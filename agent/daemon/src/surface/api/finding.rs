@@ -175,6 +175,19 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
             level: level.label().into(),
             message: Cow::Borrowed(message),
         },
+        diagnosis::Diagnosis::TransformFault {
+            namespace, fault, ..
+        } => Diagnosis::TransformFault {
+            namespace: Cow::Borrowed(namespace),
+            fault: fault.kind.label().into(),
+            parent: Cow::Borrowed(&fault.parent),
+            child: Cow::Borrowed(&fault.child),
+            names: fault
+                .names
+                .iter()
+                .map(|name| Cow::Borrowed(&**name))
+                .collect(),
+        },
         diagnosis::Diagnosis::SlowChain {
             from, max_latency, ..
         } => Diagnosis::SlowChain {

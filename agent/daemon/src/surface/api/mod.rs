@@ -44,6 +44,7 @@ mod server;
 mod services;
 mod snapshots;
 mod topics;
+mod transforms;
 mod watch;
 mod why;
 
@@ -190,6 +191,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(needs(Access::All, Access::All, logs::routes()))
         .merge(needs(Access::All, Access::All, diagnostics::routes()))
         .merge(needs(Access::All, Access::All, ros_parameters::routes()))
+        .merge(transforms::routes())
         .merge(health::routes())
         .merge(needs(Access::All, Access::All, reload::routes()))
         .merge(needs(Access::All, Access::All, page::routes()))

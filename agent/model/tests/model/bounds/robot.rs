@@ -1,7 +1,7 @@
 //! A storm of log messages from ever new writers and nodes.
 
 use ros2probe_testing::robot_log::{DDS_TYPE, log};
-use ros2probe_testing::{robot_diagnostics, robot_parameters};
+use ros2probe_testing::{robot_diagnostics, robot_parameters, robot_transforms};
 
 use super::*;
 
@@ -47,7 +47,7 @@ pub(super) fn parts(observer: &mut Observer, dice: &mut Dice, now: u64) {
     let mut prefix = [7; 12];
     prefix[11] = dice.pick(40) as u8;
     let prefix = GuidPrefix(prefix);
-    let (number, kind) = (dice.pick(60), dice.pick(3));
+    let (number, kind) = (dice.pick(60), dice.pick(5));
     let guid = Guid::new(prefix, EntityId([kind as u8, 4, number as u8, 3]));
     let message = Message::from(prefix);
     let (topic, type_name) = [
@@ -56,6 +56,11 @@ pub(super) fn parts(observer: &mut Observer, dice: &mut Dice, now: u64) {
         (
             format!("rq/n{number}/set_parametersRequest"),
             robot_parameters::REQUEST,
+        ),
+        ("rt/tf".to_owned(), robot_transforms::DDS_TYPE),
+        (
+            format!("rt/r{number}/tf_static"),
+            robot_transforms::DDS_TYPE,
         ),
     ][kind as usize]
         .clone();
@@ -91,6 +96,20 @@ pub(super) fn parts(observer: &mut Observer, dice: &mut Dice, now: u64) {
                         0 => robot_parameters::event(&node, &integers, &[], &[]),
                         _ => robot_parameters::event(&node, &[], &integers, &[]),
                     }
+                }
+                3 | 4 => {
+                    let parent = format!("frame{}", dice.pick(300));
+                    let children = [0; 6].map(|_| format!("frame{}", dice.pick(3000)));
+                    let all = children
+                        .each_ref()
+                        .map(|child| robot_transforms::Transform {
+                            parent: &parent,
+                            child,
+                            stamp: dice.pick(1 << 40),
+                            x: dice.roll() as f64,
+                            yaw: dice.roll() as f64,
+                        });
+                    robot_transforms::transforms(&all)
                 }
                 _ => robot_parameters::request(&[(&*name, value); 3], true),
             };

@@ -14,6 +14,7 @@ use crate::missed_announcements;
 use ros2probe_api::live::{Finding, Severity};
 use ros2probe_model::facts::diagnosis::{Diagnosis, Policies, Policy, TopicKey};
 use ros2probe_model::facts::names::NodeName;
+use ros2probe_model::facts::robot::{TransformFault, TransformFaultKind};
 use ros2probe_model::graph::zenoh::Unseen;
 use ros2probe_model::measure::history::Past;
 use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot, TopicFacts, WatchState};
@@ -57,6 +58,45 @@ fn of_node(
         node: ids.node(domain_id, node),
         ..finding(kind, Severity::Warning, &about, text)
     }
+}
+
+/// Returns a fault of transforms.
+fn of_transforms(
+    kind: &'static str,
+    domain_id: DomainId,
+    namespace: &str,
+    fault: &TransformFault,
+) -> Finding {
+    let edge = format!("the transform {} -> {}", fault.parent, fault.child);
+    let names = fault.names.join(", ");
+    let (text, remedy) = match fault.kind {
+        TransformFaultKind::Silent => (
+            format!("{edge} is no longer broadcast, although {names} runs"),
+            "look at the log and the inputs of that node",
+        ),
+        TransformFaultKind::SeveralBroadcasters => (
+            format!("{edge} has several broadcasters, which contradict each other: {names}"),
+            "let one of them broadcast it",
+        ),
+        TransformFaultKind::TimeWentBack => (
+            format!("{edge} has a stamp before an earlier one, from {names}"),
+            "look at the clock of that host, and for a bag that plays in a loop",
+        ),
+        TransformFaultKind::Apart => (
+            format!("the frames are in several trees, with the roots {names}"),
+            "find the missing transform between them with `rp tf`",
+        ),
+    };
+    let about = format!(
+        "{domain_id}|{namespace}|{}|{}",
+        fault.child,
+        fault.kind.label()
+    );
+    Finding {
+        domain_id: Some(domain_id.0),
+        ..finding(kind, Severity::Warning, &about, text)
+    }
+    .with_remedy(remedy)
 }
 
 pub(super) fn finding(
@@ -370,6 +410,11 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             };
             found.with_remedy("`rp diag --verbose` prints its values")
         }
+        Diagnosis::TransformFault {
+            domain_id,
+            namespace,
+            fault,
+        } => of_transforms(kind, *domain_id, namespace, fault),
         Diagnosis::LossyLink { link, .. } => {
             let text = format!(
                 "TCP repeats many segments from {} to {} ({}): the network between them loses packets",

@@ -131,6 +131,7 @@ impl Figures<'_> {
                 | Diagnosis::LossyLink { .. }
                 | Diagnosis::LogErrors { .. }
                 | Diagnosis::DiagnosticError { .. }
+                | Diagnosis::TransformFault { .. }
                 | Diagnosis::SlowChain { .. } => {}
             }
         }
