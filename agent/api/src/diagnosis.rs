@@ -209,6 +209,8 @@ pub enum Diagnosis<'a> {
         parent: Cow<'a, str>,
         /// Child frame of the edge; empty if the fault is `apart`.
         child: Cow<'a, str>,
+        /// Edges with this fault from the same broadcasters.
+        edges: u64,
         /// Nodes that broadcast the edge, or the roots of the trees.
         names: Vec<Cow<'a, str>>,
     },

@@ -490,6 +490,7 @@ fn diagnoses() -> Diagnoses {
                 child: "base_link".into(),
                 parent: "odom".into(),
                 kind: TransformFaultKind::Silent,
+                edges: 3,
                 names: vec!["/ekf".into()],
             },
         },

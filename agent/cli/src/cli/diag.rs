@@ -13,6 +13,7 @@ use ros2probe_api::diagnostics::{DiagnosticStatus, Diagnostics};
 use ros2probe_daemon::escape::visible;
 use ros2probe_wire::diagnostics::DiagnosticLevel;
 
+use super::shared::names_of;
 use super::{Output, UserError};
 
 /// Interval between two views.
@@ -80,6 +81,7 @@ impl Diag {
             }
             if is_first && printed == 0 {
                 eprintln!("rp: {}", self.nothing(&answer));
+                names_of(&agent, domain_id)?;
             }
             if !self.follow {
                 return Ok(ExitCode::SUCCESS);

@@ -13,6 +13,7 @@ use ros2probe_api::path::encoded;
 use ros2probe_daemon::escape::visible;
 
 use super::Output;
+use super::shared::names_of;
 
 /// Interval between two views.
 const INTERVAL: Duration = Duration::from_millis(500);
@@ -65,7 +66,8 @@ impl Param {
 
 impl Dump {
     fn ask(self) -> Result<ExitCode> {
-        let path = path(self.target.domain()?, self.node.as_deref());
+        let domain_id = self.target.domain()?;
+        let path = path(domain_id, self.node.as_deref());
         let agent = Agent::reach(&self.target)?;
         let answer: Parameters<'_> = agent.get(&path)?;
         note(&answer);
@@ -73,6 +75,7 @@ impl Dump {
             eprintln!(
                 "rp: no parameters were seen: nodes announce them when they start or change them"
             );
+            names_of(&agent, domain_id)?;
         }
         let mut output = Output::new();
         let mut node = "";
@@ -90,7 +93,8 @@ impl Dump {
 
 impl Changes {
     fn ask(self) -> Result<ExitCode> {
-        let path = path(self.target.domain()?, self.node.as_deref());
+        let domain_id = self.target.domain()?;
+        let path = path(domain_id, self.node.as_deref());
         let agent = Agent::reach(&self.target)?;
         let mut output = Output::new();
         let mut printed: Vec<ParameterChange<'static>> = Vec::new();
@@ -102,6 +106,7 @@ impl Changes {
             }
             if is_first && answer.changes.is_empty() && !self.follow {
                 eprintln!("rp: no changes were seen since the agent started");
+                names_of(&agent, domain_id)?;
             }
             // The list is in the order of time, and old changes leave it at its begin.
             let last = printed.last();

@@ -10,6 +10,7 @@ use ros2probe::frames::Frames;
 use ros2probe_api::transforms::{TransformTree, Transforms};
 use ros2probe_daemon::escape::visible;
 
+use super::shared::names_of;
 use super::{Output, UserError};
 
 /// `rp tf`.
@@ -52,7 +53,8 @@ fn rate(text: &str) -> Result<f64, UnsupportedRate> {
 
 impl Tf {
     pub(crate) fn ask(self) -> Result<ExitCode> {
-        let path = format!("/transforms?domain_id={}", self.target.domain()?);
+        let domain_id = self.target.domain()?;
+        let path = format!("/transforms?domain_id={domain_id}");
         let agent = Agent::reach(&self.target)?;
         let mut output = Output::new();
         let frames = self
@@ -65,10 +67,16 @@ impl Tf {
         }
         let Some((source, target)) = frames else {
             self.print(&answer, &mut output)?;
+            if answer.trees.is_empty() {
+                names_of(&agent, domain_id)?;
+            }
             return Ok(ExitCode::SUCCESS);
         };
         let mut answer = answer;
         loop {
+            if answer.trees.is_empty() {
+                names_of(&agent, domain_id)?;
+            }
             let tree = self.only(&answer)?;
             let between = Frames::new(tree).between(source, target).map_err(|error| {
                 let note = unread(tree).unwrap_or_default();

@@ -510,6 +510,7 @@ fn finding(finding: &Diagnosis) -> Values {
             ("fault", Some(text(fault.kind.label()))),
             ("parent", Some(text(&fault.parent))),
             ("child", Some(text(&fault.child))),
+            ("edges", number(fault.edges as u64)),
             ("names", list(&fault.names)),
         ],
         Diagnosis::LossyLink {

@@ -71,6 +71,7 @@ const FINDING: &[&str] = &[
     "fault",
     "parent",
     "child",
+    "edges",
     "names",
     "from",
     "max_latency_ms",

@@ -113,6 +113,8 @@ pub struct TransformFault {
     pub parent: Arc<str>,
     /// Kind of the fault.
     pub kind: TransformFaultKind,
+    /// Edges with this fault and these names; the fault has the first one.
+    pub edges: usize,
     /// Nodes that broadcast the edge, or the roots of the trees; at most four.
     pub names: Vec<Arc<str>>,
 }

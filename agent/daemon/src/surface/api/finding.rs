@@ -182,6 +182,7 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
             fault: fault.kind.label().into(),
             parent: Cow::Borrowed(&fault.parent),
             child: Cow::Borrowed(&fault.child),
+            edges: fault.edges as u64,
             names: fault
                 .names
                 .iter()

@@ -276,15 +276,24 @@ impl Tree {
         is_whole: bool,
         is_paused: &impl Fn(Guid) -> bool,
     ) -> bool {
-        let mut faults = Vec::new();
+        let mut faults: Vec<TransformFault> = Vec::new();
         for (child, edge) in &mut self.edges {
             edge.end_second();
             if let Some(kind) = edge.fault(now, is_paused) {
+                let names = edge.names();
+                // One broadcaster may have many edges.
+                let same = faults.iter_mut();
+                let mut same = same.filter(|each| each.kind == kind && each.names == names);
+                if let Some(same) = same.next() {
+                    same.edges += 1;
+                    continue;
+                }
                 faults.push(TransformFault {
                     child: Arc::clone(child),
                     parent: edge.parent(),
                     kind,
-                    names: edge.names(),
+                    edges: 1,
+                    names,
                 });
             }
         }
@@ -297,6 +306,7 @@ impl Tree {
                         child: Arc::default(),
                         parent: Arc::default(),
                         kind: TransformFaultKind::Apart,
+                        edges: 0,
                         names: roots.into_iter().take(NAMED).collect(),
                     });
                 }

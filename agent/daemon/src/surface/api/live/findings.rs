@@ -67,7 +67,11 @@ fn of_transforms(
     namespace: &str,
     fault: &TransformFault,
 ) -> Finding {
-    let edge = format!("the transform {} -> {}", fault.parent, fault.child);
+    let others = match fault.edges {
+        0 | 1 => String::new(),
+        edges => format!(" (and {} others)", edges - 1),
+    };
+    let edge = format!("the transform {} -> {}{others}", fault.parent, fault.child);
     let names = fault.names.join(", ");
     let (text, remedy) = match fault.kind {
         TransformFaultKind::Silent => (
