@@ -23,6 +23,8 @@ pub mod backends;
 pub mod cursor;
 pub mod delivery;
 #[cfg(feature = "alloc")]
+pub mod diagnostics;
+#[cfg(feature = "alloc")]
 pub mod discovery;
 mod domain;
 #[cfg(feature = "alloc")]
@@ -39,9 +41,13 @@ pub mod log;
 pub mod names;
 pub mod parameters;
 #[cfg(feature = "alloc")]
+mod plain;
+#[cfg(feature = "alloc")]
 pub mod qos;
 pub mod quic;
 pub mod record;
+#[cfg(feature = "alloc")]
+pub mod ros_parameters;
 pub mod rtps;
 pub mod rtps_tcp;
 #[cfg(test)]
@@ -49,6 +55,8 @@ mod testing;
 #[cfg(feature = "alloc")]
 mod text;
 pub mod time;
+#[cfg(feature = "alloc")]
+pub mod transforms;
 pub mod walk;
 #[cfg(feature = "alloc")]
 pub mod xcdr2;

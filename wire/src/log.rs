@@ -3,7 +3,7 @@
 //! The layout is the same in all distributions since Foxy: stamp, level, name of the logger, text,
 //! file, function, and line.
 
-use crate::cursor::{Cursor, WireError};
+use crate::cursor::WireError;
 use crate::text;
 
 /// Name of the type, as ROS writes it.
@@ -98,22 +98,16 @@ impl<'a> Log<'a> {
         Ok(Self {
             stamp: (stamp.0.cast_signed(), stamp.1),
             level: LogLevel::of(level),
-            logger: octets(&mut cursor, "name")?,
-            text: octets(&mut cursor, "msg")?,
-            file: octets(&mut cursor, "file")?,
-            function: octets(&mut cursor, "function")?,
+            logger: text::unterminated(&mut cursor, "name")?,
+            text: text::unterminated(&mut cursor, "msg")?,
+            file: text::unterminated(&mut cursor, "file")?,
+            function: text::unterminated(&mut cursor, "function")?,
             line: {
                 cursor.align(4);
                 cursor.u32("line")?
             },
         })
     }
-}
-
-/// Reads a string without its terminator.
-fn octets<'a>(cursor: &mut Cursor<'a>, what: &'static str) -> Result<&'a [u8], WireError> {
-    let bytes = text::octets(cursor, what)?;
-    Ok(bytes.strip_suffix(b"\0").unwrap_or(bytes))
 }
 
 #[cfg(test)]

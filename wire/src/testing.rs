@@ -129,14 +129,29 @@ impl Encoder {
         }
     }
 
+    /// Writes eight bytes with this alignment.
+    pub(crate) fn wide(&mut self, value: u64, alignment: usize) -> &mut Self {
+        let length = self.bytes.len().next_multiple_of(alignment);
+        self.bytes.resize(length, 0);
+        match self.endianness {
+            Endianness::Big => self.raw(&value.to_be_bytes()),
+            Endianness::Little => self.raw(&value.to_le_bytes()),
+        }
+    }
+
     pub(crate) fn sequence_number(&mut self, value: i64) -> &mut Self {
         self.u32((value.cast_unsigned() >> 32) as u32)
             .u32(value as u32)
     }
 
     pub(crate) fn string(&mut self, text: &str) -> &mut Self {
+        self.unpadded(text).align()
+    }
+
+    /// Writes a string without the padding before the next field.
+    pub(crate) fn unpadded(&mut self, text: &str) -> &mut Self {
         self.u32(u32::try_from(text.len() + 1).unwrap());
-        self.raw((text.to_string() + "\0").as_bytes()).align()
+        self.raw((text.to_string() + "\0").as_bytes())
     }
 
     /// Writes one parameter and pads its value.

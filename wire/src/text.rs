@@ -45,13 +45,27 @@ pub(crate) fn octets<'a>(
     cursor: &mut Cursor<'a>,
     what: &'static str,
 ) -> Result<&'a [u8], WireError> {
+    let bytes = unpadded(cursor, what)?;
+    cursor.align(4);
+    Ok(bytes)
+}
+
+fn unpadded<'a>(cursor: &mut Cursor<'a>, what: &'static str) -> Result<&'a [u8], WireError> {
     cursor.align(4);
     let start = *cursor;
     let length =
         usize::try_from(cursor.u32(what)?).map_err(|_| start.error(what, Reason::BadLength))?;
-    let bytes = cursor.take(what, length)?;
-    cursor.align(4);
-    Ok(bytes)
+    cursor.take(what, length)
+}
+
+/// Reads a CDR string of any encoding, without its terminator. Unlike [`octets`], it leaves the
+/// padding before the next field, whose alignment may be smaller.
+pub(crate) fn unterminated<'a>(
+    cursor: &mut Cursor<'a>,
+    what: &'static str,
+) -> Result<&'a [u8], WireError> {
+    let bytes = unpadded(cursor, what)?;
+    Ok(bytes.strip_suffix(b"\0").unwrap_or(bytes))
 }
 
 /// Returns whether a name can stand unquoted on a terminal, in a label and in a log line: no

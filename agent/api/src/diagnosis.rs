@@ -186,6 +186,34 @@ pub enum Diagnosis<'a> {
         /// Text of the last one of these.
         text: Cow<'a, str>,
     },
+    /// A part of the robot has been in error, or without a new status, for at least 5 s.
+    DiagnosticError {
+        /// Node that publishes its diagnostics.
+        ros_node: Option<Cow<'a, str>>,
+        /// Name of the part.
+        name: Cow<'a, str>,
+        /// Id of its hardware; often empty.
+        hardware_id: Cow<'a, str>,
+        /// `error` or `stale`.
+        level: Cow<'static, str>,
+        /// Message when it was reported.
+        message: Cow<'a, str>,
+    },
+    /// Transforms between frames are missing, contradict each other, or are in several trees.
+    TransformFault {
+        /// Namespace of the topics; empty for `/tf`.
+        namespace: Cow<'a, str>,
+        /// `silent`, `several_broadcasters`, `time_went_back` or `apart`.
+        fault: Cow<'static, str>,
+        /// Parent frame of the edge; empty if the fault is `apart`.
+        parent: Cow<'a, str>,
+        /// Child frame of the edge; empty if the fault is `apart`.
+        child: Cow<'a, str>,
+        /// Edges with this fault from the same broadcasters.
+        edges: u64,
+        /// Nodes that broadcast the edge, or the roots of the trees.
+        names: Vec<Cow<'a, str>>,
+    },
     /// The clock of another host differs much from this host's.
     ClocksApart {
         /// Name or address of the other host.
@@ -231,6 +259,8 @@ impl Diagnosis<'_> {
             Self::SharedMachineId { .. } => "shared_machine_id",
             Self::LossyLink { .. } => "lossy_link",
             Self::LogErrors { .. } => "log_errors",
+            Self::DiagnosticError { .. } => "diagnostic_error",
+            Self::TransformFault { .. } => "transform_fault",
             Self::ClocksApart { .. } => "clocks_apart",
             Self::SlowChain { .. } => "slow_chain",
         }

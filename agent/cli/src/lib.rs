@@ -21,6 +21,7 @@ pub mod chain;
 pub mod client;
 pub mod discover;
 pub mod doctor;
+pub mod frames;
 pub mod inside;
 pub mod learn;
 pub mod ros2;

@@ -37,7 +37,9 @@ use crate::surface::ros2_daemon::Ros2Daemon;
 use crate::surface::{Exposition, Format, MetricSources};
 use crate::watches::Watches;
 use crate::{control, file, memory};
-use ros2probe_metrics::otlp::{self, Exporter, Host, Inputs, SpanQueue, SpanSink};
+use ros2probe_metrics::otlp::{
+    self, Exporter, Host, Inputs, NodeLogQueue, NodeLogSink, SpanQueue, SpanSink,
+};
 
 /// Default configuration file.
 pub const DEFAULT_CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
@@ -83,6 +85,8 @@ pub struct Components<'a> {
     pub sources: MetricSources,
     /// Spans of sampled messages that wait for export.
     pub spans: Arc<SpanQueue>,
+    /// Messages of nodes' logs for the exporter.
+    pub node_logs: Arc<NodeLogQueue>,
     /// Watched topics.
     pub watches: Arc<Watches>,
     /// Writer of the discovery state.
@@ -153,6 +157,11 @@ impl Components<'_> {
             latest: Arc::clone(&sources.latest),
             events: Arc::clone(&sources.events),
             limits: Arc::clone(&sources.limits),
+            node_logs: NodeLogSink {
+                queue: self.node_logs,
+                exports: Arc::clone(&sources.exports),
+                level: config.otlp.node_logs,
+            },
             spans: SpanSink {
                 queue: self.spans,
                 exports: sources.exports,
@@ -227,12 +236,14 @@ pub fn run(options: Options) -> Result<()> {
     let worker = worker(&mut source)?;
     let responder = Responder::start().context("cannot start the thread that answers requests")?;
     let spans = Arc::<SpanQueue>::default();
+    let node_logs = Arc::<NodeLogQueue>::default();
     let ros2_daemon = ros2_daemon(&config, options.report)?;
     let inputs = Inputs {
         metrics: Arc::new(sources.clone()),
         events: Arc::<EventLog>::clone(&sources.events),
         spans: Arc::clone(&spans),
         log: log.exported_lines(),
+        node_logs: Arc::clone(&node_logs),
         exports: Arc::clone(&sources.exports),
     };
     let exporter = export.map(|export| Exporter::start(export, inputs, privilege::spawn_export));
@@ -250,6 +261,7 @@ pub fn run(options: Options) -> Result<()> {
         observer,
         sources: sources.clone(),
         spans,
+        node_logs,
         watches: Arc::clone(&watches),
         keeper: state
             .keep(&watches)

@@ -409,6 +409,7 @@ const fn group(class: Class) -> &'static str {
         Class::Loss => "ros2.message.*",
         Class::Expectation => "ros2.topic.*",
         Class::Diagnosis => "ros2.graph.*",
+        Class::Robot => "ros2.robot.*",
     }
 }
 

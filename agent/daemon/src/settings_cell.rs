@@ -23,6 +23,8 @@ pub struct Settings {
     pub histograms: bool,
     /// Whether watched topics have series per writer.
     pub per_writer: bool,
+    /// Values of diagnostics with a metric: patterns of name, slash and key.
+    pub diagnostic_values: Vec<String>,
     /// Caps, which never change after the start.
     pub limits: Limits,
 }
@@ -44,6 +46,7 @@ impl Settings {
             watches: config.watches.iter().cloned().map(Arc::new).collect(),
             histograms: config.metrics.histograms,
             per_writer: config.metrics.per_writer,
+            diagnostic_values: config.diagnostic_values.clone(),
             limits: config.limits,
         }
     }

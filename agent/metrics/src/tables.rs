@@ -5,6 +5,10 @@ ros2probe_model::tables! {
     WaitingSpans {
         name: "otlp.spans", entries: 4096, effect: "dropped", reported: "`ros2probe_otlp_dropped_total`",
     }
+    /// Messages of nodes' logs that wait for export, at most 1 KiB each
+    WaitingNodeLogs {
+        name: "otlp.node_logs", entries: 1024, effect: "dropped", reported: "`ros2probe_otlp_dropped_total`",
+    }
     /// Series with a start time
     SeriesStarts { name: "otlp.starts", entries: 200_000, effect: "further ones start with the agent" }
 }

@@ -24,6 +24,6 @@ pub fn log(level: u8, logger: &str, text: &[u8]) -> Vec<u8> {
     bytes
 }
 
-fn align(bytes: &mut Vec<u8>) {
+pub(crate) fn align(bytes: &mut Vec<u8>) {
     bytes.resize(bytes.len().next_multiple_of(4), 0);
 }

@@ -23,6 +23,8 @@ use ros2probe_model::facts::histogram::Histogram;
 use ros2probe_model::facts::link::{LinkKey, LinkProtocol};
 use ros2probe_model::facts::loss_share::LossShare;
 use ros2probe_model::facts::model_time::ModelTime;
+use ros2probe_model::facts::names::NodeName;
+use ros2probe_model::facts::robot::{TransformFault, TransformFaultKind};
 use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::facts::watch::Watch;
@@ -30,17 +32,20 @@ use ros2probe_model::graph::discovery::Addresses;
 use ros2probe_model::graph::zenoh::{Counters, ZenohFacts};
 use ros2probe_model::measure::links::LinkFacts;
 use ros2probe_model::report::snapshot::{
-    AcknowledgementFacts, ActionFacts, Breakdown, ChurnCount, ClockFacts, ClockOffset,
-    DecodeErrorCount, Delivered, DeliveryFacts, Direction, EarlierCounts, EndpointFacts,
-    GoalCounts, LatencyFacts, LogFacts, LogMessage, Measurement, NodeFacts, NodeLogFacts,
-    ParticipantFacts, PeerClock, ProcessFacts, SampledFacts, ServiceFacts, Snapshot, SocketFacts,
-    Source, Subscriber, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts,
-    WatchFacts, WatchState, WatchedTopicFacts,
+    AcknowledgementFacts, ActionFacts, Breakdown, Broadcaster, ChurnCount, ClockFacts, ClockOffset,
+    DecodeErrorCount, Delivered, DeliveryFacts, DiagnosticFacts, DiagnosticStatus, Direction,
+    EarlierCounts, EdgeFacts, EndpointFacts, GoalCounts, Jumps, LatencyFacts, LogFacts, LogMessage,
+    Measurement, NodeFacts, NodeLogFacts, ParameterChange, ParameterFacts, ParametersFacts,
+    ParticipantFacts, PeerClock, ProcessFacts, Requester, SampledFacts, ServiceFacts, Snapshot,
+    SocketFacts, Source, Subscriber, TableFacts, TopicFacts, TransformFacts, Transport,
+    TransportCount, TreeFacts, UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
 };
+use ros2probe_wire::diagnostics::DiagnosticLevel;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::log::LogLevel;
 use ros2probe_wire::qos::{History, HistoryKind, Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::transforms::Pose;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 /// Returns a chain of 100 messages from /points to /cmd_vel, configured with a limit of 15 ms.
@@ -111,6 +116,90 @@ fn chains() -> ChainsFacts {
             exemplars,
             hops,
         }],
+    }
+}
+
+/// Returns the diagnostics of one part, which is in error.
+fn diagnostics(writer: Guid) -> DiagnosticFacts {
+    let at = ModelTime::from_nanoseconds(1_699_999_999_000_000_000);
+    DiagnosticFacts {
+        are_read: true,
+        statuses: vec![Arc::new(DiagnosticStatus {
+            domain_id: DomainId(0),
+            topic: "/diagnostics".into(),
+            name: "lidar: connection".into(),
+            hardware_id: "vlp16".into(),
+            node: Some("/lidar".into()),
+            writer,
+            level: DiagnosticLevel::Error,
+            message: "no data".into(),
+            values: vec![("packet rate (Hz)".into(), "0.5".into())],
+            at,
+            since: at,
+        })],
+    }
+}
+
+/// Returns a tree with one edge at 50 Hz.
+fn transforms(writer: Guid) -> TransformFacts {
+    TransformFacts {
+        are_read: true,
+        trees: vec![TreeFacts {
+            domain_id: DomainId(0),
+            namespace: "".into(),
+            edges: vec![EdgeFacts {
+                parent: "odom".into(),
+                child: "base_link".into(),
+                is_static: false,
+                broadcasters: vec![Broadcaster {
+                    writer,
+                    node: Some("/ekf".into()),
+                }],
+                count: 500,
+                rate: Some(50.0),
+                at: ModelTime::from_nanoseconds(1_699_999_999_000_000_000),
+                stamp: (1_699_999_999, 0),
+                pose: Pose {
+                    translation: [1.0, 0.0, 0.0],
+                    rotation: [0.0, 0.0, 0.0, 1.0],
+                },
+                jumps: Jumps {
+                    translation: 1,
+                    rotation: 0,
+                    time: 0,
+                },
+            }],
+            unread_static: 1,
+        }],
+    }
+}
+
+/// Returns one parameter, which a client changed.
+fn parameters(writer: Guid) -> ParametersFacts {
+    let at = ModelTime::from_nanoseconds(1_699_999_999_000_000_000);
+    let (domain_id, node) = (DomainId(0), NodeName::from("/lidar"));
+    ParametersFacts {
+        are_read: true,
+        known: vec![ParameterFacts {
+            domain_id,
+            node: node.clone(),
+            name: "rpm".into(),
+            value: "600".into(),
+            at,
+        }],
+        changes: vec![Arc::new(ParameterChange {
+            at,
+            domain_id,
+            node: node.clone(),
+            name: "rpm".into(),
+            before: Some("300".into()),
+            value: Some("600".into()),
+            requested_by: Some(Requester {
+                node: Some("/tuner".into()),
+                writer,
+            }),
+        })],
+        counts: vec![(domain_id, node, 1)],
     }
 }
 
@@ -225,6 +314,9 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             measurement: measurement(),
         }],
         logs: logs(guid),
+        diagnostics: diagnostics(guid),
+        parameters: parameters(guid),
+        transforms: transforms(guid),
         clocks: clocks(),
         services: vec![service()],
         actions: vec![action()],
@@ -406,6 +498,26 @@ fn diagnoses() -> Diagnoses {
             node: "/lidar".into(),
             errors: 10,
             text: "no data".into(),
+        },
+        Diagnosis::DiagnosticError {
+            domain_id: DomainId(0),
+            topic: "/diagnostics".into(),
+            node: Some("/lidar".into()),
+            name: "lidar: connection".into(),
+            hardware_id: "vlp16".into(),
+            level: DiagnosticLevel::Error,
+            message: "no data".into(),
+        },
+        Diagnosis::TransformFault {
+            domain_id: DomainId(0),
+            namespace: "".into(),
+            fault: TransformFault {
+                child: "base_link".into(),
+                parent: "odom".into(),
+                kind: TransformFaultKind::Silent,
+                edges: 3,
+                names: vec!["/ekf".into()],
+            },
         },
         Diagnosis::ClocksApart {
             peer: "camera-pc".into(),

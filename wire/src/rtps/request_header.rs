@@ -18,7 +18,10 @@ pub struct RequestHeader {
 
 impl RequestHeader {
     /// Length of the encapsulation header (RTPS 2.5, 10.2) and of this header together, in bytes.
-    pub const END: usize = 20;
+    pub const END: usize = 4 + Self::LENGTH;
+
+    /// Length of this header, in bytes.
+    pub const LENGTH: usize = 16;
 
     /// Parses the start of a serialized payload, encapsulation included.
     ///

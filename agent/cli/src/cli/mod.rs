@@ -6,6 +6,7 @@ mod attach;
 mod bag;
 mod chain;
 mod convert;
+mod diag;
 mod discover;
 mod doctor;
 mod echo;
@@ -20,12 +21,14 @@ mod node;
 mod notes;
 mod output;
 mod page;
+mod param;
 mod rates;
 mod record;
 mod reference;
 mod run;
 mod service;
 mod shared;
+mod tf;
 mod top;
 mod topic;
 mod why;
@@ -92,6 +95,12 @@ pub(crate) enum Question {
     Chain(chain::Chain),
     /// Print what nodes log, and follow it
     Log(log::Log),
+    /// Print the diagnostics of the robot's parts
+    Diag(diag::Diag),
+    /// Print parameters of nodes and their changes
+    Param(param::Param),
+    /// Print the trees of frames, or the transform between two of them
+    Tf(tf::Tf),
     /// Check what is visible on this host and what is not, with remedies
     Doctor(doctor::Doctor),
     /// Show a robot's topics live in the terminal: rates, losses, latencies, problems
@@ -122,6 +131,9 @@ impl Question {
             Self::Action(action) => action.ask(),
             Self::Chain(chain) => chain.ask(),
             Self::Log(log) => log.ask(),
+            Self::Diag(diag) => diag.ask(),
+            Self::Param(param) => param.ask(),
+            Self::Tf(tf) => tf.ask(),
             Self::Doctor(doctor) => doctor.ask(),
             Self::Top(top) => top.ask(),
             Self::Inside(inside) => inside.ask(),
@@ -142,6 +154,9 @@ impl Question {
             | Self::Action(_)
             | Self::Chain(_)
             | Self::Log(_)
+            | Self::Diag(_)
+            | Self::Param(_)
+            | Self::Tf(_)
             | Self::Doctor(_)
             | Self::Inside(_)
             | Self::Why(_)

@@ -250,6 +250,7 @@ fn assemble(
         observer: Observer::new(settings),
         sources,
         spans: Arc::default(),
+        node_logs: Arc::default(),
         watches: Arc::new(watches.map_err(io::Error::other)?),
         keeper: None,
         // `rp bag record` records a capture, not the agent that replays it.

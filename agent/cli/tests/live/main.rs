@@ -38,6 +38,7 @@ mod prometheus;
 mod rates;
 mod record;
 mod robot;
+mod robot_parts;
 mod rtps_tcp;
 mod samples;
 mod shm;

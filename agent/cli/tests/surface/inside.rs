@@ -100,6 +100,7 @@ fn page(observer: &Observer, source: Option<InsideSourceFacts>) -> String {
         watches: vec![Arc::new(Watch::named("/**").unwrap())],
         histograms: true,
         per_writer: false,
+        diagnostic_values: Vec::new(),
         limits: Limits::default(),
     };
     let sources = MetricSources::new(SourceKind::Host, settings);

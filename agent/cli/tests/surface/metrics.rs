@@ -40,6 +40,7 @@ fn settings() -> Settings {
         })],
         histograms: true,
         per_writer: true,
+        diagnostic_values: vec!["lidar*/packet rate*".to_owned()],
         limits: Limits::default(),
     }
 }
@@ -145,14 +146,28 @@ fn the_tables_in_the_book_equal_those_of_the_sources() {
         ];
         derived.iter().any(|name| table.name.starts_with(name))
     };
+    let is_of_robot = |table: &Table| {
+        let of_robot = [
+            "robot_",
+            "log_",
+            "diagnostics",
+            "parameter",
+            "changed_",
+            "transform",
+            "clock",
+        ];
+        of_robot.iter().any(|name| table.name.starts_with(name))
+    };
     let declared = |page, tables: &[Table]| {
         let (begin, end) = ("/tables.rs -->\n", "<!-- tables: end");
         (page, begin, end, markdown::tables(tables))
     };
     let tables = |page, derived| {
-        let tables = ALL.iter().filter(|table| is_derived(table) == derived);
+        let tables = ALL.iter().filter(|table| !is_of_robot(table));
+        let tables = tables.filter(|table| is_derived(table) == derived);
         declared(page, &tables.copied().collect::<Vec<_>>())
     };
+    let of_robot: Vec<_> = (ALL.iter().copied()).filter(is_of_robot).collect();
     let agent = [
         ros2probe_daemon::tables::ALL,
         ros2probe_metrics::tables::ALL,
@@ -179,6 +194,7 @@ fn the_tables_in_the_book_equal_those_of_the_sources() {
         ),
         tables("limits-model.md", false),
         tables("limits-tables.md", true),
+        declared("limits-robot.md", &of_robot),
         declared("limits-capture.md", ros2probe_capture::tables::ALL),
         (
             "limits-tables.md",

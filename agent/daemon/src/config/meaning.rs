@@ -10,13 +10,15 @@ use std::time::Duration;
 use globset::Glob;
 use ros2probe_wire::DomainId;
 use ros2probe_wire::filter::PORT_CAPACITY;
+use ros2probe_wire::log::LogLevel;
 
 use super::check::check;
 use super::document::Node;
 use super::mistake::{Mistakes, Position};
 use super::shape::{
-    ApiShape, CaptureShape, ConfigShape, FoxgloveShape, MetricsShape, OtlpShape, RecordingsShape,
-    RobotShape, Ros2DaemonShape, SnapshotShape, Switch, WatchEntryShape, WatchShape,
+    ApiShape, CaptureShape, ConfigShape, FoxgloveShape, LogLevelShape, MetricsShape, OtlpShape,
+    RecordingsShape, RobotShape, Ros2DaemonShape, SnapshotShape, Switch, WatchEntryShape,
+    WatchShape,
 };
 use super::watch::{
     ExpectationValues, Expectations, PatternError, Retain, Watch, check_globs, check_pattern,
@@ -138,6 +140,7 @@ impl Reader {
         let limits = Limits::from(shape.limits.unwrap_or_default());
         let api = self.api(shape.api.unwrap_or_default());
         let has_token = api.token_file.is_some();
+        let robot = shape.robot.unwrap_or_default();
         Config {
             watches: self.watches(shape.watch.unwrap_or_default(), limits.watches),
             chains: self.chains(shape.chains.unwrap_or_default()),
@@ -153,7 +156,8 @@ impl Reader {
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             service_timeout: Duration::from_secs_f64(shape.service_timeout_s),
             retain: shape.retain,
-            robot: robot(&shape.robot.unwrap_or_default()),
+            robot: parts(&robot),
+            diagnostic_values: robot.diagnostic_values.unwrap_or_default(),
             state_directory: state(&shape.state_directory),
             log: shape.log,
         }
@@ -466,6 +470,11 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
         "state_directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => Err(
             InvalidText::RelativePath("`/var/lib/ros2probe`, `auto` or `off`"),
         ),
+        "robot.diagnostic_values[]" if text.len() > 256 || !text.contains('/') => {
+            Err(InvalidText::Unfit(
+                "name, slash and key, as in `battery*/Voltage*`, in at most 256 bytes",
+            ))
+        }
         "recordings.snapshots[].name" if !is_plain(text) => Err(InvalidText::Unfit(
             "1 to 64 letters, digits, `_` or `-`: it names directories",
         )),
@@ -568,8 +577,14 @@ fn metrics(shape: MetricsShape) -> MetricsSettings {
     }
 }
 
-fn robot(shape: &RobotShape) -> Parts {
-    let parts = [(Part::Logs, shape.logs), (Part::Clocks, shape.clocks)];
+fn parts(shape: &RobotShape) -> Parts {
+    let parts = [
+        (Part::Logs, shape.logs),
+        (Part::Diagnostics, shape.diagnostics),
+        (Part::Parameters, shape.parameters),
+        (Part::Transforms, shape.transforms),
+        (Part::Clocks, shape.clocks),
+    ];
     let on = parts
         .into_iter()
         .filter(|(_, switch)| *switch == Switch::On);
@@ -594,6 +609,13 @@ fn otlp(shape: OtlpShape) -> OtlpSettings {
         traces: shape.traces,
         late_calls: shape.late_calls.unwrap_or(false),
         log: shape.log.map(Level::filter),
+        node_logs: shape.node_logs.map(|level| match level {
+            LogLevelShape::Debug => LogLevel::Debug,
+            LogLevelShape::Info => LogLevel::Info,
+            LogLevelShape::Warn => LogLevel::Warn,
+            LogLevelShape::Error => LogLevel::Error,
+            LogLevelShape::Fatal => LogLevel::Fatal,
+        }),
         robot: shape.robot,
         attributes: shape.attributes.unwrap_or_default(),
     }

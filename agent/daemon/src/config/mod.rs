@@ -73,6 +73,8 @@ pub struct Config {
     pub retain: RetainChoice,
     /// What the agent reads of what the robot says.
     pub robot: Parts,
+    /// Values of diagnostics with a metric: patterns of name, slash and key.
+    pub diagnostic_values: Vec<String>,
     /// Directory of the saved discovery state.
     pub state_directory: StateChoice,
     /// Minimum severity that is logged.
@@ -437,6 +439,7 @@ impl Default for Config {
             service_timeout: Duration::from_secs_f64(defaults::service_timeout_s()),
             retain: RetainChoice::default(),
             robot: Parts::ALL,
+            diagnostic_values: Vec::new(),
             state_directory: StateChoice::default(),
             log: Level::default(),
         }

@@ -343,6 +343,23 @@ pub(super) enum Switch {
     Off,
 }
 
+/// A level of a node's log.
+#[derive(Clone, Copy, Debug, Deserialize, JsonSchema)]
+#[schemars(rename = "LogLevel")]
+#[serde(rename_all = "lowercase")]
+pub(super) enum LogLevelShape {
+    /// All messages.
+    Debug,
+    /// Without those of `debug`.
+    Info,
+    /// `warn`, `error` and `fatal`.
+    Warn,
+    /// `error` and `fatal`.
+    Error,
+    /// Only `fatal`.
+    Fatal,
+}
+
 /// A ROS distribution.
 #[derive(Clone, Copy, Debug, Deserialize, JsonSchema)]
 #[schemars(rename = "Distro")]
@@ -387,6 +404,18 @@ pub(super) struct RobotShape {
     /// Logs of nodes (`/rosout`): counts by node and level, the latest messages, and bursts of
     /// errors as findings.
     pub(super) logs: Switch,
+    /// Diagnostics (`/diagnostics`): the level of each part of the robot, and those in error as
+    /// findings.
+    pub(super) diagnostics: Switch,
+    /// Values in diagnostics that have a metric: patterns of name, slash and key, as in
+    /// `battery*/Voltage*`; `*` matches any characters. Applied on reload.
+    #[schemars(length(max = 64))]
+    pub(super) diagnostic_values: Option<Vec<String>>,
+    /// Parameters of nodes (`/parameter_events`): last known values, changes, and who requested
+    /// them.
+    pub(super) parameters: Switch,
+    /// Transforms (`/tf`, `/tf_static`): trees of frames, their broadcasters, and faults.
+    pub(super) transforms: Switch,
     /// Offsets between the clocks of hosts, from stamps, replies and acknowledgements.
     pub(super) clocks: Switch,
 }
@@ -395,6 +424,10 @@ impl Default for RobotShape {
     fn default() -> Self {
         Self {
             logs: Switch::On,
+            diagnostics: Switch::On,
+            diagnostic_values: None,
+            parameters: Switch::On,
+            transforms: Switch::On,
             clocks: Switch::On,
         }
     }
@@ -569,6 +602,9 @@ pub(super) struct OtlpShape {
     /// Minimum severity of lines of the agent's own log that are exported, e.g. `warn`. By default
     /// no line is exported.
     pub(super) log: Option<Level>,
+    /// Minimum level of messages of nodes' logs (`/rosout`) that are exported as log records, e.g.
+    /// `warn`. By default no message is exported. It needs `robot.logs`.
+    pub(super) node_logs: Option<LogLevelShape>,
     /// Name of this robot: the attribute `robot.name` of all exports.
     pub(super) robot: Option<String>,
     /// Additional attributes of the resource, names and values.

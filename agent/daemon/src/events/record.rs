@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use std::fmt::Display;
 use std::time::Duration;
 
+use ros2probe_wire::diagnostics::DiagnosticLevel;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::{DomainId, Timestamp};
@@ -139,6 +140,9 @@ impl Occurrence {
                 Disposed | Expired | Cascaded => &table::NODE_LOST,
             },
             Self::Robot(EventKind::Lifecycle(_)) => &table::LIFECYCLE_TRANSITION,
+            Self::Robot(EventKind::Diagnostic { .. }) => &table::DIAGNOSTIC_CHANGED,
+            Self::Robot(EventKind::Parameter(_)) => &table::PARAMETER_CHANGED,
+            Self::Robot(EventKind::TransformJump { .. }) => &table::TRANSFORM_JUMPED,
             Self::Robot(EventKind::Loss(_)) => &table::MESSAGE_LOST,
             Self::Robot(EventKind::Expectation { .. }) => &table::EXPECTATION_CHANGED,
             Self::Robot(EventKind::Silence { .. }) => &table::TOPIC_SILENT,
@@ -173,6 +177,9 @@ impl Occurrence {
             Self::Robot(EventKind::Participant { change, .. }) => *change == churn::Event::Disposed,
             Self::Robot(EventKind::Lifecycle(state)) => *state.state != *ERROR_PROCESSING,
             Self::Robot(EventKind::Expectation { to, .. }) => *to == WatchState::Ok,
+            Self::Robot(EventKind::Diagnostic { status, .. }) => {
+                status.level == DiagnosticLevel::Ok
+            }
             // These findings are common while nodes start, and with tools that publish without a
             // subscriber.
             Self::Robot(EventKind::Diagnosis { finding, .. }) => matches!(
@@ -278,6 +285,43 @@ fn robot(kind: &EventKind, at: Timestamp) -> Values {
             ("from", Some(text(&state.before))),
             ("to", Some(text(&state.state))),
         ],
+        EventKind::Diagnostic { before, status } => vec![
+            domain(status.domain_id),
+            ("topic", Some(text(&status.topic))),
+            ("name", Some(text(&status.name))),
+            ("hardware_id", Some(text(&status.hardware_id))),
+            ("ros_node", status.node.as_deref().map(text)),
+            ("from", before.map(|level| text(level.label()))),
+            ("to", Some(text(status.level.label()))),
+            ("message", Some(text(&status.message))),
+        ],
+        EventKind::TransformJump {
+            domain_id,
+            namespace,
+            parent,
+            child,
+            node,
+            jump,
+        } => vec![
+            domain(*domain_id),
+            ("namespace", Some(text(namespace))),
+            ("parent", Some(text(parent))),
+            ("child", Some(text(child))),
+            ("ros_node", node.as_deref().map(text)),
+            ("kind", Some(text(jump.label()))),
+        ],
+        EventKind::Parameter(change) => {
+            let client = change.requested_by.as_ref();
+            let client = client.and_then(|client| client.node.as_deref());
+            vec![
+                domain(change.domain_id),
+                ("ros_node", Some(text(&change.node))),
+                ("parameter", Some(text(&change.name))),
+                ("from", change.before.as_deref().map(text)),
+                ("to", change.value.as_deref().map(text)),
+                ("requested_by", client.map(text)),
+            ]
+        }
         EventKind::Loss(loss) => self::loss(loss),
         EventKind::Expectation {
             domain_id,
@@ -439,6 +483,36 @@ fn finding(finding: &Diagnosis) -> Values {
             ("ros_node", Some(text(node))),
             ("log_errors", number(*errors)),
             ("log_text", Some(text(said))),
+        ],
+        Diagnosis::DiagnosticError {
+            domain_id,
+            topic,
+            node,
+            name,
+            hardware_id,
+            level,
+            message,
+        } => vec![
+            domain(*domain_id),
+            ("topic", Some(text(topic))),
+            ("ros_node", node.as_deref().map(text)),
+            ("name", Some(text(name))),
+            ("hardware_id", Some(text(hardware_id))),
+            ("level", Some(text(level.label()))),
+            ("message", Some(text(message))),
+        ],
+        Diagnosis::TransformFault {
+            domain_id,
+            namespace,
+            fault,
+        } => vec![
+            ("domain_id", number(*domain_id)),
+            ("namespace", Some(text(namespace))),
+            ("fault", Some(text(fault.kind.label()))),
+            ("parent", Some(text(&fault.parent))),
+            ("child", Some(text(&fault.child))),
+            ("edges", number(fault.edges as u64)),
+            ("names", list(&fault.names)),
         ],
         Diagnosis::ClocksApart {
             peer,

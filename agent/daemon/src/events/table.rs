@@ -63,6 +63,16 @@ const FINDING: &[&str] = &[
     "retransmitted_ratio",
     "log_errors",
     "log_text",
+    "name",
+    "hardware_id",
+    "level",
+    "message",
+    "namespace",
+    "fault",
+    "parent",
+    "child",
+    "edges",
+    "names",
     "peer",
     "offset_seconds",
     "uncertainty_seconds",
@@ -127,6 +137,51 @@ pub(super) const LIFECYCLE_TRANSITION: Definition = Definition::new(
      errorprocessing now.",
 )
 .relief(Severity::Info);
+pub(super) const DIAGNOSTIC_CHANGED: Definition = Definition::new(
+    "ros2.robot.diagnostic_changed",
+    Severity::Warn,
+    &[
+        "domain_id",
+        "topic",
+        "name",
+        "hardware_id",
+        "ros_node",
+        "from",
+        "to",
+        "message",
+    ],
+    "A part of the robot has another level in its diagnostics, or ceased to publish them (`stale`); \
+     INFO if it is `ok` now.",
+)
+.relief(Severity::Info);
+pub(super) const TRANSFORM_JUMPED: Definition = Definition::new(
+    "ros2.robot.transform_jumped",
+    Severity::Warn,
+    &[
+        "domain_id",
+        "namespace",
+        "parent",
+        "child",
+        "ros_node",
+        "kind",
+    ],
+    "A transform differs suddenly from the last one of its edge: its translation, its rotation, or its \
+     time, which went back.",
+);
+pub(super) const PARAMETER_CHANGED: Definition = Definition::new(
+    "ros2.robot.parameter_changed",
+    Severity::Info,
+    &[
+        "domain_id",
+        "ros_node",
+        "parameter",
+        "from",
+        "to",
+        "requested_by",
+    ],
+    "A parameter of a node has another value; `requested_by` is the node of the client, if its \
+     request was seen.",
+);
 pub(super) const MESSAGE_LOST: Definition = Definition::new(
     "ros2.message.lost",
     Severity::Warn,
@@ -174,7 +229,7 @@ pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
     "Another fault of the graph, named by `diagnosis`: type_conflict, type_hash_conflict, \
      duplicate_node, node_in_several_domains, slow_callback, executor_wait, \
      late_callback, intra_process_overflow, reader_queue_overflow, observation_suspended, \
-     shared_machine_id, lossy_link, log_errors, clocks_apart, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
+     shared_machine_id, lossy_link, log_errors, diagnostic_error, transform_fault, clocks_apart, slow_chain, or (INFO) unmatched_publisher, unmatched_subscription, \
      restamping_node, buffers_by_cpu.",
 )
 .relief(Severity::Info);
@@ -292,6 +347,9 @@ pub const EVENTS: &[Definition] = &[
     NODE_DISCOVERED,
     NODE_LOST,
     LIFECYCLE_TRANSITION,
+    DIAGNOSTIC_CHANGED,
+    PARAMETER_CHANGED,
+    TRANSFORM_JUMPED,
     MESSAGE_LOST,
     EXPECTATION_CHANGED,
     TOPIC_SILENT,

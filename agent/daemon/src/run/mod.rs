@@ -27,7 +27,7 @@ use ros2probe_capture::live::{CaptureError, LiveSource};
 use ros2probe_capture::pcap::PcapError;
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::library::{DescribedFigures, Library};
-use ros2probe_metrics::otlp::SpanSink;
+use ros2probe_metrics::otlp::{NodeLogSink, SpanSink};
 use ros2probe_model::derive::type_descriptions::TypeSource;
 use ros2probe_model::facts::selection::SampleRequest;
 use ros2probe_model::measure::history::History;
@@ -105,6 +105,8 @@ pub struct Outputs {
     pub limits: Arc<LimitFigures>,
     /// Receives spans of sampled messages.
     pub spans: SpanSink,
+    /// Messages of nodes' logs, if they are exported.
+    pub node_logs: NodeLogSink,
     /// Receives descriptions of types.
     pub library: Arc<Library>,
 }
@@ -303,6 +305,8 @@ impl Run {
         }
         let spans = &self.outputs.spans;
         spans.add(output.spans, output.chain_spans, &output.late_calls);
+        let node_logs = &self.outputs.node_logs;
+        node_logs.add(output.logs, output.lost_logs);
         let clock = self.observer.dispatched_until(now);
         if clock + SET_BACK < self.published_until {
             self.published_until = clock;

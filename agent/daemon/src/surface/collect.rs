@@ -103,6 +103,9 @@ impl MetricSource for MetricSources {
         link_metrics::links(sink, snapshot)?;
         robot_metrics::clocks(sink, snapshot)?;
         robot_metrics::logs(sink, snapshot)?;
+        robot_metrics::diagnostics(sink, snapshot, &settings.diagnostic_values)?;
+        robot_metrics::parameters(sink, snapshot)?;
+        robot_metrics::transforms(sink, snapshot)?;
         ros2_metrics::watches(sink, snapshot, &settings.watches)?;
         agent_metrics::identity(sink, &state, now)?;
         agent_metrics::capture(sink, &state)?;

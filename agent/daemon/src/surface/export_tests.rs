@@ -123,6 +123,7 @@ fn start(address: SocketAddr, interval: u32, more: &str, sources: &MetricSources
         events: Arc::<EventLog>::clone(&sources.events),
         spans: Arc::default(),
         log: None,
+        node_logs: Arc::default(),
         exports: Arc::clone(&sources.exports),
     };
     Exporter::start(settings.unwrap(), inputs, crate::privilege::spawn_export).unwrap()

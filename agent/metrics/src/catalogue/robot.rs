@@ -28,3 +28,48 @@ pub const LOG_MESSAGES: Metric = Metric::counter(
     "Messages of a node's log on /rosout, each counted once; only those that were sent and seen.",
 )
 .experimental();
+pub const DIAGNOSTICS_LEVEL: Metric = Metric::gauge(
+    "ros2_diagnostics_level",
+    &["domain_id", "topic", "name", "hardware_id"],
+    "Level of a part of the robot in its diagnostics: 0 ok, 1 warn, 2 error, 3 stale. It is also \
+     stale if its messages cease.",
+)
+.experimental();
+pub const DIAGNOSTICS_VALUE: Metric = Metric::gauge(
+    "ros2_diagnostics_value",
+    &["domain_id", "topic", "name", "hardware_id", "key"],
+    "Last number of a value in diagnostics that `robot.diagnostic_values` selects.",
+)
+.experimental();
+pub const PARAMETER_CHANGES: Metric = Metric::counter(
+    "ros2_parameter_changes_total",
+    &["domain_id", "ros_node"],
+    "Changes of a node's parameters, without those that it declares; only those that were seen.",
+)
+.experimental();
+pub const TRANSFORM_MESSAGES: Metric = Metric::counter(
+    "ros2_transform_messages_total",
+    TRANSFORM,
+    "Transforms of an edge that were seen; its rate is that of its broadcasters together.",
+)
+.experimental();
+pub const TRANSFORM_AGE: Metric = Metric::gauge(
+    "ros2_transform_age_seconds",
+    TRANSFORM,
+    "Time since the last transform of an edge; absent for static ones.",
+)
+.experimental();
+pub const TRANSFORM_BROADCASTERS: Metric = Metric::gauge(
+    "ros2_transform_broadcasters",
+    TRANSFORM,
+    "Publishers that broadcast an edge, at most four.",
+)
+.experimental();
+pub const TRANSFORM_JUMPS: Metric = Metric::counter(
+    "ros2_transform_jumps_total",
+    &["domain_id", "namespace", "parent", "child", "kind"],
+    "Sudden changes of an edge: its translation, its rotation, or its time, which went back.",
+)
+.experimental();
+
+const TRANSFORM: &[&str] = &["domain_id", "namespace", "parent", "child"];

@@ -17,6 +17,7 @@ use super::delivery::{Delivery, Export};
 use super::events::{self, LogExport, Reporter};
 use super::exports::{Exports, Signal};
 use super::metrics::{Collector, MetricExport};
+use super::node_logs::{self, NodeLogQueue, NodeLogs};
 use super::own_log::{self, LogQueue};
 use super::points::scope;
 use super::reports::Reports;
@@ -46,6 +47,8 @@ pub struct Inputs {
     pub spans: Arc<SpanQueue>,
     /// Lines of the agent's own log, if they are exported.
     pub log: Option<Arc<LogQueue>>,
+    /// Messages of the logs of nodes.
+    pub node_logs: Arc<NodeLogQueue>,
     /// Counters of exports.
     pub exports: Arc<Exports>,
 }
@@ -125,6 +128,7 @@ struct Jobs {
     events: Option<(Reporter, Delivery<LogExport>)>,
     traces: Option<(Tracing, Delivery<SpanExport>)>,
     log: Option<(Arc<LogQueue>, Delivery<LogExport>)>,
+    node_logs: Option<(NodeLogs, Delivery<LogExport>)>,
 }
 
 impl Jobs {
@@ -156,6 +160,7 @@ impl Jobs {
         };
         let events = delivery(Signal::Events, settings.events, exports, stop, logs)?;
         let log = delivery(Signal::Log, settings.log, exports, stop, logs)?;
+        let node_logs = delivery(Signal::NodeLogs, settings.node_logs, exports, stop, logs)?;
         let traces = delivery(
             Signal::Traces,
             settings.traces,
@@ -175,6 +180,7 @@ impl Jobs {
             events: events.map(|delivery| (reporter(), delivery)),
             traces: traces.map(|delivery| (tracing, delivery)),
             log: inputs.log.zip(log),
+            node_logs: node_logs.map(|delivery| (NodeLogs::new(inputs.node_logs), delivery)),
         })
     }
 
@@ -199,7 +205,12 @@ impl Jobs {
                 delivery.drain(&*queue, own_log::GATHER).await;
             }
         };
-        tokio::join!(metrics, events, traces, log);
+        let node_logs = async {
+            if let Some((logs, delivery)) = self.node_logs {
+                delivery.drain(logs, node_logs::GATHER).await;
+            }
+        };
+        tokio::join!(metrics, events, traces, log, node_logs);
     }
 }
 

@@ -14,6 +14,8 @@ pub enum Signal {
     Traces,
     /// Lines of the agent's own log.
     Log,
+    /// Messages of the logs of nodes.
+    NodeLogs,
 }
 
 /// Result of a request.
@@ -54,7 +56,13 @@ pub struct Exports {
 
 impl Signal {
     /// All signals.
-    pub const ALL: [Self; 4] = [Self::Metrics, Self::Events, Self::Traces, Self::Log];
+    pub const ALL: [Self; 5] = [
+        Self::Metrics,
+        Self::Events,
+        Self::Traces,
+        Self::Log,
+        Self::NodeLogs,
+    ];
 
     /// Returns the label value.
     #[must_use]
@@ -64,6 +72,7 @@ impl Signal {
             Self::Events => "events",
             Self::Traces => "traces",
             Self::Log => "log",
+            Self::NodeLogs => "node_logs",
         }
     }
 }

@@ -13,6 +13,7 @@ mod exports;
 mod instruments;
 mod metrics;
 mod naming;
+mod node_logs;
 mod own_log;
 pub(crate) mod points;
 mod reports;
@@ -25,6 +26,7 @@ mod transport;
 pub use endpoint::otlp_endpoint;
 pub use exporter::{Exporter, Inputs, Spawn, StartError};
 pub use exports::{Exports, Outcome, Reason, Signal};
+pub use node_logs::{NodeLogQueue, NodeLogSink};
 pub use own_log::LogQueue;
 pub use resource::Host;
 pub use settings::{

@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use opentelemetry_otlp::ExporterBuildError;
 use opentelemetry_sdk::Resource;
+use ros2probe_wire::log::LogLevel;
 use schemars::JsonSchema;
 use serde::Deserialize;
 use tonic::codegen::http::{HeaderMap, HeaderName, HeaderValue, Uri};
@@ -56,6 +57,8 @@ pub struct OtlpSettings {
     pub late_calls: bool,
     /// Minimum severity of exported lines of the log; `None` exports no line.
     pub log: Option<LevelFilter>,
+    /// Minimum level of exported messages of nodes' logs; `None` exports no message.
+    pub node_logs: Option<LogLevel>,
     /// Name of the robot.
     pub robot: Option<String>,
     /// Additional attributes of the resource.
@@ -118,6 +121,7 @@ pub struct Settings {
     pub(super) events: Option<Target>,
     pub(super) traces: Option<Target>,
     pub(super) log: Option<Target>,
+    pub(super) node_logs: Option<Target>,
 }
 
 /// Why exports cannot be set up.
@@ -203,12 +207,14 @@ impl Settings {
             events: target(Signal::Events)?,
             traces: target(Signal::Traces)?,
             log: target(Signal::Log)?,
+            node_logs: target(Signal::NodeLogs)?,
         };
         let signals = [
             &settings.metrics,
             &settings.events,
             &settings.traces,
             &settings.log,
+            &settings.node_logs,
         ];
         let any = signals.iter().any(|target| target.is_some());
         Ok(any.then_some(settings))
@@ -240,7 +246,7 @@ impl Variables<'_> {
 const fn standard(signal: Signal) -> &'static str {
     match signal {
         Signal::Metrics => "METRICS",
-        Signal::Events | Signal::Log => "LOGS",
+        Signal::Events | Signal::Log | Signal::NodeLogs => "LOGS",
         Signal::Traces => "TRACES",
     }
 }
@@ -266,6 +272,7 @@ fn target(
         Signal::Events => file.events,
         Signal::Traces => file.traces,
         Signal::Log => Some(file.log.is_some()),
+        Signal::NodeLogs => Some(file.node_logs.is_some()),
     };
     let exporter = format!("OTEL_{}_EXPORTER", standard(signal));
     let refused = || variables.find(&exporter).is_some_and(|name| name == "none");
@@ -320,7 +327,7 @@ fn target(
 const fn path(signal: Signal) -> &'static str {
     match signal {
         Signal::Metrics => "/v1/metrics",
-        Signal::Events | Signal::Log => "/v1/logs",
+        Signal::Events | Signal::Log | Signal::NodeLogs => "/v1/logs",
         Signal::Traces => "/v1/traces",
     }
 }

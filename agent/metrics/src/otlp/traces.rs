@@ -276,7 +276,7 @@ fn context(trace_id: u128, id: u64) -> SpanContext {
 }
 
 /// Returns the id of the send span of the message with this trace.
-fn send_id(trace_id: u128) -> u64 {
+pub(super) fn send_id(trace_id: u128) -> u64 {
     let mut identity = Identity::of(b"send");
     identity.add(&trace_id.to_be_bytes());
     identity.bits() as u64

@@ -5,20 +5,32 @@
 //! writer that exceeds its allowance is paused for some seconds. Each message is decoded once,
 //! whichever copies of it were captured.
 
+pub mod diagnostics;
 pub mod logs;
+pub mod parameters;
+mod text;
+pub mod transforms;
 
 use foldhash::HashMap;
+use ros2probe_wire::diagnostics::{self as wire, DiagnosticStatuses};
+use ros2probe_wire::ros_parameters::{self, ParameterEvent};
+use ros2probe_wire::rtps::{RequestHeader, VendorId};
+use ros2probe_wire::transforms as wire_transforms;
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, WireError, log};
 
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
+use crate::facts::event::Events;
 use crate::facts::model_time::ModelTime;
-use crate::facts::names::NodeName;
+use crate::facts::names::{NodeName, TopicName};
 use crate::facts::observation::Sample;
 use crate::facts::tables::RobotWriters;
 use crate::measure::allowance::{Allowance, CommonAllowance, WriterAllowance};
 use crate::measure::assembly::Assembly;
-use logs::{Logs, Origin};
+use diagnostics::Diagnostics;
+use logs::Logs;
+use parameters::Parameters;
+use transforms::Transforms;
 
 /// Maximum size of a message that is decoded, in bytes.
 const MESSAGE_BYTES: usize = 64 << 10;
@@ -28,6 +40,9 @@ const ASSEMBLY_BYTES: usize = 1 << 20;
 const WRITER: Allowance = Allowance::new(1 << 20, 64 << 10);
 /// Bytes of all writers that may be captured in a burst, and per second.
 const ALL_WRITERS: Allowance = Allowance::new(8 << 20, 512 << 10);
+/// The same of transforms: a message each of thirty joints, 100 times a second, is 300 KB/s.
+const BROADCASTER: Allowance = Allowance::new(2 << 20, 512 << 10);
+const ALL_BROADCASTERS: Allowance = Allowance::new(8 << 20, 2 << 20);
 /// A paused writer is captured again once it is allowed this many bytes.
 const RESUME_BYTES: u64 = 256 << 10;
 
@@ -36,6 +51,12 @@ const RESUME_BYTES: u64 = 256 << 10;
 pub enum Part {
     /// Logs of nodes.
     Logs,
+    /// Diagnostics.
+    Diagnostics,
+    /// Parameters of nodes.
+    Parameters,
+    /// Transforms between frames.
+    Transforms,
     /// Clocks of hosts.
     Clocks,
 }
@@ -49,6 +70,14 @@ pub struct Parts(u8);
 pub enum Standard {
     /// `rcl_interfaces/msg/Log`.
     Log,
+    /// `diagnostic_msgs/msg/DiagnosticArray`.
+    Diagnostics,
+    /// `rcl_interfaces/msg/ParameterEvent`.
+    ParameterEvent,
+    /// Request of `rcl_interfaces/srv/SetParameters` or of its atomic variant.
+    SetParameters,
+    /// `tf2_msgs/msg/TFMessage`.
+    Transforms,
 }
 
 /// Writers of standard types, and what they said.
@@ -58,11 +87,17 @@ pub struct Robot {
     assembly: Assembly,
     allowance: CommonAllowance,
     logs: Logs,
+    diagnostics: Diagnostics,
+    parameters: Parameters,
+    transforms: Transforms,
+    /// Transforms have an allowance of their own: thirty of them at 100 Hz take 300 KB/s.
+    of_transforms: CommonAllowance,
 }
 
 #[derive(Debug)]
 struct RobotWriter {
     domain_id: DomainId,
+    topic: TopicName,
     standard: Standard,
     allowance: WriterAllowance,
     read: ReadNumbers,
@@ -81,6 +116,23 @@ pub enum Heard {
     Malformed(Standard, WireError),
 }
 
+/// Where and when a message was seen.
+#[derive(Clone, Copy, Debug)]
+pub struct Origin<'a> {
+    /// Time of its arrival.
+    pub at: ModelTime,
+    /// Domain of its writer.
+    pub domain_id: DomainId,
+    /// Topic.
+    pub topic: &'a TopicName,
+    /// Its writer.
+    pub writer: Guid,
+    /// Its sequence number.
+    pub number: SequenceNumber,
+    /// The node that has the writer.
+    pub node: Option<&'a NodeName>,
+}
+
 /// The latest numbers of a writer that were decoded.
 #[derive(Clone, Copy, Debug, Default)]
 struct ReadNumbers {
@@ -95,6 +147,11 @@ impl Standard {
     pub fn of(message_type: &str) -> Option<Self> {
         match message_type {
             log::TYPE => Some(Self::Log),
+            wire::TYPE => Some(Self::Diagnostics),
+            ros_parameters::EVENT => Some(Self::ParameterEvent),
+            wire_transforms::TYPE => Some(Self::Transforms),
+            "rcl_interfaces/srv/SetParameters_Request"
+            | "rcl_interfaces/srv/SetParametersAtomically_Request" => Some(Self::SetParameters),
             _ => None,
         }
     }
@@ -104,6 +161,10 @@ impl Standard {
     pub const fn stage(self) -> &'static str {
         match self {
             Self::Log => "log",
+            Self::Diagnostics => "diagnostics",
+            Self::ParameterEvent => "parameter_event",
+            Self::SetParameters => "set_parameters",
+            Self::Transforms => "transforms",
         }
     }
 
@@ -112,13 +173,16 @@ impl Standard {
     pub const fn part(self) -> Part {
         match self {
             Self::Log => Part::Logs,
+            Self::Diagnostics => Part::Diagnostics,
+            Self::ParameterEvent | Self::SetParameters => Part::Parameters,
+            Self::Transforms => Part::Transforms,
         }
     }
 }
 
 impl Parts {
-    /// All parts.
-    pub const ALL: Self = Self(1 << Part::Logs as u8 | 1 << Part::Clocks as u8);
+    /// All parts, up to the last one.
+    pub const ALL: Self = Self((1 << (Part::Clocks as u8 + 1)) - 1);
 
     /// Returns whether it contains this part.
     #[must_use]
@@ -144,27 +208,53 @@ impl Default for Robot {
             assembly: Assembly::new(ASSEMBLY_BYTES),
             allowance: CommonAllowance::new(ALL_WRITERS, RESUME_BYTES),
             logs: Logs::default(),
+            diagnostics: Diagnostics::default(),
+            parameters: Parameters::default(),
+            transforms: Transforms::default(),
+            of_transforms: CommonAllowance::new(ALL_BROADCASTERS, RESUME_BYTES),
         }
     }
 }
 
 impl Robot {
     /// Begins to read this writer, unless the table of writers is full.
-    pub fn follow(&mut self, writer: Guid, domain_id: DomainId, standard: Standard) {
+    pub fn follow(
+        &mut self,
+        writer: Guid,
+        (domain_id, topic): (DomainId, &TopicName),
+        standard: Standard,
+    ) {
         let new = || RobotWriter {
             domain_id,
+            topic: topic.clone(),
             standard,
-            allowance: WriterAllowance::new(WRITER),
+            allowance: WriterAllowance::new(match standard {
+                Standard::Transforms => BROADCASTER,
+                _ => WRITER,
+            }),
             read: ReadNumbers::default(),
         };
         self.writers.get_or_insert_with(writer, new);
+        if standard == Standard::Transforms {
+            self.transforms.follow(writer, domain_id, topic);
+        }
     }
 
     /// Stops reading this writer.
     pub fn forget(&mut self, writer: Guid) {
         if let Some(known) = self.writers.remove(&writer) {
-            self.allowance.forget(&known.allowance);
+            let allowance = match known.standard {
+                Standard::Transforms => &mut self.of_transforms,
+                _ => &mut self.allowance,
+            };
+            allowance.forget(&known.allowance);
             self.assembly.release(writer);
+            match known.standard.part() {
+                Part::Logs | Part::Clocks => {}
+                Part::Diagnostics => self.diagnostics.forget(writer),
+                Part::Parameters => self.parameters.forget(writer),
+                Part::Transforms => self.transforms.forget(writer),
+            }
         }
     }
 
@@ -183,21 +273,30 @@ impl Robot {
     }
 
     /// Reads a DATA or DATA_FRAG of a followed writer. `node` is the node that has the writer.
-    pub fn hear(&mut self, sample: &Sample, payload: &[u8], node: Option<&NodeName>) -> Heard {
+    /// `vendor` is its implementation.
+    pub fn hear(
+        &mut self,
+        sample: &Sample,
+        payload: &[u8],
+        (node, vendor): (Option<&NodeName>, VendorId),
+        events: &mut Events,
+    ) -> Heard {
         let (writer, now) = (sample.head.writer, sample.head.at);
         let Some(known) = self.writers.get_mut(&writer) else {
             return Heard::Nothing;
         };
         // Until the kernel knows of a pause, it captures more.
-        let is_allowed = self
-            .allowance
-            .spend(&mut known.allowance, payload.len(), now);
+        let allowance = match known.standard {
+            Standard::Transforms => &mut self.of_transforms,
+            _ => &mut self.allowance,
+        };
+        let is_allowed = allowance.spend(&mut known.allowance, payload.len(), now);
         if known.allowance.is_paused() || !sample.is_message() {
             return Heard::Nothing;
         }
         let bytes = usize::try_from(sample.size()).unwrap_or(usize::MAX);
         if !is_allowed || bytes > MESSAGE_BYTES {
-            self.allowance.pause(&mut known.allowance);
+            allowance.pause(&mut known.allowance);
             self.assembly.release(writer);
             return Heard::Paused;
         }
@@ -205,7 +304,7 @@ impl Robot {
         if known.read.has(number) {
             return Heard::Nothing;
         }
-        let (standard, domain_id) = (known.standard, known.domain_id);
+        let standard = known.standard;
         let assembled;
         let payload = match sample.is_start() && sample.is_end() {
             true => payload,
@@ -224,13 +323,28 @@ impl Robot {
         known.read.add(number);
         let origin = Origin {
             at: now,
-            domain_id,
+            domain_id: known.domain_id,
+            topic: &known.topic,
             writer,
             number,
             node,
         };
         let decoded = match standard {
             Standard::Log => log::Log::parse(payload).map(|log| self.logs.add(&origin, &log)),
+            Standard::Diagnostics => DiagnosticStatuses::parse(payload)
+                .and_then(|statuses| self.diagnostics.add(&origin, statuses, events)),
+            Standard::ParameterEvent => ParameterEvent::parse(payload)
+                .and_then(|event| self.parameters.add(&origin, event, events)),
+            Standard::Transforms => wire_transforms::Transforms::parse(payload)
+                .and_then(|transforms| self.transforms.add(&origin, transforms, events)),
+            Standard::SetParameters => {
+                let header = match vendor {
+                    VendorId::CYCLONE => RequestHeader::LENGTH,
+                    _ => 0,
+                };
+                ros_parameters::Parameters::of_request(payload, header)
+                    .and_then(|parameters| self.parameters.request(&origin, parameters))
+            }
         };
         match decoded {
             Ok(()) => Heard::Decoded,
@@ -240,12 +354,32 @@ impl Robot {
 
     /// Ends a second: unfinished messages and old errors expire. Returns the writers that are
     /// captured again.
-    pub fn end_second(&mut self, now: ModelTime) -> Vec<Guid> {
+    pub fn end_second(&mut self, now: ModelTime, events: &mut Events) -> Vec<Guid> {
         self.assembly.expire(now);
         self.logs.end_second();
-        let writers = self.writers.iter_mut();
-        let writers = writers.map(|(writer, known)| (writer, &mut known.allowance));
-        self.allowance.resume(writers, now)
+        let is_paused = |writer| {
+            let known = self.writers.get(&writer);
+            known.is_some_and(|known: &RobotWriter| known.allowance.is_paused())
+        };
+        self.diagnostics.end_second(now, is_paused, events);
+        self.transforms.end_second(now, is_paused);
+        let mut resumed = Vec::new();
+        for (allowance, of_transforms) in [
+            (&mut self.allowance, false),
+            (&mut self.of_transforms, true),
+        ] {
+            let writers = self.writers.iter_mut().filter_map(|(writer, known)| {
+                let is_this = (known.standard == Standard::Transforms) == of_transforms;
+                is_this.then_some((writer, &mut known.allowance))
+            });
+            resumed.extend(allowance.resume(writers, now));
+        }
+        resumed
+    }
+
+    /// Removes and returns the messages of logs since the last call.
+    pub fn take_logs(&mut self) -> logs::NewLogs {
+        self.logs.take()
     }
 
     /// Returns the logs of all nodes.
@@ -254,15 +388,36 @@ impl Robot {
         &self.logs
     }
 
+    /// Returns the diagnostics of all robots.
+    #[must_use]
+    pub const fn diagnostics(&self) -> &Diagnostics {
+        &self.diagnostics
+    }
+
+    /// Returns the parameters of all nodes.
+    #[must_use]
+    pub const fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
+    /// Returns the transforms of all robots.
+    #[must_use]
+    pub const fn transforms(&self) -> &Transforms {
+        &self.transforms
+    }
+
     /// Returns the number of changes of [`Self::findings`].
     #[must_use]
     pub const fn revision(&self) -> u64 {
-        self.logs.revision()
+        self.logs.revision() + self.diagnostics.revision() + self.transforms.revision()
     }
 
     /// Returns what the robot says about problems of its own.
     pub fn findings(&self) -> impl Iterator<Item = Diagnosis> {
-        self.logs.findings()
+        let logged = self.logs.findings();
+        logged
+            .chain(self.diagnostics.findings())
+            .chain(self.transforms.findings())
     }
 
     /// Returns the sizes and limits of the tables.
@@ -270,6 +425,9 @@ impl Robot {
     pub fn tables(&self) -> Vec<TableFacts> {
         let mut tables = vec![self.writers.facts()];
         tables.extend(self.logs.tables());
+        tables.extend(self.diagnostics.tables());
+        tables.extend(self.parameters.tables());
+        tables.extend(self.transforms.tables());
         tables
     }
 }

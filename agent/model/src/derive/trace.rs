@@ -265,6 +265,14 @@ impl Tracer {
         }
     }
 
+    /// Returns the trace id of a message whose writer has been observed, if it is traced.
+    #[must_use]
+    pub fn trace_of(&self, writer: Guid, number: SequenceNumber) -> Option<u128> {
+        let traced = self.writers.get(&writer)?.as_ref()?;
+        let trace_id = numbered(traced.identity, number);
+        traced.share.takes(trace_id).then_some(trace_id)
+    }
+
     /// Returns the size, limit and evictions of the table of open messages.
     #[must_use]
     pub fn table(&self) -> TableFacts {

@@ -12,6 +12,7 @@ use std::cmp::Ordering;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ros2probe_wire::diagnostics::DiagnosticLevel;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{DomainId, Guid};
 
@@ -21,6 +22,7 @@ use crate::facts::calls::other_thread::Culprit;
 use crate::facts::calls::report::Trigger;
 use crate::facts::link::LinkKey;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
+use crate::facts::robot::TransformFault;
 use crate::facts::topic_kind::TopicKind;
 pub(crate) use matching::effort;
 pub use matching::{Offer, Policies, Policy, Verdict, verdict};
@@ -234,6 +236,32 @@ pub enum Diagnosis {
         /// Text of the last one of these.
         text: Arc<str>,
     },
+    /// A part of the robot has been in error, or without a new status, for at least 5 s.
+    DiagnosticError {
+        /// Domain.
+        domain_id: DomainId,
+        /// Topic of its diagnostics.
+        topic: TopicName,
+        /// Node that publishes them, if known.
+        node: Option<NodeName>,
+        /// Name of the part.
+        name: Arc<str>,
+        /// Id of its hardware; often empty.
+        hardware_id: Arc<str>,
+        /// Level when it was reported.
+        level: DiagnosticLevel,
+        /// Message when it was reported.
+        message: Arc<str>,
+    },
+    /// Transforms between frames are missing, contradict each other, or are in several trees.
+    TransformFault {
+        /// Domain.
+        domain_id: DomainId,
+        /// Namespace of the topics; empty for `/tf`.
+        namespace: Arc<str>,
+        /// The fault.
+        fault: TransformFault,
+    },
     /// The clock of another host differs much from this host's.
     ClocksApart {
         /// The other host: its name or address.
@@ -304,7 +332,7 @@ pub enum Change<'a> {
 
 impl Diagnosis {
     /// All kinds, as label values.
-    pub const KINDS: [&'static str; 21] = [
+    pub const KINDS: [&'static str; 23] = [
         "qos_incompatible",
         "type_conflict",
         "type_hash_conflict",
@@ -324,6 +352,8 @@ impl Diagnosis {
         "shared_machine_id",
         "lossy_link",
         "log_errors",
+        "diagnostic_error",
+        "transform_fault",
         "clocks_apart",
         "slow_chain",
     ];
@@ -351,6 +381,8 @@ impl Diagnosis {
             Self::SharedMachineId { .. } => "shared_machine_id",
             Self::LossyLink { .. } => "lossy_link",
             Self::LogErrors { .. } => "log_errors",
+            Self::DiagnosticError { .. } => "diagnostic_error",
+            Self::TransformFault { .. } => "transform_fault",
             Self::ClocksApart { .. } => "clocks_apart",
             Self::SlowChain { .. } => "slow_chain",
         }
@@ -379,6 +411,8 @@ impl Diagnosis {
             | Self::SharedMachineId { .. }
             | Self::LossyLink { .. }
             | Self::LogErrors { .. }
+            | Self::DiagnosticError { .. }
+            | Self::TransformFault { .. }
             | Self::ClocksApart { .. }
             | Self::ObservationSuspended { .. } => None,
         }
@@ -399,6 +433,29 @@ impl Diagnosis {
             .then_with(|| self.within_topic().cmp(&other.within_topic()))
             .then_with(|| self.handle().cmp(&other.handle()))
             .then_with(|| self.link().cmp(&other.link()))
+            .then_with(|| self.part().cmp(&other.part()))
+            .then_with(|| self.frame().cmp(&other.frame()))
+    }
+
+    /// Returns the child frame and the kind of a fault of transforms.
+    fn frame(&self) -> Option<(&str, &'static str)> {
+        match self {
+            Self::TransformFault { fault, .. } => Some((&fault.child, fault.kind.label())),
+            _ => None,
+        }
+    }
+
+    /// Returns topic, name and hardware id of the part of the robot that is in error.
+    fn part(&self) -> Option<(&TopicName, &str, &str)> {
+        match self {
+            Self::DiagnosticError {
+                topic,
+                name,
+                hardware_id,
+                ..
+            } => Some((topic, name, hardware_id)),
+            _ => None,
+        }
     }
 
     /// Returns the link of the finding, if it concerns one.
@@ -452,7 +509,13 @@ impl Diagnosis {
             Self::NodeInSeveralDomains {
                 node, participant, ..
             } => (DomainId(0), node, Some(*participant), None),
-            Self::ObservationSuspended { domain_id, .. } => (*domain_id, "", None, None),
+            Self::ObservationSuspended { domain_id, .. }
+            | Self::DiagnosticError { domain_id, .. } => (*domain_id, "", None, None),
+            Self::TransformFault {
+                domain_id,
+                namespace,
+                ..
+            } => (*domain_id, namespace, None, None),
             Self::SharedMachineId {
                 domain_id,
                 participants,

@@ -7,7 +7,9 @@
 //! replay speed.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
+use ros2probe_wire::diagnostics::DiagnosticLevel;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
@@ -19,6 +21,7 @@ use crate::facts::diagnosis::Diagnosis;
 use crate::facts::loss::Loss;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
+use crate::facts::robot::{DiagnosticStatus, ParameterChange, TransformJump};
 use crate::facts::route::Receiver;
 use crate::facts::tables::{LosingReceivers, LossBursts, WaitingEvents};
 use crate::facts::wall_clock::WallClock;
@@ -116,6 +119,30 @@ pub enum EventKind {
         /// Time of the last message; `None` before the first.
         last_message: Option<Timestamp>,
     },
+    /// A part of the robot changed the level of its diagnostics.
+    Diagnostic {
+        /// Previous level; `None` at its first status.
+        before: Option<DiagnosticLevel>,
+        /// Its status.
+        status: Arc<DiagnosticStatus>,
+    },
+    /// A transform differs suddenly from the last one of its edge.
+    TransformJump {
+        /// Domain.
+        domain_id: DomainId,
+        /// Namespace of the topic; empty for `/tf`.
+        namespace: Arc<str>,
+        /// Parent frame.
+        parent: Arc<str>,
+        /// Child frame.
+        child: Arc<str>,
+        /// Node of the broadcaster, if known.
+        node: Option<NodeName>,
+        /// What jumped.
+        jump: TransformJump,
+    },
+    /// A parameter of a node changed.
+    Parameter(Arc<ParameterChange>),
     /// A problem of the graph appeared, changed or was resolved.
     Diagnosis {
         /// Whether the problem is resolved.
@@ -157,6 +184,8 @@ pub enum Class {
     Expectation,
     /// Findings about the graph.
     Diagnosis,
+    /// What the robot itself says.
+    Robot,
 }
 
 /// Events removed from the queue.
@@ -195,13 +224,14 @@ struct Burst {
 
 impl Class {
     /// All classes.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::Participant,
         Self::Endpoint,
         Self::Node,
         Self::Loss,
         Self::Expectation,
         Self::Diagnosis,
+        Self::Robot,
     ];
 }
 
@@ -216,6 +246,9 @@ impl EventKind {
             Self::Loss(_) => Class::Loss,
             Self::Expectation { .. } | Self::Silence { .. } => Class::Expectation,
             Self::Diagnosis { .. } => Class::Diagnosis,
+            Self::Diagnostic { .. } | Self::TransformJump { .. } | Self::Parameter(_) => {
+                Class::Robot
+            }
         }
     }
 }
@@ -370,6 +403,8 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         | Diagnosis::RestampingNode { .. }
         | Diagnosis::BuffersByCpu { .. }
         | Diagnosis::LossyLink { .. }
+        | Diagnosis::DiagnosticError { .. }
+        | Diagnosis::TransformFault { .. }
         | Diagnosis::SlowChain { .. } => {}
     }
     finding

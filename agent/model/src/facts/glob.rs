@@ -21,6 +21,12 @@ pub fn covers(pattern: &str, name: &str) -> bool {
     covers_token(prefix, head) && covers_tokens(pattern, name)
 }
 
+/// Returns whether `pattern` covers the whole `text`: `*` matches any characters, slashes included.
+#[must_use]
+pub fn covers_text(pattern: &str, text: &str) -> bool {
+    covers_token(pattern, text)
+}
+
 fn covers_tokens(pattern: &str, name: &str) -> bool {
     let Some((first, others)) = pattern.split_once(ANY_TOKENS) else {
         return strip_tokens(name, pattern) == Some("");

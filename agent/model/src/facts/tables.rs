@@ -150,8 +150,30 @@ crate::tables! {
     }
     /// Writers of standard types that the agent reads
     RobotWriters { name: "robot_writers", entries: 1024, effect: "it is not read" }
+    /// Parts of the robot with diagnostics
+    DiagnosticsTable { name: "diagnostics", entries: 1024, effect: "the one with the longest silence is dropped" }
+    /// Bytes of the values of diagnostics
+    DiagnosticValueBytes { name: "diagnostics.values", entries: 1 << 20, effect: "the values of a status are left out" }
+    /// Parameters of nodes with their last known values
+    KnownParameters { name: "parameters", entries: 4096, effect: "the one with the oldest value is dropped" }
+    /// Latest changes of parameters
+    ParameterChanges { name: "parameter_changes", entries: 1000, rule: Oldest }
+    /// Parameters in the latest requests to set them
+    ParameterRequests { name: "parameter_requests", entries: 256, rule: Oldest, effect: "its effect has no known requester" }
+    /// Domains and namespaces with transforms
+    TransformTrees { name: "transform_trees", entries: 64, effect: "its transforms are not shown" }
+    /// Edges of all trees of transforms
+    TransformEdges { name: "transforms", entries: 2048, effect: "it is not shown" }
+    /// Broadcasters of one edge
+    EdgeBroadcasters { name: "transforms.broadcasters", entries: 4, effect: "the one with the longest silence is dropped" }
+    /// Publishers of static transforms
+    StaticBroadcasters { name: "transforms.static", entries: 1024, effect: "it counts as read" }
+    /// Nodes whose changes of parameters are counted
+    ChangedNodes { name: "changed_nodes", entries: 512, effect: "its changes are not counted" }
     /// Nodes with figures of their logs
     LogNodes { name: "log_nodes", entries: 512, effect: "the one with the longest silence is dropped" }
+    /// Messages of logs that wait to be taken
+    FreshLogMessages { name: "log_messages.fresh", entries: 1000, effect: "it is not exported", reported: "`ros2probe_otlp_dropped_total`" }
     /// Latest messages of logs, at most 1 KiB each
     LogMessages { name: "log_messages", entries: 1000, rule: Oldest }
     /// Latest discovery events

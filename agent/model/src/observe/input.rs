@@ -10,6 +10,7 @@ use ros2probe_wire::{Guid, GuidPrefix, Reason, Timestamp};
 use crate::derive::chain::causality::CausalPublication;
 use crate::derive::chain::expected::ExpectedChain;
 use crate::derive::chain::spans::ChainSpans;
+use crate::derive::robot::logs::LogMessage;
 use crate::derive::trace::Spans;
 use crate::derive::type_descriptions::TypeSource;
 use crate::facts::calls::facts::NewLateCalls;
@@ -170,6 +171,17 @@ impl<'a> Captured<'a> {
     }
 }
 
+/// A new message of a log.
+#[derive(Clone, Debug)]
+pub struct NewLog {
+    /// Time of its arrival.
+    pub arrival: Timestamp,
+    /// Its trace id, if it is traced.
+    pub trace_id: Option<u128>,
+    /// The message.
+    pub message: Arc<LogMessage>,
+}
+
 /// Outputs of the model since they were last drained.
 #[derive(Debug, Default)]
 pub struct Output {
@@ -185,6 +197,10 @@ pub struct Output {
     pub chain_spans: ChainSpans,
     /// Late calls of callbacks.
     pub late_calls: NewLateCalls,
+    /// New messages of logs.
+    pub logs: Vec<NewLog>,
+    /// Number of messages of logs that were dropped because there were too many.
+    pub lost_logs: u64,
     /// What nodes sent about their types.
     pub type_sources: Vec<TypeSource>,
 }

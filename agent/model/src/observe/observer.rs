@@ -64,7 +64,7 @@ use crate::measure::payloads::Payloads;
 use crate::measure::profiler::{ObservationOutcome, Profiler};
 use crate::measure::receivers::{Graph, Receivers};
 use crate::measure::topic::{Accelerated, TopicId, Topics, Watched};
-use crate::observe::input::{Captured, Input, Output};
+use crate::observe::input::{Captured, Input, NewLog, Output};
 use crate::observe::interest::Interest;
 use crate::report::snapshot::Snapshot;
 use crate::report::transport::{lacks_names, may_share_memory};
@@ -287,11 +287,21 @@ impl Observer {
 
     /// Removes and returns all output since the last call.
     pub fn drain(&mut self) -> Output {
+        let clock = self.graph.wall_clock;
+        let new = self.derive.robot.take_logs();
+        let tracer = &self.derive.tracer;
+        let logs = new.messages.into_iter().map(|message| NewLog {
+            arrival: clock.wall_time(message.at),
+            trace_id: tracer.trace_of(message.writer, message.number),
+            message,
+        });
         let mut output = Output {
+            logs: logs.collect(),
+            lost_logs: new.lost,
             interest: self.requested.interest.changes(),
-            events: self.journal.events.take(self.graph.wall_clock),
-            samples: self.measure.payloads.take(self.graph.wall_clock),
-            spans: self.derive.tracer.take(self.graph.wall_clock),
+            events: self.journal.events.take(clock),
+            samples: self.measure.payloads.take(clock),
+            spans: self.derive.tracer.take(clock),
             chain_spans: self.derive.chains.take_spans(),
             late_calls: self.derive.inside.take_late_calls(),
             type_sources: self.derive.type_descriptions.take(),

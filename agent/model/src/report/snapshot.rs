@@ -16,7 +16,12 @@ use ros2probe_wire::{DomainId, Guid, RtpsDuration, Timestamp};
 pub use crate::derive::chain::path::{ChainFacts, ChainsFacts};
 pub use crate::derive::clocks::{ClockFacts, ClockOffset, PeerClock};
 pub use crate::derive::inside::source::Source;
+pub use crate::derive::robot::diagnostics::DiagnosticFacts;
 pub use crate::derive::robot::logs::{LogFacts, LogMessage, NodeLogFacts};
+pub use crate::derive::robot::parameters::{ParameterFacts, ParametersFacts};
+pub use crate::derive::robot::transforms::{
+    Broadcaster, EdgeFacts, Jumps, TransformFacts, TreeFacts,
+};
 pub use crate::derive::services::action::GoalCounts;
 pub use crate::derive::services::facts::{ActionFacts, ServiceFacts};
 pub use crate::derive::services::latency::LatencyFacts;
@@ -30,6 +35,7 @@ pub use crate::facts::measurement::{
 };
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
+pub use crate::facts::robot::{DiagnosticStatus, ParameterChange, Requester};
 pub use crate::facts::route::Direction;
 use crate::facts::selection::Candidate;
 use crate::facts::topic_kind::TopicKind;
@@ -78,6 +84,12 @@ pub struct Snapshot {
     pub links: Vec<LinkFacts>,
     /// Logs of nodes.
     pub logs: LogFacts,
+    /// Diagnostics.
+    pub diagnostics: DiagnosticFacts,
+    /// Transforms.
+    pub transforms: TransformFacts,
+    /// Parameters of nodes.
+    pub parameters: ParametersFacts,
     /// Clocks of hosts.
     pub clocks: ClockFacts,
     /// Problems of the graph; the same value while nothing changes.

@@ -471,6 +471,14 @@ fn forged_input_fills_no_table_beyond_its_cap() {
     assert_filled(&["robot_writers", "log_nodes", "log_messages"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
+    let whole = drive(MESSAGES / 3, 10_000_000, &mut robot::parts);
+    assert_filled(&[
+        "diagnostics.values",
+        "parameter_requests",
+        "transforms.broadcasters",
+    ]);
+    assert!(whole < 96 << 20, "{whole} bytes");
+
     inside::of_a_queue();
 
     let ledger = ledger();

@@ -174,7 +174,7 @@ impl Pair {
 }
 
 fn wire_time(nanoseconds: u64) -> u64 {
-    nanoseconds / SECOND << 32 | (nanoseconds % SECOND << 32) / SECOND
+    ((nanoseconds / SECOND) << 32) | (((nanoseconds % SECOND) << 32) / SECOND)
 }
 
 #[test]

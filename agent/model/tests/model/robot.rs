@@ -213,3 +213,18 @@ fn more_nodes_than_the_table_holds_displace_the_most_silent_one() {
     assert!(facts.nodes.iter().any(|log| &*log.node == "/n599"));
     assert!(ledger()["log_nodes"].is_driven());
 }
+
+#[test]
+fn messages_that_are_not_taken_in_time_are_counted() {
+    let mut node = Node::new();
+    for number in 0..1005 {
+        node.log(20, &format!("message {number}"));
+        node.domain.wait(5);
+    }
+    let output = node.domain.observer.drain();
+    assert_eq!((output.logs.len(), output.lost_logs), (1000, 5));
+    assert_eq!(&*output.logs[0].message.text, "message 0");
+    node.log(20, "later");
+    let output = node.domain.observer.drain();
+    assert_eq!((output.logs.len(), output.lost_logs), (1, 0));
+}

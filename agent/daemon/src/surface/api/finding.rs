@@ -162,6 +162,34 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
             errors: *errors,
             text: Cow::Borrowed(text),
         },
+        diagnosis::Diagnosis::DiagnosticError {
+            node,
+            name,
+            hardware_id,
+            level,
+            message,
+            ..
+        } => Diagnosis::DiagnosticError {
+            ros_node: node.as_deref().map(Cow::Borrowed),
+            name: Cow::Borrowed(name),
+            hardware_id: Cow::Borrowed(hardware_id),
+            level: level.label().into(),
+            message: Cow::Borrowed(message),
+        },
+        diagnosis::Diagnosis::TransformFault {
+            namespace, fault, ..
+        } => Diagnosis::TransformFault {
+            namespace: Cow::Borrowed(namespace),
+            fault: fault.kind.label().into(),
+            parent: Cow::Borrowed(&fault.parent),
+            child: Cow::Borrowed(&fault.child),
+            edges: fault.edges as u64,
+            names: fault
+                .names
+                .iter()
+                .map(|name| Cow::Borrowed(&**name))
+                .collect(),
+        },
         diagnosis::Diagnosis::ClocksApart {
             peer,
             offset,

@@ -9,6 +9,7 @@ mod body;
 mod body_stream;
 pub mod chains;
 mod clocks;
+mod diagnostics;
 mod downloads;
 mod endpoint;
 mod events;
@@ -36,6 +37,7 @@ mod processes;
 mod reasons;
 mod recordings;
 pub mod reload;
+mod ros_parameters;
 mod samples;
 mod scope;
 pub(in crate::surface) mod security;
@@ -43,6 +45,7 @@ mod server;
 mod services;
 mod snapshots;
 mod topics;
+mod transforms;
 mod watch;
 mod why;
 
@@ -187,6 +190,9 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(calls(turns(why::routes())))
         .merge(processes::routes())
         .merge(needs(Access::All, Access::All, logs::routes()))
+        .merge(needs(Access::All, Access::All, diagnostics::routes()))
+        .merge(needs(Access::All, Access::All, ros_parameters::routes()))
+        .merge(transforms::routes())
         .merge(health::routes())
         .merge(needs(Access::All, Access::All, reload::routes()))
         .merge(needs(Access::All, Access::All, page::routes()))

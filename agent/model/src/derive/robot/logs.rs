@@ -6,11 +6,13 @@ use std::sync::Arc;
 use ros2probe_wire::log::{Log, LogLevel};
 use ros2probe_wire::{DomainId, Guid, SequenceNumber};
 
+use super::Origin;
+use super::text::bounded;
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::NodeName;
-use crate::facts::tables::{LogMessages, LogNodes};
+use crate::facts::tables::{FreshLogMessages, LogMessages, LogNodes};
 
 /// Maximum length of a message's text, in bytes.
 const TEXT: usize = 512;
@@ -27,22 +29,11 @@ pub struct Logs {
     nodes: Bounded<Counted<LogNodes>, BTreeMap<(DomainId, NodeName), NodeLog>>,
     /// The latest messages of all nodes, oldest first.
     latest: Bounded<Counted<LogMessages>, VecDeque<Arc<LogMessage>>>,
+    /// Messages that are not yet taken.
+    fresh: Bounded<FreshLogMessages, Vec<Arc<LogMessage>>>,
+    /// Messages that were not taken because there were too many.
+    lost: u64,
     revision: u64,
-}
-
-/// Where and when a message was seen.
-#[derive(Clone, Copy, Debug)]
-pub struct Origin<'a> {
-    /// Time of its arrival.
-    pub at: ModelTime,
-    /// Domain of its writer.
-    pub domain_id: DomainId,
-    /// Its writer.
-    pub writer: Guid,
-    /// Its sequence number.
-    pub number: SequenceNumber,
-    /// The node that has the writer.
-    pub node: Option<&'a NodeName>,
 }
 
 /// A message of a log, with bounded texts.
@@ -99,6 +90,15 @@ struct Burst {
     text: Arc<str>,
 }
 
+/// Messages since the last call.
+#[derive(Debug, Default)]
+pub struct NewLogs {
+    /// The messages, oldest first.
+    pub messages: Vec<Arc<LogMessage>>,
+    /// Number of messages that were dropped because there were too many.
+    pub lost: u64,
+}
+
 /// Figures of the log of one node.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NodeLogFacts {
@@ -124,7 +124,7 @@ pub struct LogFacts {
 impl Logs {
     /// Adds a message.
     pub fn add(&mut self, origin: &Origin<'_>, log: &Log<'_>) {
-        let logger = text(log.logger, NAME);
+        let logger = bounded(log.logger, NAME);
         let node = match origin.node {
             Some(node) => node.clone(),
             None => NodeName::from(format!("/{}", logger.replace('.', "/"))),
@@ -138,12 +138,13 @@ impl Logs {
             node: node.clone(),
             level: log.level,
             logger,
-            text: text(log.text, TEXT),
-            file: text(log.file, NAME),
-            function: text(log.function, NAME),
+            text: bounded(log.text, TEXT),
+            file: bounded(log.file, NAME),
+            function: bounded(log.function, NAME),
             line: log.line,
         });
         self.latest.push_back(Arc::clone(&message));
+        self.lost += u64::from(self.fresh.push(Arc::clone(&message)).is_some());
         let key = (origin.domain_id, node);
         if self.nodes.is_full() && !self.nodes.contains_key(&key) {
             self.nodes.refuse();
@@ -155,6 +156,14 @@ impl Logs {
         }
         if let Some(known) = self.nodes.get_or_insert_with(key, NodeLog::default) {
             self.revision += u64::from(known.add(message));
+        }
+    }
+
+    /// Removes and returns the messages since the last call.
+    pub fn take(&mut self) -> NewLogs {
+        NewLogs {
+            messages: self.fresh.take(),
+            lost: std::mem::take(&mut self.lost),
         }
     }
 
@@ -254,13 +263,4 @@ impl NodeLog {
             .iter()
             .fold(0, |sum, errors| sum.saturating_add(*errors))
     }
-}
-
-/// Returns a text of at most `most` bytes. Bytes that are not UTF-8 become the replacement
-/// character.
-fn text(bytes: &[u8], most: usize) -> Box<str> {
-    let text = String::from_utf8_lossy(bytes.get(..most).unwrap_or(bytes));
-    // A replacement character is longer than the byte that it replaces.
-    let end = text.floor_char_boundary(most);
-    text.get(..end).unwrap_or_default().into()
 }

@@ -41,7 +41,7 @@ impl Observer {
             self.identify_call(found, sample, vendor);
             self.keep_type_source(found, sample, vendor);
             self.keep_payload(sample, found.payload);
-            self.hear_robot(sample, found.payload);
+            self.hear_robot(sample, found.payload, vendor);
         }
     }
 

@@ -143,7 +143,7 @@ impl Observer {
                 self.apply_again(writer, now);
             }
             self.end_second_of_clocks(now);
-            for writer in self.derive.robot.end_second(now) {
+            for writer in self.derive.robot.end_second(now, &mut self.journal.events) {
                 self.apply_again(writer, now);
             }
             let profiler = &self.measure.profiler;

@@ -199,7 +199,8 @@ impl Observer {
                 let standard = Standard::of(&endpoint.message_type);
                 match standard {
                     Some(standard) if counts && self.settings.robot.has(standard.part()) => {
-                        self.derive.robot.follow(guid, topic.domain_id, standard);
+                        let topic = (topic.domain_id, &topic.naming.name);
+                        self.derive.robot.follow(guid, topic, standard);
                     }
                     _ => self.derive.robot.forget(guid),
                 }

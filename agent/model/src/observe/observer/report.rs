@@ -48,6 +48,14 @@ pub(super) fn snapshot(observer: &Observer, wall_time: Timestamp) -> Snapshot {
         zenoh: observer.zenoh.is_used().then(|| observer.zenoh.facts()),
         chains: observer.derive.chains.facts(wall_time),
         links: observer.measure.links.facts(),
+        diagnostics: (observer.derive.robot.diagnostics())
+            .facts(observer.settings.robot.has(Part::Diagnostics)),
+        transforms: (observer.derive.robot.transforms()).facts(
+            observer.settings.robot.has(Part::Transforms),
+            observer.clock,
+        ),
+        parameters: (observer.derive.robot.parameters())
+            .facts(observer.settings.robot.has(Part::Parameters)),
         logs: (observer.derive.robot.logs()).facts(observer.settings.robot.has(Part::Logs)),
         clocks: observer.derive.clocks.facts(
             observer.settings.robot.has(Part::Clocks),

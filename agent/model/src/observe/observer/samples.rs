@@ -5,6 +5,7 @@ use std::sync::Arc;
 use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
 use ros2probe_wire::names::DdsTopic;
+use ros2probe_wire::rtps::VendorId;
 
 use super::Observer;
 use crate::derive::robot::Heard;
@@ -148,13 +149,14 @@ impl Observer {
     }
 
     /// Reads a sample of a standard type, in which the robot itself says something.
-    pub(super) fn hear_robot(&mut self, sample: &Sample, payload: &[u8]) {
+    pub(super) fn hear_robot(&mut self, sample: &Sample, payload: &[u8], vendor: VendorId) {
         let writer = sample.head.writer;
         if !self.derive.robot.is_captured(writer) {
             return;
         }
         let node = self.graph.discovery.node_of(writer).map(|node| &node.name);
-        match self.derive.robot.hear(sample, payload, node) {
+        let events = &mut self.journal.events;
+        match (self.derive.robot).hear(sample, payload, (node, vendor), events) {
             Heard::Nothing | Heard::Decoded => {}
             Heard::Paused => self.apply_again(writer, sample.head.at),
             Heard::Malformed(standard, error) => self.decode_error(standard.stage(), error.reason),

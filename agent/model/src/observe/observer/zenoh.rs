@@ -3,7 +3,7 @@
 use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::discovery::{EndpointAnnouncement, Role};
 use ros2probe_wire::record::Verdict;
-use ros2probe_wire::rtps::StatusInfo;
+use ros2probe_wire::rtps::{StatusInfo, VendorId};
 use ros2probe_wire::zenoh::Gid;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, RtpsTime, SequenceNumber};
 
@@ -222,7 +222,7 @@ impl Observer {
         }
         if let Some(payload) = payload.filter(|_| sample.referring.is_none()) {
             self.keep_payload(&observed, payload);
-            self.hear_robot(&observed, payload);
+            self.hear_robot(&observed, payload, VendorId::default());
         }
         self.observe(&Observation::Sample(observed));
         if stream.outgoing && stream.is_loopback() {

@@ -3,6 +3,7 @@
 
 use std::collections::HashMap;
 
+use ros2probe_wire::diagnostics::DiagnosticLevel;
 use ros2probe_wire::{DomainId, Guid, RtpsDuration};
 
 use super::inside;
@@ -13,6 +14,7 @@ use crate::missed_announcements;
 use ros2probe_api::live::{Finding, Severity};
 use ros2probe_model::facts::diagnosis::{Diagnosis, Policies, Policy, TopicKey};
 use ros2probe_model::facts::names::NodeName;
+use ros2probe_model::facts::robot::{TransformFault, TransformFaultKind};
 use ros2probe_model::graph::zenoh::Unseen;
 use ros2probe_model::measure::history::Past;
 use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot, TopicFacts, WatchState};
@@ -64,6 +66,49 @@ fn of_node(
         node: ids.node(domain_id, node),
         ..finding(kind, Severity::Warning, &about, text)
     }
+}
+
+/// Returns a fault of transforms.
+fn of_transforms(
+    kind: &'static str,
+    domain_id: DomainId,
+    namespace: &str,
+    fault: &TransformFault,
+) -> Finding {
+    let others = match fault.edges {
+        0 | 1 => String::new(),
+        edges => format!(" (and {} others)", edges - 1),
+    };
+    let edge = format!("the transform {} -> {}{others}", fault.parent, fault.child);
+    let names = fault.names.join(", ");
+    let (text, remedy) = match fault.kind {
+        TransformFaultKind::Silent => (
+            format!("{edge} is no longer broadcast, although {names} runs"),
+            "look at the log and the inputs of that node",
+        ),
+        TransformFaultKind::SeveralBroadcasters => (
+            format!("{edge} has several broadcasters, which contradict each other: {names}"),
+            "let one of them broadcast it",
+        ),
+        TransformFaultKind::TimeWentBack => (
+            format!("{edge} has a stamp before an earlier one, from {names}"),
+            "look at the clock of that host, and for a bag that plays in a loop",
+        ),
+        TransformFaultKind::Apart => (
+            format!("the frames are in several trees, with the roots {names}"),
+            "find the missing transform between them with `rp tf`",
+        ),
+    };
+    let about = format!(
+        "{domain_id}|{namespace}|{}|{}",
+        fault.child,
+        fault.kind.label()
+    );
+    Finding {
+        domain_id: Some(domain_id.0),
+        ..finding(kind, Severity::Warning, &about, text)
+    }
+    .with_remedy(remedy)
 }
 
 pub(super) fn finding(
@@ -352,6 +397,36 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             let found = of_node(kind, all.ids, (*domain_id, node), said);
             found.with_remedy(format!("`rp log {node} --level error` prints them"))
         }
+        Diagnosis::DiagnosticError {
+            domain_id,
+            topic,
+            node,
+            name,
+            hardware_id,
+            level,
+            message,
+        } => {
+            let text = match level {
+                DiagnosticLevel::Stale => {
+                    format!("`{name}` sends no new diagnostics; the last message is: {message}")
+                }
+                _ => format!("`{name}` is in error: {message}"),
+            };
+            let about = format!("{domain_id}|{topic}|{name}|{hardware_id}");
+            let found = Finding {
+                domain_id: Some(domain_id.0),
+                node: node
+                    .as_ref()
+                    .and_then(|node| all.ids.node(*domain_id, node)),
+                ..finding(kind, Severity::Warning, &about, text)
+            };
+            found.with_remedy("`rp diag --verbose` prints its values")
+        }
+        Diagnosis::TransformFault {
+            domain_id,
+            namespace,
+            fault,
+        } => of_transforms(kind, *domain_id, namespace, fault),
         Diagnosis::ClocksApart {
             peer,
             offset,

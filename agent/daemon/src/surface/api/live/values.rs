@@ -130,6 +130,8 @@ impl Figures<'_> {
                 | Diagnosis::SharedMachineId { .. }
                 | Diagnosis::LossyLink { .. }
                 | Diagnosis::LogErrors { .. }
+                | Diagnosis::DiagnosticError { .. }
+                | Diagnosis::TransformFault { .. }
                 | Diagnosis::ClocksApart { .. }
                 | Diagnosis::SlowChain { .. } => {}
             }

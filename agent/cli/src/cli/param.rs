@@ -1,0 +1,176 @@
+//! `rp param`: prints parameters of nodes and their changes.
+
+use std::process::ExitCode;
+use std::time::Duration;
+
+use anyhow::Result;
+use clap::{Args, Subcommand};
+use jiff::Timestamp;
+use jiff::tz::TimeZone;
+use ros2probe::client::{Agent, Target};
+use ros2probe_api::parameters::{ParameterChange, Parameters};
+use ros2probe_api::path::encoded;
+use ros2probe_daemon::escape::visible;
+
+use super::Output;
+use super::shared::names_of;
+
+/// Interval between two views.
+const INTERVAL: Duration = Duration::from_millis(500);
+
+/// `rp param`.
+#[derive(Args, Debug)]
+pub(crate) struct Param {
+    #[command(subcommand)]
+    command: Command,
+}
+
+/// Commands about parameters.
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Print last known values of parameters
+    Dump(Dump),
+    /// Print changes: time, node, name, old and new value, and who requested it
+    Changes(Changes),
+}
+
+/// `rp param dump`.
+#[derive(Args, Debug)]
+struct Dump {
+    /// Only this node, e.g. /robot1/planner
+    node: Option<String>,
+    #[command(flatten)]
+    target: Target,
+}
+
+/// `rp param changes`.
+#[derive(Args, Debug)]
+struct Changes {
+    /// Only this node, e.g. /robot1/planner
+    node: Option<String>,
+    /// Go on, and print further changes
+    #[arg(long, short = 'f')]
+    follow: bool,
+    #[command(flatten)]
+    target: Target,
+}
+
+impl Param {
+    pub(crate) fn ask(self) -> Result<ExitCode> {
+        match self.command {
+            Command::Dump(dump) => dump.ask(),
+            Command::Changes(changes) => changes.ask(),
+        }
+    }
+}
+
+impl Dump {
+    fn ask(self) -> Result<ExitCode> {
+        let domain_id = self.target.domain()?;
+        let path = path(domain_id, self.node.as_deref());
+        let agent = Agent::reach(&self.target)?;
+        let answer: Parameters<'_> = agent.get(&path)?;
+        note(&answer);
+        if answer.parameters.is_empty() {
+            eprintln!(
+                "rp: no parameters were seen: nodes announce them when they start or change them"
+            );
+            names_of(&agent, domain_id)?;
+        }
+        let mut output = Output::new();
+        let mut node = "";
+        for parameter in &answer.parameters {
+            if parameter.ros_node != node {
+                node = &parameter.ros_node;
+                output.write(&format!("{}:\n", visible(node)))?;
+            }
+            let (name, value) = (visible(&parameter.name), visible(&parameter.value));
+            output.write(&format!("  {name}: {value}\n"))?;
+        }
+        Ok(ExitCode::SUCCESS)
+    }
+}
+
+impl Changes {
+    fn ask(self) -> Result<ExitCode> {
+        let domain_id = self.target.domain()?;
+        let path = path(domain_id, self.node.as_deref());
+        let agent = Agent::reach(&self.target)?;
+        let mut output = Output::new();
+        let mut printed: Vec<ParameterChange<'static>> = Vec::new();
+        let mut is_first = true;
+        loop {
+            let answer: Parameters<'static> = agent.get(&path)?;
+            if is_first {
+                note(&answer);
+            }
+            if is_first && answer.changes.is_empty() && !self.follow {
+                eprintln!("rp: no changes were seen since the agent started");
+                names_of(&agent, domain_id)?;
+            }
+            // The list is in the order of time, and old changes leave it at its begin.
+            let last = printed.last();
+            let known = last.and_then(|last| answer.changes.iter().rposition(|each| each == last));
+            for change in answer
+                .changes
+                .iter()
+                .skip(known.map_or(0, |known| known + 1))
+            {
+                output.write(&line(change))?;
+            }
+            if !self.follow {
+                return Ok(ExitCode::SUCCESS);
+            }
+            if !answer.changes.is_empty() {
+                printed = answer.changes;
+            }
+            is_first = false;
+            std::thread::sleep(INTERVAL);
+        }
+    }
+}
+
+fn path(domain_id: u32, node: Option<&str>) -> String {
+    let node = node.map(|node| format!("&node={}", encoded(node)));
+    format!(
+        "/parameters?domain_id={domain_id}{}",
+        node.unwrap_or_default()
+    )
+}
+
+fn note(answer: &Parameters<'_>) {
+    if !answer.is_on {
+        eprintln!("rp: the agent reads no parameters: `robot.parameters` is `off`");
+    }
+}
+
+/// Returns the line of a change.
+fn line(change: &ParameterChange<'_>) -> String {
+    let at = Timestamp::from_millisecond(milliseconds(change.timestamp_seconds));
+    let at = at.map(|at| {
+        at.to_zoned(TimeZone::system())
+            .strftime("%H:%M:%S%.3f")
+            .to_string()
+    });
+    let before = change.before.as_deref().unwrap_or("?");
+    let value = match change.value.as_deref() {
+        Some(value) => format!("{} -> {}", visible(before), visible(value)),
+        None => format!("{} -> removed", visible(before)),
+    };
+    let by = match (&change.requested_by, &change.requested_by_writer) {
+        (Some(node), _) => format!("requested by {}", visible(node)),
+        (None, Some(writer)) => format!("requested by the client {}", visible(writer)),
+        (None, None) => "by the node itself, or by a client that was not seen".to_owned(),
+    };
+    format!(
+        "{} {} {}: {value} ({by})\n",
+        at.unwrap_or_default(),
+        visible(&change.ros_node),
+        visible(&change.name)
+    )
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "a time of this century")]
+fn milliseconds(seconds: f64) -> i64 {
+    (seconds * 1e3) as i64
+}

@@ -1,0 +1,259 @@
+//! What the robot itself says: its diagnostics.
+
+use ros2probe_model::derive::robot::Parts;
+use ros2probe_model::facts::diagnosis::Diagnosis;
+use ros2probe_model::facts::event::EventKind;
+use ros2probe_model::observe::observer::Settings;
+use ros2probe_model::report::snapshot::DiagnosticStatus;
+use ros2probe_testing::model::domain::VirtualDomain;
+use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
+use ros2probe_testing::robot_diagnostics::{DDS_TYPE, Status, diagnostics};
+use ros2probe_wire::diagnostics::DiagnosticLevel::{self, Error, Ok, Stale, Warn};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+
+const PREFIX: GuidPrefix = GuidPrefix([3; 12]);
+const WRITER: Guid = Guid::new(PREFIX, EntityId([0, 0, 1, 3]));
+const LIDAR: &str = "lidar: connection";
+
+/// A robot that publishes diagnostics. No watch covers them.
+struct Robot {
+    domain: VirtualDomain,
+    number: u64,
+}
+
+impl Robot {
+    fn with(settings: Settings, topic: &str) -> Self {
+        let mut domain = VirtualDomain::new(&[], settings);
+        domain.participant(PREFIX, 100_000);
+        let payload = forge::endpoint(WRITER, topic, DDS_TYPE, true);
+        domain.put(Message::from(PREFIX).data(SEDP_WRITERS, 1, &payload));
+        domain.nodes(PREFIX, 1, &[("/", "driver", WRITER)]);
+        Self { domain, number: 0 }
+    }
+
+    fn new() -> Self {
+        Self::with(Settings::default(), "rt/diagnostics")
+    }
+
+    fn send(&mut self, statuses: &[Status<'_>]) {
+        self.number += 1;
+        let payload = diagnostics(statuses);
+        let message = Message::from(PREFIX).data(WRITER.entity, self.number, &payload);
+        self.domain.put(message);
+    }
+
+    fn say(&mut self, level: u8, message: &str) {
+        self.send(&[Status {
+            level,
+            name: LIDAR,
+            message,
+            values: &[("rate", "9.5")],
+        }]);
+    }
+
+    /// Sends this level once a second.
+    fn go_on(&mut self, level: u8, seconds: u64) {
+        for second in 0..seconds {
+            self.say(level, &format!("message {second}"));
+            self.domain.wait(1000);
+        }
+    }
+
+    fn only(&self) -> DiagnosticStatus {
+        let statuses = self.domain.snapshot().diagnostics.statuses;
+        let [status] = &statuses[..] else {
+            panic!("{statuses:?}")
+        };
+        DiagnosticStatus::clone(status)
+    }
+
+    /// Returns level and message of the findings.
+    fn findings(&self) -> Vec<(DiagnosticLevel, String)> {
+        let diagnoses = &self.domain.snapshot().diagnoses;
+        let errors = diagnoses.list.iter().filter_map(|each| match each {
+            Diagnosis::DiagnosticError { level, message, .. } => {
+                Some((*level, message.to_string()))
+            }
+            _ => None,
+        });
+        errors.collect()
+    }
+
+    /// Returns the changes of levels since the last call.
+    fn changes(&mut self) -> Vec<(Option<DiagnosticLevel>, DiagnosticLevel)> {
+        let events = self.domain.observer.drain().events.events;
+        let changes = events.iter().filter_map(|event| match &event.kind {
+            EventKind::Diagnostic { before, status } => Some((*before, status.level)),
+            _ => None,
+        });
+        changes.collect()
+    }
+}
+
+#[test]
+fn the_last_status_of_each_part_is_kept_with_its_values_and_node() {
+    let mut robot = Robot::new();
+    robot.say(1, "old");
+    robot.send(&[
+        Status {
+            level: 2,
+            name: LIDAR,
+            message: "no data",
+            values: &[("rate", "0"), ("port", "/dev/ttyUSB0")],
+        },
+        Status {
+            level: 0,
+            name: "battery",
+            message: "full",
+            values: &[],
+        },
+    ]);
+    let statuses = robot.domain.snapshot().diagnostics.statuses;
+    let [battery, lidar] = &statuses[..] else {
+        panic!("{statuses:?}")
+    };
+    assert_eq!((&*battery.name, battery.level), ("battery", Ok));
+    assert_eq!((&*lidar.name, lidar.level), (LIDAR, Error));
+    assert_eq!((&*lidar.message, &*lidar.hardware_id), ("no data", "hw"));
+    assert_eq!(lidar.node.as_deref(), Some("/driver"));
+    assert_eq!(lidar.values[1], ("port".into(), "/dev/ttyUSB0".into()));
+}
+
+#[test]
+fn a_change_of_level_is_one_event_and_the_first_ok_is_none() {
+    let mut robot = Robot::new();
+    for level in [0, 0, 1, 1, 2, 3, 0] {
+        robot.say(level, "text");
+    }
+    let levels = [(Ok, Warn), (Warn, Error), (Error, Stale), (Stale, Ok)];
+    assert_eq!(robot.changes(), levels.map(|(from, to)| (Some(from), to)));
+    let mut robot = Robot::new();
+    robot.say(2, "from the start");
+    assert_eq!(robot.changes(), [(None, Error)]);
+}
+
+#[test]
+fn an_error_of_five_seconds_is_a_finding_until_it_ends() {
+    let mut robot = Robot::new();
+    robot.go_on(2, 4);
+    assert_eq!(robot.findings(), []);
+    robot.go_on(2, 5);
+    // The message is that of the report, so that the finding does not change each second.
+    let reported = robot.findings();
+    assert_eq!(reported.len(), 1);
+    robot.go_on(2, 5);
+    assert_eq!(robot.findings(), reported);
+    robot.go_on(0, 2);
+    assert_eq!(robot.findings(), []);
+}
+
+#[test]
+fn a_start_up_in_error_and_a_warning_are_no_findings() {
+    let mut robot = Robot::new();
+    robot.go_on(2, 4);
+    robot.go_on(1, 60);
+    assert_eq!(robot.findings(), []);
+}
+
+#[test]
+fn a_part_whose_messages_cease_becomes_stale_and_then_a_finding() {
+    let mut robot = Robot::new();
+    robot.go_on(0, 10);
+    (0..4).for_each(|_| robot.domain.wait(1000));
+    assert_eq!(robot.only().level, Ok);
+    (0..3).for_each(|_| robot.domain.wait(1000));
+    assert_eq!(
+        (robot.only().level, robot.changes()),
+        (Stale, vec![(Some(Ok), Stale)])
+    );
+    (0..5).for_each(|_| robot.domain.wait(1000));
+    assert_eq!(robot.findings(), [(Stale, "message 9".to_owned())]);
+    robot.say(0, "back");
+    robot.domain.wait(1000);
+    assert_eq!((robot.only().level, robot.findings()), (Ok, vec![]));
+}
+
+#[test]
+fn a_part_that_publishes_every_forty_seconds_is_never_stale() {
+    let mut robot = Robot::new();
+    for _ in 0..5 {
+        robot.say(0, "alive");
+        (0..40).for_each(|_| robot.domain.wait(1000));
+        assert_eq!(robot.only().level, Ok);
+    }
+    (0..90).for_each(|_| robot.domain.wait(1000));
+    assert_eq!(robot.only().level, Stale);
+}
+
+#[test]
+fn a_node_that_departs_takes_its_parts_along() {
+    let mut robot = Robot::new();
+    robot.go_on(2, 8);
+    assert_eq!(robot.findings().len(), 1);
+    robot
+        .domain
+        .put(Message::from(PREFIX).dispose_by_hash(SEDP_WRITERS, 2, WRITER));
+    robot.domain.wait(1000);
+    assert!(robot.domain.snapshot().diagnostics.statuses.is_empty());
+    assert_eq!(robot.findings(), []);
+}
+
+#[test]
+fn what_an_aggregator_repeats_is_kept_and_is_no_finding_of_its_own() {
+    let mut robot = Robot::with(Settings::default(), "rt/diagnostics_agg");
+    robot.go_on(2, 20);
+    assert_eq!(robot.only().level, Error);
+    assert_eq!((robot.findings(), robot.changes()), (vec![], vec![]));
+}
+
+#[test]
+fn diagnostics_are_not_read_if_they_are_switched_off() {
+    let settings = Settings {
+        robot: Parts::default(),
+        ..Settings::default()
+    };
+    let mut robot = Robot::with(settings, "rt/diagnostics");
+    robot.say(2, "text");
+    let facts = robot.domain.snapshot().diagnostics;
+    assert!(!facts.are_read && facts.statuses.is_empty());
+}
+
+#[test]
+fn malformed_messages_count_and_keep_what_precedes_the_error() {
+    let mut robot = Robot::new();
+    let statuses = [LIDAR, "battery"].map(|name| Status {
+        level: 1,
+        name,
+        message: "text",
+        values: &[],
+    });
+    let whole = diagnostics(&statuses);
+    let message = Message::from(PREFIX).data(WRITER.entity, 1, &whole[..whole.len() - 8]);
+    robot.domain.put(message);
+    assert_eq!(&*robot.only().name, LIDAR);
+    let errors = robot.domain.snapshot().decode_errors;
+    assert!(
+        errors
+            .iter()
+            .any(|each| each.stage == "diagnostics" && each.count == 1)
+    );
+}
+
+#[test]
+fn more_parts_than_the_table_holds_displace_the_most_silent_one() {
+    let mut robot = Robot::new();
+    for number in 0..1100 {
+        let name = format!("part {number}");
+        robot.send(&[Status {
+            level: 0,
+            name: &name,
+            message: "",
+            values: &[("key", "value")],
+        }]);
+        robot.domain.wait(20);
+    }
+    let statuses = robot.domain.snapshot().diagnostics.statuses;
+    assert_eq!(statuses.len(), 1024);
+    assert!(statuses.iter().all(|status| &*status.name != "part 0"));
+    assert!(statuses.iter().any(|status| &*status.name == "part 1099"));
+}

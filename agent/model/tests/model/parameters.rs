@@ -1,0 +1,217 @@
+//! What the robot itself says: parameters of its nodes.
+
+use ros2probe_model::derive::robot::Parts;
+use ros2probe_model::facts::event::EventKind;
+use ros2probe_model::observe::observer::Settings;
+use ros2probe_testing::model::domain::VirtualDomain;
+use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
+use ros2probe_testing::robot_parameters::{EVENT, Integers, REQUEST, event, request};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+
+const PLANNER: GuidPrefix = GuidPrefix([3; 12]);
+const CLIENT: GuidPrefix = GuidPrefix([4; 12]);
+const EVENTS: Guid = Guid::new(PLANNER, EntityId([0, 0, 1, 3]));
+const REQUESTS: Guid = Guid::new(CLIENT, EntityId([0, 0, 2, 3]));
+
+/// A node with parameters, and a node that sets them.
+struct Scene {
+    domain: VirtualDomain,
+    number: u64,
+    /// Whether the client is of Cyclone DDS, whose requests have a header.
+    is_cyclone: bool,
+}
+
+impl Scene {
+    fn with(settings: Settings, is_cyclone: bool) -> Self {
+        let mut domain = VirtualDomain::new(&[], settings);
+        let mut scene = Self {
+            number: 0,
+            is_cyclone,
+            domain: {
+                domain.participant(PLANNER, 100_000);
+                let payload = forge::endpoint(EVENTS, "rt/parameter_events", EVENT, true);
+                domain.put(Message::from(PLANNER).data(SEDP_WRITERS, 1, &payload));
+                domain.nodes(PLANNER, 1, &[("/", "planner", EVENTS)]);
+                domain
+            },
+        };
+        let participant = forge::participant(CLIENT, 100_000, Some(0));
+        let spdp = scene
+            .of_client()
+            .data(EntityId::SPDP_WRITER, 1, &participant);
+        scene.domain.put(spdp);
+        let payload = forge::endpoint(REQUESTS, "rq/planner/set_parametersRequest", REQUEST, true);
+        let sedp = scene.of_client().data(SEDP_WRITERS, 1, &payload);
+        scene.domain.put(sedp);
+        scene.domain.nodes(CLIENT, 1, &[("/", "tuner", REQUESTS)]);
+        scene
+    }
+
+    fn new() -> Self {
+        Self::with(Settings::default(), false)
+    }
+
+    fn of_client(&self) -> Message {
+        match self.is_cyclone {
+            true => Message::from(CLIENT),
+            false => Message::from_fast(CLIENT),
+        }
+    }
+
+    fn event(&mut self, new: Integers<'_>, changed: Integers<'_>, deleted: &[&str]) {
+        self.number += 1;
+        let payload = event("/planner", new, changed, deleted);
+        let message = Message::from(PLANNER).data(EVENTS.entity, self.number, &payload);
+        self.domain.put(message);
+    }
+
+    fn request(&mut self, integers: Integers<'_>) {
+        self.number += 1;
+        let payload = request(integers, self.is_cyclone);
+        let message = self
+            .of_client()
+            .data(REQUESTS.entity, self.number, &payload);
+        self.domain.put(message);
+    }
+
+    /// Returns names and values of the known parameters.
+    fn known(&self) -> Vec<(String, String)> {
+        let known = self.domain.snapshot().parameters.known;
+        let known = known
+            .iter()
+            .inspect(|each| assert_eq!(&*each.node, "/planner"));
+        known
+            .map(|each| (each.name.to_string(), each.value.to_string()))
+            .collect()
+    }
+
+    /// Returns name, old and new value, and node of the client of each change.
+    fn changes(&self) -> Vec<[Option<String>; 4]> {
+        let changes = self.domain.snapshot().parameters.changes;
+        let changes = changes.iter().map(|change| {
+            let client = change.requested_by.as_ref();
+            [
+                Some(change.name.to_string()),
+                change.before.as_deref().map(str::to_owned),
+                change.value.as_deref().map(str::to_owned),
+                client.and_then(|client| client.node.as_deref().map(str::to_owned)),
+            ]
+        });
+        changes.collect()
+    }
+}
+
+fn owned<const N: usize>(texts: [Option<&str>; N]) -> [Option<String>; N] {
+    texts.map(|text| text.map(str::to_owned))
+}
+
+#[test]
+fn declared_parameters_are_known_and_no_changes() {
+    let mut scene = Scene::new();
+    scene.event(&[("speed", 5), ("retries", -1)], &[], &[]);
+    let known = [("retries", "-1"), ("speed", "5")];
+    assert_eq!(
+        scene.known(),
+        known.map(|(name, value)| (name.into(), value.into()))
+    );
+    assert!(scene.changes().is_empty());
+}
+
+#[test]
+fn a_change_has_old_and_new_value_and_is_an_event() {
+    let mut scene = Scene::new();
+    scene.event(&[("speed", 5)], &[], &[]);
+    scene.event(&[], &[("speed", 7)], &[]);
+    scene.event(&[], &[("speed", 7)], &[]);
+    scene.event(&[], &[("unknown before", 1)], &[]);
+    scene.event(&[], &[], &["speed"]);
+    assert_eq!(
+        scene.changes(),
+        [
+            owned([Some("speed"), Some("5"), Some("7"), None]),
+            owned([Some("unknown before"), None, Some("1"), None]),
+            owned([Some("speed"), Some("7"), None, None]),
+        ]
+    );
+    let events = scene.domain.observer.drain().events.events;
+    let changes = events
+        .iter()
+        .filter(|event| matches!(event.kind, EventKind::Parameter(_)));
+    assert_eq!(changes.count(), 3);
+    let counts = scene.domain.snapshot().parameters.counts;
+    assert_eq!((&*counts[0].1, counts[0].2), ("/planner", 3));
+}
+
+#[test]
+fn the_requester_of_a_change_is_the_node_of_the_client() {
+    for is_cyclone in [false, true] {
+        let mut scene = Scene::with(Settings::default(), is_cyclone);
+        scene.event(&[("speed", 5)], &[], &[]);
+        scene.request(&[("other", 1), ("speed", 9)]);
+        scene.domain.wait(20);
+        scene.event(&[], &[("speed", 9)], &[]);
+        let change = owned([Some("speed"), Some("5"), Some("9"), Some("/tuner")]);
+        assert_eq!(scene.changes(), [change], "{is_cyclone}");
+    }
+}
+
+#[test]
+fn an_old_request_or_one_for_another_value_is_not_the_cause() {
+    let mut scene = Scene::new();
+    scene.request(&[("speed", 9)]);
+    scene.event(&[], &[("speed", 8)], &[]);
+    scene.domain.wait(6000);
+    scene.event(&[], &[("speed", 9)], &[]);
+    assert!(scene.changes().iter().all(|change| change[3].is_none()));
+    assert_eq!(scene.changes().len(), 2);
+}
+
+#[test]
+fn the_parameters_of_a_departed_node_are_forgotten_and_its_changes_stay() {
+    let mut scene = Scene::new();
+    scene.event(&[("speed", 5)], &[("speed", 6)], &[]);
+    let gone = Message::from(PLANNER).dispose_by_hash(SEDP_WRITERS, 2, EVENTS);
+    scene.domain.put(gone);
+    assert!(scene.known().is_empty());
+    assert_eq!(scene.changes().len(), 1);
+}
+
+#[test]
+fn parameters_are_not_read_if_they_are_switched_off() {
+    let settings = Settings {
+        robot: Parts::default(),
+        ..Settings::default()
+    };
+    let mut scene = Scene::with(settings, false);
+    scene.event(&[], &[("speed", 5)], &[]);
+    let facts = scene.domain.snapshot().parameters;
+    assert!(!facts.are_read && facts.known.is_empty() && facts.changes.is_empty());
+}
+
+#[test]
+fn more_parameters_than_the_table_holds_displace_the_oldest_value() {
+    let mut scene = Scene::new();
+    for number in 0..4200 {
+        scene.event(&[(&format!("p{number}"), number)], &[], &[]);
+        scene.domain.wait(5);
+    }
+    let known = scene.known();
+    assert_eq!(known.len(), 4096);
+    assert!(known.iter().all(|(name, _)| name != "p0"));
+    assert!(known.iter().any(|(name, _)| name == "p4199"));
+}
+
+#[test]
+fn more_nodes_than_the_table_holds_are_not_counted_and_old_changes_go() {
+    let mut scene = Scene::new();
+    for number in 0..1200 {
+        scene.number += 1;
+        let payload = event(&format!("/n{number}"), &[], &[("speed", number)], &[]);
+        let message = Message::from(PLANNER).data(EVENTS.entity, scene.number, &payload);
+        scene.domain.put(message);
+        scene.domain.wait(20);
+    }
+    let facts = scene.domain.snapshot().parameters;
+    assert_eq!((facts.counts.len(), facts.changes.len()), (512, 1000));
+    assert_eq!(&*facts.changes[999].node, "/n1199");
+}
