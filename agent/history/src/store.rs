@@ -1,0 +1,406 @@
+//! The directory of files: two tiers, their budgets, and what is read from them.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::ops::Range;
+use std::os::unix::fs::DirBuilderExt as _;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use crate::block::{Block, Kind};
+use crate::columns::{self, Name, Row};
+use crate::file::Blocks;
+use crate::merge::{Merge, merge_by_name};
+use crate::rows::{ProcessName, ProcessRow, Series, TopicName, TopicRow};
+
+/// Step of the rows in [`Tier::Tens`], in seconds.
+const TEN: u32 = 10;
+/// Time of a block in [`Tier::Tens`], in seconds.
+const WINDOW: u32 = 600;
+/// Maximum number of these blocks that one call writes.
+const MAX_WINDOWS: usize = 12;
+/// A file ends after this part of its tier's budget, so that deleting one frees little history.
+const FILES: u64 = 24;
+/// Maximum number of files of a tier. The oldest of more is deleted.
+const MAX_FILES: usize = 256;
+/// Free space below which nothing is written, in bytes. Other programs need the rest.
+const MIN_FREE: u64 = 64 << 20;
+/// Ending of the files' names.
+const EXTENSION: &str = "history";
+
+/// Resolution of rows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tier {
+    /// One row per second, and a state per minute.
+    Seconds,
+    /// One row per ten seconds, and a state per ten minutes.
+    Tens,
+}
+
+/// History in a directory. Readers never wait for the writer.
+#[derive(Debug)]
+pub struct Store {
+    directory: PathBuf,
+    /// Maximum size of all files, in bytes.
+    limit: u64,
+    tiers: Mutex<[Vec<Blocks>; 2]>,
+}
+
+/// Times from which a tier has blocks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Span {
+    /// Unix time at which the oldest block begins.
+    pub begin: u32,
+    /// Unix time at which the latest block ends.
+    pub end: u32,
+}
+
+/// Size and reach of a store.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Facts {
+    /// Size of all files, in bytes.
+    pub bytes: u64,
+    /// Maximum size, in bytes.
+    pub limit: u64,
+    /// Reach of [`Tier::Seconds`]; `None` without a block.
+    pub seconds: Option<Span>,
+    /// Reach of [`Tier::Tens`]; `None` without a block.
+    pub tens: Option<Span>,
+}
+
+impl Tier {
+    const ALL: [Self; 2] = [Self::Seconds, Self::Tens];
+
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Seconds => "seconds",
+            Self::Tens => "tens",
+        }
+    }
+
+    /// Returns the tier's part of a limit: two thirds and one third.
+    const fn budget(self, limit: u64) -> u64 {
+        match self {
+            Self::Seconds => limit / 3 * 2,
+            Self::Tens => limit / 3,
+        }
+    }
+
+    /// Returns the maximum time of a file, in seconds.
+    const fn span(self) -> u32 {
+        match self {
+            Self::Seconds => 3_600,
+            Self::Tens => 12 * 3_600,
+        }
+    }
+}
+
+impl Store {
+    /// Opens a directory with at most `limit` bytes. The first write creates it if it is missing.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the directory cannot be read.
+    pub fn open(directory: &Path, limit: u64) -> io::Result<Self> {
+        let mut tiers: [Vec<Blocks>; 2] = Default::default();
+        let entries = match fs::read_dir(directory) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => None,
+            entries => Some(entries?),
+        };
+        for entry in entries.into_iter().flatten() {
+            let path = entry?.path();
+            let Some(tier) = tier_of(&path) else {
+                continue;
+            };
+            if let Some(files) = tiers.get_mut(tier as usize) {
+                files.extend(Blocks::open(&path));
+            }
+        }
+        for files in &mut tiers {
+            files.sort_by(|one, other| one.path.cmp(&other.path));
+        }
+        Ok(Self {
+            directory: directory.to_path_buf(),
+            limit,
+            tiers: Mutex::new(tiers),
+        })
+    }
+
+    /// Appends blocks to a tier, and deletes its oldest files beyond the limit.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the blocks cannot be written, or if little space is free. The store is as before.
+    pub fn append(&self, tier: Tier, blocks: &[Block]) -> io::Result<()> {
+        let Some(begin) = blocks.iter().map(|block| block.begin).min() else {
+            return Ok(());
+        };
+        self.prepare()?;
+        let budget = tier.budget(self.limit);
+        let mut file = match self.files(tier).pop() {
+            Some(last)
+                if last.length < budget / FILES && begin.abs_diff(last.begin) < tier.span() =>
+            {
+                last
+            }
+            _ => Blocks::create(self.free_path(tier, begin), begin)?,
+        };
+        file.append(blocks)?;
+        // A slow storage must not hold the lock, for which readers would wait.
+        for excess in self.replace_last(tier, file, budget) {
+            let _ = fs::remove_file(excess.path);
+        }
+        Ok(())
+    }
+
+    /// Stores the new state of the last file of a tier. Returns the oldest files beyond the budget.
+    fn replace_last(&self, tier: Tier, file: Blocks, budget: u64) -> Vec<Blocks> {
+        let mut tiers = self.lock();
+        let Some(files) = tiers.get_mut(tier as usize) else {
+            return Vec::new();
+        };
+        match files.last_mut().filter(|last| last.path == file.path) {
+            Some(last) => *last = file,
+            None => files.push(file),
+        }
+        let mut size: u64 = files.iter().map(|file| file.length).sum();
+        let mut excess = 0;
+        for file in files.iter().take(files.len().saturating_sub(1)) {
+            if size <= budget && files.len() - excess <= MAX_FILES {
+                break;
+            }
+            size = size.saturating_sub(file.length);
+            excess += 1;
+        }
+        files.drain(..excess).collect()
+    }
+
+    /// Merges rows of [`Tier::Seconds`] into [`Tier::Tens`], for each ten minutes that have passed
+    /// at the time `now`.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the blocks cannot be written.
+    pub fn condense(&self, now: u32) -> io::Result<()> {
+        for _ in 0..MAX_WINDOWS {
+            let Some(times) = self.next_window(now) else {
+                return Ok(());
+            };
+            let topics = self.gathered(Kind::Topics, &times);
+            let processes = self.gathered(Kind::Processes, &times);
+            let mut blocks = vec![Block::of_topics(times.start, times.end, &topics)];
+            if !processes.is_empty() {
+                blocks.push(Block::of_processes(times.start, times.end, &processes));
+            }
+            let state = self
+                .state(times.end)
+                .filter(|state| state.end > times.start);
+            blocks.extend(state);
+            let mut events = Vec::new();
+            self.visit(Tier::Seconds, Kind::Events, &times, &mut |block| {
+                events.push(block);
+            });
+            blocks.extend(events);
+            self.append(Tier::Tens, &blocks)?;
+        }
+        Ok(())
+    }
+
+    /// Visits the rows of the wanted topics that end after the begin of the times and not after
+    /// their end, the oldest first. Rows are those of [`Tier::Tens`] if `step` is ten seconds or
+    /// more, or if they are too old for [`Tier::Seconds`].
+    pub fn topics(
+        &self,
+        times: Range<u32>,
+        step: u32,
+        wanted: &dyn Fn(&TopicName) -> bool,
+        each: &mut dyn FnMut(&TopicName, TopicRow),
+    ) {
+        for (tier, times) in self.parts(times, step) {
+            self.rows(tier, Kind::Topics, &times, wanted, each);
+        }
+    }
+
+    /// Visits the rows of the wanted processes, as [`Self::topics`] does.
+    pub fn processes(
+        &self,
+        times: Range<u32>,
+        step: u32,
+        wanted: &dyn Fn(&ProcessName) -> bool,
+        each: &mut dyn FnMut(&ProcessName, ProcessRow),
+    ) {
+        for (tier, times) in self.parts(times, step) {
+            self.rows(tier, Kind::Processes, &times, wanted, each);
+        }
+    }
+
+    /// Visits the content of the blocks of events that overlap the times, the oldest first.
+    pub fn events(&self, times: Range<u32>, each: &mut dyn FnMut(&[u8])) {
+        for (tier, times) in self.parts(times, TEN) {
+            self.visit(tier, Kind::Events, &times, &mut |block| {
+                each(&block.content);
+            });
+        }
+    }
+
+    /// Returns the latest state of the robot at this time; `None` if no earlier one is kept.
+    #[must_use]
+    pub fn state(&self, time: u32) -> Option<Block> {
+        let states = Tier::ALL.into_iter().filter_map(|tier| {
+            let mut files = self.files(tier);
+            files.retain(|file| file.begin <= time);
+            files.sort_by_key(|file| file.begin);
+            let latest = files.iter().rev();
+            latest
+                .filter_map(|file| file.last(Kind::State, time))
+                .next()
+        });
+        states.max_by_key(|state| state.end)
+    }
+
+    /// Returns size and reach.
+    #[must_use]
+    pub fn facts(&self) -> Facts {
+        let bytes = self.lock().iter().flatten().map(|file| file.length).sum();
+        Facts {
+            bytes,
+            limit: self.limit,
+            seconds: self.span(Tier::Seconds),
+            tens: self.span(Tier::Tens),
+        }
+    }
+
+    /// Returns the reach of a tier; `None` without a block.
+    #[must_use]
+    pub fn span(&self, tier: Tier) -> Option<Span> {
+        let files = self.files(tier);
+        Some(Span {
+            begin: files.iter().map(|file| file.begin).min()?,
+            end: files.iter().map(|file| file.end).max()?,
+        })
+    }
+
+    fn lock(&self) -> MutexGuard<'_, [Vec<Blocks>; 2]> {
+        self.tiers.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn files(&self, tier: Tier) -> Vec<Blocks> {
+        self.lock().get(tier as usize).cloned().unwrap_or_default()
+    }
+
+    fn visit(&self, tier: Tier, kind: Kind, times: &Range<u32>, each: &mut dyn FnMut(Block)) {
+        for file in self.files(tier) {
+            if file.overlaps(times) {
+                file.visit(kind, times, each);
+            }
+        }
+    }
+
+    fn rows<N: Name, R: Row + Merge>(
+        &self,
+        tier: Tier,
+        kind: Kind,
+        times: &Range<u32>,
+        wanted: &dyn Fn(&N) -> bool,
+        each: &mut dyn FnMut(&N, R),
+    ) {
+        self.visit(tier, kind, times, &mut |block| {
+            columns::read(&block.content, wanted, &mut |name, row: R| {
+                if row.at() > times.start && row.at() <= times.end {
+                    each(name, row);
+                }
+            });
+        });
+    }
+
+    /// Returns which tier has which part of the times.
+    fn parts(&self, times: Range<u32>, step: u32) -> [(Tier, Range<u32>); 2] {
+        let border = if step >= TEN {
+            self.condensed(times.end)
+        } else {
+            let files = self.files(Tier::Seconds);
+            files.iter().map(|file| file.begin).min().unwrap_or(0)
+        };
+        let older = times.start..times.end.min(border);
+        let newer = times.start.max(border)..times.end;
+        [(Tier::Tens, older), (Tier::Seconds, newer)]
+    }
+
+    /// Returns the time up to which [`Tier::Tens`] has blocks at the time `now`. Later blocks are
+    /// those of a clock that was set back.
+    fn condensed(&self, now: u32) -> u32 {
+        let files = self.files(Tier::Tens);
+        let past = files.iter().filter(|file| file.begin <= now);
+        past.map(|file| file.end).max().unwrap_or(0)
+    }
+
+    /// Returns the next ten minutes for [`Tier::Tens`] that [`Tier::Seconds`] has whole.
+    fn next_window(&self, now: u32) -> Option<Range<u32>> {
+        let whole = now / WINDOW * WINDOW;
+        let done = self.condensed(now);
+        let files = self.files(Tier::Seconds);
+        // A time without observation has no files, and is skipped.
+        let left = files
+            .iter()
+            .filter(|file| file.begin < whole && file.end > done);
+        let begin = left.map(|file| file.begin.max(done)).min()? / WINDOW * WINDOW;
+        let begin = begin.max(done);
+        (begin < whole).then(|| begin..(begin / WINDOW + 1) * WINDOW)
+    }
+
+    /// Returns the merged rows of all topics or processes.
+    fn gathered<N: Name + Ord + Clone, R: Row + Merge>(
+        &self,
+        kind: Kind,
+        times: &Range<u32>,
+    ) -> Vec<Series<N, R>> {
+        let mut all = BTreeMap::<N, Vec<R>>::new();
+        self.rows(Tier::Seconds, kind, times, &|_| true, &mut |name, row| {
+            merge_by_name(&mut all, name, row, TEN);
+        });
+        let series = all.into_iter();
+        series.map(|(of, rows)| Series { of, rows }).collect()
+    }
+
+    /// Returns a name that no file of the tier has. After a step back of the clock, a begin may
+    /// occur twice.
+    fn free_path(&self, tier: Tier, begin: u32) -> PathBuf {
+        let files = self.files(tier);
+        let last = files.last().and_then(|last| begin_of(&last.path));
+        // The order of the names is that of writing.
+        let number = last.map_or(begin, |last| begin.max(last.saturating_add(1)));
+        let name = format!("{}-{number:010}.{EXTENSION}", tier.name());
+        self.directory.join(name)
+    }
+
+    /// Creates the directory if it is missing. Fails if little space is free.
+    fn prepare(&self) -> io::Result<()> {
+        let exists = self.directory.is_dir();
+        let parent = self.directory.parent().filter(|_| !exists);
+        let space = rustix::fs::statvfs(parent.unwrap_or(&self.directory))?;
+        if space.f_bavail.saturating_mul(space.f_frsize) < MIN_FREE {
+            return Err(io::Error::from(io::ErrorKind::StorageFull));
+        }
+        if !exists {
+            fs::DirBuilder::new().mode(0o700).create(&self.directory)?;
+        }
+        Ok(())
+    }
+}
+
+/// Returns the tier of a file by its name; `None` for other files.
+fn tier_of(path: &Path) -> Option<Tier> {
+    begin_of(path)?;
+    let name = path.file_stem()?.to_str()?;
+    Tier::ALL.into_iter().find(|tier| {
+        name.strip_prefix(tier.name())
+            .is_some_and(|rest| rest.starts_with('-'))
+    })
+}
+
+fn begin_of(path: &Path) -> Option<u32> {
+    let is_ours = path.extension()?.to_str()? == EXTENSION;
+    let (_, number) = path.file_stem()?.to_str()?.split_once('-')?;
+    number.parse().ok().filter(|_| is_ours)
+}

@@ -1,0 +1,56 @@
+//! Memory of writing: a minute of as many topics as may be measured.
+
+#![allow(clippy::unwrap_used, reason = "a failed test may panic")]
+
+use std::fs;
+
+use ros2probe_history::{Block, Series, Store, Tier, TopicName, TopicRow};
+
+/// Default of `limits.topics`.
+const TOPICS: u32 = 1000;
+/// Documented memory without events, in KiB (docs/limits.md).
+const ALLOWED: u64 = 6 << 10;
+
+fn minute(begin: u32) -> Vec<Series<TopicName, TopicRow>> {
+    let series = |topic| Series {
+        of: TopicName {
+            domain_id: 0,
+            dds_name: format!("rt/robot/part_{topic:04}/data_raw"),
+        },
+        rows: (begin + 1..=begin + 60)
+            .map(|at| TopicRow {
+                at,
+                seconds: 1,
+                messages: at.wrapping_mul(topic) % 1000,
+                ..TopicRow::default()
+            })
+            .collect(),
+    };
+    (0..TOPICS).map(series).collect()
+}
+
+/// Returns the most memory that this process has had, in KiB.
+fn peak() -> u64 {
+    let status = fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+    let number = line.unwrap().split_whitespace().next().unwrap();
+    number.parse().unwrap()
+}
+
+#[test]
+fn a_minute_of_all_topics_is_written_within_the_documented_memory() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = Store::open(directory.path(), 64 << 20).unwrap();
+    store
+        .append(Tier::Seconds, &[Block::of_topics(0, 1, &[])])
+        .unwrap();
+    let before = peak();
+    for begin in (60..=1200).step_by(60) {
+        let block = Block::of_topics(begin, begin + 60, &minute(begin));
+        store.append(Tier::Seconds, &[block]).unwrap();
+        store.condense(begin + 60).unwrap();
+    }
+    let most = peak() - before;
+    println!("{most} KiB");
+    assert!(most <= ALLOWED, "{most} KiB");
+}
