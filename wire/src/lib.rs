@@ -33,8 +33,12 @@ mod expansion;
 pub mod filter;
 pub mod frame;
 pub mod guid;
+#[cfg(feature = "alloc")]
+pub mod header;
 pub mod host;
 pub mod inside;
+#[cfg(feature = "alloc")]
+pub mod lifecycle;
 #[cfg(feature = "alloc")]
 pub mod log;
 #[cfg(feature = "alloc")]

@@ -48,3 +48,36 @@ impl<'a> PlainCursor<'a> {
         self.wide(what).map(f64::from_bits)
     }
 }
+
+/// A sequence whose elements are read one after the other. It ends at the first malformed one.
+#[derive(Clone, Debug)]
+pub(crate) struct Sequence<'a> {
+    cursor: PlainCursor<'a>,
+    left: u32,
+}
+
+impl<'a> Sequence<'a> {
+    /// Reads the number of elements at this cursor.
+    pub(crate) fn at(mut cursor: PlainCursor<'a>, what: &'static str) -> Result<Self, WireError> {
+        let left = cursor.count(what)?;
+        Ok(Self { cursor, left })
+    }
+
+    /// Reads the next element.
+    pub(crate) fn next<T>(
+        &mut self,
+        read: impl FnOnce(&mut PlainCursor<'a>) -> Result<T, WireError>,
+    ) -> Option<Result<T, WireError>> {
+        self.left = self.left.checked_sub(1)?;
+        let element = read(&mut self.cursor);
+        if element.is_err() {
+            self.left = 0;
+        }
+        Some(element)
+    }
+
+    /// Returns the cursor after the elements that were read.
+    pub(crate) const fn cursor(&self) -> PlainCursor<'a> {
+        self.cursor
+    }
+}

@@ -1,5 +1,6 @@
 //! Parameters of nodes: `rcl_interfaces/msg/ParameterEvent`, as published on `/parameter_events`,
-//! and requests of `rcl_interfaces/srv/SetParameters`.
+//! requests of `rcl_interfaces/srv/SetParameters`, and requests and replies of
+//! `rcl_interfaces/srv/GetParameters`.
 //!
 //! The layouts are the same in all distributions since Foxy. A value contains a field of each of
 //! its types; the number of its type says which one counts.
@@ -7,7 +8,7 @@
 use core::fmt;
 
 use crate::cursor::{Reason, WireError};
-use crate::plain::PlainCursor;
+use crate::plain::{PlainCursor, Sequence};
 
 /// Name of the type of events, as ROS writes it.
 pub const EVENT: &str = "rcl_interfaces/msg/ParameterEvent";
@@ -86,10 +87,16 @@ enum Element {
 
 /// Reads the parameters of a sequence. It ends at the first malformed one.
 #[derive(Clone, Debug)]
-pub struct Parameters<'a> {
-    cursor: PlainCursor<'a>,
-    left: u32,
-}
+pub struct Parameters<'a>(Sequence<'a>);
+
+/// Reads the names of a request for values. It ends at the first malformed one.
+#[derive(Clone, Debug)]
+pub struct RequestedNames<'a>(Sequence<'a>);
+
+/// Reads the values of a reply, in the order of the requested names. It ends at the first malformed
+/// one.
+#[derive(Clone, Debug)]
+pub struct RepliedValues<'a>(Sequence<'a>);
 
 /// Reads the changes of an event. It ends at the first malformed one.
 #[derive(Clone, Debug)]
@@ -170,11 +177,11 @@ impl<'a> ParameterEvent<'a> {
         cursor.cursor.u32("stamp.sec")?;
         cursor.cursor.u32("stamp.nanosec")?;
         let node = cursor.text("node")?;
-        let left = cursor.count("new_parameters")?;
+        let parameters = Parameters(Sequence::at(cursor, "new_parameters")?);
         Ok(Self {
             node,
             changes: ParameterChanges {
-                parameters: Parameters { cursor, left },
+                parameters,
                 kind: ChangeKind::New,
             },
         })
@@ -188,10 +195,56 @@ impl<'a> Parameters<'a> {
     /// # Errors
     /// Returns [`Reason::BadMarker`] if the payload is not plain CDR.
     pub fn of_request(payload: &'a [u8], header: usize) -> Result<Self, WireError> {
-        let mut cursor = PlainCursor::of(payload)?;
-        cursor.cursor.take("request header", header)?;
-        let left = cursor.count("parameters")?;
-        Ok(Self { cursor, left })
+        sequence(payload, header, "parameters").map(Self)
+    }
+}
+
+/// Begins to read the only sequence of a request or reply, after its header.
+fn sequence<'a>(
+    payload: &'a [u8],
+    header: usize,
+    what: &'static str,
+) -> Result<Sequence<'a>, WireError> {
+    let mut cursor = PlainCursor::of(payload)?;
+    cursor.cursor.take("header of the call", header)?;
+    Sequence::at(cursor, what)
+}
+
+impl<'a> RequestedNames<'a> {
+    /// Reads the request of a `get_parameters` service. `header` bytes precede the request itself,
+    /// after the encapsulation header (rmw_cyclonedds: 16).
+    ///
+    /// # Errors
+    /// Returns [`Reason::BadMarker`] if the payload is not plain CDR.
+    pub fn of_request(payload: &'a [u8], header: usize) -> Result<Self, WireError> {
+        sequence(payload, header, "names").map(Self)
+    }
+}
+
+impl<'a> RepliedValues<'a> {
+    /// Reads the reply of a `get_parameters` service. `header` is the length of its header, as in a
+    /// request.
+    ///
+    /// # Errors
+    /// Returns [`Reason::BadMarker`] if the payload is not plain CDR.
+    pub fn of_reply(payload: &'a [u8], header: usize) -> Result<Self, WireError> {
+        sequence(payload, header, "values").map(Self)
+    }
+}
+
+impl<'a> Iterator for RequestedNames<'a> {
+    type Item = Result<&'a [u8], WireError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        self.0.next(|cursor| cursor.text("name"))
+    }
+}
+
+impl<'a> Iterator for RepliedValues<'a> {
+    type Item = Result<ParameterValue<'a>, WireError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        self.0.next(PlainCursor::value)
     }
 }
 
@@ -199,12 +252,7 @@ impl<'a> Iterator for Parameters<'a> {
     type Item = Result<Parameter<'a>, WireError>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        self.left = self.left.checked_sub(1)?;
-        let parameter = self.cursor.parameter();
-        if parameter.is_err() {
-            self.left = 0;
-        }
-        Some(parameter)
+        self.0.next(PlainCursor::parameter)
     }
 }
 
@@ -227,8 +275,8 @@ impl<'a> Iterator for ParameterChanges<'a> {
                 ChangeKind::Changed => ChangeKind::Deleted,
                 ChangeKind::Deleted => return None,
             };
-            match self.parameters.cursor.count("parameters") {
-                Ok(left) => self.parameters.left = left,
+            match Sequence::at(self.parameters.0.cursor(), "parameters") {
+                Ok(next) => self.parameters = Parameters(next),
                 Err(error) => {
                     self.kind = ChangeKind::Deleted;
                     return Some(Err(error));
@@ -300,7 +348,13 @@ mod tests {
 
     /// Writes a parameter whose fields all have a value.
     fn parameter(encoder: &mut Encoder, name: &str, kind: u8, alignment: usize) {
-        encoder.unpadded(name).raw(&[kind, 1]);
+        encoder.unpadded(name);
+        value(encoder, kind, alignment);
+    }
+
+    /// Writes a value whose fields all have a value.
+    fn value(encoder: &mut Encoder, kind: u8, alignment: usize) {
+        encoder.raw(&[kind, 1]);
         encoder.wide((-5_i64).cast_unsigned(), alignment);
         encoder.wide(0.5_f64.to_bits(), alignment);
         encoder.unpadded("text");
@@ -378,6 +432,32 @@ mod tests {
             let parameters: Vec<_> = parameters.map(Result::unwrap).collect();
             assert_eq!(parameters[0].name, b"speed");
             assert_eq!(parameters[0].value.to_string(), "0.5");
+        }
+    }
+
+    #[test]
+    fn names_of_a_request_and_values_of_its_reply_have_one_order() {
+        for header in [0, 16] {
+            let mut encoder = Encoder::new(Endianness::Little);
+            encoder.raw(&[9; 16][..header]).u32(2);
+            encoder.unpadded("speed").unpadded("is_on");
+            let bytes = [&[0, 1, 0, 0], &encoder.bytes[..]].concat();
+            let names = RequestedNames::of_request(&bytes, header).unwrap();
+            let names: Vec<_> = names.map(Result::unwrap).collect();
+            assert_eq!(names, [b"speed", b"is_on"]);
+            let cut = RequestedNames::of_request(&bytes[..bytes.len() - 1], header).unwrap();
+            assert_eq!(cut.filter(Result::is_err).count(), 1);
+
+            let mut encoder = Encoder::new(Endianness::Little);
+            encoder.raw(&[9; 16][..header]).u32(2);
+            value(&mut encoder, 3, 8);
+            value(&mut encoder, 1, 8);
+            let bytes = [&[0, 1, 0, 0], &encoder.bytes[..]].concat();
+            let values = RepliedValues::of_reply(&bytes, header).unwrap();
+            let values: Vec<_> = values.map(|value| value.unwrap().to_string()).collect();
+            assert_eq!(values, ["0.5", "true"]);
+            let cut = RepliedValues::of_reply(&bytes[..bytes.len() - 1], header).unwrap();
+            assert_eq!(cut.filter(Result::is_err).count(), 1);
         }
     }
 

@@ -4,7 +4,7 @@
 //! frame, translation and rotation.
 
 use crate::cursor::WireError;
-use crate::plain::PlainCursor;
+use crate::plain::{PlainCursor, Sequence};
 
 /// Name of the type, as ROS writes it.
 pub const TYPE: &str = "tf2_msgs/msg/TFMessage";
@@ -33,10 +33,7 @@ pub struct Pose {
 
 /// The transforms of a message, one after the other. It ends at the first malformed one.
 #[derive(Clone, Debug)]
-pub struct Transforms<'a> {
-    cursor: PlainCursor<'a>,
-    left: u32,
-}
+pub struct Transforms<'a>(Sequence<'a>);
 
 impl<'a> Transforms<'a> {
     /// Begins to read a sample's payload, encapsulation header included.
@@ -45,13 +42,13 @@ impl<'a> Transforms<'a> {
     /// Returns [`Reason::BadMarker`](crate::cursor::Reason::BadMarker) if the payload is not plain
     /// CDR.
     pub fn parse(payload: &'a [u8]) -> Result<Self, WireError> {
-        let mut cursor = PlainCursor::of(payload)?;
-        let left = cursor.count("transforms")?;
-        Ok(Self { cursor, left })
+        let cursor = PlainCursor::of(payload)?;
+        Sequence::at(cursor, "transforms").map(Self)
     }
+}
 
-    fn transform(&mut self) -> Result<Transform<'a>, WireError> {
-        let cursor = &mut self.cursor;
+impl<'a> Transform<'a> {
+    fn read(cursor: &mut PlainCursor<'a>) -> Result<Self, WireError> {
         let seconds = cursor.count("header.stamp.sec")?.cast_signed();
         let nanoseconds = cursor.count("header.stamp.nanosec")?;
         let parent = cursor.text("header.frame_id")?;
@@ -66,7 +63,7 @@ impl<'a> Transforms<'a> {
         for number in &mut pose.rotation {
             *number = cursor.double("transform.rotation")?;
         }
-        Ok(Transform {
+        Ok(Self {
             stamp: (seconds, nanoseconds),
             parent,
             child,
@@ -79,12 +76,7 @@ impl<'a> Iterator for Transforms<'a> {
     type Item = Result<Transform<'a>, WireError>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        self.left = self.left.checked_sub(1)?;
-        let transform = self.transform();
-        if transform.is_err() {
-            self.left = 0;
-        }
-        Some(transform)
+        self.0.next(Transform::read)
     }
 }
 

@@ -111,6 +111,8 @@ pub struct Counters {
     pub uncertain: u64,
     /// Files and directories skipped because of a cap.
     pub left_out: u64,
+    /// Share of the fullest directory in use, in thousandths.
+    pub used_permille: u64,
 }
 
 type PortKey = (ShmDirectoryId, Generation, u32);
@@ -470,6 +472,7 @@ impl Tap {
                 self.directories.find();
             }
             self.abandoned.clear();
+            self.counters.used_permille = self.directories.used_permille();
         }
         if !self.directories.list() && !finds {
             return;

@@ -33,6 +33,8 @@ pub use bounds::{Range, Source};
 pub const THIS_HOST: &str = "localhost";
 /// Latest messages of one writer whose acknowledgement gives a round trip.
 const SENT: usize = 16;
+/// Latest messages of writers that no peer has acknowledged so far.
+const OTHERS: usize = 32;
 /// Nanoseconds between two clocks, beyond the uncertainty: from the first number on the offset is a
 /// finding, and below the second it is none any longer.
 const APART: i64 = 10_000_000;
@@ -45,6 +47,8 @@ pub struct Clocks {
     peers: Bounded<Counted<ClockPeers>, BTreeMap<IpAddr, Peer>>,
     /// Writers of this host with readers on a peer that acknowledge.
     writers: Bounded<Counted<ClockWriters>, HashMap<Guid, Sent>>,
+    /// The latest messages of all other writers.
+    others: Others,
     /// Name that participants of this host announce.
     name: Option<Arc<str>>,
     revision: u64,
@@ -63,6 +67,14 @@ struct Peer {
 struct Sent {
     newest: SequenceNumber,
     times: [(SequenceNumber, ModelTime); SENT],
+}
+
+/// The latest messages of writers that no peer has acknowledged, and the times at which they left.
+#[derive(Debug, Default)]
+struct Others {
+    messages: [(Guid, SequenceNumber, ModelTime); OTHERS],
+    /// Place of the oldest message.
+    oldest: usize,
 }
 
 /// Offset between two clocks.
@@ -93,6 +105,17 @@ pub struct PeerClock {
     pub source: Option<Source>,
     /// Steps of its clock that were noticed.
     pub steps: u64,
+}
+
+impl PeerClock {
+    /// Returns nanoseconds by which it is ahead, and the greatest error of that; `None` while one
+    /// bound has no evidence.
+    #[must_use]
+    pub fn offset(&self) -> Option<(i64, i64)> {
+        let (least, most) = (self.ahead.0?, self.ahead.1?);
+        let range = Range { least, most };
+        Some((range.middle(), range.uncertainty()))
+    }
 }
 
 /// Clocks as a snapshot shows them.
@@ -128,8 +151,10 @@ impl Clocks {
 
     /// Records that a message of this host left for the first time or again.
     pub fn left(&mut self, writer: Guid, number: SequenceNumber, at: ModelTime) {
-        if let Some(sent) = self.writers.get_mut(&writer) {
-            sent.put(number, at);
+        match self.writers.get_mut(&writer) {
+            Some(sent) => sent.put(number, at),
+            // A writer may request one acknowledgement only, of its first messages.
+            None => self.others.put((writer, number, at)),
         }
     }
 
@@ -141,11 +166,15 @@ impl Clocks {
         number: SequenceNumber,
         at: ModelTime,
     ) {
-        let Some(sent) = self.writers.get_or_insert_with(writer, Sent::default) else {
-            return;
+        let left = match self.writers.get_mut(&writer) {
+            Some(sent) => sent.time(number),
+            None => {
+                self.writers.get_or_insert_with(writer, Sent::default);
+                self.others.time(writer, number)
+            }
         };
-        if let Some(left) = sent.time(number)
-            && let Some(peer) = self.peers.get_mut(&peer)
+        if let Some(left) = left
+            && let Some(peer) = self.peer(peer, None)
         {
             peer.evidence.round_trip(at - left, at);
         }
@@ -220,6 +249,8 @@ impl Clocks {
             source: peer.evidence.source(now),
             steps: peer.evidence.steps(),
         });
+        // A round trip alone gives no bound.
+        let peers = peers.filter(|peer| peer.ahead != (None, None) || peer.steps > 0);
         let ranges = self
             .peers
             .iter()
@@ -289,6 +320,24 @@ impl Sent {
         let known = self.times.get(slot(number));
         let known = known.filter(|(known, _)| *known == number && number != SequenceNumber::ZERO);
         known.map(|(_, at)| *at)
+    }
+}
+
+impl Others {
+    fn put(&mut self, message: (Guid, SequenceNumber, ModelTime)) {
+        if let Some(oldest) = self.messages.get_mut(self.oldest) {
+            *oldest = message;
+        }
+        self.oldest = (self.oldest + 1) % OTHERS;
+    }
+
+    /// Returns the first time at which a message left: an acknowledgement may be for the first
+    /// transmission.
+    fn time(&self, writer: Guid, number: SequenceNumber) -> Option<ModelTime> {
+        let messages = self.messages.iter();
+        let of_message =
+            messages.filter(|(of, of_number, _)| (*of, *of_number) == (writer, number));
+        of_message.map(|(_, _, at)| *at).min()
     }
 }
 

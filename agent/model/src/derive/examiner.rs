@@ -2,6 +2,7 @@
 //! within caps.
 
 mod endpoints;
+mod near;
 mod nodes;
 
 use std::cmp::Ordering;
@@ -17,12 +18,14 @@ use crate::derive::clocks::Clocks;
 use crate::derive::inside::Inside;
 use crate::derive::robot::Robot;
 use crate::derive::services::Services;
+use crate::derive::stamps::Stamps;
 use crate::facts::diagnosis::{Diagnoses, Diagnosis, QosPairs};
 use crate::facts::model_time::ModelTime;
 use crate::graph::discovery::Discovery;
 use crate::measure::links::Links;
 use crate::measure::topic::Topics;
 use endpoints::{EndpointExaminer, UnmatchedEndpoint};
+use near::LonelyTopics;
 
 /// Time for which an endpoint may have no counterpart, because nodes start one after another.
 const MATCH_TIMEOUT: Duration = Duration::from_secs(5);
@@ -38,8 +41,8 @@ const STEPS_PER_TOPIC: usize = 50_000;
 #[derive(Debug, Default)]
 pub struct Examiner {
     /// Revisions of discovery, hanging calls, findings from inside processes, chains, links,
-    /// robot and clocks at the last examination.
-    revision: Option<[u64; 7]>,
+    /// robot, clocks and stamps at the last examination.
+    revision: Option<[u64; 8]>,
     /// Time at which the first unmatched endpoint becomes a finding.
     due: Option<ModelTime>,
     /// Time at which each unmatched endpoint was first found to be unmatched.
@@ -94,7 +97,8 @@ impl Examiner {
         discovery: &Discovery,
         topics: &Topics,
         services: &Services,
-        (inside, chains, links, robot, clocks): (&Inside, &Chains, &Links, &Robot, &Clocks),
+        (inside, chains, links): (&Inside, &Chains, &Links),
+        (robot, clocks, stamps): (&Robot, &Clocks, &Stamps),
         now: ModelTime,
     ) {
         let revision = Some([
@@ -105,6 +109,7 @@ impl Examiner {
             links.revision(),
             robot.revision(),
             clocks.revision(),
+            stamps.revision(),
         ]);
         let is_due = self.due.is_some_and(|due| due <= now);
         if self.revision == revision && !is_due {
@@ -115,6 +120,7 @@ impl Examiner {
         let endpoints = EndpointExaminer::new(discovery);
         let mut alone = HashMap::new();
         let mut due = None;
+        let mut lonely = LonelyTopics::default();
         for (_, topic) in topics.iter() {
             for unmatched in endpoints.examine(topic, &mut findings) {
                 let UnmatchedEndpoint { guid, diagnosis } = unmatched;
@@ -122,12 +128,14 @@ impl Examiner {
                 alone.insert(guid, since);
                 let end = since + MATCH_TIMEOUT;
                 if end <= now {
+                    lonely.add(&diagnosis, discovery, &mut findings);
                     findings.add(diagnosis);
                 } else {
                     due = Some(due.map_or(end, |due: ModelTime| due.min(end)));
                 }
             }
         }
+        lonely.examine(discovery, &mut findings);
         nodes::examine(discovery, &mut findings);
         nodes::examine_machines(discovery, &mut findings);
         for (topic, writer) in services.hanging() {
@@ -139,7 +147,7 @@ impl Examiner {
         for finding in links.findings() {
             findings.add(finding);
         }
-        for finding in clocks.findings() {
+        for finding in clocks.findings().chain(stamps.findings()) {
             findings.add(finding);
         }
         for finding in robot.findings() {

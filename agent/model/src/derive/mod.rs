@@ -6,5 +6,6 @@ pub mod examiner;
 pub mod inside;
 pub mod robot;
 pub mod services;
+pub mod stamps;
 pub mod trace;
 pub mod type_descriptions;

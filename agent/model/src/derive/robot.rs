@@ -6,30 +6,42 @@
 //! whichever copies of it were captured.
 
 pub mod diagnostics;
+pub mod fields;
+mod frames;
+pub mod lifecycle;
 pub mod logs;
 pub mod parameters;
 mod text;
 pub mod transforms;
 
+use std::sync::Arc;
+
 use foldhash::HashMap;
 use ros2probe_wire::diagnostics::{self as wire, DiagnosticStatuses};
-use ros2probe_wire::ros_parameters::{self, ParameterEvent};
+use ros2probe_wire::lifecycle::{self as wire_lifecycle, LifecycleState, Transition};
+use ros2probe_wire::ros_parameters::{self, ParameterEvent, RepliedValues, RequestedNames};
 use ros2probe_wire::rtps::{RequestHeader, VendorId};
 use ros2probe_wire::transforms as wire_transforms;
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, WireError, log};
 
+use crate::derive::services::Half;
+use crate::derive::services::service::CallId;
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::event::Events;
 use crate::facts::model_time::ModelTime;
-use crate::facts::names::{NodeName, TopicName};
+use crate::facts::names::{NodeName, TopicName, TypeName};
 use crate::facts::observation::Sample;
 use crate::facts::tables::RobotWriters;
+use crate::graph::discovery::Discovery;
 use crate::measure::allowance::{Allowance, CommonAllowance, WriterAllowance};
 use crate::measure::assembly::Assembly;
 use diagnostics::Diagnostics;
+use fields::{FieldMessage, Fields};
+use frames::Frames;
+use lifecycle::{Lifecycle, ManagedNode};
 use logs::Logs;
-use parameters::Parameters;
+use parameters::{ExpectedParameter, Parameters};
 use transforms::Transforms;
 
 /// Maximum size of a message that is decoded, in bytes.
@@ -46,6 +58,10 @@ const ALL_BROADCASTERS: Allowance = Allowance::new(8 << 20, 2 << 20);
 /// A paused writer is captured again once it is allowed this many bytes.
 const RESUME_BYTES: u64 = 256 << 10;
 
+/// Thousandths of shared memory in use from which it is nearly full, and below which it no longer is.
+const FULL: u64 = 900;
+const FREE: u64 = 850;
+
 /// What the agent may read of what the robot says; each can be switched off.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Part {
@@ -57,6 +73,10 @@ pub enum Part {
     Parameters,
     /// Transforms between frames.
     Transforms,
+    /// States of managed nodes.
+    Lifecycle,
+    /// Fields of messages that have metrics.
+    Fields,
     /// Clocks of hosts.
     Clocks,
 }
@@ -76,8 +96,29 @@ pub enum Standard {
     ParameterEvent,
     /// Request of `rcl_interfaces/srv/SetParameters` or of its atomic variant.
     SetParameters,
+    /// Requests of `rcl_interfaces/srv/GetParameters`.
+    GetParameters,
+    /// Replies of `rcl_interfaces/srv/GetParameters`.
+    ParameterValues,
     /// `tf2_msgs/msg/TFMessage`.
     Transforms,
+    /// `lifecycle_msgs/msg/TransitionEvent`.
+    TransitionEvent,
+    /// Reply of `lifecycle_msgs/srv/GetState`.
+    LifecycleState,
+    /// Any type whose fields have metrics.
+    Fields,
+}
+
+/// What the configuration expects of a robot, and wants to know about it.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct RobotExpectations {
+    /// Patterns of the names of managed nodes that should be active; `*` matches any characters.
+    pub active: Arc<Vec<Box<str>>>,
+    /// Parameters that should have these values.
+    pub parameters: Arc<Vec<ExpectedParameter>>,
+    /// Topics whose fields have metrics.
+    pub fields: Arc<Vec<TopicName>>,
 }
 
 /// Writers of standard types, and what they said.
@@ -85,13 +126,25 @@ pub enum Standard {
 pub struct Robot {
     writers: Bounded<Counted<RobotWriters>, HashMap<Guid, RobotWriter>>,
     assembly: Assembly,
-    allowance: CommonAllowance,
+    allowances: Allowances,
     logs: Logs,
     diagnostics: Diagnostics,
     parameters: Parameters,
     transforms: Transforms,
-    /// Transforms have an allowance of their own: thirty of them at 100 Hz take 300 KB/s.
-    of_transforms: CommonAllowance,
+    frames: Frames,
+    lifecycle: Lifecycle,
+    fields: Fields,
+    /// Thousandths of shared memory in use when it was found to be nearly full.
+    full_memory: Option<u64>,
+    memory_changes: u64,
+}
+
+/// Allowances of all writers together. Transforms have one of their own: thirty of them at 100 Hz
+/// take 300 KB/s.
+#[derive(Debug)]
+struct Allowances {
+    transforms: CommonAllowance,
+    others: CommonAllowance,
 }
 
 #[derive(Debug)]
@@ -104,14 +157,16 @@ struct RobotWriter {
 }
 
 /// What a sample of a followed writer changed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Heard {
     /// Nothing, or some of its bytes are still missing.
     Nothing,
-    /// The writer is paused: its verdict has changed.
+    /// The writer is paused, or needs no further messages: its verdict has changed.
     Paused,
     /// It was decoded.
     Decoded,
+    /// It was decoded, and a managed node has left the first state for its present one.
+    Transition(LifecycleState, ManagedNode),
     /// It is malformed.
     Malformed(Standard, WireError),
 }
@@ -150,8 +205,12 @@ impl Standard {
             wire::TYPE => Some(Self::Diagnostics),
             ros_parameters::EVENT => Some(Self::ParameterEvent),
             wire_transforms::TYPE => Some(Self::Transforms),
+            wire_lifecycle::EVENT => Some(Self::TransitionEvent),
+            wire_lifecycle::STATE_REPLY => Some(Self::LifecycleState),
             "rcl_interfaces/srv/SetParameters_Request"
             | "rcl_interfaces/srv/SetParametersAtomically_Request" => Some(Self::SetParameters),
+            "rcl_interfaces/srv/GetParameters_Request" => Some(Self::GetParameters),
+            "rcl_interfaces/srv/GetParameters_Response" => Some(Self::ParameterValues),
             _ => None,
         }
     }
@@ -164,7 +223,12 @@ impl Standard {
             Self::Diagnostics => "diagnostics",
             Self::ParameterEvent => "parameter_event",
             Self::SetParameters => "set_parameters",
+            Self::GetParameters => "get_parameters",
+            Self::ParameterValues => "parameter_values",
             Self::Transforms => "transforms",
+            Self::TransitionEvent => "transition_event",
+            Self::LifecycleState => "lifecycle_state",
+            Self::Fields => "fields",
         }
     }
 
@@ -174,8 +238,13 @@ impl Standard {
         match self {
             Self::Log => Part::Logs,
             Self::Diagnostics => Part::Diagnostics,
-            Self::ParameterEvent | Self::SetParameters => Part::Parameters,
+            Self::ParameterEvent
+            | Self::SetParameters
+            | Self::GetParameters
+            | Self::ParameterValues => Part::Parameters,
             Self::Transforms => Part::Transforms,
+            Self::TransitionEvent | Self::LifecycleState => Part::Lifecycle,
+            Self::Fields => Part::Fields,
         }
     }
 }
@@ -201,22 +270,74 @@ impl FromIterator<Part> for Parts {
     }
 }
 
+impl Allowances {
+    const fn of(&mut self, standard: Standard) -> &mut CommonAllowance {
+        match standard {
+            Standard::Transforms => &mut self.transforms,
+            _ => &mut self.others,
+        }
+    }
+}
+
 impl Default for Robot {
     fn default() -> Self {
         Self {
             writers: Bounded::default(),
             assembly: Assembly::new(ASSEMBLY_BYTES),
-            allowance: CommonAllowance::new(ALL_WRITERS, RESUME_BYTES),
+            allowances: Allowances {
+                transforms: CommonAllowance::new(ALL_BROADCASTERS, RESUME_BYTES),
+                others: CommonAllowance::new(ALL_WRITERS, RESUME_BYTES),
+            },
             logs: Logs::default(),
             diagnostics: Diagnostics::default(),
             parameters: Parameters::default(),
             transforms: Transforms::default(),
-            of_transforms: CommonAllowance::new(ALL_BROADCASTERS, RESUME_BYTES),
+            frames: Frames::default(),
+            lifecycle: Lifecycle::default(),
+            fields: Fields::default(),
+            full_memory: None,
+            memory_changes: 0,
         }
     }
 }
 
 impl Robot {
+    /// Sets what the configuration expects.
+    pub fn expect(&mut self, expectations: RobotExpectations) {
+        let RobotExpectations {
+            active,
+            parameters,
+            fields,
+        } = expectations;
+        self.lifecycle.expect(active);
+        self.parameters.expect(&parameters);
+        self.fields.expect(fields);
+    }
+
+    /// Records how full the fullest directory of shared memory is, in thousandths.
+    pub fn use_shared_memory(&mut self, permille: u64) {
+        let is_full = match self.full_memory {
+            Some(_) => permille >= FREE,
+            None => permille >= FULL,
+        };
+        if is_full != self.full_memory.is_some() {
+            self.full_memory = is_full.then_some(permille);
+            self.memory_changes += 1;
+        }
+    }
+
+    /// Returns what is read of messages of this type on this topic.
+    #[must_use]
+    pub fn standard(&self, topic: &TopicName, message_type: &TypeName) -> Option<Standard> {
+        let is_wanted = || self.fields.cover(topic, message_type);
+        Standard::of(message_type).or_else(|| is_wanted().then_some(Standard::Fields))
+    }
+
+    /// Begins to wait for one message of this writer, for the frame in its header.
+    pub fn follow_frame(&mut self, writer: Guid, domain_id: DomainId, topic: &TopicName) {
+        self.frames.follow(writer, domain_id, topic);
+    }
+
     /// Begins to read this writer, unless the table of writers is full.
     pub fn follow(
         &mut self,
@@ -242,18 +363,17 @@ impl Robot {
 
     /// Stops reading this writer.
     pub fn forget(&mut self, writer: Guid) {
+        self.frames.forget(writer);
         if let Some(known) = self.writers.remove(&writer) {
-            let allowance = match known.standard {
-                Standard::Transforms => &mut self.of_transforms,
-                _ => &mut self.allowance,
-            };
-            allowance.forget(&known.allowance);
+            self.allowances.of(known.standard).forget(&known.allowance);
             self.assembly.release(writer);
             match known.standard.part() {
                 Part::Logs | Part::Clocks => {}
                 Part::Diagnostics => self.diagnostics.forget(writer),
                 Part::Parameters => self.parameters.forget(writer),
                 Part::Transforms => self.transforms.forget(writer),
+                Part::Lifecycle => self.lifecycle.forget(writer),
+                Part::Fields => self.fields.forget(writer),
             }
         }
     }
@@ -264,6 +384,7 @@ impl Robot {
         self.writers
             .get(&writer)
             .is_some_and(|known| !known.allowance.is_paused())
+            || self.frames.waits(writer)
     }
 
     /// Returns whether a writer of a standard type is known.
@@ -273,23 +394,25 @@ impl Robot {
     }
 
     /// Reads a DATA or DATA_FRAG of a followed writer. `node` is the node that has the writer.
-    /// `vendor` is its implementation.
+    /// `vendor` is its implementation. `call` identifies the call of a request or reply.
     pub fn hear(
         &mut self,
         sample: &Sample,
         payload: &[u8],
         (node, vendor): (Option<&NodeName>, VendorId),
+        call: impl FnOnce(Half) -> Option<CallId>,
         events: &mut Events,
     ) -> Heard {
         let (writer, now) = (sample.head.writer, sample.head.at);
+        if sample.is_message() && sample.is_start() && self.frames.waits(writer) {
+            self.frames.read(writer, payload);
+            return Heard::Paused;
+        }
         let Some(known) = self.writers.get_mut(&writer) else {
             return Heard::Nothing;
         };
         // Until the kernel knows of a pause, it captures more.
-        let allowance = match known.standard {
-            Standard::Transforms => &mut self.of_transforms,
-            _ => &mut self.allowance,
-        };
+        let allowance = self.allowances.of(known.standard);
         let is_allowed = allowance.spend(&mut known.allowance, payload.len(), now);
         if known.allowance.is_paused() || !sample.is_message() {
             return Heard::Nothing;
@@ -337,13 +460,30 @@ impl Robot {
                 .and_then(|event| self.parameters.add(&origin, event, events)),
             Standard::Transforms => wire_transforms::Transforms::parse(payload)
                 .and_then(|transforms| self.transforms.add(&origin, transforms, events)),
+            Standard::TransitionEvent => match Transition::parse(payload) {
+                Ok(transition) => match self.lifecycle.transit(&origin, transition) {
+                    Some(node) => return Heard::Transition(transition.from, node),
+                    None => Ok(()),
+                },
+                Err(error) => Err(error),
+            },
+            Standard::LifecycleState => LifecycleState::of_reply(payload, header(vendor))
+                .map(|state| self.lifecycle.replied(&origin, state)),
+            Standard::Fields => {
+                self.fields.add(&origin, payload);
+                Ok(())
+            }
             Standard::SetParameters => {
-                let header = match vendor {
-                    VendorId::CYCLONE => RequestHeader::LENGTH,
-                    _ => 0,
-                };
-                ros_parameters::Parameters::of_request(payload, header)
+                ros_parameters::Parameters::of_request(payload, header(vendor))
                     .and_then(|parameters| self.parameters.request(&origin, parameters))
+            }
+            Standard::GetParameters => RequestedNames::of_request(payload, header(vendor))
+                .and_then(|names| self.parameters.ask(call(Half::Requests), names)),
+            Standard::ParameterValues => {
+                RepliedValues::of_reply(payload, header(vendor)).and_then(|values| {
+                    self.parameters
+                        .replied(&origin, call(Half::Replies), values)
+                })
             }
         };
         match decoded {
@@ -363,15 +503,16 @@ impl Robot {
         };
         self.diagnostics.end_second(now, is_paused, events);
         self.transforms.end_second(now, is_paused);
+        self.frames.end_second(now, &self.transforms);
+        self.lifecycle.end_second(now);
+        self.parameters.end_second(now);
         let mut resumed = Vec::new();
-        for (allowance, of_transforms) in [
-            (&mut self.allowance, false),
-            (&mut self.of_transforms, true),
-        ] {
-            let writers = self.writers.iter_mut().filter_map(|(writer, known)| {
-                let is_this = (known.standard == Standard::Transforms) == of_transforms;
-                is_this.then_some((writer, &mut known.allowance))
-            });
+        let Allowances { transforms, others } = &mut self.allowances;
+        for (allowance, is_of_transforms) in [(others, false), (transforms, true)] {
+            let writers = self.writers.iter_mut();
+            let writers = writers
+                .filter(|(_, known)| (known.standard == Standard::Transforms) == is_of_transforms)
+                .map(|(writer, known)| (writer, &mut known.allowance));
             resumed.extend(allowance.resume(writers, now));
         }
         resumed
@@ -406,18 +547,43 @@ impl Robot {
         &self.transforms
     }
 
+    /// Returns the managed nodes of all robots.
+    #[must_use]
+    pub const fn lifecycle(&self) -> &Lifecycle {
+        &self.lifecycle
+    }
+
+    /// Returns the last message of each writer whose fields have metrics.
+    #[must_use]
+    pub fn field_messages(&self, discovery: &Discovery) -> Vec<FieldMessage> {
+        self.fields.facts(discovery)
+    }
+
     /// Returns the number of changes of [`Self::findings`].
     #[must_use]
     pub const fn revision(&self) -> u64 {
-        self.logs.revision() + self.diagnostics.revision() + self.transforms.revision()
+        self.logs.revision()
+            + self.diagnostics.revision()
+            + self.transforms.revision()
+            + self.frames.revision()
+            + self.lifecycle.revision()
+            + self.parameters.revision()
+            + self.memory_changes
     }
 
     /// Returns what the robot says about problems of its own.
     pub fn findings(&self) -> impl Iterator<Item = Diagnosis> {
         let logged = self.logs.findings();
+        let full_memory = self.full_memory;
+        let full_memory =
+            full_memory.map(|used_permille| Diagnosis::SharedMemoryFull { used_permille });
         logged
             .chain(self.diagnostics.findings())
             .chain(self.transforms.findings())
+            .chain(self.frames.findings())
+            .chain(self.lifecycle.findings())
+            .chain(self.parameters.findings())
+            .chain(full_memory)
     }
 
     /// Returns the sizes and limits of the tables.
@@ -428,6 +594,9 @@ impl Robot {
         tables.extend(self.diagnostics.tables());
         tables.extend(self.parameters.tables());
         tables.extend(self.transforms.tables());
+        tables.push(self.frames.table());
+        tables.push(self.lifecycle.table());
+        tables.extend(self.fields.tables());
         tables
     }
 }
@@ -451,6 +620,14 @@ impl ReadNumbers {
                 self.newest = number;
             }
         }
+    }
+}
+
+/// Returns the length of the header that this implementation sends before requests and replies.
+const fn header(vendor: VendorId) -> usize {
+    match vendor {
+        VendorId::CYCLONE => RequestHeader::LENGTH,
+        _ => 0,
     }
 }
 

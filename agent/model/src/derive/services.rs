@@ -76,9 +76,12 @@ struct ServiceWriter {
     suspended: Option<ModelTime>,
 }
 
+/// One half of a call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Half {
+pub enum Half {
+    /// The topic of requests.
     Requests,
+    /// The topic of replies.
     Replies,
 }
 
@@ -566,6 +569,14 @@ impl Identity {
             first: body.first().copied().unwrap_or_default(),
         }
     }
+}
+
+/// Returns the identity of the call to which a whole request or reply belongs; `None` if the
+/// middleware does not relate replies to requests.
+#[must_use]
+pub fn call(half: Half, found: &Found<'_>, sample: &Sample, vendor: VendorId) -> Option<CallId> {
+    let identity = identity(half, found, sample, vendor).ok()?;
+    identity.map(|identity| identity.call)
 }
 
 /// Bytes of the encapsulation header (RTPS 2.5, 10.2).

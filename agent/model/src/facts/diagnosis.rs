@@ -7,6 +7,7 @@
 //! finding has no severity; the surfaces assign it.
 
 mod matching;
+mod similar;
 
 use std::cmp::Ordering;
 use std::sync::Arc;
@@ -14,6 +15,7 @@ use std::time::Duration;
 
 use ros2probe_wire::diagnostics::DiagnosticLevel;
 use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::lifecycle::LifecycleState;
 use ros2probe_wire::{DomainId, Guid};
 
 use crate::facts::calls::facts::Owner;
@@ -22,10 +24,12 @@ use crate::facts::calls::other_thread::Culprit;
 use crate::facts::calls::report::Trigger;
 use crate::facts::link::LinkKey;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
+use crate::facts::naming::Naming;
 use crate::facts::robot::TransformFault;
 use crate::facts::topic_kind::TopicKind;
 pub(crate) use matching::effort;
 pub use matching::{Offer, Policies, Policy, Verdict, verdict};
+pub use similar::Difference;
 
 /// The topic of a finding.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -38,6 +42,19 @@ pub struct TopicKey {
     pub name: TopicName,
     /// Role of the topic in ROS.
     pub kind: TopicKind,
+}
+
+impl TopicKey {
+    /// Returns the identity of a topic with these names.
+    #[must_use]
+    pub fn of(domain_id: DomainId, naming: &Naming) -> Self {
+        Self {
+            domain_id,
+            dds_name: naming.dds_name.clone(),
+            name: naming.name.clone(),
+            kind: naming.kind,
+        }
+    }
 }
 
 /// A finding. The first fields of a variant identify it; the last one may change.
@@ -271,6 +288,66 @@ pub enum Diagnosis {
         /// The offset was wrong by at most this number of nanoseconds.
         uncertainty: i64,
     },
+    /// A publisher and a subscription of one type have no counterpart. Their topics differ so little
+    /// that one of them is probably a mistake.
+    NearMiss {
+        /// Topic of the publisher.
+        topic: TopicKey,
+        /// Topic of the subscription.
+        subscription: TopicKey,
+        /// How the topics differ.
+        difference: Difference,
+    },
+    /// A managed node has not been active for at least 5 s, although the configuration expects it or
+    /// its last transition failed.
+    NodeInactive {
+        /// Domain.
+        domain_id: DomainId,
+        /// Fully qualified name.
+        node: NodeName,
+        /// Its state.
+        state: LifecycleState,
+        /// Whether a transition failed since it was last active.
+        has_failed: bool,
+    },
+    /// A parameter has another value than the configuration expects.
+    ParameterDrift {
+        /// Domain.
+        domain_id: DomainId,
+        /// Fully qualified name of the node.
+        node: NodeName,
+        /// Name of the parameter.
+        name: Arc<str>,
+        /// Value that the configuration expects, as YAML.
+        expected: Arc<str>,
+        /// Last known value.
+        value: Arc<str>,
+    },
+    /// Some nodes of a domain use simulated time (`use_sim_time`), and others do not.
+    MixedTime {
+        /// Domain.
+        domain_id: DomainId,
+        /// Nodes with simulated time, at most four.
+        simulated: Vec<NodeName>,
+        /// Nodes without it, at most four.
+        system: Vec<NodeName>,
+    },
+    /// Stamps in the headers of a publisher's messages cannot be right.
+    WrongStamps {
+        /// Topic.
+        topic: TopicKey,
+        /// GUID of the writer.
+        writer: Guid,
+        /// What is wrong.
+        fault: StampFault,
+        /// Nanoseconds by which they were wrong when the fault began.
+        nanoseconds: i64,
+    },
+    /// A directory of shared memory is nearly full: Fast DDS then falls back to the network, or fails.
+    SharedMemoryFull {
+        /// Thousandths of its space in use when that was noticed.
+        used_permille: u64,
+    },
     /// A configured chain exceeds its maximum latency.
     SlowChain {
         /// Last topic of the chain.
@@ -280,6 +357,32 @@ pub enum Diagnosis {
         /// Maximum latency of the chain.
         max_latency: Duration,
     },
+}
+
+/// What is wrong with the stamps of a publisher.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum StampFault {
+    /// They are later than the publication of their messages.
+    Future,
+    /// One was earlier than that of the message before, within the last minute.
+    WentBack,
+    /// Their age grows or shrinks steadily.
+    Drifting,
+    /// They differ by more than an hour from the publisher's clock.
+    OtherClock,
+}
+
+impl StampFault {
+    /// Returns the label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Future => "future",
+            Self::WentBack => "went_back",
+            Self::Drifting => "drifting",
+            Self::OtherClock => "other_clock",
+        }
+    }
 }
 
 /// Why an endpoint has no counterpart: the mismatch that is nearest to a match.
@@ -332,7 +435,7 @@ pub enum Change<'a> {
 
 impl Diagnosis {
     /// All kinds, as label values.
-    pub const KINDS: [&'static str; 23] = [
+    pub const KINDS: [&'static str; 29] = [
         "qos_incompatible",
         "type_conflict",
         "type_hash_conflict",
@@ -355,6 +458,12 @@ impl Diagnosis {
         "diagnostic_error",
         "transform_fault",
         "clocks_apart",
+        "near_miss",
+        "node_inactive",
+        "parameter_drift",
+        "mixed_time",
+        "wrong_stamps",
+        "shared_memory_full",
         "slow_chain",
     ];
 
@@ -384,6 +493,12 @@ impl Diagnosis {
             Self::DiagnosticError { .. } => "diagnostic_error",
             Self::TransformFault { .. } => "transform_fault",
             Self::ClocksApart { .. } => "clocks_apart",
+            Self::NearMiss { .. } => "near_miss",
+            Self::NodeInactive { .. } => "node_inactive",
+            Self::ParameterDrift { .. } => "parameter_drift",
+            Self::MixedTime { .. } => "mixed_time",
+            Self::WrongStamps { .. } => "wrong_stamps",
+            Self::SharedMemoryFull { .. } => "shared_memory_full",
             Self::SlowChain { .. } => "slow_chain",
         }
     }
@@ -402,6 +517,8 @@ impl Diagnosis {
             | Self::ReaderQueueOverflow { topic, .. }
             | Self::RestampingNode { topic, .. }
             | Self::BuffersByCpu { topic, .. }
+            | Self::NearMiss { topic, .. }
+            | Self::WrongStamps { topic, .. }
             | Self::SlowChain { topic, .. } => Some(topic),
             Self::SlowCallback { topic, .. }
             | Self::ExecutorWait { topic, .. }
@@ -414,6 +531,10 @@ impl Diagnosis {
             | Self::DiagnosticError { .. }
             | Self::TransformFault { .. }
             | Self::ClocksApart { .. }
+            | Self::NodeInactive { .. }
+            | Self::ParameterDrift { .. }
+            | Self::MixedTime { .. }
+            | Self::SharedMemoryFull { .. }
             | Self::ObservationSuspended { .. } => None,
         }
     }
@@ -435,6 +556,7 @@ impl Diagnosis {
             .then_with(|| self.link().cmp(&other.link()))
             .then_with(|| self.part().cmp(&other.part()))
             .then_with(|| self.frame().cmp(&other.frame()))
+            .then_with(|| self.parameter().cmp(&other.parameter()))
     }
 
     /// Returns the child frame and the kind of a fault of transforms.
@@ -454,6 +576,14 @@ impl Diagnosis {
                 hardware_id,
                 ..
             } => Some((topic, name, hardware_id)),
+            _ => None,
+        }
+    }
+
+    /// Returns the name of the parameter.
+    fn parameter(&self) -> Option<&str> {
+        match self {
+            Self::ParameterDrift { name, .. } => Some(name),
             _ => None,
         }
     }
@@ -501,8 +631,15 @@ impl Diagnosis {
             }
             | Self::LogErrors {
                 domain_id, node, ..
+            }
+            | Self::NodeInactive {
+                domain_id, node, ..
+            }
+            | Self::ParameterDrift {
+                domain_id, node, ..
             } => (*domain_id, node, None, None),
             Self::UnmatchedPublisher { writer, .. }
+            | Self::WrongStamps { writer, .. }
             | Self::HangingCall { writer, .. }
             | Self::BuffersByCpu { writer, .. } => (DomainId(0), "", Some(*writer), None),
             Self::UnmatchedSubscription { reader, .. } => (DomainId(0), "", Some(*reader), None),
@@ -510,6 +647,7 @@ impl Diagnosis {
                 node, participant, ..
             } => (DomainId(0), node, Some(*participant), None),
             Self::ObservationSuspended { domain_id, .. }
+            | Self::MixedTime { domain_id, .. }
             | Self::DiagnosticError { domain_id, .. } => (*domain_id, "", None, None),
             Self::TransformFault {
                 domain_id,
@@ -528,6 +666,10 @@ impl Diagnosis {
             Self::LossyLink { .. } => (DomainId(0), "", None, None),
             Self::ClocksApart { peer, .. } => (DomainId(0), peer, None, None),
             Self::RestampingNode { node, .. } => (DomainId(0), node, None, None),
+            Self::NearMiss { subscription, .. } => {
+                (subscription.domain_id, &subscription.dds_name, None, None)
+            }
+            Self::SharedMemoryFull { .. } => (DomainId(0), "", None, None),
             Self::SlowChain { from, .. } => (DomainId(0), from, None, None),
         }
     }

@@ -15,7 +15,6 @@ use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
 
 use crate::facts::bounded::Bounded;
-use crate::facts::calls::facts::LifecycleState;
 use crate::facts::churn;
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::loss::Loss;
@@ -90,7 +89,18 @@ pub enum EventKind {
         name: NodeName,
     },
     /// A managed node changed its lifecycle state.
-    Lifecycle(LifecycleState),
+    Lifecycle {
+        /// Its domain.
+        domain_id: DomainId,
+        /// The node, if known.
+        node: Option<NodeName>,
+        /// Its process, if calls inside it showed the change.
+        process: Option<u32>,
+        /// Label of the previous state.
+        from: Arc<str>,
+        /// Label of the new state.
+        to: Arc<str>,
+    },
     /// Samples of a writer within about one second were settled as lost.
     Loss(LossBurst),
     /// A watched topic changed its state under a watchlist entry.
@@ -242,7 +252,7 @@ impl EventKind {
         match self {
             Self::Participant { .. } => Class::Participant,
             Self::Endpoint { .. } => Class::Endpoint,
-            Self::Node { .. } | Self::Lifecycle(_) => Class::Node,
+            Self::Node { .. } | Self::Lifecycle { .. } => Class::Node,
             Self::Loss(_) => Class::Loss,
             Self::Expectation { .. } | Self::Silence { .. } => Class::Expectation,
             Self::Diagnosis { .. } => Class::Diagnosis,
@@ -405,6 +415,12 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         | Diagnosis::LossyLink { .. }
         | Diagnosis::DiagnosticError { .. }
         | Diagnosis::TransformFault { .. }
+        | Diagnosis::NearMiss { .. }
+        | Diagnosis::NodeInactive { .. }
+        | Diagnosis::ParameterDrift { .. }
+        | Diagnosis::MixedTime { .. }
+        | Diagnosis::WrongStamps { .. }
+        | Diagnosis::SharedMemoryFull { .. }
         | Diagnosis::SlowChain { .. } => {}
     }
     finding

@@ -118,7 +118,7 @@ const TOPICS: Row = Row {
     reached: "a vanished one makes room, or the latest one not watched by its exact name for one \
               that is; otherwise the newcomer is listed but not measured until an entry is free",
     metric: "ros2probe_topics_rejected_total",
-    bytes: 15 << 10,
+    bytes: 16 << 10,
 };
 const WATCHES: Row = Row {
     key: "watches",
@@ -345,9 +345,14 @@ impl Limits {
     /// each), and responses that wait (2 MiB).
     pub const TYPES: usize = 18 << 20;
 
-    /// Memory of the logs of nodes, in bytes: 3560 messages, the nodes, and incomplete messages (1
-    /// MiB).
-    pub const LOGS: usize = 6 << 20;
+    /// Memory of what the robot itself says, in bytes. Logs take 6 MiB, parameters and their changes
+    /// 4 MiB, values of diagnostics and messages with fields 1 MiB each. The rest is for transforms,
+    /// frames, stamps and states of nodes.
+    pub const ROBOT: usize = 14 << 20;
+
+    /// Memory of the history on disk while a minute is written, in bytes: its rows and blocks (6 MiB,
+    /// ten minutes merged into steps included), and events (4 MiB).
+    pub const HISTORY: usize = 10 << 20;
 
     /// Returns the memory in bytes that all limits together allow.
     #[must_use]

@@ -46,6 +46,15 @@ impl DiagnosticStatus {
         values.map(|(key, value)| key.len() + value.len()).sum()
     }
 
+    /// Returns it without its values, whose bytes have a cap.
+    #[must_use]
+    pub fn without_values(&self) -> Self {
+        Self {
+            values: Vec::new(),
+            ..self.clone()
+        }
+    }
+
     /// Returns whether an aggregator repeats what other topics say.
     #[must_use]
     pub fn is_aggregated(&self) -> bool {
@@ -107,15 +116,17 @@ impl TransformJump {
 /// What is wrong with the transforms of a robot.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct TransformFault {
-    /// Child frame of the edge; empty if the fault concerns the whole tree.
+    /// Child frame of the edge, or the unknown frame; empty if the fault concerns the whole tree.
     pub child: Arc<str>,
     /// Parent frame of the edge.
     pub parent: Arc<str>,
     /// Kind of the fault.
     pub kind: TransformFaultKind,
-    /// Edges with this fault and these names; the fault has the first one.
+    /// Edges with this fault and these names, of which the fault has the first one; or topics that
+    /// name the frame.
     pub edges: usize,
-    /// Nodes that broadcast the edge, or the roots of the trees; at most four.
+    /// Nodes that broadcast the edge, the roots of the trees, or topics that name the frame; at most
+    /// four.
     pub names: Vec<Arc<str>>,
 }
 
@@ -128,8 +139,12 @@ pub enum TransformFaultKind {
     SeveralBroadcasters,
     /// Stamps of its broadcaster went back within the last minute.
     TimeWentBack,
+    /// Its position or orientation jumped several times within a minute.
+    Jumps,
     /// The frames belong to several trees.
     Apart,
+    /// Messages name a frame that no transform has.
+    UnknownFrame,
 }
 
 impl TransformFaultKind {
@@ -140,7 +155,9 @@ impl TransformFaultKind {
             Self::Silent => "silent",
             Self::SeveralBroadcasters => "several_broadcasters",
             Self::TimeWentBack => "time_went_back",
+            Self::Jumps => "jumps",
             Self::Apart => "apart",
+            Self::UnknownFrame => "unknown_frame",
         }
     }
 }

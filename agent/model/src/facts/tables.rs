@@ -160,6 +160,8 @@ crate::tables! {
     ParameterChanges { name: "parameter_changes", entries: 1000, rule: Oldest }
     /// Parameters in the latest requests to set them
     ParameterRequests { name: "parameter_requests", entries: 256, rule: Oldest, effect: "its effect has no known requester" }
+    /// Parameters in the latest requests for values
+    AskedParameters { name: "parameter_reads", entries: 1024, rule: Oldest, effect: "the value in the reply is not known" }
     /// Domains and namespaces with transforms
     TransformTrees { name: "transform_trees", entries: 64, effect: "its transforms are not shown" }
     /// Edges of all trees of transforms
@@ -170,6 +172,16 @@ crate::tables! {
     StaticBroadcasters { name: "transforms.static", entries: 1024, effect: "it counts as read" }
     /// Nodes whose changes of parameters are counted
     ChangedNodes { name: "changed_nodes", entries: 512, effect: "its changes are not counted" }
+    /// Managed nodes whose lifecycle state is known from their topic
+    ManagedNodes { name: "robot_managed_nodes", entries: 256, effect: "its state is not shown" }
+    /// Writers of which one message with a header is read
+    FrameWriters { name: "robot_frames", entries: 512, effect: "its frame is not compared with the transforms" }
+    /// Writers whose last message is kept, because its fields have metrics
+    FieldMessages { name: "robot_fields", entries: 64, effect: "its fields have no metrics" }
+    /// Bytes of these messages
+    FieldBytes { name: "robot_fields.bytes", entries: 1 << 20, effect: "the fields of the newcomer have no metrics" }
+    /// Measured publishers whose stamps are judged
+    StampWriters { name: "stamp_writers", entries: 512, effect: "its stamps are not judged" }
     /// Nodes with figures of their logs
     LogNodes { name: "log_nodes", entries: 512, effect: "the one with the longest silence is dropped" }
     /// Messages of logs that wait to be taken

@@ -265,6 +265,14 @@ impl Past {
         self.names.find(domain_id, dds_name)
     }
 
+    /// Returns the topics with a history: the domain, the DDS name, and the id in [`Row::topic`].
+    pub fn topics(&self) -> impl Iterator<Item = (DomainId, &DdsName, u32)> {
+        let domains = self.names.by_domain.iter();
+        domains.flat_map(|(domain_id, names)| {
+            names.iter().map(move |(name, id)| (*domain_id, name, *id))
+        })
+    }
+
     /// Returns the seconds, oldest first.
     #[must_use]
     pub fn seconds(&self) -> &[Arc<Second>] {

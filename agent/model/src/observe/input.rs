@@ -10,6 +10,7 @@ use ros2probe_wire::{Guid, GuidPrefix, Reason, Timestamp};
 use crate::derive::chain::causality::CausalPublication;
 use crate::derive::chain::expected::ExpectedChain;
 use crate::derive::chain::spans::ChainSpans;
+use crate::derive::robot::RobotExpectations;
 use crate::derive::robot::logs::LogMessage;
 use crate::derive::trace::Spans;
 use crate::derive::type_descriptions::TypeSource;
@@ -89,6 +90,8 @@ pub enum Input<'a> {
     },
     /// The polling gap exceeds the shared-memory ring; loss before this time is unknown.
     SharedMemoryGap(Timestamp),
+    /// The share of the fullest directory of shared memory that is in use, in thousandths.
+    SharedMemoryUsed(u64),
     /// Uprobes no longer observe writes to shared memory, so sampled messages count again.
     ProbesDetached,
     /// The sender's state of a TCP connection to another host.
@@ -132,6 +135,8 @@ pub enum Input<'a> {
     SampleRequests(Arc<Vec<SampleRequest>>),
     /// The chains with a limit for their latency. The topics between their ends are measured.
     ExpectedChains(Arc<Vec<ExpectedChain>>),
+    /// What the configuration expects of the robot.
+    RobotExpectations(RobotExpectations),
     /// A publication within the callback that processes an input, from inside a process.
     CausalPublication(&'a CausalPublication),
     /// State from before a restart, valid for at most one lease from `now` on.

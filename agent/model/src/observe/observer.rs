@@ -44,6 +44,7 @@ use crate::derive::examiner::Examiner;
 use crate::derive::inside::Inside;
 use crate::derive::robot::Robot;
 use crate::derive::services::Services;
+use crate::derive::stamps::Stamps;
 use crate::derive::trace::{Tracer, WriterDescription};
 use crate::derive::type_descriptions::TypeDescriptions;
 use crate::facts::event::TEXT;
@@ -141,6 +142,7 @@ pub(crate) struct Derive {
     pub(crate) inside: Inside,
     pub(crate) chains: Chains,
     pub(crate) clocks: Clocks,
+    pub(crate) stamps: Stamps,
     pub(crate) tracer: Tracer,
     pub(crate) examiner: Examiner,
     pub(crate) robot: Robot,
@@ -204,6 +206,7 @@ impl Observer {
                 inside: Inside::default(),
                 chains: Chains::default(),
                 clocks: Clocks::default(),
+                stamps: Stamps::default(),
                 tracer: Tracer::new(settings.directed),
                 examiner: Examiner::default(),
                 robot: Robot::default(),
@@ -277,6 +280,8 @@ impl Observer {
             Input::MoreLists => self.apply_more_lists(),
             Input::SampleRequests(sample_requests) => self.set_sample_requests(sample_requests),
             Input::ExpectedChains(chains) => self.derive.chains.expect(chains),
+            Input::SharedMemoryUsed(permille) => self.derive.robot.use_shared_memory(permille),
+            Input::RobotExpectations(expected) => self.derive.robot.expect(expected),
             Input::CausalPublication(publication) => self.chain_published(publication),
             Input::Restored { memory, now } => {
                 self.restore(memory, self.graph.wall_clock.model_time(now));
@@ -479,6 +484,7 @@ impl Observer {
         }
         self.renew_lease(observation);
         self.compare_clocks(observation);
+        self.judge_stamp(observation);
         if writer.entity.is_builtin() {
             return;
         }
@@ -725,6 +731,7 @@ impl Observer {
         self.measure.payloads.release(guid, now);
         self.measure.latched.forget(guid);
         self.derive.robot.forget(guid);
+        self.derive.stamps.forget(guid);
         self.derive.clocks.forget(guid);
         self.references.remove(guid);
         let (domain_id, topic) = (endpoint.domain_id, endpoint.topic.bounded(TEXT));

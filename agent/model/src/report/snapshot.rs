@@ -17,6 +17,8 @@ pub use crate::derive::chain::path::{ChainFacts, ChainsFacts};
 pub use crate::derive::clocks::{ClockFacts, ClockOffset, PeerClock};
 pub use crate::derive::inside::source::Source;
 pub use crate::derive::robot::diagnostics::DiagnosticFacts;
+pub use crate::derive::robot::fields::FieldMessage;
+pub use crate::derive::robot::lifecycle::{LifecycleFacts, ManagedNode};
 pub use crate::derive::robot::logs::{LogFacts, LogMessage, NodeLogFacts};
 pub use crate::derive::robot::parameters::{ParameterFacts, ParametersFacts};
 pub use crate::derive::robot::transforms::{
@@ -88,6 +90,10 @@ pub struct Snapshot {
     pub diagnostics: DiagnosticFacts,
     /// Transforms.
     pub transforms: TransformFacts,
+    /// States of managed nodes.
+    pub lifecycle: LifecycleFacts,
+    /// Last messages whose fields have metrics, sorted by domain and topic, the latest first.
+    pub fields: Vec<FieldMessage>,
     /// Parameters of nodes.
     pub parameters: ParametersFacts,
     /// Clocks of hosts.

@@ -479,15 +479,25 @@ fn forged_input_fills_no_table_beyond_its_cap() {
     ]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
+    let whole = drive(MESSAGES / 3, 10_000_000, &mut robot::states);
+    assert_filled(&[
+        "robot_managed_nodes",
+        "robot_frames",
+        "robot_fields",
+        "robot_fields.bytes",
+    ]);
+    assert!(whole < 96 << 20, "{whole} bytes");
+
     inside::of_a_queue();
 
     let ledger = ledger();
     println!("{ledger:#?}");
     let mut empty: Vec<_> = tables::ALL.iter().map(|table| table.name).collect();
     empty.retain(|table| ledger.get(table).is_none_or(|used| used.largest == 0));
-    // Other tests fill these tables: `clocks`, `deliveries`, `event`, `latched` and `zenoh::routers`.
+    // Other tests fill these tables: `clocks`, `parameters`, `deliveries`, `event`, `latched` and `zenoh::routers`.
     let rare = [
         "clock_writers",
+        "parameter_reads",
         "delivery.withheld",
         "events.losers",
         "retained_bytes",

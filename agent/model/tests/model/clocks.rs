@@ -246,6 +246,27 @@ fn few_messages_and_repetitions_are_no_evidence_for_a_round_trip() {
 }
 
 #[test]
+fn one_acknowledgement_is_a_round_trip_for_ten_minutes() {
+    let mut pair = Pair::new();
+    // Alice is unknown as a peer until her first message.
+    pair.speak();
+    let clock = Clock::ahead(3 * MILLISECOND as i64);
+    let mut hear_for = |seconds: u64| {
+        for _ in 0..seconds * 10 {
+            pair.until(pair.host.now + SECOND / 10);
+            pair.hear(clock);
+        }
+        pair.offsets()
+    };
+    for _ in 0..2 {
+        let offsets = hear_for(290);
+        let error = (offsets[0].offset - 3 * MILLISECOND as i64).abs();
+        assert!(error <= offsets[0].uncertainty && offsets[0].uncertainty < 1_000_000);
+    }
+    assert_eq!(hear_for(150), [], "the network may be another one");
+}
+
+#[test]
 fn the_bounds_widen_in_silence_and_expire() {
     let mut pair = Pair::new();
     pair.talk(Clock::ahead(0), 10, |_| {});

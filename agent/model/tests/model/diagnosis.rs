@@ -4,7 +4,7 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 use std::time::Instant;
 
-use ros2probe_model::facts::diagnosis::{Diagnoses, Diagnosis, Policy, Unmatched};
+use ros2probe_model::facts::diagnosis::{Diagnoses, Diagnosis, Difference, Policy, Unmatched};
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
@@ -346,6 +346,77 @@ fn an_unmatched_endpoint_is_found_later_except_where_that_is_normal() {
     assert_eq!(names(&world.diagnoses()), expected[1..]);
     world.wait(2000);
     assert_eq!(names(&world.diagnoses()), expected);
+}
+
+#[test]
+fn a_lonely_publisher_and_a_lonely_subscription_with_similar_names_are_a_near_miss() {
+    let mut world = World::with(2);
+    let misses = |found: Vec<Diagnosis>| -> Vec<(String, String, Difference)> {
+        let pairs = found.into_iter().filter_map(|found| match found {
+            Diagnosis::NearMiss {
+                topic,
+                subscription,
+                difference,
+            } => Some((
+                topic.name.to_string(),
+                subscription.name.to_string(),
+                difference,
+            )),
+            _ => None,
+        });
+        pairs.collect()
+    };
+    world.announce(writer(1, 1), "rt/robot/cmd_vel", STRING, &[]);
+    world.announce(reader(2, 1), "rt/robot/cmd_val", STRING, &[]);
+    world.announce(reader(2, 2), "rt/cmd_vel", STRING, &[]);
+    // Another type, another domain on another host, and a publisher that is not lonely.
+    world.announce(reader(2, 3), "rt/robot/Cmd_vel", IMAGE, &[]);
+    world.announce(writer(1, 4), "rt/image", IMAGE, &[]);
+    world.announce(reader(1, 5), "rt/image", IMAGE, &[]);
+    world.announce(reader(1, 6), "rt/images", IMAGE, &[]);
+    let name = |name: &str| name.to_owned();
+    let expected = [
+        (
+            name("/robot/cmd_vel"),
+            name("/cmd_vel"),
+            Difference::Namespace,
+        ),
+        (
+            name("/robot/cmd_vel"),
+            name("/robot/cmd_val"),
+            Difference::Letter,
+        ),
+    ];
+    world.wait(4000);
+    assert_eq!(world.diagnoses().list, []);
+    assert_eq!(misses(world.found("near_miss")), expected);
+    // The subscription begins where the publisher is.
+    world.announce(reader(2, 9), "rt/robot/cmd_vel", STRING, &[]);
+    assert_eq!(misses(world.found("near_miss")), []);
+}
+
+#[test]
+fn one_topic_in_two_domains_is_a_near_miss_on_one_host_but_not_in_a_fleet() {
+    let at = |last: u8| [SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, last), 7411)];
+    let mut world = World::new();
+    world.participant(1, &at(1));
+    world.announce(writer(1, 1), "rt/points", STRING, &[]);
+    world.domain_id = 5;
+    world.participant(2, &at(2));
+    world.announce(reader(2, 1), "rt/points", STRING, &[]);
+    assert_eq!(world.found("near_miss"), []);
+    world.domain_id = 7;
+    world.participant(3, &at(1));
+    world.announce(reader(3, 1), "rt/points", STRING, &[]);
+    let found = world.found("near_miss");
+    assert!(
+        matches!(
+            &found[..],
+            [Diagnosis::NearMiss { topic, subscription, difference: Difference::Domain }]
+                if topic.domain_id == DomainId(0) && subscription.domain_id == DomainId(7)
+        ),
+        "{found:?}"
+    );
 }
 
 #[test]

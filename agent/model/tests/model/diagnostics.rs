@@ -83,7 +83,10 @@ impl Robot {
     fn changes(&mut self) -> Vec<(Option<DiagnosticLevel>, DiagnosticLevel)> {
         let events = self.domain.observer.drain().events.events;
         let changes = events.iter().filter_map(|event| match &event.kind {
-            EventKind::Diagnostic { before, status } => Some((*before, status.level)),
+            EventKind::Diagnostic { before, status } => {
+                assert!(status.values.is_empty(), "values have a cap of their own");
+                Some((*before, status.level))
+            }
             _ => None,
         });
         changes.collect()

@@ -274,6 +274,6 @@ fn all_limits_together_fit_into_the_memory_limit_of_the_unit() {
     let allowed = megabytes.unwrap().strip_suffix('M').unwrap();
     let allowed = allowed.parse::<usize>().unwrap() << 20;
     let all = Limits::default().bytes() + Limits::BESIDE + Limits::ZENOH + Limits::LATCHED;
-    let all = all + Limits::INSIDE + Limits::TYPES + Limits::LOGS;
+    let all = all + Limits::INSIDE + Limits::TYPES + Limits::ROBOT + Limits::HISTORY;
     assert!(all <= allowed, "{} of {} KiB", all >> 10, allowed >> 10);
 }

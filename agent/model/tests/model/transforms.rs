@@ -4,7 +4,7 @@ use ros2probe_model::derive::robot::Parts;
 use ros2probe_model::facts::diagnosis::Diagnosis;
 use ros2probe_model::facts::event::EventKind;
 use ros2probe_model::facts::robot::TransformFaultKind::{
-    self, Apart, SeveralBroadcasters, Silent, TimeWentBack,
+    self, Apart, Jumps, SeveralBroadcasters, Silent, TimeWentBack,
 };
 use ros2probe_model::facts::robot::TransformJump;
 use ros2probe_model::observe::observer::Settings;
@@ -265,6 +265,25 @@ fn a_jump_is_an_event_if_it_is_far_longer_than_the_steps_before() {
         (robot.edge("base_link").jumps.translation, robot.faults()),
         (1, vec![])
     );
+}
+
+#[test]
+fn three_jumps_within_a_minute_are_a_fault_until_a_minute_after_the_first_one() {
+    let mut robot = Robot::new();
+    let mut drive = |seconds: u64, x: f64| {
+        for _ in 0..seconds * 50 {
+            robot.broadcast(FIRST, "odom", "base_link", x);
+            robot.wait(20);
+        }
+        robot.faults()
+    };
+    assert_eq!(drive(10, 0.0), []);
+    assert_eq!(drive(10, 2.0), []);
+    assert_eq!(drive(10, 0.0), [], "a localisation corrects itself");
+    let fault = [(Jumps, "base_link".to_owned(), names(["/ekf"]))];
+    assert_eq!(drive(10, 2.0), fault);
+    assert_eq!(drive(28, 2.0), fault);
+    assert_eq!(drive(4, 2.0), []);
 }
 
 #[test]

@@ -195,10 +195,5 @@ pub(super) fn is_stamped(topic: &Topic, discovery: &Discovery) -> bool {
 
 /// Returns the identity of a topic.
 pub(super) fn key(topic: &Topic) -> TopicKey {
-    TopicKey {
-        domain_id: topic.domain_id,
-        dds_name: topic.naming.dds_name.clone(),
-        name: topic.naming.name.clone(),
-        kind: topic.naming.kind,
-    }
+    TopicKey::of(topic.domain_id, &topic.naming)
 }

@@ -13,6 +13,8 @@ const DRIFT: i64 = 10_000;
 const WINDOW: Duration = Duration::from_secs(10);
 /// Evidence expires after this time: it has widened by 12 ms then.
 const EXPIRY: Duration = Duration::from_secs(120);
+/// Time after which a round trip is no evidence: the network may be another one.
+const TRIP_EXPIRY: Duration = Duration::from_secs(600);
 /// Nanoseconds for which the fastest message may wait between its stamp and its sending.
 const STAMPING: i64 = 500_000;
 /// Messages among which one is expected to be as fast as a round trip.
@@ -34,8 +36,8 @@ pub enum Source {
 /// Nanoseconds by which a clock is ahead at least and at most.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Range {
-    least: i64,
-    most: i64,
+    pub(super) least: i64,
+    pub(super) most: i64,
 }
 
 /// A bound at the time of its evidence.
@@ -63,6 +65,9 @@ pub(super) struct Evidence {
     reply: Option<Aged>,
     /// Upper bound from round trips of earlier windows.
     trips: Option<Aged>,
+    /// The fastest round trip of the last window that had one, and its time. Many writers request
+    /// acknowledgements only when a reader appears.
+    known_trip: Option<(i64, ModelTime)>,
     began: ModelTime,
     last: ModelTime,
     /// Greatest lower bound of this second, and the number of messages.
@@ -136,10 +141,11 @@ impl Window {
         Some(least.least(now))
     }
 
-    /// Returns the upper bound from round trips.
-    fn most(&self, now: ModelTime) -> Option<i64> {
+    /// Returns the upper bound from round trips: those of the window, else the known one.
+    fn most(&self, now: ModelTime, known_trip: Option<i64>) -> Option<i64> {
         let least = self.least.filter(|least| least.is_valid(now))?;
-        let round_trip = self.round_trip.filter(|_| self.messages >= ENOUGH)?;
+        let round_trip = self.round_trip.or(known_trip);
+        let round_trip = round_trip.filter(|_| self.messages >= ENOUGH)?;
         let later = round_trip.saturating_add(STAMPING);
         Some(least.most(now).saturating_add(later))
     }
@@ -171,7 +177,9 @@ impl Evidence {
         self.last = at;
         let time = i64::try_from(nanoseconds(time)).unwrap_or(i64::MAX);
         let known = self.current.round_trip.unwrap_or(i64::MAX);
-        self.current.round_trip = Some(known.min(time));
+        let fastest = known.min(time);
+        self.current.round_trip = Some(fastest);
+        self.known_trip = Some((fastest, at));
     }
 
     /// Ends a second. Returns false once all evidence has expired.
@@ -187,11 +195,12 @@ impl Evidence {
                 began: now,
                 last: self.last,
                 steps: self.steps,
+                known_trip: self.known_trip,
                 ..Self::default()
             };
             return true;
         }
-        if let Some(most) = self.current.most(now) {
+        if let Some(most) = self.current.most(now, self.known_trip(now)) {
             lower(&mut self.trips, most, now);
         }
         if self.current.messages >= ENOUGH && now - self.began >= WINDOW {
@@ -222,6 +231,12 @@ impl Evidence {
         self.relative(now).2
     }
 
+    /// Returns the fastest round trip of the last window that had one.
+    fn known_trip(&self, now: ModelTime) -> Option<i64> {
+        let known = self.known_trip.filter(|(_, at)| now - *at < TRIP_EXPIRY);
+        known.map(|(time, _)| time)
+    }
+
     /// Returns the number of noticed steps.
     pub(super) const fn steps(&self) -> u64 {
         self.steps
@@ -235,7 +250,7 @@ impl Evidence {
             let bound = bound.filter(|bound| bound.is_valid(now))?;
             Some((bound.most(now), source))
         };
-        let current = self.current.most(now);
+        let current = self.current.most(now, self.known_trip(now));
         let most = [
             of(self.reply, Source::Reply),
             of(self.trips, Source::RoundTrip),

@@ -60,13 +60,7 @@ impl<'a> EndpointExaminer<'a> {
 
     /// Adds findings and returns the endpoints without a counterpart.
     pub(super) fn examine(&self, topic: &Topic, findings: &mut Findings) -> Vec<UnmatchedEndpoint> {
-        let naming = &topic.naming;
-        let key = || TopicKey {
-            domain_id: topic.domain_id,
-            dds_name: naming.dds_name.clone(),
-            name: naming.name.clone(),
-            kind: naming.kind,
-        };
+        let key = || TopicKey::of(topic.domain_id, &topic.naming);
         let mut writers = self.groups(&topic.writers);
         let mut readers = self.groups(&topic.readers);
         self.types(topic, &key, findings);

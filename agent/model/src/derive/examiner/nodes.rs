@@ -123,6 +123,12 @@ impl Host {
     }
 }
 
+/// Returns whether both participants are on one host, as far as announcements show it.
+pub(super) fn is_one_host(one: &Participant, other: &Participant) -> bool {
+    let shared = || Some(!addresses(one)?.is_disjoint(&addresses(other)?));
+    one.local && other.local || shared().unwrap_or(false)
+}
+
 /// Returns the addresses of a participant other than those of loopback; `None` without one.
 fn addresses(participant: &Participant) -> Option<BTreeSet<IpAddr>> {
     let addresses = &participant.addresses;

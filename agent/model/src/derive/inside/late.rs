@@ -74,9 +74,7 @@ impl LateCalls {
         clock: WallClock,
     ) {
         let key = (call.process, call.handle);
-        if !self.callbacks.contains_key(&key) {
-            self.make_space();
-        }
+        self.callbacks.make_room(&key, |lateness| lateness.last);
         let started = clock.model_time(call.started);
         let new = || Lateness::new(&call, domain_id, started);
         let Some(lateness) = self.callbacks.get_or_insert_with(key, new) else {
@@ -90,21 +88,6 @@ impl LateCalls {
     /// Removes and returns the late calls since the last call.
     pub(super) fn take_new(&mut self) -> NewLateCalls {
         std::mem::take(&mut self.new)
-    }
-
-    /// Removes the callback that was late the longest time ago, if the table is full.
-    fn make_space(&mut self) {
-        if !self.callbacks.is_full() {
-            return;
-        }
-        let oldest = self
-            .callbacks
-            .iter()
-            .min_by_key(|(_, lateness)| lateness.last);
-        if let Some(key) = oldest.map(|(key, _)| *key) {
-            self.callbacks.remove(&key);
-            self.callbacks.refuse();
-        }
     }
 
     /// Evaluates the rule at `at`. Returns whether a finding appeared, ended or changed.

@@ -195,6 +195,13 @@ impl Inside {
         found
     }
 
+    /// Returns whether calls have shown the lifecycle state of this node.
+    #[must_use]
+    pub fn knows_state(&self, domain_id: DomainId, node: &NodeName) -> bool {
+        let mut states = self.states.values();
+        states.any(|state| state.domain_id == domain_id && state.node.as_ref() == Some(node))
+    }
+
     /// Returns whether this participant's process is observed.
     #[must_use]
     pub fn observes(&self, prefix: GuidPrefix) -> bool {

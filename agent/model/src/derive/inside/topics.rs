@@ -239,12 +239,7 @@ impl InsideTopic {
 
     /// Returns the topic's identity.
     pub(super) fn key(&self, domain_id: DomainId) -> TopicKey {
-        TopicKey {
-            domain_id,
-            dds_name: self.naming.dds_name.clone(),
-            name: self.naming.name.clone(),
-            kind: self.naming.kind,
-        }
+        TopicKey::of(domain_id, &self.naming)
     }
 
     /// Returns where the topic's counts come from.

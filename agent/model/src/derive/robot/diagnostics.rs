@@ -55,8 +55,8 @@ struct Part {
 #[derive(Debug)]
 struct Fault {
     since: ModelTime,
-    /// The status when it was reported.
-    reported: Option<Arc<DiagnosticStatus>>,
+    /// The finding, as it began. It holds none of the values, whose bytes have a cap.
+    reported: Option<Diagnosis>,
 }
 
 /// Facts about diagnostics.
@@ -94,14 +94,12 @@ impl Diagnostics {
         let name = bounded(status.name, NAME).into();
         let hardware_id = bounded(status.hardware_id, NAME).into();
         let key = (origin.domain_id, origin.topic.clone(), name, hardware_id);
+        if let Some((_, silent)) = self.parts.make_room(&key, |part| part.status.at) {
+            self.removed(&silent);
+        }
         let known = self.parts.remove(&key);
-        match &known {
-            Some(part) => self.value_bytes.sub(part.status.value_bytes()),
-            None if self.parts.is_full() => {
-                self.parts.refuse();
-                self.displace();
-            }
-            None => {}
+        if let Some(part) = &known {
+            self.value_bytes.sub(part.status.value_bytes());
         }
         let before = known.as_ref().map(|part| part.status.level);
         let level = status.level;
@@ -151,20 +149,14 @@ impl Diagnostics {
         values
     }
 
-    /// Removes the part with the longest silence.
-    fn displace(&mut self) {
-        let oldest = self.parts.iter().min_by_key(|(_, part)| part.status.at);
-        if let Some(key) = oldest.map(|(key, _)| key.clone()) {
-            self.remove(&key);
-        }
-    }
-
-    fn remove(&mut self, key: &Key) {
-        if let Some(part) = self.parts.remove(key) {
-            self.value_bytes.sub(part.status.value_bytes());
-            let is_reported = part.fault.is_some_and(|fault| fault.reported.is_some());
-            self.revision += u64::from(is_reported);
-        }
+    /// Notes that a part was removed.
+    fn removed(&mut self, part: &Part) {
+        self.value_bytes.sub(part.status.value_bytes());
+        let is_reported = part
+            .fault
+            .as_ref()
+            .is_some_and(|fault| fault.reported.is_some());
+        self.revision += u64::from(is_reported);
     }
 
     /// Removes the parts of a writer that departed.
@@ -173,7 +165,9 @@ impl Diagnostics {
         let of_writer = parts.filter(|(_, part)| part.status.writer == writer);
         let keys: Vec<_> = of_writer.map(|(key, _)| key.clone()).collect();
         for key in keys {
-            self.remove(&key);
+            if let Some(part) = self.parts.remove(&key) {
+                self.removed(&part);
+            }
         }
     }
 
@@ -215,16 +209,7 @@ impl Diagnostics {
     /// Returns the parts that are in error or stale.
     pub(super) fn findings(&self) -> impl Iterator<Item = Diagnosis> {
         let faults = self.parts.values().filter_map(|part| part.fault.as_ref());
-        let reported = faults.filter_map(|fault| fault.reported.as_ref());
-        reported.map(|status| Diagnosis::DiagnosticError {
-            domain_id: status.domain_id,
-            topic: status.topic.clone(),
-            node: status.node.clone(),
-            name: Arc::clone(&status.name),
-            hardware_id: Arc::clone(&status.hardware_id),
-            level: status.level,
-            message: Arc::clone(&status.message),
-        })
+        faults.filter_map(|fault| fault.reported.clone())
     }
 
     /// Returns the facts.
@@ -264,16 +249,24 @@ impl Part {
         });
         let is_new = fault.reported.is_none() && now - fault.since >= PATIENCE;
         if is_new {
-            fault.reported = Some(Arc::clone(status));
+            fault.reported = Some(Diagnosis::DiagnosticError {
+                domain_id: status.domain_id,
+                topic: status.topic.clone(),
+                node: status.node.clone(),
+                name: Arc::clone(&status.name),
+                hardware_id: Arc::clone(&status.hardware_id),
+                level: status.level,
+                message: Arc::clone(&status.message),
+            });
         }
         is_new
     }
 }
 
 /// Adds an event: the level changed. An aggregator repeats others, so its statuses are no events.
-fn note(status: &Arc<DiagnosticStatus>, before: Option<DiagnosticLevel>, events: &mut Events) {
+fn note(status: &DiagnosticStatus, before: Option<DiagnosticLevel>, events: &mut Events) {
     if !status.is_aggregated() {
-        let status = Arc::clone(status);
+        let status = Arc::new(status.without_values());
         events.push(status.since, EventKind::Diagnostic { before, status });
     }
 }

@@ -146,14 +146,8 @@ impl Logs {
         self.latest.push_back(Arc::clone(&message));
         self.lost += u64::from(self.fresh.push(Arc::clone(&message)).is_some());
         let key = (origin.domain_id, node);
-        if self.nodes.is_full() && !self.nodes.contains_key(&key) {
-            self.nodes.refuse();
-            let silent = self.nodes.iter().min_by_key(|(_, log)| log.at);
-            if let Some(key) = silent.map(|(key, _)| key.clone()) {
-                self.nodes.remove(&key);
-                self.revision += 1;
-            }
-        }
+        let silent = self.nodes.make_room(&key, |log| log.at);
+        self.revision += u64::from(silent.is_some());
         if let Some(known) = self.nodes.get_or_insert_with(key, NodeLog::default) {
             self.revision += u64::from(known.add(message));
         }

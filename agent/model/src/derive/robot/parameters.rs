@@ -5,17 +5,23 @@ use std::fmt::Write as _;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_wire::ros_parameters::{self as wire, ChangeKind, ParameterEvent, ParameterValue};
+use ros2probe_wire::ros_parameters::{
+    self as wire, ChangeKind, ParameterEvent, ParameterValue, RepliedValues, RequestedNames,
+};
 use ros2probe_wire::{DomainId, Guid, WireError};
 
 use super::Origin;
 use super::text::bounded;
+use crate::derive::services::service::CallId;
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
+use crate::facts::diagnosis::Diagnosis;
 use crate::facts::event::{EventKind, Events};
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::NodeName;
 use crate::facts::robot::{ParameterChange, Requester};
-use crate::facts::tables::{ChangedNodes, KnownParameters, ParameterChanges, ParameterRequests};
+use crate::facts::tables::{
+    AskedParameters, ChangedNodes, KnownParameters, ParameterChanges, ParameterRequests,
+};
 
 /// Maximum length of a name, in bytes.
 const NAME: usize = 128;
@@ -23,6 +29,13 @@ const NAME: usize = 128;
 const VALUE: usize = 256;
 /// Time after a request in which a change counts as its effect.
 const EFFECT: Duration = Duration::from_secs(5);
+
+/// Parameter with which a node uses simulated time.
+const SIMULATED_TIME: &str = "use_sim_time";
+/// Time for which nodes may have different clocks.
+const MIXED: Duration = Duration::from_secs(5);
+/// Maximum number of nodes that a finding names.
+const NAMED: usize = 4;
 
 /// Domain, node and name.
 type Key = (DomainId, NodeName, Arc<str>);
@@ -35,8 +48,29 @@ pub struct Parameters {
     changes: Bounded<Counted<ParameterChanges>, VecDeque<Arc<ParameterChange>>>,
     /// The latest requests, oldest first.
     requests: Bounded<Counted<ParameterRequests>, VecDeque<Request>>,
+    /// Parameters in the latest requests for values, oldest first.
+    asked: Bounded<Counted<AskedParameters>, VecDeque<Asked>>,
     /// Changes of each node since the agent started.
     counts: Bounded<Counted<ChangedNodes>, BTreeMap<(DomainId, NodeName), u64>>,
+    /// What the configuration expects.
+    expected: BTreeMap<(NodeName, Arc<str>), Arc<str>>,
+    /// Domains whose nodes have different clocks, with the time since which they have.
+    mixed: BTreeMap<DomainId, ModelTime>,
+    findings: Vec<Diagnosis>,
+    revision: u64,
+    /// Whether a value has changed since the findings were computed.
+    has_changed: bool,
+}
+
+/// A parameter that should have a value.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ExpectedParameter {
+    /// Fully qualified name of the node, in any domain.
+    pub node: NodeName,
+    /// Name.
+    pub name: Arc<str>,
+    /// Value, as YAML.
+    pub value: Arc<str>,
 }
 
 /// A parameter and its last known value.
@@ -55,6 +89,15 @@ struct Request {
     value: Arc<str>,
     at: ModelTime,
     by: Requester,
+}
+
+/// A parameter in a request for values.
+#[derive(Clone, Debug)]
+struct Asked {
+    call: CallId,
+    /// Its place in the request and in the reply.
+    index: usize,
+    name: Arc<str>,
 }
 
 /// A parameter that a node has, with its last known value.
@@ -86,6 +129,88 @@ pub struct ParametersFacts {
 }
 
 impl Parameters {
+    /// Sets what the configuration expects.
+    pub(super) fn expect(&mut self, expected: &[ExpectedParameter]) {
+        self.expected.clear();
+        for each in expected {
+            let parameter = (each.node.clone(), Arc::clone(&each.name));
+            let value = || Arc::clone(&each.value);
+            self.expected.entry(parameter).or_insert_with(value);
+        }
+        self.has_changed = true;
+    }
+
+    /// Updates the findings: other values than expected, and different clocks in one domain.
+    pub(super) fn end_second(&mut self, now: ModelTime) {
+        if !self.has_changed && self.mixed.is_empty() {
+            return;
+        }
+        self.has_changed = false;
+        let mut findings: Vec<_> = self.drifts().collect();
+        let clocks = self.clocks();
+        self.mixed
+            .retain(|domain_id, _| clocks.contains_key(domain_id));
+        for (domain_id, [simulated, system]) in clocks {
+            let since = *self.mixed.entry(domain_id).or_insert(now);
+            if now - since >= MIXED {
+                findings.push(Diagnosis::MixedTime {
+                    domain_id,
+                    simulated,
+                    system,
+                });
+            }
+        }
+        if findings != self.findings {
+            self.findings = findings;
+            self.revision += 1;
+        }
+    }
+
+    fn drifts(&self) -> impl Iterator<Item = Diagnosis> {
+        let known = self.known.iter().filter(|_| !self.expected.is_empty());
+        known.filter_map(|((domain_id, node, name), known)| {
+            let parameter = (node.clone(), Arc::clone(name));
+            let expected = self.expected.get(&parameter)?;
+            (*expected != known.value).then(|| Diagnosis::ParameterDrift {
+                domain_id: *domain_id,
+                node: node.clone(),
+                name: Arc::clone(name),
+                expected: Arc::clone(expected),
+                value: Arc::clone(&known.value),
+            })
+        })
+    }
+
+    /// Returns the domains with several clocks, each with nodes of simulated time and others.
+    fn clocks(&self) -> BTreeMap<DomainId, [Vec<NodeName>; 2]> {
+        let mut clocks: BTreeMap<DomainId, [Vec<NodeName>; 2]> = BTreeMap::new();
+        for ((domain_id, node, name), known) in &*self.known {
+            if **name == *SIMULATED_TIME {
+                let [simulated, system] = clocks.entry(*domain_id).or_default();
+                let nodes = if &*known.value == "true" {
+                    simulated
+                } else {
+                    system
+                };
+                if nodes.len() < NAMED {
+                    nodes.push(node.clone());
+                }
+            }
+        }
+        clocks.retain(|_, nodes| nodes.iter().all(|nodes| !nodes.is_empty()));
+        clocks
+    }
+
+    /// Returns the present problems.
+    pub(super) fn findings(&self) -> impl Iterator<Item = Diagnosis> {
+        self.findings.iter().cloned()
+    }
+
+    /// Returns the number of changes of the findings.
+    pub(super) const fn revision(&self) -> u64 {
+        self.revision
+    }
+
     /// Adds an event of a node. A declaration is no change.
     ///
     /// # Errors
@@ -114,17 +239,11 @@ impl Parameters {
         events: &mut Events,
     ) {
         let (at, kind) = (origin.at, change.kind);
+        self.has_changed = true;
         let before = self.known.get(&key).map(|known| Arc::clone(&known.value));
         let value = (kind != ChangeKind::Deleted).then(|| text(&change.parameter.value));
         match &value {
-            Some(value) => {
-                let known = Known {
-                    value: Arc::clone(value),
-                    at,
-                    writer: origin.writer,
-                };
-                self.learn(key.clone(), known);
-            }
+            Some(value) => self.know(origin, key.clone(), Arc::clone(value)),
             None => {
                 self.known.remove(&key);
             }
@@ -151,16 +270,71 @@ impl Parameters {
         events.push(at, EventKind::Parameter(change));
     }
 
-    /// Keeps the last known value; the one with the oldest value makes room.
-    fn learn(&mut self, key: Key, known: Known) {
-        if self.known.is_full() && !self.known.contains_key(&key) {
-            self.known.refuse();
-            let oldest = self.known.iter().min_by_key(|(_, known)| known.at);
-            if let Some(key) = oldest.map(|(key, _)| key.clone()) {
-                self.known.remove(&key);
+    /// Records the last known value of a parameter.
+    fn know(&mut self, origin: &Origin<'_>, key: Key, value: Arc<str>) {
+        let known = Known {
+            value,
+            at: origin.at,
+            writer: origin.writer,
+        };
+        self.has_changed = true;
+        self.known.make_room(&key, |known| known.at);
+        self.known.insert(key, known);
+    }
+
+    /// Adds a request for values of parameters.
+    ///
+    /// # Errors
+    /// Fails if the request is malformed. The names before the error are added.
+    pub fn ask(
+        &mut self,
+        call: Option<CallId>,
+        names: RequestedNames<'_>,
+    ) -> Result<(), WireError> {
+        let Some(call) = call else {
+            return Ok(());
+        };
+        for (index, name) in names.enumerate() {
+            let name = bounded(name?, NAME).into();
+            self.asked.push_back(Asked { call, index, name });
+        }
+        Ok(())
+    }
+
+    /// Adds the values of a reply, if its request was seen. They are no changes: the agent came
+    /// after the node.
+    ///
+    /// # Errors
+    /// Fails if the reply is malformed. The values before the error are added.
+    pub fn replied(
+        &mut self,
+        origin: &Origin<'_>,
+        call: Option<CallId>,
+        values: RepliedValues<'_>,
+    ) -> Result<(), WireError> {
+        let (Some(call), Some((node, _service))) = (call, origin.topic.rsplit_once('/')) else {
+            return Ok(());
+        };
+        let mut names = BTreeMap::new();
+        self.asked.retain(|asked| {
+            if asked.call == call {
+                names.insert(asked.index, Arc::clone(&asked.name));
+            }
+            asked.call != call
+        });
+        let node = NodeName::from(node);
+        for (index, value) in values.enumerate() {
+            let value = value?;
+            // A node replies "not set" about a parameter that it does not have.
+            if let (Some(name), false) = (
+                names.remove(&index),
+                matches!(value, ParameterValue::NotSet),
+            ) {
+                let key = (origin.domain_id, node.clone(), name);
+                self.know(origin, key, text(&value));
             }
         }
-        self.known.insert(key, known);
+        Ok(())
     }
 
     /// Adds a request to set parameters of a node.
@@ -210,6 +384,7 @@ impl Parameters {
             .filter(|(_, known)| known.writer == writer);
         let keys: Vec<_> = of_writer.map(|(key, _)| key.clone()).collect();
         for key in keys {
+            self.has_changed = true;
             self.known.remove(&key);
         }
     }
@@ -234,11 +409,12 @@ impl Parameters {
         }
     }
 
-    pub(super) fn tables(&self) -> [TableFacts; 4] {
+    pub(super) fn tables(&self) -> [TableFacts; 5] {
         [
             self.known.facts(),
             self.changes.facts(),
             self.requests.facts(),
+            self.asked.facts(),
             self.counts.facts(),
         ]
     }

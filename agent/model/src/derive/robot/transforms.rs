@@ -25,11 +25,11 @@ use edge::Edge;
 pub use edge::{Broadcaster, EdgeFacts, Jumps};
 
 /// Maximum length of a frame's name, in bytes.
-const NAME: usize = 128;
+pub(super) const NAME: usize = 128;
 /// Time for which trees stay apart before that is a fault.
 const APART: Duration = Duration::from_secs(10);
 /// Maximum number of roots that a fault names.
-const NAMED: usize = 4;
+pub(super) const NAMED: usize = 4;
 
 /// The transforms of all robots.
 #[derive(Debug, Default)]
@@ -59,6 +59,8 @@ struct Tree {
     edges: BTreeMap<Arc<str>, Edge>,
     /// Time since which the tree has several roots.
     apart: Option<ModelTime>,
+    /// Frames without a parent at the end of the last second, sorted.
+    roots: Vec<Arc<str>>,
     faults: Vec<TransformFault>,
 }
 
@@ -126,6 +128,7 @@ impl Transforms {
                     namespace: namespace.into(),
                     edges: BTreeMap::new(),
                     apart: None,
+                    roots: Vec::new(),
                     faults: Vec::new(),
                 });
                 self.trees.len() - 1
@@ -164,6 +167,16 @@ impl Transforms {
                 self.revision += 1;
             }
         }
+    }
+
+    /// Returns whether the domain has transforms, and none of them has this frame. A static one that
+    /// was sent before the agent started may have it.
+    pub(super) fn lack(&self, domain_id: DomainId, frame: &str) -> bool {
+        let of_domain = || self.trees.iter().filter(|tree| tree.domain_id == domain_id);
+        let mut unread = self.broadcasters.values();
+        of_domain().next().is_some()
+            && !of_domain().any(|tree| tree.has(frame))
+            && unread.all(|each| each.is_heard || each.domain_id != domain_id)
     }
 
     /// Returns the number of changes of [`Self::findings`].
@@ -297,8 +310,8 @@ impl Tree {
                 });
             }
         }
-        let roots = self.roots();
-        match roots.len() {
+        self.roots = self.roots();
+        match self.roots.len() {
             2.. if is_whole => {
                 let since = *self.apart.get_or_insert(now);
                 if now - since >= APART {
@@ -307,7 +320,7 @@ impl Tree {
                         parent: Arc::default(),
                         kind: TransformFaultKind::Apart,
                         edges: 0,
-                        names: roots.into_iter().take(NAMED).collect(),
+                        names: self.roots.iter().take(NAMED).cloned().collect(),
                     });
                 }
             }
@@ -316,6 +329,12 @@ impl Tree {
         let changes = faults != self.faults;
         self.faults = faults;
         changes
+    }
+
+    /// Returns whether a transform has the frame. One that came within this second may be missing.
+    fn has(&self, frame: &str) -> bool {
+        let is_root = |root: &Arc<str>| (**root).cmp(frame);
+        self.edges.contains_key(frame) || self.roots.binary_search_by(is_root).is_ok()
     }
 
     /// Returns the frames without a parent, sorted.
@@ -337,6 +356,6 @@ fn namespace(topic: &str) -> (&str, bool) {
 }
 
 /// Returns a frame without the leading slash of older names, which tf2 ignores.
-fn without_slash(frame: &str) -> &str {
+pub(super) fn without_slash(frame: &str) -> &str {
     frame.strip_prefix('/').unwrap_or(frame)
 }

@@ -48,14 +48,8 @@ impl Action {
             return;
         }
         self.counts.accepted += 1;
-        if self.goals.is_full() {
-            self.goals.refuse();
-            let oldest = self.goals.iter().min_by_key(|(_, sent)| **sent);
-            if let Some(oldest) = oldest.map(|(goal, _)| *goal) {
-                self.goals.remove(&oldest);
-                self.evictions += 1;
-            }
-        }
+        let oldest = self.goals.make_room(&goal, |sent| *sent);
+        self.evictions += u64::from(oldest.is_some());
         self.goals.insert(goal, sent);
     }
 

@@ -254,13 +254,7 @@ impl Service {
 
     /// Returns whether the client has not sent this number before.
     fn is_new(&mut self, id: CallId, at: ModelTime) -> bool {
-        if !self.clients.contains_key(&id.client) && self.clients.is_full() {
-            self.clients.refuse();
-            let oldest = self.clients.iter().min_by_key(|(_, client)| client.last);
-            if let Some(oldest) = oldest.map(|(client, _)| *client) {
-                self.clients.remove(&oldest);
-            }
-        }
+        self.clients.make_room(&id.client, |client| client.last);
         let client = self.clients.get_or_insert_with(id.client, Client::default);
         client.is_none_or(|client| {
             client.last = at;

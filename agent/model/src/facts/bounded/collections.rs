@@ -251,6 +251,21 @@ impl<D: Declared, K: Ord, V> Bounded<D, BTreeMap<K, V>> {
         self.add((key, value))
     }
 
+    /// Removes and returns the entry with the least age, counted as a refusal, if the map is full
+    /// and lacks this key.
+    pub fn make_room<T: Ord>(&mut self, key: &K, age: impl Fn(&V) -> T) -> Option<(K, V)>
+    where
+        K: Clone,
+    {
+        if !self.is_full() || self.inner.contains_key(key) {
+            return None;
+        }
+        self.refuse();
+        let oldest = self.inner.iter().min_by_key(|(_, value)| age(value));
+        let key = oldest.map(|(key, _)| key.clone())?;
+        self.inner.remove_entry(&key)
+    }
+
     /// Returns the value of this key, and adds it if it is missing. Returns `None` if the map is
     /// full.
     pub fn get_or_insert_with(&mut self, key: K, value: impl FnOnce() -> V) -> Option<&mut V> {

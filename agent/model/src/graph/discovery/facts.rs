@@ -1,7 +1,7 @@
 //! State of participants, endpoints and nodes, and how a participant's domain is determined.
 
 use std::collections::BTreeSet;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 
 use ros2probe_wire::backends::Backends;
@@ -89,6 +89,16 @@ pub struct Addresses {
     pub metatraffic: Box<[SocketAddr]>,
     /// Addresses of its other endpoints.
     pub default: Box<[SocketAddr]>,
+}
+
+impl Addresses {
+    /// Returns the first one that other hosts can reach.
+    #[must_use]
+    pub fn reachable(&self) -> Option<IpAddr> {
+        let mut all = self.metatraffic.iter().chain(&self.default);
+        let first = all.find(|address| !address.ip().is_loopback());
+        first.map(SocketAddr::ip)
+    }
 }
 
 /// A participant.

@@ -7,6 +7,7 @@ use ros2probe_wire::walk::Found;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, WireError};
 
 use super::Observer;
+use crate::derive::services;
 use crate::facts::observation::{Content, Observation, Sample};
 use crate::facts::route::Destination;
 use crate::graph::discovery::{Origin, Priority, endpoints_of};
@@ -41,7 +42,8 @@ impl Observer {
             self.identify_call(found, sample, vendor);
             self.keep_type_source(found, sample, vendor);
             self.keep_payload(sample, found.payload);
-            self.hear_robot(sample, found.payload, vendor);
+            let call = |half| services::call(half, found, sample, vendor);
+            self.hear_robot(sample, found.payload, vendor, call);
         }
     }
 

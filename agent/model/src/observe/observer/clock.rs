@@ -180,9 +180,8 @@ impl Observer {
                 &self.derive.inside,
                 &self.derive.chains,
                 &self.measure.links,
-                &self.derive.robot,
-                &self.derive.clocks,
             ),
+            (&self.derive.robot, &self.derive.clocks, &self.derive.stamps),
             now,
         );
         let after = self.derive.examiner.current();

@@ -6,9 +6,9 @@ use ros2probe_wire::{Guid, GuidPrefix};
 
 use super::Observer;
 use crate::derive::robot::Part;
+use crate::facts::diagnosis::TopicKey;
 use crate::facts::model_time::ModelTime;
 use crate::facts::observation::{AckNack, Observation, Sample};
-use crate::graph::discovery::Participant;
 
 impl Observer {
     /// Passes the times in an observation on to the clocks.
@@ -32,6 +32,36 @@ impl Observer {
             clocks.name(own.find_map(|participant| participant.proxy.host.as_ref()));
         }
         clocks.end_second(now, graph.wall_clock);
+        let clocks = graph.topics.iter().map(|(_, topic)| topic);
+        let clocks = clocks
+            .filter(|topic| *topic.naming.name == *"/clock" && !topic.writers.is_empty())
+            .map(|topic| topic.domain_id);
+        self.derive.stamps.end_second(now, clocks);
+    }
+
+    /// Compares the stamp of a measured message with the time of its publication.
+    pub(super) fn judge_stamp(&mut self, observation: &Observation) {
+        let Observation::Sample(sample) = observation else {
+            return;
+        };
+        let (writer, at) = (sample.head.writer, sample.head.at);
+        if let Some(stamp) = sample.header_stamp
+            && sample.is_message()
+            && self.settings.robot.has(Part::Clocks)
+            && let Some(published) = sample.source_timestamp.timestamp()
+            && let Some(measured) = self.measure.profiler.get(writer)
+            && measured.writer.traits().has_header
+        {
+            let message = (writer, sample.sequence_number);
+            let topics = &self.graph.topics;
+            let topic = || {
+                let topic = topics.get(measured.topic?)?;
+                Some(TopicKey::of(topic.domain_id, &topic.naming))
+            };
+            self.derive
+                .stamps
+                .add(message, (stamp, published), at, topic);
+        }
     }
 
     fn clock_of_sample(&mut self, sample: &Sample) {
@@ -41,8 +71,9 @@ impl Observer {
             self.derive.clocks.left(head.writer, number, head.at);
             return;
         }
-        // Announcements are repeated with old stamps.
-        if head.writer.entity.is_builtin() {
+        // Announcements are repeated with old stamps, and only the first fragment follows its stamp
+        // at once.
+        if head.writer.entity.is_builtin() || !sample.is_start() {
             return;
         }
         let Some(participant) = self.graph.discovery.participants().get(&head.writer.prefix) else {
@@ -51,7 +82,7 @@ impl Observer {
         let name = participant.proxy.host.as_ref();
         if !participant.local
             && let Some(stamp) = sample.source_timestamp.timestamp()
-            && let Some(address) = address(participant)
+            && let Some(address) = participant.addresses.reachable()
         {
             // The first of several datagrams already follows the stamp.
             self.derive
@@ -91,14 +122,7 @@ impl Observer {
 
     fn remote_address(&self, prefix: &GuidPrefix) -> Option<IpAddr> {
         let participant = self.graph.discovery.participants().get(prefix)?;
-        address(participant).filter(|_| !participant.local)
+        let address = participant.addresses.reachable();
+        address.filter(|_| !participant.local)
     }
-}
-
-/// Returns the first announced address that other hosts can reach.
-fn address(participant: &Participant) -> Option<IpAddr> {
-    let addresses = &participant.addresses;
-    let mut all = addresses.metatraffic.iter().chain(&addresses.default);
-    let first = all.find(|address| !address.ip().is_loopback());
-    first.map(std::net::SocketAddr::ip)
 }

@@ -1,8 +1,11 @@
 //! Figures from inside processes: their topics, and whether they or the network determine the
 //! counts.
 
+use ros2probe_wire::lifecycle::LifecycleState;
+
 use super::Observer;
 use crate::derive::inside::source::Seen;
+use crate::derive::robot::lifecycle::ManagedNode;
 use crate::facts::calls::report::Report;
 use crate::facts::event::EventKind;
 use crate::facts::model_time::ModelTime;
@@ -21,9 +24,35 @@ impl Observer {
             .report(report, clock, discovery, receivers);
         for state in transitions {
             let events = &mut self.journal.events;
-            events.push(state.at, EventKind::Lifecycle(state));
+            events.push(
+                state.at,
+                EventKind::Lifecycle {
+                    domain_id: state.domain_id,
+                    node: state.node,
+                    process: Some(state.process),
+                    from: state.before,
+                    to: state.state,
+                },
+            );
         }
         self.compare_queues(at);
+    }
+
+    /// Records a transition that a managed node published, unless calls inside its process show it.
+    pub(super) fn note_transition(&mut self, from: LifecycleState, node: ManagedNode) {
+        if self.derive.inside.knows_state(node.domain_id, &node.node) {
+            return;
+        }
+        self.journal.events.push(
+            node.at,
+            EventKind::Lifecycle {
+                domain_id: node.domain_id,
+                node: Some(node.node),
+                process: None,
+                from: from.label().into(),
+                to: node.state.label().into(),
+            },
+        );
     }
 
     /// Lists the topics of observed processes, and chooses the source of their counts.

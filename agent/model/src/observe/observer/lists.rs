@@ -11,7 +11,7 @@ use ros2probe_wire::{Guid, RtpsDuration, SequenceNumber};
 use super::MAX_MATCHES_PER_ROUND;
 use super::Observer;
 use super::references::Reference;
-use crate::derive::robot::Standard;
+use crate::derive::robot::Part;
 use crate::derive::trace::share::Share;
 use crate::facts::dispatch::{self, Offered};
 use crate::facts::header::begins_with_header;
@@ -196,13 +196,19 @@ impl Observer {
                     _ => self.measure.latched.forget(guid),
                 }
                 let latched = self.measure.latched.verdict(guid);
-                let standard = Standard::of(&endpoint.message_type);
-                match standard {
-                    Some(standard) if counts && self.settings.robot.has(standard.part()) => {
-                        let topic = (topic.domain_id, &topic.naming.name);
-                        self.derive.robot.follow(guid, topic, standard);
+                let (robot, parts) = (&mut self.derive.robot, self.settings.robot);
+                let (domain_id, name) = (topic.domain_id, &topic.naming.name);
+                match robot.standard(name, &endpoint.message_type) {
+                    Some(standard) if counts && parts.has(standard.part()) => {
+                        robot.follow(guid, (domain_id, name), standard);
                     }
-                    _ => self.derive.robot.forget(guid),
+                    None if counts
+                        && parts.has(Part::Transforms)
+                        && begins_with_header(&endpoint.message_type) =>
+                    {
+                        robot.follow_frame(guid, domain_id, name);
+                    }
+                    _ => robot.forget(guid),
                 }
                 let is_read = self.derive.robot.is_captured(guid);
                 let verdict = match topic.naming.kind {

@@ -54,6 +54,12 @@ pub(super) fn snapshot(observer: &Observer, wall_time: Timestamp) -> Snapshot {
             observer.settings.robot.has(Part::Transforms),
             observer.clock,
         ),
+        lifecycle: (observer.derive.robot.lifecycle())
+            .facts(observer.settings.robot.has(Part::Lifecycle)),
+        fields: observer
+            .derive
+            .robot
+            .field_messages(&observer.graph.discovery),
         parameters: (observer.derive.robot.parameters())
             .facts(observer.settings.robot.has(Part::Parameters)),
         logs: (observer.derive.robot.logs()).facts(observer.settings.robot.has(Part::Logs)),
@@ -472,6 +478,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     tables.extend(observer.zenoh.tables());
     tables.push(observer.measure.links.tables());
     tables.extend(observer.derive.robot.tables());
+    tables.push(observer.derive.stamps.table());
     tables.extend(observer.derive.clocks.tables());
     tables
 }

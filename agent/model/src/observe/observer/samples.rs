@@ -9,6 +9,8 @@ use ros2probe_wire::rtps::VendorId;
 
 use super::Observer;
 use crate::derive::robot::Heard;
+use crate::derive::services::Half;
+use crate::derive::services::service::CallId;
 use crate::facts::dispatch::{self, Dispatch, SampleOutcome};
 use crate::facts::model_time::ModelTime;
 use crate::facts::naming::Naming;
@@ -149,16 +151,23 @@ impl Observer {
     }
 
     /// Reads a sample of a standard type, in which the robot itself says something.
-    pub(super) fn hear_robot(&mut self, sample: &Sample, payload: &[u8], vendor: VendorId) {
+    pub(super) fn hear_robot(
+        &mut self,
+        sample: &Sample,
+        payload: &[u8],
+        vendor: VendorId,
+        call: impl FnOnce(Half) -> Option<CallId>,
+    ) {
         let writer = sample.head.writer;
         if !self.derive.robot.is_captured(writer) {
             return;
         }
         let node = self.graph.discovery.node_of(writer).map(|node| &node.name);
         let events = &mut self.journal.events;
-        match (self.derive.robot).hear(sample, payload, (node, vendor), events) {
+        match (self.derive.robot).hear(sample, payload, (node, vendor), call, events) {
             Heard::Nothing | Heard::Decoded => {}
             Heard::Paused => self.apply_again(writer, sample.head.at),
+            Heard::Transition(from, node) => self.note_transition(from, node),
             Heard::Malformed(standard, error) => self.decode_error(standard.stage(), error.reason),
         }
     }

@@ -222,7 +222,12 @@ impl Observer {
         }
         if let Some(payload) = payload.filter(|_| sample.referring.is_none()) {
             self.keep_payload(&observed, payload);
-            self.hear_robot(&observed, payload, VendorId::default());
+            let call = |_| {
+                let (client, number) = sample.call?;
+                let client = client.0;
+                Some(CallId { client, number })
+            };
+            self.hear_robot(&observed, payload, VendorId::default(), call);
         }
         self.observe(&Observation::Sample(observed));
         if stream.outgoing && stream.is_loopback() {

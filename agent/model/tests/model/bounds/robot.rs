@@ -1,7 +1,7 @@
 //! A storm of log messages from ever new writers and nodes.
 
 use ros2probe_testing::robot_log::{DDS_TYPE, log};
-use ros2probe_testing::{robot_diagnostics, robot_parameters, robot_transforms};
+use ros2probe_testing::{robot_diagnostics, robot_parameters, robot_states, robot_transforms};
 
 use super::*;
 
@@ -112,6 +112,54 @@ pub(super) fn parts(observer: &mut Observer, dice: &mut Dice, now: u64) {
                     robot_transforms::transforms(&all)
                 }
                 _ => robot_parameters::request(&[(&*name, value); 3], true),
+            };
+            message.data(guid.entity, step, &payload)
+        }
+    };
+    observer.input(Input::Datagram {
+        envelope: &forge::multicast(now, 0),
+        payload: &message.bytes(),
+        handover: None,
+    });
+}
+
+/// Announces a managed node, a battery or a camera, or sends its state or a message.
+pub(super) fn states(observer: &mut Observer, dice: &mut Dice, now: u64) {
+    let step = (now - START) / 1_000_000;
+    let mut prefix = [8; 12];
+    prefix[11] = dice.pick(40) as u8;
+    let prefix = GuidPrefix(prefix);
+    let (number, kind) = (dice.pick(60), [0, 0, 1, 1, 2, 2][dice.pick(6) as usize]);
+    let guid = Guid::new(prefix, EntityId([kind as u8, 5, number as u8, 3]));
+    let node = u64::from(prefix.0[11]) * 60 + number;
+    let (topic, type_name) = [
+        (
+            format!("rt/n{node}/transition_event"),
+            robot_states::TRANSITION,
+        ),
+        (format!("rt/battery{node}"), robot_states::BATTERY),
+        (
+            format!("rt/image{number}"),
+            "sensor_msgs::msg::dds_::Image_",
+        ),
+    ][kind]
+        .clone();
+    let message = Message::from(prefix);
+    let message = match dice.pick(6) {
+        0 => message.data(
+            SPDP,
+            1 + step,
+            &forge::participant(prefix, 1_000_000, Some(0)),
+        ),
+        1 | 2 => {
+            let payload = forge::endpoint(guid, &topic, type_name, true);
+            message.data(SEDP_WRITERS, 1 + step, &payload)
+        }
+        _ => {
+            let frame = format!("frame{}", dice.pick(3000));
+            let payload = match kind {
+                0 => robot_states::transition(dice.pick(17) as u8, dice.pick(17) as u8),
+                _ => robot_states::with_header(&frame, dice.pick(60_000) as usize),
             };
             message.data(guid.entity, step, &payload)
         }

@@ -221,7 +221,7 @@ fn callbacks_and_transitions_belong_to_the_only_node_of_a_process() {
     });
     let events = world.observer.drain().events.events;
     let transitions = events.iter().filter_map(|event| match &event.kind {
-        EventKind::Lifecycle(state) => Some((&state.node, &*state.before, &*state.state)),
+        EventKind::Lifecycle { node, from, to, .. } => Some((node, &**from, &**to)),
         _ => None,
     });
     let lidar = node("/lidar");

@@ -30,6 +30,10 @@ const WENT_BACK: Duration = Duration::from_secs(60);
 const HISTORY: u32 = 10;
 /// A jump is at least this many times as long as the longest of the latest steps.
 const JUMP: f64 = 10.0;
+/// Number of jumps that are a fault, and the time within which they are. A localisation corrects
+/// itself less often.
+const MANY_JUMPS: usize = 3;
+const JUMPS_WITHIN: Duration = Duration::from_secs(60);
 /// Minimum of a jump in metres and in radians.
 const METRES: f64 = 0.3;
 const RADIANS: f64 = 0.5;
@@ -49,6 +53,8 @@ pub(super) struct Edge {
     interval: Option<Duration>,
     steps: Steps,
     jumps: Jumps,
+    /// Times of the latest jumps of the pose, the last one last.
+    jumped: [Option<ModelTime>; MANY_JUMPS],
     went_back: Option<ModelTime>,
 }
 
@@ -67,7 +73,6 @@ struct Last {
 struct Source {
     writer: Guid,
     node: Option<NodeName>,
-    parent: Arc<str>,
     stamp: (i32, u32),
     since: ModelTime,
     at: ModelTime,
@@ -151,7 +156,7 @@ impl Edge {
             Some(last) if last.parent.as_bytes() == transform.parent => Arc::clone(&last.parent),
             _ => without_slash(&bounded(transform.parent, NAME)).into(),
         };
-        let went_back = self.heard(origin, transform.stamp, &parent);
+        let went_back = self.heard(origin, transform.stamp);
         self.count += 1;
         if let Some(current) = self.seconds.last_mut() {
             *current = current.saturating_add(1);
@@ -165,6 +170,12 @@ impl Edge {
             let longest = self.interval.unwrap_or_default();
             self.interval = Some((origin.at - last.at).max(longest - longest / 8));
             jump = self.steps.add(&last.pose, &transform.pose);
+            if jump.is_some() {
+                self.jumped.rotate_left(1);
+                if let Some(latest) = self.jumped.last_mut() {
+                    *latest = Some(origin.at);
+                }
+            }
         }
         if went_back && !is_static {
             self.went_back = Some(origin.at);
@@ -187,7 +198,7 @@ impl Edge {
     }
 
     /// Notes the broadcaster. Returns whether its stamp went back.
-    fn heard(&mut self, origin: &Origin<'_>, stamp: (i32, u32), parent: &Arc<str>) -> bool {
+    fn heard(&mut self, origin: &Origin<'_>, stamp: (i32, u32)) -> bool {
         let place = self
             .broadcasters
             .iter()
@@ -199,15 +210,11 @@ impl Edge {
             if source.node.is_none() {
                 source.node = origin.node.cloned();
             }
-            if source.parent != *parent {
-                source.parent = Arc::clone(parent);
-            }
             return went_back;
         }
         let new = Source {
             writer: origin.writer,
             node: origin.node.cloned(),
-            parent: Arc::clone(parent),
             stamp,
             since: origin.at,
             at: origin.at,
@@ -250,6 +257,10 @@ impl Edge {
         }
         if self.went_back.is_some_and(|at| now - at < WENT_BACK) {
             return Some(TransformFaultKind::TimeWentBack);
+        }
+        let [earliest, ..] = self.jumped;
+        if earliest.is_some_and(|at| now - at < JUMPS_WITHIN) {
+            return Some(TransformFaultKind::Jumps);
         }
         let limit = SILENCE.max(self.interval? * INTERVALS);
         let mut writers = self.broadcasters.iter();
