@@ -73,6 +73,14 @@ impl Filter {
         parse::expression(&tokens).map(Self)
     }
 
+    /// Parses a field of a message: names with dots, and indices, as in `cells[0].voltage`.
+    ///
+    /// # Errors
+    /// Fails like [`Self::parse`].
+    pub fn of_field(field: &str) -> Result<Self, FilterError> {
+        Self::parse(&format!("m.{field}"))
+    }
+
     /// Returns whether a message passes.
     ///
     /// # Errors
@@ -80,6 +88,14 @@ impl Filter {
     /// incomparable values.
     pub fn passes(&self, subject: Subject<'_>) -> Result<bool, FilterError> {
         evaluate::passes(&self.0, subject)
+    }
+
+    /// Returns the value as a number; a boolean is 0 or 1.
+    ///
+    /// # Errors
+    /// Fails like [`Self::passes`], and if the value is neither a number nor a boolean.
+    pub fn number(&self, subject: Subject<'_>) -> Result<f64, FilterError> {
+        evaluate::number(&self.0, subject)
     }
 }
 

@@ -35,6 +35,7 @@ pub mod filter;
 mod hash;
 pub mod library;
 mod name;
+pub mod preview;
 pub mod python;
 pub mod truncation;
 pub mod type_description;

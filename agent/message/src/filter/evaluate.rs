@@ -68,12 +68,14 @@ pub enum Subject<'a> {
 }
 
 pub(super) fn passes(node: &Node, subject: Subject<'_>) -> Result<bool, FilterError> {
-    let object = match subject {
-        Subject::Message(message) => Object::Message(message),
-        Subject::Value(value) => Object::of(value),
-        Subject::Bytes(bytes) => Object::Bytes(Cow::Borrowed(bytes)),
-    };
-    Ok(evaluate(node, &object)?.is_true())
+    Ok(evaluate(node, &Object::subject(subject))?.is_true())
+}
+
+pub(super) fn number(node: &Node, subject: Subject<'_>) -> Result<f64, FilterError> {
+    let value = evaluate(node, &Object::subject(subject))?;
+    let number = value.number().map(Number::float);
+    let wrong = || Exception::NotNumber(value.type_name());
+    number.ok_or_else(|| FilterError::new(node.column, wrong().to_string()))
 }
 
 /// An intermediate value.
@@ -91,6 +93,14 @@ enum Object<'a> {
 }
 
 impl<'a> Object<'a> {
+    fn subject(subject: Subject<'a>) -> Self {
+        match subject {
+            Subject::Message(message) => Self::Message(message),
+            Subject::Value(value) => Self::of(value),
+            Subject::Bytes(bytes) => Self::Bytes(Cow::Borrowed(bytes)),
+        }
+    }
+
     fn of(value: &'a Value<'a>) -> Self {
         match value {
             Value::Scalar(scalar) => Self::scalar(*scalar),
