@@ -158,7 +158,7 @@ impl Process {
             return Ok(status);
         }
         self.signal("TERM")?;
-        self.wait(Duration::from_secs(30))
+        self.wait(Duration::from_secs(70))
     }
 }
 

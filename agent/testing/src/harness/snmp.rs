@@ -23,6 +23,11 @@ impl Snmp {
         self.value("Udp:", "InErrors")
     }
 
+    /// Returns the number of IP datagrams of which fragments were missing.
+    pub fn reassembly_failures(&self) -> Result<u64> {
+        self.value("Ip:", "ReasmFails")
+    }
+
     /// Returns the number of datagrams sent.
     pub fn sent(&self) -> Result<u64> {
         self.value("Udp:", "OutDatagrams")

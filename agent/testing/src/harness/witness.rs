@@ -53,6 +53,14 @@ impl Testimony {
         }
         Ok(())
     }
+
+    /// Returns the counters that are not zero, for the message of a failed test.
+    #[must_use]
+    pub fn counted(&self) -> String {
+        let counters = self.counters.iter().filter(|(_, count)| *count > 0);
+        let counters = counters.map(|(counter, count)| format!(" {} {count}", counter.label()));
+        counters.collect()
+    }
 }
 
 #[derive(Default)]

@@ -37,6 +37,12 @@ impl Cell {
         share(self.found(), self.reported.len())
     }
 
+    /// Returns the number of samples that the agent reports as lost by this cause.
+    pub(crate) fn losses_by(&self, cause: LossCause) -> usize {
+        let causes = self.reported.values();
+        causes.filter(|each| **each == cause).count()
+    }
+
     /// Returns the deviations from a correct report.
     pub(crate) fn faults(&self) -> Vec<String> {
         let named: BTreeSet<u64> = self.reported.keys().copied().collect();
@@ -79,11 +85,7 @@ impl fmt::Display for Cell {
             self.precision()
         )?;
         for cause in LossCause::ALL {
-            let count = self
-                .reported
-                .values()
-                .filter(|each| **each == cause)
-                .count();
+            let count = self.losses_by(cause);
             if count > 0 {
                 write!(f, " {} {count}", cause.label())?;
             }

@@ -189,6 +189,7 @@ impl Experiment {
         let topic = self.size.stream().topic;
         let page = agent.as_ref().map(|agent| agent.settled_scrape(&topic, 0));
         let page = page.transpose()?;
+        let incomplete = Snmp::of(peers.host()?)?.reassembly_failures()?;
         peers.terminate()?;
         let testimony = witness.finish()?;
         testimony.ensure_complete()?;
@@ -204,7 +205,20 @@ impl Experiment {
             }
             let missing = truth.missing(&sent.numbers);
             for (span, due) in spans.iter().zip(1..) {
-                cells.push(self.cell(subscriber, (span, due), &missing, &losses));
+                let mut cell = self.cell(subscriber, (span, due), &missing, &losses);
+                if let Trouble::Fragments(_) = span.trouble {
+                    let reported = cell.losses_by(LossCause::Reassembly);
+                    ensure!(
+                        reported as u64 == incomplete,
+                        "{cell}: the kernel had {incomplete} incomplete datagrams, and counted{}",
+                        testimony.counted()
+                    );
+                    // A busy machine may drop a first fragment, too: nothing is incomplete then.
+                    let is_less = reported < cell.lost.len();
+                    cell.possible
+                        .extend(is_less.then_some(LossCause::BeforeHost));
+                }
+                cells.push(cell);
             }
             let beyond: Vec<_> = losses.range(self.samples() + 1..).collect();
             ensure!(beyond.is_empty(), "never sent: {beyond:?}");
@@ -298,8 +312,7 @@ impl Experiment {
 
     /// Applies one fault while the next stretch is sent, until `due` samples are sent in total.
     fn span(&self, trouble: Trouble, due: u64, link: &Link, peers: &mut Peers) -> Result<Span> {
-        let subscriber = peers.subscribers.first().context("no subscriber")?;
-        let host = subscriber.process.pid();
+        let host = peers.host()?;
         let overflows = || Snmp::of(host)?.receive_buffer_errors();
         let before = overflows()?;
         let _loss = self.loss(trouble, link, peers)?;
@@ -416,6 +429,12 @@ struct Peers {
 }
 
 impl Peers {
+    /// Returns a process on the subscribers' host.
+    fn host(&self) -> Result<u32> {
+        let subscriber = self.subscribers.first().context("no subscriber")?;
+        Ok(subscriber.process.pid())
+    }
+
     /// Returns the ports that only the last subscriber has.
     fn ports_of_the_last(&self) -> Result<Vec<String>> {
         let mut sockets = self
