@@ -2,13 +2,13 @@
 
 import { render } from './vendor/preact.mjs';
 import { useEffect, useRef, useState } from './vendor/hooks.mjs';
-import { keepToken } from './api.js';
-import { count, visible } from './format.js';
+import { keepToken, token } from './api.js';
+import { count, date, visible } from './format.js';
 import { address, parse, tokenOf } from './router.js';
 import { Keys, Search, Token } from './dialogs.js';
 import { kept, keep, state, stream, useLive, useRoute } from './store.js';
 import { html, Mark } from './ui.js';
-import { TimeBar } from './timebar.js';
+import { PresentOnly, TimeBar } from './timebar.js';
 import { Agent } from './views/agent.js';
 import { ChainView, Chains } from './views/chains.js';
 import { Events } from './views/events.js';
@@ -16,6 +16,7 @@ import { Graph } from './views/graph.js';
 import { NodeView, Nodes } from './views/nodes.js';
 import { Overview } from './views/overview.js';
 import { Recordings } from './views/recordings.js';
+import { Robot } from './views/robot.js';
 import { Topic } from './views/topic.js';
 import { Topics } from './views/topics.js';
 
@@ -27,14 +28,17 @@ applyTheme(theme);
 /** @type {[string, string, string][]} view, title, second key of its shortcut */
 const VIEWS = [
   ['', 'Overview', 'o'], ['topics', 'Topics', 't'], ['graph', 'Graph', 'g'],
-  ['chains', 'Chains', 'c'], ['nodes', 'Nodes', 'n'], ['events', 'Events', 'e'], ['recordings', 'Recordings', 'r'],
-  ['agent', 'Agent', 'a'],
+  ['chains', 'Chains', 'c'], ['nodes', 'Nodes', 'n'], ['robot', 'Robot', 'b'], ['events', 'Events', 'e'],
+  ['recordings', 'Recordings', 'r'], ['agent', 'Agent', 'a'],
 ];
 
+/** Views whose figures the history does not have. */
+const PRESENT_ONLY = ['chains', 'robot', 'recordings', 'agent'];
+
 function takeToken() {
-  const token = tokenOf(location.hash);
-  if (!token) return;
-  keepToken(token);
+  const given = tokenOf(location.hash);
+  if (!given) return;
+  keepToken(given);
   history.replaceState(null, '', address(''));
 }
 
@@ -52,16 +56,16 @@ function App() {
   useEffect(() => keyboard(show), []);
   useEffect(() => {
     const ask = () => show('token');
-    const token = () => {
+    const given = () => {
       if (!tokenOf(location.hash)) return;
       takeToken();
       stream.reopen();
     };
     window.addEventListener('ask-token', ask);
-    window.addEventListener('hashchange', token);
+    window.addEventListener('hashchange', given);
     return () => {
       window.removeEventListener('ask-token', ask);
-      window.removeEventListener('hashchange', token);
+      window.removeEventListener('hashchange', given);
     };
   }, []);
   const refused = stream.status === 'refused';
@@ -81,6 +85,10 @@ function App() {
     if (!first.current) {
       window.scrollTo(0, 0);
       main.current?.querySelector('h1')?.focus({ preventScroll: true });
+    }
+    // On a phone, the views are one row that scrolls.
+    for (const here of document.querySelectorAll('nav [aria-current]')) {
+      here.scrollIntoView({ block: 'nearest', inline: 'nearest' });
     }
     first.current = false;
   }, [place]);
@@ -106,6 +114,10 @@ function App() {
 /** @param {{route: import('./router.js').Route|null}} props */
 function View({ route }) {
   const query = route?.query ?? {};
+  if (stream.at != null && PRESENT_ONLY.includes(route?.view ?? '')) {
+    const [, title] = VIEWS.find(([view]) => view === route?.view) ?? ['', ''];
+    return html`<${PresentOnly} title=${title} />`;
+  }
   switch (route?.view) {
     case '': return html`<${Overview} />`;
     case 'topics': return route.name == null
@@ -118,6 +130,7 @@ function View({ route }) {
     case 'nodes': return route.name == null
       ? html`<${Nodes} query=${query} />`
       : html`<${NodeView} name=${route.name} query=${query} />`;
+    case 'robot': return html`<${Robot} name=${route.name} query=${query} />`;
     case 'events': return html`<${Events} query=${query} />`;
     case 'recordings': return html`<${Recordings} />`;
     case 'agent': return html`<${Agent} />`;
@@ -159,6 +172,7 @@ function Header({ route, show }) {
 }
 
 function PauseButton() {
+  if (stream.at != null) return null;
   const paused = stream.status === 'paused';
   return html`<button type="button" aria-pressed=${paused}
     onClick=${() => (paused ? stream.resume() : stream.pause())}>${paused ? 'Paused' : 'Pause'}</button>`;
@@ -167,7 +181,7 @@ function PauseButton() {
 function Status() {
   const words = {
     connecting: ['note', 'connecting'], live: ['good', 'live'], paused: ['note', 'paused'],
-    asleep: ['note', 'asleep'], lost: ['warning', 'no connection'], refused: ['warning', 'refused'],
+    past: ['note', 'past'], asleep: ['note', 'asleep'], lost: ['warning', 'no connection'], refused: ['warning', 'refused'],
   };
   const [severity, word] = words[stream.status];
   return html`<span class="status"><${Mark} severity=${severity} /> ${word}</span>`;
@@ -183,6 +197,18 @@ function Notice() {
   if (stream.status === 'paused') {
     return html`<p class="notice" role="status">Paused: the figures below are not updated.${' '}
       <button type="button" onClick=${() => stream.resume()}>Continue</button></p>`;
+  }
+  if (stream.status === 'live' && token() && state.open?.access !== 'all') {
+    return html`<p class="notice" role="status"><${Mark} severity="warning" /> The token of this tab is
+      no longer valid: the agent was restarted, or newer tokens replaced it.${' '}
+      <button type="button" onClick=${() => window.dispatchEvent(new Event('ask-token'))}>Another
+      token</button></p>`;
+  }
+  if (stream.status === 'past') {
+    return html`<p class="notice" role="status">${stream.problem
+      ? html`<${Mark} severity="warning" /> The robot’s state at that time is unknown:${' '}
+        ${stream.problem.message}. Only charts and events may show it.`
+      : `The robot as it was at ${date(state.time)}.`}</p>`;
   }
   return null;
 }
@@ -203,7 +229,7 @@ function News() {
     const more = fresh.length > 1 ? ` And ${count(fresh.length - 1)} more.` : '';
     say(`New finding: ${visible(fresh[0].text)}.${more}`);
   }, [ids, state.batches > 0]);
-  return html`<div class="unseen" role="status" aria-live="polite">${text}</div>`;
+  return html`<div class="reader-only" role="status" aria-live="polite">${text}</div>`;
 }
 
 /**
@@ -230,7 +256,7 @@ function keyboard(show) {
       show('keys');
     } else if (event.key === 'p') {
       if (stream.status === 'paused') stream.resume();
-      else stream.pause();
+      else if (stream.at == null) stream.pause();
     } else if (event.key === 'g') {
       first = 'g';
       timer = setTimeout(() => { first = ''; }, 1500);

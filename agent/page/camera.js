@@ -2,8 +2,8 @@
 
 const LEAST = 0.05;
 const MOST = 4;
-/** Smallest scale at which names are legible. */
-const LEGIBLE = 0.7;
+/** Smallest scale at which names are legible: 11 of the 12 pixels of their font. */
+export const LEGIBLE = 11 / 12;
 
 export class Camera {
   /** @param {SVGSVGElement} svg @param {SVGGElement} stage */
@@ -33,34 +33,54 @@ export class Camera {
     this.watch.disconnect();
   }
 
-  /**
-   * Sets the size of the drawing; a fitted view stays fitted.
-   * @param {number} width
-   * @param {number} height
-   */
-  frame(width, height) {
-    const first = this.size.width === 0;
-    this.size = { width: Math.max(1, width), height: Math.max(1, height) };
-    if (this.fitted) this.fit();
-    if (first && this.scale < LEGIBLE) this.begin();
+  /** Lets the next drawing be shown like the first one. */
+  renew() {
+    this.size = { width: 0, height: 0 };
+    this.fitted = true;
   }
 
-  /** Shows the left part of a drawing that would be illegible as a whole. */
-  begin() {
-    const { height } = this.view();
+  /**
+   * Sets the size of the drawing; a fitted view stays fitted. Of a first drawing that would be
+   * illegible as a whole, it shows the part around a place. Returns whether the whole is legible.
+   * @param {number} width
+   * @param {number} height
+   * @param {{x: number, y: number}} [place]
+   * @returns {boolean}
+   */
+  frame(width, height, place) {
+    const first = this.size.width === 0;
+    this.size = { width: Math.max(1, width), height: Math.max(1, height) };
+    const legible = this.fitting() >= LEGIBLE;
+    if (this.fitted) this.fit();
+    if (first && !legible) this.begin(place);
+    return legible;
+  }
+
+  /** Shows a legible part: the one around a place, or the left one. @param {{x: number, y: number}} [place] */
+  begin(place) {
+    const view = this.view();
+    const { width, height } = this.size;
     this.scale = LEGIBLE;
-    this.x = 12;
-    this.y = Math.max(12, (height - this.size.height * LEGIBLE) / 2);
+    const start = (/** @type {number} */ room, /** @type {number} */ all, /** @type {number} */ at) =>
+      (all * LEGIBLE <= room - 24 ? (room - all * LEGIBLE) / 2
+        : Math.min(12, Math.max(room - 12 - all * LEGIBLE, room / 2 - at * LEGIBLE)));
+    this.x = start(view.width, width, place?.x ?? 0);
+    this.y = start(view.height, height, place?.y ?? height / 2);
     this.fitted = false;
     this.apply();
   }
 
-  fit() {
+  /** Returns the scale at which the whole drawing is visible. */
+  fitting() {
     const { width, height } = this.view();
     const margin = 16;
-    const scale = Math.min((width - 2 * margin) / this.size.width,
+    return Math.min((width - 2 * margin) / this.size.width,
       (height - 2 * margin) / this.size.height, 1.2);
-    this.scale = Math.max(LEAST, scale);
+  }
+
+  fit() {
+    const { width, height } = this.view();
+    this.scale = Math.max(LEAST, this.fitting());
     this.x = (width - this.size.width * this.scale) / 2;
     this.y = (height - this.size.height * this.scale) / 2;
     this.fitted = true;
@@ -133,8 +153,6 @@ export class Camera {
 
   /** @param {WheelEvent} event */
   wheel(event) {
-    // Without Ctrl the page scrolls, unless the drawing has the focus.
-    if (!event.ctrlKey && !this.svg.contains(document.activeElement)) return;
     event.preventDefault();
     const { left, top } = this.svg.getBoundingClientRect();
     this.zoom(Math.exp(-event.deltaY * 0.0015), event.clientX - left, event.clientY - top);

@@ -1,9 +1,9 @@
-// A chart of the last ten minutes: uPlot on a canvas, a summary in words, and a table.
+// A chart over time: uPlot on a canvas, a summary in words, and a table.
 // All charts of a view share one cursor, which the arrow keys move as well.
 
 import { useEffect, useRef, useState } from './vendor/hooks.mjs';
 import { clock, NOTHING } from './format.js';
-import { html } from './ui.js';
+import { colour, html } from './ui.js';
 
 const uPlot = /** @type {any} */ (globalThis).uPlot;
 const HEIGHT = 150;
@@ -35,9 +35,16 @@ export function summary(line, print) {
   return `${line.label}: last ${print(last)}, minimum ${print(least)}, maximum ${print(most)}`;
 }
 
-/** @param {string} variable */
-function colour(variable) {
-  return getComputedStyle(document.documentElement).getPropertyValue(variable).trim();
+/**
+ * Returns an axis around values, so that small changes of a large value are visible.
+ * @param {number|null} least
+ * @param {number|null} most
+ * @returns {[number, number]}
+ */
+export function around(least, most) {
+  if (least == null || most == null) return [0, 1];
+  const span = most - least || Math.abs(most) * 0.1 || 1;
+  return [least - span * 0.1, most + span * 0.1];
 }
 
 /** @param {string} variable @param {number} alpha a byte */
@@ -45,14 +52,54 @@ function faint(variable, alpha) {
   return `${colour(variable)}${alpha.toString(16).padStart(2, '0')}`;
 }
 
+/** Colours of the marks of events, by severity. */
+const MARKS = /** @type {Record<string, string>} */ ({ ERROR: '--error', WARN: '--warning', INFO: '--dim' });
+/** Least width of a selection, in pixels; less is a click. */
+const LEAST_SELECTION = 6;
+
+/**
+ * Draws a line for each event.
+ * @param {any} plot
+ * @param {{time: number, severity: string}[]} marks
+ */
+function drawMarks(plot, marks) {
+  const { ctx, bbox } = plot;
+  ctx.save();
+  ctx.setLineDash([4, 4]);
+  for (const { time, severity } of marks) {
+    if (time < plot.scales.x.min || time > plot.scales.x.max) continue;
+    const x = Math.round(plot.valToPos(time, 'x', true));
+    ctx.strokeStyle = colour(MARKS[severity] ?? '--dim');
+    ctx.beginPath();
+    ctx.moveTo(x, bbox.top);
+    ctx.lineTo(x, bbox.top + bbox.height);
+    ctx.stroke();
+  }
+  ctx.restore();
+}
+
 /**
  * @param {{title: string, times: number[], lines: Line[], print: (value: number|null) => string,
- *   note?: string, whole?: boolean, pick?: (picked: {time: number}) => void}} props
- *   `whole`: values are counts. `pick` receives the time of a click, or of Enter at the cursor.
+ *   note?: string, whole?: boolean, fitted?: boolean, range?: string,
+ *   marks?: {time: number, severity: string}[],
+ *   pick?: (picked: {time: number}) => void, select?: (from: number, to: number) => void}} props
+ *   `whole`: values are counts. `fitted`: the axis spans the values, without 0. `range`: the time in
+ *   words. `pick` receives the time of a click, or of Enter at the cursor; `select` the part that was
+ *   dragged over.
  */
-export function Chart({ title, times, lines, print, note, whole, pick }) {
+export function Chart({ title, times, lines, print, note, whole, fitted, pick, select,
+  range = 'the last ten minutes', marks = [] }) {
   const place = useRef(/** @type {HTMLElement|null} */ (null));
   const plot = useRef(/** @type {any} */ (null));
+  /** Returns the place of the latest second with a value. */
+  const last = () => {
+    let place = times.length - 1;
+    while (place > 0 && lines.every((line) => line.values[place] == null)) place -= 1;
+    return place;
+  };
+  const latest = useRef({ marks, select, last });
+  latest.current = { marks, select, last };
+  const selected = useRef(false);
   const [asTable, showTable] = useState(false);
   const names = lines.map((line) => line.label).join();
   const data = [times, ...lines.map((line) => line.values)];
@@ -68,10 +115,24 @@ export function Chart({ title, times, lines, print, note, whole, pick }) {
     const own = new uPlot({
       width: host.clientWidth || 300,
       height: HEIGHT,
-      cursor: { sync: { key: 'topic' }, drag: { x: false, y: false } },
+      cursor: { sync: { key: 'topic' }, drag: { x: Boolean(select), y: false, setScale: false } },
+      hooks: {
+        ready: [(/** @type {any} */ drawn) => drawn.setLegend({ idx: latest.current.last() })],
+        draw: [(/** @type {any} */ drawn) => drawMarks(drawn, latest.current.marks)],
+        setSelect: [(/** @type {any} */ drawn) => {
+          const { left, width } = drawn.select;
+          if (width < LEAST_SELECTION || selected.current) return;
+          // The click at the end of dragging selects no time.
+          selected.current = true;
+          setTimeout(() => { selected.current = false; }, 100);
+          drawn.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
+          latest.current.select?.(drawn.posToVal(left, 'x'), drawn.posToVal(left + width, 'x'));
+        }],
+      },
       legend: { live: true },
       scales: { y: { range: (/** @type {any} */ _, /** @type {number} */ least,
-        /** @type {number} */ most) => [Math.min(0, least ?? 0), (most || 1) * 1.1] } },
+        /** @type {number} */ most) => (fitted ? around(least, most)
+        : [Math.min(0, least ?? 0), (most || 1) * 1.1]) } },
       axes: [
         { ...axis, values: (/** @type {any} */ _, /** @type {number[]} */ ticks) =>
           ticks.map(clock), space: 80 },
@@ -111,13 +172,11 @@ export function Chart({ title, times, lines, print, note, whole, pick }) {
     own.setData(data);
     // Without a cursor the legend shows the latest values.
     if (own.cursor.idx != null) return;
-    let latest = times.length - 1;
-    while (latest > 0 && lines.every((line) => line.values[latest] == null)) latest -= 1;
-    own.setLegend({ idx: latest });
+    own.setLegend({ idx: last() });
   });
   const pickCursor = () => {
     const time = times[plot.current?.cursor.idx ?? -1];
-    if (pick && time != null) pick({ time });
+    if (pick && time != null && !selected.current) pick({ time });
   };
   const move = (/** @type {KeyboardEvent} */ event) => {
     const by = { ArrowLeft: -1, ArrowRight: 1, PageUp: -60, PageDown: 60 }[event.key];
@@ -139,7 +198,7 @@ export function Chart({ title, times, lines, print, note, whole, pick }) {
       ? html`<${ValueTable} title=${title} times=${times} lines=${lines} print=${print} />`
       : html`<div class="plot" ref=${place} role="img" tabindex="0" onKeyDown=${move}
         onClick=${pickCursor}
-        aria-label="${title} over the last ten minutes. ${words}."></div>`}
+        aria-label="${title} over ${range.replace(/^The/, 'the')}. ${words}."></div>`}
     <p class="dim">${words}${note ? html`. ${note}` : ''}</p></figure>`;
 }
 

@@ -6,6 +6,7 @@ import { several } from './format.js';
 import { address, nodeAddress, topicAddress } from './router.js';
 import { state, stream, useKept, usePoll } from './store.js';
 import { html, Mark, matches, Name } from './ui.js';
+import { placeOf } from './views/overview.js';
 
 /** @param {{title: string, close: () => void, children: any}} props */
 function Dialog({ title, close, children }) {
@@ -76,7 +77,8 @@ function search(words, services) {
     (state.hasDomains() ? `domain ${thing.domain}` : '');
   for (const finding of state.findings) {
     if (matches(words, finding.text)) {
-      found.push({ kind: 'finding', name: finding.text, more: '', href: address('') });
+      const [href] = placeOf(finding) ?? [address('')];
+      found.push({ kind: 'finding', name: finding.text, more: '', href });
     }
   }
   for (const node of state.nodes.values()) {
@@ -100,10 +102,21 @@ function search(words, services) {
       : address('graph', null, { services: true });
     found.push({ kind: 'service', name: service.name, more, href });
   }
-  // An exact match precedes names that contain the words.
-  const exact = (/** @type {{name: string}} */ each) =>
-    (each.name === words || each.name === `/${words}` ? 0 : 1);
-  return found.sort((one, other) => exact(one) - exact(other)).slice(0, MOST_FOUND);
+  return found.sort((one, other) => rank(one, words) - rank(other, words)).slice(0, MOST_FOUND);
+}
+
+/**
+ * Returns the rank of a result: the exact name, names whose last part begins with the words, names
+ * that contain them, types that do, and sentences.
+ * @param {{kind: string, name: string}} result
+ * @param {string} words
+ */
+export function rank({ kind, name }, words) {
+  if (kind === 'finding') return 4;
+  const [own, wanted] = [name.toLowerCase(), words.toLowerCase()];
+  if (own === wanted || own === `/${wanted}`) return 0;
+  if (own.slice(own.lastIndexOf('/') + 1).startsWith(wanted)) return 1;
+  return own.includes(wanted) ? 2 : 3;
 }
 
 /** @param {{views: [string, string, string][], close: () => void}} props */
@@ -150,6 +163,9 @@ export function Token({ close }) {
       : 'This address requires a token.'}</p>
     <p>Run <code>rp page</code> on the robot and open the address it prints, or paste the token here.
       It stays in this tab and is sent in a header only.</p>
+    ${token() && access !== 'all' && html`<p><${Mark} severity="warning" /> The token of this tab is no
+      longer valid: the agent was restarted, or newer tokens replaced it. <code>rp page</code> prints
+      another one.</p>`}
     ${stream.problem && html`<p><${Mark} severity="warning" /> ${stream.problem.message}</p>`}
     <form onSubmit=${submit}>
       <label class="filter">Token <input type="password" ref=${field} autofocus=${true} autocomplete="off"

@@ -13,18 +13,20 @@ const HUBS = new Set(['rosout', 'parameter_events', 'tf', 'tf_static', 'clock', 
 /**
  * @typedef {{mode: 'both'|'nodes', hubs: boolean, hidden: boolean,
  *   boxes: 'none'|'namespace'|'process', toggled: Set<string>, focus: string|null,
- *   hops: number, shown?: Set<string>, only?: boolean}} Options
+ *   hops: number, shown?: Set<string>, only?: boolean, fold?: number}} Options
  *   `toggled` holds the boxes whose initial state the user has changed; `shown` what is neither
- *   folded nor hidden. `only` omits everything else.
+ *   folded nor hidden. `only` omits everything else. `fold` 1 omits topics with one neighbour; 2
+ *   also closes namespaces; 3 also shows nodes only.
  * @typedef {{key: string, kind: 'node'|'participant'|'topic'|'service'|'action'|'box',
  *   name: string, detail: string, parent: string|null, topic: number|null, node: number|null,
  *   closed: boolean, count: number, members: string[], w: number, h: number}} Vertex
  *   A closed box is a vertex without content; `members` are the nodes and topics in it.
  * @typedef {{id: string, from: string, to: string, kind: string, topics: number[],
  *   guids: string[], passages: number}} Edge
- * @typedef {{vertices: Vertex[], edges: Edge[], signature: string, folded: number,
+ * @typedef {{vertices: Vertex[], edges: Edge[], signature: string, folded: number, leaves: number,
  *   nodes: number}} Graph
- *   `folded` counts the omitted hubs; `nodes` the nodes before boxes were closed.
+ *   `folded` counts the omitted hubs, `leaves` the omitted topics with one neighbour; `nodes` the
+ *   nodes before boxes were closed.
  */
 
 // Services that every node has.
@@ -46,6 +48,11 @@ export function nodeKey(node) {
   return `node:${node.domain}:${node.name}`;
 }
 
+/** Returns the name in a key. @param {string} key */
+export function nameOf(key) {
+  return key.split(':').slice(2).join(':');
+}
+
 /**
  * @param {import('./state.js').State} state
  * @param {Options} options
@@ -62,10 +69,15 @@ export function build(state, options, joints = null) {
   if (options.only && shown?.size) {
     for (const key of [...base.vertices.keys()]) if (!shown.has(key)) base.vertices.delete(key);
   }
-  const joined = base.edges.filter((edge) =>
+  let joined = base.edges.filter((edge) =>
     base.vertices.has(edge.from) && base.vertices.has(edge.to));
+  const fold = options.fold ?? 0;
+  const leaves = fold >= 1 && options.mode === 'both' ? leavesOf(state, base.vertices, joined, options)
+    : new Set();
+  for (const key of leaves) base.vertices.delete(key);
+  joined = joined.filter((edge) => !leaves.has(edge.from) && !leaves.has(edge.to));
   let edges = joined;
-  if (options.mode === 'nodes') {
+  if (options.mode === 'nodes' || fold >= 3) {
     edges = [...pairs(base.vertices, joined),
       ...joined.filter((edge) => edge.kind === 'calls' || edge.kind === 'served_by')];
     for (const vertex of [...base.vertices.values()]) {
@@ -79,7 +91,7 @@ export function build(state, options, joints = null) {
     : options.boxes === 'process' ? processes(state, base.vertices) : new Map();
   enclose(base.vertices, edges, boxes);
   const closed = options.boxes === 'namespace'
-    ? closedBoxes(boxes, options.toggled, nodes > MANY_NODES)
+    ? closedBoxes(boxes, options.toggled, fold >= 2 || nodes > MANY_NODES)
     : new Set([...boxes.keys()].filter((key) => options.toggled.has(key)));
   const graph = close(base.vertices, boxes, edges, closed);
   for (const vertex of graph.vertices) measure(vertex);
@@ -87,7 +99,74 @@ export function build(state, options, joints = null) {
     graph.vertices.map((vertex) => [vertex.key, vertex.parent, vertex.closed, vertex.w]),
     graph.edges.map((edge) => edge.id),
   ]);
-  return { ...graph, signature, folded: base.folded, nodes };
+  return { ...graph, signature, folded: base.folded, leaves: leaves.size, nodes };
+}
+
+/**
+ * Returns the topics with one neighbour and no finding.
+ * @param {import('./state.js').State} state
+ * @param {Map<string, Vertex>} vertices
+ * @param {Edge[]} edges
+ * @param {Options} options
+ */
+function leavesOf(state, vertices, edges, options) {
+  const serious = new Set(state.findings.filter((finding) => finding.severity !== 'note')
+    .map((finding) => finding.topic));
+  /** @type {Map<string, Set<string>>} */
+  const neighbours = new Map();
+  for (const { from, to } of edges) {
+    for (const [own, other] of [[from, to], [to, from]]) {
+      neighbours.set(own, (neighbours.get(own) ?? new Set()).add(other));
+    }
+  }
+  return new Set([...vertices.values()].filter((each) => each.kind === 'topic'
+    && (neighbours.get(each.key)?.size ?? 0) <= 1 && !serious.has(each.topic)
+    && options.focus !== each.key && !options.shown?.has(each.key)).map((each) => each.key));
+}
+
+/**
+ * Returns each node and each end of a topic by a name that a restart keeps, with its QoS.
+ * @param {import('./state.js').State} state
+ */
+function named(state) {
+  const nodes = new Set([...state.nodes.values()].filter((node) => !node.hidden).map(nodeKey));
+  /** @type {Map<string, string>} */
+  const ends = new Map();
+  for (const topic of state.topics.values()) {
+    if (topic.hidden || topic.vanished) continue;
+    for (const [side, word] of /** @type {const} */ ([['publishers', 'publishes'],
+      ['subscriptions', 'subscribes to']])) {
+      for (const endpoint of topic[side]) {
+        const { key, node, name } = state.ownerOf(endpoint);
+        if (!node || node.hidden || !key) continue;
+        ends.set(`${name} ${word} ${topic.name}`, `${endpoint.reliability}, ${endpoint.durability}`);
+      }
+    }
+  }
+  return { nodes, ends };
+}
+
+/**
+ * Returns what came, went or changed its QoS between two states.
+ * @param {import('./state.js').State} before
+ * @param {import('./state.js').State} now
+ * @returns {{came: string[], gone: string[], joined: string[], left: string[], changed: string[]}}
+ *   `came` and `gone` are keys of nodes; the others are sentences about nodes that were there before
+ *   and are there now
+ */
+export function differences(before, now) {
+  const [one, other] = [named(before), named(now)];
+  const came = [...other.nodes].filter((key) => !one.nodes.has(key));
+  const gone = [...one.nodes].filter((key) => !other.nodes.has(key));
+  const names = new Set([...came, ...gone].map(nameOf));
+  const stayed = (/** @type {string} */ end) => !names.has(end.split(' ')[0]);
+  const missing = (/** @type {Map<string, string>} */ all, /** @type {Map<string, string>} */ from) =>
+    [...all.keys()].filter((end) => !from.has(end) && stayed(end));
+  return {
+    came, gone, joined: missing(other.ends, one.ends), left: missing(one.ends, other.ends),
+    changed: [...other.ends].filter(([end, qos]) => one.ends.has(end) && one.ends.get(end) !== qos)
+      .map(([end, qos]) => `${end}: ${one.ends.get(end)} → ${qos}`),
+  };
 }
 
 /**
@@ -306,7 +385,7 @@ function processes(state, vertices) {
   const place = (/** @type {Vertex} */ each) => {
     const node = each.node == null ? null : state.nodes.get(each.node);
     const participant = node ? state.participants.get(node.participants[0])
-      : byGuid.get(each.key.split(':').slice(2).join(':'));
+      : byGuid.get(nameOf(each.key));
     if (!participant) return null;
     const host = participant.host ?? 'unknown host';
     const { pid, process } = participant;
@@ -453,7 +532,7 @@ function textWidth(text) {
   let units = 0;
   // East Asian characters are twice as wide.
   for (const character of text) units += /[\u1100-\uffdc\u{1f000}-\u{3ffff}]/u.test(character) ? 2 : 1;
-  return units * 6.7;
+  return units * 7.3;
 }
 
 /** The longest text of a topic's figures. */

@@ -13,7 +13,8 @@
  * @typedef {{x: number, y: number}} Point
  * @typedef {{id: string, x: number, y: number, w: number, h: number, box: boolean}} Placed
  *   Centre and size.
- * @typedef {{id: string, points: Point[]}} Routed From the right of `from` to the left of `to`.
+ * @typedef {{id: string, points: Point[], left: boolean}} Routed From the right of `from` to the left of
+ *   `to`; the other way round if `to` lies to the `left`.
  * @typedef {{width: number, height: number, crossings: number, vertices: Placed[],
  *   edges: Routed[]}} Layout
  * @typedef {{gapX?: number, gapY?: number, sweeps?: number, padding?: number,
@@ -134,9 +135,11 @@ export function layout(vertices, edges, options = {}) {
     const edge = edges[index];
     const from = /** @type {Placed} */ (placed.get(edge.from));
     const to = /** @type {Placed} */ (placed.get(edge.to));
-    const start = { x: from.x + from.w / 2, y: from.y };
-    const end = { x: to.x - to.w / 2, y: to.y };
-    routed.push({ id: edge.id, points: [start, ...points, end] });
+    // An edge to the left leaves on that side, so that it passes under neither of its ends.
+    const side = to.x + to.w / 2 < from.x - from.w / 2 ? -1 : 1;
+    const start = { x: from.x + (side * from.w) / 2, y: from.y };
+    const end = { x: to.x - (side * to.w) / 2, y: to.y };
+    routed.push({ id: edge.id, points: [start, ...points, end], left: side < 0 });
   }
   return {
     width: whole.width,

@@ -5,6 +5,7 @@ import { useEffect, useRef, useState } from './vendor/hooks.mjs';
 import { named, Refusal, request } from './api.js';
 import { Chart } from './chart.js';
 import { bytes, clock, count, visible } from './format.js';
+import { Preview } from './preview.js';
 import { Lines } from './state.js';
 import { state, stream, useKept } from './store.js';
 import { AskButton, Failed, html, Mark, Name, Text } from './ui.js';
@@ -16,18 +17,22 @@ const MOST_POINTS = 600;
 const MOST_LINES = 400;
 
 /**
- * @typedef {{path: string, depth: number, key: string, value: unknown, count: number|null}} Leaf
+ * @typedef {{path: string, depth: number, key: string, value: unknown, count: number|null,
+ *   closed: boolean}} Leaf
  *   `count` is the number of members of an object or array, null for a value.
  */
+
+/** Arrays with more members are closed at first. */
+const LONG = 40;
 
 /**
  * Returns a message as lines; arrays and texts truncated by the agent show their full length.
  * @param {unknown} value
- * @param {Set<string>} closed paths of collapsed objects
+ * @param {Set<string>} toggled paths of objects and arrays that the user has opened or closed
  * @param {number} [most]
  * @returns {Leaf[]}
  */
-export function flatten(value, closed, most = MOST_LINES) {
+export function flatten(value, toggled, most = MOST_LINES) {
   /** @type {Leaf[]} */
   const lines = [];
   const walk = (/** @type {unknown} */ each, /** @type {string} */ key, /** @type {string} */ path,
@@ -35,11 +40,13 @@ export function flatten(value, closed, most = MOST_LINES) {
     if (lines.length >= most) return;
     const [members, length, cut] = inside(each);
     if (!members) {
-      lines.push({ path, depth, key, value: cut ?? each, count: null });
+      lines.push({ path, depth, key, value: cut ?? each, count: null, closed: false });
       return;
     }
-    if (depth >= 0) lines.push({ path, depth, key, value: null, count: length });
-    if (closed.has(path)) return;
+    const isLong = typeof members[0]?.[0] === 'number' && length > LONG;
+    const closed = toggled.has(path) !== isLong;
+    if (depth >= 0) lines.push({ path, depth, key, value: null, count: length, closed });
+    if (closed) return;
     for (const [name, member] of members) {
       const isPlace = typeof name === 'number';
       walk(member, isPlace ? `[${name}]` : name,
@@ -105,7 +112,7 @@ function Follow({ scope, name, topic }) {
   const [message, setMessage] = useState(/** @type {any} */ (null));
   const [problem, refuse] = useState(/** @type {Refusal|null} */ (null));
   const [end, setEnd] = useState('');
-  const [closed, close] = useState(/** @type {Set<string>} */ (new Set()));
+  const [toggled, setToggled] = useState(/** @type {Set<string>} */ (new Set()));
   const [plotted, plot] = useKept(`plot ${topic.types[0]}`, /** @type {string[]} */ ([]));
   const [run, again] = useState(0);
   const points = useRef({ times: /** @type {number[]} */ ([]),
@@ -135,7 +142,7 @@ function Follow({ scope, name, topic }) {
       }
     };
     const follow = async () => {
-      const rest = `/messages${scope}${scope ? '&' : '?'}max_hertz=${HERTZ}`;
+      const rest = `/messages${scope}${scope ? '&' : '?'}max_hertz=${HERTZ}&preview=true`;
       const response = await request(named('topics', name, rest), { signal: abort.signal });
       const reader = /** @type {ReadableStream<Uint8Array>} */ (response.body).getReader();
       const [decoder, lines] = [new TextDecoder(), new Lines()];
@@ -163,13 +170,13 @@ function Follow({ scope, name, topic }) {
     };
   }, [name, scope, run]);
   const toggle = (/** @type {string} */ path) => {
-    const next = new Set(closed);
+    const next = new Set(toggled);
     if (!next.delete(path)) next.add(path);
-    close(next);
+    setToggled(next);
   };
   const choose = (/** @type {string} */ path) => plot(plotted.includes(path)
     ? plotted.filter((each) => each !== path) : [...plotted, path].slice(-6));
-  const lines = message?.value != null ? flatten(message.value, closed) : [];
+  const lines = message?.value != null ? flatten(message.value, toggled) : [];
   const { times, values } = points.current;
   const colours = ['--line-1', '--line-2', '--line-3', '--line-4', '--line-1', '--line-2'];
   return html`
@@ -181,18 +188,19 @@ function Follow({ scope, name, topic }) {
       are not.</p>`}
     ${!message && !problem && !end && html`<p class="dim">Waiting for a message …</p>`}
     ${plotted.map((path, at) => values.has(path) && html`<${Chart} key=${path} title=${path}
-      times=${times} print=${printNumber} lines=${[{ label: path, colour: colours[at],
+      times=${times} print=${printNumber} fitted lines=${[{ label: path, colour: colours[at],
         values: values.get(path) ?? [] }]} />`)}
     ${message && html`<p class="dim">${clock(message.time)}, ${bytes(message.bytes)}${
       message.sequence_number != null ? `, number ${count(message.sequence_number)}` : ''}${
       message.node ? html` by <${Name} text=${message.node} />` : ''}${message.skipped
       ? `, ${count(message.skipped)} not shown before it` : ''}</p>`}
+    ${message && html`<${Preview} preview=${message.preview} error=${message.preview_error} />`}
     ${message?.error && html`<p><${Mark} severity="warning" /> <${Name} text=${message.error} /></p>`}
     ${lines.length > 0 && html`<div class="scroll tree" tabindex="0" role="group"
       aria-label="Fields of the message"><table><thead><tr><th scope="col">Field</th>
-      <th scope="col">Value</th><th scope="col"><span class="unseen">Plot</span></th></tr></thead>
+      <th scope="col">Value</th><th scope="col"><span class="reader-only">Plot</span></th></tr></thead>
       <tbody>${lines.map((line) => html`<${FieldRow} key=${line.path} line=${line}
-        closed=${closed.has(line.path)} toggle=${toggle} choose=${choose}
+        closed=${line.closed} toggle=${toggle} choose=${choose}
         plotted=${plotted.includes(line.path)} />`)}</tbody></table></div>`}
     ${lines.length >= MOST_LINES && html`<p class="dim">The first ${count(MOST_LINES)} fields.</p>`}
     ${type?.definition && html`<details><summary>Definition of <${Name} text=${type.name} /></summary>

@@ -5,7 +5,8 @@
  *   `name` is that of the topic or node in the view, if any.
  */
 
-const VIEWS = ['', 'topics', 'graph', 'chains', 'nodes', 'events', 'recordings', 'agent', 'token'];
+const VIEWS = ['', 'topics', 'graph', 'chains', 'nodes', 'robot', 'events', 'recordings', 'agent',
+  'token'];
 
 /**
  * @param {string} fragment with or without its `#`
@@ -28,13 +29,23 @@ export function parse(fragment) {
   }
 }
 
+/** Keys of the time that the page shows, which every address keeps. */
+const TIME = ['span', 'at'];
+/** @type {Record<string, string>} */
+let time = {};
+
+/** Keeps the time of an address for the following ones. @param {Record<string, string>} query */
+export function keepTime(query) {
+  time = Object.fromEntries(TIME.filter((key) => query[key]).map((key) => [key, query[key]]));
+}
+
 /**
  * @param {string} view
  * @param {string|null} [name]
  * @param {Record<string, string|number|boolean|null|undefined>} [query] empty values are omitted
  */
 export function address(view, name = null, query = {}) {
-  const given = Object.entries(query)
+  const given = Object.entries({ ...time, ...query })
     .filter(([, value]) => value != null && value !== '' && value !== false)
     .map(([key, value]) => [key, value === true ? '1' : String(value)]);
   const rest = new URLSearchParams(given).toString();
@@ -50,6 +61,24 @@ export function topicAddress(topic) {
 /** @param {{name: string, domain: number}} node */
 export function nodeAddress(node) {
   return address('nodes', node.name, { domain: node.domain });
+}
+
+/** Parts of the view of the robot by the kind of a finding. */
+const PARTS = /** @type {Record<string, [string, string]>} */ ({
+  log_errors: ['logs', 'Logs'], diagnostic_error: ['diagnostics', 'Diagnostics'],
+  transform_fault: ['transforms', 'Transforms'], parameter_drift: ['parameters', 'Parameters'],
+  mixed_time: ['parameters', 'Parameters'], hanging_call: ['services', 'Services'],
+  clocks_apart: ['clocks', 'Clocks'],
+});
+
+/**
+ * Returns address and title of the part of the robot that a finding is about, or null.
+ * @param {string} kind
+ * @returns {[string, string]|null}
+ */
+export function partAddress(kind) {
+  const found = PARTS[kind];
+  return found ? [address('robot', found[0]), found[1]] : null;
 }
 
 /**

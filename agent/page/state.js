@@ -81,6 +81,8 @@ export class State {
   /** @type {string|null} */ ended = null;
   /** Complete batches of this run of the agent. */
   batches = 0;
+  /** Whether this is the state of a moment in the past. */
+  past = false;
 
   /** Resets the state for another run of the agent. */
   clear() {
@@ -104,9 +106,16 @@ export class State {
     return Boolean(line.values || line.end);
   }
 
+  /** Replaces the state by that of a moment in the past. @param {Record<string, any>[]} lines */
+  show(lines) {
+    this.clear();
+    for (const line of lines) this.apply(line);
+    this.past = true;
+  }
+
   /** @param {any} open */
   takeOpen(open) {
-    if (!this.open || this.open.run !== open.run) this.clear();
+    if (!this.open || this.open.run !== open.run || this.past) this.clear();
     this.open = open;
     this.ended = null;
     this.figures.clear();

@@ -2,7 +2,7 @@
 
 import { useEffect, useReducer, useRef, useState } from './vendor/hooks.mjs';
 import { json, Refusal } from './api.js';
-import { parse } from './router.js';
+import { keepTime, parse } from './router.js';
 import { State } from './state.js';
 import { Stream } from './stream.js';
 
@@ -33,11 +33,18 @@ export function useLive() {
   return state;
 }
 
+/** Returns the route of the address, and keeps its time. */
+function routeNow() {
+  const route = parse(location.hash);
+  keepTime(route?.query ?? {});
+  return route;
+}
+
 /** Returns the route of the address; null if no view has it. */
 export function useRoute() {
-  const [route, become] = useState(() => parse(location.hash));
+  const [route, become] = useState(routeNow);
   useEffect(() => {
-    const follow = () => become(parse(location.hash));
+    const follow = () => become(routeNow());
     window.addEventListener('hashchange', follow);
     return () => window.removeEventListener('hashchange', follow);
   }, []);
@@ -51,7 +58,8 @@ export function replaceAddress(to) {
 }
 
 /**
- * Requests an endpoint periodically while the view is shown and the stream runs.
+ * Requests an endpoint periodically while the view is shown and the stream runs. It has the present,
+ * so a moment in the past needs no request.
  * @param {string|null} path null sends no request
  * @param {number} every milliseconds; 0 sends one request
  * @returns {{data: any, problem: Refusal|null, refresh: () => void}}
@@ -62,8 +70,9 @@ export function usePoll(path, every) {
     ({ path: null, data: null, problem: null }),
   );
   const again = useRef(() => {});
+  const past = stream.at != null;
   useEffect(() => {
-    if (path == null) return undefined;
+    if (path == null || past) return undefined;
     const abort = new AbortController();
     let timer = 0;
     const ask = async () => {
@@ -85,8 +94,8 @@ export function usePoll(path, every) {
       clearTimeout(timer);
       abort.abort();
     };
-  }, [path, every]);
-  const own = answer.path === path;
+  }, [path, every, past]);
+  const own = answer.path === path && !past;
   return {
     data: own ? answer.data : null,
     problem: own ? answer.problem : null,

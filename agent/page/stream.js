@@ -10,7 +10,18 @@ const SLEEP_MS = 10000;
 const FIRST_WAIT_MS = 1000;
 const LONGEST_WAIT_MS = 10000;
 
-/** @typedef {'connecting'|'live'|'paused'|'asleep'|'lost'|'refused'} Status */
+/** @typedef {'connecting'|'live'|'paused'|'past'|'asleep'|'lost'|'refused'} Status */
+
+/**
+ * Requests the state of the robot at a moment.
+ * @param {number} at Unix time
+ * @param {AbortSignal} signal
+ * @returns {Promise<Record<string, any>[]>} its lines
+ */
+export async function moment(at, signal) {
+  const response = await request(`history/moment?at=${at}`, { signal });
+  return new Lines().take(await response.text());
+}
 
 export class Stream {
   /**
@@ -23,6 +34,7 @@ export class Stream {
     /** @type {Status} */ this.status = 'connecting';
     /** @type {Refusal|null} */ this.problem = null;
     /** @type {AbortController|null} */ this.connection = null;
+    /** @type {number|null} Unix time of a moment in the past that is shown. */ this.at = null;
     this.wait = FIRST_WAIT_MS;
     this.retry = 0;
     this.sleep = 0;
@@ -41,11 +53,30 @@ export class Stream {
     this.become('connecting', this.problem);
     const connection = new AbortController();
     this.connection = connection;
-    this.follow(connection).then(() => null, (error) => error).then((error) => {
+    const past = this.at != null;
+    const read = past ? this.visit(connection, Number(this.at)) : this.follow(connection);
+    read.then(() => null, (error) => error).then((error) => {
       if (this.connection !== connection) return;
       this.connection = null;
-      this.broken(error);
+      if (past && !(error instanceof Refusal && error.status === 401)) {
+        this.become('past', error instanceof Refusal ? error : null);
+      } else {
+        this.broken(error);
+      }
     });
+  }
+
+  /** Shows a moment in the past, or the present. @param {number|null} at Unix time */
+  go(at) {
+    if (at === this.at) return;
+    this.at = at;
+    this.reopen();
+  }
+
+  /** Reads the state at a moment. @param {AbortController} connection @param {number} at */
+  async visit(connection, at) {
+    const lines = await moment(at, connection.signal);
+    if (this.connection === connection) this.state.show(lines);
   }
 
   /** @param {Status} status */

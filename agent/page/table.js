@@ -120,7 +120,9 @@ export function Table({ label, columns, rows, keyOf, sort, onSort, rowClass }) {
     const own = sort.replace(/^-/, '') === column.key;
     const down = sort.startsWith('-');
     const order = own ? (down ? 'descending' : 'ascending') : undefined;
-    const next = own && !down ? `-${column.key}` : column.key;
+    // The highest number matters first, and the first name.
+    const isNumber = column.kind?.includes('number');
+    const next = (own ? !down : isNumber) ? `-${column.key}` : column.key;
     return html`<th scope="col" class=${column.kind ?? ''} aria-sort=${order}>
       ${column.by
         ? html`<button type="button" class="plain" onClick=${() => onSort(next)}>${column.title}<span

@@ -1,11 +1,157 @@
-// The time of a replay, to which the figures of every view refer.
+// The time that the page shows: the present, or a part of the last days. It is part of every address.
 
+import { useEffect, useState } from './vendor/hooks.mjs';
+import { json, Refusal, request } from './api.js';
 import { date, duration, percent } from './format.js';
-import { state, useLive } from './store.js';
+import { address } from './router.js';
+import { Lines } from './state.js';
+import { state, stream, useLive, useRoute } from './store.js';
 import { html } from './ui.js';
+
+/** Times to choose from, in seconds. */
+const SPANS = /** @type {[number, string][]} */ ([
+  [600, 'ten minutes'], [3600, 'hour'], [21600, '6 hours'], [86400, '24 hours'], [604800, '7 days'],
+]);
+const DEFAULT_SPAN = 600;
+const LONGEST_SPAN = 31 * 86400;
+/** Time between two requests for charts whose end is the present. */
+const AGAIN_MS = 10000;
+
+/** @typedef {{span: number, at: number|null}} Shown seconds, and the Unix time of their end */
+
+/**
+ * Returns the time in an address.
+ * @param {Record<string, string>} query
+ * @returns {Shown}
+ */
+export function timeOf(query) {
+  const span = Math.round(Number(query.span));
+  const at = Math.round(Number(query.at));
+  return {
+    span: span >= 1 && span <= LONGEST_SPAN ? span : DEFAULT_SPAN,
+    at: at > 0 && at < 2 ** 32 ? at : null,
+  };
+}
+
+/** Returns the time of the present address. */
+export function useTime() {
+  return timeOf(useRoute()?.query ?? {});
+}
+
+/** Changes the time of the address. @param {Partial<Shown>} time */
+export function showTime(time) {
+  const [path, query = ''] = location.hash.slice(1).split('?');
+  const parameters = new URLSearchParams(query);
+  for (const [key, value] of Object.entries(time)) {
+    if (value == null || (key === 'span' && value === DEFAULT_SPAN)) parameters.delete(key);
+    else parameters.set(key, String(Math.round(Number(value))));
+  }
+  const rest = parameters.toString();
+  location.hash = `#${path}${rest ? `?${rest}` : ''}`;
+}
+
+/** Shows the part of a chart that was selected. @param {number} from @param {number} to */
+export function zoom(from, to) {
+  showTime({ at: Math.ceil(to), span: Math.max(5, Math.ceil(to) - Math.floor(from)) });
+}
+
+/** Returns a time as words for a heading. @param {Shown} shown */
+export function inWords({ span, at }) {
+  const known = SPANS.find(([seconds]) => seconds === span)?.[1] ?? duration(span);
+  return at == null ? `The last ${known}` : `${date(at - span)} to ${date(at)}`;
+}
+
+/**
+ * Requests a part of the history, again while its end is the present. Until an answer arrives, the
+ * previous one stays.
+ * @param {string|null} path null sends no request
+ * @param {Shown} shown
+ * @param {(path: string, options: RequestInit) => Promise<any>} [ask]
+ * @returns {{data: any, problem: Refusal|null}}
+ */
+export function useHistory(path, { span, at }, ask = json) {
+  const [answer, take] = useState(/** @type {any} */ ({ path: null, data: null, problem: null }));
+  useEffect(() => {
+    if (path == null) return undefined;
+    const abort = new AbortController();
+    let timer = 0;
+    const poll = async () => {
+      if (document.visibilityState !== 'hidden' && (at != null || stream.status === 'live')) {
+        const to = at ?? Math.floor(state.time);
+        const times = `${path.includes('?') ? '&' : '?'}from=${to - span}&to=${to}`;
+        try {
+          take({ path, data: await ask(path + times, { signal: abort.signal }), problem: null });
+        } catch (error) {
+          if (abort.signal.aborted) return;
+          take({ path, data: null, problem: error instanceof Refusal ? error : null });
+        }
+      }
+      if (at == null && !abort.signal.aborted) timer = setTimeout(poll, AGAIN_MS);
+    };
+    poll();
+    return () => {
+      clearTimeout(timer);
+      abort.abort();
+    };
+  }, [path, span, at]);
+  return answer.path === path ? answer : { data: null, problem: null };
+}
+
+/** Requests lines of JSON. @param {string} path @param {RequestInit} options */
+async function lines(path, options) {
+  const response = await request(path, options);
+  return new Lines().take(await response.text());
+}
+
+/**
+ * Returns the events of a time. Without a history on disk, these are the ones that the page knows.
+ * @param {Shown} shown
+ * @returns {import('./state.js').Event[]}
+ */
+export function useEvents(shown) {
+  const { data } = useHistory(state.open?.keeps_history ? 'history/events' : null, shown, lines);
+  const to = shown.at ?? state.time;
+  const all = new Map([...(data ?? []), ...(shown.at == null ? state.events : [])]
+    .map((event) => [event.id, event]));
+  return [...all.values()].filter((event) => {
+    const time = Date.parse(event.time) / 1000;
+    return time > to - shown.span && time <= to + 1;
+  });
+}
+
+/** Unix time as the value of an input, in the time zone of the browser. @param {number} time */
+function forInput(time) {
+  const moment = new Date(time * 1000);
+  return new Date(moment.getTime() - moment.getTimezoneOffset() * 60000).toISOString().slice(0, 19);
+}
 
 export function TimeBar() {
   useLive();
+  const shown = useTime();
+  const { span, at } = shown;
+  useEffect(() => stream.go(at), [at]);
+  if (state.open?.replay) return html`<${Replay} />`;
+  if (!state.open?.keeps_history && at == null) return null;
+  const known = SPANS.some(([seconds]) => seconds === span);
+  const end = at ?? state.time;
+  return html`<section class="timebar" aria-label="Time">
+    <label>Show the last <select value=${span}
+      onChange=${(/** @type {any} */ event) => showTime({ span: Number(event.target.value) })}>
+      ${!known && html`<option value=${span}>${duration(span)}</option>`}
+      ${SPANS.map(([seconds, words]) => html`<option value=${seconds}>${words}</option>`)}</select></label>
+    <label>until <input type="datetime-local" step="1" value=${at == null ? '' : forInput(at)}
+      onChange=${(/** @type {any} */ event) => {
+        const time = Date.parse(event.target.value) / 1000;
+        showTime({ at: Number.isFinite(time) ? time : null });
+      }} /></label>
+    <button type="button" onClick=${() => showTime({ at: end - span })}>Earlier</button>
+    ${at != null && html`<button type="button" onClick=${() => showTime({
+      at: at + span >= Date.now() / 1000 ? null : at + span })}>Later</button>
+      <button type="button" onClick=${() => showTime({ at: null })}>Now</button>`}</section>`;
+}
+
+/** The time of a replay, to which the figures of every view refer. */
+function Replay() {
   const begin = state.open?.replay?.begin;
   if (begin == null || !state.replay) return null;
   const { part, finished } = state.replay;
@@ -16,4 +162,11 @@ export function TimeBar() {
       <progress max="1" value=${done ?? undefined}></progress></label>
     <span>${date(state.time)}, ${duration(elapsed)} after the begin${
       finished ? ', finished' : done == null ? '' : `, ${percent(done)} read`}</span></section>`;
+}
+
+/** What a view without a history shows in place of a moment in the past. @param {{title: string}} props */
+export function PresentOnly({ title }) {
+  return html`<h1 tabindex="-1">${title}</h1><p>This view has no history. <button type="button"
+    onClick=${() => showTime({ at: null })}>Show the present</button> or look at the${' '}
+    <a href=${address('')}>overview</a> of that time.</p>`;
 }

@@ -20,6 +20,12 @@ export function Name({ text, most = 0 }) {
     >${shown}</bdi>`;
 }
 
+/** A sentence from the agent, whose commands are in backticks. @param {{text: string}} props */
+export function Sentence({ text }) {
+  return String(text).split('`').map((part, at) => (at % 2
+    ? html`<code key=${at}><${Name} text=${part} /></code>` : html`<${Name} key=${at} text=${part} />`));
+}
+
 /** @param {{topic: import('./state.js').Topic, most?: number}} props */
 export function TopicLink({ topic, most }) {
   return html`<a href=${topicAddress(topic)}><${Name} text=${topic.name} most=${most} /></a>`;
@@ -42,7 +48,7 @@ const MARKS = /** @type {Record<string, [string, string]>} */ ({
 export function Mark({ severity }) {
   const [sign, word] = MARKS[severity] ?? MARKS.note;
   return html`<span class="mark ${severity}"><span aria-hidden="true">${sign}</span
-    ><span class="unseen">${word}</span></span>`;
+    ><span class="reader-only">${word}</span></span>`;
 }
 
 /** Each flag of a topic: severity, word, and explanation. */
@@ -56,7 +62,7 @@ export const FLAGS = /** @type {Record<string, [string, string, string]>} */ ({
   rejected: ['warning', 'rejected', 'limits.topics is reached: the topic is not measured.'],
   unmatched_publisher: ['note', 'unmatched pub', 'A publisher has no matching subscription.'],
   unmatched_subscription: ['note', 'unmatched sub', 'A subscription has no matching publisher.'],
-  unseen: ['note', 'unseen', 'Messages of a pair take a path that the agent cannot observe.'],
+  unseen: ['note', 'not observed', 'Messages of a pair take a path that the agent cannot observe.'],
   sampled: ['note', 'sampled', 'Counts come from samples of shared memory.'],
   encrypted: ['note', 'encrypted', 'A participant announces DDS security.'],
 });
@@ -65,9 +71,9 @@ export const FLAGS = /** @type {Record<string, [string, string, string]>} */ ({
 export const PASSAGES = /** @type {Record<string, string>} */ ({
   network: 'network',
   shared_memory: 'shared memory',
-  data_sharing: 'data sharing (unseen)',
-  same_process: 'same process (unseen)',
-  iceoryx: 'iceoryx (unseen)',
+  data_sharing: 'data sharing (not observed)',
+  same_process: 'same process (not observed)',
+  iceoryx: 'iceoryx (not observed)',
   tcp: 'TCP',
 });
 
@@ -203,4 +209,9 @@ export function download(file, blob) {
 /** Lines of text from the network, escaped like names. @param {{text: string}} props */
 export function Text({ text }) {
   return html`<pre tabindex="0">${String(text).split(/\r?\n/).map(visible).join('\n')}</pre>`;
+}
+
+/** Returns the colour of a CSS variable, such as `--line-1`. @param {string} variable */
+export function colour(variable) {
+  return getComputedStyle(document.documentElement).getPropertyValue(variable).trim();
 }

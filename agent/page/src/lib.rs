@@ -29,7 +29,7 @@ impl File {
 }
 
 /// Every file, by its path below `/page/`; `index.html` is also served at `/`.
-pub static FILES: [File; 40] = [
+pub static FILES: [File; 43] = [
     File::new("api.js", SCRIPT, include_bytes!("../api.js")),
     File::new("app.css", CSS, include_bytes!("../app.css")),
     File::new("app.js", SCRIPT, include_bytes!("../app.js")),
@@ -54,6 +54,7 @@ pub static FILES: [File; 40] = [
     ),
     File::new("layout.js", SCRIPT, include_bytes!("../layout.js")),
     File::new("message.js", SCRIPT, include_bytes!("../message.js")),
+    File::new("preview.js", SCRIPT, include_bytes!("../preview.js")),
     File::new("qos.js", SCRIPT, include_bytes!("../qos.js")),
     File::new("router.js", SCRIPT, include_bytes!("../router.js")),
     File::new("state.js", SCRIPT, include_bytes!("../state.js")),
@@ -61,6 +62,7 @@ pub static FILES: [File; 40] = [
     File::new("stream.js", SCRIPT, include_bytes!("../stream.js")),
     File::new("table.js", SCRIPT, include_bytes!("../table.js")),
     File::new("timebar.js", SCRIPT, include_bytes!("../timebar.js")),
+    File::new("transforms.js", SCRIPT, include_bytes!("../transforms.js")),
     File::new("ui.js", SCRIPT, include_bytes!("../ui.js")),
     File::new(
         "vendor/hooks.mjs",
@@ -127,6 +129,11 @@ pub static FILES: [File; 40] = [
         "views/recordings.js",
         SCRIPT,
         include_bytes!("../views/recordings.js"),
+    ),
+    File::new(
+        "views/robot.js",
+        SCRIPT,
+        include_bytes!("../views/robot.js"),
     ),
     File::new(
         "views/topic.js",

@@ -17,3 +17,9 @@ test('attributes stay text', () => {
   assert.equal(attributesText({ topic: '/a\u202eb', count: 3, list: ['<b>'] }),
     'topic: /a\\u{202e}b, count: 3, list: ["<b>"]');
 });
+
+test('a GUID with a known name becomes that name', () => {
+  const names = new Map([['01', '/lidar']]);
+  assert.equal(attributesText({ writer: '01', reader: '02', count: 1 }, names),
+    'writer: /lidar, reader: 02, count: 1');
+});

@@ -1,6 +1,6 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
-import { build, dot, isHub } from '../graph-model.js';
+import { build, differences, dot, isHub } from '../graph-model.js';
 import { layout } from '../layout.js';
 import { State } from '../state.js';
 
@@ -174,4 +174,38 @@ test('Graphviz gets quoted text only', () => {
   assert.ok(text.includes('label="/a\\"];x"'));
   assert.ok(text.includes('label="/b\\\\\\\\\\\\u{202e}"'), text);
   assert.ok(text.includes('label="l\\""'));
+});
+
+test('folding omits topics with one neighbour, then closes namespaces, then shows nodes only', () => {
+  const state = robot(['/a', '/ns/b', '/ns/c'], [
+    ['/ab', ['/a'], ['/ns/b']], ['/bc', ['/ns/b'], ['/ns/c']], ['/alone', ['/a'], []],
+    ['/lost', ['/a'], []],
+  ]);
+  state.findings = [{ id: 'f', kind: 'loss', severity: 'warning', domain_id: 0, topic: 4, node: null,
+    since: null, text: '', remedy: null }];
+  const folded = (/** @type {number} */ fold) => build(state, { ...ALL, boxes: 'namespace', fold });
+  assert.ok(names(folded(0)).includes('/alone'));
+  const one = folded(1);
+  assert.equal(one.leaves, 1);
+  assert.ok(!names(one).includes('/alone') && names(one).includes('/lost'));
+  assert.ok(names(folded(2)).includes('/ab') && !names(folded(2)).includes('/ns/b'));
+  assert.deepEqual(names(folded(3)), ['/a', '/ns/']);
+  // What is searched for stays.
+  assert.ok(names(build(state, { ...ALL, fold: 1, focus: 'topic:0:/alone' })).includes('/alone'));
+});
+
+test('differences name nodes, connections and QoS by names that a restart keeps', () => {
+  const before = robot(['/a', '/b', '/gone'], [['/x', ['/a'], ['/b']], ['/y', ['/gone'], ['/b']],
+    ['/z', ['/a'], ['/b']]]);
+  const now = robot(['/a', '/b', '/came'], [['/w', ['/b'], ['/a']], ['/x', ['/a'], ['/b']],
+    ['/y', ['/came'], []], ['/z', ['/a'], []]]);
+  const [topic] = [...now.topics.values()].filter((each) => each.name === '/x');
+  topic.publishers[0].reliability = 'BEST_EFFORT';
+  assert.deepEqual(differences(before, now), {
+    came: ['node:0:/came'], gone: ['node:0:/gone'],
+    joined: ['/b publishes /w', '/a subscribes to /w'],
+    left: ['/b subscribes to /y', '/b subscribes to /z'],
+    changed: ['/a publishes /x: RELIABLE, VOLATILE → BEST_EFFORT, VOLATILE'],
+  });
+  assert.deepEqual(differences(now, now), { came: [], gone: [], joined: [], left: [], changed: [] });
 });

@@ -17,7 +17,7 @@ const IMU = {
 };
 
 test('a message becomes lines in the order of its definition', () => {
-  const lines = flatten(IMU, new Set());
+  const lines = flatten(IMU, new Set(['ranges']));
   assert.deepEqual(lines.map((line) => line.path), ['header', 'header.stamp', 'header.stamp.sec',
     'header.stamp.nanosec', 'header.frame_id', 'ranges', 'ranges[0]', 'ranges[1]', 'covariance',
     'covariance[0]', 'covariance[1]', 'big', 'note', 'ok']);
@@ -30,7 +30,7 @@ test('a message becomes lines in the order of its definition', () => {
 test('closed members take no lines, and a large message is cut', () => {
   assert.ok(!flatten(IMU, new Set(['header'])).some((line) => line.path.startsWith('header.')));
   const large = { a: Array.from({ length: 5000 }, (_, at) => at) };
-  assert.equal(flatten(large, new Set()).length, 400);
+  assert.equal(flatten(large, new Set(['a'])).length, 400);
 });
 
 test('numbers are found by their path, and nothing else is', () => {

@@ -17,6 +17,13 @@ test('endpoints of a topic without a counterpart are one finding, others stay', 
   assert.deepEqual([...more], [[list[1], 2]]);
 });
 
+test('a mismatch of QoS is one finding, although both endpoints have no counterpart', () => {
+  const finding = (/** @type {string} */ kind, /** @type {number} */ topic) => ({ kind, topic });
+  const list = [finding('qos_incompatible', 1), finding('unmatched_publisher', 1),
+    finding('unmatched_subscription', 1), finding('unmatched_publisher', 2)];
+  assert.deepEqual(grouped(/** @type {any} */ (list))[0], [list[0], list[3]]);
+});
+
 test('a page without topics says that writers send whose announcement was missed', () => {
   state.findings = [];
   assert.equal(Incomplete({ missing: 'this lacks them' }), undefined);

@@ -6,7 +6,7 @@ import { fileURLToPath } from 'node:url';
 import { gzipSync } from 'node:zlib';
 
 const PAGE = join(dirname(fileURLToPath(import.meta.url)), '..');
-const MOST_BYTES = 136_000;
+const MOST_BYTES = 160_000;
 
 /** Files that the agent serves. */
 const served = readdirSync(PAGE, { recursive: true, withFileTypes: true })
@@ -17,7 +17,7 @@ const served = readdirSync(PAGE, { recursive: true, withFileTypes: true })
 const text = (/** @type {string} */ path) => readFileSync(join(PAGE, path), 'utf8');
 const own = served.filter((path) => !path.startsWith('vendor/'));
 
-test('the whole page is at most 136 KB, compressed', (context) => {
+test('the whole page is at most 160 KB, compressed', (context) => {
   let total = 0;
   for (const path of served) total += gzipSync(readFileSync(join(PAGE, path)), { level: 9 }).length;
   context.diagnostic(`${served.length} files, ${total} bytes compressed`);
@@ -55,6 +55,24 @@ test('nothing leads to another origin, and nothing is inline', () => {
   }
   const html = text('index.html');
   assert.doesNotMatch(html, /<style|\sstyle=|\son[a-z]+=|<script(?![^>]*\ssrc=)/);
+});
+
+test('no class has a rule of its own and refines another one', () => {
+  const css = text('app.css').replace(/\/\*[^]*?\*\//g, '').replace(/:not\([^)]*\)|\[[^\]]*\]/g, '');
+  const alone = new Set();
+  const refining = new Set();
+  for (const [, selectors] of css.matchAll(/([^{}]+)\{/g)) {
+    for (const selector of selectors.split(',').map((each) => each.trim())) {
+      const parts = selector.replace(/::?[a-z-]+/g, '').split(/[\s>+~]+/);
+      for (const part of parts) {
+        const [first, ...more] = part.match(/\.[a-z][\w-]*/gi) ?? [];
+        more.forEach((each) => refining.add(each));
+        if (parts.length === 1 && part === first) alone.add(first);
+      }
+    }
+  }
+  assert.ok(alone.has('.reader-only') && refining.has('.unseen'), [...alone].join(' '));
+  assert.deepEqual([...alone].filter((each) => refining.has(each)), []);
 });
 
 /** @param {string} colour such as `#12ab34` */

@@ -1,6 +1,6 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
-import { address, parse, tokenOf } from '../router.js';
+import { address, parse, partAddress, tokenOf } from '../router.js';
 
 test('every name comes back from its address', () => {
   for (const name of ['/points', '/a/b c?d=e&f#g', '/ü/日本', '/"><img src=x>', '%2F', '/\u202e\0']) {
@@ -28,4 +28,9 @@ test('the token is taken from the fragment alone', () => {
   assert.equal(tokenOf('#/topics?token=0a'), null);
   assert.equal(tokenOf('#token=<b>'), null);
   assert.equal(tokenOf(''), null);
+});
+
+test('a finding about a part of the robot leads to that part', () => {
+  assert.deepEqual(partAddress('transform_fault'), ['#/robot/transforms', 'Transforms']);
+  assert.equal(partAddress('qos_incompatible'), null);
 });

@@ -184,7 +184,7 @@ function Waterfall({ chain, limit }) {
         name=${hop.input} domain=${chain.domain_id} /> → <${TopicName} name=${hop.output}
         domain=${chain.domain_id} /></span>`
       : 'End to end') },
-    { key: 'time', title: html`<span class="unseen">Parts</span><${Axis} ticks=${ticks}
+    { key: 'time', title: html`<span class="reader-only">Parts</span><${Axis} ticks=${ticks}
         end=${end} />`, kind: 'time',
       cell: (/** @type {any} */ row) => html`${track(row)}${row.parts.length > 0 && html`<span
         class="parts">${row.parts.map((/** @type {any} */ part) => html`<span key=${part.name}

@@ -2,13 +2,17 @@
 
 import { useEffect, useState } from '../vendor/hooks.mjs';
 import { request } from '../api.js';
-import { clock, count, several, visible } from '../format.js';
+import { clock, count, date, several, visible } from '../format.js';
 import { address } from '../router.js';
 import { replaceAddress, state, useLive } from '../store.js';
+import { inWords, useEvents, useTime } from '../timebar.js';
 import { Filter, html, Mark, matches, Name } from '../ui.js';
 
 /** Most events in the document; the filter finds older ones. */
 const MOST_SHOWN = 300;
+
+/** Events that each node brings by the dozen when it starts and ends. */
+const ROUTINE = /^ros2\.(endpoint|participant)\./;
 
 const SEVERITY = /** @type {Record<string, string>} */ ({
   ERROR: 'error', WARN: 'warning', INFO: 'note',
@@ -30,12 +34,38 @@ export function parseEvents(text) {
   return events;
 }
 
-/** Formats an event's attributes. @param {Record<string, unknown>} attributes */
-export function attributesText(attributes) {
+/**
+ * Formats an event's attributes. A GUID with a known name becomes that name.
+ * @param {Record<string, unknown>} attributes
+ * @param {Map<string, string>} [names]
+ */
+export function attributesText(attributes, names) {
   return Object.entries(attributes).map(([name, value]) => {
-    const text = typeof value === 'string' ? value : JSON.stringify(value);
+    const text = typeof value === 'string' ? names?.get(value) ?? value : JSON.stringify(value);
     return `${visible(name)}: ${visible(text)}`;
   }).join(', ');
+}
+
+/** Names of endpoints and participants by GUID, also of departed ones. */
+const owners = /** @type {Map<string, string>} */ (new Map());
+const MOST_OWNERS = 20000;
+
+/** Adds the present endpoints and participants, and returns all names. */
+function ownersNow() {
+  if (owners.size > MOST_OWNERS) owners.clear();
+  for (const topic of state.topics.values()) {
+    for (const endpoint of [...topic.publishers, ...topic.subscriptions]) {
+      const { name, node } = state.ownerOf(endpoint);
+      if (node) owners.set(endpoint.guid, name);
+    }
+  }
+  for (const node of state.nodes.values()) {
+    for (const id of node.participants) {
+      const participant = state.participants.get(id);
+      if (participant) owners.set(participant.guid, node.name);
+    }
+  }
+  return owners;
 }
 
 /** @param {{query: Record<string, string>}} props */
@@ -58,41 +88,48 @@ export function Events({ query }) {
   const { filter = '', severity = '' } = query;
   const change = (/** @type {Record<string, any>} */ more) => replaceAddress(
     address('events', null, { ...query, ...more }));
-  const rows = (held ?? state.events).filter((/** @type {any} */ event) =>
-    (!severity || event.severity === severity || (severity === 'WARN' && event.severity === 'ERROR'))
-    && matches(filter, `${event.name} ${attributesText(event.attributes)}`)).reverse();
+  const names = ownersNow();
+  const shown = useTime();
+  const past = useEvents(shown);
+  const isPast = shown.at != null || (query.span != null && state.open?.keeps_history);
+  const rows = (isPast ? past : held ?? state.events).filter((/** @type {any} */ event) =>
+    (severity || filter || !ROUTINE.test(event.name))
+    && (!severity || severity === 'ALL' || event.severity === severity || (severity === 'WARN' && event.severity === 'ERROR'))
+    && (!filter || matches(filter, `${event.name} ${attributesText(event.attributes)} ${
+      attributesText(event.attributes, names)}`))).reverse();
   const fresh = held ? state.events.length - held.length : 0;
   return html`<h1 tabindex="-1">Events</h1>
+    ${isPast && html`<p>${inWords(shown)}</p>`}
     <div class="controls">
       <${Filter} label="Filter" value=${filter} found=${rows.length} noun="event"
         change=${(/** @type {string} */ text) => change({ filter: text })} />
       <label>Show <select value=${severity}
         onChange=${(/** @type {any} */ event) => change({ severity: event.target.value })}>
-        <option value="">all</option><option value="WARN">warnings and errors</option>
+        <option value="">all but discovery</option><option value="ALL">all</option>
+        <option value="WARN">warnings and errors</option>
         <option value="ERROR">errors</option></select></label>
-      <button type="button" aria-pressed=${held != null}
+      ${!isPast && html`<button type="button" aria-pressed=${held != null}
         onClick=${() => hold(held ? null : [...state.events])}>${held
-          ? `Continue${fresh > 0 ? ` (${several(fresh, 'new event')})` : ''}` : 'Pause'}</button></div>
+          ? `Continue${fresh > 0 ? ` (${several(fresh, 'new event')})` : ''}` : 'Pause'}</button>`}</div>
     ${failed && html`<p class="problem"><${Mark} severity="warning" /> No earlier events: ${failed}</p>`}
     ${state.missedEvents > 0 && html`<p class="dim">${count(state.missedEvents)} events were
       overwritten before this page could read them.</p>`}
     ${rows.length ? html`<div class="scroll tall" tabindex="0" role="group" aria-label="Events"><table>
       <thead><tr><th scope="col">Time</th><th scope="col">Event</th><th scope="col">What</th></tr></thead>
       <tbody>${rows.slice(0, MOST_SHOWN).map((/** @type {any} */ event) => html`<tr key=${event.id}>
-        <td class="number"><time datetime=${event.time} title=${event.time}>${clock(
+        <td class="number"><time datetime=${event.time} title=${event.time}>${(isPast ? date : clock)(
           Date.parse(event.time) / 1000)}</time></td>
         <th scope="row"><${Mark} severity=${SEVERITY[event.severity] ?? 'note'} /> ${event.name}</th>
-        <td><${Attributes} event=${event} /></td></tr>`)}</tbody></table></div>
+        <td><${Attributes} event=${event} names=${names} /></td></tr>`)}</tbody></table></div>
       ${rows.length > MOST_SHOWN && html`<p class="dim">The latest ${count(MOST_SHOWN)} of ${count(
         rows.length)}.</p>`}`
       : html`<p class="empty">${state.events.length ? 'No event matches.' : 'No event yet.'}</p>`}`;
 }
 
-/** @param {{event: import('../state.js').Event}} props */
-function Attributes({ event }) {
+/** @param {{event: import('../state.js').Event, names: Map<string, string>}} props */
+function Attributes({ event, names }) {
   const { topic, ...rest } = event.attributes;
   const link = typeof topic === 'string' && html`<a href=${address('topics', topic, {
     domain: /** @type {any} */ (event.attributes).domain_id })}><${Name} text=${topic} /></a> `;
-  const text = attributesText(rest);
-  return html`${link}<bdi dir="ltr">${text}</bdi>`;
+  return html`${link}<bdi dir="ltr" title=${attributesText(rest)}>${attributesText(rest, names)}</bdi>`;
 }

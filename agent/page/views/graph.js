@@ -1,11 +1,14 @@
 // The graph: nodes and topics from left to right, with traffic and failures.
 
 import { useEffect, useMemo, useRef, useState } from '../vendor/hooks.mjs';
-import { bandwidth, count, rate, several, shortened, visible } from '../format.js';
-import { build, dot, MANY_NODES, MOST_LABEL } from '../graph-model.js';
+import { bandwidth, count, date, rate, several, shortened, visible } from '../format.js';
+import { build, differences, dot, MANY_NODES, MOST_LABEL, nameOf } from '../graph-model.js';
 import { address, nodeAddress, topicAddress } from '../router.js';
+import { State } from '../state.js';
 import { replaceAddress, state, useLive, usePoll } from '../store.js';
-import { Badges, download, Failed, html, Mark, Name, PASSAGES, worst } from '../ui.js';
+import { moment } from '../stream.js';
+import { Badges, download, Failed, html, Mark, Name, PASSAGES, Sentence, worst }
+  from '../ui.js';
 import { Camera } from '../camera.js';
 import { chainsThrough, graphWords, marked, NO_CHAIN, section, throughGraph, wayOf }
   from '../chains.js';
@@ -75,6 +78,87 @@ function healths() {
   return nodes;
 }
 
+/** Levels of folding that the first view may need. */
+const MOST_FOLDED = 3;
+/** What colours the vertices, besides their health. */
+const TINTS = /** @type {[string, string][]} */ ([['', 'health'], ['rate', 'rate'],
+  ['latency', 'latency'], ['process', 'process'], ['host', 'host']]);
+/** Times before the shown one that can be compared, in seconds. */
+const BEFORE = /** @type {[number, string][]} */ ([[60, 'a minute before'],
+  [600, 'ten minutes before'], [3600, 'an hour before'], [86400, 'a day before']]);
+/** Hues of processes and hosts. */
+const HUES = 9;
+
+/** Returns a hue for a name. @param {string} name */
+function hueOf(name) {
+  let sum = 0;
+  for (const character of name) sum = (sum * 31 + (character.codePointAt(0) ?? 0)) % 65521;
+  return `hsl(${(sum % HUES) * (360 / HUES)} 65% 50%)`;
+}
+
+/** Returns a colour between green and red on a logarithmic scale. @param {number} part 0 to 1 */
+function heat(part) {
+  return `hsl(${140 - 140 * Math.max(0, Math.min(1, part))} 65% 45%)`;
+}
+
+/**
+ * Returns the colour of a vertex; null for that of its health.
+ * @param {import('../graph-model.js').Vertex} vertex
+ * @param {string} tint
+ */
+function tintOf(vertex, tint) {
+  if (vertex.topic != null) {
+    const { rate: hertz, p99 } = state.figuresOf(vertex.topic);
+    if (tint === 'rate' && hertz) return heat(Math.log10(Math.max(1, hertz)) / 3);
+    if (tint === 'latency' && p99) return heat(Math.log10(p99 / 1e-4) / 4);
+  }
+  if (vertex.node == null) return null;
+  const own = state.participants.get(state.nodes.get(vertex.node)?.participants[0] ?? -1);
+  if (tint === 'host') return hueOf(own?.host ?? '');
+  return tint === 'process' ? hueOf(`${own?.host} ${own?.pid}`) : null;
+}
+
+/**
+ * Returns what has changed since a moment before.
+ * @param {number} seconds 0 = no comparison
+ */
+function useDifferences(seconds) {
+  const [before, take] = useState(/** @type {State|null} */ (null));
+  const [failed, fail] = useState('');
+  const at = Math.floor(state.time) - seconds;
+  useEffect(() => {
+    take(null);
+    fail('');
+    if (!seconds) return undefined;
+    const abort = new AbortController();
+    moment(at, abort.signal)
+      .then((lines) => {
+        const past = new State();
+        past.show(lines);
+        take(past);
+      })
+      .catch((error) => { if (!abort.signal.aborted) fail(error.message); });
+    return () => abort.abort();
+  }, [seconds, state.past]);
+  const found = useMemo(() => before && differences(before, state), [before, state.structure]);
+  return { found, failed, since: before?.time ?? null };
+}
+
+/** @param {{found: ReturnType<typeof differences>|null, failed: string, since: number|null}} props */
+function Differences({ found, failed, since }) {
+  if (failed) return html`<p class="problem">Nothing to compare with: ${failed}</p>`;
+  if (!found) return null;
+  const lists = /** @type {[string, string[]][]} */ ([['New nodes', found.came.map(nameOf)],
+    ['Nodes that went', found.gone.map(nameOf)], ['New', found.joined], ['Ended', found.left],
+    ['Other QoS', found.changed]]);
+  const known = lists.filter(([, list]) => list.length);
+  return html`<section aria-label="Differences" class="differences">
+    <p>Since ${date(since)}: ${known.length ? '' : 'the same nodes, topics and QoS.'}</p>
+    ${known.map(([title, list]) => html`<details key=${title} open=${list.length <= 5}>
+      <summary>${title} (${count(list.length)})</summary><ul class="plain">${list.slice(0, 200).map((text) =>
+        html`<li key=${text}><${Name} text=${text} /></li>`)}</ul></details>`)}</section>`;
+}
+
 /** @param {{query: Record<string, string>}} props */
 export function Graph({ query }) {
   useLive();
@@ -105,16 +189,40 @@ export function Graph({ query }) {
     shown: trail ? new Set(trail.keys.keys()) : undefined,
     only: Boolean(query.only),
   });
+  // The first view folds as much as legible names need, until the user decides.
+  const scene = JSON.stringify([options.mode, options.boxes, focus, hops, query.hubs, query.hidden,
+    query.services, query.actions, query.chain, query.only, query.fold]);
+  const [folding, setFolding] = useState({ scene, level: 0 });
+  const isAutomatic = !query.fold && !trail && !query.boxed;
+  const level = query.fold ? 0 : folding.scene === scene ? folding.level : 0;
+  options.fold = level;
+  const against = Number(query.against) || 0;
+  const compared = useDifferences(state.open?.keeps_history ? against : 0);
   const graph = useMemo(() => build(state, options, joints), [
-    state.structure, JSON.stringify(query), asked.data, trail]);
+    state.structure, JSON.stringify(query), asked.data, trail, level]);
+  const raise = () => {
+    for (let next = level + 1; isAutomatic && next <= MOST_FOLDED; next += 1) {
+      const folded = build(state, { ...options, fold: next }, joints);
+      if (folded.signature !== graph.signature) {
+        setFolding({ scene, level: next });
+        return true;
+      }
+    }
+    return false;
+  };
   const marks = useMemo(() => trail && marked(graph, trail), [graph, trail]);
   const { picture, milliseconds, failed } = useLayout(graph);
   const [chosen, choose] = useState(/** @type {string|null} */ (focus));
+  /** Moves the drawing to a vertex. */
+  const camera = useRef(/** @type {((key: string) => void)|null} */ (null));
+  const find = (/** @type {string} */ key) => camera.current?.(key);
   const toggle = (/** @type {string} */ box) => {
     const next = new Set(toggled);
     if (!next.delete(box)) next.add(box);
     change({ boxed: [...next].map(encodeURIComponent).join(' ') });
   };
+  const isPicked = graph.vertices.some((/** @type {any} */ each) => each.key === chosen)
+    || graph.edges.some((/** @type {any} */ each) => each.id === chosen);
   const drawing = useRef(/** @type {SVGSVGElement|null} */ (null));
   const host = state.open?.host ?? 'robot';
   const vertexNames = new Map(graph.vertices.map(
@@ -135,8 +243,18 @@ export function Graph({ query }) {
         <label key=${key}><input type="checkbox" checked=${Boolean(query[key])}
           onChange=${(/** @type {any} */ event) => change({ [key]: event.target.checked })} />
           ${title}</label>`)}
+      <label>Colour <select value=${query.tint ?? ''}
+        onChange=${(/** @type {any} */ event) => change({ tint: event.target.value })}>
+        ${TINTS.map(([tint, title]) => html`<option value=${tint}>${title}</option>`)}</select></label>
+      ${state.open?.keeps_history && html`<label>Compare with <select value=${String(against || '')}
+        onChange=${(/** @type {any} */ event) => change({ against: event.target.value })}>
+        <option value="">nothing</option>
+        ${BEFORE.map(([seconds, title]) => html`<option value=${String(seconds)}>${title}</option>`)}
+        </select></label>`}
+      <${FindField} graph=${graph} find=${(/** @type {string} */ key) => { choose(key); find(key); }} />
       <${FocusField} focus=${focus} hops=${hops} change=${change} />
     </div>
+    <${Differences} ...${compared} />
     <${ChainField} chains=${chains} chain=${chain} query=${query} change=${change} />
     <div class="controls">
       <button type="button" onClick=${() => download(`${host}.svg`, new Blob(
@@ -146,25 +264,52 @@ export function Graph({ query }) {
       <a href=${address(options.mode === 'nodes' ? 'nodes' : 'topics')}>Show as a list</a>
       <span class="dim">${several(graph.nodes, 'node')}, ${several(graph.edges.length, 'edge')}${
         milliseconds != null ? `; laid out in ${milliseconds.toFixed(0)} ms` : ''}${
-        graph.nodes > MANY_NODES && options.boxes === 'namespace'
-          ? '; namespaces are closed at first' : ''}</span>
+        options.boxes === 'namespace' && (graph.nodes > MANY_NODES || level >= 2)
+          ? '; namespaces are closed at first' : ''}${level > 2 && options.mode === 'both'
+        ? '; topics are folded into edges' : graph.leaves ? html`; ${several(graph.leaves,
+        'topic')} with one neighbour folded` : ''}</span>
+      ${level > 0 && html`<button type="button" class="small"
+        onClick=${() => change({ fold: 'none' })}>Show everything</button>`}
+      ${query.fold && html`<button type="button" class="small"
+        onClick=${() => change({ fold: '' })}>Fold</button>`}
+      <span class="dim by-mouse">The wheel zooms, dragging moves, <kbd>0</kbd> shows all.</span>
     </div>
     <${Failed} problem=${asked.problem} what="No services and actions" />
     ${failed && html`<p class="problem">${failed}</p>`}
     ${!graph.vertices.length && html`<p class="empty">${focus
       ? 'The selected node or topic does not exist now.' : 'No node is known.'}</p><${Incomplete} missing="the graph lacks them" />`}
-    ${picture && graph.vertices.length > 0 && html`<div class="graph">
+    ${picture && graph.vertices.length > 0 && html`<div class="graph ${isPicked
+      ? 'beside' : ''}">
       <${Drawing} graph=${graph} picture=${picture} chosen=${chosen} choose=${choose}
-        toggle=${toggle} own=${drawing} marks=${marks} />
+        toggle=${toggle} own=${drawing} marks=${marks} scene=${scene} raise=${raise} goTo=${camera}
+        tint=${query.tint ?? ''} came=${compared.found?.came ?? []} />
       <${Panel} graph=${graph} chosen=${chosen} change=${change} toggle=${toggle}
         choose=${choose} names=${vertexNames} chains=${chains.data?.chains ?? []} /></div>`}
     <${Legend} />`;
 }
 
+/** A field that jumps to a vertex. @param {{graph: any, find: (key: string) => void}} props */
+function FindField({ graph, find }) {
+  const [missing, miss] = useState(false);
+  const vertices = graph.vertices.filter((/** @type {any} */ each) => each.kind !== 'box');
+  const go = (/** @type {string} */ text) => {
+    const own = text.trim().toLowerCase();
+    const found = own && (vertices.find((/** @type {any} */ each) => each.name.toLowerCase() === own)
+      ?? vertices.find((/** @type {any} */ each) => each.name.toLowerCase().includes(own)));
+    miss(Boolean(own) && !found);
+    if (found) find(found.key);
+  };
+  return html`<label>Find <input type="search" list="vertices" size="14" aria-invalid=${missing}
+      onChange=${(/** @type {any} */ event) => go(event.target.value)} /></label>
+    ${missing && html`<span class="dim" role="status">not in this picture</span>`}
+    <datalist id="vertices">${vertices.slice(0, 500).map((/** @type {any} */ each) => html`
+      <option key=${each.key} value=${visible(each.name)} />`)}</datalist>`;
+}
+
 /** @param {{focus: string|null, hops: number, change: (more: any) => void}} props */
 function FocusField({ focus, hops, change }) {
   if (!focus) return null;
-  return html`<span class="focus">Focus <${Name} text=${focus.split(':').slice(2).join(':')}
+  return html`<span class="focus">Focus <${Name} text=${nameOf(focus)}
       most=${40} />
     <label>hops <input type="number" min="1" max="9" value=${hops}
       onInput=${(/** @type {any} */ event) => change({ hops: event.target.value })} /></label>
@@ -220,7 +365,8 @@ function useLayout(graph) {
 
 /**
  * @typedef {{width: number, height: number, at: Map<string, import('../layout.js').Placed>,
- *   routes: Map<string, import('../layout.js').Point[]>}} Picture
+ *   routes: Map<string, import('../layout.js').Point[]>, left: Set<string>}} Picture
+ *   `left` has the edges that leave their source to the left
  * @param {import('../layout.js').Layout} result
  * @returns {Picture}
  */
@@ -230,21 +376,26 @@ function index(result) {
     height: result.height,
     at: new Map(result.vertices.map((each) => [each.id, each])),
     routes: new Map(result.edges.map((each) => [each.id, each.points])),
+    left: new Set(result.edges.filter((each) => each.left).map((each) => each.id)),
   };
 }
 
 /** Pixels within which a backward edge turns. */
 const TURN = 40;
 
-/** Returns a smooth path through an edge's points. @param {import('../layout.js').Point[]} points */
-export function curve(points) {
+/**
+ * Returns a smooth path through an edge's points.
+ * @param {import('../layout.js').Point[]} points
+ * @param {boolean} [left] whether it leaves its source to the left
+ */
+export function curve(points, left = false) {
   let path = `M${points[0].x.toFixed(1)} ${points[0].y.toFixed(1)}`;
   for (let at = 1; at < points.length; at += 1) {
     const [a, b] = [points[at - 1], points[at]];
     // A backward edge starts to the right, turns, and turns again before its end.
     const half = (b.x - a.x) / 2;
-    const out = half < 0 && at === 1 ? TURN : half;
-    const into = half < 0 && at === points.length - 1 ? TURN : half;
+    const out = half < 0 && at === 1 && !left ? TURN : half;
+    const into = half < 0 && at === points.length - 1 && !left ? TURN : half;
     path += `C${(a.x + out).toFixed(1)} ${a.y.toFixed(1)} ${(b.x - into).toFixed(1)} `
       + `${b.y.toFixed(1)} ${b.x.toFixed(1)} ${b.y.toFixed(1)}`;
   }
@@ -256,17 +407,20 @@ function label(edge) {
   const { bytes, hertz, measured } = load(edge);
   const figures = measured ? `${rate(hertz)}, ${bandwidth(bytes)}` : '';
   if (edge.kind !== 'pair') return figures;
-  const names = edge.topics.map((id) => state.topics.get(id)?.name ?? '').join(', ');
+  const names = edge.topics.map((id) => visible(state.topics.get(id)?.name)).join(', ');
   return figures ? `${names} (${figures})` : names;
 }
 
 /**
  * @param {{graph: import('../graph-model.js').Graph, picture: Picture, chosen: string|null,
  *   choose: (key: string|null) => void, toggle: (key: string) => void, own: any,
- *   marks: {vertices: Map<string, number>, edges: Set<string>}|null}} props
- *   `marks` are the vertices and edges of a chain
+ *   marks: {vertices: Map<string, number>, edges: Set<string>}|null, scene: string,
+ *   raise: () => boolean, goTo: any, tint: string, came: string[]}} props
+ *   `marks` are the vertices and edges of a chain; a new `scene` is shown like the first one;
+ *   `raise` folds more, and returns whether it can; `goTo` receives a function that moves to a vertex
  */
-function Drawing({ graph, picture, chosen, choose, toggle, own, marks }) {
+function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, raise, goTo, tint,
+  came }) {
   const stage = useRef(/** @type {SVGGElement|null} */ (null));
   const camera = useRef(/** @type {Camera|null} */ (null));
   useEffect(() => {
@@ -274,8 +428,30 @@ function Drawing({ graph, picture, chosen, choose, toggle, own, marks }) {
     camera.current = made;
     return () => made.end();
   }, []);
-  useEffect(() => camera.current?.frame(picture.width, picture.height),
-    [picture.width, picture.height]);
+  const shownScene = useRef(scene);
+  const renewed = useRef(false);
+  useEffect(() => {
+    if (shownScene.current !== scene) {
+      shownScene.current = scene;
+      renewed.current = false;
+      camera.current?.renew();
+    }
+    const worstFinding = state.findings.find((finding) => finding.topic != null
+      && finding.severity !== 'note');
+    const place = graph.vertices.find((each) => each.topic === worstFinding?.topic);
+    const legible = camera.current?.frame(picture.width, picture.height,
+      place && picture.at.get(place.key));
+    // After the first legible picture, nothing more is folded.
+    const isOver = legible || renewed.current || !raise();
+    if (!isOver) camera.current?.renew();
+    renewed.current = Boolean(isOver);
+  }, [picture, scene]);
+  useEffect(() => {
+    goTo.current = (/** @type {string} */ key) => {
+      const at = picture.at.get(key);
+      if (at) camera.current?.part([at]);
+    };
+  }, [picture]);
   const passed = marks ? [...marks.vertices.keys()].join('\n') : '';
   const framed = useRef('');
   useEffect(() => {
@@ -308,7 +484,7 @@ function Drawing({ graph, picture, chosen, choose, toggle, own, marks }) {
       }
     }
   };
-  const labels = graph.edges.length <= 60;
+  const labelled = useMemo(() => freeLabels(graph, picture), [graph, picture]);
   const few = graph.edges.length <= 400;
   return html`<div class="canvas"><svg ref=${own} role="group" onKeyDown=${keys}
     class=${marks ? 'traced' : ''}
@@ -334,19 +510,17 @@ function Drawing({ graph, picture, chosen, choose, toggle, own, marks }) {
         const isPassed = marks?.edges.has(edge.id);
         const active = chosen != null && (edge.from === chosen || edge.to === chosen
           || edge.id === chosen);
-        const middle = points[Math.floor((points.length - 1) / 2)];
-        const after = points[Math.floor((points.length - 1) / 2) + 1];
-        const [x, y] = [(middle.x + after.x) / 2, (middle.y + after.y) / 2];
+        const { x, y } = middleOf(points);
         return html`<g key=${edge.id} class="edge ${way(edge.passages, edge.kind)} ${health} ${active
           ? 'active' : ''} ${measured ? '' : 'unmeasured'} ${isPassed ? 'passed' : ''}"
           onClick=${() => choose(edge.id)}>
-          ${few && html`<path class="touch" d=${curve(points)} />`}
-          <path class="line" d=${curve(points)} stroke-width=${Math.max(
+          ${few && html`<path class="touch" d=${curve(points, picture.left.has(edge.id))} />`}
+          <path class="line" d=${curve(points, picture.left.has(edge.id))} stroke-width=${Math.max(
             isPassed ? 3 : 0, thickness(bytes)).toFixed(1)}
             marker-end="url(#arrow-${isPassed ? 'passed' : health})" />
           ${(health === 'error' || health === 'warning') && edge.kind !== 'feeds' && html`<text
             class="sign ${health}" x=${x} y=${y + 4}>${health === 'error' ? '✖' : '▲'}</text>`}
-          ${edge.kind === 'pair' && (labels || active) && html`<text class="edge-label" x=${x}
+          ${edge.kind === 'pair' && (labelled.has(edge.id) || active) && html`<text class="edge-label" x=${x}
             y=${y - 5}>${edge.topics.length === 1
               ? shortened(state.topics.get(edge.topics[0])?.name, 24)
               : several(edge.topics.length, 'topic')}${measured
@@ -356,7 +530,8 @@ function Drawing({ graph, picture, chosen, choose, toggle, own, marks }) {
       ${shown.filter((each) => each.kind !== 'box' || each.closed).map((each) => html`<${Shape}
         key=${each.key} vertex=${each} at=${picture.at.get(each.key)} nodes=${nodes}
         chosen=${chosen === each.key} roving=${roving === each.key} choose=${choose}
-        toggle=${toggle} camera=${camera} position=${marks?.vertices.get(each.key)}
+        toggle=${toggle} camera=${camera} tint=${tint && tintOf(each, tint)}
+        came=${came.includes(each.key)} position=${marks?.vertices.get(each.key)}
         positions=${marks?.vertices.size} />`)}
     </g></svg>
     <div class="zoom"><button type="button" aria-label="Zoom in"
@@ -364,6 +539,42 @@ function Drawing({ graph, picture, chosen, choose, toggle, own, marks }) {
       <button type="button" aria-label="Zoom out"
         onClick=${() => camera.current?.key('-')}>−</button>
       <button type="button" onClick=${() => camera.current?.key('0')}>Fit</button></div></div>`;
+}
+
+/** Size of an edge's label, in pixels. */
+const [CHARACTER, LINE] = [7.3, 14];
+const MOST_LABEL_CHARACTERS = 34;
+
+/**
+ * Returns the edges whose labels cover neither a vertex nor another label.
+ * @param {import('../graph-model.js').Graph} graph
+ * @param {Picture} picture
+ */
+function freeLabels(graph, picture) {
+  const taken = graph.vertices.filter((each) => each.kind !== 'box' || each.closed)
+    .map((each) => picture.at.get(each.key)).filter((at) => at != null);
+  const free = new Set();
+  for (const edge of graph.edges) {
+    const points = edge.kind === 'pair' ? picture.routes.get(edge.id) : null;
+    if (!points) continue;
+    const { x, y } = middleOf(points);
+    const name = edge.topics.length === 1 ? state.topics.get(edge.topics[0])?.name ?? '' : '12 topics';
+    const own = { x, y: y - LINE / 2, h: LINE,
+      w: Math.min(MOST_LABEL_CHARACTERS, name.length + 9) * CHARACTER };
+    const overlaps = taken.some((other) => Math.abs(own.x - other.x) < (own.w + other.w) / 2
+      && Math.abs(own.y - other.y) < (own.h + other.h) / 2);
+    if (overlaps) continue;
+    taken.push(/** @type {any} */ (own));
+    free.add(edge.id);
+  }
+  return free;
+}
+
+/** Returns the middle of a route. @param {import('../layout.js').Point[]} points */
+function middleOf(points) {
+  const at = Math.floor((points.length - 1) / 2);
+  const [middle, after] = [points[at], points[at + 1]];
+  return { x: (middle.x + after.x) / 2, y: (middle.y + after.y) / 2 };
 }
 
 /** @param {import('../graph-model.js').Graph} graph */
@@ -432,7 +643,7 @@ const SIGNS = /** @type {Record<string, string>} */ ({ error: '✖', warning: '�
 
 /** @param {any} props */
 function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera, position,
-  positions }) {
+  positions, tint, came }) {
   const figures = vertex.topic == null ? null : state.figuresOf(vertex.topic);
   const flags = vertex.topic == null ? [] : state.flagsOf(vertex.topic);
   let severity = vertex.topic != null ? worst(flags) : nodes.get(vertex.node) ?? 'good';
@@ -455,7 +666,8 @@ function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera, posi
   const words = (sign ? `, with ${severity === 'error' ? 'an error' : 'a warning'}` : '')
     + (position ? `, ${position} of ${positions} in the chain` : '');
   return html`<g class="vertex ${vertex.kind} ${severity} ${chosen ? 'chosen' : ''} ${position
-    ? 'passed' : ''}" role="button"
+    ? 'passed' : ''} ${tint ? 'tinted' : ''} ${came ? 'came' : ''}" role="button"
+    style=${tint ? `--tint: ${tint}` : undefined}
     tabindex=${roving ? 0 : -1} data-key=${vertex.key} onClick=${press}
     aria-expanded=${vertex.closed ? 'false' : undefined}
     aria-pressed=${vertex.closed ? undefined : chosen}
@@ -479,9 +691,8 @@ function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera, posi
 
 /** @param {string} key @param {Map<number, string>} nodes */
 function healthOf(key, nodes) {
-  const parts = key.split(':');
-  const [kind, domain] = parts;
-  const name = parts.slice(2).join(':');
+  const [kind, domain] = key.split(':');
+  const name = nameOf(key);
   if (kind === 'topic') {
     const topic = state.topicNamed(name, Number(domain));
     return topic ? worst(state.flagsOf(topic.id)) : 'good';
@@ -510,9 +721,10 @@ function Panel({ graph, chosen, change, toggle, choose, names, chains }) {
   const place = topic ?? node;
   const through = place ? chainsThrough(chains, { domain: place.domain,
     [topic ? 'topic' : 'node']: place.name }) : [];
+  if (!vertex && !edge) return null;
   return html`<aside class="panel" id="graph-panel" tabindex="-1" aria-label="Details">
-    <h2>${title}</h2>
-    ${!vertex && !edge && html`<p class="dim">Choose a node, a topic or an edge.</p>`}
+    <h2>${title} <button type="button" class="small" aria-label="Close the details"
+      onClick=${() => choose(null)}>×</button></h2>
     ${vertex && html`<p>${topic && html`<a href=${topicAddress(topic)}>Open the topic</a> `}
       ${node && html`<a href=${nodeAddress(node)}>Open the node</a> `}
       ${vertex.kind !== 'box' && html`<button type="button"
@@ -524,7 +736,7 @@ function Panel({ graph, chosen, change, toggle, choose, names, chains }) {
           figures.lost)} lost`}</p><p><${Badges} flags=${state.flagsOf(topic.id)} /></p>`}
       ${state.findings.filter((finding) => (topic && finding.topic === topic.id)
         || (node && finding.node === node.id)).slice(0, 8).map((finding) => html`<p
-        key=${finding.id}><${Mark} severity=${finding.severity} /> <${Name}
+        key=${finding.id}><${Mark} severity=${finding.severity} /> <${Sentence}
         text=${finding.text} /></p>`)}
       ${through.length > 0 && html`<p>In ${through.length === 1 ? 'the chain' : 'the chains'}${' '}
         <${ChainLinks} chains=${through} filter=${place?.name ?? ''} />${' '}
@@ -550,7 +762,7 @@ function wayWords(edge) {
 
 function Legend() {
   const rows = [['network', 'network'], ['shared_memory', 'shared memory'],
-    ['unseen', 'same process, data sharing or iceoryx: unseen'], ['unmatched', 'no counterpart'],
+    ['unseen', 'same process, data sharing or iceoryx: not observed'], ['unmatched', 'no counterpart'],
     ['service', 'service or action']];
   return html`<details class="legend"><summary>Legend</summary><ul>
     ${rows.map(([kind, words]) => html`<li key=${kind}><svg viewBox="0 0 48 12" aria-hidden="true"

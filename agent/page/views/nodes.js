@@ -5,7 +5,9 @@ import { named } from '../api.js';
 import { bytes, calls, count, date, duration, percent, several } from '../format.js';
 import { nodeKey } from '../graph-model.js';
 import { address } from '../router.js';
-import { replaceAddress, state, useLive, usePoll } from '../store.js';
+import { Chart } from '../chart.js';
+import { replaceAddress, state, stream, useLive, usePoll } from '../store.js';
+import { inWords, useHistory, useTime, zoom } from '../timebar.js';
 import { sorted, Table } from '../table.js';
 import { Failed, Filter, html, Mark, matches, Name, NodeLink } from '../ui.js';
 import { InChains } from './chains.js';
@@ -46,7 +48,10 @@ function useProcesses() {
       };
     }
     for (const each of data.processes) {
-      byId.set(each.process_id, { ...each, part: before.current.part.get(each.process_id) ?? null });
+      // The first answer has the average since the process started.
+      const lasted = data.timestamp_seconds - (each.started_timestamp_seconds ?? NaN);
+      const average = lasted > 1 ? each.cpu_seconds / lasted : null;
+      byId.set(each.process_id, { ...each, part: before.current.part.get(each.process_id) ?? average });
     }
   }
   return { byId, answer };
@@ -80,7 +85,7 @@ export function Nodes({ query }) {
   const process = (/** @type {any} */ node) => byId.get(participant(node)?.pid ?? -1);
   const where = (/** @type {any} */ node) => {
     const own = participant(node);
-    return [own?.process, own?.pid].filter((part) => part != null).join(' ');
+    return [process(node)?.script ?? own?.process, own?.pid].filter((part) => part != null).join(' ');
   };
   const number = (/** @type {any} */ node, /** @type {'publishers'|'subscriptions'} */ side) =>
     joined.get(node.id)?.[side].size ?? 0;
@@ -161,6 +166,23 @@ function Links() {
     </tbody></table></div></section>`;
 }
 
+/** CPU and memory of a node's processes over time. @param {{ids: (number|null|undefined)[]}} props */
+function ProcessCharts({ ids }) {
+  const shown = useTime();
+  const { data } = useHistory(state.open?.keeps_history ? 'history/processes' : null, shown);
+  const own = (data?.processes ?? []).filter((/** @type {any} */ each) =>
+    ids.includes(each.process_id) && each.times.length > 1);
+  const title = inWords(shown);
+  return own.map((/** @type {any} */ each) => html`<section key=${`${each.process_id} ${each.process}`}
+    aria-label="CPU and memory of ${each.process}"><h2>${title}: <${Name}
+      text=${`${each.process} ${each.process_id}`} /></h2><div class="charts">
+    <${Chart} title="CPU" times=${each.times} print=${percent} range=${title} select=${zoom}
+      lines=${[{ label: 'of a core', colour: '--line-1', values: each.cpu_cores, fill: true }]} />
+    <${Chart} title="Memory" times=${each.times} print=${bytes} range=${title} select=${zoom} fitted
+      lines=${[{ label: 'resident', colour: '--line-2', values: each.memory_bytes }]} />
+    </div></section>`);
+}
+
 /** @param {{name: string, query: Record<string, string>}} props */
 export function NodeView({ name, query }) {
   useLive();
@@ -201,7 +223,7 @@ export function NodeView({ name, query }) {
       <th scope="col">Started</th><th scope="col">Control group</th><th scope="col">Participant</th></tr></thead>
     <tbody>${instances.map((own) => {
       const process = own && byId.get(own.pid ?? -1);
-      return own && html`<tr key=${own.guid}><th scope="row"><${Name} text=${[own.process, own.pid]
+      return own && html`<tr key=${own.guid}><th scope="row"><${Name} text=${[process?.script ?? own.process, own.pid]
         .filter((part) => part != null).join(' ') || 'unknown'} /></th>
         <td><${Name} text=${own.host ?? 'unknown'} /></td>
         <td class="number">${percent(process?.part)}</td>
@@ -211,12 +233,13 @@ export function NodeView({ name, query }) {
         <td><${Name} text=${own.cgroup ?? ''} /></td>
         <td>${own.vendor ?? ''} <${Name} text=${own.guid} /></td></tr>`;
     })}</tbody></table></div></section>
+    <${ProcessCharts} ids=${instances.map((own) => own?.pid)} />
     <${Failed} problem=${details.problem} what="No details" />
-    <p>Parameters: ${services.data
+    <p hidden=${stream.at != null}>Parameters: ${services.data
       ? known.length ? 'the node has parameter services.' : 'the node has no parameter services.'
       : '–'}</p>
-    <${Inside} key=${`inside ${node.id}`} inside=${data?.inside} name=${node.name}
-      domain=${node.domain} />
+    ${stream.at == null && html`<${Inside} key=${`inside ${node.id}`} inside=${data?.inside}
+      name=${node.name} domain=${node.domain} />`}
     ${list('Publishers', data?.publishers, 'topics')}
     ${list('Subscriptions', data?.subscriptions, 'topics')}
     ${list('Services', data?.services, null)}

@@ -1,9 +1,9 @@
 // Findings with their age and remedy, then totals, then the agent's blind spots.
 
-import { age, bandwidth, clock, count, percent, rate, several } from '../format.js';
-import { address, nodeAddress, topicAddress } from '../router.js';
+import { age, bandwidth, clock, count, duration, percent, rate, several } from '../format.js';
+import { address, nodeAddress, partAddress, topicAddress } from '../router.js';
 import { state, useLive } from '../store.js';
-import { Figure, html, Mark, Name, TopicLink, worst, Badges } from '../ui.js';
+import { Figure, html, Mark, Name, Sentence, TopicLink, worst, Badges } from '../ui.js';
 
 const MOST_SHOWN = 50;
 
@@ -28,8 +28,8 @@ export function Overview() {
     <section aria-labelledby="blind"><h2 id="blind">What the agent cannot see</h2>
       ${unseen.length
         ? html`<ul class="findings">${unseen.map((finding) => html`<li key=${finding.id}>
-          <${Mark} severity="note" /> <span><${Name} text=${finding.text} />
-          ${finding.remedy && html`<br /><span class="dim">Remedy: <${Name} text=${finding.remedy}
+          <${Mark} severity="note" /> <span><${Sentence} text=${finding.text} />
+          ${finding.remedy && html`<br /><span class="dim">Remedy: <${Sentence} text=${finding.remedy}
             /></span>`}</span></li>`)}</ul>`
         : html`<p>${state.open?.source === 'replay'
           ? 'This is a capture: it contains the traffic of an interface, but nothing about sockets, processes and shared memory.'
@@ -43,19 +43,23 @@ export function Findings({ list }) {
   const [firsts, more] = grouped(list);
   return html`<ul class="findings">${firsts.slice(0, MOST_SHOWN).map((finding) => html`
     <li key=${finding.id} class=${finding.severity}><${Mark} severity=${finding.severity} />
-      <span><${Place} finding=${finding} /> <${Name} text=${rest(finding)} />
+      <span><${Place} finding=${finding} /> <${Sentence} text=${rest(finding)} />${now(finding)}
       ${more.has(finding) && html`
         <span class="dim"> and ${several(more.get(finding) ?? 0, 'other')} of this topic</span>`}
       ${finding.since != null && html` <span class="dim">since ${clock(finding.since)} (${age(state.time - finding.since)})</span>`}
-      ${finding.remedy && html`<br /><span class="remedy">Remedy: <${Name} text=${finding.remedy}
+      ${finding.remedy && html`<br /><span class="remedy">Remedy: <${Sentence} text=${finding.remedy}
         /></span>`}</span></li>`)}</ul>
     ${firsts.length > MOST_SHOWN && html`<p class="dim">${count(firsts.length - MOST_SHOWN)} more.
       The <a href=${address('topics', null, { sort: 'state' })}>table of topics</a> has them
       all.</p>`}`;
 }
 
+/** Findings that also leave endpoints of their topic without a counterpart. */
+const CAUSES = ['qos_incompatible', 'type_conflict'];
+
 /**
- * Groups unmatched endpoints of a topic into one finding: all nodes may subscribe to `/clock`.
+ * Groups unmatched endpoints of a topic into one finding: all nodes may subscribe to `/clock`. Those
+ * of a topic with a finding that is their cause are left out.
  * @param {import('../state.js').Finding[]} list
  * @returns {[import('../state.js').Finding[], Map<import('../state.js').Finding, number>]} the first
  *   of each topic, and how many more it has
@@ -64,8 +68,11 @@ export function grouped(list) {
   /** @type {Map<string, import('../state.js').Finding>} */
   const seen = new Map();
   const more = new Map();
+  const explained = new Set(list.filter((finding) => CAUSES.includes(finding.kind))
+    .map((finding) => finding.topic));
   const firsts = list.filter((finding) => {
     if (finding.topic == null || !/^unmatched_/.test(finding.kind)) return true;
+    if (explained.has(finding.topic)) return false;
     const key = `${finding.kind} ${finding.topic}`;
     const first = seen.get(key);
     if (first) more.set(first, (more.get(first) ?? 0) + 1);
@@ -75,6 +82,22 @@ export function grouped(list) {
   return [firsts, more];
 }
 
+/** Returns the present figures beside what is expected. @param {import('../state.js').Finding} finding */
+function now(finding) {
+  if (finding.topic == null) return '';
+  const figures = state.figuresOf(finding.topic);
+  const { lost, messages } = figures;
+  if (finding.kind === 'loss' && lost != null && lost > 0) {
+    return `, ${percent(lost / (lost + (messages ?? 0)))} since it is measured`;
+  }
+  if (finding.kind === 'watch_violated' && figures.rate != null) {
+    const latency = /latency/.test(finding.text) && figures.p99 != null
+      ? `, latency p99 ${duration(figures.p99)}` : '';
+    return ` (now ${rate(figures.rate)}${latency})`;
+  }
+  return '';
+}
+
 /** Returns a finding's text without its leading topic name. @param {any} finding */
 function rest(finding) {
   const name = state.topics.get(finding.topic)?.name;
@@ -82,16 +105,25 @@ function rest(finding) {
     : finding.text;
 }
 
-/** A link to a finding's subject. @param {{finding: import('../state.js').Finding}} props */
-function Place({ finding }) {
+/**
+ * Returns address and title of the view of a finding's subject; null if it is the agent.
+ * @param {import('../state.js').Finding} finding
+ * @returns {[string, string]|null}
+ */
+export function placeOf(finding) {
   const topic = finding.topic == null ? null : state.topics.get(finding.topic);
   if (finding.kind === 'slow_chain') {
-    return html`<a href=${address('chains', null, { filter: topic?.name })}>Chains</a>:`;
+    return [address('chains', null, { filter: topic?.name }), 'Chains'];
   }
-  if (topic) return html`<a href=${topicAddress(topic)}><${Name} text=${topic.name} /></a>:`;
+  if (topic) return [topicAddress(topic), topic.name];
   const node = finding.node == null ? null : state.nodes.get(finding.node);
-  if (node) return html`<a href=${nodeAddress(node)}><${Name} text=${node.name} /></a>:`;
-  return html`<a href=${address('agent')}>Agent</a>:`;
+  return node ? [nodeAddress(node), node.name] : partAddress(finding.kind);
+}
+
+/** A link to a finding's subject. @param {{finding: import('../state.js').Finding}} props */
+function Place({ finding }) {
+  const [href, title] = placeOf(finding) ?? [address('agent'), 'Agent'];
+  return html`<a href=${href}><${Name} text=${title} /></a>:`;
 }
 
 function Totals() {
@@ -120,7 +152,7 @@ function Totals() {
 export function Incomplete({ missing }) {
   const finding = state.findings.find((each) => each.kind === 'unknown_writers');
   return finding && html`<p class="incomplete"><${Mark} severity="warning" />
-    ${' '}${finding.text}: ${missing}. <span class="remedy">Remedy: <${Name}
+    ${' '}${finding.text}: ${missing}. <span class="remedy">Remedy: <${Sentence}
     text=${finding.remedy ?? ''} /></span></p>`;
 }
 

@@ -29,6 +29,20 @@ export function Recordings() {
       ? data.recordings.map((/** @type {any} */ each) => html`<${Recording} key=${each.name}
         recording=${each} again=${again} />`)
       : data.directory && html`<p class="empty">No recording yet.</p>`)}
+    ${data?.kept?.length > 0 && html`<section aria-labelledby="kept"><h2 id="kept">Earlier bags</h2>
+      <p class="dim">Bags of earlier runs of the agent, and snapshots, in <${Name}
+        text=${data.directory} />.</p>
+      <div class="scroll tall" tabindex="0" role="group" aria-labelledby="kept"><table>
+      <thead><tr><th scope="col">Bag</th><th scope="col">Last change</th>
+        <th scope="col" class="number">Size</th><th scope="col">Files</th></tr></thead>
+      <tbody>${data.kept.map((/** @type {any} */ each) => html`<tr key=${each.name}>
+        <th scope="row"><${Name} text=${each.name} />${each.is_complete ? '' : html`
+          <span class="badge warning" title="It was cut off: rp bag reindex writes its metadata"><${Mark}
+          severity="warning" /> cut off</span>`}</th>
+        <td>${date(each.modified_timestamp_seconds)}</td>
+        <td class="number">${bytes(each.file_bytes)}</td>
+        <td><${Files} path=${`recordings/${encodeURIComponent(each.name)}`} name=${each.name} /></td>
+        </tr>`)}</tbody></table></div></section>`}
     <section aria-labelledby="snapshots"><h2 id="snapshots">Snapshots</h2>
     <p class="dim">The agent keeps the last seconds of these topics in memory. It writes them as a bag
       on request, and with the seconds that follow on an event.</p>
@@ -132,7 +146,9 @@ function Files({ path, name }) {
     download(file, await response.blob());
   };
   if (!files) {
-    return html`<${Act} label="Files of ${name}" action=${async () => {
+    return html`<${Act} label="Download ${name} as an archive" action=${async () => {
+      download(`${name}.tar`, await (await request(`${path}/archive`)).blob());
+    }}>Download</${Act}> <${Act} label="Files of ${name}" action=${async () => {
       take((await json(`${path}/files`)).files);
     }}>Files</${Act}>`;
   }

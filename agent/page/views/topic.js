@@ -3,12 +3,13 @@
 import { useEffect, useRef, useState } from '../vendor/hooks.mjs';
 import { json, named } from '../api.js';
 import { Chart } from '../chart.js';
-import { bandwidth, clock, count, duration, percent, rate } from '../format.js';
+import { bandwidth, clock, count, date, duration, percent, rate, several } from '../format.js';
 import { address } from '../router.js';
 import { topicKey } from '../graph-model.js';
 import { LiveMessage } from '../message.js';
 import { Endpoints, Offered } from '../qos.js';
 import { state, stream, useLive, usePoll } from '../store.js';
+import { inWords, useEvents, useHistory, useTime, zoom } from '../timebar.js';
 import { Badges, Failed, Figure, html, Mark, Name, PASSAGES, Text } from '../ui.js';
 import { InChains } from './chains.js';
 import { Inside } from './inside.js';
@@ -19,6 +20,10 @@ const COLUMNS = ['times', 'rate_hertz', 'bandwidth_bytes_per_second', 'lost_mess
   'latency_p50_seconds', 'latency_p99_seconds', 'interarrival_p50_seconds',
   'interarrival_p99_seconds'];
 const HISTORY_AGAIN_MS = 10000;
+/** Time of the charts that the stream continues, in seconds. */
+const LIVE_SPAN = 600;
+/** Most events in the list below the charts. */
+const MOST_MARKED = 100;
 
 /** @param {{name: string, query: Record<string, string>}} props */
 export function Topic({ name, query }) {
@@ -30,7 +35,8 @@ export function Topic({ name, query }) {
   const details = usePoll(topic ? named('topics', apiName(topic), scope) : null, 2000);
   if (!topic) {
     return html`<h1 tabindex="-1"><${Name} text=${name} /></h1>
-      <p>No such topic now. It may have had no endpoint since the agent started.${' '}
+      <p>No such topic ${stream.at == null ? 'now. It may have had no endpoint since the agent started'
+        : 'at that time'}.${' '}
       <a href=${address('topics')}>All topics</a></p>`;
   }
   const figures = state.figuresOf(topic.id);
@@ -61,6 +67,8 @@ export function Topic({ name, query }) {
       <${Figure} label="latency p99" value=${duration(figures.p99)} />
       <${Figure} label="last message" value=${clock(figures.last)} />
     </div>
+    <${Clocks} publishers=${details.data?.publishers ?? []} />
+    ${stream.at == null && html`<${LiveMessage} key=${`message ${topic.id}`} topic=${topic} scope=${scope} name=${apiName(topic)} />`}
     <${Charts} key=${topic.id} topic=${topic} scope=${scope} pick=${(/** @type {{time: number}} */
       { time }) => pick({ time, topic: topic.id })} />
     <${Failed} problem=${details.problem} what="No details" />
@@ -71,9 +79,8 @@ export function Topic({ name, query }) {
         domain=${topic.domain} picked=${picked?.topic === topic.id ? picked : null} />
       <${Waterfall} details=${details.data} />
       <${Passages} details=${details.data} />`}
-    <${Definition} key=${`definition ${topic.id}`} path=${named('topics', apiName(topic),
-      `/definition${scope}`)} />
-    <${LiveMessage} key=${`message ${topic.id}`} topic=${topic} scope=${scope} name=${apiName(topic)} />`;
+    ${stream.at == null && html`<${Definition} key=${`definition ${topic.id}`}
+      path=${named('topics', apiName(topic), `/definition${scope}`)} />`}`;
 }
 
 /** Returns the name for addresses: the DDS name if it has no ROS name. @param {any} topic */
@@ -81,13 +88,82 @@ function apiName(topic) {
   return topic.kind === 'dds' ? topic.ddsName : topic.name;
 }
 
+/** How wrong latencies from other hosts are. @param {{publishers: any[]}} props */
+function Clocks({ publishers }) {
+  const hosts = new Map(publishers.filter((each) => each.clock).map((each) =>
+    [each.clock.peer, each.clock]));
+  return html`${[...hosts.values()].map((each) => html`<p key=${each.peer} class="dim">
+    ${each.correction_seconds == null
+      ? html`The clock of <${Name} text=${each.peer} /> has an unknown offset: latencies from there
+        may be wrong by any time.`
+      : html`Add ${duration(each.correction_seconds)} (± ${duration(each.uncertainty_seconds)}) to
+        latencies from <${Name} text=${each.peer} />, because of its clock.`}</p>`)}`;
+}
+
 /** @param {{topic: import('../state.js').Topic, scope: string,
  *   pick: (picked: {time: number}) => void}} props */
 function Charts({ topic, scope, pick }) {
+  const shown = useTime();
+  const path = named('topics', apiName(topic), `/history${scope}`);
+  const isLive = shown.at == null && shown.span === LIVE_SPAN;
+  const latest = useLatest(isLive ? path : null, topic);
+  const past = useHistory(isLive ? null : path, shown);
+  const columns = isLive ? latest : COLUMNS.map((column) => past.data?.[column] ?? []);
+  const events = useEvents(shown).filter((event) => event.attributes.topic === topic.name
+    || (event.attributes.topic == null && event.severity !== 'INFO'));
+  const marks = events.map((event) => ({ time: Date.parse(event.time) / 1000,
+    severity: event.severity }));
+  const [times, rates, sizes, lost, half, most, gapHalf, gapMost] = columns;
+  const title = inWords(shown);
+  if (!times.length) {
+    return html`<p class="dim">${past.problem ? `No history: ${past.problem.message}`
+      : !isLive && !past.data ? 'Reading the history …'
+        : topic.measured ? 'No second has been measured yet.'
+          : 'The topic is not measured: no charts.'}</p>`;
+  }
+  const own = /** @type {number[]} */ (times);
+  const chart = (/** @type {Record<string, any>} */ props) => html`<${Chart} times=${own} range=${title}
+    marks=${marks} select=${state.open?.keeps_history ? zoom : undefined} ...${props} />`;
+  return html`<section aria-labelledby="course"><h2 id="course">${title}</h2>
+    ${state.open?.keeps_history && html`<p class="dim by-mouse">Drag over a part of a chart to see it alone.</p>`}
+    <div class="charts">
+    ${chart({ title: 'Rate', print: rate,
+      lines: [{ label: 'rate', colour: '--line-1', values: rates, fill: true }] })}
+    ${chart({ title: 'Bandwidth', print: bandwidth,
+      lines: [{ label: 'bandwidth', colour: '--line-2', values: sizes, fill: true }] })}
+    ${chart({ title: 'Time between messages', print: duration, lines: [
+      { label: 'p50', colour: '--line-1', values: gapHalf },
+      { label: 'p99', colour: '--line-3', values: gapMost }] })}
+    ${chart({ title: 'Latency', print: duration, lines: [
+      { label: 'p50', colour: '--line-1', values: half },
+      { label: 'p99', colour: '--line-3', values: most }],
+      note: `From the writer’s timestamp to the capture; between hosts it needs equal clocks.${
+        shown.at == null ? ` A click, or Enter at the cursor, observes calls and lists the late ones of
+        that time` : ''}`, pick: shown.at == null ? pick : undefined })}
+    ${chart({ title: 'Lost messages', print: count, whole: true,
+      lines: [{ label: 'lost', colour: '--line-4', values: lost, fill: true }] })}
+    </div><${Marked} events=${events} /></section>`;
+}
+
+/** The events that the charts mark. @param {{events: import('../state.js').Event[]}} props */
+function Marked({ events }) {
+  if (!events.length) return null;
+  return html`<details><summary>${several(events.length, 'event')} in this time</summary>
+    <ul class="plain">${events.slice(-MOST_MARKED).map((event) => html`<li key=${event.id}>
+      ${date(Date.parse(event.time) / 1000)} ${event.name}</li>`)}</ul></details>`;
+}
+
+/**
+ * Returns the columns of the last minutes. Between two requests the stream provides the latest
+ * second.
+ * @param {string|null} path
+ * @param {import('../state.js').Topic} topic
+ */
+function useLatest(path, topic) {
   const columns = useRef(/** @type {(number|null)[][]} */ (COLUMNS.map(() => [])));
   const [, draw] = useState(0);
-  const path = named('topics', apiName(topic), `/history${scope}`);
   useEffect(() => {
+    if (path == null) return undefined;
     const abort = new AbortController();
     let timer = 0;
     const ask = async () => {
@@ -109,39 +185,16 @@ function Charts({ topic, scope, pick }) {
     };
   }, [path]);
   const [times] = columns.current;
-  // Between two requests the stream provides the latest second.
   const { rate: hertz, bandwidth: size, lostNow, p50, p99 } = state.figuresOf(topic.id);
   const last = times[times.length - 1] ?? 0;
-  if (hertz != null && state.time >= Number(last) + 0.9) {
+  if (path != null && hertz != null && state.time >= Number(last) + 0.9) {
     [state.time, hertz, size, lostNow, p50, p99, null, null].forEach((value, at) => {
       const own = columns.current[at];
       own.push(value);
-      if (own.length > (state.open?.history_seconds ?? 600)) own.shift();
+      if (own.length > (state.open?.history_seconds ?? LIVE_SPAN)) own.shift();
     });
   }
-  const [, rates, sizes, lost, half, most, gapHalf, gapMost] = columns.current;
-  if (!times.length) {
-    return html`<p class="dim">${topic.measured ? 'No second has been measured yet.'
-      : 'The topic is not measured: no charts.'}</p>`;
-  }
-  const own = /** @type {number[]} */ (times);
-  return html`<section aria-labelledby="course"><h2 id="course">The last ten minutes</h2>
-    <div class="charts">
-    <${Chart} title="Rate" times=${own} print=${rate}
-      lines=${[{ label: 'rate', colour: '--line-1', values: rates, fill: true }]} />
-    <${Chart} title="Bandwidth" times=${own} print=${bandwidth}
-      lines=${[{ label: 'bandwidth', colour: '--line-2', values: sizes, fill: true }]} />
-    <${Chart} title="Time between messages" times=${own} print=${duration} lines=${[
-      { label: 'p50', colour: '--line-1', values: gapHalf },
-      { label: 'p99', colour: '--line-3', values: gapMost }]} />
-    <${Chart} title="Latency" times=${own} print=${duration} lines=${[
-      { label: 'p50', colour: '--line-1', values: half },
-      { label: 'p99', colour: '--line-3', values: most }]}
-      note="From the writer’s timestamp to the capture; between hosts it needs equal clocks. A click, or
-        Enter at the cursor, observes calls and lists the late ones of that time" pick=${pick} />
-    <${Chart} title="Lost messages" times=${own} print=${count} whole
-      lines=${[{ label: 'lost', colour: '--line-4', values: lost, fill: true }]} />
-    </div></section>`;
+  return columns.current;
 }
 
 /** The definition of the topic's type, requested when it is opened. @param {{path: string}} props */
@@ -212,7 +265,7 @@ function Waterfall({ details }) {
         <td><${Bar} delivered=${delivered} queue=${queue ?? 0} total=${total} /></td></tr>`;
     })}</tbody></table></div>
     ${received.some((/** @type {any} */ each) => each.lost_in_reader_queue_messages == null)
-      && html`<p class="dim">–: the queue is unseen, because the takes of that subscriber are not
+      && html`<p class="dim">–: the queue is not observed, because the takes of that subscriber are not
         observed, or not alone (capture.inside).</p>`}</section>`;
 }
 

@@ -15,6 +15,7 @@ const VIEWS = [
   ['#/chains', 'main .empty, main tbody tr[data-row]'],
   ['#/nodes', 'main tbody tr[data-row]'],
   ['#/nodes/%2Flidar?domain=0', 'main ul.plain'],
+  ['#/robot/services', 'main .empty, main tbody tr[data-row]'],
   ['#/events', 'main tbody tr'],
   ['#/recordings', 'form'],
   ['#/agent', 'section[aria-labelledby="limits"] tbody tr'],

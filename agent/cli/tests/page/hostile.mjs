@@ -72,7 +72,7 @@ await scenario(async (open) => {
   await harmless('events');
 
   // The worker computes the layout of the graph of all topics while the page stays responsive.
-  await tab.go('#/graph?boxes=none&hidden=1');
+  await tab.go('#/graph?boxes=none&hidden=1&fold=none');
   await until('the layout', async () => /laid out in \d+ ms/.test(await tab.text()), 60_000);
   await harmless('graph');
   const shown = await tab.page.locator('.vertex').count();
@@ -83,6 +83,11 @@ await scenario(async (open) => {
   await until('results', async () => (await tab.page.locator('.results li').count()) > 1);
   await harmless('search');
   await tab.escape();
+  // Topics between two nodes are words of an edge.
+  await tab.go('#/graph?boxes=none&hidden=1&mode=nodes');
+  const folded = tab.page.locator('.edge title', { hasText: '/s' });
+  await until('names at an edge', async () => (await folded.count()) > 0, 60_000);
+  await harmless('a graph of nodes');
 
   const phone = await open({ fragment: '#/topics', width: 360, height: 740 });
   await phone.live();

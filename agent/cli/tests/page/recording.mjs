@@ -58,8 +58,22 @@ await scenario(async (open) => {
     assert.equal(bytes.length, size, `${name} is the agent's file`);
   }
 
-  const row = tab.page.locator('tr', { hasText: 'incident' });
+  const row = tab.page.locator('section[aria-labelledby="snapshots"] tr', { hasText: 'incident' });
   await until('messages in memory', async () => /[1-9][\d,]* messages?,/.test(await row.innerText()));
   await row.getByRole('button', { name: 'Write now: snapshot incident' }).click();
   await until('a bag of it', async () => /[1-9][\d,]* messages in /.test(await row.innerText()));
+
+  // The bags stay in the list after a restart of the agent. The browser reports the lost requests.
+  tab.expect(/ERR_|Failed to load|Failed to fetch|NetworkError/);
+  await ask('restart');
+  await tab.go('#/recordings');
+  const earlier = tab.page.locator('section[aria-labelledby="kept"]');
+  await until('the earlier bags', async () => (await earlier.locator('tbody tr').count()) === 2);
+  const kept = earlier.locator('tr', { hasText: 'lap-one' });
+  assert.doesNotMatch(await kept.innerText(), /cut off/);
+  await kept.getByRole('button', { name: 'Files of lap-one' }).click();
+  const waiting = tab.page.waitForEvent('download');
+  await kept.getByRole('button', { name: 'Download metadata.yaml' }).click();
+  assert.equal(readFileSync(await (await waiting).path()).toString(), metadata);
+  await tab.accessible('earlier bags');
 });

@@ -41,7 +41,6 @@ async function topics(tab) {
   assert.ok(!(await names()).includes('/rosout') || (await names()).length > 4);
   // The topics are sorted by rate, with the fastest first and absent rates last.
   await tab.page.getByRole('button', { name: /^Rate/ }).click();
-  await tab.page.getByRole('button', { name: /^Rate/ }).click();
   await until('sorted by rate', async () => (await names())[0] === '/imu');
   assert.equal(await tab.page.locator('th[aria-sort]').getAttribute('aria-sort'), 'descending');
   await tab.page.getByLabel('Filter').fill('point cloud2');
@@ -120,6 +119,9 @@ async function graph(tab) {
   await tab.page.getByRole('button', { name: 'Show all' }).click();
   await vertex('/cmd_vel').waitFor();
   await gone(vertex('/rosout'));
+  // One pair is within a process.
+  const styles = await tab.inked();
+  assert.ok(styles.network > 1 && styles.shared_memory && styles.unseen, JSON.stringify(styles));
   // The edges of /points transport megabytes and are wide.
   const widths = await until('edges', async () => {
     const all = await tab.page.locator('.edge .line').evaluateAll((lines) => lines.map((line) =>
@@ -143,6 +145,19 @@ async function graph(tab) {
   const before = await scale();
   await tab.page.getByRole('button', { name: 'Zoom in' }).click();
   await until('a larger picture', async () => (await scale()) !== before);
+  await tab.page.getByRole('button', { name: 'Fit' }).click();
+  // Names are legible, a field finds a vertex, and colours can mean something else.
+  const legible = async () => 12 * Number(/scale\(([\d.]+)\)/.exec(await scale())[1]);
+  assert.ok(await legible() >= 10.9, `${await legible()} px`);
+  await tab.page.getByRole('button', { name: 'Close the details' }).click();
+  await gone(tab.page.locator('#graph-panel'));
+  await tab.page.getByLabel('Find', { exact: true }).fill('imu_dri');
+  await tab.page.keyboard.press('Enter');
+  await reads(tab.page.locator('#graph-panel'), '/imu_driver');
+  await tab.page.getByRole('combobox', { name: 'Colour' }).selectOption('process');
+  await until('colours of processes', async () => (await tab.page.locator('.vertex.tinted').count()) >= 3);
+  await tab.page.getByRole('combobox', { name: 'Colour' }).selectOption('');
+  await gone(tab.page.locator('.vertex.tinted'));
   await tab.page.getByRole('button', { name: 'Fit' }).click();
   // Positions stay while figures change.
   const place = await vertex('/lidar').boundingBox();
@@ -207,7 +222,11 @@ async function events(tab) {
   await tab.heading('Events');
   await tab.shows('ros2.node.');
   const rows = () => tab.page.locator('main tbody tr').count();
-  const all = await rows();
+  // Endpoints come by the dozen with each node and are hidden at first.
+  const notable = await rows();
+  assert.equal(await tab.page.getByText('ros2.endpoint.discovered').count(), 0);
+  await tab.page.getByRole('combobox', { name: /^Show/ }).last().selectOption('ALL');
+  const all = await until('all events', async () => (await rows()) > notable && rows());
   await tab.page.getByLabel('Filter').fill('/lidar');
   await until('filtered events', async () => (await rows()) > 0 && (await rows()) < all);
   await tab.page.getByRole('button', { name: 'Pause' }).last().click();

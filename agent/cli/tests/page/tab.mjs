@@ -225,6 +225,20 @@ export class Tab {
     assert.deepEqual(await this.page.evaluate(looked, UNSEEN.source), [], what);
   }
 
+  /** Fails if an edge of the graph is not drawn. Returns the number of edges by their style. */
+  async inked() {
+    const edges = await this.page.locator('.edge').evaluateAll((all) => all.map((edge) => {
+      const line = edge.querySelector('.line');
+      const [own, drawn] = [getComputedStyle(edge), getComputedStyle(line)];
+      const isSeen = own.clipPath === 'none' && own.display !== 'none' && own.visibility === 'visible'
+        && drawn.stroke !== 'none' && Number(drawn.strokeOpacity) > 0.3
+        && parseFloat(drawn.strokeWidth) > 0 && line.getTotalLength() > 5;
+      return [edge.getAttribute('class').split(' ')[1], isSeen];
+    }));
+    assert.deepEqual(edges.filter(([, isSeen]) => !isSeen), [], 'edges without ink');
+    return edges.reduce((sum, [style]) => ({ ...sum, [style]: (sum[style] ?? 0) + 1 }), {});
+  }
+
   /** Fails if the page scrolls sideways, with the names of elements that are too wide. */
   async narrow(what) {
     const wide = await this.page.evaluate(() => {

@@ -28,9 +28,11 @@ async function loopback(open, browser) {
   await tab.page.getByRole('button', { name: 'Use this token' }).click();
   await tab.live();
   await tab.shows(/Rights at this address\s+read/);
+  await tab.shows('The token of this tab is no longer valid', 'body');
   await tab.page.getByRole('button', { name: 'Enter a token' }).click();
   await tab.page.getByRole('button', { name: 'Forget the token' }).click();
   await tab.live();
+  await gone(tab.page.locator('.notice'));
 
   // The page is opened at the address of `rp page`.
   const { printed } = await ask('rp page');

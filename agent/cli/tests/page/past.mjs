@@ -1,0 +1,72 @@
+// What happened before the agent and the robot were restarted: the history on disk shows the former
+// robot's topics, charts, processes and events, and the page returns to the present.
+
+import assert from 'node:assert/strict';
+import { ask, gone, reads, scenario, there, until } from './tab.mjs';
+
+await scenario(async (open) => {
+  const { begin, end } = await ask('another robot after a restart');
+  const tab = await open({ fragment: '#/topics' });
+  await tab.live();
+  const { page } = tab;
+  const row = (name) => page.locator('main tbody tr[data-row]', { hasText: name });
+  await row('/after_restart').waitFor();
+  assert.equal(await row('/imu').count(), 0, 'the former robot is gone');
+
+  // An address of the past shows the robot as it was.
+  await page.goto(`${page.url().split('#')[0]}#/topics?at=${end}&span=${end - begin}`);
+  await reads(page.locator('.notice'), 'The robot as it was');
+  await until('its figures', async () => /Hz/.test(await row('/imu').innerText()));
+  assert.equal(await row('/after_restart').count(), 0);
+  await tab.accessible('the past');
+
+  // Its links keep the time.
+  await row('/imu').getByRole('link', { name: '/imu' }).click();
+  const charts = page.locator('.chart');
+  await there(charts);
+  assert.ok(page.url().includes(`at=${end}`), page.url());
+  const rate = charts.filter({ has: page.getByRole('heading', { name: 'Rate' }) });
+  await reads(rate, /maximum 20\d Hz/);
+  await tab.accessible('a topic of the past');
+
+  // A part of a chart is dragged over, and shown alone; the browser's Back returns.
+  const before = page.url();
+  const over = rate.locator('.u-over');
+  const box = await over.boundingBox();
+  await page.mouse.move(box.x + box.width * 0.4, box.y + 40);
+  await page.mouse.down();
+  await page.mouse.move(box.x + box.width * 0.8, box.y + 40, { steps: 4 });
+  await page.mouse.up();
+  await until('a shorter time', async () => {
+    const span = Number(/span=(\d+)/.exec(page.url())?.[1]);
+    return span >= 5 && span < end - begin;
+  });
+  await page.goBack();
+  await until('the time before', async () => page.url() === before);
+
+  // Events and processes of that time.
+  await page.getByRole('link', { name: 'Events', exact: true }).first().click();
+  await reads(page.locator('main'), 'ros2.node.discovered');
+  await page.getByRole('navigation').getByRole('link', { name: 'Nodes' }).click();
+  await page.getByRole('link', { name: '/lidar', exact: true }).first().click();
+  await there(page.locator('.chart').filter({ has: page.getByRole('heading', { name: 'CPU' }) }));
+  await page.getByRole('navigation').getByRole('link', { name: 'Robot' }).click();
+  await reads(page.locator('main'), 'This view has no history');
+
+  // A time without an agent.
+  await page.goto(`${page.url().split('#')[0]}#/topics?at=1000000`);
+  await reads(page.locator('.notice'), 'The robot’s state at that time is unknown');
+  tab.expect(/^error: Failed to load resource.*404/);
+
+  await page.getByRole('button', { name: 'Now' }).click();
+  await tab.live();
+  await row('/after_restart').waitFor();
+  await gone(page.locator('.notice'));
+
+  // The graph compared with a moment before the restart.
+  await page.goto(`${page.url().split('#')[0]}#/graph?against=3`);
+  const differences = page.getByRole('region', { name: 'Differences' });
+  await reads(differences, /New nodes[^]*\/other/);
+  await reads(differences, /Nodes that went[^]*\/lidar/);
+  await there(page.locator('.vertex.came'));
+});

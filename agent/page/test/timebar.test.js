@@ -1,0 +1,43 @@
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+import { address, keepTime, parse } from '../router.js';
+
+// The module reads the address of the page.
+Object.assign(globalThis, {
+  location: { hash: '' },
+  document: { addEventListener() {}, visibilityState: 'visible' },
+  window: { addEventListener() {} },
+});
+const { inWords, showTime, timeOf } = await import('../timebar.js');
+
+test('the time of an address is bounded', () => {
+  assert.deepEqual(timeOf({}), { span: 600, at: null });
+  assert.deepEqual(timeOf({ span: '3600', at: '1790000000' }), { span: 3600, at: 1790000000 });
+  for (const [span, at] of [['-1', '-1'], ['x', 'x'], ['1e99', '1e99'], ['', '']]) {
+    assert.deepEqual(timeOf({ span, at }), { span: 600, at: null });
+  }
+});
+
+test('every address keeps the time until it is given up', () => {
+  keepTime({ span: '3600', at: '1790000000', filter: 'x' });
+  assert.equal(address('topics', '/a'), '#/topics/%2Fa?span=3600&at=1790000000');
+  assert.equal(address('topics', null, { at: null, sort: 'name' }), '#/topics?span=3600&sort=name');
+  keepTime({});
+  assert.equal(address('topics'), '#/topics');
+});
+
+test('a change of the time keeps the rest of the address', () => {
+  const hash = () => globalThis.location.hash;
+  globalThis.location.hash = '#/topics/%2Fa?domain=0';
+  showTime({ span: 3600 });
+  assert.deepEqual(parse(hash())?.query, { domain: '0', span: '3600' });
+  showTime({ at: 1790000000.4 });
+  assert.deepEqual(parse(hash())?.query, { domain: '0', span: '3600', at: '1790000000' });
+  showTime({ at: null, span: 600 });
+  assert.equal(hash(), '#/topics/%2Fa?domain=0');
+});
+
+test('a time is named', () => {
+  assert.equal(inWords({ span: 3600, at: null }), 'The last hour');
+  assert.match(inWords({ span: 60, at: 1790000000 }), / to /);
+});
