@@ -203,7 +203,7 @@ pub enum Diagnosis<'a> {
     TransformFault {
         /// Namespace of the topics; empty for `/tf`.
         namespace: Cow<'a, str>,
-        /// `silent`, `several_broadcasters`, `time_went_back` or `apart`.
+        /// `silent`, `several_broadcasters`, `time_went_back`, `jumps`, `apart` or `unknown_frame`.
         fault: Cow<'static, str>,
         /// Parent frame of the edge; empty if the fault is `apart`.
         parent: Cow<'a, str>,
@@ -222,6 +222,54 @@ pub enum Diagnosis<'a> {
         offset_seconds: f64,
         /// The offset was wrong by at most this time.
         uncertainty_seconds: f64,
+    },
+    /// The topic has a publisher without a subscription, and a similar topic of the same type has a
+    /// subscription without a publisher.
+    NearMiss {
+        /// Topic of the subscription.
+        subscription: Cow<'a, str>,
+        /// Domain of the subscription.
+        subscription_domain_id: u32,
+        /// `case`, `slash`, `namespace`, `letter` or `domain`.
+        difference: Cow<'static, str>,
+    },
+    /// A managed node has not been active for at least 5 s, although the configuration expects it or
+    /// its last transition failed.
+    NodeInactive {
+        /// State of the node.
+        state: Cow<'static, str>,
+        /// Whether a transition failed since it was last active.
+        failed: bool,
+    },
+    /// A parameter of the node has another value than the configuration expects.
+    ParameterDrift {
+        /// Name of the parameter.
+        name: Cow<'a, str>,
+        /// Value that the configuration expects, as YAML.
+        expected: Cow<'a, str>,
+        /// Last known value.
+        value: Cow<'a, str>,
+    },
+    /// Some nodes of the domain use simulated time (`use_sim_time`), and others do not.
+    MixedTime {
+        /// Nodes with simulated time, at most four.
+        simulated: Vec<Cow<'a, str>>,
+        /// Nodes without it, at most four.
+        system: Vec<Cow<'a, str>>,
+    },
+    /// Stamps in the headers of the publisher's messages cannot be right.
+    WrongStamps {
+        /// GUID of the writer.
+        writer: String,
+        /// `future`, `went_back`, `drifting` or `other_clock`.
+        fault: Cow<'static, str>,
+        /// Time by which they were wrong when the problem appeared.
+        offset_seconds: f64,
+    },
+    /// A directory of shared memory is nearly full: Fast DDS then falls back to the network, or fails.
+    SharedMemoryFull {
+        /// Share of its space in use when that was noticed.
+        used_ratio: f64,
     },
     /// A configured chain that ends with the topic exceeds its maximum latency.
     SlowChain {
@@ -262,6 +310,12 @@ impl Diagnosis<'_> {
             Self::DiagnosticError { .. } => "diagnostic_error",
             Self::TransformFault { .. } => "transform_fault",
             Self::ClocksApart { .. } => "clocks_apart",
+            Self::NearMiss { .. } => "near_miss",
+            Self::NodeInactive { .. } => "node_inactive",
+            Self::ParameterDrift { .. } => "parameter_drift",
+            Self::MixedTime { .. } => "mixed_time",
+            Self::WrongStamps { .. } => "wrong_stamps",
+            Self::SharedMemoryFull { .. } => "shared_memory_full",
             Self::SlowChain { .. } => "slow_chain",
         }
     }

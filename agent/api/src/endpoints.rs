@@ -49,9 +49,25 @@ pub struct Endpoint<'a> {
     pub backends: Vec<Cow<'a, str>>,
     /// Counts and times of this writer; null for readers and for topics that are not watched.
     pub measurement: Option<Measurement>,
+    /// Clock of this writer's host, compared with that of the agent. Null for writers of the agent's
+    /// host, without a measurement, and if clocks are not compared.
+    pub clock: Option<WriterClock<'a>>,
     /// The last message of this writer, if it is transient local and the agent keeps such messages;
     /// null for readers and for other writers.
     pub latched: Option<Latched>,
+}
+
+/// The clock of the host of a writer. Its latencies are wrong by the correction.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct WriterClock<'a> {
+    /// Name of the host, or its address.
+    pub peer: Cow<'a, str>,
+    /// Seconds to add to a latency of this writer; null while the offset of the clocks is unknown.
+    pub correction_seconds: Option<f64>,
+    /// The correction is wrong by at most this time.
+    pub uncertainty_seconds: Option<f64>,
 }
 
 impl Endpoint<'_> {

@@ -26,6 +26,7 @@ pub mod endpoints;
 pub mod events;
 pub mod graph;
 pub mod health;
+pub mod history;
 pub mod inside;
 pub mod latched;
 pub mod live;

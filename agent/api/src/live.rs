@@ -49,6 +49,9 @@ pub struct Open {
     pub interval_seconds: u32,
     /// Seconds that `/topics/{topic}/history` covers.
     pub history_seconds: u64,
+    /// Whether the agent keeps a history of the last days (`/history`).
+    #[serde(default)]
+    pub keeps_history: bool,
     /// Meaning of the bits of a topic's flags, starting with the lowest bit.
     pub flags: Vec<Cow<'static, str>>,
     /// Meaning of the bits of passages, starting with the lowest bit.

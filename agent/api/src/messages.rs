@@ -69,6 +69,46 @@ pub struct Message<V> {
     pub value: Option<V>,
     /// Why the message cannot be decoded; null if it can be decoded.
     pub error: Option<String>,
+    /// A small picture of the message, if the request has `preview=true` and the type has one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub preview: Option<Preview>,
+    /// Why the message has no preview.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub preview_error: Option<String>,
+}
+
+/// A small picture of a message: an object with one member.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = MessagesPreview))]
+#[serde(rename_all = "snake_case")]
+pub enum Preview {
+    /// Pixels of an image or a map, at most 320 on each side.
+    Picture {
+        /// Width in pixels.
+        width: u32,
+        /// Height in pixels.
+        height: u32,
+        /// Width and height in the message.
+        source: [u32; 2],
+        /// Red, green and blue of each pixel, row by row from the top, in Base64.
+        rgb: String,
+    },
+    /// An image as its node compressed it, at most 512 KiB.
+    Encoded {
+        /// Format as the message names it.
+        format: String,
+        /// The compressed image in Base64.
+        data: String,
+    },
+    /// Points of a scan or a cloud, at most 4000.
+    Points {
+        /// Number of points in the message.
+        total: u64,
+        /// x, y and z of each point in metres, as little-endian floats in Base64.
+        xyz: String,
+    },
+    /// Poses seen from above, at most 4000: x and y in metres, yaw in radians.
+    Poses(Vec<[f64; 3]>),
 }
 
 /// Messages that cannot be shown.

@@ -45,6 +45,9 @@ pub struct Node<'a> {
     pub action_servers: Vec<Named<'a>>,
     /// Actions that the node calls.
     pub action_clients: Vec<Named<'a>>,
+    /// Last known state of a managed node: `unconfigured`, `inactive`, `active`, `finalized`, or a
+    /// state of transition; null when unknown.
+    pub lifecycle_state: Option<Cow<'a, str>>,
     /// Problems of the node. Problems of its topics are in `/topics`.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<Diagnosis<'static>>))]
     pub diagnoses: Vec<Finding<'a>>,

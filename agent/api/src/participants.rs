@@ -141,6 +141,8 @@ pub struct ProcessUsage {
     pub process_id: u32,
     /// Name of the process.
     pub process: String,
+    /// File or module that an interpreter runs (`robot.py`); null for another program.
+    pub script: Option<String>,
     /// CPU time since the process started, in seconds. The CPU share is the difference of two
     /// readings, divided by the time between them.
     pub cpu_seconds: f64,

@@ -25,6 +25,8 @@ pub enum Code {
     NoSuchTopic,
     /// The node does not exist.
     NoSuchNode,
+    /// No history is kept, or none of that time.
+    NoHistory,
     /// The name exists several times; the request must select one of them.
     Ambiguous,
     /// The path exists, but not with this method.
@@ -127,6 +129,7 @@ impl Code {
             Self::NoSuchWatch => ("no-such-watch", 404, "No such watch"),
             Self::NoSuchTopic => ("no-such-topic", 404, "No such topic"),
             Self::NoSuchNode => ("no-such-node", 404, "No such node"),
+            Self::NoHistory => ("no-history", 404, "No history"),
             Self::Ambiguous => ("ambiguous", 409, "The name is ambiguous"),
             Self::MethodNotAllowed => ("method-not-allowed", 405, "Method not allowed"),
             Self::WatchDiffers => ("watch-differs", 409, "Watched with other settings"),

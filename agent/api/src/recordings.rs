@@ -14,8 +14,30 @@ pub struct RecordingList {
     pub directory: Option<String>,
     /// Running recordings, and the most recently ended recordings.
     pub recordings: Vec<Recording>,
+    /// Bags in the directory that this run of the agent did not begin: those of earlier runs, and
+    /// snapshots. The latest 200, the last one first. Empty if the storage does not answer within 2 s.
+    pub kept: Vec<KeptBag>,
     /// Limits of the disk space that recordings use.
     pub limits: RecordingLimits,
+}
+
+/// A bag in the directory of recordings. `GET /recordings/{name}/files` lists its files.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct KeptBag {
+    /// Name of its directory.
+    pub name: String,
+    /// Path of the bag on the robot.
+    pub directory: String,
+    /// Unix time of the last change of its directory.
+    pub modified_timestamp_seconds: f64,
+    /// Total size of its files of messages, in bytes.
+    pub file_bytes: u64,
+    /// Number of files of messages.
+    pub files: usize,
+    /// Whether it has metadata. `rp bag reindex` writes those of a bag that was cut off.
+    pub is_complete: bool,
 }
 
 /// Limits of the disk space that recordings use. A recording that reaches a limit ends with a

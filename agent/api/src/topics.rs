@@ -239,8 +239,10 @@ pub enum ReasonCode {
     Quiet,
 }
 
-/// Measurements of the last seconds of a topic. All columns have the same length. A null value
-/// means that the topic was not measured in that second, or that no value exists.
+/// Measurements of a topic over some time. All columns have the same length. A null value means
+/// that the topic was not measured in that second, or that no value exists. If a row covers
+/// several seconds (`interval_seconds`), counts are sums, rates and medians are means, and the
+/// highest of the 99th percentiles is shown.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]

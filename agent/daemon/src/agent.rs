@@ -30,7 +30,8 @@ use crate::state::{StateDirectory, StateWriter};
 use crate::subscriptions::{Caps, Subscriptions};
 use crate::supervise::{Responder, Supervisor, Surfaces, Worker};
 use crate::surface::api::reload::Reloads;
-use crate::surface::api::{self, reload};
+use crate::surface::api::{self, HistoryWriter, reload};
+use crate::surface::field_metrics::FieldMetrics;
 use crate::surface::foxglove;
 use crate::surface::http::Server;
 use crate::surface::ros2_daemon::Ros2Daemon;
@@ -94,7 +95,7 @@ pub struct Components<'a> {
     /// Directory of recordings. `None` means that recordings are refused.
     pub recordings: Option<PathBuf>,
     /// Definitions of messages.
-    pub library: Library,
+    pub library: Arc<Library>,
     /// Time span of the figures kept for topics; zero means none.
     pub history: Duration,
     /// Addresses at which the page is served.
@@ -131,7 +132,7 @@ impl Components<'_> {
         let subscriptions =
             Subscriptions::new(Arc::clone(&sources.latest), caps, self.stop.clone());
         let subscriptions = Arc::new(subscriptions);
-        let library = Arc::new(self.library);
+        let library = self.library;
         let recordings = Arc::new(Recordings::new(recording::Components {
             directory: self.recordings,
             limits: config.recordings.limits,
@@ -190,6 +191,7 @@ impl Components<'_> {
             recordings,
             snapshots: Arc::new(snapshots),
             live: Arc::new(api::Live::new(config.history)),
+            disk_history: sources.disk_history,
             library,
             viewers: sources.viewers,
             ros2_daemon: sources.ros2_daemon,
@@ -219,6 +221,8 @@ pub fn run(options: Options) -> Result<()> {
     source.announce(&config.capture);
     let mut sources = MetricSources::new(source.kind(), Settings::new(&config));
     sources.lost_lines = log.lost_lines();
+    let library = Arc::new(library());
+    sources.fields = Arc::new(FieldMetrics::new(&config.extractions, Arc::clone(&library)));
     let watches = watches(&config, options.watch, &sources)?;
     let (server, mut control) = listeners(&config, &sources)?;
     // A replay runs as the user of the command line and accesses that user's files.
@@ -233,6 +237,15 @@ pub fn run(options: Options) -> Result<()> {
     let viewers = foxglove::Server::open(&config.foxglove, &config.api, &sources.viewers)?;
     let mut state = KeptState::open(&source, &config, &watches);
     let recordings = memory::recordings(&config.recordings.directory, state.directory());
+    let kept = history(&config, &control);
+    if let Some(state) = state.directory()
+        && !kept.is_zero()
+        && config.history_bytes > 0
+    {
+        sources
+            .disk_history
+            .keep_in(state.path(), config.history_bytes);
+    }
     let worker = worker(&mut source)?;
     let responder = Responder::start().context("cannot start the thread that answers requests")?;
     let spans = Arc::<SpanQueue>::default();
@@ -253,6 +266,7 @@ pub fn run(options: Options) -> Result<()> {
 
     let mut observer = Observer::new(settings(&config, options.replay.is_none()));
     observer.input(Input::ExpectedChains(Arc::new(config.chains.clone())));
+    observer.input(Input::RobotExpectations(config.expectations()));
     state.restore(&mut observer, &source);
     let stop = CancellationToken::new();
     let components = Components {
@@ -267,8 +281,8 @@ pub fn run(options: Options) -> Result<()> {
             .keep(&watches)
             .context("cannot start the threads that keep state")?,
         recordings,
-        library: library(),
-        history: history(&config, &control),
+        library,
+        history: kept,
         addresses: page_addresses(&config, &control),
         stop: stop.clone(),
     };
@@ -403,12 +417,17 @@ fn supervise(
         .build();
     let runtime = runtime.context("cannot start the runtime of signals")?;
     let watches = Arc::clone(&supervisor.watches);
+    let history = HistoryWriter::start(surfaces.context.clone());
+    let history = history.context("cannot start the thread of the history")?;
     let (recordings, snapshots) = (
         Arc::clone(&surfaces.context.recordings),
         Arc::clone(&surfaces.context.snapshots),
     );
     let ended = supervisor.run(worker, run, responder, surfaces, report);
     let ended = runtime.block_on(ended);
+    if let Some(history) = history {
+        history.finish();
+    }
     snapshots.finish();
     recordings.finish();
     watches.finish();

@@ -62,6 +62,8 @@ pub enum Reader {
     Stream,
     /// The exporter of log records.
     Otlp,
+    /// The history on disk.
+    History,
 }
 
 /// Position in the events of a run.
@@ -383,13 +385,14 @@ impl Entry {
 }
 
 impl Reader {
-    const ALL: [Self; 2] = [Self::Stream, Self::Otlp];
+    const ALL: [Self; 3] = [Self::Stream, Self::Otlp, Self::History];
 
     /// Returns the label value.
     const fn reason(self) -> &'static str {
         match self {
             Self::Stream => "stream_lagged",
             Self::Otlp => "otlp_lagged",
+            Self::History => "history_lagged",
         }
     }
 }

@@ -7,6 +7,7 @@
 //! - [`snapshot_cell`] holds the latest snapshot, [`events`] the log of events, [`limit_facts`] the
 //!   caps.
 //! - [`surface`] serves snapshots: Prometheus, the API and the page. OTLP exports them.
+//! - [`disk_history`] is the history of the last days.
 //! - [`subscriptions`] and [`recording`] pass single messages into streams and bags.
 //!
 //! ```
@@ -23,6 +24,7 @@ pub mod agent;
 pub mod agent_facts;
 pub mod config;
 mod control;
+pub mod disk_history;
 pub mod escape;
 pub mod events;
 pub mod file;

@@ -40,8 +40,9 @@ const MAX_BYTES: u64 = 64 << 20;
 const PERIOD: Duration = Duration::from_secs(3);
 /// Time after a failure until the next attempt, if nothing has changed.
 const RETRY_INTERVAL: Duration = Duration::from_secs(10);
-/// Maximum time to wait for the file system when the agent ends.
-pub(crate) const ENDING: Duration = Duration::from_secs(10);
+/// Maximum time to wait for the file system when the agent ends. An fsync on an SD card that also
+/// stores a recording takes more than ten seconds.
+pub(crate) const ENDING: Duration = Duration::from_secs(30);
 const POLL: Duration = Duration::from_millis(5);
 const BOOT_ID: &str = "/proc/sys/kernel/random/boot_id";
 

@@ -29,6 +29,8 @@ pub mod pseudo_terminal;
 pub mod robot_diagnostics;
 pub mod robot_log;
 pub mod robot_parameters;
+pub mod robot_pictures;
+pub mod robot_states;
 pub mod robot_transforms;
 pub mod rotel;
 pub mod sample_robot;

@@ -52,3 +52,9 @@ pub(crate) fn number(bytes: &mut Vec<u8>, number: usize) {
     align(bytes);
     bytes.extend(u32::try_from(number).unwrap_or(u32::MAX).to_le_bytes());
 }
+
+/// Appends a number of double precision.
+pub(crate) fn double(bytes: &mut Vec<u8>, number: f64) {
+    bytes.resize(bytes.len().next_multiple_of(8), 0);
+    bytes.extend(number.to_le_bytes());
+}

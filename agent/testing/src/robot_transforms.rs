@@ -1,6 +1,6 @@
 //! Transforms, encoded by hand after `tf2_msgs/msg/TFMessage`, as XCDR1 in little-endian order.
 
-use crate::robot_diagnostics::{number, text};
+use crate::robot_diagnostics::{double, number, text};
 
 /// DDS name of the type.
 pub const DDS_TYPE: &str = "tf2_msgs::msg::dds_::TFMessage_";
@@ -33,8 +33,7 @@ pub fn transforms(transforms: &[Transform<'_>]) -> Vec<u8> {
         text(&mut body, transform.child);
         let (sine, cosine) = (transform.yaw / 2.0).sin_cos();
         for value in [transform.x, 0.0, 0.0, 0.0, 0.0, sine, cosine] {
-            body.resize(body.len().next_multiple_of(8), 0);
-            body.extend(value.to_le_bytes());
+            double(&mut body, value);
         }
     }
     [&[0, 1, 0, 0], &body[..]].concat()

@@ -1,6 +1,7 @@
 //! A robot of any size as the model describes it, with a value for every fact.
 
 pub mod inside;
+mod robot;
 
 use std::net::Ipv4Addr;
 use std::sync::Arc;
@@ -14,16 +15,14 @@ use ros2probe_model::derive::chain::exemplar::Exemplars;
 use ros2probe_model::derive::chain::expected::{ChainState, ExpectedChain, ExpectedFacts};
 use ros2probe_model::derive::chain::path::{ChainFacts, ChainsFacts, HopHistograms, Quantiles};
 use ros2probe_model::derive::chain::trace::{HopTimes, Method, Path, Point};
-use ros2probe_model::derive::clocks::Source as ClockSource;
 use ros2probe_model::derive::services::latency::Latencies;
 use ros2probe_model::facts::diagnosis::{
-    Diagnoses, Diagnosis, Policies, Policy, QosPairs, TopicKey, Unmatched,
+    Diagnoses, Diagnosis, Difference, Policies, Policy, QosPairs, StampFault, TopicKey, Unmatched,
 };
 use ros2probe_model::facts::histogram::Histogram;
 use ros2probe_model::facts::link::{LinkKey, LinkProtocol};
 use ros2probe_model::facts::loss_share::LossShare;
 use ros2probe_model::facts::model_time::ModelTime;
-use ros2probe_model::facts::names::NodeName;
 use ros2probe_model::facts::robot::{TransformFault, TransformFaultKind};
 use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_model::facts::wall_clock::WallClock;
@@ -32,20 +31,17 @@ use ros2probe_model::graph::discovery::Addresses;
 use ros2probe_model::graph::zenoh::{Counters, ZenohFacts};
 use ros2probe_model::measure::links::LinkFacts;
 use ros2probe_model::report::snapshot::{
-    AcknowledgementFacts, ActionFacts, Breakdown, Broadcaster, ChurnCount, ClockFacts, ClockOffset,
-    DecodeErrorCount, Delivered, DeliveryFacts, DiagnosticFacts, DiagnosticStatus, Direction,
-    EarlierCounts, EdgeFacts, EndpointFacts, GoalCounts, Jumps, LatencyFacts, LogFacts, LogMessage,
-    Measurement, NodeFacts, NodeLogFacts, ParameterChange, ParameterFacts, ParametersFacts,
-    ParticipantFacts, PeerClock, ProcessFacts, Requester, SampledFacts, ServiceFacts, Snapshot,
-    SocketFacts, Source, Subscriber, TableFacts, TopicFacts, TransformFacts, Transport,
-    TransportCount, TreeFacts, UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
+    AcknowledgementFacts, ActionFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered,
+    DeliveryFacts, Direction, EarlierCounts, EndpointFacts, GoalCounts, LatencyFacts, Measurement,
+    NodeFacts, ParticipantFacts, ProcessFacts, SampledFacts, ServiceFacts, Snapshot, SocketFacts,
+    Source, Subscriber, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts,
+    WatchFacts, WatchState, WatchedTopicFacts,
 };
 use ros2probe_wire::diagnostics::DiagnosticLevel;
 use ros2probe_wire::discovery::TypeHash;
-use ros2probe_wire::log::LogLevel;
+use ros2probe_wire::lifecycle::LifecycleState;
 use ros2probe_wire::qos::{History, HistoryKind, Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::transforms::Pose;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 /// Returns a chain of 100 messages from /points to /cmd_vel, configured with a limit of 15 ms.
@@ -119,144 +115,6 @@ fn chains() -> ChainsFacts {
     }
 }
 
-/// Returns the diagnostics of one part, which is in error.
-fn diagnostics(writer: Guid) -> DiagnosticFacts {
-    let at = ModelTime::from_nanoseconds(1_699_999_999_000_000_000);
-    DiagnosticFacts {
-        are_read: true,
-        statuses: vec![Arc::new(DiagnosticStatus {
-            domain_id: DomainId(0),
-            topic: "/diagnostics".into(),
-            name: "lidar: connection".into(),
-            hardware_id: "vlp16".into(),
-            node: Some("/lidar".into()),
-            writer,
-            level: DiagnosticLevel::Error,
-            message: "no data".into(),
-            values: vec![("packet rate (Hz)".into(), "0.5".into())],
-            at,
-            since: at,
-        })],
-    }
-}
-
-/// Returns a tree with one edge at 50 Hz.
-fn transforms(writer: Guid) -> TransformFacts {
-    TransformFacts {
-        are_read: true,
-        trees: vec![TreeFacts {
-            domain_id: DomainId(0),
-            namespace: "".into(),
-            edges: vec![EdgeFacts {
-                parent: "odom".into(),
-                child: "base_link".into(),
-                is_static: false,
-                broadcasters: vec![Broadcaster {
-                    writer,
-                    node: Some("/ekf".into()),
-                }],
-                count: 500,
-                rate: Some(50.0),
-                at: ModelTime::from_nanoseconds(1_699_999_999_000_000_000),
-                stamp: (1_699_999_999, 0),
-                pose: Pose {
-                    translation: [1.0, 0.0, 0.0],
-                    rotation: [0.0, 0.0, 0.0, 1.0],
-                },
-                jumps: Jumps {
-                    translation: 1,
-                    rotation: 0,
-                    time: 0,
-                },
-            }],
-            unread_static: 1,
-        }],
-    }
-}
-
-/// Returns one parameter, which a client changed.
-fn parameters(writer: Guid) -> ParametersFacts {
-    let at = ModelTime::from_nanoseconds(1_699_999_999_000_000_000);
-    let (domain_id, node) = (DomainId(0), NodeName::from("/lidar"));
-    ParametersFacts {
-        are_read: true,
-        known: vec![ParameterFacts {
-            domain_id,
-            node: node.clone(),
-            name: "rpm".into(),
-            value: "600".into(),
-            at,
-        }],
-        changes: vec![Arc::new(ParameterChange {
-            at,
-            domain_id,
-            node: node.clone(),
-            name: "rpm".into(),
-            before: Some("300".into()),
-            value: Some("600".into()),
-            requested_by: Some(Requester {
-                node: Some("/tuner".into()),
-                writer,
-            }),
-        })],
-        counts: vec![(domain_id, node, 1)],
-    }
-}
-
-/// Returns the log of a node with one error.
-fn clocks() -> ClockFacts {
-    let offset = |host: Option<&str>, peer: &str| ClockOffset {
-        host: host.map(Into::into),
-        peer: peer.into(),
-        offset: -20_000_000,
-        uncertainty: 300_000,
-    };
-    ClockFacts {
-        are_compared: true,
-        peers: vec![PeerClock {
-            peer: "camera-pc".into(),
-            address: [10, 0, 0, 2].into(),
-            ahead: (Some(-20_300_000), Some(-19_700_000)),
-            source: Some(ClockSource::Reply),
-            steps: 1,
-        }],
-        offsets: vec![
-            offset(None, "camera-pc"),
-            offset(Some("camera-pc"), "arm-pc"),
-        ],
-    }
-}
-
-fn logs(writer: Guid) -> LogFacts {
-    let message = Arc::new(LogMessage {
-        at: ModelTime::from_nanoseconds(1_699_999_999_000_000_000),
-        stamp: (1_699_999_998, 5),
-        domain_id: DomainId(0),
-        writer,
-        number: SequenceNumber(7),
-        node: "/lidar".into(),
-        level: LogLevel::Error,
-        logger: "lidar".into(),
-        text: "no data".into(),
-        file: "lidar.cpp".into(),
-        function: "read".into(),
-        line: 81,
-    });
-    let level = |level| match level {
-        LogLevel::Error => (1, Some(Arc::clone(&message))),
-        _ => (0, None),
-    };
-    LogFacts {
-        are_read: true,
-        nodes: vec![NodeLogFacts {
-            domain_id: DomainId(0),
-            node: "/lidar".into(),
-            levels: LogLevel::ALL.map(level),
-        }],
-        latest: vec![message],
-    }
-}
-
 /// Returns an agent's full state for a robot with topics of these names, all watched by `/**`.
 pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
     let guid = Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 0xc1]));
@@ -313,11 +171,13 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             first_seen: ModelTime::from_nanoseconds(3),
             measurement: measurement(),
         }],
-        logs: logs(guid),
-        diagnostics: diagnostics(guid),
-        parameters: parameters(guid),
-        transforms: transforms(guid),
-        clocks: clocks(),
+        logs: robot::logs(guid),
+        diagnostics: robot::diagnostics(guid),
+        parameters: robot::parameters(guid),
+        lifecycle: robot::lifecycle(),
+        fields: robot::fields(),
+        transforms: robot::transforms(guid),
+        clocks: robot::clocks(),
         services: vec![service()],
         actions: vec![action()],
         inside: Some(Arc::new(inside::inside())),
@@ -524,6 +384,41 @@ fn diagnoses() -> Diagnoses {
             offset: -20_000_000,
             uncertainty: 300_000,
         },
+        Diagnosis::NearMiss {
+            topic: TopicKey {
+                domain_id: DomainId(0),
+                dds_name: "rt/Scan".into(),
+                name: "/Scan".into(),
+                kind: TopicKind::Topic,
+            },
+            subscription: topic.clone(),
+            difference: Difference::Case,
+        },
+        Diagnosis::NodeInactive {
+            domain_id: DomainId(0),
+            node: "/lidar".into(),
+            state: LifecycleState::Inactive,
+            has_failed: true,
+        },
+        Diagnosis::ParameterDrift {
+            domain_id: DomainId(0),
+            node: "/lidar".into(),
+            name: "frame_rate".into(),
+            expected: "20.0".into(),
+            value: "10.0".into(),
+        },
+        Diagnosis::MixedTime {
+            domain_id: DomainId(0),
+            simulated: vec!["/planner".into()],
+            system: vec!["/lidar".into()],
+        },
+        Diagnosis::WrongStamps {
+            topic: topic.clone(),
+            writer,
+            fault: StampFault::Future,
+            nanoseconds: 80_000_000,
+        },
+        Diagnosis::SharedMemoryFull { used_permille: 960 },
         Diagnosis::SlowChain {
             topic: topic.clone(),
             from: "/scan".into(),

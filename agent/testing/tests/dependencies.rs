@@ -25,6 +25,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
     // The next two crates read payloads and times with the bounded cursor of `wire`.
     ("message", &["wire"]),
     ("bag", &["wire"]),
+    ("history", &[]),
     ("api", &[]),
     // The samples of this crate are the model's figures.
     ("metrics", &["wire", "model"]),
@@ -32,7 +33,8 @@ const ALLOWED: &[(&str, &[&str])] = &[
     (
         "daemon",
         &[
-            "wire", "model", "attach", "capture", "message", "bag", "api", "metrics", "page",
+            "wire", "model", "attach", "capture", "message", "bag", "history", "api", "metrics",
+            "page",
         ],
     ),
     // The package is called ros2probe. It reaches a running agent only through the API. A replay

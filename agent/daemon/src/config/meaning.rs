@@ -24,16 +24,22 @@ use super::watch::{
     ExpectationValues, Expectations, PatternError, Retain, Watch, check_globs, check_pattern,
 };
 use super::{
-    ApiSettings, CaptureSettings, Config, Endpoint, FoxgloveSettings, Level, Limits,
-    MetricsSettings, OtlpSettings, RecordingLimits, RecordingSettings, Ros2DaemonSettings,
-    ShmSettings, SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
+    ApiSettings, CaptureSettings, Config, Endpoint, Extraction, FoxgloveSettings, Level, Limits,
+    MAX_PARAMETERS, MetricsSettings, OtlpSettings, RecordingLimits, RecordingSettings,
+    Ros2DaemonSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
 };
 use crate::events::Trigger;
+use ros2probe_message::filter::{Filter, FilterError};
 use ros2probe_metrics::otlp::otlp_endpoint;
+use ros2probe_model::derive::robot::parameters::ExpectedParameter;
 use ros2probe_model::derive::robot::{Part, Parts};
 
 /// Maximum number of configured snapshots; each needs memory and a thread.
 const MAX_SNAPSHOTS: usize = 8;
+/// Maximum number of patterns of nodes that should be active.
+const MAX_ACTIVE: usize = 64;
+/// Maximum number of fields of messages with a metric.
+const MAX_EXTRACTIONS: usize = 64;
 /// Minimum of the default interval between triggered bags of a snapshot, in seconds.
 const SNAPSHOT_INTERVAL_S: u64 = 10;
 
@@ -141,6 +147,7 @@ impl Reader {
         let api = self.api(shape.api.unwrap_or_default());
         let has_token = api.token_file.is_some();
         let robot = shape.robot.unwrap_or_default();
+        let page = shape.page.unwrap_or_default();
         Config {
             watches: self.watches(shape.watch.unwrap_or_default(), limits.watches),
             chains: self.chains(shape.chains.unwrap_or_default()),
@@ -150,28 +157,55 @@ impl Reader {
             api,
             foxglove: self.foxglove(shape.foxglove.unwrap_or_default(), has_token),
             ros2_daemon: ros2_daemon(shape.ros2_daemon.unwrap_or_default()),
-            history: Duration::from_secs(shape.page.unwrap_or_default().history_s.into()),
+            history: Duration::from_secs(page.history_s.into()),
+            history_bytes: page.history_bytes,
             otlp: otlp(shape.otlp.unwrap_or_default()),
             recordings: self.recordings(shape.recordings.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             service_timeout: Duration::from_secs_f64(shape.service_timeout_s),
             retain: shape.retain,
             robot: parts(&robot),
+            active_nodes: self.listed("robot.active", robot.active, MAX_ACTIVE),
+            expected_parameters: self
+                .listed(
+                    "robot.parameters_expected",
+                    robot.parameters_expected,
+                    MAX_PARAMETERS,
+                )
+                .into_iter()
+                .map(|shape| ExpectedParameter {
+                    node: shape.node.as_str().into(),
+                    name: shape.name.into(),
+                    value: shape.value.into(),
+                })
+                .collect(),
+            extractions: self
+                .listed("robot.extract", robot.extract, MAX_EXTRACTIONS)
+                .into_iter()
+                .map(|shape| Extraction {
+                    topic: shape.topic,
+                    field: shape.field,
+                    metric: shape.metric,
+                })
+                .collect(),
             diagnostic_values: robot.diagnostic_values.unwrap_or_default(),
             state_directory: state(&shape.state_directory),
             log: shape.log,
         }
     }
 
-    fn recordings(&mut self, shape: RecordingsShape) -> RecordingSettings {
-        let shapes = shape.snapshots.unwrap_or_default();
-        if shapes.len() > MAX_SNAPSHOTS {
-            let message = format!(
-                "has {} entries, at most {MAX_SNAPSHOTS} are allowed",
-                shapes.len()
-            );
-            self.wrong("recordings.snapshots", message);
+    /// Returns the entries of a list, unless they are too many.
+    fn listed<T>(&mut self, key: &str, entries: Option<Vec<T>>, most: usize) -> Vec<T> {
+        let entries = entries.unwrap_or_default();
+        if entries.len() > most {
+            let message = format!("has {} entries, at most {most} are allowed", entries.len());
+            self.wrong(key, message);
         }
+        entries
+    }
+
+    fn recordings(&mut self, shape: RecordingsShape) -> RecordingSettings {
+        let shapes = self.listed("recordings.snapshots", shape.snapshots, MAX_SNAPSHOTS);
         let mut snapshots: Vec<SnapshotSettings> = Vec::new();
         for (index, shape) in shapes.into_iter().enumerate() {
             let key = format!("recordings.snapshots[{index}]");
@@ -438,6 +472,8 @@ pub(super) enum InvalidText {
          `[::1]:{port}`, or `off`"
     )]
     Address { text: String, port: u16 },
+    #[error("is no field: {}", .0.message)]
+    Field(#[from] FilterError),
     #[error("must be {0}")]
     Unfit(&'static str),
 }
@@ -475,6 +511,30 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
                 "name, slash and key, as in `battery*/Voltage*`, in at most 256 bytes",
             ))
         }
+        "robot.active[]" | "robot.parameters_expected[].node"
+            if text.len() > 256 || !text.starts_with('/') =>
+        {
+            Err(InvalidText::Unfit(
+                "the full name of a node, as in `/lidar`",
+            ))
+        }
+        "robot.parameters_expected[].name" if text.is_empty() || text.len() > 128 => Err(
+            InvalidText::Unfit("the name of a parameter, in at most 128 bytes"),
+        ),
+        "robot.parameters_expected[].value" if text.len() > 256 => {
+            Err(InvalidText::Unfit("at most 256 bytes long"))
+        }
+        "robot.extract[].topic" if text.contains('*') || check_pattern(text).is_err() => Err(
+            InvalidText::Unfit("the name of one topic, as in `/battery`"),
+        ),
+        "robot.extract[].field" => {
+            Filter::of_field(text)?;
+            Ok(())
+        }
+        "robot.extract[].metric" if !is_metric(text) => Err(InvalidText::Unfit(
+            "1 to 128 lower-case letters, digits and `_`, as in `robot_battery_ratio`; the \
+             beginnings `ros2` and `process_`, and the ends of other types, as `_total`, are taken",
+        )),
         "recordings.snapshots[].name" if !is_plain(text) => Err(InvalidText::Unfit(
             "1 to 64 letters, digits, `_` or `-`: it names directories",
         )),
@@ -531,6 +591,19 @@ fn is_origin(text: &str) -> bool {
     }
 }
 
+/// Returns whether the name is that of a gauge, and no metric of the agent begins like it.
+fn is_metric(name: &str) -> bool {
+    let taken = ["_total", "_info", "_bucket", "_count", "_sum", "_created"];
+    let is_plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
+    (1..=128).contains(&name.len())
+        && name.starts_with(|c: char| c.is_ascii_lowercase())
+        && name.chars().all(is_plain)
+        && !["ros2", "process_", "target_"]
+            .iter()
+            .any(|taken| name.starts_with(taken))
+        && !taken.iter().any(|taken| name.ends_with(taken))
+}
+
 /// Returns whether the name is a valid file name on every system.
 fn is_plain(name: &str) -> bool {
     let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
@@ -583,6 +656,8 @@ fn parts(shape: &RobotShape) -> Parts {
         (Part::Diagnostics, shape.diagnostics),
         (Part::Parameters, shape.parameters),
         (Part::Transforms, shape.transforms),
+        (Part::Lifecycle, shape.lifecycle),
+        (Part::Fields, shape.fields),
         (Part::Clocks, shape.clocks),
     ];
     let on = parts

@@ -10,12 +10,15 @@ mod meaning;
 mod mistake;
 mod shape;
 
+use std::collections::BTreeSet;
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_model::derive::robot::Parts;
+use ros2probe_model::derive::robot::parameters::ExpectedParameter;
+use ros2probe_model::derive::robot::{Parts, RobotExpectations};
 use schemars::JsonSchema;
 use serde::Deserialize;
 
@@ -37,8 +40,21 @@ pub use ros2probe_model::facts::watch::{
 pub use ros2probe_model::measure::rehearsal;
 use tracing_subscriber::filter::LevelFilter;
 
+/// Maximum number of parameters that should have a value.
+pub const MAX_PARAMETERS: usize = 1024;
 /// Maximum size of the file, in bytes.
 const MAX_BYTES: u64 = 1 << 20;
+
+/// A field of the messages of a topic, and its metric.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Extraction {
+    /// ROS name of the topic.
+    pub topic: String,
+    /// The field: names with dots, and indices.
+    pub field: String,
+    /// Name of the metric.
+    pub metric: String,
+}
 
 /// The checked configuration.
 #[derive(Clone, Debug, PartialEq)]
@@ -61,6 +77,8 @@ pub struct Config {
     pub ros2_daemon: Ros2DaemonSettings,
     /// Time for which figures of measured topics are kept for charts; zero = none.
     pub history: Duration,
+    /// Maximum size of the history on disk, in bytes; zero = none.
+    pub history_bytes: u64,
     /// Exports to an OpenTelemetry receiver.
     pub otlp: OtlpSettings,
     /// Recordings of the agent.
@@ -73,6 +91,12 @@ pub struct Config {
     pub retain: RetainChoice,
     /// What the agent reads of what the robot says.
     pub robot: Parts,
+    /// Patterns of the names of managed nodes that should be active.
+    pub active_nodes: Vec<String>,
+    /// Parameters that should have a value.
+    pub expected_parameters: Vec<ExpectedParameter>,
+    /// Fields of messages with a metric.
+    pub extractions: Vec<Extraction>,
     /// Values of diagnostics with a metric: patterns of name, slash and key.
     pub diagnostic_values: Vec<String>,
     /// Directory of the saved discovery state.
@@ -345,6 +369,19 @@ impl Config {
         meaning::parse(bytes)
     }
 
+    /// Returns what the model compares the robot with.
+    #[must_use]
+    pub fn expectations(&self) -> RobotExpectations {
+        let active = self.active_nodes.iter().map(|name| name.as_str().into());
+        let fields = self.extractions.iter();
+        let fields: BTreeSet<_> = fields.map(|each| each.topic.as_str().into()).collect();
+        RobotExpectations {
+            active: Arc::new(active.collect()),
+            parameters: Arc::new(self.expected_parameters.clone()),
+            fields: Arc::new(fields.into_iter().collect()),
+        }
+    }
+
     /// Returns the keys whose change in `new` takes effect only after a restart.
     #[must_use]
     pub fn needs_restart(&self, new: &Self) -> Vec<&'static str> {
@@ -360,12 +397,21 @@ impl Config {
             ("api", self.api != new.api),
             ("foxglove", self.foxglove != new.foxglove),
             ("ros2_daemon", self.ros2_daemon != new.ros2_daemon),
-            ("page", self.history != new.history),
+            (
+                "page",
+                (self.history, self.history_bytes) != (new.history, new.history_bytes),
+            ),
             ("otlp", self.otlp != new.otlp),
             ("recordings", self.recordings != new.recordings),
             ("topic_grace_s", self.topic_grace != new.topic_grace),
             ("retain", self.retain != new.retain),
             ("robot", self.robot != new.robot),
+            ("robot.active", self.active_nodes != new.active_nodes),
+            ("robot.extract", self.extractions != new.extractions),
+            (
+                "robot.parameters_expected",
+                self.expected_parameters != new.expected_parameters,
+            ),
             (
                 "service_timeout_s",
                 self.service_timeout != new.service_timeout,
@@ -433,12 +479,16 @@ impl Default for Config {
             },
             ros2_daemon: Ros2DaemonSettings::default(),
             history: Duration::from_secs(defaults::HISTORY_S.into()),
+            history_bytes: defaults::HISTORY_BYTES,
             otlp: OtlpSettings::default(),
             recordings: RecordingSettings::default(),
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
             service_timeout: Duration::from_secs_f64(defaults::service_timeout_s()),
             retain: RetainChoice::default(),
             robot: Parts::ALL,
+            active_nodes: Vec::new(),
+            expected_parameters: Vec::new(),
+            extractions: Vec::new(),
             diagnostic_values: Vec::new(),
             state_directory: StateChoice::default(),
             log: Level::default(),
@@ -488,6 +538,9 @@ mod defaults {
     /// Origins of the web application and of desktop applications, whose pages are files.
     pub(super) const ORIGINS: [&str; 2] = ["https://app.foxglove.dev", "file://"];
     pub(super) const HISTORY_S: u32 = 600;
+
+    /// Size of seven days of some hundred topics.
+    pub(super) const HISTORY_BYTES: u64 = 256 << 20;
     pub(super) const SNAPSHOT_COUNT: usize = 20;
     pub(super) const SNAPSHOT_TOTAL_BYTES: u64 = 1 << 30;
 

@@ -414,6 +414,21 @@ pub(super) struct RobotShape {
     /// Parameters of nodes (`/parameter_events`): last known values, changes, and who requested
     /// them.
     pub(super) parameters: Switch,
+    /// Values that parameters should have; other values are findings. `rp learn --parameters` writes
+    /// such a list.
+    #[schemars(length(max = 1024))]
+    pub(super) parameters_expected: Option<Vec<ExpectedParameterShape>>,
+    /// States of managed nodes (`transition_event`), and failed transitions as findings.
+    pub(super) lifecycle: Switch,
+    /// Names of managed nodes that should be active; `*` matches any characters. Another state for
+    /// 5 s is a finding.
+    #[schemars(length(max = 64))]
+    pub(super) active: Option<Vec<String>>,
+    /// Fields of messages that have a metric: those of batteries, and those of `extract`.
+    pub(super) fields: Switch,
+    /// Fields of further messages that have a metric.
+    #[schemars(length(max = 64))]
+    pub(super) extract: Option<Vec<ExtractionShape>>,
     /// Transforms (`/tf`, `/tf_static`): trees of frames, their broadcasters, and faults.
     pub(super) transforms: Switch,
     /// Offsets between the clocks of hosts, from stamps, replies and acknowledgements.
@@ -427,10 +442,42 @@ impl Default for RobotShape {
             diagnostics: Switch::On,
             diagnostic_values: None,
             parameters: Switch::On,
+            parameters_expected: None,
+            lifecycle: Switch::On,
+            active: None,
+            fields: Switch::On,
+            extract: None,
             transforms: Switch::On,
             clocks: Switch::On,
         }
     }
+}
+
+/// A parameter and the value that it should have.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ExpectedParameterShape {
+    /// Fully qualified name of the node, in any domain.
+    pub(super) node: String,
+    /// Name of the parameter.
+    pub(super) name: String,
+    /// Value as YAML, in quotes, as `rp param dump` prints it: `"0.5"`.
+    pub(super) value: String,
+}
+
+/// A field of the messages of a topic, and its metric.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ExtractionShape {
+    /// ROS name of the topic. The messages may have up to 64 KiB.
+    pub(super) topic: String,
+    /// A number or boolean in the messages: names with dots, and indices, as in
+    /// `cells[0].voltage`.
+    pub(super) field: String,
+    /// Name of the metric, a gauge with the labels `domain_id` and `topic`.
+    pub(super) metric: String,
 }
 
 /// The web page; `api.page` disables it.
@@ -442,6 +489,11 @@ pub(super) struct PageShape {
     /// with more than 436 topics, fewer seconds are kept.
     #[schemars(range(min = 0, max = 3_600))]
     pub(super) history_s: u32,
+    /// Maximum size of the history of the last days in `state_directory`, in bytes; 0 = none. It
+    /// has one row per second of each measured topic, older ones per ten seconds, and needs
+    /// `history_s`.
+    #[schemars(range(min = 0, max = 1_099_511_627_776_u64))]
+    pub(super) history_bytes: u64,
 }
 
 impl From<RetainShape> for Retain {
@@ -457,6 +509,7 @@ impl Default for PageShape {
     fn default() -> Self {
         Self {
             history_s: defaults::HISTORY_S,
+            history_bytes: defaults::HISTORY_BYTES,
         }
     }
 }

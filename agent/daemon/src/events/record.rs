@@ -139,7 +139,7 @@ impl Occurrence {
                 Appeared | Changed => &table::NODE_DISCOVERED,
                 Disposed | Expired | Cascaded => &table::NODE_LOST,
             },
-            Self::Robot(EventKind::Lifecycle(_)) => &table::LIFECYCLE_TRANSITION,
+            Self::Robot(EventKind::Lifecycle { .. }) => &table::LIFECYCLE_TRANSITION,
             Self::Robot(EventKind::Diagnostic { .. }) => &table::DIAGNOSTIC_CHANGED,
             Self::Robot(EventKind::Parameter(_)) => &table::PARAMETER_CHANGED,
             Self::Robot(EventKind::TransformJump { .. }) => &table::TRANSFORM_JUMPED,
@@ -175,7 +175,7 @@ impl Occurrence {
         let definition = self.definition();
         let relieves = match self {
             Self::Robot(EventKind::Participant { change, .. }) => *change == churn::Event::Disposed,
-            Self::Robot(EventKind::Lifecycle(state)) => *state.state != *ERROR_PROCESSING,
+            Self::Robot(EventKind::Lifecycle { to, .. }) => **to != *ERROR_PROCESSING,
             Self::Robot(EventKind::Expectation { to, .. }) => *to == WatchState::Ok,
             Self::Robot(EventKind::Diagnostic { status, .. }) => {
                 status.level == DiagnosticLevel::Ok
@@ -278,12 +278,18 @@ fn robot(kind: &EventKind, at: Timestamp) -> Values {
             ("participant", written(participant)),
             cause(change),
         ],
-        EventKind::Lifecycle(state) => vec![
-            domain(state.domain_id),
-            ("ros_node", state.node.as_deref().map(text)),
-            ("process_id", number(state.process)),
-            ("from", Some(text(&state.before))),
-            ("to", Some(text(&state.state))),
+        EventKind::Lifecycle {
+            domain_id,
+            node,
+            process,
+            from,
+            to,
+        } => vec![
+            domain(*domain_id),
+            ("ros_node", node.as_deref().map(text)),
+            ("process_id", process.and_then(number)),
+            ("from", Some(text(from))),
+            ("to", Some(text(to))),
         ],
         EventKind::Diagnostic { before, status } => vec![
             domain(status.domain_id),
@@ -529,6 +535,67 @@ fn finding(finding: &Diagnosis) -> Values {
                 Some(Value::Real(clocks::seconds(*uncertainty))),
             ),
         ],
+        Diagnosis::NearMiss {
+            subscription,
+            difference,
+            ..
+        } => vec![
+            ("subscription", Some(text(&subscription.name))),
+            ("domains", list([subscription.domain_id])),
+            ("difference", Some(text(difference.label()))),
+        ],
+        Diagnosis::NodeInactive {
+            domain_id,
+            node,
+            state,
+            has_failed,
+        } => vec![
+            domain(*domain_id),
+            ("ros_node", Some(text(node))),
+            ("state", Some(text(state.label()))),
+            (
+                "reason",
+                Some(text(if *has_failed { "failed" } else { "expected" })),
+            ),
+        ],
+        Diagnosis::ParameterDrift {
+            domain_id,
+            node,
+            name,
+            expected,
+            value,
+        } => vec![
+            domain(*domain_id),
+            ("ros_node", Some(text(node))),
+            ("name", Some(text(name))),
+            ("expected", Some(text(expected))),
+            ("value", Some(text(value))),
+        ],
+        Diagnosis::MixedTime {
+            domain_id,
+            simulated,
+            system,
+        } => vec![
+            domain(*domain_id),
+            ("simulated", list(simulated)),
+            ("system", list(system)),
+        ],
+        Diagnosis::WrongStamps {
+            writer,
+            fault,
+            nanoseconds,
+            ..
+        } => vec![
+            ("writer", written(writer)),
+            ("fault", Some(text(fault.label()))),
+            (
+                "offset_seconds",
+                Some(Value::Real(clocks::seconds(*nanoseconds))),
+            ),
+        ],
+        Diagnosis::SharedMemoryFull { used_permille } => {
+            vec![("used_ratio", Some(Value::Real(*used_permille as f64 / 1e3)))]
+        }
         Diagnosis::LossyLink {
             link,
             retransmitted_permille,

@@ -76,6 +76,14 @@ const FINDING: &[&str] = &[
     "peer",
     "offset_seconds",
     "uncertainty_seconds",
+    "subscription",
+    "difference",
+    "state",
+    "expected",
+    "value",
+    "simulated",
+    "system",
+    "used_ratio",
     "from",
     "max_latency_ms",
 ];
@@ -133,8 +141,8 @@ pub(super) const LIFECYCLE_TRANSITION: Definition = Definition::new(
     "ros2.node.lifecycle_transition",
     Severity::Warn,
     &["domain_id", "ros_node", "process_id", "from", "to"],
-    "A managed node in an observed process changed its lifecycle state; WARN if it is \
-     errorprocessing now.",
+    "A managed node changed its lifecycle state; WARN if it is errorprocessing now. The process is \
+     known with capture.inside.",
 )
 .relief(Severity::Info);
 pub(super) const DIAGNOSTIC_CHANGED: Definition = Definition::new(

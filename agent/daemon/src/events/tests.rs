@@ -1,10 +1,8 @@
 //! Log of events under bursts, slow readers and restarts.
 
-use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_wire::{DomainId, Guid};
 
 use super::*;
-use ros2probe_model::facts::calls::facts::LifecycleState;
 use ros2probe_model::facts::churn;
 use ros2probe_model::facts::event::{Event, EventKind};
 
@@ -69,14 +67,13 @@ fn numbers_grow_by_one_and_a_reader_continues_after_its_position() {
 fn a_lifecycle_transition_is_a_warning_only_on_an_error() {
     let log = EventLog::new();
     let transition = |name: Option<&str>, from: &str, to: &str| Event {
-        kind: EventKind::Lifecycle(LifecycleState {
-            process: 70,
+        kind: EventKind::Lifecycle {
+            process: Some(70),
             domain_id: DomainId(7),
             node: name.map(Into::into),
-            state: to.into(),
-            before: from.into(),
-            at: ModelTime::ZERO,
-        }),
+            to: to.into(),
+            from: from.into(),
+        },
         ..node(1)
     };
     let transitions = vec![

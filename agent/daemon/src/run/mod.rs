@@ -241,6 +241,10 @@ impl Run {
         }
         self.hand_over();
         self.publish();
+        // The history on disk has the last seconds, too.
+        if let Some(history) = &self.history {
+            self.outputs.latest.publish_past(history.past());
+        }
         Ok(())
     }
 
@@ -391,6 +395,12 @@ impl Run {
             }
         }
         let revision = self.observer.memory_revision();
+        if let Source::Live(live) = &self.source
+            && let Some(shared_memory) = live.shared_memory()
+        {
+            let used = shared_memory.counters.used_permille;
+            self.observer.input(Input::SharedMemoryUsed(used));
+        }
         let mut snapshot = self.observer.snapshot(self.source.clock());
         snapshot.tables.extend(self.source.tables());
         let described = self.outputs.library.described_figures();

@@ -10,6 +10,7 @@ use super::process::Process;
 use super::ros2_daemon::{PortState, Ros2DaemonFigures};
 use super::ros2_metrics::TopicRows;
 use crate::agent_facts::{Ability, InterfaceFacts, SharedMemoryFacts};
+use crate::disk_history::DiskHistory;
 use crate::events::EventLog;
 use crate::limit_facts::{LimitFacts, LimitFigures};
 use crate::recording::{RecordingFigures, SnapshotFigures};
@@ -212,6 +213,20 @@ pub(super) fn kept(sink: &mut MetricSink<'_>, state: &State) -> fmt::Result {
     let participants = snapshot.flat_map(|snapshot| &snapshot.participants);
     let restored = participants.filter(|participant| participant.restored);
     sink.single(&metric::RESTORED, restored.count())
+}
+
+/// Writes the metrics of the history on disk.
+pub(super) fn history(sink: &mut MetricSink<'_>, history: &DiskHistory) -> fmt::Result {
+    let store = history.store();
+    sink.family(&metric::HISTORY_WRITES, |family| {
+        let counts = ["written", "failed"].into_iter().zip(history.writes());
+        let mut counts = counts.filter(|_| history.is_kept());
+        counts.try_for_each(|(outcome, count)| family.sample(&[Label::Text(outcome)], count))
+    })?;
+    sink.family(&metric::HISTORY_BYTES, |family| {
+        let bytes = store.map(|store| store.facts().bytes);
+        bytes.map_or(Ok(()), |bytes| family.sample(&[], bytes))
+    })
 }
 
 /// Writes the age of the snapshot, the duration of the last scrape, and the last reload.

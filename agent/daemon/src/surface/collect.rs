@@ -11,6 +11,7 @@ use super::agent_metrics;
 use super::chain_metrics;
 use super::delivery_metrics::{self, Deliveries};
 use super::diagnosis_metrics;
+use super::field_metrics::FieldMetrics;
 use super::foxglove::Viewers;
 use super::inside_metrics::{self, Callbacks};
 use super::ros2_daemon::Ros2DaemonFigures;
@@ -18,6 +19,7 @@ use super::ros2_metrics::{self, TopicRows};
 use super::service_metrics;
 use super::{link_metrics, robot_metrics, zenoh_metrics};
 use crate::agent_facts::SourceKind;
+use crate::disk_history::DiskHistory;
 use crate::events::{AgentEvent, EventLog};
 use crate::limit_facts::LimitFigures;
 use crate::recording::RecordingFigures;
@@ -47,6 +49,10 @@ pub struct MetricSources {
     pub viewers: Arc<Viewers>,
     /// Ports and requests of the ros2 daemon.
     pub ros2_daemon: Arc<Ros2DaemonFigures>,
+    /// Metrics of fields of messages.
+    pub fields: Arc<FieldMetrics>,
+    /// History on disk.
+    pub disk_history: Arc<DiskHistory>,
     /// Lines of the log that standard error did not accept.
     pub lost_lines: Arc<AtomicU64>,
 }
@@ -67,6 +73,8 @@ impl MetricSources {
             exports: Arc::default(),
             viewers: Arc::default(),
             ros2_daemon: Arc::default(),
+            fields: Arc::default(),
+            disk_history: Arc::default(),
             lost_lines: Arc::default(),
         }
     }
@@ -96,7 +104,7 @@ impl MetricSource for MetricSources {
         ros2_metrics::topics(sink, snapshot, &rows.shown, &settings)?;
         delivery_metrics::sums(sink, &rows.shown, &settings)?;
         inside_metrics::topics(sink, snapshot, &rows.shown, &settings)?;
-        inside_metrics::callbacks(sink, &callbacks, known, &settings)?;
+        inside_metrics::callbacks(sink, &callbacks, snapshot, &settings)?;
         ros2_metrics::writers(sink, &rows.shown, &settings)?;
         deliveries.write(sink)?;
         delivery_metrics::sockets(sink, &snapshot.sockets)?;
@@ -106,6 +114,7 @@ impl MetricSource for MetricSources {
         robot_metrics::diagnostics(sink, snapshot, &settings.diagnostic_values)?;
         robot_metrics::parameters(sink, snapshot)?;
         robot_metrics::transforms(sink, snapshot)?;
+        self.fields.write(sink, snapshot)?;
         ros2_metrics::watches(sink, snapshot, &settings.watches)?;
         agent_metrics::identity(sink, &state, now)?;
         agent_metrics::capture(sink, &state)?;
@@ -115,6 +124,7 @@ impl MetricSource for MetricSources {
         agent_metrics::model(sink, &state, &rows, deliveries.hidden, &self.limits)?;
         agent_metrics::surface(sink, &state, self.settings.reload(), previous, now)?;
         agent_metrics::kept(sink, &state)?;
+        agent_metrics::history(sink, &self.disk_history)?;
         agent_metrics::subscriptions(sink, &state)?;
         agent_metrics::viewers(sink, &self.viewers)?;
         agent_metrics::ros2_daemon(sink, &self.ros2_daemon)?;

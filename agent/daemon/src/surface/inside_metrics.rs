@@ -124,9 +124,10 @@ fn inside<'a>(row: &TopicRow<'a>) -> Option<&'a TopicInside> {
 pub(super) fn callbacks(
     sink: &mut MetricSink<'_>,
     callbacks: &Callbacks<'_>,
-    known: Option<&InsideFacts>,
+    snapshot: &Snapshot,
     settings: &Settings,
 ) -> fmt::Result {
+    let known = snapshot.inside.as_deref();
     let sums = &callbacks.sums;
     let histograms: [(&'static Metric, Values); 2] = [
         (&metric::CALLBACK_DURATION, |sum| &sum.duration),
@@ -177,7 +178,7 @@ pub(super) fn callbacks(
         timers.try_for_each(|(key, sum)| family.sample(&labels(key), sum.skipped))
     })?;
     late(sink, known)?;
-    nodes(sink, known)
+    nodes(sink, snapshot)
 }
 
 /// Writes the metrics of late calls. Callbacks with the same labels share their series.
@@ -210,8 +211,8 @@ fn late_labels<'a>(of: &'a (CallbackKey<'_>, Stage, Cause)) -> [Label<'a>; 6] {
     [domain_id, node, trigger, name, stage, cause]
 }
 
-fn nodes(sink: &mut MetricSink<'_>, known: Option<&InsideFacts>) -> fmt::Result {
-    let activities: Vec<_> = known.into_iter().flat_map(NodeActivity::all).collect();
+fn nodes(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
+    let activities = NodeActivity::all(snapshot);
     sink.family(&metric::NODE_BUSY, |family| {
         for ((domain_id, name), activity) in &activities {
             if let Some(busy) = activity.busy {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use ros2probe_model::facts::calls::facts::InsideFacts;
+use ros2probe_model::report::snapshot::Snapshot;
 use ros2probe_wire::DomainId;
 
 /// Activity of one node.
@@ -15,9 +15,17 @@ pub(super) struct NodeActivity<'a> {
 }
 
 impl<'a> NodeActivity<'a> {
-    /// Returns the activity of each node, by domain and name.
-    pub(super) fn all(known: &'a InsideFacts) -> BTreeMap<(DomainId, &'a str), Self> {
+    /// Returns the activity of each node, by domain and name. A state that calls inside its process
+    /// show precedes one that it published.
+    pub(super) fn all(snapshot: &'a Snapshot) -> BTreeMap<(DomainId, &'a str), Self> {
         let mut all: BTreeMap<_, Self> = BTreeMap::new();
+        for managed in &snapshot.lifecycle.nodes {
+            let key = (managed.domain_id, managed.node.as_str());
+            all.entry(key).or_default().state = Some(managed.state.label());
+        }
+        let Some(known) = snapshot.inside.as_deref() else {
+            return all;
+        };
         for callback in &known.callbacks {
             if let (Some(node), Some(busy)) = (&callback.owner.node, callback.busy) {
                 let key = (callback.owner.domain_id, node.as_str());

@@ -13,6 +13,7 @@ mod delivery_metrics;
 mod diagnosis_metrics;
 #[cfg(test)]
 mod export_tests;
+pub mod field_metrics;
 pub mod foxglove;
 pub mod http;
 mod inside_metrics;

@@ -2,6 +2,7 @@
 //! the sandbox of a service may hide some values.
 
 use std::fs;
+use std::io::Read as _;
 
 /// Resource usage of this process.
 #[derive(Clone, Copy, Debug, Default)]
@@ -50,6 +51,48 @@ impl Usage {
                 .zip(boot_time())
                 .map(|(start, boot)| boot + start / ticks),
         })
+    }
+}
+
+/// Maximum length of a command line that is read, in bytes.
+const COMMAND_LINE: u64 = 4096;
+/// Beginnings of the names of interpreters.
+const INTERPRETERS: [&str; 6] = ["python", "node", "ruby", "perl", "bash", "sh"];
+
+/// Returns the file or module that an interpreter runs; `None` for another program.
+pub(super) fn script(id: u32) -> Option<String> {
+    let mut line = Vec::new();
+    let file = fs::File::open(format!("/proc/{id}/cmdline")).ok()?;
+    file.take(COMMAND_LINE).read_to_end(&mut line).ok()?;
+    script_of(&line)
+}
+
+/// Returns the script in a command line, whose words end with a zero byte.
+fn script_of(line: &[u8]) -> Option<String> {
+    let words = line.split(|byte| *byte == 0).map(String::from_utf8_lossy);
+    let mut words = words.filter(|word| !word.is_empty());
+    let file_name = |path: &str| path.rsplit('/').next().unwrap_or_default().to_owned();
+    let program = file_name(&words.next()?);
+    let is_interpreter = INTERPRETERS.iter().any(|name| {
+        let version = program.strip_prefix(name);
+        version.is_some_and(|version| {
+            version
+                .chars()
+                .all(|each| each.is_ascii_digit() || each == '.')
+        })
+    });
+    if !is_interpreter {
+        return None;
+    }
+    loop {
+        match &*words.next()? {
+            "-m" => return words.next().map(|module| module.into_owned()),
+            "-c" | "-e" => return None,
+            // These take a further word.
+            "-W" | "-X" | "-r" => drop(words.next()),
+            word if word.starts_with('-') => {}
+            word => return Some(file_name(word)).filter(|name| !name.is_empty()),
+        }
     }
 }
 
@@ -171,6 +214,28 @@ fn page_bytes() -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_process_of_an_interpreter_is_named_by_its_script() {
+        for (line, script) in [
+            (
+                "/usr/bin/python3.11\0-u\0/opt/robot/robot.py\0--ros-args\0",
+                Some("robot.py"),
+            ),
+            ("python3\0-W\0ignore\0-m\0robot.main\0", Some("robot.main")),
+            ("/bin/sh\0/opt/robot/start\0", Some("start")),
+            ("node\0server.js\0", Some("server.js")),
+            ("python3\0-c\0import robot\0", None),
+            ("python3\0", None),
+            ("/opt/ros/lib/nodelet\0robot.py\0", None),
+            ("/opt/ros/lib/python_bridge\0robot.py\0", None),
+            ("", None),
+        ] {
+            assert_eq!(script_of(line.as_bytes()).as_deref(), script, "{line}");
+        }
+        assert_eq!(script(std::process::id()), None);
+        assert_eq!(script(u32::MAX - 1), None);
+    }
 
     #[test]
     fn a_process_can_read_its_own_resource_usage() {

@@ -228,6 +228,17 @@ pub const RESTORED: Metric = Metric::gauge(
     &[],
     "Participants restored from saved state and not heard since; removed when their lease ends.",
 );
+pub const HISTORY_WRITES: Metric = Metric::counter(
+    "ros2probe_history_writes_total",
+    &["outcome"],
+    "Minutes of history on disk, by result; absent if none is kept.",
+);
+pub const HISTORY_BYTES: Metric = Metric::gauge(
+    "ros2probe_history_bytes",
+    &[],
+    "Size of the history on disk.",
+)
+.unit("bytes");
 pub const OTLP_EXPORTS: Metric = Metric::counter(
     "ros2probe_otlp_exports_total",
     &["signal", "outcome"],
@@ -237,7 +248,7 @@ pub const OTLP_DROPPED: Metric = Metric::counter(
     "ros2probe_otlp_dropped_total",
     &["signal", "reason"],
     "Data points, log records and spans that were not delivered: overflow (queue full), \
-     superseded (by newer points while the endpoint was away), refused, rejected (in part) or \
+     superseded (by newer points), refused, rejected (in part) or \
      shutdown.",
 );
 
@@ -260,9 +271,7 @@ pub const SAMPLES_MISSED: Metric = Metric::counter(
     "ros2probe_missed_messages_total",
     &["reason"],
     "Messages that a subscription missed, as reported to it: incomplete (fragments were never \
-     seen), lost (no part was seen), unannounced (sent before the writer's announcement and \
-     never repeated), not_captured (the bytes could not be captured), queue_full (the reader was \
-     too slow).",
+     seen), lost (no part was seen), unannounced (sent before the writer's announcement), not_captured (the bytes could not be captured), queue_full (a slow reader).",
 );
 pub const SAMPLES_QUEUED: Metric = Metric::gauge(
     "ros2probe_queued_bytes",
@@ -321,8 +330,8 @@ pub const FOXGLOVE_DROPPED: Metric = Metric::counter(
 pub const ROS2_DAEMON_PORTS: Metric = Metric::gauge(
     "ros2probe_ros2_daemon_ports",
     &["state"],
-    "Domains by the state of their port as the ros2 daemon: listening (the agent answers), \
-     occupied (another process has the port), released (by ros2 daemon stop), failed, limit (more \
+    "Domains by the state of their port as the ros2 daemon: listening, \
+     occupied (by another process), released (by ros2 daemon stop), failed, limit (more \
      domains than ports).",
 )
 .experimental();
@@ -341,16 +350,12 @@ pub const ROS2_DAEMON_REQUESTS: Metric = Metric::counter(
 pub const ROS2_DAEMON_REFUSED: Metric = Metric::counter(
     "ros2probe_ros2_daemon_refused_total",
     &["reason"],
-    "Requests refused as the ros2 daemon: full (too many connections), host (another Host \
-     header), origin (from a web page), path (another path or method), size, malformed (not a \
+    "Requests refused as the ros2 daemon: full (too many connections), host (another header), \
+     origin (a web page), path (or method), size, malformed (not a \
      call), memory (slow readers).",
 )
 .experimental();
-pub const RECORDINGS: Metric = Metric::gauge(
-    "ros2probe_recordings",
-    &[],
-    "Bags that the agent is writing.",
-);
+pub const RECORDINGS: Metric = Metric::gauge("ros2probe_recordings", &[], "Bags being written.");
 pub const RECORDED_MESSAGES: Metric = Metric::counter(
     "ros2probe_recorded_messages_total",
     &[],
@@ -414,8 +419,7 @@ pub const EVENTS: Metric = Metric::counter(
 pub const EVENTS_DROPPED: Metric = Metric::counter(
     "ros2probe_events_dropped_total",
     &["reason"],
-    "Events counted but not emitted in a storm, or overwritten before a slow reader (a stream of \
-     /events, or the sender of log records) read them.",
+    "Events counted but not emitted in a storm, or overwritten before a slow reader read them.",
 );
 pub const LOG_LINES_LOST: Metric = Metric::counter(
     "ros2probe_log_lines_lost_total",

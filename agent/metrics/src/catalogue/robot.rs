@@ -72,4 +72,37 @@ pub const TRANSFORM_JUMPS: Metric = Metric::counter(
 )
 .experimental();
 
+pub const BATTERY_CHARGE: Metric = Metric::gauge(
+    "ros2_battery_charge_ratio",
+    TOPIC,
+    "Charge of a battery, from 0 to 1 (`percentage` of BatteryState); absent if it is not measured.",
+)
+.unit("ratio")
+.experimental();
+pub const BATTERY_VOLTAGE: Metric =
+    Metric::gauge("ros2_battery_voltage_volts", TOPIC, "Voltage of a battery.")
+        .unit("volts")
+        .experimental();
+pub const BATTERY_CURRENT: Metric = Metric::gauge(
+    "ros2_battery_current_amperes",
+    TOPIC,
+    "Current of a battery, negative while it discharges; absent if it is not measured.",
+)
+.unit("amperes")
+.experimental();
+pub const BATTERY_TEMPERATURE: Metric = Metric::gauge(
+    "ros2_battery_temperature_celsius",
+    TOPIC,
+    "Temperature of a battery; absent if it is not measured.",
+)
+.unit("celsius")
+.experimental();
+pub const FIELD_UNREADABLE: Metric = Metric::gauge(
+    "ros2probe_field_unreadable",
+    &["domain_id", "topic", "metric", "reason"],
+    "1 while a metric of a field has no value: unknown_type, malformed or no_number.",
+)
+.experimental();
+
+const TOPIC: &[&str] = &["domain_id", "topic"];
 const TRANSFORM: &[&str] = &["domain_id", "namespace", "parent", "child"];

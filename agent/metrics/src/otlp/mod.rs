@@ -22,6 +22,7 @@ mod settings;
 mod starts;
 mod traces;
 mod transport;
+mod waiting;
 
 pub use endpoint::otlp_endpoint;
 pub use exporter::{Exporter, Inputs, Spawn, StartError};

@@ -1,21 +1,19 @@
 //! The logs of nodes as log records, on request (`otlp.node_logs`).
 
-use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use opentelemetry::logs::{AnyValue, LogRecord as _, Logger as _, LoggerProvider as _, Severity};
 use opentelemetry::trace::{SpanId, TraceFlags, TraceId};
 use opentelemetry_sdk::logs::{SdkLogRecord, SdkLogger, SdkLoggerProvider};
-use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::observe::input::NewLog;
 use ros2probe_wire::log::LogLevel;
-use tokio::sync::Notify;
 
 use super::delivery::Queue;
 use super::events::time;
 use super::exports::{Exports, Reason, Signal};
 use super::traces::send_id;
+use super::waiting::Waiting;
 use crate::tables::WaitingNodeLogs;
 
 /// Maximum number of messages in one request.
@@ -25,10 +23,7 @@ pub(super) const GATHER: Duration = Duration::from_millis(500);
 
 /// The queue of messages between the capture thread and the exporter.
 #[derive(Debug, Default)]
-pub struct NodeLogQueue {
-    waiting: Mutex<Bounded<WaitingNodeLogs, VecDeque<NewLog>>>,
-    added: Notify,
-}
+pub struct NodeLogQueue(Waiting<WaitingNodeLogs, NewLog>);
 
 /// The input of the queue, if logs of nodes are exported.
 #[derive(Clone, Debug, Default)]
@@ -52,41 +47,10 @@ impl NodeLogSink {
         let selected = messages
             .into_iter()
             .filter(|log| log.message.level >= level);
-        let refused = self.queue.put(selected);
+        let refused = self.queue.0.put(selected);
         let signal = Signal::NodeLogs;
         self.exports
             .count_dropped(signal, Reason::Overflow, refused + lost);
-    }
-}
-
-impl NodeLogQueue {
-    /// Appends messages and returns the number of those that did not fit.
-    fn put(&self, messages: impl Iterator<Item = NewLog>) -> u64 {
-        let mut waiting = self.waiting();
-        let refused = messages.filter_map(|log| waiting.push_back(log)).count();
-        drop(waiting);
-        self.added.notify_one();
-        refused as u64
-    }
-
-    fn take(&self) -> Vec<NewLog> {
-        let mut waiting = self.waiting();
-        let most = waiting.len().min(REQUEST);
-        waiting.drain(..most).collect()
-    }
-
-    async fn filled(&self) {
-        loop {
-            let added = self.added.notified();
-            if !self.waiting().is_empty() {
-                return;
-            }
-            added.await;
-        }
-    }
-
-    fn waiting(&self) -> MutexGuard<'_, Bounded<WaitingNodeLogs, VecDeque<NewLog>>> {
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -101,12 +65,12 @@ impl Queue for NodeLogs {
     type Batch = Vec<SdkLogRecord>;
 
     async fn filled(&self) {
-        self.queue.filled().await;
+        self.queue.0.filled().await;
     }
 
     /// The sink counts messages that do not fit.
     fn take(&mut self) -> (Option<Vec<SdkLogRecord>>, u64) {
-        let taken = self.queue.take();
+        let taken = self.queue.0.take(REQUEST);
         let records: Vec<_> = taken.iter().map(|log| self.record(log)).collect();
         ((!records.is_empty()).then_some(records), 0)
     }
@@ -231,11 +195,11 @@ mod tests {
     fn only_messages_of_the_level_are_queued_and_losses_count() {
         let sink = sink(Some(LogLevel::Warn));
         sink.add(LogLevel::ALL.map(new_log).to_vec(), 4);
-        assert_eq!(sink.queue.take().len(), 3);
+        assert_eq!(sink.queue.0.take(REQUEST).len(), 3);
         assert_eq!(sink.exports.dropped(Signal::NodeLogs, Reason::Overflow), 4);
         let off = self::sink(None);
         off.add(LogLevel::ALL.map(new_log).to_vec(), 0);
-        assert!(off.queue.take().is_empty());
+        assert!(off.queue.0.take(REQUEST).is_empty());
     }
 
     #[test]
@@ -243,7 +207,7 @@ mod tests {
         let sink = sink(Some(LogLevel::Warn));
         sink.add(vec![new_log(LogLevel::Error); WaitingNodeLogs::CAP + 3], 0);
         assert_eq!(sink.exports.dropped(Signal::NodeLogs, Reason::Overflow), 3);
-        assert_eq!(sink.queue.take().len(), REQUEST);
+        assert_eq!(sink.queue.0.take(REQUEST).len(), REQUEST);
     }
 
     #[test]

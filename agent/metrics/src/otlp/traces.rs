@@ -7,8 +7,7 @@
 mod chains;
 mod late_calls;
 
-use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use opentelemetry::trace::{
@@ -19,17 +18,16 @@ use opentelemetry_otlp::SpanExporter;
 use opentelemetry_sdk::error::OTelSdkResult;
 use opentelemetry_sdk::trace::{SpanData, SpanEvents, SpanExporter as _, SpanLinks};
 use ros2probe_wire::Timestamp;
-use tokio::sync::Notify;
 
 use self::late_calls::LateSpan;
 use super::delivery::{Export, Queue};
 use super::events::time;
 use super::exports::{Exports, Reason, Signal};
 use super::points::scope;
+use super::waiting::Waiting;
 use crate::tables::WaitingSpans;
 use ros2probe_model::derive::chain::spans::{ChainSpan, ChainSpans};
 use ros2probe_model::derive::trace::{Span, SpanStage, Spans};
-use ros2probe_model::facts::bounded::Bounded;
 use ros2probe_model::facts::calls::facts::NewLateCalls;
 use ros2probe_model::facts::identity::Identity;
 
@@ -42,10 +40,7 @@ const FLAGS: u8 = 0b11;
 
 /// The queue of spans between the capture thread and the exporter.
 #[derive(Debug, Default)]
-pub struct SpanQueue {
-    waiting: Mutex<Bounded<WaitingSpans, VecDeque<QueuedSpan>>>,
-    added: Notify,
-}
+pub struct SpanQueue(Waiting<WaitingSpans, QueuedSpan>);
 
 /// A span in the queue.
 #[derive(Clone, Debug)]
@@ -78,7 +73,7 @@ impl SpanSink {
         let lost = lost + chains.lost;
         let mut signals = self.exports.signals();
         if signals.any(|signal| signal == Signal::Traces) {
-            let refused = self.queue.put(spans.chain(of_chains));
+            let refused = self.queue.0.put(spans.chain(of_chains));
             let refused = refused + self.add_late_calls(late);
             self.exports
                 .count_dropped(Signal::Traces, Reason::Overflow, refused + lost);
@@ -96,59 +91,9 @@ impl SpanSink {
         let calls = late.calls.iter();
         let refused = calls.map(|(domain_id, example)| {
             let spans = LateSpan::of(*domain_id, example).into_iter();
-            self.queue.put_whole(spans.map(QueuedSpan::LateCall))
+            self.queue.0.put_whole(spans.map(QueuedSpan::LateCall))
         });
         late.lost + refused.sum::<u64>()
-    }
-}
-
-impl SpanQueue {
-    /// Appends all of these spans, or none. Returns the number of spans that did not fit.
-    fn put_whole(&self, spans: impl ExactSizeIterator<Item = QueuedSpan>) -> u64 {
-        let count = spans.len();
-        let mut waiting = self.waiting();
-        if waiting.len() + count > WaitingSpans::CAP {
-            return count as u64;
-        }
-        spans.for_each(|span| {
-            waiting.push_back(span);
-        });
-        drop(waiting);
-        self.added.notify_one();
-        0
-    }
-
-    /// Appends spans and returns the number of spans that did not fit.
-    fn put(&self, spans: impl IntoIterator<Item = QueuedSpan>) -> u64 {
-        let mut spans = spans.into_iter().peekable();
-        if spans.peek().is_none() {
-            return 0;
-        }
-        let mut waiting = self.waiting();
-        let refused = spans.filter_map(|span| waiting.push_back(span)).count();
-        drop(waiting);
-        self.added.notify_one();
-        refused as u64
-    }
-
-    fn take(&self) -> Vec<QueuedSpan> {
-        let mut waiting = self.waiting();
-        let most = waiting.len().min(REQUEST);
-        waiting.drain(..most).collect()
-    }
-
-    async fn filled(&self) {
-        loop {
-            let added = self.added.notified();
-            if !self.waiting().is_empty() {
-                return;
-            }
-            added.await;
-        }
-    }
-
-    fn waiting(&self) -> MutexGuard<'_, Bounded<WaitingSpans, VecDeque<QueuedSpan>>> {
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -179,12 +124,12 @@ impl Queue for Tracing {
     type Batch = Vec<SpanData>;
 
     async fn filled(&self) {
-        self.queue.filled().await;
+        self.queue.0.filled().await;
     }
 
     /// The sink counts spans that do not fit.
     fn take(&mut self) -> (Option<Vec<SpanData>>, u64) {
-        let spans = self.queue.take();
+        let spans = self.queue.0.take(REQUEST);
         let exported = spans.iter().map(|span| match span {
             QueuedSpan::Message(span) => self.of_message(span),
             QueuedSpan::Chain(span) => self.exported(chains::parts(span, self.host)),
@@ -410,12 +355,12 @@ mod tests {
     async fn the_queue_is_bounded_and_counts_refused_spans() {
         let queue = SpanQueue::default();
         let spans = |count| vec![QueuedSpan::Message(span(SpanStage::Send)); count];
-        assert_eq!(queue.put(Vec::new()), 0);
-        assert_eq!(queue.put(spans(WaitingSpans::CAP - 1)), 0);
-        assert_eq!(queue.put(spans(3)), 2);
-        queue.filled().await;
+        assert_eq!(queue.0.put(Vec::new()), 0);
+        assert_eq!(queue.0.put(spans(WaitingSpans::CAP - 1)), 0);
+        assert_eq!(queue.0.put(spans(3)), 2);
+        queue.0.filled().await;
         let mut taken = 0;
-        while let more @ 1.. = queue.take().len() {
+        while let more @ 1.. = queue.0.take(REQUEST).len() {
             assert!(more <= REQUEST);
             taken += more;
         }

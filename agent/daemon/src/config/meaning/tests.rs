@@ -167,6 +167,39 @@ watch:
 }
 
 #[test]
+fn what_the_robot_should_be_is_checked() {
+    let source = "\
+robot:
+  active: [/nav/*, lidar]
+  parameters_expected:
+    - {node: /planner, name: speed, value: '0.5'}
+    - {node: planner, name: '', value: '0.5'}
+  extract:
+    - {topic: /battery, field: 'cells[0].voltage', metric: robot_cell_volts}
+    - {topic: /b*, field: 'percentage +', metric: ros2_battery}
+    - {topic: /battery, field: percentage, metric: robot_cells_total}
+";
+    let report = report(source);
+    let wrong: Vec<_> = report
+        .lines()
+        .map(|line| line.trim().split(": ").nth(1).unwrap_or_default())
+        .collect();
+    let expected = [
+        "robot.active[1]",
+        "robot.parameters_expected[1].node",
+        "robot.parameters_expected[1].name",
+        "robot.extract[1].topic",
+        "robot.extract[1].field",
+        "robot.extract[1].metric",
+        "robot.extract[2].metric",
+    ];
+    assert_eq!(wrong, expected, "{report}");
+    let config = Config::parse(b"robot:\n  extract: [{topic: /a, field: b.c, metric: d}]\n");
+    let expectations = config.unwrap().expectations();
+    assert_eq!(*expectations.fields, ["/a"]);
+}
+
+#[test]
 fn a_setting_of_the_other_source_is_a_mistake() {
     let source = "\
 capture:

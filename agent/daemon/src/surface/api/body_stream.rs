@@ -2,6 +2,9 @@
 
 use std::convert::Infallible;
 
+use axum::body::Body;
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
+use axum::response::{IntoResponse as _, Response};
 use futures_util::stream::{self, Stream};
 use serde::Serialize;
 
@@ -22,6 +25,15 @@ pub(super) fn stream_of<S: Pieces>(
         let piece = source.next().await?;
         Some((Ok(piece), source))
     })
+}
+
+/// Returns an answer of lines of JSON.
+pub(super) fn lines_of(body: impl Into<Body>) -> Response {
+    let headers = [
+        (CACHE_CONTROL, "no-store"),
+        (CONTENT_TYPE, "application/x-ndjson"),
+    ];
+    (headers, body.into()).into_response()
 }
 
 /// Appends a line of JSON to `lines`.

@@ -11,8 +11,8 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
-use super::parameters::Parameters;
-use super::problem::{Code, Problem, ProblemBody};
+use super::parameters::{Parameters, labelled};
+use super::problem::{Problem, ProblemBody};
 use super::scope::Domain;
 use ros2probe_api::diagnostics::{DiagnosticStatus, DiagnosticValue, Diagnostics};
 use ros2probe_model::facts::wall_clock::WallClock;
@@ -61,7 +61,7 @@ async fn diagnostics(
     let domain = Domain::of(of.domain_id).checked()?;
     let least = match of.level.as_deref() {
         None => DiagnosticLevel::Ok,
-        Some(name) => level(name)?,
+        Some(name) => labelled("level", name, &DiagnosticLevel::ALL, DiagnosticLevel::label)?,
     };
     let state = context.state().await;
     let snapshot = state.known();
@@ -77,19 +77,6 @@ async fn diagnostics(
             .collect(),
     };
     Ok(Json(answer).into_response())
-}
-
-/// # Errors
-/// Fails if no level has this name.
-fn level(name: &str) -> Result<DiagnosticLevel, Problem> {
-    DiagnosticLevel::named(name).ok_or_else(|| {
-        let detail = format!(
-            "the level `{}` is none of {}",
-            name.chars().take(32).collect::<String>(),
-            DiagnosticLevel::ALL.map(DiagnosticLevel::label).join(", ")
-        );
-        Problem::new(Code::InvalidRequest, detail)
-    })
 }
 
 fn view(status: &snapshot::DiagnosticStatus, clock: WallClock) -> DiagnosticStatus<'_> {

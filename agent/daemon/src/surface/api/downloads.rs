@@ -1,11 +1,13 @@
-//! `/recordings/{name}/files`: downloads of a bag's files.
+//! `/recordings/{name}/files` and `/recordings/{name}/archive`: downloads of a bag's files.
 //!
 //! Only files in the listing are served: plain files in the recording's own directory. Links are
 //! not followed.
 
+use std::collections::VecDeque;
 use std::fs::{self, File};
 use std::io::{self, Read as _};
-use std::path::Path as FilePath;
+use std::path::{Path as FilePath, PathBuf};
+use std::time::UNIX_EPOCH;
 
 use axum::Json;
 use axum::body::{Body, Bytes};
@@ -21,7 +23,8 @@ use utoipa_axum::routes;
 
 use super::Context;
 use super::problem::{Code, Problem, ProblemBody};
-use super::recordings::find;
+use super::recordings::directory;
+use crate::file;
 use ros2probe_api::recordings::{RecordingFile, RecordingFiles};
 
 /// Maximum number of files listed per bag.
@@ -33,6 +36,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
         .routes(routes!(list))
         .routes(routes!(download))
+        .routes(routes!(archive))
 }
 
 /// The files of a recording
@@ -51,8 +55,8 @@ async fn list(
     State(context): State<Context>,
     Path(name): Path<String>,
 ) -> Result<Json<RecordingFiles>, Problem> {
-    let recording = find(&context, &name)?;
-    let listed = spawn_blocking(move || files(&recording.directory)).await;
+    let directory = directory(&context, &name).await?;
+    let listed = spawn_blocking(move || files(&directory)).await;
     let files = listed.map_err(|_| Problem::new(Code::Ending, "the agent is shutting down"))?;
     Ok(Json(RecordingFiles { files }))
 }
@@ -80,12 +84,12 @@ async fn download(
     State(context): State<Context>,
     Path((name, file)): Path<(String, String)>,
 ) -> Result<Response, Problem> {
-    let recording = find(&context, &name)?;
+    let directory = directory(&context, &name).await?;
     let opened = spawn_blocking(move || {
         // Only listed files are served, so no path leads out of the directory.
-        let files = files(&recording.directory);
+        let files = files(&directory);
         let found = files.into_iter().find(|each| each.file == file)?;
-        let open = File::open(recording.directory.join(&found.file)).ok()?;
+        let open = File::open(directory.join(&found.file)).ok()?;
         Some((found, open))
     });
     let opened = opened.await;
@@ -95,43 +99,149 @@ async fn download(
         Problem::new(Code::NoSuchRecording, detail)
     };
     let (RecordingFile { file, bytes }, open) = opened.ok_or_else(missing)?;
-    let pieces = stream::unfold(Some((open, bytes)), |open| async {
-        let (open, left) = open.filter(|(_, left)| *left > 0)?;
-        let read = spawn_blocking(move || piece(open, left)).await;
+    let part = Part::File {
+        path: PathBuf::new(),
+        open: Some(open),
+        left: bytes,
+    };
+    let disposition = format!("attachment; filename=\"{file}\"");
+    let headers = [(CONTENT_DISPOSITION, disposition)];
+    Ok((headers, answer("application/octet-stream", vec![part])).into_response())
+}
+
+/// All files of a recording
+///
+/// The answer is a tar archive with the bag's directory. It has the lengths of the files at the time
+/// of the request; data appended later are not included.
+#[utoipa::path(
+    get,
+    path = "/recordings/{name}/archive",
+    tag = "recordings",
+    params(("name" = String, Path, description = "Name of the recording.")),
+    responses(
+        (status = 200, description = "The archive.", body = Vec<u8>, content_type = "application/x-tar"),
+        (status = 404, description = "The recording does not exist.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn archive(
+    State(context): State<Context>,
+    Path(name): Path<String>,
+) -> Result<Response, Problem> {
+    let directory = directory(&context, &name).await?;
+    let parts = spawn_blocking(move || archive_parts(&directory)).await;
+    let parts = parts.map_err(|_| Problem::new(Code::Ending, "the agent is shutting down"))?;
+    Ok(answer("application/x-tar", parts))
+}
+
+/// A part of an answer.
+#[derive(Debug)]
+enum Part {
+    Bytes(Bytes),
+    /// The next bytes of a file, which is opened when they are due.
+    File {
+        path: PathBuf,
+        open: Option<File>,
+        left: u64,
+    },
+}
+
+impl Part {
+    const fn length(&self) -> u64 {
+        match self {
+            Self::Bytes(bytes) => bytes.len() as u64,
+            Self::File { left, .. } => *left,
+        }
+    }
+
+    /// Reads the next bytes. Returns them with the part that is left.
+    fn read(self) -> io::Result<(Bytes, Self)> {
+        let (path, open, left) = match self {
+            Self::Bytes(bytes) => return Ok((bytes, Self::Bytes(Bytes::new()))),
+            Self::File { path, open, left } => (path, open, left),
+        };
+        let mut file = open.map_or_else(|| file::open_no_link(&path), Ok)?;
+        let mut piece = Vec::with_capacity(PIECE);
+        let most = left.min(PIECE as u64);
+        let read = io::Read::take(&mut file, most).read_to_end(&mut piece)? as u64;
+        if read < most {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        let rest = Self::File {
+            path,
+            open: Some(file),
+            left: left - read,
+        };
+        Ok((piece.into(), rest))
+    }
+}
+
+/// Returns an answer of these parts, which are read while the client reads.
+fn answer(content_type: &'static str, mut parts: Vec<Part>) -> Response {
+    parts.retain(|part| part.length() > 0);
+    let length: u64 = parts.iter().map(Part::length).sum();
+    let pieces = stream::unfold(VecDeque::from(parts), |mut parts| async {
+        let part = parts.pop_front()?;
+        let read = spawn_blocking(move || part.read()).await;
         Some(
             match read.unwrap_or_else(|error| Err(io::Error::other(error))) {
-                Ok((piece, rest)) => (Ok(piece), Some(rest)),
+                Ok((piece, rest)) => {
+                    if rest.length() > 0 {
+                        parts.push_front(rest);
+                    }
+                    (Ok(piece), parts)
+                }
                 // The error breaks the connection, so the client notices the missing bytes.
-                Err(error) => (Err(error), None),
+                Err(error) => (Err(error), VecDeque::new()),
             },
         )
     });
     let headers = [
         (CACHE_CONTROL, "no-store".to_owned()),
-        (CONTENT_TYPE, "application/octet-stream".to_owned()),
+        (CONTENT_TYPE, content_type.to_owned()),
         (X_CONTENT_TYPE_OPTIONS, "nosniff".to_owned()),
-        (CONTENT_LENGTH, bytes.to_string()),
-        (
-            CONTENT_DISPOSITION,
-            format!("attachment; filename=\"{file}\""),
-        ),
+        (CONTENT_LENGTH, length.to_string()),
     ];
-    Ok((headers, Body::from_stream(pieces)).into_response())
+    (headers, Body::from_stream(pieces)).into_response()
 }
 
-/// Reads the next bytes of a file. Returns them with the file and the number of bytes left.
-fn piece(mut file: File, left: u64) -> io::Result<(Bytes, (File, u64))> {
-    let mut piece = Vec::with_capacity(PIECE);
-    let most = left.min(PIECE as u64);
-    let read = io::Read::take(&mut file, most).read_to_end(&mut piece)? as u64;
-    if read < most {
-        return Err(io::ErrorKind::UnexpectedEof.into());
+/// Returns the parts of a tar archive of a bag: for each file its header, its content, and zeros up
+/// to a whole block; at the end two empty blocks.
+fn archive_parts(directory: &FilePath) -> Vec<Part> {
+    const BLOCK: u64 = 512;
+    let name = directory.file_name().unwrap_or_default();
+    let mut parts = Vec::new();
+    for RecordingFile { file, bytes } in files(directory) {
+        let path = directory.join(&file);
+        let mut header = tar::Header::new_ustar();
+        if header.set_path(FilePath::new(name).join(&file)).is_err() {
+            // A longer path does not fit into the format: the file alone has a shorter one.
+            let _ = header.set_path(&file);
+        }
+        header.set_size(bytes);
+        header.set_mode(0o644);
+        let modified = fs::metadata(&path).and_then(|metadata| metadata.modified());
+        let since = modified
+            .ok()
+            .and_then(|time| time.duration_since(UNIX_EPOCH).ok());
+        header.set_mtime(since.unwrap_or_default().as_secs());
+        header.set_cksum();
+        parts.push(Part::Bytes(Bytes::copy_from_slice(header.as_bytes())));
+        parts.push(Part::File {
+            path,
+            open: None,
+            left: bytes,
+        });
+        let padding = (BLOCK - bytes % BLOCK) % BLOCK;
+        let zeros = vec![0; usize::try_from(padding).unwrap_or_default()];
+        parts.push(Part::Bytes(zeros.into()));
     }
-    Ok((piece.into(), (file, left - read)))
+    parts.push(Part::Bytes(vec![0; 1024].into()));
+    parts
 }
 
 /// Returns the plain files of a directory whose names are valid in a header.
-fn files(directory: &FilePath) -> Vec<RecordingFile> {
+pub(super) fn files(directory: &FilePath) -> Vec<RecordingFile> {
     let entries = fs::read_dir(directory).into_iter().flatten();
     let files = entries.filter_map(|entry| {
         let entry = entry.ok()?;
@@ -167,6 +277,39 @@ mod tests {
         assert_eq!(names, ["bag_0.mcap", "metadata.yaml"]);
         assert_eq!(listed[1].bytes, 5);
         assert!(files(&path.join("nowhere")).is_empty());
+    }
+
+    #[test]
+    fn an_archive_has_every_file_in_the_directory_of_the_bag() {
+        let directory = tempfile::tempdir().unwrap();
+        let bag = directory.path().join("lap");
+        fs::create_dir(&bag).unwrap();
+        let contents = [
+            ("lap_0.mcap", vec![7; 700]),
+            ("metadata.yaml", vec![8; 512]),
+            ("empty", vec![]),
+        ];
+        for (name, content) in &contents {
+            fs::write(bag.join(name), content).unwrap();
+        }
+        let mut bytes = Vec::new();
+        for part in archive_parts(&bag) {
+            match part {
+                Part::Bytes(own) => bytes.extend_from_slice(&own),
+                Part::File { path, .. } => bytes.extend(fs::read(path).unwrap()),
+            }
+        }
+        assert_eq!(bytes.len() % 512, 0);
+        let mut archive = tar::Archive::new(&bytes[..]);
+        let mut found = std::collections::BTreeMap::new();
+        for entry in archive.entries().unwrap() {
+            let mut entry = entry.unwrap();
+            let mut content = Vec::new();
+            entry.read_to_end(&mut content).unwrap();
+            found.insert(entry.path().unwrap().display().to_string(), content);
+        }
+        let expected = contents.map(|(name, content)| (format!("lap/{name}"), content));
+        assert_eq!(found, expected.into());
     }
 
     #[test]

@@ -49,6 +49,7 @@ pub(super) fn endpoint<'a>(
             .collect(),
         first_seen_timestamp_seconds: clock.wall_time(facts.first_seen).seconds(),
         measurement: measured.map(|facts| measurement(facts, clock)),
+        clock: None,
         latched: facts.latched.map(latched),
     }
 }

@@ -199,6 +199,50 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
             offset_seconds: seconds(*offset),
             uncertainty_seconds: seconds(*uncertainty),
         },
+        diagnosis::Diagnosis::NearMiss {
+            subscription,
+            difference,
+            ..
+        } => Diagnosis::NearMiss {
+            subscription: Cow::Borrowed(&subscription.name),
+            subscription_domain_id: subscription.domain_id.0,
+            difference: difference.label().into(),
+        },
+        diagnosis::Diagnosis::NodeInactive {
+            state, has_failed, ..
+        } => Diagnosis::NodeInactive {
+            state: state.label().into(),
+            failed: *has_failed,
+        },
+        diagnosis::Diagnosis::ParameterDrift {
+            name,
+            expected,
+            value,
+            ..
+        } => Diagnosis::ParameterDrift {
+            name: Cow::Borrowed(name),
+            expected: Cow::Borrowed(expected),
+            value: Cow::Borrowed(value),
+        },
+        diagnosis::Diagnosis::MixedTime {
+            simulated, system, ..
+        } => Diagnosis::MixedTime {
+            simulated: texts(simulated),
+            system: texts(system),
+        },
+        diagnosis::Diagnosis::WrongStamps {
+            writer,
+            fault,
+            nanoseconds,
+            ..
+        } => Diagnosis::WrongStamps {
+            writer: writer.to_string(),
+            fault: fault.label().into(),
+            offset_seconds: seconds(*nanoseconds),
+        },
+        diagnosis::Diagnosis::SharedMemoryFull { used_permille } => Diagnosis::SharedMemoryFull {
+            used_ratio: thousandths(*used_permille),
+        },
         diagnosis::Diagnosis::SlowChain {
             from, max_latency, ..
         } => Diagnosis::SlowChain {

@@ -4,6 +4,7 @@ use axum::Json;
 use axum::response::{IntoResponse, Response};
 
 use super::Context;
+use super::past::TopicRange;
 use super::problem::ProblemBody;
 use super::scope::Domain;
 use super::topics::{TopicParameter, find};
@@ -12,20 +13,23 @@ use ros2probe_api::topics::History;
 
 /// The last minutes of a topic
 ///
-/// The answer covers as many seconds as `page.history_s`, the oldest first. A topic has a history
-/// while it is measured. A path such as `/topics/camera/history` means the topic `/camera/history`
+/// Without `from`, `to` and `step`, the answer covers as many seconds as `page.history_s`, the oldest
+/// first. With one of them it covers these times in the history on disk, also of a topic that no
+/// longer exists. A topic has a history while it is measured. A path such as `/topics/camera/history` means the topic `/camera/history`
 /// if that topic exists. With encoded slashes (`/topics/%2Fcamera%2Fimage/history`), the path is
 /// unambiguous.
 #[utoipa::path(
     get,
     path = "/topics/{topic}/history",
     tag = "graph",
-    params(TopicParameter, Domain),
+    params(TopicParameter, TopicRange),
     responses(
         (status = 200, description = "The last minutes of the topic.", body = History),
         (status = 404, description = "The topic does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 409, description = "The name exists in several domains; add `domain_id`.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 422, description = "A time or the step is invalid.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]

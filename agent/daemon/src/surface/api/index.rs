@@ -6,7 +6,8 @@ use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
 use ros2probe_model::facts::diagnosis::Diagnosis;
 use ros2probe_model::report::snapshot::{
-    EndpointFacts, ParticipantFacts, Snapshot, TopicFacts, WatchFacts, WatchedTopicFacts,
+    ClockFacts, EndpointFacts, ParticipantFacts, PeerClock, Snapshot, TopicFacts, WatchFacts,
+    WatchedTopicFacts,
 };
 
 /// A watchlist entry and the state of a topic under it.
@@ -16,6 +17,7 @@ pub(super) type Standing<'a> = (&'a WatchFacts, &'a WatchedTopicFacts);
 #[derive(Debug)]
 pub(super) struct Index<'a> {
     participants: HashMap<GuidPrefix, &'a ParticipantFacts>,
+    clocks: &'a ClockFacts,
     findings: HashMap<(DomainId, &'a str), Vec<&'a Diagnosis>>,
     watches: HashMap<(DomainId, &'a str), Vec<Standing<'a>>>,
 }
@@ -43,6 +45,7 @@ impl<'a> Index<'a> {
         }
         Self {
             participants: participants.map(|each| (each.guid.prefix, each)).collect(),
+            clocks: &snapshot.clocks,
             findings,
             watches,
         }
@@ -50,6 +53,14 @@ impl<'a> Index<'a> {
 
     pub(super) fn participant(&self, guid: Guid) -> Option<&'a ParticipantFacts> {
         self.participants.get(&guid.prefix).copied()
+    }
+
+    /// Returns what is known of the clock of the host of an endpoint; `None` for this host, and if
+    /// clocks are not compared.
+    pub(super) fn clock(&self, guid: Guid) -> Option<&'a PeerClock> {
+        let address = self.participant(guid)?.addresses.reachable()?;
+        let mut peers = self.clocks.peers.iter();
+        peers.find(|peer| peer.address == address)
     }
 
     /// Returns the problems of a topic.

@@ -250,17 +250,14 @@ pub(super) fn topic_details<'a>(
 
 /// Returns the observations of a node, or `None` without observations.
 pub(super) fn node<'a>(
-    domain_id: DomainId,
-    name: &str,
+    (domain_id, name): (DomainId, &str),
+    activity: NodeActivity<'a>,
     snapshot: &'a Snapshot,
 ) -> Option<NodeInside<'a>> {
     let (known, clock) = (snapshot.inside.as_deref()?, snapshot.wall_clock);
     let is_own = |owner: &facts::Owner| {
         owner.domain_id == domain_id && owner.node.as_ref().is_some_and(|node| *node == *name)
     };
-    let activities = NodeActivity::all(known);
-    let activity = activities.get(&(domain_id, name)).copied();
-    let activity = activity.unwrap_or_default();
     let publishers = known.publishers.iter().filter(|each| is_own(&each.owner));
     let subscriptions = known.subscriptions.iter();
     let subscriptions = subscriptions.filter(|each| is_own(&each.owner));
@@ -512,7 +509,9 @@ mod tests {
         assert_eq!((topic.published_messages, topic.publishers.len()), (30, 1));
         assert!(topic.callbacks.is_empty(), "its timer has no topic");
 
-        let node = node(DomainId(0), "/lidar", &snapshot).unwrap();
+        let key = (DomainId(0), "/lidar");
+        let activity = NodeActivity::all(&snapshot)[&key];
+        let node = node(key, activity, &snapshot).unwrap();
         assert_eq!((node.callbacks.len(), node.publishers.len()), (1, 1));
         let callback = &node.callbacks[0];
         assert_eq!(callback.trigger.words(), "timer 100 ms");
@@ -526,7 +525,9 @@ mod tests {
             [shares.cpu, shares.blocked, shares.throttled],
             [0.75, 0.25, 0.0]
         );
-        assert!(super::node(DomainId(0), "/camera", &snapshot).is_none());
+        assert!(
+            super::node((DomainId(0), "/camera"), NodeActivity::default(), &snapshot).is_none()
+        );
     }
 
     #[test]

@@ -11,7 +11,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
-use super::parameters::Parameters;
+use super::parameters::{Parameters, labelled};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::Domain;
 use ros2probe_api::logs::{LevelLog, LogMessage, Logs, NodeLog};
@@ -71,7 +71,7 @@ async fn logs(
     let domain = Domain::of(of.domain_id).checked()?;
     let least = match of.level.as_deref() {
         None => LogLevel::Debug,
-        Some(name) => level(name)?,
+        Some(name) => labelled("level", name, &LogLevel::ALL, LogLevel::label)?,
     };
     let limit = of.limit.unwrap_or(LIMIT);
     if limit > MOST {
@@ -100,19 +100,6 @@ async fn logs(
         messages,
     };
     Ok(Json(answer).into_response())
-}
-
-/// # Errors
-/// Fails if no level has this name.
-fn level(name: &str) -> Result<LogLevel, Problem> {
-    LogLevel::named(name).ok_or_else(|| {
-        let detail = format!(
-            "the level `{}` is none of {}",
-            name.chars().take(32).collect::<String>(),
-            LogLevel::ALL.map(LogLevel::label).join(", ")
-        );
-        Problem::new(Code::InvalidRequest, detail)
-    })
 }
 
 fn node(log: &NodeLogFacts, clock: WallClock) -> NodeLog<'_> {

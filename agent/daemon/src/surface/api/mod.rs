@@ -19,6 +19,7 @@ mod health;
 mod history;
 mod index;
 mod inside;
+mod kept;
 pub mod live;
 mod logs;
 mod measured;
@@ -31,6 +32,7 @@ pub mod page;
 mod parameters;
 mod participants;
 mod party;
+mod past;
 mod pipe;
 pub mod problem;
 mod processes;
@@ -66,6 +68,7 @@ use super::foxglove::Viewers;
 use super::large_responses::LargeResponses;
 use super::ros2_daemon::Ros2DaemonFigures;
 use crate::config::{Access, Limit};
+use crate::disk_history::DiskHistory;
 use crate::events::EventLog;
 use crate::limit_facts::LimitFigures;
 use crate::recording::RecordingFigures;
@@ -76,6 +79,7 @@ use crate::watches::Watches;
 pub use live::Live;
 pub use openapi::document;
 pub use page::Page;
+pub use past::HistoryWriter;
 pub use pipe::serve as serve_in_process;
 use problem::{Code, Problem};
 use reload::Reloader;
@@ -112,6 +116,8 @@ pub struct Context {
     pub snapshots: Arc<Snapshots>,
     /// State that all streams of the web page share.
     pub live: Arc<Live>,
+    /// History on disk.
+    pub disk_history: Arc<DiskHistory>,
     /// Message definitions.
     pub library: Arc<Library>,
     /// The viewers.
@@ -210,6 +216,7 @@ fn views() -> OpenApiRouter<Context> {
         .merge(participants::routes())
         .merge(graph::routes())
         .merge(names::routes())
+        .merge(past::routes())
         .merge(clocks::routes())
 }
 

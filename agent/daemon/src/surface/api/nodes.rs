@@ -21,11 +21,13 @@ use super::parameters::{Name, Parameters};
 use super::party::{Side, action, action_type, service_type};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::{Scope, only};
+use crate::surface::inside_nodes::NodeActivity;
 use ros2probe_api::diagnosis::Finding;
 use ros2probe_api::nodes::{Named, Node, NodeInstance, NodeList};
 use ros2probe_model::facts::diagnosis::Diagnosis;
 use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_model::report::snapshot::{NodeFacts, Snapshot};
+use ros2probe_wire::DomainId;
 
 /// Names with their types, sorted.
 #[derive(Debug, Default)]
@@ -129,6 +131,7 @@ struct NodeAnswers<'a> {
     snapshot: &'a Snapshot,
     index: Index<'a>,
     ends: Ends<'a>,
+    activities: BTreeMap<(DomainId, &'a str), NodeActivity<'a>>,
     scope: Scope,
 }
 
@@ -138,6 +141,7 @@ impl<'a> NodeAnswers<'a> {
             snapshot,
             index: Index::new(snapshot),
             ends: Ends::new(snapshot),
+            activities: NodeActivity::all(snapshot),
             scope,
         }
     }
@@ -179,6 +183,8 @@ impl<'a> NodeAnswers<'a> {
                 _ => subscriptions.add(&topic.name, Some(message_type)),
             }
         }
+        let activity = self.activities.get(&(first.domain_id, &*first.name));
+        let activity = activity.copied().unwrap_or_default();
         Some(Node {
             domain_id: first.domain_id.0,
             name: Cow::Borrowed(&first.name),
@@ -190,8 +196,9 @@ impl<'a> NodeAnswers<'a> {
             clients: clients.views(),
             action_servers: action_servers.views(),
             action_clients: action_clients.views(),
+            lifecycle_state: activity.state.map(Cow::Borrowed),
             diagnoses: self.findings(first),
-            inside: inside::node(first.domain_id, &first.name, self.snapshot),
+            inside: inside::node((first.domain_id, &first.name), activity, self.snapshot),
         })
     }
 
@@ -208,6 +215,15 @@ impl<'a> NodeAnswers<'a> {
         let found = self.snapshot.diagnoses.list.iter();
         let about = found.filter(|finding| match finding {
             Diagnosis::DuplicateNode {
+                domain_id, node, ..
+            }
+            | Diagnosis::LogErrors {
+                domain_id, node, ..
+            }
+            | Diagnosis::NodeInactive {
+                domain_id, node, ..
+            }
+            | Diagnosis::ParameterDrift {
                 domain_id, node, ..
             } => *domain_id == own.domain_id && *node == own.name,
             Diagnosis::NodeInSeveralDomains { node, domains, .. } => {

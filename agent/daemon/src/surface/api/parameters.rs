@@ -17,6 +17,28 @@ pub(super) struct Name(pub(super) String);
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Parameters<T>(pub(super) T);
 
+/// Returns the value with this label, for a parameter called `what`.
+///
+/// # Errors
+/// Fails if no value has this label.
+pub(super) fn labelled<T: Copy>(
+    what: &str,
+    label: &str,
+    all: &[T],
+    label_of: fn(T) -> &'static str,
+) -> Result<T, Problem> {
+    let found = all.iter().find(|value| label_of(**value) == label);
+    found.copied().ok_or_else(|| {
+        let labels: Vec<_> = all.iter().map(|value| label_of(*value)).collect();
+        let detail = format!(
+            "the {what} `{}` is none of {}",
+            label.chars().take(32).collect::<String>(),
+            labels.join(", ")
+        );
+        Problem::new(Code::InvalidRequest, detail)
+    })
+}
+
 impl<S: Send + Sync> FromRequestParts<S> for Name {
     type Rejection = Problem;
 

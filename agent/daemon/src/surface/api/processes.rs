@@ -14,12 +14,12 @@ use utoipa_axum::routes;
 
 use super::Context;
 use super::problem::{Code, Problem};
-use crate::surface::process::Usage;
+use crate::surface::process::{Usage, script};
 use ros2probe_api::participants::{ProcessList, ProcessUsage};
 use ros2probe_model::report::snapshot::Snapshot;
 
 /// Maximum number of processes per answer.
-const MAX_PROCESSES: usize = 512;
+pub(super) const MAX_PROCESSES: usize = 512;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(list))
@@ -40,7 +40,7 @@ async fn list(State(context): State<Context>) -> Result<Json<ProcessList>, Probl
 }
 
 /// Returns the processes that own a participant's socket on this host, with their announced names.
-fn local(snapshot: &Snapshot) -> BTreeMap<u32, Option<Arc<str>>> {
+pub(super) fn local(snapshot: &Snapshot) -> BTreeMap<u32, Option<Arc<str>>> {
     let mut ids = BTreeMap::new();
     for participant in &snapshot.participants {
         let process = &participant.process;
@@ -64,6 +64,7 @@ fn read(ids: BTreeMap<u32, Option<Arc<str>>>) -> ProcessList {
         processes.push(ProcessUsage {
             process_id,
             process: name.map_or(usage.name, |name| name.to_string()),
+            script: script(process_id),
             cpu_seconds: usage.cpu_seconds,
             memory_bytes: usage.resident_bytes,
             threads: usage.threads,
@@ -125,6 +126,7 @@ mod tests {
         let ids: Vec<_> = view.processes.iter().map(|each| each.process_id).collect();
         assert_eq!((ids, view.unreadable), (vec![own], 1));
         let process = &view.processes[0];
+        assert_eq!(process.script, None);
         assert!(
             process.memory_bytes > 100_000 && process.threads >= 1,
             "{process:?}"

@@ -3,6 +3,8 @@
 //! Recordings are stored in the configured directory; a name must be a plain file name. `rp bag
 //! record` writes bags elsewhere.
 
+use std::collections::BTreeSet;
+use std::path::{Path as FilePath, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, UNIX_EPOCH};
 
@@ -11,16 +13,21 @@ use axum::extract::{DefaultBodyLimit, Path, State};
 use axum::http::StatusCode;
 use axum::http::header::LOCATION;
 use axum::response::{IntoResponse, Response};
+use tokio::sync::Semaphore;
+use tokio::task::spawn_blocking;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
 use super::body::Body;
+use super::kept;
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::domain;
 use super::security::MAX_BODY;
 use crate::recording::{Command, Recording, RecordingOptions, Refusal};
-use ros2probe_api::recordings::{self as answers, FilterOptions, RecordingList, RecordingRequest};
+use ros2probe_api::recordings::{
+    self as answers, FilterOptions, KeptBag, RecordingList, RecordingRequest,
+};
 use ros2probe_bag::{Form, Options, Storage};
 
 /// Maximum time that an answer waits for a bag to be completed.
@@ -28,6 +35,9 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 /// Maximum time that a new recording waits for the capture to apply its subscription, and for
 /// breakpoints in the processes that send the messages.
 const BEGINS_WITHIN: Duration = Duration::from_secs(6);
+/// Maximum time that the list of recordings waits for the storage. The kept bags are absent then.
+const LISTED_WITHIN: Duration = Duration::from_secs(2);
+static LISTING: Semaphore = Semaphore::const_new(1);
 /// Maximum duration of one file: a year, in seconds.
 const MAX_DURATION: u64 = 31_536_000;
 
@@ -52,11 +62,39 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 async fn list(State(context): State<Context>) -> Json<RecordingList> {
     let recordings = context.recordings.all();
     let directory = context.recordings.directory();
+    let known = recordings.iter().map(|each| each.name.clone()).collect();
+    let root = directory.map(FilePath::to_owned);
+    let listed = tokio::time::timeout(LISTED_WITHIN, listed(root, known)).await;
+    let kept = listed.ok().flatten().unwrap_or_default();
     Json(RecordingList {
         directory: directory.map(|directory| directory.display().to_string()),
         recordings: recordings.iter().map(|each| view(each)).collect(),
+        kept,
         limits: limits(&context),
     })
+}
+
+/// Returns the bags that are kept. One thread at a time reads the directory: a storage that hangs
+/// holds one thread, whatever the number of clients.
+async fn listed(root: Option<PathBuf>, known: BTreeSet<String>) -> Option<Vec<KeptBag>> {
+    let permit = LISTING.acquire().await.ok()?;
+    let found = spawn_blocking(move || {
+        let _permit = permit;
+        Some(kept::kept(&root?, &known))
+    });
+    found.await.ok().flatten()
+}
+
+/// Returns the directory of a recording, or of a bag that is kept.
+pub(super) async fn directory(context: &Context, name: &str) -> Result<PathBuf, Problem> {
+    let missing = match find(context, name) {
+        Ok(recording) => return Ok(recording.directory.clone()),
+        Err(missing) => missing,
+    };
+    let root = context.recordings.directory().map(FilePath::to_owned);
+    let name = name.to_owned();
+    let found = spawn_blocking(move || kept::directory_of(&root?, &name)).await;
+    found.ok().flatten().ok_or(missing)
 }
 
 /// Start a recording
@@ -89,7 +127,7 @@ async fn begin(
     // A fresh snapshot provides the known topics for the bag's list of topics.
     context.state().await;
     let recordings = Arc::clone(&context.recordings);
-    let begun = tokio::task::spawn_blocking(move || recordings.begin(wanted)).await;
+    let begun = spawn_blocking(move || recordings.begin(wanted)).await;
     let begun = begun.map_err(|_| Problem::new(Code::Ending, "the agent is shutting down"))?;
     let recording = begun.map_err(|refusal| problem(&refusal))?;
     // Once the subscription is in force, the kernel's programs capture each message of the
@@ -217,7 +255,7 @@ fn order(context: &Context, name: &str, command: Command) -> Result<Response, Pr
     Ok((StatusCode::ACCEPTED, Json(view(&recording))).into_response())
 }
 
-pub(super) fn find(context: &Context, name: &str) -> Result<Arc<Recording>, Problem> {
+fn find(context: &Context, name: &str) -> Result<Arc<Recording>, Problem> {
     let found = context.recordings.find(name);
     found.ok_or_else(|| {
         let name: String = name.chars().take(128).collect();

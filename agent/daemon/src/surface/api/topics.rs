@@ -21,6 +21,7 @@ use super::measured::{breakdown, buckets, delivered, topic_measurement};
 use super::messages;
 use super::nearest::hint;
 use super::parameters::{Name, Parameters};
+use super::past::{self, TopicRange};
 use super::problem::{Code, Problem, ProblemBody};
 use super::reasons::Circumstances;
 use super::scope::{Domain, Scope, only};
@@ -29,9 +30,11 @@ use super::watch::expectations;
 use crate::agent_facts::{Ability, SourceKind};
 use crate::snapshot_cell::State as AgentState;
 use crate::watches::InForce;
+use ros2probe_api::endpoints::WriterClock;
 use ros2probe_api::topics::{
     self, Acknowledgement, Delivery, Topic, TopicDetails, TopicList, Watching,
 };
+use ros2probe_model::derive::clocks::{PeerClock, seconds};
 use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_model::report::snapshot::{
     AcknowledgementFacts, DeliveryFacts, Snapshot, TopicFacts, Transport,
@@ -97,8 +100,11 @@ async fn show(
 ) -> Result<Response, Problem> {
     match aspect(&context, &uri, &name) {
         Some((topic, Aspect::History)) => {
-            let Parameters(domain) = Parameters::of(&uri)?;
-            return history::show(&context, topic, domain).await;
+            let Parameters(question) = Parameters::<TopicRange>::of(&uri)?;
+            return match question.parts() {
+                (domain, None) => history::show(&context, topic, domain).await,
+                (domain, Some(range)) => past::show_topic(&context, topic, domain, range).await,
+            };
         }
         Some((topic, Aspect::Definition)) => {
             let Parameters(domain) = Parameters::of(&uri)?;
@@ -234,6 +240,9 @@ impl<'a> TopicAnswers<'a> {
         let is_unseen = facts.measurement.is_some() && facts.rate_hz().is_none();
         let publisher = |publisher| {
             let mut shown = endpoint(publisher);
+            let is_measured = publisher.measurement.is_some();
+            let peer = index.clock(publisher.guid).filter(|_| is_measured);
+            shown.clock = peer.map(writer_clock);
             if let Some(measured) = shown.measurement.as_mut().filter(|_| is_unseen) {
                 (measured.rate_hertz, measured.bandwidth_bytes_per_second) = (None, None);
             }
@@ -317,6 +326,16 @@ impl<'a> TopicAnswers<'a> {
                 expectations(&entry.watch.expectations)
             }),
         }
+    }
+}
+
+/// Returns the correction of latencies from a host with this clock.
+fn writer_clock(peer: &PeerClock) -> WriterClock<'_> {
+    let offset = peer.offset();
+    WriterClock {
+        peer: Cow::Borrowed(&peer.peer),
+        correction_seconds: offset.map(|(ahead, _)| seconds(ahead)),
+        uncertainty_seconds: offset.map(|(_, uncertainty)| seconds(uncertainty)),
     }
 }
 

@@ -3,21 +3,20 @@
 
 use std::collections::HashMap;
 
-use ros2probe_wire::diagnostics::DiagnosticLevel;
 use ros2probe_wire::{DomainId, Guid, RtpsDuration};
 
 use super::inside;
+use super::measured;
+use super::robot;
 use super::structure::Ids;
-use super::values::{LOSS, lost_lately};
 use crate::agent_facts::{Ability, AgentFacts, SourceKind};
 use crate::missed_announcements;
 use ros2probe_api::live::{Finding, Severity};
 use ros2probe_model::facts::diagnosis::{Diagnosis, Policies, Policy, TopicKey};
 use ros2probe_model::facts::names::NodeName;
-use ros2probe_model::facts::robot::{TransformFault, TransformFaultKind};
 use ros2probe_model::graph::zenoh::Unseen;
 use ros2probe_model::measure::history::Past;
-use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot, TopicFacts, WatchState};
+use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot};
 
 /// Maximum number of findings in a list.
 const MOST: usize = 512;
@@ -36,8 +35,8 @@ pub(super) struct Circumstances<'a> {
 pub(super) fn findings(circumstances: &Circumstances<'_>) -> Vec<Finding> {
     let mut list = of_agent(circumstances);
     list.extend(of_graph(circumstances));
-    list.extend(of_watches(circumstances));
-    list.extend(losses(circumstances));
+    list.extend(measured::of_watches(circumstances));
+    list.extend(measured::losses(circumstances));
     list.sort_by(|one, other| {
         (one.severity, &one.kind, &one.id).cmp(&(other.severity, &other.kind, &other.id))
     });
@@ -45,16 +44,8 @@ pub(super) fn findings(circumstances: &Circumstances<'_>) -> Vec<Finding> {
     list
 }
 
-/// Returns nanoseconds of a clock in words.
-fn of_clock(nanoseconds: u64) -> String {
-    match std::time::Duration::from_nanos(nanoseconds).as_secs_f64() {
-        seconds if seconds < 1.0 => format!("{:.1} ms", seconds * 1e3),
-        seconds => format!("{seconds:.3} s"),
-    }
-}
-
 /// Returns a warning about a node.
-fn of_node(
+pub(super) fn of_node(
     kind: &'static str,
     ids: &Ids,
     (domain_id, node): (DomainId, &NodeName),
@@ -66,49 +57,6 @@ fn of_node(
         node: ids.node(domain_id, node),
         ..finding(kind, Severity::Warning, &about, text)
     }
-}
-
-/// Returns a fault of transforms.
-fn of_transforms(
-    kind: &'static str,
-    domain_id: DomainId,
-    namespace: &str,
-    fault: &TransformFault,
-) -> Finding {
-    let others = match fault.edges {
-        0 | 1 => String::new(),
-        edges => format!(" (and {} others)", edges - 1),
-    };
-    let edge = format!("the transform {} -> {}{others}", fault.parent, fault.child);
-    let names = fault.names.join(", ");
-    let (text, remedy) = match fault.kind {
-        TransformFaultKind::Silent => (
-            format!("{edge} is no longer broadcast, although {names} runs"),
-            "look at the log and the inputs of that node",
-        ),
-        TransformFaultKind::SeveralBroadcasters => (
-            format!("{edge} has several broadcasters, which contradict each other: {names}"),
-            "let one of them broadcast it",
-        ),
-        TransformFaultKind::TimeWentBack => (
-            format!("{edge} has a stamp before an earlier one, from {names}"),
-            "look at the clock of that host, and for a bag that plays in a loop",
-        ),
-        TransformFaultKind::Apart => (
-            format!("the frames are in several trees, with the roots {names}"),
-            "find the missing transform between them with `rp tf`",
-        ),
-    };
-    let about = format!(
-        "{domain_id}|{namespace}|{}|{}",
-        fault.child,
-        fault.kind.label()
-    );
-    Finding {
-        domain_id: Some(domain_id.0),
-        ..finding(kind, Severity::Warning, &about, text)
-    }
-    .with_remedy(remedy)
 }
 
 pub(super) fn finding(
@@ -387,61 +335,16 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             };
             found.with_remedy("end subscriptions of older distributions and of other middleware")
         }
-        Diagnosis::LogErrors {
-            domain_id,
-            node,
-            errors,
-            text,
-        } => {
-            let said = format!("{node} logged {errors} errors within a minute: {text}");
-            let found = of_node(kind, all.ids, (*domain_id, node), said);
-            found.with_remedy(format!("`rp log {node} --level error` prints them"))
-        }
-        Diagnosis::DiagnosticError {
-            domain_id,
-            topic,
-            node,
-            name,
-            hardware_id,
-            level,
-            message,
-        } => {
-            let text = match level {
-                DiagnosticLevel::Stale => {
-                    format!("`{name}` sends no new diagnostics; the last message is: {message}")
-                }
-                _ => format!("`{name}` is in error: {message}"),
-            };
-            let about = format!("{domain_id}|{topic}|{name}|{hardware_id}");
-            let found = Finding {
-                domain_id: Some(domain_id.0),
-                node: node
-                    .as_ref()
-                    .and_then(|node| all.ids.node(*domain_id, node)),
-                ..finding(kind, Severity::Warning, &about, text)
-            };
-            found.with_remedy("`rp diag --verbose` prints its values")
-        }
-        Diagnosis::TransformFault {
-            domain_id,
-            namespace,
-            fault,
-        } => of_transforms(kind, *domain_id, namespace, fault),
-        Diagnosis::ClocksApart {
-            peer,
-            offset,
-            uncertainty,
-        } => {
-            let ahead = if *offset < 0 { "behind" } else { "ahead of" };
-            let text = format!(
-                "the clock of {peer} is {} {ahead} the clock of this host (± {}): latencies between \
-                 them are wrong by that, and transforms may be refused",
-                of_clock(offset.unsigned_abs()),
-                of_clock(uncertainty.unsigned_abs()),
-            );
-            finding(kind, Severity::Warning, peer, text)
-                .with_remedy("synchronise both clocks (NTP, PTP): `chronyc tracking` on each host")
-        }
+        Diagnosis::LogErrors { .. }
+        | Diagnosis::DiagnosticError { .. }
+        | Diagnosis::TransformFault { .. }
+        | Diagnosis::NearMiss { .. }
+        | Diagnosis::NodeInactive { .. }
+        | Diagnosis::ParameterDrift { .. }
+        | Diagnosis::MixedTime { .. }
+        | Diagnosis::WrongStamps { .. }
+        | Diagnosis::SharedMemoryFull { .. }
+        | Diagnosis::ClocksApart { .. } => robot::in_words(all.ids, diagnosis),
         Diagnosis::LossyLink { link, .. } => {
             let text = format!(
                 "TCP repeats many segments from {} to {} ({}): the network between them loses packets",
@@ -560,119 +463,6 @@ fn alone(reason: &str) -> Severity {
         "qos" | "type" | "partition" => Severity::Warning,
         _ => Severity::Note,
     }
-}
-
-fn of_watches(all: &Circumstances<'_>) -> Vec<Finding> {
-    let mut list = Vec::new();
-    for watch in &all.snapshot.watches {
-        for topic in &watch.topics {
-            let (kind, text) = match topic.state {
-                WatchState::Violated => {
-                    let broken = topic.violations.join(", ");
-                    let text = format!("{} violates its expectations: {broken}", topic.topic);
-                    ("watch_violated", text)
-                }
-                WatchState::Silent => {
-                    let text = format!("{} is silent for longer than expected", topic.topic);
-                    ("watch_silent", text)
-                }
-                WatchState::Ok | WatchState::NotPublished | WatchState::NoSubscriber => continue,
-            };
-            let mut topics = all.snapshot.topics.iter();
-            let facts = topics
-                .find(|facts| facts.domain_id == topic.domain_id && facts.name == topic.topic);
-            let about = format!(
-                "{}|{}|{}",
-                topic.domain_id, topic.topic, watch.watch.pattern
-            );
-            list.push(Finding {
-                domain_id: Some(topic.domain_id.0),
-                topic: facts.and_then(|facts| all.ids.topic(facts.domain_id, &facts.dds_name)),
-                ..finding(kind, Severity::Error, &about, text)
-            });
-        }
-    }
-    list
-}
-
-/// Returns a finding with the cause for each topic that lost messages recently.
-fn losses(all: &Circumstances<'_>) -> Vec<Finding> {
-    let lost = lost_lately(all.past);
-    let topics = all.snapshot.topics.iter();
-    let found = topics.filter_map(|topic| {
-        let known = all.past.id(topic.domain_id, &topic.dds_name)?;
-        lost.get(&known)?;
-        let (place, remedy) = died(topic);
-        let text = format!("{} loses messages{place}", topic.name);
-        let about = format!("{}|{}", topic.domain_id, topic.dds_name);
-        let loss = Finding {
-            domain_id: Some(topic.domain_id.0),
-            topic: all.ids.topic(topic.domain_id, &topic.dds_name),
-            since: began(all.past, known),
-            ..finding("loss", Severity::Error, &about, text)
-        };
-        Some(loss.with_remedy(remedy))
-    });
-    found.collect()
-}
-
-/// Returns where most of a topic's messages were lost, if known, and the remedy.
-fn died(topic: &TopicFacts) -> (&'static str, &'static str) {
-    let received = topic.received.as_deref();
-    let at = received.map_or([0; 4], |received| {
-        [
-            received.lost_at_sender,
-            received.lost_before_host,
-            received.lost_in_reassembly,
-            received.lost_in_socket_buffer,
-        ]
-    });
-    let most = at.iter().copied().max().unwrap_or_default();
-    let [sender, before, reassembly, _] = at;
-    if most == 0 {
-        (
-            "",
-            "compare the loss of each subscriber on the topic's page; `rp doctor` checks buffers",
-        )
-    } else if most == sender {
-        (
-            ", most of them at the sender, before its TCP connection",
-            "send less over this link, or raise the publisher's history depth and TCP send buffer",
-        )
-    } else if most == before {
-        (
-            ", most of them before they reach this host",
-            "check the network and the sender's host",
-        )
-    } else if most == reassembly {
-        (
-            ", most of them in IP reassembly",
-            "raise net.ipv4.ipfrag_high_thresh, or send smaller messages; `rp doctor` checks it",
-        )
-    } else {
-        (
-            ", most of them in the full buffer of a subscriber's socket",
-            "raise net.core.rmem_max and the receive buffer, or read faster; `rp doctor` checks it",
-        )
-    }
-}
-
-/// Returns when the current loss began. Pauses of up to [`LOSS`] seconds do not end a loss. Returns
-/// `None` without a recent loss.
-fn began(past: &Past, topic: u32) -> Option<f64> {
-    let mut began = None;
-    let mut pause = 0;
-    for second in past.seconds().iter().rev() {
-        if second.row(topic).is_some_and(|row| row.lost > 0) {
-            (began, pause) = (Some(second.at.seconds()), 0);
-        } else {
-            pause += 1;
-        }
-        if pause > LOSS {
-            break;
-        }
-    }
-    began
 }
 
 /// Endpoints by GUID.

@@ -6,6 +6,8 @@
 
 mod findings;
 mod inside;
+mod measured;
+mod robot;
 mod shared_lines;
 mod structure;
 mod values;
@@ -15,8 +17,7 @@ use std::time::Duration;
 
 use axum::body::Body;
 use axum::extract::{Extension, State};
-use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
-use axum::response::{IntoResponse, Response};
+use axum::response::Response;
 use bytes::Bytes;
 use tokio::sync::OwnedSemaphorePermit;
 use tokio::time::{Instant, sleep_until};
@@ -24,13 +25,14 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
-use super::body_stream::{Pieces, stream_of, write_line};
+use super::body_stream::{Pieces, lines_of, stream_of, write_line};
 use super::events::event;
 use super::health::HOST;
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
 use crate::agent_facts::SourceKind;
 use crate::events::Reader;
+use crate::snapshot_cell::State as Known;
 use crate::surface::places::Places;
 use ros2probe_api::live::{End, Events, Line, Open, Replay};
 use ros2probe_model::report::snapshot::Transport;
@@ -123,11 +125,45 @@ async fn live(
         permit: Some(permit),
         context,
     };
-    let headers = [
-        (CACHE_CONTROL, "no-store"),
-        (CONTENT_TYPE, "application/x-ndjson"),
-    ];
-    Ok((headers, Body::from_stream(stream_of(stream))).into_response())
+    Ok(lines_of(Body::from_stream(stream_of(stream))))
+}
+
+/// Returns the lines that describe the whole state, as at the beginning of a stream, without rates
+/// of earlier minutes and events.
+pub(super) fn whole_state(context: &Context) -> Vec<u8> {
+    let (state, past) = (context.latest.state(), context.latest.past());
+    let mut shared = SharedLines::default();
+    shared.update(&state, &past, &context.watches.in_force());
+    let mut lines = Vec::new();
+    write_line(
+        &mut lines,
+        &Line::Open(open(context, &state, "watch".into())),
+    );
+    for part in shared.parts(0) {
+        lines.extend_from_slice(part);
+    }
+    write_line(&mut lines, &Line::Values(shared.values(0)));
+    lines
+}
+
+/// Returns the first line of a stream.
+fn open(context: &Context, state: &Known, access: String) -> Open {
+    let replay = (state.agent.source == SourceKind::Replay).then(|| Replay {
+        begin: state.agent.capture_begin.map(|begin| begin.seconds()),
+    });
+    Open {
+        run: context.events.run(),
+        host: HOST.clone(),
+        version: env!("CARGO_PKG_VERSION").into(),
+        source: state.agent.source.label().into(),
+        access,
+        interval_seconds: 1,
+        history_seconds: context.live.history.as_secs(),
+        keeps_history: context.disk_history.is_kept(),
+        flags: values::FLAGS.map(Into::into).into(),
+        passages: Transport::ALL.map(|each| each.label().into()).into(),
+        replay,
+    }
 }
 
 impl Pieces for Stream {
@@ -179,21 +215,7 @@ impl Stream {
         shared.update(&state, &past, &context.watches.in_force());
         let seen = self.seen.unwrap_or(0);
         if self.seen.is_none() {
-            let replay = (state.agent.source == SourceKind::Replay).then(|| Replay {
-                begin: state.agent.capture_begin.map(|begin| begin.seconds()),
-            });
-            let open = Open {
-                run: context.events.run(),
-                host: HOST.clone(),
-                version: env!("CARGO_PKG_VERSION").into(),
-                source: state.agent.source.label().into(),
-                access: self.access.clone(),
-                interval_seconds: 1,
-                history_seconds: context.live.history.as_secs(),
-                flags: values::FLAGS.map(Into::into).into(),
-                passages: Transport::ALL.map(|each| each.label().into()).into(),
-                replay,
-            };
+            let open = open(context, &state, self.access.clone());
             write_line(lines, &Line::Open(open));
         }
         for part in shared.parts(seen) {

@@ -133,6 +133,12 @@ impl Figures<'_> {
                 | Diagnosis::DiagnosticError { .. }
                 | Diagnosis::TransformFault { .. }
                 | Diagnosis::ClocksApart { .. }
+                | Diagnosis::NearMiss { .. }
+                | Diagnosis::NodeInactive { .. }
+                | Diagnosis::ParameterDrift { .. }
+                | Diagnosis::MixedTime { .. }
+                | Diagnosis::WrongStamps { .. }
+                | Diagnosis::SharedMemoryFull { .. }
                 | Diagnosis::SlowChain { .. } => {}
             }
         }

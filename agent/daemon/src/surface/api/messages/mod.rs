@@ -11,8 +11,9 @@ use std::time::Duration;
 
 use axum::Json;
 use axum::body::Body;
-use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 use serde_json::value::RawValue;
@@ -21,7 +22,7 @@ use tokio::task::spawn_blocking;
 use tokio::time::{Instant, sleep_until};
 use utoipa::{IntoParams, ToSchema};
 
-use super::body_stream::{Pieces, stream_of, write_line};
+use super::body_stream::{Pieces, lines_of, stream_of, write_line};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::Domain;
 use super::security::Granted;
@@ -30,6 +31,7 @@ use super::{Context, Streamed};
 use crate::config::Access;
 use crate::subscriptions::{Depth, Item, Overflow, Refused, Request, Selection, Subscription};
 use ros2probe_api::messages::{self, Beat, Definition, End, Message, Missed};
+use ros2probe_message::preview::{self, Preview, PreviewError};
 use ros2probe_message::{DecodeError, Library, Limits, MessageType, decode};
 use ros2probe_model::facts::dispatch::Sample;
 use ros2probe_model::facts::names::{DdsName, TypeName};
@@ -60,6 +62,8 @@ pub(super) struct Wanted {
     /// Maximum number of messages shown per second; by default 5.
     #[param(minimum = 0.1, maximum = 5)]
     max_hertz: Option<f64>,
+    /// Whether messages have a small picture: images, maps, scans, point clouds and poses.
+    preview: Option<bool>,
 }
 
 /// A decoded message as JSON text.
@@ -76,6 +80,7 @@ struct Stream {
     context: Context,
     subscription: Subscription,
     pause: Duration,
+    has_previews: bool,
     /// When the last message was shown, and when the last line was sent.
     shown: Option<Instant>,
     written: Instant,
@@ -188,6 +193,7 @@ pub(super) async fn follow(
     let stream = Stream {
         subscription,
         pause: Duration::from_secs_f64(1.0 / hertz),
+        has_previews: wanted.preview == Some(true),
         shown: None,
         written: Instant::now(),
         newest: None,
@@ -199,11 +205,7 @@ pub(super) async fn follow(
         _permit: permit,
         context,
     };
-    let headers = [
-        (CACHE_CONTROL, "no-store"),
-        (CONTENT_TYPE, "application/x-ndjson"),
-    ];
-    let mut response = (headers, Body::from_stream(stream_of(stream))).into_response();
+    let mut response = lines_of(Body::from_stream(stream_of(stream)));
     response.extensions_mut().insert(Streamed);
     Ok(response)
 }
@@ -298,7 +300,20 @@ impl Stream {
         self.shown = Some(Instant::now());
         let message_type = self.find(&sample, lines).await;
         let shown = Arc::clone(&sample);
-        let decoded = spawn_blocking(move || value(message_type.as_deref(), &shown)).await;
+        let has_previews = self.has_previews;
+        let decoded = spawn_blocking(move || {
+            let preview = has_previews.then(|| preview(&shown));
+            let value = value(message_type.as_deref(), &shown);
+            (value, preview.transpose())
+        });
+        let (decoded, preview) = match decoded.await {
+            Ok((value, preview)) => (Ok(value), preview),
+            Err(error) => (Err(error), Ok(None)),
+        };
+        let (preview, preview_error) = match preview {
+            Ok(preview) => (preview.flatten(), None),
+            Err(error) => (None, Some(error.to_string())),
+        };
         let (value, error) = match decoded {
             Ok(Ok(value)) => (value, None),
             Ok(Err(error)) => (None, Some(error.to_string())),
@@ -321,6 +336,8 @@ impl Stream {
             skipped: std::mem::take(&mut self.skipped),
             value,
             error,
+            preview,
+            preview_error,
         };
         write_line(lines, &Line::Message(line));
     }
@@ -415,6 +432,36 @@ fn value(
     let decoded = decode(message_type, payload, &limits)?;
     let shown = serde_json::value::to_raw_value(&Tree::new(&decoded.message))?;
     Ok(Some(JsonText(shown)))
+}
+
+/// Returns the small picture of a message; `None` if its type has none or its bytes are unknown.
+fn preview(sample: &Sample) -> Result<Option<messages::Preview>, PreviewError> {
+    let Some(payload) = &sample.payload else {
+        return Ok(None);
+    };
+    let found = preview::preview(&sample.topic.message_type, payload)?;
+    Ok(found.map(|found| match found {
+        Preview::Picture(picture) => messages::Preview::Picture {
+            width: picture.width,
+            height: picture.height,
+            source: picture.source,
+            rgb: BASE64_STANDARD.encode(picture.rgb),
+        },
+        Preview::Encoded { format, bytes } => messages::Preview::Encoded {
+            format,
+            data: BASE64_STANDARD.encode(bytes),
+        },
+        Preview::Points { points, total } => {
+            let numbers = points.as_flattened().iter();
+            let bytes: Vec<u8> = numbers.flat_map(|number| number.to_le_bytes()).collect();
+            let xyz = BASE64_STANDARD.encode(bytes);
+            messages::Preview::Points { total, xyz }
+        }
+        Preview::Poses(poses) => {
+            let poses = poses.iter().map(|pose| [pose.x, pose.y, pose.yaw]);
+            messages::Preview::Poses(poses.collect())
+        }
+    }))
 }
 
 #[cfg(test)]

@@ -1,0 +1,64 @@
+//! `/history`: the history on disk.
+
+use serde::{Deserialize, Serialize};
+
+/// Size and reach of the history on disk.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct DiskHistory {
+    /// Whether a history is kept on disk.
+    pub is_kept: bool,
+    /// Size of its files.
+    pub bytes: u64,
+    /// Maximum size, `page.history_bytes`.
+    pub limit_bytes: u64,
+    /// Reach of the rows of one second and of the states of one minute.
+    pub seconds: Option<HistorySpan>,
+    /// Reach of the rows of ten seconds and of the states of ten minutes.
+    pub tens: Option<HistorySpan>,
+    /// Minutes that this run of the agent wrote.
+    pub writes: u64,
+    /// Minutes that could not be written.
+    pub failed_writes: u64,
+}
+
+/// Begin and end of a part of the history.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct HistorySpan {
+    /// Unix time of the oldest row.
+    pub begin_timestamp_seconds: f64,
+    /// Unix time of the latest row.
+    pub end_timestamp_seconds: f64,
+}
+
+/// Usage of the robot's processes over some time.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct ProcessHistory {
+    /// Seconds between two rows, at least; processes are read each ten seconds.
+    pub interval_seconds: u32,
+    /// The processes.
+    pub processes: Vec<ProcessColumns>,
+}
+
+/// Usage of one process. All columns have the same length.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct ProcessColumns {
+    /// Process id.
+    pub process_id: u32,
+    /// Its script, or the name of its program.
+    #[cfg_attr(feature = "openapi", schema(example = "robot.py"))]
+    pub process: String,
+    /// Unix time at which each row ends.
+    pub times: Vec<f64>,
+    /// CPU time divided by time: 1 is one busy core.
+    pub cpu_cores: Vec<f64>,
+    /// Resident memory at the end.
+    pub memory_bytes: Vec<u64>,
+}

@@ -1,0 +1,197 @@
+//! `/history`: what the agent keeps on disk of the last days, and the robot as it was at a moment.
+
+mod query;
+mod topic;
+mod writer;
+
+use std::collections::BTreeMap;
+
+use axum::Json;
+use axum::extract::State;
+use axum::response::Response;
+use serde::Deserialize;
+use utoipa::IntoParams;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::body_stream::lines_of;
+use super::parameters::Parameters;
+use super::problem::{Code, Problem, ProblemBody};
+use super::processes::MAX_PROCESSES;
+use ros2probe_api::history::{DiskHistory, HistorySpan, ProcessColumns, ProcessHistory};
+use ros2probe_history::{ProcessName, ProcessRow, Span, Store, merge_by_name};
+
+pub(super) use query::TopicRange;
+use query::{Range, read_store};
+pub(super) use topic::show as show_topic;
+pub use writer::HistoryWriter;
+
+/// Maximum length of the events in one answer, in bytes.
+const MAX_EVENT_BYTES: usize = 8 << 20;
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new()
+        .routes(routes!(about))
+        .routes(routes!(moment))
+        .routes(routes!(processes))
+        .routes(routes!(events))
+}
+
+/// The moment of a question.
+#[derive(Clone, Copy, Debug, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+struct Moment {
+    /// Unix time.
+    #[param(minimum = 0, example = 1_790_000_000)]
+    at: f64,
+}
+
+/// Size and reach of the history on disk
+///
+/// The agent writes it each minute (`page.history_bytes`): the figures of each measured topic and of
+/// the robot's processes, the events, and the state of the robot.
+#[utoipa::path(
+    get,
+    path = "/history",
+    tag = "graph",
+    responses((status = 200, description = "The history.", body = DiskHistory))
+)]
+async fn about(State(context): State<Context>) -> Json<DiskHistory> {
+    let history = &context.disk_history;
+    let [writes, failed_writes] = history.writes();
+    let span = |span: Option<Span>| {
+        span.map(|span| HistorySpan {
+            begin_timestamp_seconds: span.begin.into(),
+            end_timestamp_seconds: span.end.into(),
+        })
+    };
+    let facts = read_store(&context, Store::facts).await;
+    let facts = facts.unwrap_or_default();
+    Json(DiskHistory {
+        is_kept: history.is_kept(),
+        bytes: facts.bytes,
+        limit_bytes: facts.limit,
+        seconds: span(facts.seconds),
+        tens: span(facts.tens),
+        writes,
+        failed_writes,
+    })
+}
+
+/// The robot as it was
+///
+/// The lines are those at the beginning of `/live`, without rates of earlier minutes. They describe
+/// the last state that was written before `at`: one a minute, and one per ten minutes further back.
+#[utoipa::path(
+    get,
+    path = "/history/moment",
+    tag = "graph",
+    params(Moment),
+    responses(
+        (status = 200, description = "The lines of the state.",
+            body = ros2probe_api::live::Line<'static>, content_type = "application/x-ndjson"),
+        (status = 404, description = "No state of that time is kept.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 422, description = "A time or the step is invalid.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn moment(
+    State(context): State<Context>,
+    Parameters(moment): Parameters<Moment>,
+) -> Result<Response, Problem> {
+    let at = query::second(moment.at)?;
+    let state = read_store(&context, move |store| store.state(at)).await?;
+    let state = state.ok_or_else(|| {
+        Problem::new(
+            Code::NoHistory,
+            "no state of that time or before is in the history",
+        )
+    })?;
+    Ok(lines_of(state.content))
+}
+
+/// CPU time and memory of the robot's processes
+///
+/// The rows are at most ten seconds apart. A process is named by its id and its script or program.
+#[utoipa::path(
+    get,
+    path = "/history/processes",
+    tag = "graph",
+    params(Range),
+    responses(
+        (status = 200, description = "The processes of that time.", body = ProcessHistory),
+        (status = 404, description = "No history is kept.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 422, description = "A time or the step is invalid.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn processes(
+    State(context): State<Context>,
+    Parameters(range): Parameters<Range>,
+) -> Result<Json<ProcessHistory>, Problem> {
+    let range = range.checked(query::now(&context))?;
+    let all = read_store(&context, move |store| {
+        let mut all = BTreeMap::<ProcessName, Vec<ProcessRow>>::new();
+        store.processes(range.times(), range.step, &|_| true, &mut |name, row| {
+            if all.len() < MAX_PROCESSES || all.contains_key(name) {
+                merge_by_name(&mut all, name, row, range.step);
+            }
+        });
+        all
+    });
+    let columns = all.await?.into_iter().map(|(process, rows)| {
+        let cpu = |row: &ProcessRow| {
+            let seconds = f64::from(row.seconds.max(1));
+            super::history::thousandths(f64::from(row.cpu_ms) / 1e3 / seconds)
+        };
+        ProcessColumns {
+            process_id: process.id,
+            process: process.name,
+            times: rows.iter().map(|row| row.at.into()).collect(),
+            cpu_cores: rows.iter().map(cpu).collect(),
+            memory_bytes: rows.iter().map(|row| row.memory_kib << 10).collect(),
+        }
+    });
+    Ok(Json(ProcessHistory {
+        interval_seconds: range.step,
+        processes: columns.collect(),
+    }))
+}
+
+/// The events of a time
+///
+/// Each line is an event, as in `/events`. If they are more than 8 MiB, the latest are missing.
+#[utoipa::path(
+    get,
+    path = "/history/events",
+    tag = "events",
+    params(Range),
+    responses(
+        (status = 200, description = "The events, the oldest first.",
+            body = ros2probe_api::events::Event<'static>, content_type = "application/x-ndjson"),
+        (status = 404, description = "No history is kept.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 422, description = "A time or the step is invalid.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn events(
+    State(context): State<Context>,
+    Parameters(range): Parameters<Range>,
+) -> Result<Response, Problem> {
+    let range = range.checked(query::now(&context))?;
+    let text = read_store(&context, move |store| {
+        let mut text = Vec::new();
+        store.events(range.times(), &mut |lines| {
+            if text.len() + lines.len() <= MAX_EVENT_BYTES {
+                text.extend_from_slice(lines);
+            }
+        });
+        text
+    });
+    Ok(lines_of(text.await?))
+}

@@ -1,0 +1,344 @@
+//! Writes the history on disk: each minute the rows of topics and processes, the state of the
+//! robot as the page shows it, and the events.
+//!
+//! A thread of its own writes, so that a slow storage delays nothing else.
+
+use std::collections::{BTreeMap, HashMap};
+use std::io;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant, SystemTime};
+
+use ros2probe_history::{
+    Block, Kind, ProcessName, ProcessRow, Series, Store, Tier, TopicName, TopicRow,
+};
+use ros2probe_model::measure::history::{Past, Row};
+use serde::Serialize;
+
+use super::super::body_stream::write_line;
+use super::super::events::event;
+use super::super::processes::{MAX_PROCESSES, local};
+use super::super::{Context, live};
+use crate::events::Reader;
+use crate::state::{ENDING, join_until};
+use crate::surface::process::{Usage, script};
+
+/// Time between two readings of the processes and of the events.
+const READING: Duration = Duration::from_secs(10);
+/// Number of readings after which the rows are written.
+const READINGS: u32 = 6;
+/// Time within which the working thread publishes a requested state, unless the machine is busy.
+const PUBLICATION: Duration = Duration::from_secs(2);
+/// Number of these times after which an old state is written.
+const PUBLICATIONS: u32 = 10;
+/// Number of events read at once.
+const BATCH: usize = 512;
+/// Maximum length of the events of a minute, in bytes.
+const MAX_EVENT_BYTES: usize = 4 << 20;
+
+/// The writing thread. It ends when this is dropped.
+#[derive(Debug)]
+pub struct HistoryWriter {
+    end: Sender<()>,
+    thread: JoinHandle<()>,
+}
+
+/// What one minute brings.
+struct Minute {
+    context: Context,
+    /// Unix time up to which rows are written.
+    written: u32,
+    /// Usage of each process at the last reading.
+    usage: HashMap<u32, LastUsage>,
+    processes: BTreeMap<ProcessName, Vec<ProcessRow>>,
+    events: EventLines,
+    /// Number of the last event.
+    place: u64,
+    is_failing: bool,
+}
+
+/// Events as lines of JSON.
+#[derive(Debug, Default)]
+struct EventLines(Vec<u8>);
+
+/// Usage of a process at the last reading.
+struct LastUsage {
+    name: ProcessName,
+    started: Option<f64>,
+    cpu_seconds: f64,
+    at: Instant,
+}
+
+impl HistoryWriter {
+    /// Starts the thread. Returns `None` if no history is kept on disk.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the thread cannot be started.
+    pub fn start(context: Context) -> io::Result<Option<Self>> {
+        if !context.disk_history.is_kept() {
+            return Ok(None);
+        }
+        let (end, ended) = channel();
+        let thread = std::thread::Builder::new().name("history".to_owned());
+        let thread = thread.spawn(move || Minute::new(context).write_until(&ended))?;
+        Ok(Some(Self { end, thread }))
+    }
+
+    /// Writes the rest, and waits until it is written.
+    pub fn finish(self) {
+        let Self { end, thread } = self;
+        drop(end);
+        if !join_until(thread, Instant::now() + ENDING) {
+            tracing::error!(
+                "the file system does not answer: the last minute is not in the history"
+            );
+        }
+    }
+}
+
+impl Minute {
+    fn new(context: Context) -> Self {
+        Self {
+            context,
+            written: 0,
+            usage: HashMap::new(),
+            processes: BTreeMap::new(),
+            events: EventLines::default(),
+            place: 0,
+            is_failing: false,
+        }
+    }
+
+    fn write_until(mut self, ended: &Receiver<()>) {
+        if !self.context.disk_history.open() {
+            return;
+        }
+        let mut readings = 0;
+        while let Err(RecvTimeoutError::Timeout) = ended.recv_timeout(READING) {
+            readings += 1;
+            self.read();
+            if readings % READINGS == 0 {
+                if !self.wait_for_publication(ended) {
+                    break;
+                }
+                self.write();
+            }
+        }
+        self.read();
+        self.write();
+    }
+
+    /// Waits until the working thread has published, which it does for readers only. Returns false if
+    /// the agent ends.
+    fn wait_for_publication(&self, ended: &Receiver<()>) -> bool {
+        let latest = &self.context.latest;
+        let before = latest.past();
+        for _ in 0..PUBLICATIONS {
+            let _ = latest.state();
+            if ended.recv_timeout(PUBLICATION) != Err(RecvTimeoutError::Timeout) {
+                return false;
+            }
+            if !Arc::ptr_eq(&before, &latest.past()) {
+                break;
+            }
+        }
+        true
+    }
+
+    /// Reads the processes and the new events.
+    fn read(&mut self) {
+        self.read_processes();
+        let log = &self.context.events;
+        loop {
+            let batch = log.read(self.place, BATCH);
+            let mut lagged = batch.lagged;
+            let is_last = batch.records.is_empty();
+            for record in &batch.records {
+                let is_kept = self.events.add(&event(log, record));
+                lagged += u64::from(!is_kept);
+            }
+            log.overtook(Reader::History, lagged);
+            self.place = batch.last;
+            if is_last {
+                return;
+            }
+        }
+    }
+
+    fn read_processes(&mut self) {
+        let state = self.context.latest.own_state();
+        let (now, at) = (Instant::now(), unix_time());
+        let mut left = std::mem::take(&mut self.usage);
+        for (id, name) in local(state.known()).into_iter().take(MAX_PROCESSES) {
+            let Some(usage) = Usage::read(id) else {
+                continue;
+            };
+            let before = left.remove(&id);
+            let before = before.filter(|before| before.started == usage.started);
+            let name = match &before {
+                Some(before) => before.name.clone(),
+                None => ProcessName {
+                    id,
+                    name: script(id)
+                        .or_else(|| name.map(|name| name.to_string()))
+                        .unwrap_or(usage.name),
+                },
+            };
+            if let Some(before) = before {
+                let cpu = Duration::try_from_secs_f64(usage.cpu_seconds - before.cpu_seconds);
+                let row = ProcessRow {
+                    at,
+                    seconds: saturated(now.duration_since(before.at).as_secs_f64().round() as u64),
+                    cpu_ms: saturated(cpu.unwrap_or_default().as_millis() as u64),
+                    memory_kib: usage.resident_bytes >> 10,
+                };
+                self.processes.entry(name.clone()).or_default().push(row);
+            }
+            let last = LastUsage {
+                name,
+                started: usage.started,
+                cpu_seconds: usage.cpu_seconds,
+                at: now,
+            };
+            self.usage.insert(id, last);
+        }
+    }
+
+    /// Writes everything since the last time. After a failure it is dropped and counted.
+    fn write(&mut self) {
+        let history = Arc::clone(&self.context.disk_history);
+        let Some(store) = history.store() else {
+            return;
+        };
+        let past = self.context.latest.past();
+        let last = past.seconds().last().map(|last| seconds(last.at));
+        let now = last.unwrap_or_else(unix_time);
+        let begin = self.begin(&past, now);
+        let mut blocks = vec![Block::of_topics(begin, now, &topics(&past, begin))];
+        let processes = std::mem::take(&mut self.processes).into_iter();
+        let processes: Vec<_> = processes.map(|(of, rows)| Series { of, rows }).collect();
+        if !processes.is_empty() {
+            blocks.push(Block::of_processes(begin, now, &processes));
+        }
+        let text = |kind, content| Block {
+            kind,
+            begin,
+            end: now,
+            content,
+        };
+        blocks.push(text(Kind::State, live::whole_state(&self.context)));
+        let EventLines(events) = std::mem::take(&mut self.events);
+        if !events.is_empty() {
+            blocks.push(text(Kind::Events, events));
+        }
+        // Without a published second, those until now are written next time.
+        self.written = last.unwrap_or(self.written);
+        let written = append(store, &blocks, now);
+        history.count(&written);
+        let failed_before = std::mem::replace(&mut self.is_failing, written.is_err());
+        match written {
+            Ok(()) if failed_before => tracing::info!("the history is written again"),
+            Err(error) if !failed_before => {
+                tracing::warn!(%error, "cannot write the history: a part of this minute is missing in it");
+            }
+            Ok(()) | Err(_) => {}
+        }
+    }
+
+    /// Returns the time after which rows are not written yet.
+    fn begin(&self, past: &Past, now: u32) -> u32 {
+        let first = past.seconds().first();
+        let first = first.map_or(now, |first| seconds(first.at));
+        // After a step back of the clock, the ring begins again.
+        let last = Some(self.written).filter(|written| *written <= now);
+        last.unwrap_or(0).max(first.saturating_sub(1))
+    }
+}
+
+impl EventLines {
+    /// Adds an event. Returns whether it had room.
+    fn add(&mut self, event: &impl Serialize) -> bool {
+        let before = self.0.len();
+        write_line(&mut self.0, event);
+        let has_room = self.0.len() <= MAX_EVENT_BYTES;
+        if !has_room {
+            self.0.truncate(before);
+        }
+        has_room
+    }
+}
+
+fn append(store: &Store, blocks: &[Block], now: u32) -> io::Result<()> {
+    store.append(Tier::Seconds, blocks)?;
+    store.condense(now)
+}
+
+/// Returns the rows of each topic that end after `begin`.
+fn topics(past: &Past, begin: u32) -> Vec<Series<TopicName, TopicRow>> {
+    let mut rows: HashMap<u32, Vec<TopicRow>> = HashMap::new();
+    let new = past
+        .seconds()
+        .iter()
+        .filter(|second| seconds(second.at) > begin);
+    for second in new {
+        for row in second.rows() {
+            let rows = rows.entry(row.topic()).or_default();
+            rows.push(topic_row(seconds(second.at), row));
+        }
+    }
+    let series = past.topics().filter_map(|(domain_id, name, id)| {
+        let of = TopicName {
+            domain_id: domain_id.0,
+            dds_name: name.to_string(),
+        };
+        Some(Series {
+            of,
+            rows: rows.remove(&id)?,
+        })
+    });
+    series.collect()
+}
+
+/// Returns a row of one second as it is stored.
+pub(super) fn topic_row(at: u32, row: &Row) -> TopicRow {
+    TopicRow {
+        at,
+        seconds: 1,
+        messages: row.messages,
+        lost: row.lost,
+        bytes: row.bytes as u64,
+        latency: row.latency(),
+        interarrival: row.interarrival(),
+    }
+}
+
+/// Returns a time in whole seconds.
+pub(super) fn seconds(time: ros2probe_wire::Timestamp) -> u32 {
+    saturated(time.whole_seconds())
+}
+
+fn unix_time() -> u32 {
+    let since = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
+    saturated(since.as_secs())
+}
+
+fn saturated(value: u64) -> u32 {
+    value.try_into().unwrap_or(u32::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn events_beyond_the_cap_of_a_minute_are_left_out() {
+        let mut lines = EventLines::default();
+        let event = "e".repeat(60_000);
+        let kept = (0..100).filter(|_| lines.add(&event)).count();
+        assert!(lines.0.len() <= MAX_EVENT_BYTES && kept * 60_003 == lines.0.len());
+        // A shorter one still has room.
+        assert!(kept < 100 && lines.add(&"short"));
+    }
+}
