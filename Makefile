@@ -54,6 +54,8 @@ test: ## format, spelling, lints, kernel object, and all tests with real DDS par
 	@$(MAKE) --no-print-directory arm
 	cargo build --workspace --bins --examples
 	cargo test --workspace --doc --quiet
+	cargo nextest run --workspace --no-run
+	@sync # An fsync in a test would wait until all that the build wrote is on the disk.
 	cargo nextest run --workspace $$(.ci/prerequisites.sh --left-out)
 	@.ci/prerequisites.sh --ros2-summary
 	@if [ -d "$(CORPUS)" ]; then $(MAKE) --no-print-directory test-corpus; fi

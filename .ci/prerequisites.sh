@@ -410,7 +410,7 @@ for need; do
         ;;
     test)
         packages "${network_tools[@]}" clang gcc g++ make tshark systemd strace \
-            libfastrtps-dev libfastcdr-dev cyclonedds-dev cyclonedds-tools
+            libfastrtps-dev libfastcdr-dev cyclonedds-dev cyclonedds-tools faketime
         prometheus
         schemathesis
         rotel

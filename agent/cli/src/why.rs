@@ -195,7 +195,9 @@ fn bar(parts: &[Part<'_>], total: f64) -> String {
     bar
 }
 
-fn time(seconds: f64, zone: &TimeZone) -> String {
+/// Returns the time of day of a Unix time, to the millisecond.
+#[must_use]
+pub fn time(seconds: f64, zone: &TimeZone) -> String {
     #[expect(
         clippy::cast_possible_truncation,
         reason = "milliseconds fit until the year 292471208"

@@ -27,6 +27,8 @@ const REFRESH: Duration = Duration::from_secs(2);
 /// The agent's default ports, which are also used here if they are free.
 const METRICS: u16 = 17400;
 const API: u16 = 17401;
+/// Port of the listener for viewers.
+const VIEWERS: u16 = 8765;
 
 #[derive(Parser)]
 #[command(about = "Shows the agent watching a small robot; needs root for network namespaces")]
@@ -62,6 +64,7 @@ async fn demo(options: &Options) -> Result<()> {
         return relay::serve(socket, options.port);
     }
     let agent = options.agent.clone().map_or_else(beside_this_program, Ok)?;
+    let command = as_typed(&agent);
     for needed in [&agent, &options.config] {
         if !needed.exists() {
             bail!(
@@ -88,6 +91,7 @@ async fn demo(options: &Options) -> Result<()> {
     let relays = Relays {
         metrics: Relay::start(&link.robot, directory.path(), METRICS)?,
         api: Relay::start(&link.robot, directory.path(), API)?,
+        viewers: Relay::start(&link.robot, directory.path(), VIEWERS)?,
     };
     let robots = [
         robot(&link.robot, "lidar")?,
@@ -95,7 +99,7 @@ async fn demo(options: &Options) -> Result<()> {
         robot(&link.monitor, "monitor")?,
     ];
 
-    let mut summary = Summary::new(std::io::stdout().is_terminal());
+    let mut summary = Summary::new(std::io::stdout().is_terminal(), command);
     let mut failure = None;
     loop {
         tokio::select! {
@@ -151,6 +155,13 @@ fn beside_this_program() -> Result<PathBuf> {
         .nth(2)
         .context("this program is in no directory")?;
     Ok(directory.join("rp"))
+}
+
+/// Returns a program as a user of this directory types it.
+fn as_typed(program: &Path) -> String {
+    let here = std::env::current_dir().ok();
+    let below = here.and_then(|here| program.strip_prefix(here).ok());
+    below.unwrap_or(program).display().to_string()
 }
 
 fn robot(host: &Namespace, role: &str) -> Result<Process> {

@@ -23,6 +23,8 @@ pub(crate) struct Relays {
     pub(crate) metrics: Relay,
     /// The control API and the page.
     pub(crate) api: Relay,
+    /// The listener for viewers.
+    pub(crate) viewers: Relay,
 }
 
 impl Relays {

@@ -10,14 +10,17 @@ use ros2probe_testing::harness::network::Link;
 pub(crate) struct Summary {
     /// Whether the table may overwrite the previous one.
     redraws: bool,
+    /// The program `rp`, as a user types it.
+    command: String,
     /// Sum and count of each topic's latency at the previous scrape.
     latencies: BTreeMap<String, (f64, f64)>,
 }
 
 impl Summary {
-    pub(crate) fn new(redraws: bool) -> Summary {
+    pub(crate) fn new(redraws: bool, command: String) -> Summary {
         Summary {
             redraws,
+            command,
             latencies: BTreeMap::new(),
         }
     }
@@ -52,7 +55,9 @@ impl Summary {
             );
         }
         let (api, options) = (relays.api.address(), relays.options(API));
-        println!("\nrp topic list{options}    rp top{options}");
+        let rp = &self.command;
+        println!("\n{rp} topic list{options}");
+        println!("{rp} top{options}");
         println!("curl http://{}/metrics", relays.metrics.address());
         println!("curl -X POST http://{api}/watch/points");
         println!(
@@ -60,6 +65,8 @@ impl Summary {
             link.robot.name()
         );
         println!("the page: http://localhost:{}/", api.port());
+        let viewers = relays.viewers.address().port();
+        println!("Foxglove: ws://localhost:{viewers}");
     }
 
     /// Returns the mean time from the writer's timestamp to the wire since the previous scrape.

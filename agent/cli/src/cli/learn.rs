@@ -15,8 +15,9 @@ use anyhow::{Context as _, Result};
 use clap::Args;
 use jiff::{Timestamp, Unit};
 use ros2probe::client::{Agent, Lines, Next, Target};
-use ros2probe::learn::watchlist::{Source, is_expected, text};
+use ros2probe::learn::watchlist::{Source, is_expected, parameters, text};
 use ros2probe::learn::{Learner, Learnt, MAX_SECONDS, Selection};
+use ros2probe_api::parameters::Parameters;
 use ros2probe_api::path::encoded;
 use ros2probe_api::topics::TopicList;
 use ros2probe_daemon::run::CaptureTime;
@@ -50,6 +51,9 @@ pub(crate) struct Learn {
     /// File to write; `-` is standard output
     #[arg(long, short = 'o', value_name = "FILE", default_value = "-")]
     output: Destination,
+    /// Write the last known values of parameters, too; other values are findings later
+    #[arg(long)]
+    parameters: bool,
     /// Replace an existing file
     #[arg(long)]
     force: bool,
@@ -87,9 +91,19 @@ impl Learn {
         };
         session.progress.clear();
         learnt?;
-        let (text, learnt) = session.finish(&agent)?;
+        let (mut text, learnt) = session.finish(&agent)?;
+        // Minutes of learning are not lost if the parameters fail.
+        let known = self
+            .parameters
+            .then(|| agent.get::<Parameters<'_>>("/parameters"));
+        if let Some(Ok(known)) = &known {
+            text.push_str(&parameters(known, domain_id));
+        }
         self.output.write(&text, self.force)?;
         session.report(&learnt, &self.output);
+        if let Some(Err(error)) = known {
+            return Err(anyhow::Error::from(error).context("the file lacks the parameters"));
+        }
         let is_truncated = agent
             .outcome()
             .is_some_and(|outcome| outcome.fault.is_some());

@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use anyhow::Result;
 use clap::{Args, Subcommand};
-use jiff::Timestamp;
 use jiff::tz::TimeZone;
 use ros2probe::client::{Agent, Target};
+use ros2probe::why::time;
 use ros2probe_api::parameters::{ParameterChange, Parameters};
 use ros2probe_api::path::encoded;
 use ros2probe_daemon::escape::visible;
@@ -146,12 +146,7 @@ fn note(answer: &Parameters<'_>) {
 
 /// Returns the line of a change.
 fn line(change: &ParameterChange<'_>) -> String {
-    let at = Timestamp::from_millisecond(milliseconds(change.timestamp_seconds));
-    let at = at.map(|at| {
-        at.to_zoned(TimeZone::system())
-            .strftime("%H:%M:%S%.3f")
-            .to_string()
-    });
+    let at = time(change.timestamp_seconds, &TimeZone::system());
     let before = change.before.as_deref().unwrap_or("?");
     let value = match change.value.as_deref() {
         Some(value) => format!("{} -> {}", visible(before), visible(value)),
@@ -163,14 +158,8 @@ fn line(change: &ParameterChange<'_>) -> String {
         (None, None) => "by the node itself, or by a client that was not seen".to_owned(),
     };
     format!(
-        "{} {} {}: {value} ({by})\n",
-        at.unwrap_or_default(),
+        "{at} {} {}: {value} ({by})\n",
         visible(&change.ros_node),
         visible(&change.name)
     )
-}
-
-#[expect(clippy::cast_possible_truncation, reason = "a time of this century")]
-fn milliseconds(seconds: f64) -> i64 {
-    (seconds * 1e3) as i64
 }

@@ -255,7 +255,7 @@ fn assemble(
         keeper: None,
         // `rp bag record` records a capture, not the agent that replays it.
         recordings: None,
-        library: Library::new(Sources::default()),
+        library: Arc::new(Library::new(Sources::default())),
         history: Duration::ZERO,
         addresses: Vec::new(),
         stop,

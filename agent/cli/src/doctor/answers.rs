@@ -1,5 +1,6 @@
 //! Answers of a running agent.
 
+use ros2probe_api::clocks::Clocks;
 use ros2probe_api::health::Health;
 use ros2probe_api::participants::ParticipantList;
 use ros2probe_api::topics::TopicList;
@@ -18,6 +19,8 @@ pub struct Answers {
     pub topics: TopicList<'static>,
     /// `GET /watch`.
     pub watches: WatchList,
+    /// `GET /clocks`; empty from an agent that does not compare clocks yet.
+    pub clocks: Clocks<'static>,
 }
 
 impl Answers {
@@ -33,6 +36,10 @@ impl Answers {
             participants: agent.get(&format!("/participants{within}"))?,
             topics: agent.get(&format!("/topics{within}"))?,
             watches: agent.get("/watch")?,
+            clocks: match agent.get("/clocks") {
+                Err(ClientError::Older { .. }) => Clocks::default(),
+                answer => answer?,
+            },
         })
     }
 }

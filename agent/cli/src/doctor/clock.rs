@@ -2,6 +2,7 @@
 
 use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
+use ros2probe_api::clocks::{ClockOffset, Clocks};
 
 const AREA: Area = Area::Clock;
 /// Programs that synchronize clocks.
@@ -16,6 +17,8 @@ const KEEPERS: [&str; 7] = [
 ];
 /// Estimated error in microseconds above which latencies between hosts are unreliable.
 const COARSE: i64 = 10_000;
+/// Maximum number of hosts in one sentence.
+const NAMED: usize = 3;
 
 /// Returns the findings of all clock checks.
 #[must_use]
@@ -71,6 +74,53 @@ pub fn check(host: &HostState) -> Vec<Finding> {
         }
     };
     vec![finding.seen(kept, "/proc/<pid>/comm")]
+}
+
+/// Returns the finding about the clocks of other hosts; `None` if no offset is known.
+#[must_use]
+pub fn compared(clocks: &Clocks<'_>) -> Option<Finding> {
+    let shown = |offset: &ClockOffset<'_>| {
+        let (ahead, error) = (
+            1e3 * offset.offset_seconds,
+            1e3 * offset.uncertainty_seconds,
+        );
+        format!("{} {ahead:+.2} ms (± {error:.2} ms)", offset.peer)
+    };
+    // The offsets of this host come first, one for each peer with both bounds.
+    let host = &clocks.offsets.first()?.host;
+    let own = clocks
+        .offsets
+        .iter()
+        .take_while(|offset| offset.host == *host);
+    let mut own: Vec<_> = own.collect();
+    own.sort_by(|one, other| {
+        other
+            .offset_seconds
+            .abs()
+            .total_cmp(&one.offset_seconds.abs())
+    });
+    let apart = own.iter().filter(|offset| {
+        1e6 * (offset.offset_seconds.abs() - offset.uncertainty_seconds) > COARSE as f64
+    });
+    let apart = apart.count();
+    let listed: Vec<_> = own.iter().take(NAMED).map(|offset| shown(offset)).collect();
+    let severity = if apart > 0 {
+        Severity::Warning
+    } else {
+        Severity::Ok
+    };
+    let sentence = format!(
+        "clocks of other hosts, ahead of this one: {}",
+        listed.join(", ")
+    );
+    let finding = Finding::new(AREA, "offsets", severity, sentence);
+    let finding = own.iter().fold(finding, |finding, offset| {
+        finding.seen(shown(offset), "GET /clocks")
+    });
+    Some(match apart {
+        0 => finding,
+        _ => finding.remedy("chronyc tracking    # on each host"),
+    })
 }
 
 fn keepers(host: &HostState) -> Vec<&'static str> {
@@ -131,6 +181,36 @@ mod tests {
             good.sentence,
             "the clock is synchronised, estimated error 0.12 ms, at most 3.40 ms (kept by chronyd)"
         );
+    }
+
+    #[test]
+    fn offsets_of_other_hosts_are_listed_and_certain_ones_are_a_warning() {
+        assert_eq!(compared(&Clocks::default()), None);
+        let offset = |host: &'static str, peer: &'static str, offset_seconds| ClockOffset {
+            host: host.into(),
+            peer: peer.into(),
+            offset_seconds,
+            uncertainty_seconds: 0.0003,
+        };
+        let mut clocks = Clocks {
+            offsets: vec![
+                offset("robot", "nas", 0.0004),
+                offset("robot", "camera", -0.009),
+                offset("nas", "camera", -0.0094),
+            ],
+            ..Clocks::default()
+        };
+        let fine = compared(&clocks).unwrap();
+        assert_eq!(fine.severity, Severity::Ok);
+        assert_eq!(
+            fine.sentence,
+            "clocks of other hosts, ahead of this one: camera -9.00 ms (± 0.30 ms), nas +0.40 ms \
+             (± 0.30 ms)"
+        );
+        clocks.offsets[1].offset_seconds = -0.0204;
+        let warning = compared(&clocks).unwrap();
+        assert_eq!(warning.severity, Severity::Warning);
+        assert!(!warning.remedies.is_empty());
     }
 
     #[test]

@@ -6,6 +6,8 @@ use std::collections::BTreeMap;
 use super::answers::Answers;
 use super::finding::{Area, Finding, Severity};
 use crate::top::text::counted;
+use ros2probe_api::Open;
+use ros2probe_api::diagnosis::Diagnosis;
 use ros2probe_api::health::Health;
 use ros2probe_api::participants::Participant;
 use ros2probe_api::topics::Topic;
@@ -32,6 +34,7 @@ pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
     findings.extend(announced_unseen(participants));
     findings.extend(off_the_network(answers));
     findings.extend(mismatches(&answers.topics.topics));
+    findings.extend(near_misses(&answers.topics.topics));
     findings
 }
 
@@ -365,7 +368,7 @@ fn off_network<'a>(topic: &'a Topic<'_>) -> Option<&'a str> {
 
 /// Returns the findings for endpoints with incompatible types or QoS.
 fn mismatches(topics: &[Topic<'_>]) -> Vec<Finding> {
-    const KINDS: [(&str, &str, &str); 3] = [
+    const KINDS: [(&str, &str, &str); 4] = [
         (
             "qos_incompatible",
             "with publishers and subscribers of incompatible QoS",
@@ -381,6 +384,11 @@ fn mismatches(topics: &[Topic<'_>]) -> Vec<Finding> {
             "with several definitions of one type, which endpoints misread",
             "colcon build    # all nodes, with the same version of the interface package",
         ),
+        (
+            "wrong_stamps",
+            "with stamps that cannot be right",
+            "curl -s localhost:17401/topics/TOPIC    # `diagnoses` says what is wrong",
+        ),
     ];
     let find = |(kind, words, remedy): (&'static str, &str, &str)| {
         let has = |topic: &&Topic<'_>| topic.diagnoses.iter().any(|each| each.kind() == kind);
@@ -394,6 +402,39 @@ fn mismatches(topics: &[Topic<'_>]) -> Vec<Finding> {
         Some(finding.remedy(remedy))
     };
     KINDS.into_iter().filter_map(find).collect()
+}
+
+/// Warns of a publisher and a subscription whose topics differ so little that one is probably a
+/// mistake.
+fn near_misses(topics: &[Topic<'_>]) -> Option<Finding> {
+    let pairs = topics.iter().flat_map(|topic| {
+        let subscriptions = topic.diagnoses.iter().filter_map(|found| match found {
+            Open::Known(Diagnosis::NearMiss {
+                subscription,
+                subscription_domain_id,
+                ..
+            }) if *subscription == *topic.name => {
+                Some(format!("{subscription} in domain {subscription_domain_id}"))
+            }
+            Open::Known(Diagnosis::NearMiss { subscription, .. }) => Some(subscription.to_string()),
+            _ => None,
+        });
+        subscriptions.map(|subscription| format!("{} and {subscription}", topic.name))
+    });
+    let pairs: Vec<_> = pairs.collect();
+    let first = pairs.first()?;
+    let more = match pairs.len() {
+        1 => String::new(),
+        count => format!(" and {} more", many(count - 1, "pair")),
+    };
+    let sentence = format!(
+        "publisher and subscription do not meet, their topics differ little: {first}{more}"
+    );
+    let finding = Finding::new(AREA, "near_miss", Severity::Warning, sentence);
+    let finding = pairs.iter().fold(finding, |finding, pair| {
+        finding.seen(pair, "GET /topics diagnoses")
+    });
+    Some(finding.remedy("ros2 run PACKAGE NODE --ros-args -r OLD:=NEW    # or correct the domain"))
 }
 
 fn listed(topics: &[&Topic<'_>]) -> String {
@@ -416,6 +457,25 @@ fn many(count: usize, what: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn topics_that_differ_little_are_one_warning_with_both_names() {
+        let topic = |name: &str, other: &str| {
+            format!(
+                r#"{{"name":"{name}","domain_id":0,"diagnoses":[{{"kind":"near_miss","subscription":"{other}","subscription_domain_id":5,"difference":"case"}}]}}"#
+            )
+        };
+        let topics = format!("{},{}", topic("/Scan", "/scan"), topic("/imu", "/imu"));
+        let answers = answers(r#"{"participants":[]}"#, &topics, "forwarded");
+        let found = near_misses(&answers.topics.topics).unwrap();
+        assert_eq!(
+            found.sentence,
+            "publisher and subscription do not meet, their topics differ little: /Scan and /scan \
+             and 1 pair more"
+        );
+        assert_eq!(found.evidence[1].value, "/imu and /imu in domain 5");
+        assert_eq!(near_misses(&[]), None);
+    }
 
     fn answers(participants: &str, topics: &str, ability: &str) -> Answers {
         let health = format!(r#"{{"abilities":[{{"ability":"{ability}","able":true}}]}}"#);

@@ -98,6 +98,7 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
     );
     findings.extend(buffers::check(host, answers));
     findings.extend(clock::check(host));
+    findings.extend(answers.and_then(|answers| clock::compared(&answers.clocks)));
     let name = host.files.text("/proc/sys/kernel/hostname");
     Report::new(name.unwrap_or_else(|_| "this host".to_owned()), findings)
 }
@@ -109,6 +110,7 @@ pub fn examine_remote(answers: &Answers, place: &str) -> Report {
     findings.extend(visibility::check(&Visibility::of_agent(&answers.health)));
     findings.extend(ros2_daemon::check(&answers.health.ros2_daemon, &[]));
     findings.extend(graph::check(answers, None));
+    findings.extend(clock::compared(&answers.clocks));
     Report::new(place, findings)
 }
 

@@ -6,6 +6,8 @@ use super::Learnt;
 use super::thresholds::{
     LATENCY_DEVIATIONS, LEAST_LOSS, Lesson, RATE_DEVIATIONS, RATE_MARGIN, Remark, SILENCE_MARGIN,
 };
+use ros2probe_api::parameters::Parameters;
+use ros2probe_daemon::config::MAX_PARAMETERS;
 use ros2probe_daemon::config::rehearsal::GRACE;
 use ros2probe_daemon::escape::visible;
 
@@ -60,6 +62,42 @@ fn entries(learnt: &Learnt, source: &Source<'_>, is_explained: bool) -> String {
         let count = learnt.beyond_limit;
         let why = "  # Topics beyond the default of limits.watches, not learnt";
         line(&mut text, &format!("{why}: {count}"));
+    }
+    text
+}
+
+/// Returns the part of the file with the known parameters of a domain.
+#[must_use]
+pub fn parameters(known: &Parameters<'_>, domain_id: u32) -> String {
+    let mut text = String::new();
+    let own = known.parameters.iter();
+    let mut own = own.filter(|each| each.domain_id == domain_id).peekable();
+    if own.peek().is_none() {
+        line(
+            &mut text,
+            "# No parameter is known: nodes announce them when they start.",
+        );
+        return text;
+    }
+    line(
+        &mut text,
+        "# Last known values; another value is a finding. Remove those that change on purpose.",
+    );
+    line(&mut text, "robot:");
+    line(&mut text, "  parameters_expected:");
+    for each in own.by_ref().take(MAX_PARAMETERS) {
+        let quoted = |text: &str| serde_json::Value::from(text).to_string();
+        let [node, name, value] =
+            [&each.ros_node, &each.name, &each.value].map(|text| quoted(text));
+        let entry = format!("    - {{node: {node}, name: {name}, value: {value}}}");
+        line(&mut text, &entry);
+    }
+    let omitted = own.count();
+    if omitted > 0 {
+        line(
+            &mut text,
+            &format!("    # Parameters beyond the limit of {MAX_PARAMETERS}: {omitted}"),
+        );
     }
     text
 }

@@ -11,15 +11,23 @@ pub(crate) mod robot;
 
 use std::io::{Read as _, Write as _};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use crate::robot_parts::{self, Node};
 use crate::rp;
 use anyhow::{Context as _, Result, ensure};
 use flate2::read::MultiGzDecoder;
-use player::{play, watch};
+use player::{play, play_for, watch};
 use robot::{Place, Robot};
 use ros2probe_testing::harness::bpf::interest_of;
+use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::local_agent::{self, LocalAgent};
+use ros2probe_testing::robot_diagnostics::{self, Status, diagnostics};
+use ros2probe_testing::robot_log::{self, log};
+use ros2probe_testing::robot_parameters::{self, event};
+use ros2probe_testing::robot_pictures;
+use ros2probe_testing::robot_transforms::{self, Transform, transforms};
 use serde_json::{Value, json};
 
 /// Number of topics of the large robot.
@@ -33,6 +41,10 @@ const CHAINS: &str = "chains:
   - {from: /points, to: /filtered, max_latency_ms: 50}
   - {from: /camera, to: /steering, max_latency_ms: 100}
 ";
+/// Number of nodes among which one is found.
+const NODES: usize = 200;
+/// Time for which the robot of the past runs: three readings of its processes.
+const PAST: Duration = Duration::from_secs(35);
 /// Address of the page of an agent with a network namespace of its own.
 pub(crate) const PAGE: &str = "http://127.0.0.1:17401/";
 
@@ -75,7 +87,16 @@ fn is_accessible(how: &str) -> Result<()> {
     let _robot = Robot::start(&place.host)?;
     // This topic has the longest badge.
     let _unmatched = place.publisher("/unmatched", "/alone")?;
-    watch(&place.inside(), "access", &[PAGE, how])
+    // Each view is examined for half a second of CPU, and a busy machine has little of it.
+    let patience = Duration::from_secs(560);
+    let mut nothing = |question: &str| anyhow::bail!("no answer to {question}");
+    play_for(
+        patience,
+        &place.inside(),
+        "access",
+        &[PAGE, how],
+        &mut nothing,
+    )
 }
 
 #[test]
@@ -111,13 +132,222 @@ fn a_message_is_shown_as_a_tree_with_charts_of_its_numbers() -> Result<()> {
 }
 
 #[test]
+fn images_maps_scans_and_poses_have_a_picture() -> Result<()> {
+    let link = Link::new()?;
+    let config = tempfile::tempdir()?;
+    let agent = robot_parts::agent(&link, &config, "")?;
+    let topics = [
+        (1, "camera", ("rt/image", robot_pictures::IMAGE)),
+        (2, "coder", ("rt/jpeg", robot_pictures::COMPRESSED_IMAGE)),
+        (3, "mapper", ("rt/map", robot_pictures::MAP)),
+        (4, "lidar", ("rt/scan", robot_pictures::SCAN)),
+        (5, "base", ("rt/odom", robot_pictures::ODOMETRY)),
+    ];
+    let mut nodes = Vec::new();
+    for (number, name, topic) in topics {
+        nodes.push(Node::start(&link, number, name, topic)?);
+    }
+    agent.scrape_until("all nodes", |page| page.sum("ros2_nodes", &[]) == 5.0)?;
+    let mut passed = 0.0;
+    let said = || {
+        passed += 0.5;
+        let messages = [
+            robot_pictures::image(20, 10, [200, 30, 10]),
+            robot_pictures::compressed_image(),
+            robot_pictures::map(),
+            robot_pictures::scan(100),
+            robot_pictures::odometry(passed, 1.0),
+        ];
+        for (node, message) in nodes.iter_mut().zip(messages) {
+            node.renew()?;
+            node.send(&message)?;
+        }
+        Ok(())
+    };
+    while_repeating(said, || watch(&link.monitor.inside(), "previews", &[PAGE]))
+}
+
+/// Repeats an action each second until another one has ended.
+fn while_repeating(
+    mut action: impl FnMut() -> Result<()> + Send,
+    other: impl FnOnce() -> Result<()>,
+) -> Result<()> {
+    let is_over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let repeated = scope.spawn(|| {
+            while !is_over.load(Ordering::Relaxed) {
+                action()?;
+                std::thread::sleep(Duration::from_secs(1));
+            }
+            Ok(())
+        });
+        let ended = other();
+        is_over.store(true, Ordering::Relaxed);
+        let repeated = repeated.join();
+        ended.and(repeated.map_err(|_| anyhow::anyhow!("the thread panicked"))?)
+    })
+}
+
+#[test]
+fn what_the_robot_says_has_a_view_of_each_part() -> Result<()> {
+    let link = Link::new()?;
+    let config = tempfile::tempdir()?;
+    let agent = robot_parts::agent(&link, &config, "")?;
+    let mut nodes = Vec::new();
+    for (number, name, topic) in [
+        (1, "lidar", ("rt/rosout", robot_log::DDS_TYPE)),
+        (
+            2,
+            "monitor",
+            ("rt/diagnostics", robot_diagnostics::DDS_TYPE),
+        ),
+        (3, "ekf", ("rt/tf", robot_transforms::DDS_TYPE)),
+        (
+            4,
+            "planner",
+            ("rt/parameter_events", robot_parameters::EVENT),
+        ),
+    ] {
+        nodes.push(Node::start(&link, number, name, topic)?);
+    }
+    agent.scrape_until("all nodes", |page| page.sum("ros2_nodes", &[]) == 4.0)?;
+    let [lidar, monitor, ekf, planner] = &mut nodes[..] else {
+        anyhow::bail!("not four nodes")
+    };
+    lidar.send(&log(40, "lidar", b"no echo from <b>sector</b> 3"))?;
+    lidar.send(&log(20, "lidar", b"spinning"))?;
+    let part = |level, name, message| Status {
+        level,
+        name,
+        message,
+        values: &[("Voltage (V)", "11.9")],
+    };
+    monitor.send(&diagnostics(&[
+        part(0, "lidar: connection", "connected"),
+        part(2, "battery", "nearly empty"),
+    ]))?;
+    let transform = |parent, child| Transform {
+        parent,
+        child,
+        stamp: 1000,
+        x: 1.5,
+        yaw: 0.0,
+    };
+    ekf.send(&transforms(&[
+        transform("map", "odom"),
+        transform("odom", "base_link"),
+    ]))?;
+    planner.send(&event("/planner", &[("speed", 5)], &[], &[]))?;
+    planner.send(&event("/planner", &[], &[("speed", 7)], &[]))?;
+    let renew = || nodes.iter_mut().try_for_each(Node::renew);
+    while_repeating(renew, || {
+        watch(&link.monitor.inside(), "robot-says", &[PAGE])
+    })
+}
+
+#[test]
+fn the_page_shows_the_robot_as_it_was_before_a_restart() -> Result<()> {
+    let place = Place::new()?;
+    let state = place.directory.path().join("state");
+    std::fs::create_dir(&state)?;
+    let configuration = format!("watch: [/**]\nstate_directory: {}\n", state.display());
+    let mut agent = place.agent(&configuration)?;
+    let begin = unix_time();
+    let robot = Robot::start(&place.host)?;
+    std::thread::sleep(PAST);
+    agent.process.terminate()?;
+    let end = unix_time();
+    drop((agent, robot));
+    std::fs::remove_file(state.join("discovery.json"))?;
+    let mut running = None;
+    let mut answers = |question: &str| {
+        ensure!(question == "another robot after a restart", "{question}");
+        let agent = place.agent(&configuration)?;
+        running = Some((agent, place.publisher("/after_restart", "/other")?));
+        Ok(json!({"begin": begin, "end": end}))
+    };
+    play(&place.inside(), "past", &[PAGE], &mut answers)
+}
+
+fn unix_time() -> u64 {
+    let since = std::time::SystemTime::UNIX_EPOCH.elapsed();
+    since.unwrap_or_default().as_secs()
+}
+
+#[test]
+fn tasks_beside_a_running_robot_take_few_clicks() -> Result<()> {
+    let place = Place::new()?;
+    let state = place.directory.path().join("state");
+    std::fs::create_dir(&state)?;
+    let configuration = format!(
+        "watch: [/**]\nstate_directory: {}\n{}",
+        state.display(),
+        place.recordings()
+    );
+    let mut agent = place.agent(&configuration)?;
+    let robot = Robot::start(&place.host)?;
+    std::thread::sleep(Duration::from_secs(5));
+    let end = unix_time();
+    agent.process.terminate()?;
+    drop(agent);
+    let _agent = place.agent(&configuration)?;
+    let mut answers = |question: &str| {
+        ensure!(question == "when", "{question}");
+        Ok(json!({"end": end + 1}))
+    };
+    let tasks = [
+        "which node needs most CPU",
+        "content and plot of a number",
+        "ten seconds recorded and downloaded",
+        "what happened before the restart",
+        "share this view",
+    ];
+    let arguments = [&[PAGE][..], &tasks].concat();
+    let played = play(&place.inside(), "tasks", &arguments, &mut answers);
+    drop(robot);
+    played
+}
+
+#[test]
+fn tasks_on_captures_take_few_clicks() -> Result<()> {
+    let capture = data("cyclonedds/points-besteffort-lossy-2ns");
+    let mut lossy = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**"]);
+    lossy.wait_for_log("the capture has ended");
+    watch(&[], "tasks", &[&page(&lossy), "why does /points lose"])?;
+    let mut capture = tempfile::NamedTempFile::with_suffix(".pcap")?;
+    capture.write_all(&beginning(&data("cyclonedds/qos-mismatch-2ns"), 5)?)?;
+    let mismatched = replay(capture.path(), &[]);
+    watch(&[], "tasks", &[&page(&mismatched), "the QoS mismatch"])?;
+    let mut capture = tempfile::NamedTempFile::with_suffix(".pcap")?;
+    capture.write_all(&crowd::capture(NODES, false, 5))?;
+    let large = replay(capture.path(), &[]);
+    let node = format!("/{}", crowd::node_name(NODES / 2, false));
+    let mut answers = |question: &str| {
+        ensure!(question == "node", "{question}");
+        Ok(json!({"node": node}))
+    };
+    play(
+        &[],
+        "tasks",
+        &[&page(&large), "a node among many"],
+        &mut answers,
+    )
+}
+
+#[test]
 fn a_recording_is_started_ended_and_downloaded_on_the_page() -> Result<()> {
     let place = Place::new()?;
     let bags = place.directory.path().join("bags");
     let snapshots = "  snapshots: [{name: incident, topics: [/imu], seconds: 5}]\n";
-    let _agent = place.agent(&(place.recordings() + snapshots))?;
+    let configuration = place.recordings() + snapshots;
+    let mut agent = Some(place.agent(&configuration)?);
     let _robot = Robot::start(&place.host)?;
     let mut answers = |question: &str| {
+        if question == "restart" {
+            agent.take().context("no agent")?.process.terminate()?;
+            agent = Some(place.agent(&configuration)?);
+            return Ok(json!({}));
+        }
         if let Some(file) = question.strip_prefix("size ") {
             let size = std::fs::metadata(bags.join("lap-one").join(file))?.len();
             return Ok(json!({"size": size}));

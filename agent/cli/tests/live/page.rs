@@ -245,29 +245,33 @@ fn ask(address: &str, method: &str, path: &str) -> Result<String> {
 fn every_command_of_the_readme_works_against_the_demo() -> Result<()> {
     harness::require()?;
     let demo = Demo::start()?;
-    let commands = demo.line("rp topic list")?;
+    // The program is printed with its path, so that the commands work as they are.
+    let rp = env!("CARGO_BIN_EXE_rp");
+    let list = demo.line(&format!("{rp} topic list"))?;
+    let top = demo.line(&format!("{rp} top"))?;
     let metrics = demo.line("curl http://")?;
     let (metrics, _) = metrics.split_once('/').context("no address")?;
     let watch = demo.line("curl -X POST http://")?;
     let (api, path) = watch.split_once('/').context("no address")?;
     let page = demo.line("the page: http://")?;
     let page = page.trim_end_matches('/');
+    let viewers = demo.line("Foxglove: ws://")?;
+    drop(TcpStream::connect(&*viewers).context("no listener for viewers")?);
 
     ensure!(ask(metrics, "GET", "/metrics")?.contains("ros2_topic_rate_hertz"));
     ensure!(ask(page, "GET", "/")?.starts_with("HTTP/1.1 200"));
     let watched = ask(api, "POST", &format!("/{path}"))?;
     ensure!(watched.starts_with("HTTP/1.1 20"), "{watched}");
-    let (list, top) = commands.split_once("rp top").context("no second command")?;
     for (words, options, expected) in [
-        (vec!["topic", "list"], list, "/points"),
-        (vec!["top", "--once"], top, "/points"),
+        (vec!["topic", "list"], &list, "/points"),
+        (vec!["top", "--once"], &top, "/points"),
         (
             vec!["topic", "echo", "/points", "--once", "--no-arr"],
-            list,
+            &list,
             "header:",
         ),
     ] {
-        let output = Command::new(env!("CARGO_BIN_EXE_rp"))
+        let output = Command::new(rp)
             .args(&words)
             .args(options.split_whitespace())
             .output()?;

@@ -180,7 +180,8 @@ fn an_agent_started_by_root_changes_its_user_and_writes_no_file_of_root() -> Res
             let about = entry.metadata()?;
             let (owner, mode) = (about.uid(), about.mode() & 0o777);
             ensure!(owner == USER, "{:?} is {owner}'s", entry.path());
-            ensure!(mode == 0o600, "{:?} is {mode:o}", entry.path());
+            let expected = if about.is_dir() { 0o700 } else { 0o600 };
+            ensure!(mode == expected, "{:?} is {mode:o}", entry.path());
             files.push(entry.file_name());
         }
     }

@@ -6,43 +6,24 @@ use std::time::Duration;
 
 use anyhow::{Result, ensure};
 use ros2probe_api::logs::Logs;
-use ros2probe_testing::forged::{Carrier as _, SAMPLES_WRITER, Sender, Talker};
 use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, get};
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_until;
 use ros2probe_testing::robot_log::{DDS_TYPE, log};
 
+use crate::robot_parts::Node;
+
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// A node on another host that logs.
-struct Node {
-    talker: Talker,
-    sender: Sender,
-    number: u32,
+/// Starts a node on another host that logs.
+fn start(link: &Link) -> Result<Node> {
+    Node::start(link, 1, "lidar", ("rt/rosout", DDS_TYPE))
 }
 
-impl Node {
-    fn start(link: &Link) -> Result<Self> {
-        let talker = Talker::new(1, "/rosout");
-        let mut sender = Sender::between(&link.robot, &link.monitor)?;
-        sender.carry(&talker.participant())?;
-        let writer = talker.publication(SAMPLES_WRITER, "rt/rosout", DDS_TYPE, 1);
-        sender.carry(&writer)?;
-        sender.carry(&talker.entities("lidar"))?;
-        Ok(Self {
-            talker,
-            sender,
-            number: 0,
-        })
-    }
-
-    fn log(&mut self, level: u8, text: &str) -> Result<()> {
-        self.number += 1;
-        let payload = log(level, "lidar.driver", text.as_bytes());
-        let message = (self.talker).message(SAMPLES_WRITER, self.number, &payload);
-        self.sender.carry(&message)
-    }
+/// Sends a message of its log.
+fn say(node: &mut Node, level: u8, text: &str) -> Result<()> {
+    node.send(&log(level, "lidar.driver", text.as_bytes()))
 }
 
 fn logs(link: &Link, query: &str) -> Result<Logs<'static>> {
@@ -58,14 +39,14 @@ fn logs_are_counted_kept_printed_and_judged_without_a_watch() -> Result<()> {
     std::fs::write(&file, format!("watch: []\n{ON_THE_WIRE}"))?;
     let rp = env!("CARGO_BIN_EXE_rp");
     let agent = Agent::start(&link.monitor, rp, &file)?;
-    let mut node = Node::start(&link)?;
+    let mut node = start(&link)?;
     agent.scrape_until("the writer", |page| {
         page.sum("ros2_topic_publishers", &[("topic", "/rosout")]) == 1.0
     })?;
-    node.log(20, "started")?;
-    node.log(30, "no scan for 1 s")?;
+    say(&mut node, 20, "started")?;
+    say(&mut node, 30, "no scan for 1 s")?;
     for number in 1..=10 {
-        node.log(40, &format!("read failed {number}"))?;
+        say(&mut node, 40, &format!("read failed {number}"))?;
     }
     let page = agent.scrape_until("the errors", |page| {
         page.sum("ros2_log_messages_total", &[("level", "error")]) == 10.0
@@ -133,7 +114,7 @@ fn logs_are_counted_kept_printed_and_judged_without_a_watch() -> Result<()> {
     let place = "(read() at src/lidar.cpp:81)";
     let begin = "[1700000000.500000000] [lidar.driver]:";
     following.wait_for(&format!("[ERROR] {begin} read failed 10 {place}"), PATIENCE)?;
-    node.log(20, "recovered")?;
+    say(&mut node, 20, "recovered")?;
     following.wait_for(&format!("[INFO] {begin} recovered {place}"), PATIENCE)?;
     wait_until("the message that a reader requested", || {
         Ok(logs(&link, "")?.messages.len() == 13)
@@ -148,12 +129,12 @@ fn logs_are_not_read_if_the_configuration_says_so() -> Result<()> {
     let text = format!("watch: [/rosout]\nrobot: {{logs: off}}\n{ON_THE_WIRE}");
     std::fs::write(&file, text)?;
     let agent = Agent::start(&link.monitor, env!("CARGO_BIN_EXE_rp"), &file)?;
-    let mut node = Node::start(&link)?;
+    let mut node = start(&link)?;
     agent.scrape_until("the writer", |page| {
         page.sum("ros2_topic_publishers", &[("topic", "/rosout")]) == 1.0
     })?;
     for _ in 0..5 {
-        node.log(40, "read failed")?;
+        say(&mut node, 40, "read failed")?;
     }
     let page = agent.scrape_until("the messages as those of a topic", |page| {
         page.sum("ros2_topic_messages_total", &[]) == 5.0

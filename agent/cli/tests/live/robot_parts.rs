@@ -6,25 +6,26 @@ use std::time::Duration;
 
 use anyhow::Result;
 use ros2probe_testing::forged::{Carrier as _, SAMPLES_WRITER, Sender, Talker};
-use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE};
+use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, get};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::robot_diagnostics::{self, Status, diagnostics};
-use ros2probe_testing::robot_parameters::{self, event, request};
+use ros2probe_testing::robot_parameters::{self, boolean, event, request};
+use ros2probe_testing::robot_states::{self, battery, transition, with_header};
 use ros2probe_testing::robot_transforms::{self, Transform, transforms};
 
 const PATIENCE: Duration = Duration::from_secs(30);
 const RP: &str = env!("CARGO_BIN_EXE_rp");
 
 /// A node on another host with one writer.
-struct Node {
+pub(crate) struct Node {
     talker: Talker,
     sender: Sender,
     number: u32,
 }
 
 impl Node {
-    fn start(link: &Link, number: u32, name: &str, topic: (&str, &str)) -> Result<Self> {
+    pub(crate) fn start(link: &Link, number: u32, name: &str, topic: (&str, &str)) -> Result<Self> {
         let talker = Talker::new(number, "/unused");
         let mut sender = Sender::between(&link.robot, &link.monitor)?;
         sender.carry(&talker.participant())?;
@@ -37,7 +38,12 @@ impl Node {
         })
     }
 
-    fn send(&mut self, payload: &[u8]) -> Result<()> {
+    /// Announces the node's participant again, whose lease would end.
+    pub(crate) fn renew(&mut self) -> Result<()> {
+        self.sender.carry(&self.talker.participant())
+    }
+
+    pub(crate) fn send(&mut self, payload: &[u8]) -> Result<()> {
         self.number += 1;
         let message = (self.talker).message(SAMPLES_WRITER, self.number, payload);
         self.sender.carry(&message)
@@ -61,7 +67,12 @@ impl Node {
     }
 }
 
-fn agent<'a>(link: &'a Link, config: &tempfile::TempDir, more: &str) -> Result<Agent<'a>> {
+/// Starts an agent on the wire, without a watch.
+pub(crate) fn agent<'a>(
+    link: &'a Link,
+    config: &tempfile::TempDir,
+    more: &str,
+) -> Result<Agent<'a>> {
     let file = config.path().join("ros2probe.yaml");
     std::fs::write(&file, format!("watch: []\n{more}{ON_THE_WIRE}"))?;
     Agent::start(&link.monitor, RP, &file)
@@ -267,9 +278,111 @@ fn transforms_make_a_tree_with_rates_poses_and_faults() -> Result<()> {
             .contains("no transform has the frame `nose`"),
         "{unknown}"
     );
-    // Nothing is sent any more, although the node is announced.
+    // The node sends nothing from here on, and it stays announced.
     agent.scrape_until("the silence", |page| {
         page.sum("ros2_diagnoses", &[("kind", "transform_fault")]) == 1.0
+    })?;
+    Ok(())
+}
+
+#[test]
+fn managed_nodes_batteries_and_extracted_fields_have_metrics_and_findings() -> Result<()> {
+    let link = Link::new()?;
+    let config = tempfile::tempdir()?;
+    let more = "robot:\n  active: [/plan*]\n  extract:\n    - {topic: /battery, field: \
+                'cell_voltage[0]', metric: robot_cell_volts}\n";
+    let agent = agent(&link, &config, more)?;
+    let event = ("rt/planner/transition_event", robot_states::TRANSITION);
+    let mut planner = Node::start(&link, 1, "planner", event)?;
+    let mut driver = Node::start(&link, 2, "driver", ("rt/battery", robot_states::BATTERY))?;
+    agent.scrape_until("both nodes", |page| page.sum("ros2_nodes", &[]) == 2.0)?;
+    let state = |state| [("ros_node", "/planner"), ("state", state)];
+    planner.send(&transition(13, 3))?;
+    driver.send(&battery("base_link", 24.5, f32::NAN, 0.75))?;
+    let page = agent.scrape_until("the state and the battery", |page| {
+        page.sum("ros2_node_lifecycle_state", &state("active")) == 1.0
+            && page.sum("ros2_battery_voltage_volts", &[("topic", "/battery")]) == 24.5
+    })?;
+    assert_eq!(page.sum("ros2_battery_charge_ratio", &[]), 0.75);
+    assert!((page.sum("robot_cell_volts", &[("topic", "/battery")]) - 3.7).abs() < 1e-6);
+    assert_eq!(page.sum("ros2probe_field_unreadable", &[]), 0.0);
+    assert!(
+        page.value("ros2_battery_temperature_celsius", &[])
+            .is_none()
+    );
+    planner.send(&transition(14, 2))?;
+    agent.scrape_until("the finding", |page| {
+        page.sum("ros2_diagnoses", &[("kind", "node_inactive")]) == 1.0
+    })?;
+    let url = "http://127.0.0.1:17401/nodes/planner";
+    let shown: ros2probe_api::nodes::Node<'_> = serde_json::from_str(&get(&link.monitor, url)?)?;
+    assert_eq!(shown.lifecycle_state.as_deref(), Some("inactive"));
+    assert_eq!(shown.diagnoses.len(), 1);
+    planner.send(&transition(13, 3))?;
+    agent.scrape_until("the end of the finding", |page| {
+        page.sum("ros2_diagnoses", &[("kind", "node_inactive")]) == 0.0
+    })?;
+    Ok(())
+}
+
+#[test]
+fn a_name_with_a_mistake_and_a_frame_without_a_transform_are_found() -> Result<()> {
+    let link = Link::new()?;
+    let config = tempfile::tempdir()?;
+    let agent = agent(&link, &config, "")?;
+    let image = "sensor_msgs::msg::dds_::Image_";
+    let mut camera = Node::start(&link, 1, "camera", ("rt/camera/image", image))?;
+    let mut ekf = Node::start(&link, 2, "ekf", ("rt/tf", robot_transforms::DDS_TYPE))?;
+    let viewer = Talker::new(3, "/unused");
+    let mut sender = Sender::between(&link.robot, &link.monitor)?;
+    sender.carry(&viewer.participant())?;
+    sender.carry(&viewer.subscription([0, 0, 3, 4], "rt/camera/imgae", image, 1))?;
+    sender.carry(&viewer.entities("viewer"))?;
+    agent.scrape_until("the nodes", |page| page.sum("ros2_nodes", &[]) == 3.0)?;
+    // Messages renew the leases, which are short.
+    for step in 0..26 {
+        camera.send(&with_header("camera_optical", 1000))?;
+        ekf.send(&transforms(&[Transform {
+            parent: "odom",
+            child: "base_link",
+            stamp: 1000 + 500 * step,
+            x: 0.0,
+            yaw: 0.0,
+        }]))?;
+        sender.carry(&viewer.participant())?;
+        std::thread::sleep(Duration::from_millis(500));
+    }
+    agent.scrape_until("the near miss", |page| {
+        page.sum("ros2_diagnoses", &[("kind", "near_miss")]) == 1.0
+    })?;
+    agent.scrape_until("the frame", |page| {
+        page.sum("ros2_diagnoses", &[("kind", "transform_fault")]) == 1.0
+    })?;
+    Ok(())
+}
+
+#[test]
+fn other_parameters_than_expected_and_mixed_clocks_are_found() -> Result<()> {
+    let link = Link::new()?;
+    let config = tempfile::tempdir()?;
+    let more = "robot: {parameters_expected: [{node: /planner, name: speed, value: '5'}]}\n";
+    let agent = agent(&link, &config, more)?;
+    let events = ("rt/parameter_events", robot_parameters::EVENT);
+    let mut planner = Node::start(&link, 1, "planner", events)?;
+    let mut lidar = Node::start(&link, 2, "lidar", events)?;
+    agent.scrape_until("the nodes", |page| page.sum("ros2_nodes", &[]) == 2.0)?;
+    let found = |page: &Scrape, kind| page.sum("ros2_diagnoses", &[("kind", kind)]);
+    planner.send(&event("/planner", &[("speed", 5)], &[], &[]))?;
+    planner.send(&boolean("/planner", "use_sim_time", true))?;
+    lidar.send(&boolean("/lidar", "use_sim_time", false))?;
+    let page = agent.scrape_until("the clocks", |page| found(page, "mixed_time") == 1.0)?;
+    assert_eq!(found(&page, "parameter_drift"), 0.0);
+    planner.send(&event("/planner", &[], &[("speed", 7)], &[]))?;
+    agent.scrape_until("the drift", |page| found(page, "parameter_drift") == 1.0)?;
+    planner.send(&event("/planner", &[], &[("speed", 5)], &[]))?;
+    lidar.send(&boolean("/lidar", "use_sim_time", true))?;
+    agent.scrape_until("the end", |page| {
+        found(page, "parameter_drift") == 0.0 && found(page, "mixed_time") == 0.0
     })?;
     Ok(())
 }

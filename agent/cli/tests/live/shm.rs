@@ -378,6 +378,25 @@ fn losses_and_delays_of_peers_are_measured_with_and_without_an_agent() -> Result
     Ok(())
 }
 
+#[test]
+fn a_nearly_full_directory_is_a_finding_until_there_is_room() -> Result<()> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&network, directory.path())?;
+    let full = |page: &Scrape| page.sum("ros2_diagnoses", &[("kind", "shared_memory_full")]);
+    let file = host.shared_memory().join("left_by_an_ended_node");
+    let write = |megabytes: usize| fs::write(&file, vec![1; megabytes << 20]);
+    write(50)?;
+    std::thread::sleep(Duration::from_secs(3));
+    assert_eq!(full(&agent.scrape()?), 0.0);
+    write(60)?;
+    agent.scrape_until("the finding", |page| full(page) == 1.0)?;
+    fs::remove_file(&file)?;
+    agent.scrape_until("the end of the finding", |page| full(page) == 0.0)?;
+    Ok(())
+}
+
 /// A host with its own `/dev/shm`.
 struct Host<'n> {
     network: &'n Namespace,

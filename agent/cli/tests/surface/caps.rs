@@ -269,6 +269,33 @@ fn snapshots_beyond_the_cap_of_the_configuration_are_refused() {
 }
 
 #[test]
+fn lists_of_the_robot_beyond_their_caps_are_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("ros2probe.yaml");
+    let check = |key: &str, entry: &str, count: usize| {
+        let entries = vec![entry; count].join(", ");
+        std::fs::write(&file, format!("robot: {{{key}: [{entries}]}}\n")).unwrap();
+        let output = rp().arg("check-config").arg(&file).output().unwrap();
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    };
+    for (key, entry, most) in [
+        ("active", "/lidar", 64),
+        ("extract", "{topic: /a, field: b, metric: c}", 64),
+        (
+            "parameters_expected",
+            "{node: /a, name: b, value: '1'}",
+            1024,
+        ),
+    ] {
+        let fine = check(key, entry, most);
+        assert!(!fine.contains("entries, at most"), "{fine}");
+        let refused = check(key, entry, most + 1);
+        let reason = format!("has {} entries, at most {most} are allowed", most + 1);
+        assert!(refused.contains(&reason), "{refused}");
+    }
+}
+
+#[test]
 fn chains_beyond_the_cap_of_the_configuration_are_refused() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("ros2probe.yaml");

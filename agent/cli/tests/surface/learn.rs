@@ -6,6 +6,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Output, Stdio};
 
 use crate::rp;
+use ros2probe::learn::watchlist::parameters;
+use ros2probe_api::parameters::{Parameter, Parameters};
+use ros2probe_daemon::config::Config;
 use ros2probe_testing::local_agent::{LocalAgent, request};
 use ros2probe_testing::model::capture::{Capture, ETHERNET, reader, writer};
 use ros2probe_testing::pseudo_terminal::Terminal;
@@ -221,6 +224,33 @@ fn real_robots_meet_their_learnt_expectations() {
         let found = violations(&copy, &file);
         assert!(found.is_empty(), "{capture}: {found:?} {text}");
     }
+}
+
+#[test]
+fn the_known_parameters_of_a_domain_are_a_valid_configuration() {
+    let parameter = |domain_id, value: &'static str| Parameter {
+        domain_id,
+        ros_node: "/planner".into(),
+        name: "frame".into(),
+        value: value.into(),
+        timestamp_seconds: 0.0,
+    };
+    let known = |parameters| Parameters {
+        parameters,
+        ..Parameters::default()
+    };
+    let text = parameters(
+        &known(vec![parameter(0, "'a \"b\"'"), parameter(5, "1")]),
+        0,
+    );
+    let config = Config::parse(text.as_bytes()).unwrap();
+    let values = config.expected_parameters.iter().map(|each| &*each.value);
+    assert_eq!(values.collect::<Vec<_>>(), ["'a \"b\"'"], "{text}");
+    let many = parameters(&known(vec![parameter(0, "1"); 1030]), 0);
+    assert!(many.ends_with("    # Parameters beyond the limit of 1024: 6\n"));
+    let many = Config::parse(many.as_bytes()).unwrap();
+    assert_eq!(many.expected_parameters.len(), 1024);
+    assert!(parameters(&known(Vec::new()), 0).starts_with("# No parameter is known"));
 }
 
 #[test]

@@ -51,6 +51,9 @@ fn page(snapshot: Snapshot, settings: Settings, format: Format) -> String {
     sources.limits.note(&state);
     sources.exports.enable(Signal::Metrics);
     sources.ros2_daemon.set_port(0, PortState::Listening);
+    let state = tempfile::tempdir().unwrap();
+    sources.disk_history.keep_in(state.path(), 1 << 20);
+    assert!(sources.disk_history.open());
     sources
         .recordings
         .snapshot("incident", SnapshotFigures::default());

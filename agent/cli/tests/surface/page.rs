@@ -3,6 +3,7 @@
 
 mod history;
 mod messages;
+mod past;
 mod stream;
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};

@@ -50,13 +50,13 @@ impl Filter {
 
     /// Calls a callback so often that its usual duration is known.
     pub(crate) fn usual(&mut self) -> Result<()> {
-        self.process.write_line("compute 100 100")?;
+        self.process.write_line("compute 400 100")?;
         self.process.line_with_end("compute", PATIENCE).map(drop)
     }
 
     /// Calls it once with a sleep that is longer than the waits of a busy machine.
     pub(crate) fn late(&mut self) -> Result<()> {
-        self.process.write_line("sleep 1 200000")?;
+        self.process.write_line("sleep 1 400000")?;
         self.process.line_with_end("sleep", PATIENCE).map(drop)
     }
 

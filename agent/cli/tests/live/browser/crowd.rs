@@ -148,7 +148,7 @@ fn type_name(topic: usize, hostile: bool) -> String {
     }
 }
 
-fn node_name(topic: usize, hostile: bool) -> String {
+pub(super) fn node_name(topic: usize, hostile: bool) -> String {
     match hostile {
         true => format!("{}{topic}", HARM[(topic + 5) % HARM.len()]),
         false => format!("driver_{topic:03}"),

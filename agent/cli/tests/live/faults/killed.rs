@@ -318,6 +318,7 @@ fn clean(places: &Places) -> Result<()> {
     let known = [
         "discovery.json",
         "discovery.json.new",
+        "history",
         "watches.json",
         "watches.json.new",
     ];

@@ -294,8 +294,8 @@ fn files_below_dev_shm_are_opened_only_for_reading_and_never_mapped() -> Result<
             }
             // The standard library checks a descriptor that it closes.
             "fcntl" => line.contains("F_GETFD"),
-            "pread64" | "inotify_add_watch" | "statx" | "fstat" | "newfstatat" | "getdents64"
-            | "close" | "lseek" | "readlink" => true,
+            "pread64" | "inotify_add_watch" | "statx" | "statfs" | "fstat" | "newfstatat"
+            | "getdents64" | "close" | "lseek" | "readlink" => true,
             // This is the second half of a call that strace split in two; the first half is
             // checked.
             _ => call.starts_with("<...") || call.trim().starts_with("<..."),
