@@ -117,11 +117,20 @@ impl InOrder {
         self.earlier.contains(&number)
     }
 
-    /// Begins a new incarnation after all samples of the previous one are dispatched.
-    pub fn begin(&mut self, incarnation: u32, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
-        if self.incarnation.replace(incarnation) != Some(incarnation) {
-            self.give_all(now, give);
+    /// Begins a new incarnation after all samples of the previous one are dispatched. Returns whether
+    /// there was a previous one.
+    pub fn begin(
+        &mut self,
+        incarnation: u32,
+        now: ModelTime,
+        give: &mut impl FnMut(QueuedSample),
+    ) -> bool {
+        let previous = self.incarnation.replace(incarnation);
+        if previous == Some(incarnation) {
+            return false;
         }
+        self.give_all(now, give);
+        previous.is_some()
     }
 
     /// Returns the sample for immediate dispatch; no other sample waits.

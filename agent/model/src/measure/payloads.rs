@@ -205,6 +205,14 @@ impl Payloads {
         progress: &Progress,
     ) -> Option<SequenceNumber> {
         let interested = self.writers.get_mut(&writer)?;
+        let mut before = Vec::new();
+        let order = &mut interested.order;
+        let restarts = order.begin(progress.incarnation, counted.at, &mut |queued| {
+            before.push(queued);
+        });
+        if restarts {
+            (interested.begins.iter_mut()).for_each(RequestBegin::restart);
+        }
         let payload = match interested.payloads.is_empty() {
             true => None,
             false => self.assembly.take(writer, counted.number),
@@ -225,6 +233,12 @@ impl Payloads {
             None => &interested.arrivals,
         };
         let to = interested.without_repeats(to, counted.number);
+        // An unconfirmed number may be that of a new incarnation.
+        let is_complete = interested.order.is_idle() && counted.number < progress.complete;
+        let to = match is_complete && !counted.unconfirmed {
+            true => interested.without_begun_later(&to, counted.number),
+            false => to,
+        };
         for begin in &mut interested.begins {
             begin.arrived(&to, counted.number);
         }
@@ -243,13 +257,9 @@ impl Payloads {
             },
             missed,
         };
-        let mut before = Vec::new();
         let order = &mut interested.order;
-        order.begin(progress.incarnation, counted.at, &mut |queued| {
-            before.push(queued);
-        });
         self.waiting_bytes += queued.cost();
-        if counted.unconfirmed || order.is_idle() && counted.number < progress.complete {
+        if counted.unconfirmed || is_complete {
             let queued = order.pass(queued, counted.at);
             before.push(queued);
             before
@@ -564,6 +574,19 @@ impl WantedWriter {
             .copied()
             .filter(|id| !repeats.contains(id))
             .collect()
+    }
+
+    /// Returns the ids without those of requests whose samples begin with a higher number. Polling
+    /// may notice a sample after later ones were seen by other means.
+    fn without_begun_later(&self, to: &Arc<[u64]>, number: SequenceNumber) -> Arc<[u64]> {
+        let begins_later = |id: &u64| {
+            let begin = self.begins.iter().find(|begin| begin.id == *id);
+            begin.is_some_and(|begin| begin.begins_after(number))
+        };
+        if !to.iter().any(begins_later) {
+            return Arc::clone(to);
+        }
+        to.iter().copied().filter(|id| !begins_later(id)).collect()
     }
 
     /// Returns the report that a counted sample is missing for requests of its payload.

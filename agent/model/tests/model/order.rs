@@ -537,3 +537,20 @@ fn samples_sent_before_a_subscription_are_not_missing_from_it() {
         [(MissedReason::NotCaptured, 10, 11)]
     );
 }
+
+#[test]
+fn a_sample_polled_after_the_first_one_of_a_subscription_is_not_dispatched_to_it() {
+    let mut handover = Handover::new(Depth::Arrivals, 1);
+    handover.host.wait(600);
+    for number in [8, 9] {
+        handover.seen_in_its_process(number);
+        handover.host.wait(500);
+    }
+    assert_eq!(numbers(&mut handover.host), [8, 9]);
+    // A busy machine polls 7 only now.
+    handover.polled(7);
+    handover.seen_in_its_process(10);
+    assert_eq!(numbers(&mut handover.host), [10]);
+    handover.host.wait(1_000);
+    assert_eq!(missed(&mut handover.host), []);
+}

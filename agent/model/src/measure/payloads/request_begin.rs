@@ -41,6 +41,16 @@ impl RequestBegin {
         self.first.is_some_and(|first| first <= number)
     }
 
+    /// Begins again with the numbers of a writer that was started anew.
+    pub(super) fn restart(&mut self) {
+        (self.number, self.first) = (SequenceNumber::ZERO, None);
+    }
+
+    /// Returns whether its first sample so far has a higher number.
+    pub(super) fn begins_after(&self, number: SequenceNumber) -> bool {
+        self.first.is_some_and(|first| first > number)
+    }
+
     /// Records a sample that arrived for the requests `to`.
     pub(super) fn arrived(&mut self, to: &[u64], number: SequenceNumber) {
         if self.first.is_none_or(|first| number < first) && to.contains(&self.id) {
