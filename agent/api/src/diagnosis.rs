@@ -46,15 +46,16 @@ pub enum Diagnosis<'a> {
         /// GUID of the writer.
         writer: String,
         /// The closest mismatch: a reader with other QoS (`qos`), of another `type`, or in another
-        /// `partition`; `no_endpoint` if the topic has no reader.
+        /// `partition`; `no_endpoint` if the topic has no reader. `unreachable`: a reader matches
+        /// on another host, but one of the two announces loopback addresses only.
         reason: Cow<'static, str>,
     },
     /// A reader without a matching writer.
     UnmatchedSubscription {
         /// GUID of the reader.
         reader: String,
-        /// The closest mismatch: `qos`, `type` or `partition`; `no_endpoint` if the topic has no
-        /// writer.
+        /// The closest mismatch: `unreachable`, `qos`, `type` or `partition`; `no_endpoint` if the
+        /// topic has no writer.
         reason: Cow<'static, str>,
     },
     /// A client has called a service and received no reply within `service_timeout_s`.
@@ -266,10 +267,17 @@ pub enum Diagnosis<'a> {
         /// Time by which they were wrong when the problem appeared.
         offset_seconds: f64,
     },
-    /// A directory of shared memory is nearly full: Fast DDS then falls back to the network, or fails.
-    SharedMemoryFull {
-        /// Share of its space in use when that was noticed.
-        used_ratio: f64,
+    /// Shared memory cannot serve the robot as Fast DDS expects.
+    SharedMemoryFault {
+        /// `full`: a directory is nearly full. `stale`: files of ended processes take much space.
+        /// `split`: nodes of one domain and one network have different directories.
+        fault: Cow<'static, str>,
+        /// Share of the directory in use when that was noticed (`full`).
+        used_ratio: Option<f64>,
+        /// Bytes of these files when that was noticed (`stale`).
+        stale_bytes: Option<u64>,
+        /// Number of these directories when that was noticed (`split`).
+        directories: Option<u64>,
     },
     /// A configured chain that ends with the topic exceeds its maximum latency.
     SlowChain {
@@ -315,7 +323,7 @@ impl Diagnosis<'_> {
             Self::ParameterDrift { .. } => "parameter_drift",
             Self::MixedTime { .. } => "mixed_time",
             Self::WrongStamps { .. } => "wrong_stamps",
-            Self::SharedMemoryFull { .. } => "shared_memory_full",
+            Self::SharedMemoryFault { .. } => "shared_memory_fault",
             Self::SlowChain { .. } => "slow_chain",
         }
     }

@@ -24,6 +24,7 @@ use ros2probe_model::facts::link::{LinkKey, LinkProtocol};
 use ros2probe_model::facts::loss_share::LossShare;
 use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::facts::robot::{TransformFault, TransformFaultKind};
+use ros2probe_model::facts::shared_memory::MemoryFault;
 use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::facts::watch::Watch;
@@ -418,7 +419,10 @@ fn diagnoses() -> Diagnoses {
             fault: StampFault::Future,
             nanoseconds: 80_000_000,
         },
-        Diagnosis::SharedMemoryFull { used_permille: 960 },
+        Diagnosis::SharedMemoryFault {
+            fault: MemoryFault::Stale,
+            figure: 96 << 20,
+        },
         Diagnosis::SlowChain {
             topic: topic.clone(),
             from: "/scan".into(),

@@ -193,17 +193,6 @@ impl ShmDirectories {
         self.go_through_scope();
     }
 
-    /// Returns the share of the fullest directory that is in use, in thousandths.
-    #[must_use]
-    pub fn used_permille(&self) -> u64 {
-        let used = self.directories.values().filter_map(|directory| {
-            let space = rustix::fs::statvfs(&directory.path).ok()?;
-            let used = space.f_blocks.saturating_sub(space.f_bavail);
-            used.saturating_mul(1000).checked_div(space.f_blocks)
-        });
-        used.max().unwrap_or(0)
-    }
-
     /// Returns whether each directory's path still reaches it. A path may lead through a process
     /// that has ended, while other processes use the directory.
     #[must_use]

@@ -10,6 +10,7 @@ pub mod classifier;
 mod cpu_allowance;
 pub mod directories;
 mod inbox;
+mod memory_use;
 mod owner;
 pub mod poll_interval;
 pub mod port;

@@ -5,7 +5,7 @@
 //! opens and locks nothing. It reads `/proc/locks`, where the kernel lists locks by device and
 //! inode.
 
-use std::collections::HashSet;
+use std::collections::HashMap;
 use std::fs;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
@@ -22,8 +22,19 @@ type FileId = (u32, u32, u64);
 /// A snapshot of this host's locks.
 #[derive(Debug, Default)]
 pub struct Locks {
-    /// The locked files; `None` if the list cannot be read completely.
-    held: Option<HashSet<FileId>>,
+    /// The locked files with the process of one lock; `None` if the list cannot be read completely.
+    held: Option<HashMap<FileId, u32>>,
+}
+
+/// The process that uses a file of shared memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Owner {
+    /// It is certainly dead: the lock file exists, and its lock is free.
+    Dead,
+    /// It holds the lock.
+    Alive(u32),
+    /// The file has no lock file, or the locks cannot be read.
+    Unknown,
 }
 
 impl Locks {
@@ -34,7 +45,7 @@ impl Locks {
         let sees_all = namespace.is_ok_and(|namespace| namespace.ino() == HOST_PROCESSES);
         let list = fs::read_to_string("/proc/locks").ok().filter(|_| sees_all);
         Self {
-            held: list.map(|list| list.lines().filter_map(file_of).collect()),
+            held: list.map(|list| list.lines().filter_map(lock_of).collect()),
         }
     }
 
@@ -43,43 +54,54 @@ impl Locks {
     #[must_use]
     pub fn is_held(&self, device: u64, inode: u64) -> Option<bool> {
         let held = self.held.as_ref()?;
-        Some(held.contains(&(libc::major(device), libc::minor(device), inode)))
+        Some(held.contains_key(&(libc::major(device), libc::minor(device), inode)))
     }
 
-    /// Returns whether the process that created this file is certainly dead: the lock file exists,
-    /// and its lock is free.
+    fn holder(&self, device: u64, inode: u64) -> Option<u32> {
+        let file = (libc::major(device), libc::minor(device), inode);
+        self.held.as_ref()?.get(&file).copied()
+    }
+
+    /// Returns whether the process that created this file is certainly dead.
     #[must_use]
     pub fn is_abandoned(&self, path: &Path) -> bool {
+        self.owner(path) == Owner::Dead
+    }
+
+    /// Returns the process that uses this file.
+    #[must_use]
+    pub fn owner(&self, path: &Path) -> Owner {
         if self.held.is_none() {
-            return false;
+            return Owner::Unknown;
         }
-        let mut bears_lock = false;
+        let mut owner = Owner::Unknown;
         for suffix in LOCKED {
             let mut name = path.as_os_str().to_owned();
             name.push(suffix);
             let Ok(metadata) = fs::symlink_metadata(&name) else {
                 continue;
             };
-            if self.is_held(metadata.dev(), metadata.ino()) == Some(true) {
-                return false;
+            if let Some(process) = self.holder(metadata.dev(), metadata.ino()) {
+                return Owner::Alive(process);
             }
-            bears_lock = true;
+            owner = Owner::Dead;
         }
-        bears_lock
+        owner
     }
 }
 
-/// Returns the file of a line such as `1: FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF`. A process
+/// Returns the file and the process of a line such as `1: FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF`. A process
 /// that waits for a lock (`1: -> FLOCK ...`) holds no lock.
-fn file_of(line: &str) -> Option<FileId> {
+fn lock_of(line: &str) -> Option<(FileId, u32)> {
     let mut words = line.split_whitespace().skip(1);
     if words.next() != Some("FLOCK") {
         return None;
     }
-    let mut file = words.nth(3)?.split(':');
+    let process = words.nth(2)?.parse().ok()?;
+    let mut file = words.next()?.split(':');
     let major = u32::from_str_radix(file.next()?, 16).ok()?;
     let minor = u32::from_str_radix(file.next()?, 16).ok()?;
-    Some((major, minor, file.next()?.parse().ok()?))
+    Some(((major, minor, file.next()?.parse().ok()?), process))
 }
 
 #[cfg(test)]
@@ -89,7 +111,7 @@ mod tests {
     #[test]
     fn a_line_of_the_lock_list_identifies_the_locked_file() {
         let line = "12: FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF";
-        assert_eq!(file_of(line), Some((0, 0x1a, 5678)));
+        assert_eq!(lock_of(line), Some(((0, 0x1a, 5678), 1234)));
         for other in [
             "12: -> FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF",
             "3: POSIX  ADVISORY  READ  9 fd:00:5678 0 EOF",
@@ -97,7 +119,7 @@ mod tests {
             "12: FLOCK",
             "",
         ] {
-            assert_eq!(file_of(other), None, "{other}");
+            assert_eq!(lock_of(other), None, "{other}");
         }
     }
 

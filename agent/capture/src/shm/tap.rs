@@ -25,6 +25,7 @@ use crate::system::thread_cpu;
 use crate::tables::{AbandonedPorts, Ports, Segments};
 use recent_messages::{Identity, RecentMessages};
 use ros2probe_model::facts::bounded::Bounded;
+use ros2probe_model::facts::shared_memory::MemoryUse;
 
 /// Maximum number of messages per poll. The next poll reads the rest of a flood.
 const MAX_PER_POLL: usize = 2048;
@@ -45,6 +46,8 @@ const LIST_EVERY: u64 = 100_000_000;
 const TRY_EVERY: u64 = 1_000_000;
 const FIND_EVERY: u64 = 1_000_000_000;
 const URGENT_FIND_EVERY: u64 = 10_000_000_000;
+/// Interval between two measurements of the directories' use.
+const JUDGE_EVERY: u64 = 5_000_000_000;
 
 /// The open files and the read positions.
 pub struct Tap {
@@ -72,6 +75,7 @@ pub struct Tap {
     listed: u64,
     tried: u64,
     found: u64,
+    judged: u64,
     announced: Vec<Descriptor>,
     latest: HashMap<(SegmentId, u32), usize>,
     records: Vec<Record>,
@@ -111,8 +115,8 @@ pub struct Counters {
     pub uncertain: u64,
     /// Files and directories skipped because of a cap.
     pub left_out: u64,
-    /// Share of the fullest directory in use, in thousandths.
-    pub used_permille: u64,
+    /// Use of the directories.
+    pub memory_use: MemoryUse,
 }
 
 type PortKey = (ShmDirectoryId, Generation, u32);
@@ -166,6 +170,7 @@ impl Tap {
             listed: 0,
             tried: 0,
             found: 0,
+            judged: 0,
             announced: Vec::new(),
             latest: HashMap::new(),
             records: Vec::new(),
@@ -472,7 +477,10 @@ impl Tap {
                 self.directories.find();
             }
             self.abandoned.clear();
-            self.counters.used_permille = self.directories.used_permille();
+            if now.saturating_sub(self.judged) >= JUDGE_EVERY || self.judged == 0 {
+                self.judged = now;
+                self.counters.memory_use = self.directories.memory_use();
+            }
         }
         if !self.directories.list() && !finds {
             return;

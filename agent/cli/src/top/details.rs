@@ -317,6 +317,7 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
 /// Returns the text for the reason of `unmatched_publisher` and `unmatched_subscription`.
 fn unmatched(reason: &str) -> &str {
     match reason {
+        "unreachable" => "127.0.0.1 only",
         "qos" => "incompatible QoS",
         "type" => "type mismatch",
         "partition" => "another partition",

@@ -384,17 +384,73 @@ fn a_nearly_full_directory_is_a_finding_until_there_is_room() -> Result<()> {
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&network, directory.path())?;
-    let full = |page: &Scrape| page.sum("ros2_diagnoses", &[("kind", "shared_memory_full")]);
-    let file = host.shared_memory().join("left_by_an_ended_node");
+    let file = host.shared_memory().join("of_another_program");
     let write = |megabytes: usize| fs::write(&file, vec![1; megabytes << 20]);
     write(50)?;
-    std::thread::sleep(Duration::from_secs(3));
-    assert_eq!(full(&agent.scrape()?), 0.0);
+    std::thread::sleep(Duration::from_secs(6));
+    assert_eq!(faults(&agent.scrape()?), 0.0);
     write(60)?;
-    agent.scrape_until("the finding", |page| full(page) == 1.0)?;
+    wait_for_faults(&agent, 1.0)?;
     fs::remove_file(&file)?;
-    agent.scrape_until("the end of the finding", |page| full(page) == 0.0)?;
+    wait_for_faults(&agent, 0.0)
+}
+
+#[test]
+fn files_of_killed_nodes_are_a_finding_until_they_are_removed() -> Result<()> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&network, directory.path())?;
+    let stream = Stream {
+        // The segment of a participant holds two of its messages: 8 % of the directory each.
+        size: 2_720_000,
+        ..shared()
+    };
+    let (mut publisher, mut subscriber) = host.pair(&stream)?;
+    publisher.go()?;
+    std::thread::sleep(Duration::from_secs(6));
+    assert_eq!(faults(&agent.scrape()?), 0.0);
+    for peer in [&mut publisher, &mut subscriber] {
+        peer.process.signal("KILL")?;
+    }
+    // What a node that crashes again and again leaves.
+    let left = host.shared_memory().join("fastrtps_0123456789abcdef");
+    fs::write(&left, vec![1; 8 << 20])?;
+    fs::write(left.with_file_name("fastrtps_0123456789abcdef_el"), "")?;
+    wait_for_faults(&agent, 1.0)?;
+    host.remove_shared_memory()?;
+    wait_for_faults(&agent, 0.0)
+}
+
+#[test]
+fn nodes_with_different_directories_in_one_network_are_a_finding() -> Result<()> {
+    let network = Namespace::alone()?;
+    let hosts = [Host::new(&network)?, Host::new(&network)?];
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&network, directory.path())?;
+    let stream = shared();
+    let mut peers = Vec::new();
+    for (host, role) in hosts.iter().zip([Role::Subscriber, Role::Publisher]) {
+        assert_eq!(faults(&agent.scrape()?), 0.0);
+        let mut peer = host.launch(role, &stream)?;
+        peer.wait_ready()?;
+        peers.push(peer);
+    }
+    wait_for_faults(&agent, 1.0)?;
+    for peer in &mut peers {
+        peer.process.terminate()?;
+    }
+    wait_for_faults(&agent, 0.0)
+}
+
+/// Waits until this number of findings about shared memory exists.
+fn wait_for_faults(agent: &Agent<'_>, number: f64) -> Result<()> {
+    agent.scrape_until("the finding, or its end", |page| faults(page) == number)?;
     Ok(())
+}
+
+fn faults(page: &Scrape) -> f64 {
+    page.sum("ros2_diagnoses", &[("kind", "shared_memory_fault")])
 }
 
 /// A host with its own `/dev/shm`.

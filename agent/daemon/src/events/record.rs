@@ -19,6 +19,7 @@ use ros2probe_model::facts::churn;
 use ros2probe_model::facts::diagnosis::{Diagnosis, Policy};
 use ros2probe_model::facts::event::{EventKind, LossBurst, bounded};
 use ros2probe_model::facts::naming::Naming;
+use ros2probe_model::facts::shared_memory::MemoryFault;
 use ros2probe_model::report::snapshot::WatchState;
 
 /// State of a managed node that handles an error (`lifecycle_msgs/msg/State`).
@@ -593,9 +594,14 @@ fn finding(finding: &Diagnosis) -> Values {
                 Some(Value::Real(clocks::seconds(*nanoseconds))),
             ),
         ],
-        Diagnosis::SharedMemoryFull { used_permille } => {
-            vec![("used_ratio", Some(Value::Real(*used_permille as f64 / 1e3)))]
-        }
+        Diagnosis::SharedMemoryFault { fault, figure } => vec![
+            ("fault", Some(text(fault.label()))),
+            match fault {
+                MemoryFault::Full => ("used_ratio", Some(Value::Real(*figure as f64 / 1e3))),
+                MemoryFault::Stale => ("stale_bytes", number(*figure)),
+                MemoryFault::Split => ("directories", number(*figure)),
+            },
+        ],
         Diagnosis::LossyLink {
             link,
             retransmitted_permille,

@@ -398,7 +398,7 @@ impl Run {
         if let Source::Live(live) = &self.source
             && let Some(shared_memory) = live.shared_memory()
         {
-            let used = shared_memory.counters.used_permille;
+            let used = shared_memory.counters.memory_use;
             self.observer.input(Input::SharedMemoryUsed(used));
         }
         let mut snapshot = self.observer.snapshot(self.source.clock());

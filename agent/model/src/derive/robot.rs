@@ -32,6 +32,7 @@ use crate::facts::event::Events;
 use crate::facts::model_time::ModelTime;
 use crate::facts::names::{NodeName, TopicName, TypeName};
 use crate::facts::observation::Sample;
+use crate::facts::shared_memory::{MemoryFault, MemoryUse};
 use crate::facts::tables::RobotWriters;
 use crate::graph::discovery::Discovery;
 use crate::measure::allowance::{Allowance, CommonAllowance, WriterAllowance};
@@ -57,10 +58,6 @@ const BROADCASTER: Allowance = Allowance::new(2 << 20, 512 << 10);
 const ALL_BROADCASTERS: Allowance = Allowance::new(8 << 20, 2 << 20);
 /// A paused writer is captured again once it is allowed this many bytes.
 const RESUME_BYTES: u64 = 256 << 10;
-
-/// Thousandths of shared memory in use from which it is nearly full, and below which it no longer is.
-const FULL: u64 = 900;
-const FREE: u64 = 850;
 
 /// What the agent may read of what the robot says; each can be switched off.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -134,8 +131,8 @@ pub struct Robot {
     frames: Frames,
     lifecycle: Lifecycle,
     fields: Fields,
-    /// Thousandths of shared memory in use when it was found to be nearly full.
-    full_memory: Option<u64>,
+    /// The figure of each fault of shared memory when it began.
+    memory_faults: [Option<u64>; MemoryFault::ALL.len()],
     memory_changes: u64,
 }
 
@@ -295,7 +292,7 @@ impl Default for Robot {
             frames: Frames::default(),
             lifecycle: Lifecycle::default(),
             fields: Fields::default(),
-            full_memory: None,
+            memory_faults: [None; MemoryFault::ALL.len()],
             memory_changes: 0,
         }
     }
@@ -314,15 +311,14 @@ impl Robot {
         self.fields.expect(fields);
     }
 
-    /// Records how full the fullest directory of shared memory is, in thousandths.
-    pub fn use_shared_memory(&mut self, permille: u64) {
-        let is_full = match self.full_memory {
-            Some(_) => permille >= FREE,
-            None => permille >= FULL,
-        };
-        if is_full != self.full_memory.is_some() {
-            self.full_memory = is_full.then_some(permille);
-            self.memory_changes += 1;
+    /// Records the use of the directories of shared memory.
+    pub fn use_shared_memory(&mut self, memory: &MemoryUse) {
+        for (fault, begun) in MemoryFault::ALL.into_iter().zip(&mut self.memory_faults) {
+            let exists = fault.exists(memory, begun.is_some());
+            if exists != begun.is_some() {
+                *begun = exists.then(|| fault.figure(memory));
+                self.memory_changes += 1;
+            }
         }
     }
 
@@ -574,16 +570,17 @@ impl Robot {
     /// Returns what the robot says about problems of its own.
     pub fn findings(&self) -> impl Iterator<Item = Diagnosis> {
         let logged = self.logs.findings();
-        let full_memory = self.full_memory;
-        let full_memory =
-            full_memory.map(|used_permille| Diagnosis::SharedMemoryFull { used_permille });
+        let memory = MemoryFault::ALL.into_iter().zip(self.memory_faults);
+        let memory = memory.filter_map(|(fault, figure)| {
+            figure.map(|figure| Diagnosis::SharedMemoryFault { fault, figure })
+        });
         logged
             .chain(self.diagnostics.findings())
             .chain(self.transforms.findings())
             .chain(self.frames.findings())
             .chain(self.lifecycle.findings())
             .chain(self.parameters.findings())
-            .chain(full_memory)
+            .chain(memory)
     }
 
     /// Returns the sizes and limits of the tables.

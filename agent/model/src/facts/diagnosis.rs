@@ -26,6 +26,7 @@ use crate::facts::link::LinkKey;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
 use crate::facts::naming::Naming;
 use crate::facts::robot::TransformFault;
+use crate::facts::shared_memory::MemoryFault;
 use crate::facts::topic_kind::TopicKind;
 pub(crate) use matching::effort;
 pub use matching::{Offer, Policies, Policy, Verdict, verdict};
@@ -343,10 +344,12 @@ pub enum Diagnosis {
         /// Nanoseconds by which they were wrong when the fault began.
         nanoseconds: i64,
     },
-    /// A directory of shared memory is nearly full: Fast DDS then falls back to the network, or fails.
-    SharedMemoryFull {
-        /// Thousandths of its space in use when that was noticed.
-        used_permille: u64,
+    /// Shared memory cannot serve the robot as Fast DDS expects.
+    SharedMemoryFault {
+        /// What is wrong.
+        fault: MemoryFault,
+        /// [`MemoryFault::figure`] when the fault began.
+        figure: u64,
     },
     /// A configured chain exceeds its maximum latency.
     SlowChain {
@@ -388,6 +391,8 @@ impl StampFault {
 /// Why an endpoint has no counterpart: the mismatch that is nearest to a match.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Unmatched {
+    /// A counterpart matches on another host, but one of the two announces loopback addresses only.
+    Unreachable,
     /// A counterpart exists, but its quality of service does not match.
     Qos,
     /// A counterpart exists, but with another type.
@@ -463,7 +468,7 @@ impl Diagnosis {
         "parameter_drift",
         "mixed_time",
         "wrong_stamps",
-        "shared_memory_full",
+        "shared_memory_fault",
         "slow_chain",
     ];
 
@@ -498,7 +503,7 @@ impl Diagnosis {
             Self::ParameterDrift { .. } => "parameter_drift",
             Self::MixedTime { .. } => "mixed_time",
             Self::WrongStamps { .. } => "wrong_stamps",
-            Self::SharedMemoryFull { .. } => "shared_memory_full",
+            Self::SharedMemoryFault { .. } => "shared_memory_fault",
             Self::SlowChain { .. } => "slow_chain",
         }
     }
@@ -534,7 +539,7 @@ impl Diagnosis {
             | Self::NodeInactive { .. }
             | Self::ParameterDrift { .. }
             | Self::MixedTime { .. }
-            | Self::SharedMemoryFull { .. }
+            | Self::SharedMemoryFault { .. }
             | Self::ObservationSuspended { .. } => None,
         }
     }
@@ -669,7 +674,7 @@ impl Diagnosis {
             Self::NearMiss { subscription, .. } => {
                 (subscription.domain_id, &subscription.dds_name, None, None)
             }
-            Self::SharedMemoryFull { .. } => (DomainId(0), "", None, None),
+            Self::SharedMemoryFault { fault, .. } => (DomainId(0), fault.label(), None, None),
             Self::SlowChain { from, .. } => (DomainId(0), from, None, None),
         }
     }
@@ -680,6 +685,7 @@ impl Unmatched {
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
+            Self::Unreachable => "unreachable",
             Self::Qos => "qos",
             Self::Type => "type",
             Self::Partition => "partition",

@@ -420,7 +420,7 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         | Diagnosis::ParameterDrift { .. }
         | Diagnosis::MixedTime { .. }
         | Diagnosis::WrongStamps { .. }
-        | Diagnosis::SharedMemoryFull { .. }
+        | Diagnosis::SharedMemoryFault { .. }
         | Diagnosis::SlowChain { .. } => {}
     }
     finding

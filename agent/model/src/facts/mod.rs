@@ -24,6 +24,7 @@ pub mod rate;
 pub mod robot;
 pub mod route;
 pub mod selection;
+pub mod shared_memory;
 pub mod tables;
 pub mod topic_kind;
 pub mod wall_clock;

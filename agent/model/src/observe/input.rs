@@ -21,6 +21,7 @@ use crate::facts::event::Taken;
 use crate::facts::observation::Observation;
 use crate::facts::route::Destination;
 use crate::facts::selection::SampleRequest;
+use crate::facts::shared_memory::MemoryUse;
 use crate::facts::watch::Watchlist;
 use crate::graph::discovery::Memory;
 use crate::graph::sockets::SocketFacts;
@@ -90,8 +91,8 @@ pub enum Input<'a> {
     },
     /// The polling gap exceeds the shared-memory ring; loss before this time is unknown.
     SharedMemoryGap(Timestamp),
-    /// The share of the fullest directory of shared memory that is in use, in thousandths.
-    SharedMemoryUsed(u64),
+    /// The use of the directories of shared memory.
+    SharedMemoryUsed(MemoryUse),
     /// Uprobes no longer observe writes to shared memory, so sampled messages count again.
     ProbesDetached,
     /// The sender's state of a TCP connection to another host.

@@ -280,7 +280,7 @@ impl Observer {
             Input::MoreLists => self.apply_more_lists(),
             Input::SampleRequests(sample_requests) => self.set_sample_requests(sample_requests),
             Input::ExpectedChains(chains) => self.derive.chains.expect(chains),
-            Input::SharedMemoryUsed(permille) => self.derive.robot.use_shared_memory(permille),
+            Input::SharedMemoryUsed(memory) => self.derive.robot.use_shared_memory(&memory),
             Input::RobotExpectations(expected) => self.derive.robot.expect(expected),
             Input::CausalPublication(publication) => self.chain_published(publication),
             Input::Restored { memory, now } => {

@@ -11,6 +11,7 @@ use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS,
 use ros2probe_testing::zenoh;
 use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::time::SECOND;
+use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 
 const START: u64 = 1_795_143_000 * SECOND;
@@ -33,6 +34,8 @@ struct World {
     now: u64,
     domain_id: u16,
     announced: u64,
+    /// Whether sockets of this host send the announcements.
+    is_local: bool,
 }
 
 impl World {
@@ -44,6 +47,7 @@ impl World {
             now: START,
             domain_id: 0,
             announced: 0,
+            is_local: false,
         }
     }
 
@@ -57,7 +61,12 @@ impl World {
     }
 
     fn put(&mut self, message: Message) {
-        let envelope = forge::multicast(self.now, self.domain_id);
+        let envelope = Envelope {
+            outgoing: self.is_local,
+            host: self.is_local,
+            socket: u64::from(self.is_local) * 7,
+            ..forge::multicast(self.now, self.domain_id)
+        };
         self.observer.input(Input::Datagram {
             envelope: &envelope,
             payload: &message.bytes(),
@@ -257,6 +266,34 @@ fn endpoints_in_different_partitions_are_not_incompatible() {
         ),
         "{publishers:?}"
     );
+}
+
+#[test]
+fn an_endpoint_at_127_0_0_1_does_not_match_one_on_another_host() {
+    let at = |address: Ipv4Addr| [SocketAddrV4::new(address, 7411)];
+    let reasons = |is_local, other: Ipv4Addr| {
+        let mut world = World::new();
+        world.is_local = is_local;
+        world.participant(1, &at(Ipv4Addr::LOCALHOST));
+        world.announce(writer(1, 1), "rt/points", STRING, &[]);
+        world.is_local = false;
+        world.participant(2, &at(other));
+        world.announce(reader(2, 1), "rt/points", STRING, &[]);
+        let publishers = world.found("unmatched_publisher");
+        let subscriptions = world.found("unmatched_subscription");
+        let reason = |diagnosis: &Diagnosis| match diagnosis {
+            Diagnosis::UnmatchedPublisher { reason, .. }
+            | Diagnosis::UnmatchedSubscription { reason, .. } => Some(*reason),
+            _ => None,
+        };
+        let all = publishers.iter().chain(&subscriptions);
+        all.filter_map(reason).collect::<Vec<_>>()
+    };
+    let other = Ipv4Addr::new(10, 0, 0, 2);
+    assert_eq!(reasons(true, other), [Unmatched::Unreachable; 2]);
+    // A capture may be of the other host, and both may be on one.
+    assert_eq!(reasons(false, other), []);
+    assert_eq!(reasons(true, Ipv4Addr::LOCALHOST), []);
 }
 
 #[test]

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use ros2probe_model::derive::robot::RobotExpectations;
 use ros2probe_model::derive::robot::parameters::ExpectedParameter;
+use ros2probe_model::facts::shared_memory::MemoryUse;
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::Settings;
 use ros2probe_testing::model::domain::VirtualDomain;
@@ -265,7 +266,10 @@ impl Robot {
             }
             Fault::FullMemory => {
                 let observer = &mut self.domain.observer;
-                observer.input(Input::SharedMemoryUsed(950));
+                observer.input(Input::SharedMemoryUsed(MemoryUse {
+                    used_permille: 950,
+                    ..MemoryUse::default()
+                }));
             }
             _ => {}
         }
@@ -317,7 +321,7 @@ fn each_of_twelve_faults_is_the_only_finding_within_ten_seconds() {
         (Fault::FailedTransition, "has_failed: true"),
         (Fault::ParameterChanged, "ParameterDrift"),
         (Fault::SimulatedTime, "MixedTime"),
-        (Fault::FullMemory, "SharedMemoryFull"),
+        (Fault::FullMemory, "SharedMemoryFault"),
     ] {
         let mut robot = Robot::new();
         robot.start();

@@ -7,6 +7,7 @@ use super::inside::trigger;
 use ros2probe_api::diagnosis::{Diagnosis, Finding};
 use ros2probe_model::derive::clocks::seconds;
 use ros2probe_model::facts::diagnosis;
+use ros2probe_model::facts::shared_memory::MemoryFault;
 
 /// Returns the API representation of a problem.
 pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
@@ -240,9 +241,15 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
             fault: fault.label().into(),
             offset_seconds: seconds(*nanoseconds),
         },
-        diagnosis::Diagnosis::SharedMemoryFull { used_permille } => Diagnosis::SharedMemoryFull {
-            used_ratio: thousandths(*used_permille),
-        },
+        diagnosis::Diagnosis::SharedMemoryFault { fault, figure } => {
+            let figure_of = |of| (*fault == of).then_some(*figure);
+            Diagnosis::SharedMemoryFault {
+                fault: fault.label().into(),
+                used_ratio: figure_of(MemoryFault::Full).map(thousandths),
+                stale_bytes: figure_of(MemoryFault::Stale),
+                directories: figure_of(MemoryFault::Split),
+            }
+        }
         diagnosis::Diagnosis::SlowChain {
             from, max_latency, ..
         } => Diagnosis::SlowChain {

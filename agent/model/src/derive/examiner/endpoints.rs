@@ -38,15 +38,36 @@ pub(super) struct UnmatchedEndpoint {
     pub(super) diagnosis: Diagnosis,
 }
 
-/// Endpoints of one role with the same type, QoS and vendor: their verdict against any endpoint is
-/// the same.
+/// Which endpoints a participant can reach.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+enum Reach {
+    /// It is on this host and announces loopback addresses only.
+    Loopback,
+    /// It is on another host.
+    OtherHost,
+    /// Another one on this host, or the host is unknown.
+    Any,
+}
+
+/// Endpoints of one role with the same type, QoS, vendor and reach: their verdict against any
+/// endpoint is the same.
 #[derive(Debug)]
 struct Group<'a> {
     message_type: &'a TypeName,
     offer: Offer<'a>,
+    reach: Reach,
     members: Vec<Guid>,
     /// Why the group has no counterpart; `None` if it has one or may have one.
     unmatched: Option<Unmatched>,
+}
+
+impl Reach {
+    const fn is_apart(self, other: Self) -> bool {
+        matches!(
+            (self, other),
+            (Self::Loopback, Self::OtherHost) | (Self::OtherHost, Self::Loopback)
+        )
+    }
 }
 
 impl<'a> EndpointExaminer<'a> {
@@ -146,6 +167,21 @@ impl<'a> EndpointExaminer<'a> {
         }
     }
 
+    /// Returns which endpoints a participant can reach. Where no participant is known to be on this
+    /// host, as in a capture, each may reach all.
+    fn reach(&self, guid: Guid) -> Reach {
+        let Some(participant) = self.discovery.participants().get(&guid.prefix) else {
+            return Reach::Any;
+        };
+        let addresses = &participant.addresses;
+        let has_addresses = !addresses.metatraffic.is_empty() || !addresses.default.is_empty();
+        match (participant.local, addresses.reachable()) {
+            (true, None) if has_addresses => Reach::Loopback,
+            (false, Some(_)) => Reach::OtherHost,
+            _ => Reach::Any,
+        }
+    }
+
     fn endpoint(&self, guid: Guid) -> Option<(&'a Endpoint, VendorId)> {
         let endpoint = self.discovery.endpoints().get(&guid)?;
         let participant = self.discovery.participants().get(&guid.prefix)?;
@@ -161,7 +197,8 @@ impl<'a> EndpointExaminer<'a> {
             };
             let qos = &endpoint.qos;
             let (message_type, offer) = (&endpoint.message_type, Offer { qos, vendor });
-            match places.entry((message_type, offer)) {
+            let reach = self.reach(*guid);
+            match places.entry((message_type, offer, reach)) {
                 Entry::Occupied(place) => {
                     if let Some(group) = groups.get_mut(*place.get()) {
                         group.members.push(*guid);
@@ -172,6 +209,7 @@ impl<'a> EndpointExaminer<'a> {
                     groups.push(Group {
                         message_type,
                         offer,
+                        reach,
                         members: vec![*guid],
                         unmatched: Some(Unmatched::NoEndpoint),
                     });
@@ -230,7 +268,10 @@ fn compare<'a>(
                 Some(Unmatched::Type)
             } else {
                 match diagnosis::verdict(writer.offer, reader.offer) {
-                    Verdict::Match => None,
+                    Verdict::Match => {
+                        let is_apart = writer.reach.is_apart(reader.reach);
+                        is_apart.then_some(Unmatched::Unreachable)
+                    }
                     Verdict::Partition => Some(Unmatched::Partition),
                     Verdict::Incompatible(policies) => {
                         let pairs = writer.members.len() as u64 * reader.members.len() as u64;

@@ -343,7 +343,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
         | Diagnosis::ParameterDrift { .. }
         | Diagnosis::MixedTime { .. }
         | Diagnosis::WrongStamps { .. }
-        | Diagnosis::SharedMemoryFull { .. }
+        | Diagnosis::SharedMemoryFault { .. }
         | Diagnosis::ClocksApart { .. } => robot::in_words(all.ids, diagnosis),
         Diagnosis::LossyLink { link, .. } => {
             let text = format!(
@@ -414,7 +414,13 @@ fn unmatched(
     let (who, why) = (ends.who(endpoint), lacks(reason, counterpart));
     let text = format!("{who} {verb} {}, and {why}", topic.name);
     let about = format!("{}|{}|{endpoint}", topic.domain_id, topic.dds_name);
-    finding(kind, alone(reason), &about, text)
+    let found = finding(kind, alone(reason), &about, text);
+    match reason {
+        "unreachable" => found.with_remedy(
+            "on the host with 127.0.0.1, unset ROS_LOCALHOST_ONLY, or set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
+        ),
+        _ => found,
+    }
 }
 
 /// Describes a writer and a reader with incompatible QoS.
@@ -449,6 +455,9 @@ fn incompatible(
 /// Returns why an endpoint has no counterpart.
 fn lacks(reason: &str, counterpart: &str) -> String {
     match reason {
+        "unreachable" => format!(
+            "every {counterpart} is on another host, and one of the two announces only 127.0.0.1"
+        ),
         "qos" => format!("no {counterpart} has a matching QoS"),
         "type" => format!("every {counterpart} has another type"),
         "partition" => format!("every {counterpart} is in another partition"),
@@ -460,7 +469,7 @@ fn lacks(reason: &str, counterpart: &str) -> String {
 /// incompatible counterparts is not.
 fn alone(reason: &str) -> Severity {
     match reason {
-        "qos" | "type" | "partition" => Severity::Warning,
+        "unreachable" | "qos" | "type" | "partition" => Severity::Warning,
         _ => Severity::Note,
     }
 }

@@ -8,6 +8,7 @@ use super::structure::Ids;
 use ros2probe_api::live::{Finding, Severity};
 use ros2probe_model::facts::diagnosis::{Diagnosis, Difference, StampFault, TopicKey};
 use ros2probe_model::facts::robot::{TransformFault, TransformFaultKind};
+use ros2probe_model::facts::shared_memory::MemoryFault;
 
 /// Returns such a finding in words, with its remedy.
 pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
@@ -122,14 +123,42 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
             fault,
             nanoseconds,
         } => wrong_stamps(kind, topic, *writer, (*fault, *nanoseconds)),
-        Diagnosis::SharedMemoryFull { .. } => {
-            let text = "/dev/shm, of this host or of a container, is nearly full: Fast DDS then sends \
-                        over the network, or nodes fail at start";
-            finding(kind, Severity::Warning, "", text.to_owned())
-                .with_remedy("df -h /dev/shm; `fastdds shm clean` removes what ended nodes left")
-        }
+        Diagnosis::SharedMemoryFault { fault, figure } => memory_fault(kind, *fault, *figure),
         _ => finding(kind, Severity::Warning, "", kind.to_owned()),
     }
+}
+
+/// Returns what is wrong with shared memory.
+fn memory_fault(kind: &'static str, fault: MemoryFault, figure: u64) -> Finding {
+    const CLEAN: &str = "`fastdds shm clean` removes what ended nodes left";
+    let (severity, text, remedy) = match fault {
+        MemoryFault::Full => (
+            Severity::Warning,
+            "/dev/shm, of this host or of a container, is nearly full: Fast DDS then sends over the \
+             network, or nodes fail at start"
+                .to_owned(),
+            format!("df -h /dev/shm; {CLEAN}"),
+        ),
+        MemoryFault::Stale => (
+            Severity::Warning,
+            format!(
+                "files of ended nodes take {} MB of /dev/shm: nodes that are killed leave them",
+                figure >> 20
+            ),
+            CLEAN.to_owned(),
+        ),
+        MemoryFault::Split => (
+            Severity::Error,
+            format!(
+                "nodes of one domain and one network use {figure} different directories /dev/shm: \
+                 Fast DDS considers them to be on one host, and no message passes between them"
+            ),
+            "share it between the containers (docker run --ipc=host), or disable shared memory in them: \
+             FASTDDS_BUILTIN_TRANSPORTS=UDPv4"
+                .to_owned(),
+        ),
+    };
+    finding(kind, severity, fault.label(), text).with_remedy(remedy)
 }
 
 /// Returns a publisher and a subscription that were probably meant for each other.

@@ -138,7 +138,7 @@ impl Figures<'_> {
                 | Diagnosis::ParameterDrift { .. }
                 | Diagnosis::MixedTime { .. }
                 | Diagnosis::WrongStamps { .. }
-                | Diagnosis::SharedMemoryFull { .. }
+                | Diagnosis::SharedMemoryFault { .. }
                 | Diagnosis::SlowChain { .. } => {}
             }
         }
