@@ -77,7 +77,7 @@ export class State {
   /** Time of the source's clock. */
   time = 0;
   stepBegan = 0;
-  /** @type {{part: number|null, finished: boolean}|null} */ replay = null;
+  /** @type {{part: number|null, finished: boolean, paused: boolean, speed: number}|null} */ replay = null;
   /** @type {string|null} */ ended = null;
   /** Complete batches of this run of the agent. */
   batches = 0;
@@ -167,7 +167,8 @@ export class State {
     const [rate, bandwidth, lost, measured] = values.totals;
     this.totals = { rate, bandwidth, lost, measured };
     if (values.replay) {
-      this.replay = { part: values.replay[0], finished: Boolean(values.replay[1]) };
+      const [part, finished, paused, speed] = values.replay;
+      this.replay = { part, finished: Boolean(finished), paused: Boolean(paused), speed };
     }
     this.advance(values.t);
     this.batches += 1;

@@ -1,7 +1,7 @@
 // The time that the page shows: the present, or a part of the last days. It is part of every address.
 
 import { useEffect, useState } from './vendor/hooks.mjs';
-import { json, Refusal, request } from './api.js';
+import { json, post, Refusal, request } from './api.js';
 import { date, duration, percent } from './format.js';
 import { address } from './router.js';
 import { Lines } from './state.js';
@@ -150,18 +150,44 @@ export function TimeBar() {
       <button type="button" onClick=${() => showTime({ at: null })}>Now</button>`}</section>`;
 }
 
-/** The time of a replay, to which the figures of every view refer. */
+/** Speeds of a replay; 0 is without waiting. */
+const SPEEDS = [0.1, 0.5, 1, 2, 5, 10, 60, 0];
+
+/** @param {number} speed */
+const speedInWords = (speed) => (speed === 0 ? 'without waiting' : `${speed} times`);
+
+/** The time of a replay, to which the figures of every view refer, and its pace. */
 function Replay() {
+  const [problem, take] = useState('');
   const begin = state.open?.replay?.begin;
   if (begin == null || !state.replay) return null;
-  const { part, finished } = state.replay;
+  const { part, finished, paused, speed } = state.replay;
   const elapsed = Math.max(0, state.time - begin);
   const done = finished ? 1 : part;
+  /** @param {Record<string, any>} change */
+  const go = async (change) => {
+    try {
+      const now = await post('replay', change);
+      state.replay = { part, finished, paused: now.is_paused, speed: now.speed };
+      take('');
+    } catch (error) {
+      take(String(error instanceof Error ? error.message : error));
+    }
+  };
+  const speeds = SPEEDS.includes(speed) ? SPEEDS : [speed, ...SPEEDS];
   return html`<section class="timebar" aria-label="Time of the replay">
+    ${!finished && html`<button type="button" onClick=${() => go({ is_paused: !paused })}>${
+      paused ? 'Play' : 'Pause'}</button>`}
     <label>Replay
       <progress max="1" value=${done ?? undefined}></progress></label>
     <span>${date(state.time)}, ${duration(elapsed)} after the begin${
-      finished ? ', finished' : done == null ? '' : `, ${percent(done)} read`}</span></section>`;
+      finished ? ', finished' : done == null ? '' : `, ${percent(done)} read`}</span>
+    ${!finished && html`<label>Speed <select value=${speed}
+      onChange=${(/** @type {any} */ event) => go({ speed: Number(event.target.value) })}>
+      ${speeds.map((each) => html`<option value=${each}>${speedInWords(each)}</option>`)}</select></label>
+    <button type="button" onClick=${() => go({ to_next_event: true })}>Next event</button>
+    <button type="button" onClick=${() => go({ to_timestamp_seconds: state.time + 60 })}>+1 min</button>`}
+    ${problem && html`<span class="problem" role="alert">${problem}</span>`}</section>`;
 }
 
 /** What a view without a history shows in place of a moment in the past. @param {{title: string}} props */

@@ -42,6 +42,7 @@ pub mod path;
 pub mod problem;
 pub mod recording_report;
 pub mod recordings;
+pub mod replay;
 pub mod samples;
 pub mod services;
 pub mod snapshots;

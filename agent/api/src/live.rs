@@ -289,10 +289,16 @@ pub struct Row(
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveTotals))]
 pub struct Totals(pub u64, pub u64, pub u64, pub u64);
 
-/// `[share of the file that was read (0 to 1), 1 if the replay has finished]`.
+/// `[share of the file that was read (0 to 1), 1 if the replay has finished, 1 if it stands still,
+/// multiple of the speed of the capture or 0 without waiting]`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveProgress))]
-pub struct Progress(pub Option<f64>, pub u8);
+pub struct Progress(
+    pub Option<f64>,
+    pub u8,
+    #[serde(default)] pub u8,
+    #[serde(default)] pub f64,
+);
 
 /// Why the stream ended.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -27,6 +27,8 @@ pub enum Code {
     NoSuchNode,
     /// No history is kept, or none of that time.
     NoHistory,
+    /// The agent replays no capture.
+    NoReplay,
     /// The name exists several times; the request must select one of them.
     Ambiguous,
     /// The path exists, but not with this method.
@@ -130,6 +132,7 @@ impl Code {
             Self::NoSuchTopic => ("no-such-topic", 404, "No such topic"),
             Self::NoSuchNode => ("no-such-node", 404, "No such node"),
             Self::NoHistory => ("no-history", 404, "No history"),
+            Self::NoReplay => ("no-replay", 404, "No replay"),
             Self::Ambiguous => ("ambiguous", 409, "The name is ambiguous"),
             Self::MethodNotAllowed => ("method-not-allowed", 405, "Method not allowed"),
             Self::WatchDiffers => ("watch-differs", 409, "Watched with other settings"),

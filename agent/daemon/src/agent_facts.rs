@@ -6,7 +6,9 @@ use std::time::Instant;
 use ros2probe_wire::Timestamp;
 
 use crate::privilege::{self, Sandbox};
+use crate::replay_pace::Pace;
 use crate::state::StateFacts;
+use ros2probe_capture::pcap::Speed;
 use ros2probe_model::facts::dispatch::MissedReason;
 
 /// State of the agent at one moment.
@@ -41,6 +43,10 @@ pub struct AgentFacts {
     pub capture_begin: Option<Timestamp>,
     /// Fraction of the capture's file that was read, 0 to 1. `None` if unknown.
     pub replayed: Option<f64>,
+    /// Speed with which the replay began; `None` for a live source.
+    pub replay_speed: Option<Speed>,
+    /// How clients want the replay to go on.
+    pub replay_pace: Pace,
     /// Packets of a capture with an unsupported link layer, by link-layer number.
     pub unsupported_packets: Vec<(u16, u64)>,
     /// Counters per interface, or per network namespace if the kernel has no finer ones.
@@ -202,6 +208,8 @@ impl AgentFacts {
             finished: false,
             capture_begin: None,
             replayed: None,
+            replay_speed: None,
+            replay_pace: Pace::default(),
             unsupported_packets: Vec::new(),
             interfaces: Vec::new(),
             filter_events: Vec::new(),

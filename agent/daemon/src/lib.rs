@@ -35,6 +35,7 @@ mod memory;
 pub mod missed_announcements;
 pub mod privilege;
 pub mod recording;
+pub mod replay_pace;
 pub mod run;
 pub mod settings_cell;
 pub mod snapshot_cell;

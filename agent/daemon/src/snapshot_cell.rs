@@ -13,6 +13,7 @@ use arc_swap::{ArcSwap, ArcSwapOption};
 use tokio::sync::Notify;
 
 use super::agent_facts::{AgentFacts, SourceKind};
+use super::replay_pace::{Pace, ReplayPace};
 use ros2probe_capture::bell::Bell;
 use ros2probe_capture::inside::late::{LateDemand, RequestedBound};
 use ros2probe_model::measure::history::Past;
@@ -43,6 +44,7 @@ pub struct SnapshotCell {
     calls_wanted: ArcSwapOption<Instant>,
     /// Causes of late calls for which clients asked lately.
     late_wanted: Mutex<Vec<LateQuestion>>,
+    replay_pace: ReplayPace,
     bell: Arc<CaptureBell>,
     publication: Notify,
 }
@@ -114,6 +116,7 @@ impl SnapshotCell {
             read: AtomicBool::new(false),
             calls_wanted: ArcSwapOption::empty(),
             late_wanted: Mutex::default(),
+            replay_pace: ReplayPace::default(),
             bell: Arc::new(CaptureBell::new()),
             publication: Notify::new(),
         }
@@ -199,6 +202,19 @@ impl SnapshotCell {
     fn late_questions(&self) -> MutexGuard<'_, Vec<LateQuestion>> {
         let questions = self.late_wanted.lock();
         questions.unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Returns how clients want a replay to go on.
+    #[must_use]
+    pub const fn replay_pace(&self) -> &ReplayPace {
+        &self.replay_pace
+    }
+
+    /// Changes how a replay goes on, and returns the new pace.
+    pub fn pace_replay(&self, change: impl FnOnce(&mut Pace)) -> Pace {
+        let pace = self.replay_pace.change(change);
+        self.bell.ring();
+        pace
     }
 
     /// Counts one second, and returns whether the last seconds were read lately.

@@ -145,8 +145,8 @@ test('lines of later agents change nothing', () => {
 
 test('the end of a replay is known', () => {
   const state = ready();
-  feed(state, { values: { t: 120, topics: [], totals: [0, 0, 0, 0], replay: [1, 1] } });
-  assert.deepEqual(state.replay, { part: 1, finished: true });
+  feed(state, { values: { t: 120, topics: [], totals: [0, 0, 0, 0], replay: [1, 1, 0, 2] } });
+  assert.deepEqual(state.replay, { part: 1, finished: true, paused: false, speed: 2 });
   feed(state, { end: { reason: 'agent ends' } });
   assert.equal(state.ended, 'agent ends');
 });

@@ -52,6 +52,15 @@ impl Pacer {
         }
     }
 
+    /// Creates a pacer in the middle of a capture, of which `time` is due at `now`.
+    #[must_use]
+    pub const fn from(speed: Speed, time: Timestamp, now: Instant) -> Self {
+        Self {
+            speed,
+            anchor: Some((time, now)),
+        }
+    }
+
     /// Returns the time from `now` until the packet captured at `time` is due. The first packet is
     /// due immediately and sets the pace. A late packet, or one older than the first, is also due
     /// immediately.

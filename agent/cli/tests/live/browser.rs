@@ -425,6 +425,13 @@ fn the_page_of_a_capture_shows_an_incident_of_the_past() -> Result<()> {
 }
 
 #[test]
+fn a_replay_is_paused_and_goes_to_the_next_event_in_the_page() -> Result<()> {
+    let capture = data("cyclonedds/points-besteffort-lossy-2ns");
+    let agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "0.1"]);
+    watch(&[], "replay", &[&page(&agent)])
+}
+
+#[test]
 fn a_qos_mismatch_leads_to_the_incompatible_policy() -> Result<()> {
     // The capture ends before the first goodbye.
     let mut capture = tempfile::NamedTempFile::with_suffix(".pcap")?;

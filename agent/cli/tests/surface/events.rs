@@ -18,8 +18,8 @@ const END: &str = "\n\n";
 
 /// A message of a stream.
 #[derive(Clone, Debug, Default, PartialEq)]
-struct Message {
-    event: String,
+pub(crate) struct Message {
+    pub(crate) event: String,
     id: String,
     data: String,
 }
@@ -41,7 +41,7 @@ impl Message {
         message
     }
 
-    fn json(&self) -> Value {
+    pub(crate) fn json(&self) -> Value {
         serde_json::from_str(&self.data).unwrap_or_else(|error| panic!("{error}: {self:?}"))
     }
 
@@ -51,7 +51,7 @@ impl Message {
 }
 
 /// Returns all events that the agent keeps, without the greeting.
-fn kept(agent: &LocalAgent, query: &str) -> Vec<Message> {
+pub(crate) fn kept(agent: &LocalAgent, query: &str) -> Vec<Message> {
     let path = format!("/events?after=0&follow=false{query}");
     messages(&request(agent.api, "GET", &path, "").body)
 }

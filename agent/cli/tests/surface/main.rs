@@ -39,6 +39,7 @@ mod otlp_captures;
 mod otlp_tls;
 mod page;
 mod recordings;
+mod replay;
 mod ros2;
 mod ros2_daemon;
 mod rules;

@@ -31,7 +31,7 @@ fn ended(name: &str, arguments: &[&str]) -> LocalAgent {
     agent
 }
 
-fn get(agent: &LocalAgent, path: &str) -> Value {
+pub(crate) fn get(agent: &LocalAgent, path: &str) -> Value {
     let (status, body) = ask(agent.api, "GET", path, "");
     assert_eq!(status, 200, "{path}: {body}");
     body

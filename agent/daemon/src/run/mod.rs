@@ -18,6 +18,7 @@ use crate::agent_facts::AgentFacts;
 use crate::events::DropMonitor;
 use crate::events::EventLog;
 use crate::limit_facts::LimitFigures;
+use crate::replay_pace::{Jump, Pace};
 use crate::snapshot_cell::SnapshotCell;
 use crate::state::StateWriter;
 use crate::subscriptions::Subscriptions;
@@ -29,6 +30,7 @@ use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::library::{DescribedFigures, Library};
 use ros2probe_metrics::otlp::{NodeLogSink, SpanSink};
 use ros2probe_model::derive::type_descriptions::TypeSource;
+use ros2probe_model::facts::event::Class;
 use ros2probe_model::facts::selection::SampleRequest;
 use ros2probe_model::measure::history::History;
 use ros2probe_model::observe::input::Input;
@@ -87,6 +89,8 @@ pub struct Run {
     unconfirmed: Option<(Arc<Vec<SampleRequest>>, Instant)>,
     /// Last clock item sent to subscriptions.
     published_until: Timestamp,
+    /// Whether an event other than of a participant or endpoint occurred in this round.
+    has_event: bool,
     /// Time of the latest snapshot, and the revision of the graph in it.
     taken: Option<(Instant, u64)>,
     stop: CancellationToken,
@@ -134,6 +138,7 @@ impl Run {
             sample_requests: None,
             unconfirmed: None,
             published_until: Timestamp::default(),
+            has_event: false,
             taken: None,
             stop,
             keeper: None,
@@ -191,6 +196,7 @@ impl Run {
             } else {
                 self.idle_slice()
             };
+            let pace = self.follow_pace();
             let step = self.step(subscribed);
             let bell = self.outputs.latest.bell().descriptor();
             let polled = self.source.poll(slice, step, bell, &mut self.observer);
@@ -211,11 +217,12 @@ impl Run {
                 self.confirm_requests();
             }
             self.confirm_complete();
+            let has_arrived = self.end_jump(pace);
             let age = published.elapsed();
             let is_current = age < PUBLISH_ASKED && !self.source.is_paused();
             let is_asked = !is_current && self.outputs.latest.is_asked();
             let held = self.source.reached_pause();
-            let must = finished || held || polled.is_err() || is_asked;
+            let must = finished || held || has_arrived || polled.is_err() || is_asked;
             if must || age >= PUBLISH {
                 if must || self.is_snapshot_due() {
                     self.publish();
@@ -246,6 +253,37 @@ impl Run {
             self.outputs.latest.publish_past(history.past());
         }
         Ok(())
+    }
+
+    /// Makes a replay go on as clients request it, and returns what they request.
+    fn follow_pace(&mut self) -> Pace {
+        let pace = self.outputs.latest.replay_pace().get();
+        if let Source::Replay(replay) = &mut self.source {
+            replay.follow(&pace);
+        }
+        self.has_event = false;
+        pace
+    }
+
+    /// Ends the jump of a replay that has arrived. Returns whether it has.
+    fn end_jump(&self, followed: Pace) -> bool {
+        let Source::Replay(replay) = &self.source else {
+            return false;
+        };
+        let has_arrived = match followed.jump {
+            Some(Jump::To(_)) => replay.has_arrived(),
+            Some(Jump::NextEvent) => self.has_event || replay.has_arrived(),
+            None => false,
+        };
+        if has_arrived {
+            self.outputs.latest.replay_pace().change(|pace| {
+                if pace.jump == followed.jump {
+                    pace.is_paused |= pace.jump == Some(Jump::NextEvent);
+                    pace.jump = None;
+                }
+            });
+        }
+        has_arrived
     }
 
     /// Returns the maximum wait without requests: until the next decision of the model, or the end
@@ -300,6 +338,11 @@ impl Run {
             self.causes.add_to(&mut demand, now);
             live.want_late(&demand);
         }
+        let mut events = output.events.events.iter();
+        self.has_event |= events.any(|event| {
+            let class = event.kind.class();
+            !matches!(class, Class::Participant | Class::Endpoint)
+        });
         self.outputs.events.add(output.events, now);
         for source in output.type_sources {
             match source {
@@ -436,6 +479,7 @@ impl Run {
     /// about losses.
     fn facts(&mut self) -> AgentFacts {
         let mut facts = self.source.facts();
+        facts.replay_pace = self.outputs.latest.replay_pace().get();
         facts.subscriptions = self.subscriptions.facts();
         facts.subscriptions.retained_bytes = self.observer.latched_bytes();
         if let Some(keeper) = &mut self.keeper {

@@ -12,6 +12,7 @@ use ros2probe_wire::{Expansion, Timestamp};
 use tokio::sync::watch;
 
 use super::CaptureTime;
+use crate::replay_pace::{Jump, Pace};
 use ros2probe_capture::frame_decoder::FrameDecoder;
 use ros2probe_capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed, link_name};
 use ros2probe_capture::reassembly::{Limits, Reassembly};
@@ -25,6 +26,9 @@ const FAR: Duration = Duration::from_secs(3600);
 
 /// Polling interval of requests while a replay is paused.
 const PAUSE_POLL: Duration = Duration::from_millis(5);
+
+/// Polling interval of requests while a client holds a replay.
+const HELD_POLL: Duration = Duration::from_millis(50);
 
 /// Creates a pause point and its control, which ends the pause.
 #[must_use]
@@ -87,7 +91,13 @@ pub struct Replay {
     reader: PcapReader,
     decoder: FrameDecoder,
     pacer: Pacer,
+    /// Speed at the start, and now.
+    started_speed: Speed,
     speed: Speed,
+    /// Whether a client holds it.
+    is_held: bool,
+    /// Time to which it goes without waiting.
+    target: Option<Timestamp>,
     /// Packet that is read but not due yet.
     waiting: Option<Waiting>,
     clock: Timestamp,
@@ -133,7 +143,10 @@ impl Replay {
             reader,
             decoder: FrameDecoder::new(limits),
             pacer: Pacer::new(speed),
+            started_speed: speed,
             speed,
+            is_held: false,
+            target: None,
             waiting: None,
             clock: Timestamp::default(),
             packets: 0,
@@ -172,6 +185,38 @@ impl Replay {
         }
     }
 
+    /// Goes on as clients request it.
+    pub fn follow(&mut self, pace: &Pace) {
+        let is_held = pace.is_paused && pace.jump.is_none();
+        let speed = match pace.jump {
+            Some(_) => Speed::Max,
+            None => pace.speed.unwrap_or(self.started_speed),
+        };
+        self.target = match pace.jump {
+            Some(Jump::To(time)) => Some(time),
+            Some(Jump::NextEvent) | None => None,
+        };
+        if (speed, is_held) != (self.speed, self.is_held) {
+            (self.speed, self.is_held) = (speed, is_held);
+            self.pacer = match self.began {
+                Some(_) => Pacer::from(speed, self.clock, Instant::now()),
+                None => Pacer::new(speed),
+            };
+        }
+    }
+
+    /// Returns whether the time was reached to which it goes without waiting.
+    #[must_use]
+    pub fn has_arrived(&self) -> bool {
+        self.finished || self.target.is_some_and(|target| self.clock >= target)
+    }
+
+    /// Returns the speed at the start.
+    #[must_use]
+    pub const fn started_speed(&self) -> Speed {
+        self.started_speed
+    }
+
     /// Delivers packets that are due within `timeout`. Returns earlier at the end of the capture,
     /// before a packet at or after `until`, and when the model has much output.
     ///
@@ -185,6 +230,11 @@ impl Replay {
         observer: &mut Observer,
     ) -> Result<(), PcapError> {
         let end = Instant::now() + timeout;
+        let until = until.into_iter().chain(self.target).min();
+        if self.is_held && self.began.is_some() {
+            std::thread::sleep(timeout.min(HELD_POLL));
+            return Ok(());
+        }
         while !self.finished {
             let now = Instant::now();
             if now >= end || observer.has_much_output() {

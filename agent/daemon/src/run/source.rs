@@ -200,6 +200,7 @@ impl Source {
                     finished: replay.is_finished(),
                     capture_begin: replay.began(),
                     replayed: replay.part_read(),
+                    replay_speed: Some(replay.started_speed()),
                     unsupported_packets: replay
                         .unsupported()
                         .iter()

@@ -39,6 +39,7 @@ mod processes;
 mod reasons;
 mod recordings;
 pub mod reload;
+mod replay;
 mod ros_parameters;
 mod samples;
 mod scope;
@@ -201,6 +202,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(transforms::routes())
         .merge(health::routes())
         .merge(needs(Access::All, Access::All, reload::routes()))
+        .merge(needs(Access::Read, Access::All, replay::routes()))
         .merge(needs(Access::All, Access::All, page::routes()))
         .merge(openapi::routes())
 }

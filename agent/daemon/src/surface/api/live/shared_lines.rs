@@ -9,6 +9,7 @@ use bytes::Bytes;
 
 use super::super::body_stream::write_line;
 use super::super::index::Index;
+use super::super::replay::times;
 use super::findings::{Circumstances, dropped, findings};
 use super::structure::Ids;
 use super::values::{Figures, lost_lately, totals};
@@ -86,8 +87,18 @@ impl SharedLines {
         self.update_rows(figures.rows(&self.ids));
         self.at = snapshot.time().seconds();
         self.totals = totals(snapshot, past);
-        self.progress = (state.agent.source == SourceKind::Replay)
-            .then(|| Progress(state.agent.replayed, state.agent.finished.into()));
+        let agent = &state.agent;
+        self.progress = (agent.source == SourceKind::Replay).then(|| {
+            let pace = &agent.replay_pace;
+            let speed = pace.speed.or(agent.replay_speed).map_or(0.0, times);
+            let is_paused = pace.is_paused && pace.jump.is_none();
+            Progress(
+                agent.replayed,
+                agent.finished.into(),
+                is_paused.into(),
+                speed,
+            )
+        });
         self.state = Some(Arc::clone(state));
         self.past = Some(Arc::clone(past));
         self.in_force = Some(Arc::clone(in_force));
