@@ -10,6 +10,7 @@ import { kept, keep, state, stream, useLive, useRoute } from './store.js';
 import { html, Mark } from './ui.js';
 import { PresentOnly, TimeBar } from './timebar.js';
 import { Agent } from './views/agent.js';
+import { Doctor } from './views/doctor.js';
 import { ChainView, Chains } from './views/chains.js';
 import { Events } from './views/events.js';
 import { Graph } from './views/graph.js';
@@ -33,7 +34,7 @@ const VIEWS = [
 ];
 
 /** Views whose figures the history does not have. */
-const PRESENT_ONLY = ['chains', 'robot', 'recordings', 'agent'];
+const PRESENT_ONLY = ['chains', 'robot', 'recordings', 'agent', 'doctor'];
 
 function takeToken() {
   const given = tokenOf(location.hash);
@@ -115,7 +116,7 @@ function App() {
 function View({ route }) {
   const query = route?.query ?? {};
   if (stream.at != null && PRESENT_ONLY.includes(route?.view ?? '')) {
-    const [, title] = VIEWS.find(([view]) => view === route?.view) ?? ['', ''];
+    const [, title] = VIEWS.find(([view]) => view === route?.view) ?? ['', 'Doctor'];
     return html`<${PresentOnly} title=${title} />`;
   }
   switch (route?.view) {
@@ -134,6 +135,7 @@ function View({ route }) {
     case 'events': return html`<${Events} query=${query} />`;
     case 'recordings': return html`<${Recordings} />`;
     case 'agent': return html`<${Agent} />`;
+    case 'doctor': return html`<${Doctor} />`;
     default: return html`<h1 tabindex="-1">No such view</h1>
       <p><a href=${address('')}>Overview</a></p>`;
   }
@@ -172,7 +174,8 @@ function Header({ route, show }) {
 }
 
 function PauseButton() {
-  if (stream.at != null) return null;
+  // The time bar of a replay pauses the replay itself.
+  if (stream.at != null || state.open?.replay) return null;
   const paused = stream.status === 'paused';
   return html`<button type="button" aria-pressed=${paused}
     onClick=${() => (paused ? stream.resume() : stream.pause())}>${paused ? 'Paused' : 'Pause'}</button>`;

@@ -6,7 +6,7 @@
  */
 
 const VIEWS = ['', 'topics', 'graph', 'chains', 'nodes', 'robot', 'events', 'recordings', 'agent',
-  'token'];
+  'doctor', 'token'];
 
 /**
  * @param {string} fragment with or without its `#`

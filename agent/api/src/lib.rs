@@ -22,6 +22,7 @@ pub mod chains;
 pub mod clocks;
 pub mod diagnosis;
 pub mod diagnostics;
+pub mod doctor;
 pub mod endpoints;
 pub mod events;
 pub mod graph;

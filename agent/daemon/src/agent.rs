@@ -30,7 +30,7 @@ use crate::state::{StateDirectory, StateWriter};
 use crate::subscriptions::{Caps, Subscriptions};
 use crate::supervise::{Responder, Supervisor, Surfaces, Worker};
 use crate::surface::api::reload::Reloads;
-use crate::surface::api::{self, HistoryWriter, reload};
+use crate::surface::api::{self, Doctor, HistoryWriter, reload};
 use crate::surface::field_metrics::FieldMetrics;
 use crate::surface::foxglove;
 use crate::surface::http::Server;
@@ -46,7 +46,7 @@ use ros2probe_metrics::otlp::{
 pub const DEFAULT_CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
 
 /// Options of the command line.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Options {
     /// Configuration file. `None` means [`DEFAULT_CONFIG`] if it exists.
     pub config: Option<PathBuf>,
@@ -68,6 +68,8 @@ pub struct Options {
     pub foxglove: Option<Listen>,
     /// Rights of loopback clients instead of the configured ones.
     pub api_loopback: Option<Access>,
+    /// Examines this host for clients.
+    pub doctor: Doctor,
 }
 
 /// Address of a listener; `None` = off.
@@ -100,6 +102,8 @@ pub struct Components<'a> {
     pub history: Duration,
     /// Addresses at which the page is served.
     pub addresses: Vec<SocketAddr>,
+    /// Examines this host for clients.
+    pub doctor: Doctor,
     /// Token that stops the working thread and all streams.
     pub stop: CancellationToken,
 }
@@ -196,6 +200,7 @@ impl Components<'_> {
             viewers: sources.viewers,
             ros2_daemon: sources.ros2_daemon,
             page: Arc::new(api::Page::new(self.addresses)),
+            doctor: self.doctor,
             reloader,
             stop: self.stop,
         };
@@ -284,6 +289,7 @@ pub fn run(options: Options) -> Result<()> {
         library,
         history: kept,
         addresses: page_addresses(&config, &control),
+        doctor: options.doctor,
         stop: stop.clone(),
     };
     let agent = components.assemble().context("recordings.snapshots")?;

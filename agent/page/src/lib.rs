@@ -29,7 +29,7 @@ impl File {
 }
 
 /// Every file, by its path below `/page/`; `index.html` is also served at `/`.
-pub static FILES: [File; 43] = [
+pub static FILES: [File; 44] = [
     File::new("api.js", SCRIPT, include_bytes!("../api.js")),
     File::new("app.css", CSS, include_bytes!("../app.css")),
     File::new("app.js", SCRIPT, include_bytes!("../app.js")),
@@ -98,6 +98,11 @@ pub static FILES: [File; 43] = [
         "views/chains.js",
         SCRIPT,
         include_bytes!("../views/chains.js"),
+    ),
+    File::new(
+        "views/doctor.js",
+        SCRIPT,
+        include_bytes!("../views/doctor.js"),
     ),
     File::new(
         "views/events.js",

@@ -38,6 +38,7 @@ export function Agent() {
       ? html`<${Mark} severity="good" /> The agent sees the robot.`
       : html`<${Mark} severity="error" /> The agent is not ready: <${Name}
         text=${state.agent.reason ?? ''} />`}</p>`}
+    <p><a href=${address('doctor')}>Doctor</a>: kernel, buffers, interfaces and processes of this host</p>
     ${state.ended && html`<p><${Mark} severity="warning" /> <${Name} text=${state.ended} /></p>`}
     <${Facts} title="This agent" rows=${[
       ['Host', html`<${Name} text=${open.host ?? data?.host ?? 'unknown'} />`],

@@ -118,6 +118,9 @@ function tintOf(vertex, tint) {
   return tint === 'process' ? hueOf(`${own?.host} ${own?.pid}`) : null;
 }
 
+/** Seconds after which a moment that is missing is requested again. */
+const AGAIN = 5;
+
 /**
  * Returns what has changed since a moment before.
  * @param {number} seconds 0 = no comparison
@@ -126,9 +129,11 @@ function useDifferences(seconds) {
   const [before, take] = useState(/** @type {State|null} */ (null));
   const [failed, fail] = useState('');
   const at = Math.floor(state.time) - seconds;
+  // The first state of a busy agent is old, and a new agent writes its first state after a minute.
+  const attempt = failed ? Math.floor(state.time / AGAIN) : 0;
   useEffect(() => {
     take(null);
-    fail('');
+    if (!seconds) fail('');
     if (!seconds) return undefined;
     const abort = new AbortController();
     moment(at, abort.signal)
@@ -136,10 +141,11 @@ function useDifferences(seconds) {
         const past = new State();
         past.show(lines);
         take(past);
+        fail('');
       })
       .catch((error) => { if (!abort.signal.aborted) fail(error.message); });
     return () => abort.abort();
-  }, [seconds, state.past]);
+  }, [seconds, state.past, attempt]);
   const found = useMemo(() => before && differences(before, state), [before, state.structure]);
   return { found, failed, since: before?.time ?? null };
 }

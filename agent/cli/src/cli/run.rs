@@ -72,6 +72,7 @@ impl From<Run> for Options {
             api: run.api,
             foxglove: run.foxglove,
             api_loopback: run.api_loopback,
+            doctor: ros2probe::doctor::of_agent(),
         }
     }
 }

@@ -258,6 +258,7 @@ fn assemble(
         library: Arc::new(Library::new(Sources::default())),
         history: Duration::ZERO,
         addresses: Vec::new(),
+        doctor: crate::doctor::of_agent(),
         stop,
     };
     components.assemble().map_err(io::Error::other)

@@ -7,6 +7,7 @@ use ros2probe_api::topics::TopicList;
 use ros2probe_api::watches::WatchList;
 
 use crate::client::{Agent, ClientError};
+use ros2probe_daemon::surface::api::OwnAnswers;
 
 /// All answers that the checks need.
 #[derive(Clone, Debug, Default)]
@@ -24,6 +25,21 @@ pub struct Answers {
 }
 
 impl Answers {
+    /// Reads an agent's own answers.
+    ///
+    /// # Errors
+    ///
+    /// Fails if an answer has another format, such as that of a problem.
+    pub fn of(own: &OwnAnswers) -> Result<Self, serde_json::Error> {
+        Ok(Self {
+            health: serde_json::from_slice(&own.health)?,
+            participants: serde_json::from_slice(&own.participants)?,
+            topics: serde_json::from_slice(&own.topics)?,
+            watches: serde_json::from_slice(&own.watches)?,
+            clocks: serde_json::from_slice(&own.clocks)?,
+        })
+    }
+
     /// Requests the answers for one domain, or for all of them.
     ///
     /// # Errors

@@ -26,7 +26,7 @@ pub mod visibility;
 use std::path::PathBuf;
 
 use answers::Answers;
-use finding::Finding;
+use finding::{Area, Finding, Severity};
 use host_state::HostState;
 use processes::Processes;
 use report::Report;
@@ -34,6 +34,7 @@ use ros2probe_capture::error_chain::in_words;
 use ros2probe_daemon::config::{CaptureSettings, Config, ExactChoice, InsideChoice};
 use ros2probe_daemon::privilege;
 use ros2probe_daemon::run;
+use ros2probe_daemon::surface::api::Doctor;
 use variables::{Range, Variables};
 use visibility::Visibility;
 
@@ -99,8 +100,54 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
     findings.extend(buffers::check(host, answers));
     findings.extend(clock::check(host));
     findings.extend(answers.and_then(|answers| clock::compared(&answers.clocks)));
+    Report::new(name_of(host), findings)
+}
+
+/// Returns a doctor that checks this host for the clients of its agent. Checks of a user's shell and
+/// rights belong to the command alone.
+#[must_use]
+pub fn of_agent() -> Doctor {
+    Doctor::new(|own| {
+        let report = match Answers::of(own) {
+            Ok(answers) if answers.health.source == "replay" => {
+                examine_capture(&answers, "this capture")
+            }
+            Ok(answers) => examine_within(&HostState::read(), &answers),
+            Err(error) => {
+                let sentence = format!("the agent does not understand its own answers: {error}");
+                let finding = Finding::new(Area::Agent, "answers", Severity::Problem, sentence);
+                Report::new("this host", vec![finding])
+            }
+        };
+        serde_json::to_value(report).unwrap_or_default()
+    })
+}
+
+/// Checks this host within its agent.
+fn examine_within(host: &HostState, answers: &Answers) -> Report {
+    let health = &answers.health;
+    let processes = Processes::find(host, Some(&answers.participants));
+    let mut findings = agent::check(answers, "this page", env!("CARGO_PKG_VERSION"));
+    findings.extend(visibility::check(&Visibility::of_agent(health)));
+    findings.extend(kernel::check(host, true));
+    findings.extend(interfaces::check(
+        host,
+        Some(health),
+        processes.is_any_local(),
+    ));
+    findings.extend(processes.check(host));
+    let daemons: Vec<_> = processes.ros2_daemons().collect();
+    findings.extend(ros2_daemon::check(&health.ros2_daemon, &daemons));
+    findings.extend(graph::check(answers, Some(processes.count())));
+    findings.extend(buffers::check(host, Some(answers)));
+    findings.extend(clock::check(host));
+    findings.extend(clock::compared(&answers.clocks));
+    Report::new(name_of(host), findings)
+}
+
+fn name_of(host: &HostState) -> String {
     let name = host.files.text("/proc/sys/kernel/hostname");
-    Report::new(name.unwrap_or_else(|_| "this host".to_owned()), findings)
+    name.unwrap_or_else(|_| "this host".to_owned())
 }
 
 /// Checks an agent on another host. Only the agent's own answers are available.

@@ -19,14 +19,14 @@ const VIEWS = [
   ['#/events', 'main tbody tr'],
   ['#/recordings', 'form'],
   ['#/agent', 'section[aria-labelledby="limits"] tbody tr'],
+  ['#/doctor', '.findings li'],
   ['#/nowhere', 'main p'],
 ];
 
 /** Opens the details of a view, so that they are checked as well. */
 async function unfold(tab) {
-  for (const summary of await tab.page.locator('details:not([open]) > summary').all()) {
-    await summary.click();
-  }
+  const closed = tab.page.locator('details:not([open]) > summary');
+  for (let left = await closed.count(); left > 0; left -= 1) await closed.first().click();
   const definition = tab.page.locator('section[aria-labelledby="definition"] button');
   if (await definition.count()) {
     await definition.click();

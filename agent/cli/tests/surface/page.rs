@@ -1,6 +1,7 @@
 //! Answers to the web page for replays of real robots: files, the stream of changes, history,
 //! decoded messages, tokens and downloads.
 
+mod doctor;
 mod history;
 mod messages;
 mod past;

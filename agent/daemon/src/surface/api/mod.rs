@@ -10,6 +10,7 @@ mod body_stream;
 pub mod chains;
 mod clocks;
 mod diagnostics;
+mod doctor;
 mod downloads;
 mod endpoint;
 mod events;
@@ -77,6 +78,7 @@ use crate::recording::{Recordings, Snapshots};
 use crate::snapshot_cell::{SnapshotCell, State};
 use crate::subscriptions::Subscriptions;
 use crate::watches::Watches;
+pub use doctor::{Doctor, OwnAnswers};
 pub use live::Live;
 pub use openapi::document;
 pub use page::Page;
@@ -127,6 +129,8 @@ pub struct Context {
     pub ros2_daemon: Arc<Ros2DaemonFigures>,
     /// The web page.
     pub page: Arc<Page>,
+    /// Examines this host.
+    pub doctor: Doctor,
     /// Reloads the configuration.
     pub reloader: Reloader,
     /// Ends the streams when the agent stops.
@@ -203,6 +207,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(health::routes())
         .merge(needs(Access::All, Access::All, reload::routes()))
         .merge(needs(Access::Read, Access::All, replay::routes()))
+        .merge(needs(Access::All, Access::All, doctor::routes()))
         .merge(needs(Access::All, Access::All, page::routes()))
         .merge(openapi::routes())
 }
