@@ -39,7 +39,7 @@ pub struct HistorySpan {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct ProcessHistory {
-    /// Seconds between two rows, at least; processes are read each ten seconds.
+    /// Seconds between two rows, at least.
     pub interval_seconds: u32,
     /// The processes.
     pub processes: Vec<ProcessColumns>,

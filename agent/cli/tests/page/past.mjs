@@ -18,6 +18,8 @@ await scenario(async (open) => {
   await reads(page.locator('.notice'), 'The robot as it was');
   await until('its figures', async () => /Hz/.test(await row('/imu').innerText()));
   assert.equal(await row('/after_restart').count(), 0);
+  const chart = row('/imu').locator('.spark path');
+  await until('its small chart', async () => /L/.test(await chart.getAttribute('d')));
   await tab.accessible('the past');
 
   // Its links keep the time.

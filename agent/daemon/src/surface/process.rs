@@ -23,8 +23,8 @@ pub(super) struct Usage {
     pub(super) cpu_seconds: f64,
     pub(super) resident_bytes: u64,
     pub(super) threads: u32,
-    /// Unix time of the process's start.
-    pub(super) started: Option<f64>,
+    /// Clock ticks from the start of the system to that of the process.
+    pub(super) start_ticks: Option<u64>,
 }
 
 impl Usage {
@@ -46,11 +46,15 @@ impl Usage {
             cpu_seconds: (fields.number(14)? + fields.number(15)?) / ticks,
             resident_bytes,
             threads: fields.text(20)?.parse().ok()?,
-            started: fields
-                .number(22)
-                .zip(boot_time())
-                .map(|(start, boot)| boot + start / ticks),
+            start_ticks: fields.text(22)?.parse().ok(),
         })
+    }
+
+    /// Returns the Unix time of the process's start.
+    pub(super) fn started(&self) -> Option<f64> {
+        #[expect(clippy::cast_precision_loss, reason = "exact for centuries")]
+        let start = self.start_ticks? as f64;
+        Some(boot_time()? + start / ticks_per_second())
     }
 }
 

@@ -61,6 +61,7 @@ fn read(ids: BTreeMap<u32, Option<Arc<str>>>) -> ProcessList {
             unreadable += 1;
             continue;
         };
+        let started_timestamp_seconds = usage.started();
         processes.push(ProcessUsage {
             process_id,
             process: name.map_or(usage.name, |name| name.to_string()),
@@ -68,7 +69,7 @@ fn read(ids: BTreeMap<u32, Option<Arc<str>>>) -> ProcessList {
             cpu_seconds: usage.cpu_seconds,
             memory_bytes: usage.resident_bytes,
             threads: usage.threads,
-            started_timestamp_seconds: usage.started,
+            started_timestamp_seconds,
         });
     }
     let now = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();

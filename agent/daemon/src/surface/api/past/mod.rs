@@ -1,6 +1,7 @@
 //! `/history`: what the agent keeps on disk of the last days, and the robot as it was at a moment.
 
 mod query;
+mod rates;
 mod topic;
 mod writer;
 
@@ -82,8 +83,9 @@ async fn about(State(context): State<Context>) -> Json<DiskHistory> {
 
 /// The robot as it was
 ///
-/// The lines are those at the beginning of `/live`, without rates of earlier minutes. They describe
-/// the last state that was written before `at`: one a minute, and one per ten minutes further back.
+/// The lines are those at the beginning of `/live`. They describe the last state that was written
+/// before `at`: one a minute, and one per ten minutes further back. The line with the rates of the
+/// minutes before ends at `at`.
 #[utoipa::path(
     get,
     path = "/history/moment",
@@ -103,19 +105,22 @@ async fn moment(
     Parameters(moment): Parameters<Moment>,
 ) -> Result<Response, Problem> {
     let at = query::second(moment.at)?;
-    let state = read_store(&context, move |store| store.state(at)).await?;
-    let state = state.ok_or_else(|| {
+    let lines = read_store(&context, move |store| {
+        let state = store.state(at)?;
+        Some(rates::with_rates(&state.content, store, at))
+    });
+    let lines = lines.await?.ok_or_else(|| {
         Problem::new(
             Code::NoHistory,
             "no state of that time or before is in the history",
         )
     })?;
-    Ok(lines_of(state.content))
+    Ok(lines_of(lines))
 }
 
 /// CPU time and memory of the robot's processes
 ///
-/// The rows are at most ten seconds apart. A process is named by its id and its script or program.
+/// A process is named by its id and its script or program.
 #[utoipa::path(
     get,
     path = "/history/processes",

@@ -24,10 +24,11 @@ use crate::events::Reader;
 use crate::state::{ENDING, join_until};
 use crate::surface::process::{Usage, script};
 
-/// Time between two readings of the processes and of the events.
-const READING: Duration = Duration::from_secs(10);
-/// Number of readings after which the rows are written.
-const READINGS: u32 = 6;
+/// Time between two readings of the processes.
+const READING: Duration = Duration::from_secs(1);
+/// Number of readings after which the events are read, and after which everything is written.
+const READINGS_OF_EVENTS: u32 = 10;
+const READINGS: u32 = 60;
 /// Time within which the working thread publishes a requested state, unless the machine is busy.
 const PUBLICATION: Duration = Duration::from_secs(2);
 /// Number of these times after which an old state is written.
@@ -65,7 +66,7 @@ struct EventLines(Vec<u8>);
 /// Usage of a process at the last reading.
 struct LastUsage {
     name: ProcessName,
-    started: Option<f64>,
+    start_ticks: Option<u64>,
     cpu_seconds: f64,
     at: Instant,
 }
@@ -118,7 +119,10 @@ impl Minute {
         let mut readings = 0;
         while let Err(RecvTimeoutError::Timeout) = ended.recv_timeout(READING) {
             readings += 1;
-            self.read();
+            self.read_processes();
+            if readings % READINGS_OF_EVENTS == 0 {
+                self.read_events();
+            }
             if readings % READINGS == 0 {
                 if !self.wait_for_publication(ended) {
                     break;
@@ -126,7 +130,8 @@ impl Minute {
                 self.write();
             }
         }
-        self.read();
+        self.read_processes();
+        self.read_events();
         self.write();
     }
 
@@ -147,9 +152,8 @@ impl Minute {
         true
     }
 
-    /// Reads the processes and the new events.
-    fn read(&mut self) {
-        self.read_processes();
+    /// Reads the new events.
+    fn read_events(&mut self) {
         let log = &self.context.events;
         loop {
             let batch = log.read(self.place, BATCH);
@@ -176,7 +180,7 @@ impl Minute {
                 continue;
             };
             let before = left.remove(&id);
-            let before = before.filter(|before| before.started == usage.started);
+            let before = before.filter(|before| before.start_ticks == usage.start_ticks);
             let name = match &before {
                 Some(before) => before.name.clone(),
                 None => ProcessName {
@@ -198,7 +202,7 @@ impl Minute {
             }
             let last = LastUsage {
                 name,
-                started: usage.started,
+                start_ticks: usage.start_ticks,
                 cpu_seconds: usage.cpu_seconds,
                 at: now,
             };
