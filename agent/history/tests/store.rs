@@ -126,6 +126,32 @@ fn rows_are_there_at_both_resolutions_also_after_a_restart() {
 }
 
 #[test]
+fn blocks_across_the_border_of_ten_minutes_lose_nothing() {
+    for first in [60_001, 60_037, 60_599] {
+        let directory = tempfile::tempdir().unwrap();
+        let store = Store::open(directory.path(), LIMIT).unwrap();
+        let begins = (0..45).map(|minute| first + minute * 60);
+        let mut events = String::new();
+        for begin in begins {
+            store.append(Tier::Seconds, &minute(begin)).unwrap();
+            store.condense(begin + 60).unwrap();
+            events += &format!("event {begin}\n");
+            let expected: u32 = (first + 1..=begin + 60).map(|at| row(at).messages).sum();
+            for step in [1, 10, 60] {
+                let rows = rows(&store, 0..begin + 60, step);
+                let seen: u32 = rows.iter().map(|row| row.messages).sum();
+                assert_eq!(seen, expected, "{first} {begin} {step}");
+            }
+            let mut seen = String::new();
+            store.events(0..begin + 60, &mut |text| {
+                seen += str::from_utf8(text).unwrap()
+            });
+            assert_eq!(seen, events, "{first} {begin}");
+        }
+    }
+}
+
+#[test]
 fn the_oldest_history_is_deleted_beyond_the_limit_and_tens_reach_further() {
     let directory = tempfile::tempdir().unwrap();
     let limit = 600 << 10;
