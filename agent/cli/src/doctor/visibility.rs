@@ -204,6 +204,10 @@ fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
         ),
         _ => (Severity::Warning, format!("not {}", words(ability)), None),
     };
+    // The configuration is already that of the remedy.
+    let is_configured =
+        reason.is_some_and(|reason| reason.starts_with("capture.shm.exact is auto"));
+    let remedy = remedy.filter(|_| !is_configured);
     if let Some(reason) = reason {
         sentence = format!("{sentence}: {reason}");
     }
@@ -231,6 +235,20 @@ mod tests {
 
     fn find<'a>(findings: &'a [Finding], check: &str) -> Option<&'a Finding> {
         findings.iter().find(|finding| finding.check == check)
+    }
+
+    #[test]
+    fn exact_shared_memory_has_no_remedy_while_no_client_reads() {
+        let reason = "capture.shm.exact is auto, and no client reads samples";
+        let mut visibility = host(&[]);
+        let remedies = |visibility: &Visibility| {
+            let findings = check(visibility);
+            let found = find(&findings, Ability::SharedMemoryExact.label()).unwrap();
+            found.remedies.len()
+        };
+        assert_eq!(remedies(&visibility), 1);
+        visibility.reasons = vec![(Ability::SharedMemoryExact, reason.to_owned())];
+        assert_eq!(remedies(&visibility), 0);
     }
 
     #[test]
