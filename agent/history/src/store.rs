@@ -201,8 +201,8 @@ impl Store {
             self.visit(Tier::Seconds, Kind::Events, &times, &mut |block| {
                 events.push(block);
             });
-            // A block that ends later belongs to the next window: the end of the last block tells up
-            // to which time rows are merged.
+            // A block that ends later belongs to the next window, because the latest end is the time up
+            // to which rows are merged.
             events.retain(|block| block.end <= times.end);
             blocks.extend(events);
             self.append(Tier::Tens, &blocks)?;

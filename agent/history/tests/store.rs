@@ -144,7 +144,7 @@ fn blocks_across_the_border_of_ten_minutes_lose_nothing() {
             }
             let mut seen = String::new();
             store.events(0..begin + 60, &mut |text| {
-                seen += str::from_utf8(text).unwrap()
+                seen += str::from_utf8(text).unwrap();
             });
             assert_eq!(seen, events, "{first} {begin}");
         }
