@@ -9,6 +9,10 @@ pub struct DomainId(pub u32);
 impl DomainId {
     /// The highest domain id that has UDP ports (RTPS 2.5, 9.6.2.3).
     pub const MAX: Self = Self(232);
+    /// The first UDP port of domain 0 (RTPS 2.5, 9.6.2.3).
+    pub const PORT_BASE: u16 = 7400;
+    /// Number of UDP ports of a domain.
+    pub const PORT_GAIN: u16 = 250;
 }
 
 /// A number that is not a domain id.

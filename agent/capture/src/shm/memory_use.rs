@@ -9,10 +9,8 @@ use std::path::Path;
 use super::directories::{Name, ShmDirectories, ShmDirectory};
 use super::owner::{Locks, Owner};
 use ros2probe_model::facts::shared_memory::MemoryUse;
+use ros2probe_wire::DomainId;
 
-/// Port numbers of RTPS (RTPS 2.5, 9.6.2.3): that of domain 0, and the distance between two domains.
-const FIRST_PORT: u32 = 7400;
-const DOMAIN_GAIN: u32 = 250;
 /// Size of the blocks that a file's metadata counts, in bytes.
 const BLOCK: u64 = 512;
 
@@ -61,9 +59,8 @@ impl ShmDirectory {
                 }
                 (Owner::Alive(process), Name::Port(_, number)) => {
                     let network = fs::metadata(Path::new(&format!("/proc/{process}/ns/net")));
-                    let domain = number
-                        .checked_sub(FIRST_PORT)
-                        .map(|port| port / DOMAIN_GAIN);
+                    let offset = number.checked_sub(DomainId::PORT_BASE.into());
+                    let domain = offset.map(|offset| offset / u32::from(DomainId::PORT_GAIN));
                     if let (Ok(network), Some(domain)) = (network, domain) {
                         meetings.insert((network.ino(), domain));
                     }

@@ -9,7 +9,7 @@ use std::net::SocketAddrV4;
 use ros2probe_wire::parameters::ParameterId;
 use ros2probe_wire::qos::{Durability, Reliability};
 use ros2probe_wire::rtps::{LocatorKind, SubmessageFlags, SubmessageId, VendorId};
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber};
 
 /// Vendor id, believed to be unassigned. Both vendors treat it as foreign and use no extensions.
 pub const VENDOR: VendorId = VendorId([0x01, 0x7f]);
@@ -69,8 +69,9 @@ impl Message {
     pub fn announce(self, local: LocalParticipant) -> Self {
         let own = Guid::new(local.prefix, EntityId::PARTICIPANT);
         let unicast = locator(*local.address.ip(), local.address.port());
-        // 7400 + 250 d (RTPS 2.5, 9.6.2.3); no ports exist beyond domain 232.
-        let port = local.domain_id.saturating_mul(250).saturating_add(7400);
+        // No ports exist beyond domain 232.
+        let port = local.domain_id.saturating_mul(DomainId::PORT_GAIN);
+        let port = port.saturating_add(DomainId::PORT_BASE);
         let multicast = locator(MULTICAST.into(), port);
         let payload = Parameters::default()
             .add(ParameterId::PROTOCOL_VERSION, &[2, 3, 0, 0])

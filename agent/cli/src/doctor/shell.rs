@@ -1,18 +1,16 @@
 //! Checks of this shell's ROS variables: their effect on nodes and tools started from it, and which
 //! of their traffic the agent cannot see.
 
-use super::finding::{Area, Finding, Severity};
 use super::host_state::{HostState, Unread};
 use super::variables::{Range, Variables};
+use ros2probe_api::doctor::{Area, Finding, Severity};
+use ros2probe_wire::DomainId;
 
 const AREA: Area = Area::Shell;
 const FROM: &str = "this shell";
 /// The RMW implementation without UDP ports of a domain and without DDS discovery.
 const ZENOH: &str = "rmw_zenoh_cpp";
 const PORTS: &str = "/proc/sys/net/ipv4/ip_local_port_range";
-/// RTPS 2.5, 9.6.2.3: first port of domain 0, and ports per domain.
-const PORT_BASE: u32 = 7400;
-const DOMAIN_GAIN: u32 = 250;
 /// Maximum offset from the first port, for fifty participants on one host: 11, plus two for each
 /// other.
 const PORTS_OF_FIFTY: u32 = 11 + 2 * 49;
@@ -99,7 +97,7 @@ fn ephemeral(host: &HostState) -> Option<(u32, u32)> {
 }
 
 fn overlaps(domain: u32, first: u32, last: u32) -> bool {
-    let begin = PORT_BASE + DOMAIN_GAIN * domain;
+    let begin = u32::from(DomainId::PORT_BASE) + u32::from(DomainId::PORT_GAIN) * domain;
     let end = begin + PORTS_OF_FIFTY;
     begin <= last && end >= first
 }

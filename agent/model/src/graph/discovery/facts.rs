@@ -301,16 +301,17 @@ pub(super) fn domain(announced: Option<DomainId>, origin: &Origin) -> (DomainId,
     if let Some(domain_id) = announced.filter(|domain_id| *domain_id <= DomainId::MAX) {
         return (domain_id, DomainSource::Announced);
     }
-    let Some(offset) = origin.port.checked_sub(7400) else {
+    let Some(offset) = origin.port.checked_sub(DomainId::PORT_BASE) else {
         return (DomainId(0), DomainSource::Assumed);
     };
-    let (domain_id, rest) = (DomainId(u32::from(offset / 250)), offset % 250);
+    let domain_id = DomainId(u32::from(offset / DomainId::PORT_GAIN));
+    let rest = offset % DomainId::PORT_GAIN;
     let [first, .., a, _, _, _] = origin.destination;
     let is_multicast = first == 0xff || first == 0 && a & 0xf0 == 0xe0;
     if is_multicast && rest == 0 && domain_id <= DomainId::MAX {
         return (domain_id, DomainSource::MulticastPort);
     }
-    if rest >= 10 && rest % 2 == 0 && origin.port < EPHEMERAL {
+    if rest >= 10 && rest.is_multiple_of(2) && origin.port < EPHEMERAL {
         return (domain_id, DomainSource::UnicastPort);
     }
     (DomainId(0), DomainSource::Assumed)
