@@ -297,6 +297,25 @@ fn an_endpoint_at_127_0_0_1_does_not_match_one_on_another_host() {
 }
 
 #[test]
+fn a_restored_participant_that_has_sent_nothing_yet_may_be_on_this_host() {
+    let at = |address: Ipv4Addr| [SocketAddrV4::new(address, 7411)];
+    let mut before = World::new();
+    before.is_local = true;
+    before.participant(2, &at(Ipv4Addr::new(10, 0, 0, 2)));
+    before.announce(reader(2, 1), "rt/points", STRING, &[]);
+    let mut world = World::new();
+    world.observer.input(Input::Restored {
+        memory: &before.observer.memory(),
+        now: Timestamp(START),
+    });
+    world.is_local = true;
+    world.participant(1, &at(Ipv4Addr::LOCALHOST));
+    world.announce(writer(1, 1), "rt/points", STRING, &[]);
+    assert_eq!(world.found("unmatched_publisher"), []);
+    assert_eq!(world.found("unmatched_subscription"), []);
+}
+
+#[test]
 fn two_types_and_two_definitions_of_one_type_are_found() {
     let mut world = World::with(3);
     let hash = |digit: &str| {

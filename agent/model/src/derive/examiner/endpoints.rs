@@ -168,13 +168,17 @@ impl<'a> EndpointExaminer<'a> {
     }
 
     /// Returns which endpoints a participant can reach. Where no participant is known to be on this
-    /// host, as in a capture, each may reach all.
+    /// host, as in a capture, each may reach all. So may one that was restored and has sent nothing
+    /// since.
     fn reach(&self, guid: Guid) -> Reach {
         let Some(participant) = self.discovery.participants().get(&guid.prefix) else {
             return Reach::Any;
         };
         let addresses = &participant.addresses;
         let has_addresses = !addresses.metatraffic.is_empty() || !addresses.default.is_empty();
+        if participant.restored.is_some() {
+            return Reach::Any;
+        }
         match (participant.local, addresses.reachable()) {
             (true, None) if has_addresses => Reach::Loopback,
             (false, Some(_)) => Reach::OtherHost,
