@@ -53,8 +53,8 @@ impl Locks {
     /// that is unknown.
     #[must_use]
     pub fn is_held(&self, device: u64, inode: u64) -> Option<bool> {
-        let held = self.held.as_ref()?;
-        Some(held.contains_key(&(libc::major(device), libc::minor(device), inode)))
+        self.held.as_ref()?;
+        Some(self.holder(device, inode).is_some())
     }
 
     fn holder(&self, device: u64, inode: u64) -> Option<u32> {
@@ -90,8 +90,9 @@ impl Locks {
     }
 }
 
-/// Returns the file and the process of a line such as `1: FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF`. A process
-/// that waits for a lock (`1: -> FLOCK ...`) holds no lock.
+/// Returns the file and the process of a line such as
+/// `1: FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF`. A process that waits for a lock
+/// (`1: -> FLOCK ...`) holds no lock.
 fn lock_of(line: &str) -> Option<(FileId, u32)> {
     let mut words = line.split_whitespace().skip(1);
     if words.next() != Some("FLOCK") {

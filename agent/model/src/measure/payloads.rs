@@ -232,13 +232,12 @@ impl Payloads {
             Some(_) => &interested.to,
             None => &interested.arrivals,
         };
-        let to = interested.without_repeats(to, counted.number);
         // An unconfirmed number may be that of a new incarnation.
         let is_complete = interested.order.is_idle() && counted.number < progress.complete;
-        let to = match is_complete && !counted.unconfirmed {
-            true => interested.without_begun_later(&to, counted.number),
-            false => to,
-        };
+        let is_known = is_complete && !counted.unconfirmed;
+        let to = interested.without(to, |begin| {
+            begin.before == Some(counted.number) || is_known && begin.begins_after(counted.number)
+        });
         for begin in &mut interested.begins {
             begin.arrived(&to, counted.number);
         }
@@ -561,32 +560,17 @@ impl WantedWriter {
         missed.into_iter().map(dispatches).collect()
     }
 
-    /// Returns the ids without those of requests that received this sample as the one from before
-    /// their start.
-    fn without_repeats(&self, to: &Arc<[u64]>, number: SequenceNumber) -> Arc<[u64]> {
-        let is_repeat = |begin: &&RequestBegin| begin.before == Some(number);
-        if !self.begins.iter().any(|begin| is_repeat(&begin)) {
+    /// Returns the ids without those of requests to which a sample is not dispatched: those that
+    /// received it as the one from before their start, and those that begin with a later one.
+    /// Polling may notice a sample after later ones were seen by other means.
+    fn without(&self, to: &Arc<[u64]>, is_left: impl Fn(&RequestBegin) -> bool) -> Arc<[u64]> {
+        let is_left = |begin: &&RequestBegin| is_left(begin);
+        if !self.begins.iter().any(|begin| is_left(&begin)) {
             return Arc::clone(to);
         }
-        let repeats: Vec<u64> =
-            (self.begins.iter().filter(is_repeat).map(|begin| begin.id)).collect();
-        to.iter()
-            .copied()
-            .filter(|id| !repeats.contains(id))
-            .collect()
-    }
-
-    /// Returns the ids without those of requests whose samples begin with a higher number. Polling
-    /// may notice a sample after later ones were seen by other means.
-    fn without_begun_later(&self, to: &Arc<[u64]>, number: SequenceNumber) -> Arc<[u64]> {
-        let begins_later = |id: &u64| {
-            let begin = self.begins.iter().find(|begin| begin.id == *id);
-            begin.is_some_and(|begin| begin.begins_after(number))
-        };
-        if !to.iter().any(begins_later) {
-            return Arc::clone(to);
-        }
-        to.iter().copied().filter(|id| !begins_later(id)).collect()
+        let left = self.begins.iter().filter(is_left);
+        let left: Vec<u64> = left.map(|begin| begin.id).collect();
+        to.iter().copied().filter(|id| !left.contains(id)).collect()
     }
 
     /// Returns the report that a counted sample is missing for requests of its payload.
