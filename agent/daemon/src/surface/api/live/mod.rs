@@ -7,6 +7,7 @@
 mod findings;
 mod inside;
 mod measured;
+pub(super) mod rate_steps;
 mod robot;
 mod shared_lines;
 mod structure;

@@ -4,16 +4,14 @@ use std::collections::{BTreeMap, HashMap};
 
 use super::super::history::{short, thousandths};
 use super::super::index::Index;
+use super::rate_steps::{Part, RateSteps, STEP, STEPS};
 use super::structure::{Ids, is_measured, is_shown};
 use crate::config::Watchlist;
-use ros2probe_api::live::{History, Rates, Row, Totals};
+use ros2probe_api::live::{History, Row, Totals};
 use ros2probe_model::facts::diagnosis::Diagnosis;
 use ros2probe_model::measure::history::{Past, Second};
 use ros2probe_model::report::snapshot::{Snapshot, TopicFacts, Transport, WatchState};
 
-/// Step of the initial rates, in seconds.
-const STEP: usize = 10;
-const STEPS: usize = 60;
 /// Time for which a loss is flagged, in seconds.
 pub(super) const LOSS: usize = 60;
 
@@ -228,54 +226,30 @@ pub(super) fn lost_lately(past: &Past) -> HashMap<u32, u32> {
 /// Returns the rates of the last minutes for measured topics.
 pub(super) fn history(snapshot: &Snapshot, past: &Past, ids: &Ids) -> History {
     let seconds = past.seconds();
-    let first = seconds.len().saturating_sub(STEP * STEPS);
-    let steps: Vec<_> = seconds
-        .get(first..)
-        .unwrap_or_default()
-        .chunks(STEP)
-        .collect();
-    let mut history = History {
-        step_seconds: STEP as u32,
-        ..History::default()
-    };
-    let mut rates: BTreeMap<u32, Vec<Option<f64>>> = BTreeMap::new();
-    for (place, step) in steps.iter().enumerate() {
-        let Some(last) = step.last() else { continue };
-        let mut sums: HashMap<u32, (u32, u32)> = HashMap::new();
-        let (mut messages, mut bytes, mut lost) = (0.0, 0.0, 0.0);
-        for row in step.iter().flat_map(|second| second.rows()) {
-            messages += f64::from(row.messages);
-            bytes += f64::from(row.bytes);
-            lost += f64::from(row.lost);
-            let (sum, rows) = sums.entry(row.topic()).or_default();
-            *sum = sum.saturating_add(row.messages);
-            *rows += 1;
-        }
-        let length = f64::from(u32::try_from(step.len()).unwrap_or(u32::MAX));
-        history.t.push(last.at.seconds());
-        for (column, value) in history.totals.iter_mut().zip([
-            thousandths(messages / length),
-            (bytes / length).round(),
-            lost,
-        ]) {
-            column.push(value);
-        }
-        for (topic, (sum, rows)) in sums {
-            let column = rates
-                .entry(topic)
-                .or_insert_with(|| vec![None; steps.len()]);
-            if let Some(value) = column.get_mut(place) {
-                *value = Some(thousandths(f64::from(sum) / f64::from(rows)));
-            }
-        }
-    }
+    let first = seconds.len().saturating_sub((STEP * STEPS) as usize);
+    let steps = seconds.get(first..).unwrap_or_default();
+    let steps = steps.chunks(STEP as usize);
     let topics = snapshot.topics.iter().filter_map(|topic| {
         let known = past.id(topic.domain_id, &topic.dds_name)?;
-        let id = ids.topic(topic.domain_id, &topic.dds_name)?;
-        Some(Rates(id, rates.remove(&known)?))
+        Some((known, ids.topic(topic.domain_id, &topic.dds_name)?))
     });
-    history.topics = topics.collect();
-    history
+    let topics: HashMap<u32, u32> = topics.collect();
+    let mut sums = RateSteps::new(steps.len());
+    for (place, step) in steps.clone().enumerate() {
+        for row in step.iter().flat_map(|second| second.rows()) {
+            let part = Part {
+                messages: row.messages,
+                bytes: row.bytes.into(),
+                lost: row.lost,
+                seconds: 1,
+            };
+            sums.add(place, topics.get(&row.topic()).copied(), part);
+        }
+    }
+    sums.history(steps.filter_map(|step| {
+        let length = u32::try_from(step.len()).unwrap_or(u32::MAX);
+        Some((step.last()?.at.seconds(), length.into()))
+    }))
 }
 
 #[cfg(test)]

@@ -5,13 +5,9 @@ use std::collections::BTreeMap;
 use serde::Deserialize;
 
 use super::super::body_stream::write_line;
-use super::super::history::thousandths;
-use ros2probe_api::live::{History, Line, Rates};
+use super::super::live::rate_steps::{Part, RateSteps, STEP, STEPS};
+use ros2probe_api::live::{History, Line};
 use ros2probe_history::{Store, TopicName};
-
-/// Length of a step, in seconds, and number of steps.
-const STEP: u32 = 10;
-const STEPS: u32 = 60;
 
 /// The part of the line with the graph that names the topics.
 #[derive(Deserialize)]
@@ -55,58 +51,25 @@ fn topics(lines: &[u8]) -> BTreeMap<TopicName, u32> {
 fn rates(topics: &BTreeMap<TopicName, u32>, store: &Store, at: u32) -> History {
     let end = at.div_ceil(STEP);
     let first = end.saturating_sub(STEPS);
-    let steps = end - first;
-    let mut history = History {
-        step_seconds: STEP,
-        t: (first + 1..=end)
-            .map(|step| f64::from((step * STEP).min(at)))
-            .collect(),
-        totals: [(); 3].map(|()| vec![0.0; steps as usize]),
-        topics: Vec::new(),
-    };
-    let mut counts: BTreeMap<u32, Vec<Option<(u32, u32)>>> = BTreeMap::new();
+    let mut sums = RateSteps::new((end - first) as usize);
     store.topics(first * STEP..at, STEP, &|_| true, &mut |name, row| {
-        let place = (row.at.div_ceil(STEP).saturating_sub(first + 1)) as usize;
-        let length = f64::from(STEP);
-        for (column, value) in history.totals.iter_mut().zip([
-            f64::from(row.messages) / length,
-            row.bytes as f64 / length,
-            f64::from(row.lost),
-        ]) {
-            if let Some(sum) = column.get_mut(place) {
-                *sum += value;
-            }
-        }
-        let Some(id) = topics.get(name) else { return };
-        let column = counts
-            .entry(*id)
-            .or_insert_with(|| vec![None; steps as usize]);
-        if let Some(step) = column.get_mut(place) {
-            let (messages, seconds) = step.get_or_insert((0, 0));
-            *messages = messages.saturating_add(row.messages);
-            *seconds = seconds.saturating_add(row.seconds);
-        }
+        let place = row.at.div_ceil(STEP).saturating_sub(first + 1);
+        let part = Part {
+            messages: row.messages,
+            bytes: row.bytes as f64,
+            lost: row.lost,
+            seconds: row.seconds,
+        };
+        sums.add(place as usize, topics.get(name).copied(), part);
     });
-    for column in &mut history.totals {
-        for value in column {
-            *value = thousandths(*value);
-        }
-    }
-    let rate = |(messages, seconds): (u32, u32)| {
-        thousandths(f64::from(messages) / f64::from(seconds.max(1)))
-    };
-    let topics = counts.into_iter();
-    let topics = topics.map(|(id, steps)| {
-        let steps = steps.into_iter().map(|step| step.map(rate));
-        Rates(id, steps.collect())
-    });
-    history.topics = topics.collect();
-    history
+    let ends = (first + 1..=end).map(|step| f64::from((step * STEP).min(at)));
+    sums.history(ends.map(|end| (end, f64::from(STEP))))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ros2probe_api::live::Rates;
     use ros2probe_history::{Block, Series, Tier, TopicRow};
 
     #[test]
