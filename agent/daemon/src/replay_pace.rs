@@ -29,6 +29,24 @@ pub enum Jump {
     NextEvent,
 }
 
+impl Pace {
+    /// Returns whether the replay stands still.
+    #[must_use]
+    pub const fn is_still(&self) -> bool {
+        self.is_paused && self.jump.is_none()
+    }
+
+    /// Returns the speed as a multiple of that of the capture; 0 = without waiting. `started` is the
+    /// speed of the start.
+    #[must_use]
+    pub fn times(&self, started: Option<Speed>) -> f64 {
+        match self.speed.or(started) {
+            Some(Speed::Times(times)) => times,
+            Some(Speed::Max) | None => 0.0,
+        }
+    }
+}
+
 impl ReplayPace {
     /// Returns the latest requests.
     #[must_use]

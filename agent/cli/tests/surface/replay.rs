@@ -97,4 +97,7 @@ fn a_replay_stands_still_goes_to_a_time_and_to_the_next_event() {
 
     change(&agent, &json!({"is_paused": false, "speed": 0}));
     wait_for(&agent, "finished", |replay| replay["is_finished"] == true);
+    // Nothing follows that it could jump to.
+    let ended = change(&agent, &json!({"to_next_event": true}));
+    assert_eq!(ended["is_jumping"], false);
 }

@@ -187,7 +187,7 @@ impl Replay {
 
     /// Goes on as clients request it.
     pub fn follow(&mut self, pace: &Pace) {
-        let is_held = pace.is_paused && pace.jump.is_none();
+        let is_held = pace.is_still();
         let speed = match pace.jump {
             Some(_) => Speed::Max,
             None => pace.speed.unwrap_or(self.started_speed),

@@ -1,5 +1,8 @@
 //! `/replay`: how the replay of a capture goes on.
 
+use std::sync::Arc;
+use std::time::Duration;
+
 use axum::Json;
 use axum::extract::State;
 use utoipa_axum::router::OpenApiRouter;
@@ -78,7 +81,7 @@ async fn change(
 
 /// # Errors
 /// Fails if the agent replays no capture.
-async fn replayed(context: &Context) -> Result<std::sync::Arc<Known>, Problem> {
+async fn replayed(context: &Context) -> Result<Arc<Known>, Problem> {
     let state = context.state().await;
     match state.agent.source {
         SourceKind::Replay => Ok(state),
@@ -122,7 +125,7 @@ fn requested(request: &ReplayRequest, now: Timestamp) -> Result<Pace, Problem> {
 
 /// Returns a Unix time in nanoseconds; `None` if it is out of range.
 fn timestamp(seconds: f64) -> Option<Timestamp> {
-    let whole = std::time::Duration::try_from_secs_f64(seconds).ok()?;
+    let whole = Duration::try_from_secs_f64(seconds).ok()?;
     let nanoseconds = whole.as_secs().checked_mul(SECOND)?;
     nanoseconds
         .checked_add(whole.subsec_nanos().into())
@@ -136,17 +139,9 @@ fn view(state: &Known, pace: Pace) -> ReplayState {
         timestamp_seconds: state.known().time().seconds(),
         read_ratio: agent.replayed,
         is_finished: agent.finished,
-        is_paused: pace.is_paused && pace.jump.is_none(),
-        speed: pace.speed.or(agent.replay_speed).map_or(0.0, times),
-        is_jumping: pace.jump.is_some(),
-    }
-}
-
-/// Returns a speed as a multiple of that of the capture; 0 = without waiting.
-pub(super) const fn times(speed: Speed) -> f64 {
-    match speed {
-        Speed::Max => 0.0,
-        Speed::Times(times) => times,
+        is_paused: pace.is_still(),
+        speed: pace.times(agent.replay_speed),
+        is_jumping: pace.jump.is_some() && !agent.finished,
     }
 }
 

@@ -9,7 +9,6 @@ use bytes::Bytes;
 
 use super::super::body_stream::write_line;
 use super::super::index::Index;
-use super::super::replay::times;
 use super::findings::{Circumstances, dropped, findings};
 use super::structure::Ids;
 use super::values::{Figures, lost_lately, totals};
@@ -90,13 +89,11 @@ impl SharedLines {
         let agent = &state.agent;
         self.progress = (agent.source == SourceKind::Replay).then(|| {
             let pace = &agent.replay_pace;
-            let speed = pace.speed.or(agent.replay_speed).map_or(0.0, times);
-            let is_paused = pace.is_paused && pace.jump.is_none();
             Progress(
                 agent.replayed,
                 agent.finished.into(),
-                is_paused.into(),
-                speed,
+                pace.is_still().into(),
+                pace.times(agent.replay_speed),
             )
         });
         self.state = Some(Arc::clone(state));
