@@ -9,9 +9,9 @@ use clap::Args;
 use ros2probe::client::{Agent, ClientError, Target};
 use ros2probe::doctor::answers::Answers;
 use ros2probe::doctor::host_state::HostState;
-use ros2probe::doctor::report::Report;
 use ros2probe::doctor::text::{Style, text};
 use ros2probe::doctor::{Configured, Reach, examine, examine_capture, examine_remote};
+use ros2probe_api::doctor::Report;
 use ros2probe_daemon::config::{Config, ConfigError};
 
 use super::Output;

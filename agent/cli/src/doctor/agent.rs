@@ -7,10 +7,10 @@ use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
 use std::path::Path;
 
 use super::answers::Answers;
-use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
 use super::privileges::is_installed;
 use crate::top::text::counted;
+use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::{Foxglove, Health, Limit};
 use ros2probe_api::watches::WatchState;
 use ros2probe_daemon::config::{self, Config, StateChoice};

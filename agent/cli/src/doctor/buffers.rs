@@ -7,8 +7,8 @@
 //! the requested size.
 
 use super::answers::Answers;
-use super::finding::{Area, Finding, Severity};
 use super::host_state::{Files, HostState, Unread};
+use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::measurement::Measurement;
 use ros2probe_api::topics::Topic;
 

@@ -1,8 +1,8 @@
 //! Checks of the clock: whether timestamps of this host are comparable with those of others.
 
-use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
 use ros2probe_api::clocks::{ClockOffset, Clocks};
+use ros2probe_api::doctor::{Area, Finding, Severity};
 
 const AREA: Area = Area::Clock;
 /// Programs that synchronize clocks.

@@ -4,10 +4,10 @@
 use std::collections::BTreeMap;
 
 use super::answers::Answers;
-use super::finding::{Area, Finding, Severity};
 use crate::top::text::counted;
 use ros2probe_api::Open;
 use ros2probe_api::diagnosis::Diagnosis;
+use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
 use ros2probe_api::participants::Participant;
 use ros2probe_api::topics::Topic;

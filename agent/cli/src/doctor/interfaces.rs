@@ -1,7 +1,7 @@
 //! Checks of network interfaces: their use for DDS, and which ones the agent captures.
 
-use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
+use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
 
 const AREA: Area = Area::Interfaces;

@@ -9,14 +9,12 @@ pub mod answers;
 pub mod buffers;
 pub mod cgroup;
 pub mod clock;
-pub mod finding;
 pub mod graph;
 pub mod host_state;
 pub mod interfaces;
 pub mod kernel;
 pub mod privileges;
 pub mod processes;
-pub mod report;
 pub mod ros2_daemon;
 pub mod shell;
 pub mod text;
@@ -26,10 +24,9 @@ pub mod visibility;
 use std::path::PathBuf;
 
 use answers::Answers;
-use finding::{Area, Finding, Severity};
 use host_state::HostState;
 use processes::Processes;
-use report::Report;
+use ros2probe_api::doctor::{Area, Finding, Report, Severity};
 use ros2probe_capture::error_chain::in_words;
 use ros2probe_daemon::config::{CaptureSettings, Config, ExactChoice, InsideChoice};
 use ros2probe_daemon::privilege;
@@ -100,26 +97,23 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
     findings.extend(buffers::check(host, answers));
     findings.extend(clock::check(host));
     findings.extend(answers.and_then(|answers| clock::compared(&answers.clocks)));
-    Report::new(name_of(host), findings)
+    report(name_of(host), findings)
 }
 
 /// Returns a doctor that checks this host for the clients of its agent. Checks of a user's shell and
 /// rights belong to the command alone.
 #[must_use]
 pub fn of_agent() -> Doctor {
-    Doctor::new(|own| {
-        let report = match Answers::of(own) {
-            Ok(answers) if answers.health.source == "replay" => {
-                examine_capture(&answers, "this capture")
-            }
-            Ok(answers) => examine_within(&HostState::read(), &answers),
-            Err(error) => {
-                let sentence = format!("the agent does not understand its own answers: {error}");
-                let finding = Finding::new(Area::Agent, "answers", Severity::Problem, sentence);
-                Report::new("this host", vec![finding])
-            }
-        };
-        serde_json::to_value(report).unwrap_or_default()
+    Doctor::new(|own| match Answers::of(own) {
+        Ok(answers) if answers.health.source == "replay" => {
+            examine_capture(&answers, "this capture")
+        }
+        Ok(answers) => examine_within(&HostState::read(), &answers),
+        Err(error) => {
+            let sentence = format!("the agent does not understand its own answers: {error}");
+            let finding = Finding::new(Area::Agent, "answers", Severity::Problem, sentence);
+            report("this host", vec![finding])
+        }
     })
 }
 
@@ -142,7 +136,11 @@ fn examine_within(host: &HostState, answers: &Answers) -> Report {
     findings.extend(buffers::check(host, Some(answers)));
     findings.extend(clock::check(host));
     findings.extend(clock::compared(&answers.clocks));
-    Report::new(name_of(host), findings)
+    report(name_of(host), findings)
+}
+
+fn report(subject: impl Into<String>, findings: Vec<Finding>) -> Report {
+    Report::new(env!("CARGO_PKG_VERSION"), subject, findings)
 }
 
 fn name_of(host: &HostState) -> String {
@@ -158,13 +156,13 @@ pub fn examine_remote(answers: &Answers, place: &str) -> Report {
     findings.extend(ros2_daemon::check(&answers.health.ros2_daemon, &[]));
     findings.extend(graph::check(answers, None));
     findings.extend(clock::compared(&answers.clocks));
-    Report::new(place, findings)
+    report(place, findings)
 }
 
 /// Checks the graph of a capture.
 #[must_use]
 pub fn examine_capture(answers: &Answers, name: &str) -> Report {
-    Report::new(name, graph::check(answers, None))
+    report(name, graph::check(answers, None))
 }
 
 /// Returns the findings of a trial load of the kernel programs, if permitted. Does not attach
@@ -186,7 +184,6 @@ fn tried(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
 mod tests {
     use super::host_state::tests::host;
     use super::*;
-    use finding::{Area, Severity};
 
     fn areas(report: &Report) -> Vec<Area> {
         let mut areas: Vec<_> = report.findings.iter().map(|finding| finding.area).collect();

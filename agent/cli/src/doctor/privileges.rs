@@ -3,8 +3,8 @@
 //! capabilities.
 
 use super::answers::Answers;
-use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
+use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
 use ros2probe_capture::uprobe;
 use ros2probe_daemon::config::{CaptureSettings, ExactChoice, InsideChoice, ShmMode};

@@ -7,9 +7,9 @@
 
 use std::collections::BTreeMap;
 
-use super::finding::{Area, Finding, Severity};
 use super::host_state::{HostState, Unread, base_name};
 use super::variables::{Range, Variables};
+use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::participants::ParticipantList;
 use ros2probe_attach::functions::Library;
 

@@ -1,7 +1,7 @@
 //! Checks of the daemon of the `ros2` command line: whether the agent answers in its place, and
 //! which commands then create no participant.
 
-use super::finding::{Area, Finding, Severity};
+use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::Ros2DaemonPort;
 
 const AREA: Area = Area::Processes;

@@ -4,8 +4,7 @@
 
 use std::borrow::Cow;
 
-use super::finding::{Finding, Remedy, RemedyTarget, Severity};
-use super::report::Report;
+use ros2probe_api::doctor::{Finding, Remedy, RemedyTarget, Report, Severity};
 use ros2probe_daemon::escape::visible;
 
 const WIDTH: usize = 80;
@@ -34,7 +33,7 @@ pub fn text(report: &Report, style: Style) -> String {
         style,
         text: String::new(),
     };
-    page.line(&report.headline());
+    page.line(&headline(report));
     let mut area = None;
     for finding in &report.findings {
         if area != Some(finding.area) {
@@ -46,6 +45,24 @@ pub fn text(report: &Report, style: Style) -> String {
         page.finding(finding);
     }
     page.text
+}
+
+/// Returns the number of findings of each severity, as text.
+fn headline(report: &Report) -> String {
+    let count = |severity: Severity| {
+        let findings = report.findings.iter();
+        let of_it = findings.filter(|each| each.severity == severity);
+        match (of_it.count(), severity) {
+            (0, _) => None,
+            (count, Severity::Ok | Severity::Unknown) | (count @ 1, _) => {
+                Some(format!("{count} {}", severity.label()))
+            }
+            (count, _) => Some(format!("{count} {}s", severity.label())),
+        }
+    };
+    let counts: Vec<_> = Severity::ALL.into_iter().filter_map(count).collect();
+    let (version, subject) = (&report.version, visible(&report.subject));
+    format!("rp doctor {version} on {subject}: {}", counts.join(", "))
 }
 
 struct Page {
@@ -179,11 +196,12 @@ fn pieces(word: &str, width: usize) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::finding::Area;
     use super::*;
+    use ros2probe_api::doctor::Area;
 
     fn report() -> Report {
         Report::new(
+            "0.1.0",
             "robot1",
             vec![
                 Finding::new(Area::Kernel, "version", Severity::Ok, "Linux 6.8")
@@ -253,7 +271,7 @@ Buffers
             .seen(hostile.clone(), hostile)
             .remedy("ls");
         let text = text(
-            &Report::new("\x1b[31mhost", vec![finding]),
+            &Report::new("0.1.0", "\x1b[31mhost", vec![finding]),
             Style::default(),
         );
         assert!(
@@ -267,5 +285,19 @@ Buffers
                 .all(|line| line.chars().count() <= WIDTH),
             "{text}"
         );
+    }
+
+    #[test]
+    fn the_headline_counts_the_worst_severity_first() {
+        let severities = [
+            Severity::Ok,
+            Severity::Ok,
+            Severity::Warning,
+            Severity::Problem,
+            Severity::Problem,
+        ];
+        let findings = severities.map(|severity| Finding::new(Area::Kernel, "x", severity, "x"));
+        let report = Report::new("0.1.0", "robot1", findings.into());
+        assert!(headline(&report).ends_with("on robot1: 2 problems, 1 warning, 2 ok"));
     }
 }

@@ -1,7 +1,7 @@
 //! Checks of visibility on this host, as reported by the running agent, or else from a trial.
 //! `capture` provides the reasons; this module adds their consequences.
 
-use super::finding::{Area, Finding, Severity};
+use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
 use ros2probe_daemon::agent_facts::{Ability, AgentFacts};
 
@@ -221,8 +221,8 @@ fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::finding::RemedyTarget;
     use super::*;
+    use ros2probe_api::doctor::RemedyTarget;
     use ros2probe_daemon::config::Config;
 
     fn host(able: &[Ability]) -> Visibility {

@@ -89,8 +89,6 @@ pub struct Run {
     unconfirmed: Option<(Arc<Vec<SampleRequest>>, Instant)>,
     /// Last clock item sent to subscriptions.
     published_until: Timestamp,
-    /// Whether an event other than of a participant or endpoint occurred in this round.
-    has_event: bool,
     /// Time of the latest snapshot, and the revision of the graph in it.
     taken: Option<(Instant, u64)>,
     stop: CancellationToken,
@@ -138,7 +136,6 @@ impl Run {
             sample_requests: None,
             unconfirmed: None,
             published_until: Timestamp::default(),
-            has_event: false,
             taken: None,
             stop,
             keeper: None,
@@ -212,12 +209,12 @@ impl Run {
                 self.observer.input(Input::Time(self.source.clock()));
             }
             self.remember();
-            self.hand_over();
+            let has_event = self.hand_over();
             if has_applied_lists {
                 self.confirm_requests();
             }
             self.confirm_complete();
-            let has_arrived = self.end_jump(pace);
+            let has_arrived = self.end_jump(pace, has_event);
             let age = published.elapsed();
             let is_current = age < PUBLISH_ASKED && !self.source.is_paused();
             let is_asked = !is_current && self.outputs.latest.is_asked();
@@ -261,18 +258,17 @@ impl Run {
         if let Source::Replay(replay) = &mut self.source {
             replay.follow(&pace);
         }
-        self.has_event = false;
         pace
     }
 
     /// Ends the jump of a replay that has arrived. Returns whether it has.
-    fn end_jump(&self, followed: Pace) -> bool {
+    fn end_jump(&self, followed: Pace, has_event: bool) -> bool {
         let Source::Replay(replay) = &self.source else {
             return false;
         };
         let has_arrived = match followed.jump {
             Some(Jump::To(_)) => replay.has_arrived(),
-            Some(Jump::NextEvent) => self.has_event || replay.has_arrived(),
+            Some(Jump::NextEvent) => has_event || replay.has_arrived(),
             None => false,
         };
         if has_arrived {
@@ -325,8 +321,9 @@ impl Run {
         }
     }
 
-    /// Passes new items to the outputs. Slow readers do not block this thread.
-    fn hand_over(&mut self) {
+    /// Passes new items to the outputs. Slow readers do not block this thread. Returns whether an
+    /// event other than of a participant or endpoint is among them.
+    fn hand_over(&mut self) -> bool {
         let now = self.source.clock();
         let output = self.observer.drain();
         if let Source::Live(live) = &mut self.source {
@@ -339,7 +336,7 @@ impl Run {
             live.want_late(&demand);
         }
         let mut events = output.events.events.iter();
-        self.has_event |= events.any(|event| {
+        let has_event = events.any(|event| {
             let class = event.kind.class();
             !matches!(class, Class::Participant | Class::Endpoint)
         });
@@ -361,6 +358,7 @@ impl Run {
         let new_clock = (clock > self.published_until).then_some(clock);
         self.published_until = self.published_until.max(clock);
         self.subscriptions.deliver(output.samples, new_clock);
+        has_event
     }
 
     /// Passes changed watches and requests to the model. Returns whether every topic was matched

@@ -5,18 +5,17 @@ use std::time::Duration;
 
 use axum::body::{Body, Bytes, to_bytes};
 use axum::extract::State;
-use axum::http::Request;
+use axum::http::{Request, Uri};
 use axum::{Extension, Json};
 use hyper::service::Service as _;
 use hyper_util::service::TowerToHyperService;
-use serde_json::Value;
 use tokio::sync::Semaphore;
-use tokio::task::spawn_blocking;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
+use super::turns::{NoResult, in_turn};
 use super::{Context, nouns};
 use ros2probe_api::doctor::Report;
 
@@ -28,8 +27,7 @@ static TURN: Semaphore = Semaphore::const_new(1);
 #[derive(Clone)]
 pub struct Doctor(Arc<Examine>);
 
-/// Returns a report as JSON, in the format of [`Report`].
-type Examine = dyn Fn(&OwnAnswers) -> Value + Send + Sync;
+type Examine = dyn Fn(&OwnAnswers) -> Report + Send + Sync;
 
 /// The agent's own answers, as JSON.
 #[derive(Clone, Debug, Default)]
@@ -53,8 +51,8 @@ impl std::fmt::Debug for Doctor {
 }
 
 impl Doctor {
-    /// Creates a doctor that examines with this function, in the format of [`Report`].
-    pub fn new(examine: impl Fn(&OwnAnswers) -> Value + Send + Sync + 'static) -> Self {
+    /// Creates a doctor that examines with this function.
+    pub fn new(examine: impl Fn(&OwnAnswers) -> Report + Send + Sync + 'static) -> Self {
         Self(Arc::new(examine))
     }
 }
@@ -72,7 +70,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     path = "/doctor",
     tag = "agent",
     responses(
-        (status = 200, description = "The report.", body = Report<'static>),
+        (status = 200, description = "The report.", body = Report),
         (status = 503, description = "The examination does not end, or the agent stops.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
@@ -80,34 +78,29 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 async fn examine(
     State(context): State<Context>,
     Extension(granted): Extension<Granted>,
-) -> Result<Json<Value>, Problem> {
+) -> Result<Json<Report>, Problem> {
     let doctor = context.doctor.clone();
-    let unanswered = |_| Problem::new(Code::Ending, "the examination of this host does not end");
-    let report = async {
-        let _turn = TURN.acquire().await.map_err(|_| ending())?;
-        let answers = own_answers(&context, &granted).await?;
-        let examined = spawn_blocking(move || (doctor.0)(&answers)).await;
-        examined.map_err(|_| ending())
-    };
-    let report = tokio::time::timeout(WITHIN, report).await;
-    Ok(Json(report.map_err(unanswered)??))
+    let answers = own_answers(&context, granted).await?;
+    let report = in_turn(&TURN, WITHIN, move || (doctor.0)(&answers)).await;
+    report.map(Json).map_err(|no_result| match no_result {
+        NoResult::Late => Problem::new(Code::Ending, "the examination of this host does not end"),
+        NoResult::Ending => ending(),
+    })
 }
 
 fn ending() -> Problem {
     Problem::new(Code::Ending, "the agent is shutting down")
 }
 
-async fn own_answers(context: &Context, granted: &Granted) -> Result<OwnAnswers, Problem> {
+async fn own_answers(context: &Context, granted: Granted) -> Result<OwnAnswers, Problem> {
+    let (router, _) = nouns(Some(context)).split_for_parts();
+    let router = router.layer(Extension(granted)).with_state(context.clone());
+    let router = &TowerToHyperService::new(router);
     let ask = |path: &'static str| async move {
-        let (router, _) = nouns(Some(context)).split_for_parts();
-        let router = TowerToHyperService::new(router.with_state(context.clone()));
         let mut request = Request::new(Body::empty());
-        *request.uri_mut() = axum::http::Uri::from_static(path);
-        request.extensions_mut().insert(granted.clone());
-        let answer = router
-            .call(request)
-            .await
-            .unwrap_or_else(|never| match never {});
+        *request.uri_mut() = Uri::from_static(path);
+        let answer = router.call(request).await;
+        let answer = answer.unwrap_or_else(|never| match never {});
         let body = to_bytes(answer.into_body(), usize::MAX).await;
         body.map_err(|_| ending())
     };

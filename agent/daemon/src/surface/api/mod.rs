@@ -50,6 +50,7 @@ mod services;
 mod snapshots;
 mod topics;
 mod transforms;
+mod turns;
 mod watch;
 mod why;
 

@@ -5,12 +5,12 @@ use std::time::Duration;
 
 use serde::Deserialize;
 use tokio::sync::Semaphore;
-use tokio::task::spawn_blocking;
 use utoipa::IntoParams;
 
 use super::super::Context;
 use super::super::problem::{Code, Problem};
 use super::super::scope::Domain;
+use super::super::turns::{NoResult, in_turn};
 use super::writer::seconds;
 use ros2probe_history::Store;
 
@@ -148,19 +148,12 @@ pub(in super::super) async fn read_store<T: Send + 'static>(
     if !history.is_kept() {
         return Err(missing(none));
     }
-    let ending = || Problem::new(Code::Ending, "the agent is shutting down");
-    let answer = async {
-        let turn = TURNS.acquire().await.map_err(|_| ending())?;
-        let read = spawn_blocking(move || {
-            let _turn = turn;
-            history.opened().map(read)
-        });
-        read.await
-            .map_err(|_| ending())?
-            .ok_or_else(|| missing(none))
-    };
-    let answer = tokio::time::timeout(READ_WITHIN, answer).await;
-    answer.unwrap_or_else(|_| Err(missing("the storage of the history does not answer")))
+    let answer = in_turn(&TURNS, READ_WITHIN, move || history.opened().map(read)).await;
+    match answer {
+        Ok(answer) => answer.ok_or_else(|| missing(none)),
+        Err(NoResult::Late) => Err(missing("the storage of the history does not answer")),
+        Err(NoResult::Ending) => Err(Problem::new(Code::Ending, "the agent is shutting down")),
+    }
 }
 
 fn invalid(detail: &'static str) -> Problem {
