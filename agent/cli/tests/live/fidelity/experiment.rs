@@ -33,6 +33,8 @@ const SETTLED: Duration = Duration::from_secs(60);
 const QUIET: Duration = Duration::from_millis(400);
 const PAUSE: Duration = Duration::from_millis(20);
 const ANNOUNCEMENTS: u64 = 10;
+/// Maximum number of incomplete datagrams without a report (`docs/limitations.md`).
+const UNREPORTED: u64 = 1;
 /// The kernel's timeout for IP fragments on the subscribers' host, with a margin.
 const REASSEMBLY: Duration = Duration::from_millis(1500);
 
@@ -208,10 +210,12 @@ impl Experiment {
                 let mut cell = self.cell(subscriber, (span, due), &missing, &losses);
                 if let Trouble::Fragments(_) = span.trouble {
                     let reported = cell.losses_by(LossCause::Reassembly);
+                    let unreported = incomplete.checked_sub(reported as u64);
                     ensure!(
-                        reported as u64 == incomplete,
-                        "{cell}: the kernel had {incomplete} incomplete datagrams, and counted{}",
-                        testimony.counted()
+                        unreported.is_some_and(|unreported| unreported <= UNREPORTED),
+                        "{cell}: the kernel had {incomplete} incomplete datagrams, and counted{}: {:?}",
+                        testimony.counted(),
+                        testimony.delivery_losses
                     );
                     // A busy machine may drop a first fragment, too: nothing is incomplete then.
                     let is_less = reported < cell.lost.len();
