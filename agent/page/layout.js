@@ -13,14 +13,16 @@
  * @typedef {{x: number, y: number}} Point
  * @typedef {{id: string, x: number, y: number, w: number, h: number, box: boolean}} Placed
  *   Centre and size.
- * @typedef {{id: string, points: Point[], left: boolean}} Routed From the right of `from` to the left of
- *   `to`; the other way round if `to` lies to the `left`.
+ * @typedef {{id: string, points: Point[]}} Routed From the right of `from` to the left of `to`; the
+ *   other way round if `to` lies to the left. All points lead into that direction.
  * @typedef {{width: number, height: number, crossings: number, vertices: Placed[],
  *   edges: Routed[]}} Layout
  * @typedef {{gapX?: number, gapY?: number, sweeps?: number, padding?: number,
  *   previous?: Record<string, Point>}} Options
  */
 
+/** Minimum pixels between an edge and a vertex that it passes. */
+const CLEAR = 4;
 const SWEEPS = 24;
 const SETTLES = 24;
 // Number of vertices and dummies above which half the sweeps are made.
@@ -59,7 +61,7 @@ export function layout(vertices, edges, options = {}) {
     return found;
   };
   // Each edge belongs to the innermost box around both ends, between children of that box.
-  /** @type {Map<string|null, {from: string, to: string, edge: number}[]>} */
+  /** @type {Map<string|null, Link[]>} */
   const inner = new Map();
   edges.forEach((edge, index) => {
     if (!known.has(edge.from) || !known.has(edge.to)) return;
@@ -83,9 +85,7 @@ export function layout(vertices, edges, options = {}) {
   let crossings = 0;
   /** @type {Map<string, Placed>} */
   const placed = new Map();
-  /** @type {Map<number, Point[]>} */
-  const bends = new Map();
-  /** @type {Map<string|null, Layered>} */
+  /** @type {Map<string|null, Layered & Point>} */
   const layers = new Map();
   /** @type {Map<string, {w: number, h: number}>} */
   const sizes = new Map();
@@ -107,13 +107,15 @@ export function layout(vertices, edges, options = {}) {
     const items = own.map((child) => ({ id: child.id, ...size(sizes, child.id) }));
     const result = arrange(items, inner.get(owner) ?? [], previous, options);
     crossings += result.crossings;
-    layers.set(owner, result);
+    layers.set(owner, { ...result, x: 0, y: 0 });
     return result;
   };
   const place = (/** @type {string|null} */ owner, /** @type {number} */ x,
     /** @type {number} */ y) => {
     const result = layers.get(owner);
     if (!result) return;
+    result.x = x;
+    result.y = y;
     for (const item of result.items) {
       const box = children.has(item.id);
       placed.set(item.id, { ...item, x: x + item.x, y: y + item.y, box });
@@ -123,23 +125,54 @@ export function layout(vertices, edges, options = {}) {
         place(item.id, left, y + item.y - item.h / 2 + padding + title);
       }
     }
-    for (const [edge, points] of result.paths) {
-      bends.set(edge, points.map((point) => ({ x: point.x + x, y: point.y + y })));
+  };
+  /**
+   * Returns the points from the side of a vertex to the border of the column of the box `last`,
+   * which may be the vertex itself. They pass between the vertices of the boxes on the way.
+   */
+  const leave = (/** @type {string} */ id, /** @type {string} */ last,
+    /** @type {number} */ side) => {
+    const { x, y, w } = /** @type {Placed} */ (placed.get(id));
+    const points = [{ x: x + (side * w) / 2, y }];
+    for (let item = id; ;) {
+      const owner = parentOf(/** @type {Vertex} */ (known.get(item)));
+      const level = /** @type {Layered & Point} */ (layers.get(owner));
+      const place = /** @type {Lane} */ (level.lanes.get(item));
+      const beside = (/** @type {Column} */ { left, right }) => [left + level.x, right + level.x];
+      let height = points[points.length - 1].y;
+      points.push({ x: beside(place.columns[place.at])[side > 0 ? 1 : 0], y: height });
+      if (item === last || owner == null) return points;
+      for (let at = place.at + side; place.columns[at]; at += side) {
+        height = free(place.columns[at].items, height - level.y) + level.y;
+        const [left, right] = beside(place.columns[at]);
+        for (const border of side > 0 ? [left, right] : [right, left]) {
+          points.push({ x: border, y: height });
+        }
+      }
+      item = owner;
     }
   };
   const whole = measure(null);
   place(null, 0, 0);
 
   const routed = [];
-  for (const [index, points] of bends) {
-    const edge = edges[index];
-    const from = /** @type {Placed} */ (placed.get(edge.from));
-    const to = /** @type {Placed} */ (placed.get(edge.to));
-    // An edge to the left leaves on that side, so that it passes under neither of its ends.
-    const side = to.x + to.w / 2 < from.x - from.w / 2 ? -1 : 1;
-    const start = { x: from.x + (side * from.w) / 2, y: from.y };
-    const end = { x: to.x - (side * to.w) / 2, y: to.y };
-    routed.push({ id: edge.id, points: [start, ...points, end], left: side < 0 });
+  for (const [owner, links] of inner) {
+    const { x, y, paths, lanes } = /** @type {Layered & Point} */ (layers.get(owner));
+    for (const link of links) {
+      const [from, to] = [link.from, link.to].map((id) => lanes.get(id)?.at ?? 0);
+      const edge = edges[link.edge];
+      // An edge to the left leaves on that side, so that it passes under neither of its ends.
+      const side = to < from ? -1 : 1;
+      const bends = paths.get(link.edge) ?? [];
+      routed.push({
+        id: edge.id,
+        points: distinct([
+          ...leave(edge.from, link.from, side),
+          ...bends.map((point) => ({ x: point.x + x, y: point.y + y })),
+          ...leave(edge.to, link.to, side > 0 ? -1 : 1).reverse(),
+        ]),
+      });
+    }
   }
   return {
     width: whole.width,
@@ -150,6 +183,29 @@ export function layout(vertices, edges, options = {}) {
   };
 }
 
+/** Leaves out points that repeat the previous one. @param {Point[]} points */
+function distinct(points) {
+  return points.filter(({ x, y }, at) => {
+    const before = points[at - 1];
+    return !before || Math.abs(before.x - x) + Math.abs(before.y - y) > 0.5;
+  });
+}
+
+/**
+ * Returns the height nearest to `y` that passes none of these items.
+ * @param {{y: number, h: number}[]} items
+ * @param {number} y
+ */
+function free(items, y) {
+  const hides = (/** @type {number} */ at) => items.some(
+    (item) => Math.abs(item.y - at) < item.h / 2 + CLEAR);
+  if (!hides(y)) return y;
+  const sides = items.flatMap(
+    (item) => [-1, 1].map((side) => item.y + side * (item.h / 2 + CLEAR)));
+  sides.sort((one, other) => Math.abs(one - y) - Math.abs(other - y));
+  return sides.find((at) => !hides(at)) ?? y;
+}
+
 /** @param {Map<string, {w: number, h: number}>} sizes @param {string} id */
 function size(sizes, id) {
   return sizes.get(id) ?? { w: 0, h: 0 };
@@ -158,9 +214,11 @@ function size(sizes, id) {
 /**
  * @typedef {{id: string, w: number, h: number}} Item
  * @typedef {{from: string, to: string, edge: number}} Link
- * @typedef {{width: number, height: number, crossings: number,
- *   items: {id: string, x: number, y: number, w: number, h: number}[],
- *   paths: Map<number, Point[]>}} Layered
+ * @typedef {{id: string, x: number, y: number, w: number, h: number}} Arranged
+ * @typedef {{left: number, right: number, items: Arranged[]}} Column
+ * @typedef {{columns: Column[], at: number}} Lane the columns of a part, and that of the item
+ * @typedef {{width: number, height: number, crossings: number, items: Arranged[],
+ *   lanes: Map<string, Lane>, paths: Map<number, Point[]>}} Layered
  */
 
 /**
@@ -220,11 +278,15 @@ function arrange(items, links, previous, options) {
   });
 
   /** @type {Layered} */
-  const all = { width: 0, height: 0, crossings: 0, items: [], paths: new Map() };
+  const all = {
+    width: 0, height: 0, crossings: 0, items: [], lanes: new Map(), paths: new Map(),
+  };
   for (const part of joined) {
     const result = layered(part.items, part.links, previous, gapX, gapY, options.sweeps ?? SWEEPS);
     const y = all.height > 0 ? all.height + 3 * gapY : 0;
-    for (const item of result.items) all.items.push({ ...item, y: item.y + y });
+    for (const item of result.items) item.y += y;
+    all.items.push(...result.items);
+    for (const [id, lane] of result.lanes) all.lanes.set(id, lane);
     for (const [edge, points] of result.paths) {
       all.paths.set(edge, points.map((point) => ({ x: point.x, y: point.y + y })));
     }
@@ -239,13 +301,19 @@ function arrange(items, links, previous, options) {
     let x = 0;
     let y = all.height > 0 ? all.height + 3 * gapY : 0;
     let row = 0;
+    /** @type {Column[]} */
+    let columns = [];
     for (const item of alone) {
       if (x > 0 && x + item.w > width) {
         x = 0;
         y += row + gapY;
         row = 0;
+        columns = [];
       }
-      all.items.push({ ...item, x: x + item.w / 2, y: y + item.h / 2 });
+      const arranged = { ...item, x: x + item.w / 2, y: y + item.h / 2 };
+      all.items.push(arranged);
+      all.lanes.set(item.id, { columns, at: columns.length });
+      columns.push({ left: x, right: x + item.w, items: [arranged] });
       all.width = Math.max(all.width, x + item.w);
       x += item.w + gapY * 2;
       row = Math.max(row, item.h);
@@ -320,15 +388,14 @@ function layered(items, links, previous, gapX, gapY, sweeps) {
     if (rank[a] > rank[b]) points.reverse();
     paths.set(link.edge, points);
   }
-  return {
-    width,
-    height: most - least,
-    crossings,
-    items: items.map((item, vertex) => ({
-      ...item, x: x[rank[vertex]].middle, y: columns.y[vertex] - least,
-    })),
-    paths,
-  };
+  const arranged = items.map((item, vertex) => ({
+    ...item, x: x[rank[vertex]].middle, y: columns.y[vertex] - least,
+  }));
+  /** @type {Column[]} */
+  const sides = x.map(({ left, right }) => ({ left, right, items: [] }));
+  arranged.forEach((item, vertex) => { sides[rank[vertex]].items.push(item); });
+  const lanes = new Map(items.map((item, vertex) => [item.id, { columns: sides, at: rank[vertex] }]));
+  return { width, height: most - least, crossings, items: arranged, lanes, paths };
 }
 
 /**

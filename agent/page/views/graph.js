@@ -371,8 +371,7 @@ function useLayout(graph) {
 
 /**
  * @typedef {{width: number, height: number, at: Map<string, import('../layout.js').Placed>,
- *   routes: Map<string, import('../layout.js').Point[]>, left: Set<string>}} Picture
- *   `left` has the edges that leave their source to the left
+ *   routes: Map<string, import('../layout.js').Point[]>}} Picture
  * @param {import('../layout.js').Layout} result
  * @returns {Picture}
  */
@@ -382,28 +381,20 @@ function index(result) {
     height: result.height,
     at: new Map(result.vertices.map((each) => [each.id, each])),
     routes: new Map(result.edges.map((each) => [each.id, each.points])),
-    left: new Set(result.edges.filter((each) => each.left).map((each) => each.id)),
   };
 }
-
-/** Pixels within which a backward edge turns. */
-const TURN = 40;
 
 /**
  * Returns a smooth path through an edge's points.
  * @param {import('../layout.js').Point[]} points
- * @param {boolean} [left] whether it leaves its source to the left
  */
-export function curve(points, left = false) {
+export function curve(points) {
   let path = `M${points[0].x.toFixed(1)} ${points[0].y.toFixed(1)}`;
   for (let at = 1; at < points.length; at += 1) {
     const [a, b] = [points[at - 1], points[at]];
-    // A backward edge starts to the right, turns, and turns again before its end.
-    const half = (b.x - a.x) / 2;
-    const out = half < 0 && at === 1 && !left ? TURN : half;
-    const into = half < 0 && at === points.length - 1 && !left ? TURN : half;
-    path += `C${(a.x + out).toFixed(1)} ${a.y.toFixed(1)} ${(b.x - into).toFixed(1)} `
-      + `${b.y.toFixed(1)} ${b.x.toFixed(1)} ${b.y.toFixed(1)}`;
+    const middle = ((a.x + b.x) / 2).toFixed(1);
+    path += `C${middle} ${a.y.toFixed(1)} ${middle} ${b.y.toFixed(1)} `
+      + `${b.x.toFixed(1)} ${b.y.toFixed(1)}`;
   }
   return path;
 }
@@ -520,8 +511,8 @@ function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, ra
         return html`<g key=${edge.id} class="edge ${way(edge.passages, edge.kind)} ${health} ${active
           ? 'active' : ''} ${measured ? '' : 'unmeasured'} ${isPassed ? 'passed' : ''}"
           onClick=${() => choose(edge.id)}>
-          ${few && html`<path class="touch" d=${curve(points, picture.left.has(edge.id))} />`}
-          <path class="line" d=${curve(points, picture.left.has(edge.id))} stroke-width=${Math.max(
+          ${few && html`<path class="touch" d=${curve(points)} />`}
+          <path class="line" d=${curve(points)} stroke-width=${Math.max(
             isPassed ? 3 : 0, thickness(bytes)).toFixed(1)}
             marker-end="url(#arrow-${isPassed ? 'passed' : health})" />
           ${(health === 'error' || health === 'warning') && edge.kind !== 'feeds' && html`<text
