@@ -38,6 +38,26 @@ pub struct KeptBag {
     pub files: usize,
     /// Whether it has metadata. `rp bag reindex` writes those of a bag that was cut off.
     pub is_complete: bool,
+    /// Event that triggered the snapshot; null for other bags.
+    pub trigger: Option<BagTrigger>,
+}
+
+/// An event that triggered a snapshot.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct BagTrigger {
+    /// Name of the trigger in the configuration.
+    pub trigger: String,
+    /// Name of the event.
+    pub event: String,
+    /// Time of the event, RFC 3339.
+    #[cfg_attr(feature = "openapi", schema(format = DateTime))]
+    pub time: String,
+    /// ROS name of the topic of the event; null if it has none.
+    pub topic: Option<String>,
+    /// Domain id of the topic.
+    pub domain_id: Option<u16>,
 }
 
 /// Limits of the disk space that recordings use. A recording that reaches a limit ends with a

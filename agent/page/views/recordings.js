@@ -3,10 +3,13 @@
 import { useRef, useState } from '../vendor/hooks.mjs';
 import { json, post, remove, request } from '../api.js';
 import { bytes, count, date, several } from '../format.js';
+import { address } from '../router.js';
 import { state, useLive, usePoll } from '../store.js';
 import { Act, AskButton, download, Failed, html, Mark, Name } from '../ui.js';
 
 const EVERY_MS = 2000;
+/** Seconds before and after an incident that its link shows. */
+const AROUND = 60;
 
 export function Recordings() {
   useLive();
@@ -34,13 +37,15 @@ export function Recordings() {
         text=${data.directory} />.</p>
       <div class="scroll tall" tabindex="0" role="group" aria-labelledby="kept"><table>
       <thead><tr><th scope="col">Bag</th><th scope="col">Last change</th>
-        <th scope="col" class="number">Size</th><th scope="col">Files</th></tr></thead>
+        <th scope="col" class="number">Size</th><th scope="col">Trigger</th>
+        <th scope="col">Files</th></tr></thead>
       <tbody>${data.kept.map((/** @type {any} */ each) => html`<tr key=${each.name}>
         <th scope="row"><${Name} text=${each.name} />${each.is_complete ? '' : html`
           <span class="badge warning" title="It was cut off: rp bag reindex writes its metadata"><${Mark}
           severity="warning" /> cut off</span>`}</th>
         <td>${date(each.modified_timestamp_seconds)}</td>
         <td class="number">${bytes(each.file_bytes)}</td>
+        <td>${each.trigger ? html`<${Incident} trigger=${each.trigger} />` : 'none'}</td>
         <td><${Files} path=${`recordings/${encodeURIComponent(each.name)}`} name=${each.name} /></td>
         </tr>`)}</tbody></table></div></section>`}
     <section aria-labelledby="snapshots"><h2 id="snapshots">Snapshots</h2>
@@ -66,6 +71,18 @@ export function Recordings() {
         </tbody></table></div>`
       : html`<p class="empty">The configuration names no snapshot (<code>snapshots</code>).</p>`)}
     </section>`;
+}
+
+/** Names what triggered a bag, and links to that time. @param {{trigger: any}} props */
+function Incident({ trigger }) {
+  const at = Date.parse(trigger.time) / 1000;
+  const words = html`${trigger.trigger}, ${date(at)}`;
+  if (!state.open?.keeps_history) return words;
+  const end = Math.min(Math.ceil(at) + AROUND, Math.floor(state.time));
+  const time = { at: end, span: end - Math.floor(at) + AROUND };
+  return html`<a href=${trigger.topic == null ? address('', null, time)
+    : address('topics', trigger.topic, { ...time, domain: trigger.domain_id })}
+    title="The robot as it was at ${trigger.event}">${words}</a>`;
 }
 
 /** @param {{name: string, again: () => void}} props */

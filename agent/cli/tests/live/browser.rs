@@ -338,8 +338,15 @@ fn tasks_on_captures_take_few_clicks() -> Result<()> {
 fn a_recording_is_started_ended_and_downloaded_on_the_page() -> Result<()> {
     let place = Place::new()?;
     let bags = place.directory.path().join("bags");
-    let snapshots = "  snapshots: [{name: incident, topics: [/imu], seconds: 5}]\n";
-    let configuration = place.recordings() + snapshots;
+    let state = place.directory.path().join("state");
+    std::fs::create_dir(&state)?;
+    // No robot meets this expectation, so there is an incident.
+    let configuration = format!(
+        "watch: [{{topic: /imu, min_rate_hz: 900}}]\nstate_directory: {}\n{}  \
+         snapshots: [{{name: incident, topics: [/imu], seconds: 5}}]\n",
+        state.display(),
+        place.recordings()
+    );
     let mut agent = Some(place.agent(&configuration)?);
     let _robot = Robot::start(&place.host)?;
     let mut answers = |question: &str| {

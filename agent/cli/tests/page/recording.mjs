@@ -68,7 +68,7 @@ await scenario(async (open) => {
   await ask('restart');
   await tab.go('#/recordings');
   const earlier = tab.page.locator('section[aria-labelledby="kept"]');
-  await until('the earlier bags', async () => (await earlier.locator('tbody tr').count()) === 2);
+  await until('the earlier bags', async () => (await earlier.locator('tbody tr').count()) >= 3);
   const kept = earlier.locator('tr', { hasText: 'lap-one' });
   assert.doesNotMatch(await kept.innerText(), /cut off/);
   await kept.getByRole('button', { name: 'Files of lap-one' }).click();
@@ -76,4 +76,10 @@ await scenario(async (open) => {
   await kept.getByRole('button', { name: 'Download metadata.yaml' }).click();
   assert.equal(readFileSync(await (await waiting).path()).toString(), metadata);
   await tab.accessible('earlier bags');
+
+  // A bag of an incident leads to the robot as it was then.
+  await earlier.getByRole('link', { name: /^expectation, / }).last().click();
+  await tab.page.locator('.notice', { hasText: 'The robot as it was' }).waitFor();
+  await tab.page.getByRole('heading', { name: '/imu', level: 1 }).waitFor();
+  assert.match(await tab.page.evaluate(() => location.hash), /[?&]at=\d{10}/);
 });

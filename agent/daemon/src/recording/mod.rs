@@ -25,4 +25,4 @@ pub use service::{
     Components, Recording, RecordingOptions, Recordings, Refusal, Status, default_name, schema,
 };
 pub use session::{Activity, Command, record};
-pub use snapshot::{Snapshots, WrittenBag};
+pub use snapshot::{Snapshots, TriggeredBag, WrittenBag};

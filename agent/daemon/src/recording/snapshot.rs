@@ -19,6 +19,7 @@ use std::thread::JoinHandle;
 
 use tokio::sync::oneshot;
 
+pub use self::bag::TriggeredBag;
 use self::task::SnapshotTask;
 use super::service::{Recordings, Refusal};
 use crate::config::SnapshotSettings;

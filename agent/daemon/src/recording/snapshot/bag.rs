@@ -1,9 +1,11 @@
 //! One bag of a snapshot: created on a trigger, filled from memory and then from the subscription.
 
 use std::collections::{BTreeMap, HashSet};
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
+use ros2probe_bag::metadata::{self, Metadata};
 use ros2probe_bag::{Error, Options, Writer};
 use serde::{Deserialize, Serialize};
 
@@ -16,10 +18,12 @@ use crate::recording::graph::{GraphSnapshot, PublishedTopic};
 use crate::recording::recorder::Recorder;
 use crate::recording::service::{Recordings, Refusal, causes, default_name, refusal};
 use crate::subscriptions::Item;
-use ros2probe_api::recordings::FilterOptions;
+use ros2probe_api::recordings::{BagTrigger, FilterOptions};
 
 /// Key of the trigger in the bag's custom data.
-pub(super) const TRIGGER_DATA: &str = "ros2probe_trigger";
+const TRIGGER_DATA: &str = "ros2probe_trigger";
+/// Maximum size of a metadata.yaml that is read, in bytes.
+const METADATA_BYTES: u64 = 1 << 20;
 
 /// Bytes that completing a bag adds: summary, statistics and metadata.yaml of some topics.
 const CLOSING_BYTES: u64 = 8 << 10;
@@ -43,9 +47,9 @@ pub(super) enum Cause {
 
 /// The trigger in the bag's custom data, as JSON.
 #[derive(Debug, Deserialize, Serialize)]
-pub(super) struct TriggerData {
+struct TriggerData {
     /// Name of the snapshot in the configuration.
-    pub(super) snapshot: String,
+    snapshot: String,
     /// Name of the trigger, `request` or `signal`.
     trigger: String,
     /// Name of the event that met the trigger.
@@ -53,13 +57,48 @@ pub(super) struct TriggerData {
     event: Option<String>,
     /// Id of the event that met the trigger.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) event_id: Option<String>,
+    event_id: Option<String>,
     /// Time of the event, RFC 3339.
     #[serde(skip_serializing_if = "Option::is_none")]
     time: Option<String>,
     /// Attributes of the event.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     attributes: BTreeMap<String, serde_json::Value>,
+}
+
+/// The event that triggered a bag, by its metadata.
+#[derive(Debug)]
+pub struct TriggeredBag {
+    /// Name of the snapshot in the configuration.
+    pub snapshot: String,
+    /// The event.
+    pub trigger: BagTrigger,
+}
+
+impl TriggeredBag {
+    /// Reads the metadata of a bag; `None` without an event as its trigger.
+    #[must_use]
+    pub fn read(bag: &Path) -> Option<Self> {
+        let file = bag.join(metadata::FILE_NAME);
+        let size = fs::metadata(&file).ok()?.len();
+        let text = (size <= METADATA_BYTES).then(|| fs::read_to_string(&file).ok())??;
+        let metadata = Metadata::read(&text).ok()?;
+        let data = metadata.custom_data.get(TRIGGER_DATA)?;
+        let data: TriggerData = serde_json::from_str(data).ok()?;
+        let attribute = |name| data.attributes.get(name);
+        let topic = attribute("topic").and_then(|topic| topic.as_str());
+        let domain = attribute("domain_id").and_then(serde_json::Value::as_u64);
+        Some(Self {
+            trigger: BagTrigger {
+                topic: topic.map(str::to_owned),
+                domain_id: domain.and_then(|domain| domain.try_into().ok()),
+                trigger: data.trigger,
+                event: data.event?,
+                time: data.time?,
+            },
+            snapshot: data.snapshot,
+        })
+    }
 }
 
 /// A bag in progress.
@@ -233,7 +272,7 @@ impl SnapshotBag {
     /// Removes the bag, whose messages are all still in memory.
     pub(super) fn discard(self, error: &Error) -> Failed {
         drop(self.recorder);
-        let _ = std::fs::remove_dir_all(&self.directory);
+        let _ = fs::remove_dir_all(&self.directory);
         Failed {
             cause: self.cause,
             name: self.name,

@@ -5,13 +5,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use ros2probe_bag::metadata::{self, Metadata};
-
-use super::bag::{TRIGGER_DATA, TriggerData};
+use super::bag::TriggeredBag;
 use crate::config::SnapshotSettings;
-
-/// Maximum size of a metadata.yaml that is read, in bytes.
-const METADATA_BYTES: u64 = 1 << 20;
 
 /// Space for a new bag.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -81,7 +76,7 @@ fn kept(new: &Path, settings: &SnapshotSettings) -> (Vec<KeptBag>, u64) {
         }
         let bytes = bytes_of(&path);
         used = used.saturating_add(bytes);
-        if is_triggered(&path, &settings.name) {
+        if TriggeredBag::read(&path).is_some_and(|bag| bag.snapshot == settings.name) {
             let modified = entry.metadata().and_then(|entry| entry.modified());
             triggered.push(KeptBag {
                 path,
@@ -97,17 +92,4 @@ fn bytes_of(bag: &Path) -> u64 {
     let files = fs::read_dir(bag).into_iter().flatten().flatten();
     let sizes = files.filter_map(|file| Some(file.metadata().ok()?.len()));
     sizes.fold(0, u64::saturating_add)
-}
-
-/// Returns whether the bag's metadata names an event as its trigger.
-fn is_triggered(bag: &Path, snapshot: &str) -> bool {
-    let file = bag.join(metadata::FILE_NAME);
-    if !fs::metadata(&file).is_ok_and(|file| file.len() <= METADATA_BYTES) {
-        return false;
-    }
-    let text = fs::read_to_string(&file).ok();
-    let metadata = text.and_then(|text| Metadata::read(&text).ok());
-    let data = metadata.and_then(|metadata| metadata.custom_data.get(TRIGGER_DATA).cloned());
-    let data = data.and_then(|data| serde_json::from_str::<TriggerData>(&data).ok());
-    data.is_some_and(|data| data.snapshot == snapshot && data.event_id.is_some())
 }

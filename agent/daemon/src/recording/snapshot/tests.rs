@@ -21,7 +21,7 @@ use ros2probe_wire::{DomainId, Expansion, Guid, SequenceNumber, Timestamp};
 use tempfile::TempDir;
 use tokio_util::sync::CancellationToken;
 
-use super::bag::Cause;
+use super::bag::{Cause, TriggeredBag};
 use super::task::SnapshotTask;
 use crate::agent_facts::SourceKind;
 use crate::config::{Limits, RecordingLimits, SnapshotSettings};
@@ -239,6 +239,15 @@ fn a_bag_has_the_seconds_around_its_event_and_names_the_event() {
     assert_eq!(trigger["trigger"], "message_lost");
     assert_eq!(trigger["event"], "ros2.message.lost");
     assert_eq!(trigger["attributes"]["count"], 3, "{trigger}");
+    let bag = TriggeredBag::read(&robot.directory.path().join(bags.keys().next().unwrap()));
+    let bag = bag.unwrap();
+    assert_eq!(bag.snapshot, "incident");
+    assert_eq!(bag.trigger.event, "ros2.message.lost");
+    assert_eq!(trigger["time"], bag.trigger.time);
+    assert_eq!(
+        bag.trigger.topic.as_deref(),
+        trigger["attributes"]["topic"].as_str()
+    );
     let taken = robot.events.read(0, 10).records.pop().unwrap();
     assert_eq!(taken.definition.name, "ros2probe.snapshot.taken");
     let attribute = |name| serde_json::to_value(taken.attribute(name).unwrap()).unwrap();

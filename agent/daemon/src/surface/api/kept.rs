@@ -4,9 +4,11 @@
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Component, Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use super::downloads::files;
+use crate::recording::TriggeredBag;
 use ros2probe_api::recordings::KeptBag;
 use ros2probe_bag::metadata;
 
@@ -15,14 +17,19 @@ const MAX_KEPT: usize = 200;
 /// Maximum number of entries of the directory that are read.
 const MAX_ENTRIES: usize = 10_000;
 
+/// The latest list. The metadata of a bag is read once, until the bag changes.
+static LISTED: Mutex<Vec<KeptBag>> = Mutex::new(Vec::new());
+
 /// Returns the bags in a directory without those of these names, the latest first. It reads the
 /// directory, and so it blocks.
 pub(super) fn kept(root: &Path, known: &BTreeSet<String>) -> Vec<KeptBag> {
-    among(root, known, MAX_ENTRIES)
+    let mut listed = LISTED.lock().unwrap_or_else(PoisonError::into_inner);
+    *listed = among(root, known, MAX_ENTRIES, &listed);
+    listed.clone()
 }
 
-/// Returns the bags among this number of entries.
-fn among(root: &Path, known: &BTreeSet<String>, most: usize) -> Vec<KeptBag> {
+/// Returns the bags among this number of entries. `before` is an earlier list.
+fn among(root: &Path, known: &BTreeSet<String>, most: usize, before: &[KeptBag]) -> Vec<KeptBag> {
     let entries = fs::read_dir(root).into_iter().flatten();
     let bags = entries.take(most).filter_map(|entry| {
         let entry = entry.ok()?;
@@ -40,13 +47,28 @@ fn among(root: &Path, known: &BTreeSet<String>, most: usize) -> Vec<KeptBag> {
         let is_storage = |file: &str| file.contains(".mcap") || file.contains(".db3");
         let storage: Vec<_> = files.iter().filter(|each| is_storage(&each.file)).collect();
         let since = modified.duration_since(UNIX_EPOCH).unwrap_or_default();
-        (!storage.is_empty()).then(|| KeptBag {
+        if storage.is_empty() {
+            return None;
+        }
+        let bag = KeptBag {
             name,
             directory: directory.display().to_string(),
             modified_timestamp_seconds: since.as_secs_f64(),
             file_bytes: storage.iter().map(|each| each.bytes).sum(),
             files: storage.len(),
             is_complete,
+            trigger: None,
+        };
+        let same = before.iter().find(|same| same.directory == bag.directory);
+        let trigger = same.and_then(|same| same.trigger.clone());
+        let unchanged = KeptBag { trigger, ..bag };
+        if same == Some(&unchanged) {
+            return Some(unchanged);
+        }
+        let trigger = TriggeredBag::read(&directory).map(|bag| bag.trigger);
+        Some(KeptBag {
+            trigger,
+            ..unchanged
         })
     });
     bags.take(MAX_KEPT).collect()
@@ -113,6 +135,6 @@ mod tests {
             bag(root, &format!("bag_{number}"), "bag_0.mcap");
         }
         assert_eq!(kept(root, &BTreeSet::new()).len(), MAX_KEPT);
-        assert_eq!(among(root, &BTreeSet::new(), 3).len(), 3);
+        assert_eq!(among(root, &BTreeSet::new(), 3, &[]).len(), 3);
     }
 }

@@ -3,7 +3,6 @@
 //! Recordings are stored in the configured directory; a name must be a plain file name. `rp bag
 //! record` writes bags elsewhere.
 
-use std::collections::BTreeSet;
 use std::path::{Path as FilePath, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, UNIX_EPOCH};
@@ -24,10 +23,9 @@ use super::kept;
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::domain;
 use super::security::MAX_BODY;
+use super::turns::in_turn;
 use crate::recording::{Command, Recording, RecordingOptions, Refusal};
-use ros2probe_api::recordings::{
-    self as answers, FilterOptions, KeptBag, RecordingList, RecordingRequest,
-};
+use ros2probe_api::recordings::{self as answers, FilterOptions, RecordingList, RecordingRequest};
 use ros2probe_bag::{Form, Options, Storage};
 
 /// Maximum time that an answer waits for a bag to be completed.
@@ -37,6 +35,7 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 const BEGINS_WITHIN: Duration = Duration::from_secs(6);
 /// Maximum time that the list of recordings waits for the storage. The kept bags are absent then.
 const LISTED_WITHIN: Duration = Duration::from_secs(2);
+/// One thread at a time reads the directory.
 static LISTING: Semaphore = Semaphore::const_new(1);
 /// Maximum duration of one file: a year, in seconds.
 const MAX_DURATION: u64 = 31_536_000;
@@ -64,25 +63,16 @@ async fn list(State(context): State<Context>) -> Json<RecordingList> {
     let directory = context.recordings.directory();
     let known = recordings.iter().map(|each| each.name.clone()).collect();
     let root = directory.map(FilePath::to_owned);
-    let listed = tokio::time::timeout(LISTED_WITHIN, listed(root, known)).await;
-    let kept = listed.ok().flatten().unwrap_or_default();
+    let listed = in_turn(&LISTING, LISTED_WITHIN, move || {
+        root.map(|root| kept::kept(&root, &known))
+    });
+    let kept = listed.await.ok().flatten().unwrap_or_default();
     Json(RecordingList {
         directory: directory.map(|directory| directory.display().to_string()),
         recordings: recordings.iter().map(|each| view(each)).collect(),
         kept,
         limits: limits(&context),
     })
-}
-
-/// Returns the bags that are kept. One thread at a time reads the directory: a storage that hangs
-/// holds one thread, whatever the number of clients.
-async fn listed(root: Option<PathBuf>, known: BTreeSet<String>) -> Option<Vec<KeptBag>> {
-    let permit = LISTING.acquire().await.ok()?;
-    let found = spawn_blocking(move || {
-        let _permit = permit;
-        Some(kept::kept(&root?, &known))
-    });
-    found.await.ok().flatten()
 }
 
 /// Returns the directory of a recording, or of a bag that is kept.
