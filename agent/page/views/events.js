@@ -53,16 +53,21 @@ const MOST_OWNERS = 20000;
 /** Adds the present endpoints and participants, and returns all names. */
 function ownersNow() {
   if (owners.size > MOST_OWNERS) owners.clear();
-  for (const topic of state.topics.values()) {
-    for (const endpoint of [...topic.publishers, ...topic.subscriptions]) {
-      const { name, node } = state.ownerOf(endpoint);
-      if (node) owners.set(endpoint.guid, name);
-    }
-  }
+  /** @type {Map<number, string[]>} */
+  const nodes = new Map();
   for (const node of state.nodes.values()) {
     for (const id of node.participants) {
       const participant = state.participants.get(id);
       if (participant) owners.set(participant.guid, node.name);
+      nodes.set(id, [...nodes.get(id) ?? [], node.name]);
+    }
+  }
+  for (const topic of state.topics.values()) {
+    for (const endpoint of [...topic.publishers, ...topic.subscriptions]) {
+      const { name, node } = state.ownerOf(endpoint);
+      const [only, ...others] = nodes.get(endpoint.participant) ?? [];
+      if (node) owners.set(endpoint.guid, name);
+      else if (only && !others.length) owners.set(endpoint.guid, `participant of ${only}`);
     }
   }
   return owners;

@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use ros2probe_wire::{DomainId, Guid, RtpsDuration};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix, RtpsDuration};
 
 use super::inside;
 use super::measured;
@@ -474,34 +474,52 @@ fn alone(reason: &str) -> Severity {
     }
 }
 
-/// Endpoints by GUID.
-struct Ends<'a>(HashMap<Guid, &'a EndpointFacts>);
+/// Endpoints by GUID, and the nodes of their participants.
+struct Ends<'a> {
+    endpoints: HashMap<Guid, &'a EndpointFacts>,
+    nodes: HashMap<GuidPrefix, Vec<&'a NodeName>>,
+}
 
 impl<'a> Ends<'a> {
     fn new(snapshot: &'a Snapshot) -> Self {
         let about = snapshot.diagnoses.list.iter();
         // Without findings, no lookup is needed.
         if about.len() == 0 {
-            return Self(HashMap::new());
+            return Self {
+                endpoints: HashMap::new(),
+                nodes: HashMap::new(),
+            };
         }
         let topics = snapshot.topics.iter();
         let all = topics.flat_map(|topic| topic.publishers.iter().chain(&topic.subscriptions));
-        Self(all.map(|endpoint| (endpoint.guid, endpoint)).collect())
+        let mut nodes: HashMap<_, Vec<_>> = HashMap::new();
+        for node in &snapshot.nodes {
+            let known = nodes.entry(node.participant.prefix).or_default();
+            known.push(&node.name);
+        }
+        Self {
+            endpoints: all.map(|endpoint| (endpoint.guid, endpoint)).collect(),
+            nodes,
+        }
     }
 
-    /// Returns the node of an endpoint, or its GUID.
+    /// Returns the node of an endpoint or, if it announces none, the only node of its participant.
+    /// Without these, it is the GUID.
     fn who(&self, guid: Guid) -> String {
-        let node = self
-            .0
-            .get(&guid)
-            .and_then(|endpoint| endpoint.node.as_ref());
-        node.map_or_else(|| guid.to_string(), ToString::to_string)
+        let endpoint = self.endpoints.get(&guid);
+        if let Some(node) = endpoint.and_then(|endpoint| endpoint.node.as_ref()) {
+            return node.to_string();
+        }
+        match self.nodes.get(&guid.prefix).map(Vec::as_slice) {
+            Some([node]) => format!("the participant of {node}"),
+            _ => guid.to_string(),
+        }
     }
 
     /// Describes what the writer offers and the reader requests.
     fn difference(&self, policy: Policy, writer: Guid, reader: Guid) -> String {
         let value = |guid: Guid| {
-            let endpoint = self.0.get(&guid)?;
+            let endpoint = self.endpoints.get(&guid)?;
             let qos = &endpoint.qos;
             let milliseconds = |duration: RtpsDuration| match duration.finite() {
                 Some(duration) => format!("{} ms", duration.as_millis()),
@@ -541,6 +559,8 @@ mod tests {
     use super::*;
     use ros2probe_model::facts::diagnosis::Diagnoses;
     use ros2probe_model::graph::zenoh::ZenohFacts;
+    use ros2probe_model::report::snapshot::NodeFacts;
+    use ros2probe_wire::EntityId;
 
     #[test]
     fn findings_beyond_the_cap_are_dropped_and_the_most_severe_stay() {
@@ -570,6 +590,35 @@ mod tests {
             ("agent_not_ready", Severity::Error)
         );
         assert!(found.is_sorted_by_key(|each| each.severity));
+    }
+
+    #[test]
+    fn an_endpoint_without_a_node_has_the_name_of_the_only_node_of_its_participant() {
+        let reader = Guid::new(GuidPrefix([7; 12]), EntityId::PARTICIPANT);
+        let node = |name: &str| NodeFacts {
+            domain_id: DomainId(0),
+            name: name.into(),
+            participant: reader,
+            writers: Vec::new(),
+            readers: Vec::new(),
+        };
+        let finding = Diagnosis::DuplicateNode {
+            domain_id: DomainId(0),
+            node: "/lidar".into(),
+            participants: Vec::new(),
+        };
+        let mut snapshot = Snapshot {
+            nodes: vec![node("/lidar")],
+            diagnoses: Arc::new(Diagnoses {
+                list: vec![finding],
+                ..Diagnoses::default()
+            }),
+            ..Snapshot::default()
+        };
+        let who = |snapshot: &Snapshot| Ends::new(snapshot).who(reader);
+        assert_eq!(who(&snapshot), "the participant of /lidar");
+        snapshot.nodes.push(node("/imu"));
+        assert_eq!(who(&snapshot), reader.to_string());
     }
 
     #[test]
