@@ -217,7 +217,8 @@ export function Graph({ query }) {
     return false;
   };
   const marks = useMemo(() => trail && marked(graph, trail), [graph, trail]);
-  const { picture, milliseconds, failed } = useLayout(graph);
+  const { picture, milliseconds, failed } = useLayout(graph, JSON.stringify([
+    options.mode, options.boxes, focus, query.chain, query.only]));
   const [chosen, choose] = useState(/** @type {string|null} */ (focus));
   /** Moves the drawing to a vertex. */
   const camera = useRef(/** @type {((key: string) => void)|null} */ (null));
@@ -323,14 +324,16 @@ function FocusField({ focus, hops, change }) {
 }
 
 /**
- * Returns the layout of a graph, computed in a worker some time after a change of the structure.
+ * Returns the layout of a graph, computed in a worker some time after a change of the structure. The
+ * order of the one before stays while `kind` does.
  * @param {import('../graph-model.js').Graph} graph
+ * @param {string} kind
  */
-function useLayout(graph) {
+function useLayout(graph, kind) {
   const worker = useRef(/** @type {Worker|null} */ (null));
   const number = useRef(0);
   const [answer, take] = useState(/** @type {any} */ ({
-    picture: null, signature: '', milliseconds: null, failed: '',
+    picture: null, kind, milliseconds: null, failed: '',
   }));
   const latest = useRef(answer);
   latest.current = answer;
@@ -349,13 +352,13 @@ function useLayout(graph) {
       own.onmessage = (/** @type {MessageEvent} */ { data }) => {
         if (data.number !== number.current) return;
         take({
-          picture: index(data.result), signature: graph.signature,
-          milliseconds: data.milliseconds, failed: '',
+          picture: index(data.result), kind, milliseconds: data.milliseconds, failed: '',
         });
       };
       /** @type {Record<string, {x: number, y: number}>} */
       const previous = {};
-      for (const [key, { x, y }] of latest.current.picture?.at ?? []) previous[key] = { x, y };
+      const before = latest.current.kind === kind ? latest.current.picture?.at : null;
+      for (const [key, { x, y }] of before ?? []) previous[key] = { x, y };
       own.postMessage({
         number: mine,
         vertices: graph.vertices.map(({ key, w, h, parent }) => ({ id: key, w, h, parent, title: 20 })),
@@ -365,7 +368,7 @@ function useLayout(graph) {
     };
     const timer = setTimeout(ask, latest.current.picture ? SETTLE_MS : 0);
     return () => clearTimeout(timer);
-  }, [graph.signature]);
+  }, [graph.signature, kind]);
   return answer;
 }
 
