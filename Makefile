@@ -101,7 +101,7 @@ page-bench: ## first paint with 500 topics, layout and memory of the page; MEASU
 	    --test live -- --ignored --exact browser::measurements --nocapture
 
 screenshots: ## the pictures of README and docs, from the demo, in target/screenshots (needs root)
-	@.ci/prerequisites.sh demo page
+	@.ci/prerequisites.sh demo pictures
 	cargo build --workspace --bin rp --example robot --example demo
 	$(SUDO) env PATH=$(PATH) node agent/cli/tests/page/screenshots.mjs $(TARGET)/debug/examples/demo $(TARGET)/screenshots
 

@@ -456,6 +456,10 @@ for need; do
         ;;
     types) types ;;
     page) page ;;
+    pictures)
+        packages webp
+        page
+        ;;
     ebpf)
         rust
         ebpf
@@ -493,6 +497,6 @@ for need; do
             cargo install cargo-deny --version 0.20.2 --locked
         }
         ;;
-    *) die "prerequisites.sh: unknown target $need: use demo, test, fast, dist, types, page, ebpf, fuzz, miri, book or deny" ;;
+    *) die "prerequisites.sh: unknown target $need: use demo, test, fast, dist, types, page, pictures, ebpf, fuzz, miri, book or deny" ;;
     esac
 done

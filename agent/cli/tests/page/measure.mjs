@@ -1,5 +1,5 @@
-// Measures the page: first useful paint with 500 topics, layout of large graphs in the worker, and
-// memory of a tab over minutes of stream. Prints the figures, and fails if one exceeds its budget.
+// Measures the page: first useful paint with 500 topics, layout of large graphs in the worker, frames
+// while the whole graph is moved, and memory of a tab over minutes of stream. Prints the figures, and fails if one exceeds its budget.
 // Cost of tabs for the agent: make bench BENCH_OPTIONS="--only tabs".
 // MEASURE_MINUTES is the duration of the measurement of memory (default: 2).
 
@@ -68,6 +68,41 @@ async function layouts(open) {
   await tab.page.close();
 }
 
+/** Moves the graph to and fro with the pointer, and measures the time between two frames. */
+async function panning(open) {
+  const tab = await open({ fragment: '#/graph?fold=none' });
+  await tab.live();
+  const vertices = tab.page.locator('.vertex');
+  await until('the whole graph', async () => (await vertices.count()) > 500);
+  await sleep(2000);
+  const gaps = await tab.page.evaluate((seconds) => new Promise((take) => {
+    const svg = document.querySelector('.vertex').closest('svg');
+    const { left, top, width, height } = svg.getBoundingClientRect();
+    const at = (kind, offset) => svg.dispatchEvent(new PointerEvent(kind, {
+      pointerId: 1, button: 0, bubbles: true, clientX: left + width / 2 + offset,
+      clientY: top + height / 2 + offset / 3,
+    }));
+    // No pointer is pressed, so there is none to capture.
+    svg.setPointerCapture = () => {};
+    at('pointerdown', 0);
+    const began = performance.now();
+    const times = [];
+    const next = (now) => {
+      times.push(now);
+      at('pointermove', 200 * Math.sin((now - began) / 300));
+      if (now - began < seconds * 1000) requestAnimationFrame(next);
+      else take(times.slice(1).map((time, place) => time - times[place]));
+    };
+    requestAnimationFrame(next);
+  }), 5);
+  const sorted = gaps.toSorted((one, other) => one - other);
+  const per = (share) => sorted[Math.floor(share * (sorted.length - 1))].toFixed(1);
+  console.log(`frames while ${await vertices.count()} nodes and topics with ${await tab.page
+    .locator('.edge').count()} edges move: ${(1000 * gaps.length / gaps.reduce((sum, gap) => sum
+    + gap, 0)).toFixed(0)} a second, median ${per(0.5)} ms, 95 % within ${per(0.95)} ms`);
+  await tab.page.close();
+}
+
 async function memory(open) {
   const tab = await open({ fragment: '#/topics' });
   await tab.live();
@@ -102,5 +137,6 @@ async function memory(open) {
 await scenario(async (open, browser) => {
   await paint(browser);
   await layouts(open);
+  await panning(open);
   await memory(open);
 });

@@ -1,8 +1,11 @@
 // Takes the screenshots of the documentation from the demo: `make screenshots`. Arguments: the
-// program of the demo, the directory of the pictures, and names of pictures (default: all).
+// program of the demo, the directory of the pictures, and names of pictures (default: all). The
+// picture that moves is `graph.webp`.
 
-import { spawn } from 'node:child_process';
-import { mkdirSync, statSync } from 'node:fs';
+import { execFileSync, spawn } from 'node:child_process';
+import { mkdirSync, mkdtempSync, rmSync, statSync } from 'node:fs';
+import { tmpdir } from 'node:os';
+import { join } from 'node:path';
 import { createInterface } from 'node:readline';
 import { launch, Tab, until } from './tab.mjs';
 
@@ -31,6 +34,52 @@ const PICTURES = [
   ['agent', '#/agent', 'light', 1280, 900, 'section[aria-labelledby="limits"]'],
 ];
 
+/** Milliseconds for which a step of the picture that moves is shown. */
+const STEP_MS = 2500;
+/** Its steps, each of which changes the page of the one before. */
+const STEPS = [
+  async () => {},
+  (page) => page.locator('.vertex', { hasText: '/points' }).click(),
+  (page) => page.getByRole('button', { name: /^Focus/ }).click(),
+  (page) => page.evaluate(() => { location.hash = '#/graph?boxes=process'; }),
+  (page) => page.getByLabel('Colour').selectOption({ label: 'process' }),
+];
+
+/** Opens a view in a new tab, and returns the tab once the view is drawn. */
+async function view([name, fragment, theme, width, height, ready]) {
+  const context = await browser.newContext({
+    colorScheme: theme, viewport: { width, height }, deviceScaleFactor: 1, reducedMotion: 'reduce',
+  });
+  const page = await context.newPage();
+  const tab = new Tab(page, address);
+  await page.goto(`${address}${fragment}`);
+  await tab.live();
+  await until(`${name}: ${ready}`, async () => (await page.locator(ready).count()) > 0);
+  await new Promise((wake) => setTimeout(wake, 2500));
+  return tab;
+}
+
+/** Takes a picture of each step, and joins them. */
+async function animate(file) {
+  const frames = mkdtempSync(join(tmpdir(), 'frames-'));
+  const tab = await view(['animation', '#/graph', 'light', 1280, 640, '.vertex']);
+  try {
+    const options = [];
+    for (const [at, step] of STEPS.entries()) {
+      const frame = join(frames, `${at}.png`);
+      await step(tab.page);
+      await new Promise((wake) => setTimeout(wake, 2500));
+      await tab.page.screenshot({ path: frame });
+      options.push('-lossless', '-d', String(STEP_MS), frame);
+    }
+    execFileSync('img2webp', ['-loop', '0', ...options, '-o', file], { stdio: 'pipe' });
+    tab.verify();
+  } finally {
+    rmSync(frames, { recursive: true });
+    await tab.page.context().close();
+  }
+}
+
 const demo = spawn(PROGRAM, [], { stdio: ['ignore', 'pipe', 'inherit'] });
 const lines = createInterface({ input: demo.stdout });
 const address = await new Promise((take, fail) => {
@@ -47,20 +96,17 @@ try {
   await new Promise((wake) => setTimeout(wake, WAIT_S * 1000));
   for (const [name, fragment, theme, width, height, ready] of PICTURES) {
     if (WANTED.length && !WANTED.includes(name)) continue;
-    const context = await browser.newContext({
-      colorScheme: theme, viewport: { width, height }, deviceScaleFactor: 1, reducedMotion: 'reduce',
-    });
-    const page = await context.newPage();
-    const tab = new Tab(page, address);
-    await page.goto(`${address}${fragment}`);
-    await tab.live();
-    await until(`${name}: ${ready}`, async () => (await page.locator(ready).count()) > 0);
-    await new Promise((wake) => setTimeout(wake, 2500));
+    const tab = await view([name, fragment, theme, width, height, ready]);
     const file = `${DIRECTORY}/${name}.png`;
-    await page.screenshot({ path: file });
+    await tab.page.screenshot({ path: file });
     console.log(`${file}: ${Math.ceil(statSync(file).size / 1000)} kB`);
     tab.verify();
-    await context.close();
+    await tab.page.context().close();
+  }
+  if (!WANTED.length || WANTED.includes('graph.webp')) {
+    const file = `${DIRECTORY}/graph.webp`;
+    await animate(file);
+    console.log(`${file}: ${Math.ceil(statSync(file).size / 1000)} kB`);
   }
 } finally {
   await browser.close();
