@@ -65,9 +65,9 @@ function ownersNow() {
   for (const topic of state.topics.values()) {
     for (const endpoint of [...topic.publishers, ...topic.subscriptions]) {
       const { name, node } = state.ownerOf(endpoint);
-      const [only, ...others] = nodes.get(endpoint.participant) ?? [];
+      const [one, ...others] = nodes.get(endpoint.participant) ?? [];
       if (node) owners.set(endpoint.guid, name);
-      else if (only && !others.length) owners.set(endpoint.guid, `participant of ${only}`);
+      else if (one) owners.set(endpoint.guid, `participant of ${one}${others.length ? ' and others' : ''}`);
     }
   }
   return owners;

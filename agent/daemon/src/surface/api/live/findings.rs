@@ -503,7 +503,7 @@ impl<'a> Ends<'a> {
         }
     }
 
-    /// Returns the node of an endpoint or, if it announces none, the only node of its participant.
+    /// Returns the node of an endpoint. If no node announces it, those of its participant are named.
     /// Without these, it is the GUID.
     fn who(&self, guid: Guid) -> String {
         let endpoint = self.endpoints.get(&guid);
@@ -512,6 +512,10 @@ impl<'a> Ends<'a> {
         }
         match self.nodes.get(&guid.prefix).map(Vec::as_slice) {
             Some([node]) => format!("the participant of {node}"),
+            Some([one, other]) => format!("the participant of {one} and {other}"),
+            Some([one, others @ ..]) => {
+                format!("the participant of {one} and {} others", others.len())
+            }
             _ => guid.to_string(),
         }
     }
@@ -593,7 +597,7 @@ mod tests {
     }
 
     #[test]
-    fn an_endpoint_without_a_node_has_the_name_of_the_only_node_of_its_participant() {
+    fn an_endpoint_without_a_node_is_named_by_the_nodes_of_its_participant() {
         let reader = Guid::new(GuidPrefix([7; 12]), EntityId::PARTICIPANT);
         let node = |name: &str| NodeFacts {
             domain_id: DomainId(0),
@@ -618,6 +622,10 @@ mod tests {
         let who = |snapshot: &Snapshot| Ends::new(snapshot).who(reader);
         assert_eq!(who(&snapshot), "the participant of /lidar");
         snapshot.nodes.push(node("/imu"));
+        assert_eq!(who(&snapshot), "the participant of /lidar and /imu");
+        snapshot.nodes.push(node("/base"));
+        assert_eq!(who(&snapshot), "the participant of /lidar and 2 others");
+        snapshot.nodes.clear();
         assert_eq!(who(&snapshot), reader.to_string());
     }
 
