@@ -1,6 +1,6 @@
 // Measures the page: first useful paint with 500 topics, layout of large graphs in the worker, frames
-// while the whole graph is moved, and memory of a tab over minutes of stream. Prints the figures, and fails if one exceeds its budget.
-// Cost of tabs for the agent: make bench BENCH_OPTIONS="--only tabs".
+// while the graph is moved, and memory of a tab. Prints the figures, and fails if one exceeds its
+// budget. The cost of tabs for the agent: make bench BENCH_OPTIONS="--only tabs".
 // MEASURE_MINUTES is the duration of the measurement of memory (default: 2).
 
 import assert from 'node:assert/strict';
@@ -82,7 +82,7 @@ async function panning(open) {
       pointerId: 1, button: 0, bubbles: true, clientX: left + width / 2 + offset,
       clientY: top + height / 2 + offset / 3,
     }));
-    // No pointer is pressed, so there is none to capture.
+    // The browser has no pointer of this number, and refuses to capture it.
     svg.setPointerCapture = () => {};
     at('pointerdown', 0);
     const began = performance.now();
