@@ -5,6 +5,7 @@
 //! measurements.
 
 use crate::facts::model_time::ModelTime;
+
 /// Length of the window in seconds, one slot each.
 pub const SECONDS: u64 = 10;
 const SLOTS: usize = SECONDS as usize + 1;
@@ -29,9 +30,12 @@ pub struct Slot {
     /// Samples settled as lost.
     pub lost: u64,
     /// Samples with a source latency.
-    pub delayed: u64,
+    pub delayed: u32,
     /// Sum of their latencies in seconds.
     pub delay: f64,
+    /// Longest time in seconds between two messages of one writer, the later of which is counted
+    /// here.
+    pub longest_interval: f32,
 }
 
 /// Numbers of messages and of their bytes.
@@ -74,6 +78,7 @@ impl Slot {
         self.lost += other.lost;
         self.delayed += other.delayed;
         self.delay += other.delay;
+        self.longest_interval = self.longest_interval.max(other.longest_interval);
     }
 }
 

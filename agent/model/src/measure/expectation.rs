@@ -4,7 +4,8 @@
 //! `BAD` bad evaluations in a row and recovers after `GOOD` good ones. Rates are evaluated over a
 //! window of at least three expected messages (1 to 10 s), or over the window of the entry. One
 //! message of tolerance at the window's edges keeps a healthy periodic topic stable. Silence has
-//! its own time and no hysteresis. The end of a window counts for `min_rate_hz` only as far as its
+//! its own time and no hysteresis. A silence between two messages, which ended before it was
+//! evaluated, violates at once, and recovers as the others do. The end of a window counts for `min_rate_hz` only as far as its
 //! messages are known. The messages of a sampled topic are known once polling sees the next one.
 //!
 //! Windows and silences begin at the earliest when the agent can see the messages. That is after
@@ -29,6 +30,8 @@ use crate::facts::watch::{Expectations, WatchState};
 const BAD: u8 = 2;
 /// Number of good evaluations in a row after which a violated topic recovers.
 const GOOD: u8 = 3;
+/// Number of evaluations after a silence in which its end is no silence of its own.
+const SILENCE_ENDS: u8 = 2;
 /// Seconds from a topic's first publisher until the numbers of its endpoints are evaluated.
 pub const GRACE: u64 = 10;
 const NAMES: [&str; 7] = [
@@ -69,6 +72,9 @@ pub struct Evidence<'a> {
     pub recent: &'a dyn Fn(u64) -> (Slot, u64),
     /// Loss of the worst subscriber in the last ten seconds.
     pub loss: LossShare,
+    /// Longest time in seconds between two messages, the later of which came in the last whole
+    /// second. Zero if several publishers share the topic, or if single messages are not seen.
+    pub longest_interval: f64,
 }
 
 /// State of one topic under one watchlist entry.
@@ -81,9 +87,19 @@ pub struct Judgement {
     broken: u8,
     bad: u8,
     good: u8,
+    /// Evaluations until an interval counts again after a silence.
+    ending: u8,
 }
 
 impl Evidence<'_> {
+    /// Returns whether two messages, both sent while they were expected, were further apart than
+    /// this.
+    fn has_gap(&self, maximum: Duration) -> bool {
+        let last_second = ModelTime::of_second(self.now.whole_seconds().saturating_sub(1));
+        self.longest_interval > maximum.as_secs_f64()
+            && self.longest_interval <= (last_second - self.observed).as_secs_f64()
+    }
+
     /// Returns the number of whole seconds in which messages would have been seen.
     fn observed_seconds(&self) -> u64 {
         let first = self.observed.nanoseconds().div_ceil(SECOND);
@@ -113,6 +129,7 @@ impl Default for Judgement {
             broken: 0,
             bad: 0,
             good: 0,
+            ending: 0,
         }
     }
 }
@@ -147,12 +164,27 @@ impl Judgement {
         let quiet = broken & MAX_SILENCE != 0 || evidence.last_message.is_none();
         let broken = without_consequences(broken, quiet, evidence);
         let silent = broken & MAX_SILENCE != 0;
-        if broken & !MAX_SILENCE == 0 {
+        let has_gap = !silent
+            && self.ending == 0
+            && evidence.subscriptions > 0
+            && expectations
+                .max_silence
+                .is_some_and(|maximum| evidence.has_gap(maximum));
+        self.ending = match silent {
+            true => SILENCE_ENDS,
+            false => self.ending.saturating_sub(1),
+        };
+        if broken & !MAX_SILENCE == 0 && !has_gap {
             (self.bad, self.good) = (0, self.good.saturating_add(1));
         } else {
             (self.bad, self.good) = (self.bad.saturating_add(1), 0);
         }
-        if self.bad >= BAD {
+        let broken = if has_gap {
+            broken | MAX_SILENCE
+        } else {
+            broken
+        };
+        if self.bad >= BAD || has_gap {
             self.violated = true;
         } else if self.good >= GOOD {
             self.violated = false;
@@ -214,7 +246,7 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool)
     }
     if let Some(maximum) = expectations.max_latency {
         let (slot, _) = (evidence.recent)(1);
-        if slot.delayed > 0 && slot.delay > maximum.as_secs_f64() * slot.delayed as f64 {
+        if slot.delayed > 0 && slot.delay > maximum.as_secs_f64() * f64::from(slot.delayed) {
             broken |= MAX_LATENCY;
         }
     }
@@ -320,6 +352,7 @@ mod tests {
                         lost: 10 * slot.lost,
                         expected: 10 * (slot.messages + slot.lost),
                     },
+                    longest_interval: slot.longest_interval.into(),
                 },
             );
             self.judgement.state()
@@ -344,6 +377,54 @@ mod tests {
             .into();
         let (ok, bad) = (WatchState::Ok, WatchState::Violated);
         assert_eq!(states, [ok, ok, ok, ok, bad, bad, bad, ok]);
+    }
+
+    /// Returns the counts of a second with ten messages, of which two are this far apart.
+    fn gap(seconds: f32) -> Slot {
+        Slot {
+            longest_interval: seconds,
+            ..rate(10)
+        }
+    }
+
+    fn without_silence_above(seconds: f64) -> Bench {
+        Bench::new(Expectations {
+            max_silence: Some(Duration::from_secs_f64(seconds)),
+            ..Expectations::default()
+        })
+    }
+
+    #[test]
+    fn a_gap_between_messages_violates_at_once_and_three_good_seconds_end_it() {
+        let mut bench = without_silence_above(0.2);
+        let gaps = [0.1, 0.1, 0.1, 0.3, 0.1, 0.1, 0.1];
+        let states = gaps.map(|seconds| bench.second(gap(seconds)));
+        let (ok, bad) = (WatchState::Ok, WatchState::Violated);
+        assert_eq!(states, [ok, ok, ok, bad, bad, bad, ok]);
+        assert!(bench.judgement.violations().is_empty());
+        bench.second(gap(0.3));
+        assert_eq!(bench.judgement.violations(), ["max_silence_s"]);
+    }
+
+    #[test]
+    fn an_interval_from_before_the_messages_were_expected_is_no_gap() {
+        let mut bench = without_silence_above(0.2);
+        assert_eq!(bench.second(gap(60.0)), WatchState::Ok);
+        assert_eq!(bench.second(gap(0.1)), WatchState::Ok);
+        bench.subscriptions = 0;
+        assert_ne!(bench.second(gap(0.3)), WatchState::Violated);
+    }
+
+    #[test]
+    fn the_end_of_a_silence_is_no_second_violation() {
+        let mut bench = without_silence_above(1.5);
+        for messages in [10, 10, 10, 0, 0] {
+            bench.second(rate(messages));
+        }
+        assert_eq!(bench.judgement.state(), WatchState::Silent);
+        assert_eq!(bench.second(gap(2.1)), WatchState::Ok);
+        assert_eq!(bench.second(gap(2.1)), WatchState::Ok);
+        assert_eq!(bench.second(gap(2.1)), WatchState::Violated);
     }
 
     #[test]
@@ -376,6 +457,7 @@ mod tests {
             delayed: 10,
             delay: 1.0,
             bytes: 0,
+            ..Slot::default()
         };
         bench.second(slot);
         assert_eq!(bench.second(slot), WatchState::Violated);

@@ -73,6 +73,7 @@ pub fn violations(expectations: &Expectations, seconds: &[Second]) -> Vec<&'stat
                 observed: instant(observed),
                 recent: &recent,
                 loss: loss(seconds, place + 1),
+                longest_interval: 0.0,
             },
         );
         if matches!(judgement.state(), WatchState::Violated | WatchState::Silent) {
@@ -97,8 +98,9 @@ fn recent(seconds: &[Second], begin: usize, end: usize, length: u64) -> (Slot, u
             messages: second.messages.into(),
             bytes: 0,
             lost: second.lost.into(),
-            delayed: second.delayed.into(),
+            delayed: second.delayed,
             delay: second.delay.into(),
+            longest_interval: 0.0,
         });
     }
     (sum, (end - begin) as u64)

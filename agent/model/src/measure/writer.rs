@@ -533,8 +533,9 @@ impl Writer {
         slot.messages += 1;
         slot.bytes += bytes;
         if let Some(previous) = self.last_message {
-            self.interarrival
-                .observe(seconds(now.nanoseconds_since(previous).max(0)));
+            let interval = seconds(now.nanoseconds_since(previous).max(0));
+            slot.longest_interval = slot.longest_interval.max(interval as f32);
+            self.interarrival.observe(interval);
         }
         self.last_message = self.last_message.max(Some(now));
     }

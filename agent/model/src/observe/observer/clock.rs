@@ -259,6 +259,10 @@ impl Observer {
                 None => &seeming_silence,
             };
             let last_message = last_message.max(retired).max(seen_inside);
+            let longest_interval = match (&writers[..], &inside) {
+                ([only], None) => only.writer.recent(now, 1).0.longest_interval.into(),
+                _ => 0.0,
+            };
             let evidence = Evidence {
                 now,
                 publishers: topic.writers.len().max(publishers),
@@ -269,6 +273,7 @@ impl Observer {
                 observed: topic.published.max(topic.subscribed).max(self.view_began),
                 recent,
                 loss: topic.loss.window,
+                longest_interval,
             };
             let mut judgements = topic.judgements.clone();
             for (index, judgement) in &mut judgements {

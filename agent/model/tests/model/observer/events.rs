@@ -176,6 +176,41 @@ fn a_changed_state_raises_one_event_and_another_watch_raises_none() {
 }
 
 #[test]
+fn a_gap_of_a_third_of_a_second_between_messages_violates_the_maximum_silence() {
+    let mut world = World::new(&[]);
+    let watch = Watch {
+        expectations: Expectations {
+            max_silence: Some(Duration::from_millis(200)),
+            ..Expectations::default()
+        },
+        ..Watch::named("/joint_states").unwrap()
+    };
+    world.observer.input(Input::Watchlist(Arc::new(
+        Watchlist::new(vec![watch]).unwrap(),
+    )));
+    world.spdp(ALICE, 1000);
+    world.sedp(alice(READER), "rt/joint_states");
+    world.sedp(alice(WRITER), "rt/joint_states");
+    let states = |world: &mut World| -> Vec<_> {
+        let reported = world.events().into_iter();
+        let states = reported.filter_map(|(_, kind)| match kind {
+            EventKind::Expectation { to, violations, .. } => Some((to, violations)),
+            EventKind::Silence { .. } => Some((WatchState::Silent, vec!["silence"])),
+            _ => None,
+        });
+        states.collect()
+    };
+    world.stream(alice(WRITER), 1..=500);
+    assert_eq!(states(&mut world), []);
+    world.wait(330);
+    world.stream(alice(WRITER), 501..=800);
+    let violated = (WatchState::Violated, vec!["max_silence_s"]);
+    assert_eq!(states(&mut world), [violated]);
+    world.stream(alice(WRITER), 801..=1000);
+    assert_eq!(states(&mut world), [(WatchState::Ok, Vec::new())]);
+}
+
+#[test]
 fn time_in_which_the_source_was_blind_is_not_silence() {
     let mut world = World::new(&[]);
     let watch = Watch {
