@@ -15,7 +15,7 @@ use ros2probe_testing::harness::prometheus::Prometheus;
 use serde_yaml::Value;
 
 /// Queries of panels that rightly return no data on these robots, with the reason.
-const RIGHTLY_EMPTY: [(&str, &str); 14] = [
+const RIGHTLY_EMPTY: [(&str, &str); 20] = [
     (
         "robot: Where latency arises B",
         "nothing is sent and received by sockets of one host",
@@ -44,6 +44,12 @@ const RIGHTLY_EMPTY: [(&str, &str); 14] = [
         "robot: Sampled in shared memory A",
         "RustDDS has no shared memory",
     ),
+    ("robot: Messages of logs A", "no node logs"),
+    ("robot: Diagnostics A", "no node publishes /diagnostics"),
+    ("robot: Age of transforms A", "no node publishes /tf"),
+    ("robot: Jumps of transforms A", "no node publishes /tf"),
+    ("robot: Jumps of transforms B", "no node publishes /tf"),
+    ("robot: Batteries A", "no robot has a battery"),
     ("robot: Pushed over OTLP A", "nothing is pushed"),
     ("robot: Not delivered over OTLP A", "nothing is pushed"),
     ("robot: Unreadable packets A", "everything can be read"),
