@@ -93,6 +93,12 @@ export function numberAt(value, path) {
   return typeof number === 'number' && Number.isFinite(number) ? number : null;
 }
 
+/** Returns values minus the first of them. @param {(number|null)[]} values */
+export function sinceFirst(values) {
+  const first = values.find((value) => value != null) ?? 0;
+  return values.map((value) => (value == null ? null : value - first));
+}
+
 /** @param {{topic: import('./state.js').Topic, scope: string, name: string}} props */
 export function LiveMessage({ topic, scope, name }) {
   const [open, turn] = useState(false);
@@ -114,6 +120,7 @@ function Follow({ scope, name, topic }) {
   const [end, setEnd] = useState('');
   const [toggled, setToggled] = useState(/** @type {Set<string>} */ (new Set()));
   const [plotted, plot] = useKept(`plot ${topic.types[0]}`, /** @type {string[]} */ ([]));
+  const [isRelative, setRelative] = useKept('relative plots', false);
   const [run, again] = useState(0);
   const points = useRef({ times: /** @type {number[]} */ ([]),
     values: /** @type {Map<string, (number|null)[]>} */ (new Map()) });
@@ -186,10 +193,15 @@ function Follow({ scope, name, topic }) {
     ${type && !type.known && html`<p><${Mark} severity="note" /> The definition of <${Name}
       text=${type.name} /> is not known: ${type.reason ?? 'no file has it'}. Sizes are shown, fields
       are not.</p>`}
-    ${!message && !problem && !end && html`<p class="dim">Waiting for a message …</p>`}
+    ${!message && !problem && !end && html`<p class="dim">${!topic.publishers.length
+      ? 'Nobody publishes the topic now.' : !topic.subscriptions.length
+        ? 'Nobody subscribes, so nothing is sent.' : 'Waiting for a message …'}</p>`}
+    ${plotted.length > 0 && html`<p><label><input type="checkbox" checked=${isRelative}
+      onChange=${(/** @type {any} */ event) => setRelative(event.target.checked)} />
+      Changes since the first value</label></p>`}
     ${plotted.map((path, at) => values.has(path) && html`<${Chart} key=${path} title=${path}
       times=${times} print=${printNumber} fitted lines=${[{ label: path, colour: colours[at],
-        values: values.get(path) ?? [] }]} />`)}
+        values: isRelative ? sinceFirst(values.get(path) ?? []) : values.get(path) ?? [] }]} />`)}
     ${message && html`<p class="dim">${clock(message.time)}, ${bytes(message.bytes)}${
       message.sequence_number != null ? `, number ${count(message.sequence_number)}` : ''}${
       message.node ? html` by <${Name} text=${message.node} />` : ''}${message.skipped

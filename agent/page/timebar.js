@@ -10,7 +10,7 @@ import { html } from './ui.js';
 
 /** Times to choose from, in seconds. */
 const SPANS = /** @type {[number, string][]} */ ([
-  [600, 'ten minutes'], [3600, 'hour'], [21600, '6 hours'], [86400, '24 hours'], [604800, '7 days'],
+  [60, 'minute'], [600, 'ten minutes'], [3600, 'hour'], [21600, '6 hours'], [86400, '24 hours'], [604800, '7 days'],
 ]);
 const DEFAULT_SPAN = 600;
 const LONGEST_SPAN = 31 * 86400;

@@ -5,7 +5,7 @@ import { test } from 'node:test';
 globalThis.document = /** @type {any} */ ({ addEventListener() {}, baseURI: 'http://x/' });
 globalThis.window = /** @type {any} */ ({ addEventListener() {} });
 globalThis.sessionStorage = /** @type {any} */ ({ getItem: () => null });
-const { flatten, numberAt } = await import('../message.js');
+const { flatten, numberAt, sinceFirst } = await import('../message.js');
 
 const IMU = {
   header: { stamp: { sec: 5, nanosec: 7 }, frame_id: 'imu' },
@@ -42,4 +42,9 @@ test('numbers are found by their path, and nothing else is', () => {
   assert.equal(numberAt(IMU, 'header.frame_id'), null);
   assert.equal(numberAt(IMU, 'gone.x'), null);
   assert.equal(numberAt(null, 'x'), null);
+});
+
+test('changes count from the first value, and gaps stay', () => {
+  assert.deepEqual(sinceFirst([null, 5, 7, null, 4]), [null, 0, 2, null, -1]);
+  assert.deepEqual(sinceFirst([]), []);
 });

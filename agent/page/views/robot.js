@@ -247,13 +247,16 @@ function Services({ query, change }) {
     ${goals.length > 0 && html`<section aria-labelledby="actions"><h2 id="actions">Actions</h2>
       <div class="scroll" tabindex="0" role="group" aria-labelledby="actions"><table>
       <thead><tr><th scope="col">Action</th><th scope="col">Server</th>${results.map((each) => html`
-        <th scope="col" key=${each} class="number">${each}</th>`)}</tr></thead>
+        <th scope="col" key=${each} class="number">${each}</th>`)}
+        <th scope="col" class="number">p50</th><th scope="col" class="number">p99</th></tr></thead>
       <tbody>${goals.map((/** @type {any} */ row) => html`<tr key=${`${row.domain_id} ${row.name}`}>
         <th scope="row"><${Name} text=${row.name} />${inDomain(row.domain_id)}</th>
         <td><${Name} text=${nodesOf(row.servers) || 'none'} /></td>
         ${results.map((each) => html`<td key=${each} class="number">${each === 'aborted'
           && row.goals?.aborted > 0 ? html`<${Mark} severity="warning" /> ` : ''}${count(
-          row.goals?.[each] ?? null)}</td>`)}</tr>`)}</tbody></table></div></section>`}
+          row.goals?.[each] ?? null)}</td>`)}
+        <td class="number">${duration(row.goals?.duration_p50_seconds)}</td>
+        <td class="number">${duration(row.goals?.duration_p99_seconds)}</td></tr>`)}</tbody></table></div></section>`}
     ${rows.length ? html`<section aria-labelledby="services"><h2 id="services">Services</h2>
       <${Table} label="Services" columns=${columns} rows=${sorted(rows, columns, sort)} sort=${sort}
         keyOf=${(/** @type {any} */ row) => `${row.domain_id} ${row.name}`}
