@@ -68,13 +68,11 @@ pub struct Evidence<'a> {
     pub since: ModelTime,
     /// Time at which messages became expected and visible; at least `since`.
     pub observed: ModelTime,
-    /// Returns counts of the last whole seconds and the number of these seconds.
+    /// Returns counts of the last whole seconds and the number of these seconds. Without a longest
+    /// interval if several publishers share the topic.
     pub recent: &'a dyn Fn(u64) -> (Slot, u64),
     /// Loss of the worst subscriber in the last ten seconds.
     pub loss: LossShare,
-    /// Longest time in seconds between two messages, the later of which came in the last whole
-    /// second. Zero if several publishers share the topic, or if single messages are not seen.
-    pub longest_interval: f64,
 }
 
 /// State of one topic under one watchlist entry.
@@ -96,8 +94,8 @@ impl Evidence<'_> {
     /// this.
     fn has_gap(&self, maximum: Duration) -> bool {
         let last_second = ModelTime::of_second(self.now.whole_seconds().saturating_sub(1));
-        self.longest_interval > maximum.as_secs_f64()
-            && self.longest_interval <= (last_second - self.observed).as_secs_f64()
+        let longest = f64::from((self.recent)(1).0.longest_interval);
+        longest > maximum.as_secs_f64() && longest <= (last_second - self.observed).as_secs_f64()
     }
 
     /// Returns the number of whole seconds in which messages would have been seen.
@@ -352,7 +350,6 @@ mod tests {
                         lost: 10 * slot.lost,
                         expected: 10 * (slot.messages + slot.lost),
                     },
-                    longest_interval: slot.longest_interval.into(),
                 },
             );
             self.judgement.state()

@@ -73,7 +73,6 @@ pub fn violations(expectations: &Expectations, seconds: &[Second]) -> Vec<&'stat
                 observed: instant(observed),
                 recent: &recent,
                 loss: loss(seconds, place + 1),
-                longest_interval: 0.0,
             },
         );
         if matches!(judgement.state(), WatchState::Violated | WatchState::Silent) {

@@ -225,13 +225,17 @@ impl Observer {
                 .as_ref()
                 .and_then(|retired| retired.last_message);
             let recent = |seconds: u64| {
-                writers
-                    .iter()
-                    .fold((Slot::default(), 0), |(mut sum, longest), each| {
-                        let (slot, seconds) = each.writer.recent(now, seconds);
-                        sum.add(&slot);
-                        (sum, seconds.max(longest))
-                    })
+                let (mut sum, mut longest) = (Slot::default(), 0);
+                for each in &writers {
+                    let (slot, seconds) = each.writer.recent(now, seconds);
+                    sum.add(&slot);
+                    longest = seconds.max(longest);
+                }
+                if writers.len() > 1 {
+                    // Others may fill the gaps of one writer.
+                    sum.longest_interval = 0.0;
+                }
+                (sum, longest)
             };
             let inside = self.derive.inside.evidence(topic.domain_id, &topic.naming);
             let (publishers, subscriptions) = inside.map_or((0, 0), |inside| inside.endpoints());
@@ -259,10 +263,6 @@ impl Observer {
                 None => &seeming_silence,
             };
             let last_message = last_message.max(retired).max(seen_inside);
-            let longest_interval = match (&writers[..], &inside) {
-                ([only], None) => only.writer.recent(now, 1).0.longest_interval.into(),
-                _ => 0.0,
-            };
             let evidence = Evidence {
                 now,
                 publishers: topic.writers.len().max(publishers),
@@ -273,7 +273,6 @@ impl Observer {
                 observed: topic.published.max(topic.subscribed).max(self.view_began),
                 recent,
                 loss: topic.loss.window,
-                longest_interval,
             };
             let mut judgements = topic.judgements.clone();
             for (index, judgement) in &mut judgements {

@@ -14,6 +14,26 @@ use ros2probe_wire::{DomainId, Timestamp};
 
 use super::{ALICE, BOB, READER, WRITER, World, alice, bob};
 
+/// Watches topics of this name with these expectations.
+fn expect(world: &mut World, pattern: &str, expectations: Expectations) {
+    let watch = Watch {
+        expectations,
+        ..Watch::named(pattern).unwrap()
+    };
+    let watchlist = Watchlist::new(vec![watch]).unwrap();
+    world.observer.input(Input::Watchlist(Arc::new(watchlist)));
+}
+
+/// Returns the new states of watched topics, each with its violations.
+fn changes(world: &mut World) -> Vec<(WatchState, Vec<&'static str>)> {
+    let reported = world.events().into_iter();
+    let changes = reported.filter_map(|(_, kind)| match kind {
+        EventKind::Expectation { to, violations, .. } => Some((to, violations)),
+        _ => None,
+    });
+    changes.collect()
+}
+
 #[test]
 fn joining_and_leaving_raise_events_with_the_known_attributes() {
     let mut world = World::new(&[]);
@@ -178,52 +198,40 @@ fn a_changed_state_raises_one_event_and_another_watch_raises_none() {
 #[test]
 fn a_gap_of_a_third_of_a_second_between_messages_violates_the_maximum_silence() {
     let mut world = World::new(&[]);
-    let watch = Watch {
-        expectations: Expectations {
-            max_silence: Some(Duration::from_millis(200)),
-            ..Expectations::default()
-        },
-        ..Watch::named("/joint_states").unwrap()
+    let expectations = Expectations {
+        max_silence: Some(Duration::from_millis(200)),
+        ..Expectations::default()
     };
-    world.observer.input(Input::Watchlist(Arc::new(
-        Watchlist::new(vec![watch]).unwrap(),
-    )));
+    expect(&mut world, "/joint_states", expectations);
     world.spdp(ALICE, 1000);
     world.sedp(alice(READER), "rt/joint_states");
     world.sedp(alice(WRITER), "rt/joint_states");
-    let states = |world: &mut World| -> Vec<_> {
-        let reported = world.events().into_iter();
-        let states = reported.filter_map(|(_, kind)| match kind {
-            EventKind::Expectation { to, violations, .. } => Some((to, violations)),
-            EventKind::Silence { .. } => Some((WatchState::Silent, vec!["silence"])),
-            _ => None,
-        });
-        states.collect()
-    };
     world.stream(alice(WRITER), 1..=500);
-    assert_eq!(states(&mut world), []);
+    assert_eq!(changes(&mut world), []);
     world.wait(330);
     world.stream(alice(WRITER), 501..=800);
     let violated = (WatchState::Violated, vec!["max_silence_s"]);
-    assert_eq!(states(&mut world), [violated]);
+    assert_eq!(changes(&mut world), [violated]);
     world.stream(alice(WRITER), 801..=1000);
-    assert_eq!(states(&mut world), [(WatchState::Ok, Vec::new())]);
+    assert_eq!(changes(&mut world), [(WatchState::Ok, Vec::new())]);
+
+    // A second publisher fills the gaps of the first one.
+    world.spdp(BOB, 1000);
+    world.sedp(bob(WRITER), "rt/joint_states");
+    world.stream(bob(WRITER), 1..=300);
+    world.stream(alice(WRITER), 1001..=1200);
+    assert_eq!(changes(&mut world), []);
 }
 
 #[test]
 fn time_in_which_the_source_was_blind_is_not_silence() {
     let mut world = World::new(&[]);
-    let watch = Watch {
-        expectations: Expectations {
-            max_silence: Some(Duration::from_secs(3)),
-            min_rate_hz: Some(5.0),
-            ..Expectations::default()
-        },
-        ..Watch::named("/chatter").unwrap()
+    let expectations = Expectations {
+        max_silence: Some(Duration::from_secs(3)),
+        min_rate_hz: Some(5.0),
+        ..Expectations::default()
     };
-    world.observer.input(Input::Watchlist(Arc::new(
-        Watchlist::new(vec![watch]).unwrap(),
-    )));
+    expect(&mut world, "/chatter", expectations);
     world.spdp(ALICE, 1000);
     world.sedp(alice(READER), "rt/chatter");
     world.sedp(alice(WRITER), "rt/chatter");
@@ -238,12 +246,8 @@ fn time_in_which_the_source_was_blind_is_not_silence() {
     world.wait(500);
     world.stream(alice(WRITER), 6_500..=7_000);
     let states = |world: &mut World| -> Vec<_> {
-        let reported = world.events().into_iter();
-        let states = reported.filter_map(|(_, kind)| match kind {
-            EventKind::Expectation { to, .. } => Some(to),
-            _ => None,
-        });
-        states.collect()
+        let changes = changes(world).into_iter();
+        changes.map(|(state, _)| state).collect()
     };
     assert_eq!(states(&mut world), []);
     // A publisher that stopped in that minute is silent 3 s later.
@@ -259,17 +263,12 @@ fn time_in_which_the_source_was_blind_is_not_silence() {
 #[test]
 fn a_returning_subscriber_has_time_for_its_first_message() {
     let mut world = World::new(&[]);
-    let watch = Watch {
-        expectations: Expectations {
-            max_silence: Some(Duration::from_secs(3)),
-            min_rate_hz: Some(1.0),
-            ..Expectations::default()
-        },
-        ..Watch::named("/chatter").unwrap()
+    let expectations = Expectations {
+        max_silence: Some(Duration::from_secs(3)),
+        min_rate_hz: Some(1.0),
+        ..Expectations::default()
     };
-    world.observer.input(Input::Watchlist(Arc::new(
-        Watchlist::new(vec![watch]).unwrap(),
-    )));
+    expect(&mut world, "/chatter", expectations);
     world.spdp(ALICE, 1000);
     world.sedp(alice(WRITER), "rt/chatter");
     world.sample(alice(WRITER), 1);
