@@ -94,7 +94,7 @@ page: ## unit tests of the page, its types, and its libraries compared with what
 	agent/page/test/types
 	agent/page/vendor/check
 
-page-bench: ## first paint with 500 topics, layout and memory of the page; MEASURE_MINUTES=N (10)
+page-bench: ## first paint with 500 topics, layout, frames and memory of the page; MEASURE_MINUTES=N (10)
 	@.ci/prerequisites.sh page
 	cargo build --release --package ros2probe --bin rp
 	MEASURE_MINUTES=$(or $(MEASURE_MINUTES),10) cargo test --release --package ros2probe \

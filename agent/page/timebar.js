@@ -119,6 +119,11 @@ export function useEvents(shown) {
   });
 }
 
+/** Returns the marks of events in a chart. @param {import('./state.js').Event[]} events */
+export function marksOf(events) {
+  return events.map(({ time, severity }) => ({ time: Date.parse(time) / 1000, severity }));
+}
+
 /** Unix time as the value of an input, in the time zone of the browser. @param {number} time */
 function forInput(time) {
   const moment = new Date(time * 1000);

@@ -7,7 +7,7 @@ import { nodeKey } from '../graph-model.js';
 import { address } from '../router.js';
 import { Chart } from '../chart.js';
 import { replaceAddress, state, stream, useLive, usePoll } from '../store.js';
-import { inWords, useEvents, useHistory, useTime, zoom } from '../timebar.js';
+import { inWords, marksOf, useEvents, useHistory, useTime, zoom } from '../timebar.js';
 import { sorted, Table } from '../table.js';
 import { Failed, Filter, html, Mark, matches, Name, NodeLink } from '../ui.js';
 import { InChains } from './chains.js';
@@ -174,7 +174,7 @@ function ProcessCharts({ ids }) {
     ids.includes(each.process_id) && each.times.length > 1);
   const title = inWords(shown);
   const events = useEvents(shown).filter(({ severity }) => severity !== 'INFO');
-  const marks = events.map(({ time, severity }) => ({ time: Date.parse(time) / 1000, severity }));
+  const marks = marksOf(events);
   return own.map((/** @type {any} */ each) => html`<section key=${`${each.process_id} ${each.process}`}
     aria-label="CPU and memory of ${each.process}"><h2>${title}: <${Name}
       text=${`${each.process} ${each.process_id}`} /></h2><div class="charts">

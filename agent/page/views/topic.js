@@ -9,7 +9,7 @@ import { topicKey } from '../graph-model.js';
 import { LiveMessage } from '../message.js';
 import { Endpoints, Offered } from '../qos.js';
 import { state, stream, useLive, usePoll } from '../store.js';
-import { inWords, useEvents, useHistory, useTime, zoom } from '../timebar.js';
+import { inWords, marksOf, useEvents, useHistory, useTime, zoom } from '../timebar.js';
 import { Badges, Failed, Figure, html, Mark, Name, PASSAGES, Text } from '../ui.js';
 import { InChains } from './chains.js';
 import { Inside } from './inside.js';
@@ -111,8 +111,7 @@ function Charts({ topic, scope, pick }) {
   const columns = isLive ? latest : COLUMNS.map((column) => past.data?.[column] ?? []);
   const events = useEvents(shown).filter((event) => event.attributes.topic === topic.name
     || (event.attributes.topic == null && event.severity !== 'INFO'));
-  const marks = events.map((event) => ({ time: Date.parse(event.time) / 1000,
-    severity: event.severity }));
+  const marks = marksOf(events);
   const [times, rates, sizes, lost, half, most, gapHalf, gapMost] = columns;
   const title = inWords(shown);
   if (!times.length) {
