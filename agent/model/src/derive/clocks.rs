@@ -6,9 +6,10 @@
 //!
 //! - A reply follows its request. A request that left at `d` and a reply stamped `s` show that the
 //!   peer is ahead by at most `s - d`. This holds whatever the network does.
-//! - An ACKNACK has no stamp, but it follows the message that it acknowledges. The time between them
-//!   is a round trip. The peer is ahead by at most the lower bound and the fastest round trip. This
-//!   assumes that the fastest of many messages took no longer than that.
+//! - An ACKNACK has no stamp, but it follows the message that it acknowledges, and the HEARTBEAT that
+//!   requested it. The time from the later one is a round trip. The peer is ahead by at most the
+//!   lower bound and the fastest round trip. This assumes that the fastest of many messages took no
+//!   longer than that.
 //!
 //! Each bound widens with its age, because clocks drift. Without the second bound the offset is
 //! unknown. All values refer to model time, so a step of this host's clock changes none of them.
@@ -18,6 +19,7 @@ mod bounds;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::net::IpAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
@@ -33,6 +35,8 @@ pub use bounds::{Range, Source};
 pub const THIS_HOST: &str = "localhost";
 /// Latest messages of one writer whose acknowledgement gives a round trip.
 const SENT: usize = 16;
+/// An ACKNACK answers no HEARTBEAT that left longer before it.
+const ANSWER: Duration = Duration::from_millis(500);
 /// Latest messages of writers that no peer has acknowledged so far.
 const OTHERS: usize = 32;
 /// Nanoseconds between two clocks, beyond the uncertainty: from the first number on the offset is a
@@ -67,6 +71,21 @@ struct Peer {
 struct Sent {
     newest: SequenceNumber,
     times: [(SequenceNumber, ModelTime); SENT],
+    /// HEARTBEATs that follow each other by less than `ANSWER`.
+    announced: Option<Announced>,
+    /// The greatest number that a reader acknowledged.
+    acknowledged: SequenceNumber,
+}
+
+/// HEARTBEATs that may have requested an ACKNACK.
+#[derive(Clone, Copy, Debug)]
+struct Announced {
+    /// Time of the first one.
+    first: ModelTime,
+    /// Time of the last one.
+    last: ModelTime,
+    /// Its lastSN.
+    number: SequenceNumber,
 }
 
 /// The latest messages of writers that no peer has acknowledged, and the times at which they left.
@@ -158,6 +177,13 @@ impl Clocks {
         }
     }
 
+    /// Records that a HEARTBEAT of a writer of this host left.
+    pub fn announced(&mut self, writer: Guid, number: SequenceNumber, at: ModelTime) {
+        if let Some(sent) = self.writers.get_mut(&writer) {
+            sent.announce(number, at);
+        }
+    }
+
     /// Records that a reader on a peer acknowledged all messages up to this number.
     pub fn acknowledged(
         &mut self,
@@ -167,7 +193,7 @@ impl Clocks {
         at: ModelTime,
     ) {
         let left = match self.writers.get_mut(&writer) {
-            Some(sent) => sent.time(number),
+            Some(sent) => sent.requested(number).max(sent.time(number)),
             None => {
                 self.writers.get_or_insert_with(writer, Sent::default);
                 self.others.time(writer, number)
@@ -314,6 +340,28 @@ impl Sent {
                 *slot = (number, at);
             }
         }
+    }
+
+    fn announce(&mut self, number: SequenceNumber, at: ModelTime) {
+        let before = self.announced.filter(|before| at - before.last < ANSWER);
+        self.announced = Some(Announced {
+            first: before.map_or(at, |before| before.first),
+            last: at,
+            number,
+        });
+    }
+
+    /// Returns the time of the first HEARTBEAT that may have requested the acknowledgement of a
+    /// number. Only the first acknowledgement of a number gives one: a reader may repeat it.
+    fn requested(&mut self, number: SequenceNumber) -> Option<ModelTime> {
+        let is_first = number > self.acknowledged;
+        self.acknowledged = self.acknowledged.max(number);
+        let announced = self
+            .announced
+            .filter(|announced| announced.number == number);
+        announced
+            .filter(|_| is_first)
+            .map(|announced| announced.first)
     }
 
     fn time(&self, number: SequenceNumber) -> Option<ModelTime> {

@@ -101,18 +101,31 @@ impl Pair {
     /// A message of Bob's leaves, and Alice acknowledges it.
     fn speak(&mut self) {
         let sent = self.host.now;
-        self.number += 1;
-        let writer = guid_words(Guid::new(BOB, WRITER));
-        let message = Record {
-            writer,
-            ..(self.host).record(self.bob.leaving(), kind::DATA, self.number)
-        };
-        self.host.put(message);
+        self.send(kind::DATA, sent);
         let later = 2 * WAY + 20 * MICROSECOND + self.jitter(5 * MILLISECOND);
+        self.acknowledge(sent + later);
+    }
+
+    /// A new message of Bob's leaves, or a HEARTBEAT that announces the last one.
+    fn send(&mut self, kind: u8, time: u64) {
+        self.number += u64::from(kind == kind::DATA);
+        let mut record = (self.host).record(self.bob.leaving(), kind, self.number);
+        if kind == kind::HEARTBEAT {
+            (record.payload_len, record.encapsulation) = (0, self.number as u32);
+        }
+        self.host.put(Record {
+            writer: guid_words(Guid::new(BOB, WRITER)),
+            time,
+            ..record
+        });
+    }
+
+    /// Alice acknowledges the last message of Bob's.
+    fn acknowledge(&mut self, time: u64) {
         let acknack = Record {
-            writer,
+            writer: guid_words(Guid::new(BOB, WRITER)),
             reader: guid_words(Guid::new(self.alice, READER)),
-            time: sent + later,
+            time,
             ..(self.host).record(self.bob, kind::ACKNACK, self.number + 1)
         };
         self.host.put(acknack);
@@ -264,6 +277,59 @@ fn one_acknowledgement_is_a_round_trip_for_ten_minutes() {
         assert!(error <= offsets[0].uncertainty && offsets[0].uncertainty < 1_000_000);
     }
     assert_eq!(hear_for(150), [], "the network may be another one");
+}
+
+/// A writer of Fast DDS announces its messages each 3 s, long after the last of them.
+#[test]
+fn the_heartbeat_that_requests_an_acknowledgement_begins_a_round_trip() {
+    let clock = Clock::ahead(500_000);
+    let mut pair = Pair::new();
+    // The first ACKNACK answers no HEARTBEAT.
+    pair.acknowledge(pair.host.now);
+    for _ in 0..4 {
+        let announced = pair.host.now + 190 * MILLISECOND;
+        pair.send(kind::DATA, pair.host.now);
+        // Two locators, two copies.
+        for copy in 0..2 {
+            pair.send(kind::HEARTBEAT, announced + copy * 50 * MICROSECOND);
+        }
+        pair.acknowledge(announced + 6 * MILLISECOND);
+        // The reader repeats its answer once more, just after another HEARTBEAT.
+        pair.send(kind::HEARTBEAT, announced + SECOND);
+        pair.acknowledge(announced + SECOND + 10 * MICROSECOND);
+        for _ in 0..30 {
+            pair.hear(clock);
+            pair.until(pair.host.now + SECOND / 10);
+        }
+    }
+    let (offset, uncertainty) = pair.offset();
+    assert!((offset - 500_000).abs() <= uncertainty, "{offset}");
+    assert!(
+        (3_000_000..3_600_000).contains(&uncertainty),
+        "{uncertainty}"
+    );
+}
+
+#[test]
+fn a_burst_of_heartbeats_begins_a_round_trip_with_its_first() {
+    let mut pair = Pair::new();
+    pair.acknowledge(pair.host.now);
+    pair.send(kind::DATA, pair.host.now);
+    let began = pair.host.now + 400 * MILLISECOND;
+    for heartbeat in 0..4 {
+        pair.send(kind::HEARTBEAT, began + heartbeat * 100 * MILLISECOND);
+    }
+    // This answers the third one.
+    pair.acknowledge(began + 301 * MILLISECOND);
+    for _ in 0..30 {
+        pair.hear(Clock::ahead(0));
+        pair.until(pair.host.now + SECOND / 10);
+    }
+    let (_, uncertainty) = pair.offset();
+    assert!(
+        (150_000_000..152_000_000).contains(&uncertainty),
+        "{uncertainty}"
+    );
 }
 
 #[test]

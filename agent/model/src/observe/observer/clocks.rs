@@ -8,7 +8,7 @@ use super::Observer;
 use crate::derive::robot::Part;
 use crate::facts::diagnosis::TopicKey;
 use crate::facts::model_time::ModelTime;
-use crate::facts::observation::{AckNack, Observation, Sample};
+use crate::facts::observation::{AckNack, Heartbeat, Observation, Sample};
 
 impl Observer {
     /// Passes the times in an observation on to the clocks.
@@ -19,6 +19,10 @@ impl Observer {
         match observation {
             Observation::Sample(sample) => self.clock_of_sample(sample),
             Observation::AckNack(acknack) => self.clock_of_acknack(acknack),
+            Observation::Heartbeat(heartbeat) if heartbeat.head.leaves() => {
+                let Heartbeat { head, last, .. } = heartbeat;
+                self.derive.clocks.announced(head.writer, *last, head.at);
+            }
             Observation::Heartbeat(_) | Observation::Gap(_) | Observation::Presence(_) => {}
         }
     }
