@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs the missing tools of a Makefile target, printing each of them first.
 #
-#   prerequisites.sh demo|test|fast|dist|vm|ebpf|fuzz|miri|book|deny...   install the tools of those targets
+#   prerequisites.sh demo|test|fast|dist|release|vm|ebpf|fuzz|miri|book|deny...   install the tools of those targets
 #   prerequisites.sh types                    install the type checker of the dashboards
 #   prerequisites.sh page                     install the browser of the page's tests
 #   prerequisites.sh --nightly                print the nightly toolchain that builds the kernel part
@@ -222,17 +222,41 @@ musl() {
     done
 }
 
-# A fresh Debian for installing the package: its containers do not modify it.
+# A fresh Debian for installing the package: its containers do not modify it. Ansible needs python3-apt.
 debian() {
-    local place=$tools/debian
-    [ -e "$place/complete" ] && return
+    local place=$tools/debian more=dbus,python3-apt,systemd,systemd-sysv
+    [ "$(cat "$place/complete" 2>/dev/null)" = "$more" ] && return
     packages debootstrap debian-archive-keyring systemd-container man-db
-    say "making a Debian 12 system in target/tools/debian (as root, 280 MB)"
+    say "making a Debian 12 system in target/tools/debian (as root, 320 MB)"
     as_root rm -rf "$place"
     mkdir -p "$place"
-    as_root debootstrap --variant=minbase --include=dbus,systemd,systemd-sysv bookworm "$place" >"$tools/debian.log" ||
+    as_root debootstrap --variant=minbase --include=$more bookworm "$place" >"$tools/debian.log" ||
         { tail "$tools/debian.log" >&2; die "debootstrap failed"; }
-    as_root sh -c 'rm -rf "$0"/var/cache/apt/archives/*.deb "$0"/var/lib/apt/lists/*; touch "$0/complete"' "$place"
+    as_root sh -c 'rm -rf "$0"/var/cache/apt/archives/*.deb "$0"/var/lib/apt/lists/*; echo "$1" >"$0/complete"' \
+        "$place" $more
+}
+
+# Renders the chart with Helm's own library, and validates the result against the API of Kubernetes.
+# The library is published for x86-64 only.
+helm() {
+    [ "$(uname -m)" = x86_64 ] && python_packages helm "helm-python-sdk==0.2.2" "kubernetes-validate==1.37.0"
+    return 0
+}
+
+# Unpacks only the program: the package would enable and start a service of podman.
+podman() {
+    type -P podman >/dev/null && return
+    [ -x "$tools/usr/bin/podman" ] && return
+    refresh
+    local needed
+    needed=$(apt-cache depends podman | sed -n 's/^  Depends: \([a-z0-9.+-]*\)$/\1/p')
+    [ -n "$needed" ] || die "no package source has podman (on Ubuntu: sudo add-apt-repository universe)"
+    # shellcheck disable=SC2086
+    packages ca-certificates $needed
+    say "unpacking podman into target/tools (nothing is started)"
+    mkdir -p "$tools"
+    (cd "$tools" && apt-get -o APT::Sandbox::User=root download -qq podman &&
+        dpkg-deb --fsys-tarfile podman_*.deb | tar -x ./usr/bin/podman && rm podman_*.deb)
 }
 
 # Built without optimization and without its own copy of xz, in a third of the time; it calls xz.
@@ -312,7 +336,7 @@ ros2_summary() {
 # Prints each test that `make test` omits, with the reason, to standard error. Prints the arguments
 # that omit tests which this system cannot run to standard output.
 left_out() {
-    local version elsewhere="started by another test"
+    local version elsewhere="started by another test" tests="all()"
     # `make test` runs these if the corpus exists.
     [ -d "${ROS2PROBE_FIXTURES:-../shared/fixtures}" ] && elsewhere+="|make test-corpus"
     [ -n "$(distributions)" ] && elsewhere+="|make test-ros2"
@@ -329,8 +353,13 @@ left_out() {
     version=$(systemd-analyze --version 2>/dev/null | awk 'NR == 1 { print $2 + 0 }')
     if [ "${version:-0}" -lt 250 ]; then
         say "  dist/systemd::the_exposure_level_is_at_most_2: needs systemd 250, here is ${version:-none}"
-        echo "--filterset !test(the_exposure_level_is_at_most_2)"
+        tests+="-test(the_exposure_level_is_at_most_2)"
     fi
+    if [ "$(uname -m)" != x86_64 ]; then
+        say "  dist/chart::*: need Helm's library, which is published for x86-64 only"
+        tests+="-test(/^chart::/)"
+    fi
+    if [ "$tests" != "all()" ]; then echo "--filterset $tests"; fi
 }
 
 rust() {
@@ -420,6 +449,8 @@ for need; do
         bags
         types
         page
+        helm
+        packages ansible-core
         rust
         nextest
         spelling
@@ -442,9 +473,18 @@ for need; do
         rust
         musl x86_64 aarch64
         bills
+        helm
+        packages ansible-core
         qemu
         debian
         cargo_deb
+        ;;
+    release)
+        packages git gnupg minisign apt-utils skopeo libcap2-bin
+        podman
+        qemu
+        debian
+        python_packages wheels "twine==7.0.0" "check-wheel-contents==0.6.3"
         ;;
     vm)
         other=aarch64
@@ -497,6 +537,6 @@ for need; do
             cargo install cargo-deny --version 0.20.2 --locked
         }
         ;;
-    *) die "prerequisites.sh: unknown target $need: use demo, test, fast, dist, types, page, pictures, ebpf, fuzz, miri, book or deny" ;;
+    *) die "prerequisites.sh: unknown target $need: use demo, test, fast, dist, release, types, page, pictures, ebpf, fuzz, miri, book or deny" ;;
     esac
 done

@@ -1,6 +1,6 @@
 //! The files of `deploy/` fit together. Mounted and named files exist, Prometheus accepts its
 //! configurations, and the DaemonSet's container has exactly the privileges that the agent needs.
-//! No container engine is available here, so no test starts the images.
+//! `publish::image` starts the image of a release.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

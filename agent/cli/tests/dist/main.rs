@@ -7,7 +7,9 @@
     reason = "a test that meets the unexpected has failed"
 )]
 
+mod ansible;
 mod binaries;
+mod chart;
 mod deploy;
 mod package;
 mod systemd;

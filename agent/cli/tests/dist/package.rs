@@ -5,7 +5,7 @@
 //! its packages are tested instead. Hosts are containers of a fresh Debian, which
 //! `.ci/prerequisites.sh test` creates. Their writes go to memory.
 
-mod installation;
+pub(crate) mod installation;
 
 use std::collections::BTreeMap;
 use std::path::Path;

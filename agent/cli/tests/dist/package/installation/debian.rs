@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use anyhow::{Context as _, Result, bail, ensure};
 
@@ -46,7 +47,10 @@ impl Debian {
             "no Debian system in {}: run `.ci/prerequisites.sh test`",
             system.display()
         );
-        let name = format!("{PREFIX}-{}-{start:?}", std::process::id()).to_lowercase();
+        // Hosts of one process run at the same time.
+        static STARTED: AtomicU32 = AtomicU32::new(0);
+        let number = STARTED.fetch_add(1, Ordering::Relaxed);
+        let name = format!("{PREFIX}-{}-{start:?}{number}", std::process::id()).to_lowercase();
         let cgroup = Cgroup::create(&name)?;
         let place = packages.join(&name);
         let mut words = cgroup.inside();
@@ -93,6 +97,11 @@ impl Debian {
         };
         host.wait(start)?;
         Ok(host)
+    }
+
+    /// Returns the process id of the container's first process.
+    pub(crate) fn first(&self) -> u32 {
+        self.first
     }
 
     /// Runs a script that must succeed, and returns its output.
