@@ -114,7 +114,14 @@ arm: ## build rp for aarch64, static and unoptimized, which the tests run under 
 dist: ## release both binaries, packages, bills of materials and checksums into target/dist, tested
 	@.ci/prerequisites.sh dist
 	packaging/dist.sh
-	ROS2PROBE_DIST=$(TARGET)/dist ROS2PROBE_PACKAGES=$(TARGET)/dist cargo test --package ros2probe --test dist -- --include-ignored
+	ROS2PROBE_DIST=$(TARGET)/dist ROS2PROBE_PACKAGES=$(TARGET)/dist cargo test --package ros2probe --test dist -- --include-ignored --skip publish::
+
+release: ## what a maintainer publishes, in target/publish: make dist, wheels, image, chart, apt repository, signed; TRIAL=1 without keys (needs root)
+	@.ci/prerequisites.sh release
+	@$(if $(TRIAL),,packaging/release.sh --keys)
+	@$(MAKE) --no-print-directory dist
+	packaging/release.sh $(if $(TRIAL),--trial)
+	ROS2PROBE_DIST=$(TARGET)/publish ROS2PROBE_PACKAGES=$(TARGET)/publish cargo test --package ros2probe --test dist -- --include-ignored publish::
 
 vm: ## boot whole systems, install the package in each and check it; VM="arm64-6.1 ..." chooses (needs root)
 	@.ci/prerequisites.sh vm
@@ -171,4 +178,4 @@ deny: ## licences, sources and known vulnerabilities of dependencies; DENY=bans 
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo test test-fast test-corpus test-ros2 bench-ros2 ebpf run page page-bench screenshots peers arm dist vm distcheck bench soak fuzz miri book deny prerequisites
+.PHONY: help demo test test-fast test-corpus test-ros2 bench-ros2 ebpf run page page-bench screenshots peers arm dist release vm distcheck bench soak fuzz miri book deny prerequisites

@@ -3,7 +3,7 @@
 //! it and the tests' own `rp`. `make dist` covers the release binaries (`ROS2PROBE_DIST`).
 
 mod elf;
-mod program;
+pub(crate) mod program;
 mod release;
 
 use std::collections::BTreeSet;

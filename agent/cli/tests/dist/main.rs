@@ -12,4 +12,5 @@ mod binaries;
 mod chart;
 mod deploy;
 mod package;
+mod publish;
 mod systemd;

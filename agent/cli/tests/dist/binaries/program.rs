@@ -93,25 +93,7 @@ impl Program {
 
     /// Returns a command that uses qemu on a machine of another architecture.
     pub fn command(&self) -> Command {
-        let mut command = if self.architecture == std::env::consts::ARCH {
-            Command::new(&self.path)
-        } else {
-            let mut qemu = Command::new(emulator(self.architecture));
-            qemu.arg(&self.path);
-            qemu
-        };
-        for variable in [
-            "RUST_LOG",
-            "NOTIFY_SOCKET",
-            "RUNTIME_DIRECTORY",
-            "ROS_DISTRO",
-        ] {
-            command.env_remove(variable);
-        }
-        command
-            .env_remove("ROS_DOMAIN_ID")
-            .env_remove("AMENT_PREFIX_PATH");
-        command
+        command(self.architecture, &self.path)
     }
 
     pub fn run(&self, arguments: &[&str]) -> Output {
@@ -119,6 +101,29 @@ impl Program {
         let output = command.args(arguments).output();
         output.unwrap_or_else(|error| panic!("{command:?}: {error}"))
     }
+}
+
+/// Returns a command for a binary, which uses qemu on a machine of another architecture.
+pub fn command(architecture: &str, binary: &Path) -> Command {
+    let mut command = if architecture == std::env::consts::ARCH {
+        Command::new(binary)
+    } else {
+        let mut qemu = Command::new(emulator(architecture));
+        qemu.arg(binary);
+        qemu
+    };
+    for variable in [
+        "RUST_LOG",
+        "NOTIFY_SOCKET",
+        "RUNTIME_DIRECTORY",
+        "ROS_DISTRO",
+    ] {
+        command.env_remove(variable);
+    }
+    command
+        .env_remove("ROS_DOMAIN_ID")
+        .env_remove("AMENT_PREFIX_PATH");
+    command
 }
 
 /// Returns the emulator unpacked by `.ci/prerequisites.sh`, else the installed one.

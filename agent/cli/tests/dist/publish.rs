@@ -1,0 +1,66 @@
+//! Files that `make release` creates in `target/publish`, which `ROS2PROBE_DIST` names. Other
+//! projects' programs verify, install and run them: minisign, pip, podman, apt.
+
+mod image;
+mod provenance;
+mod repository;
+mod wheel;
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::repository as sources;
+
+use super::binaries::program;
+use super::package::installation::{all, succeed};
+
+const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// Returns the directory. Fails for one that only `make dist` has written.
+fn published() -> Result<PathBuf> {
+    let directory = program::directory().context("ROS2PROBE_DIST is unset: run `make release`")?;
+    let signature = directory.join("SHA256SUMS.minisig");
+    ensure!(
+        signature.exists(),
+        "no {}: run `make release`",
+        signature.display()
+    );
+    Ok(directory)
+}
+
+/// Returns the release's Debian package of an architecture.
+fn package(architecture: &str) -> Result<PathBuf> {
+    let name = format!("ros2probe_{VERSION}_{architecture}.deb");
+    Ok(published()?.join(name))
+}
+
+/// Returns a command for a script in `packaging/`, with the time of the release.
+fn packaging(script: &str) -> Result<Command> {
+    let date = succeed(
+        Command::new("git")
+            .args(["log", "-1", "--format=%ct"])
+            .current_dir(sources("")),
+    )?;
+    let mut command = Command::new(sources("packaging").join(script));
+    command.env("SOURCE_DATE_EPOCH", date.trim());
+    Ok(command)
+}
+
+/// Returns a program that `.ci/prerequisites.sh` unpacks below `target/tools`.
+fn tool(path: &str) -> PathBuf {
+    sources("target/tools").join(path)
+}
+
+/// Runs a command that must fail, and returns its output.
+fn refuse(command: &mut Command) -> Result<String> {
+    let output = command.output().with_context(|| format!("{command:?}"))?;
+    ensure!(!output.status.success(), "{command:?}: {}", all(&output));
+    Ok(all(&output))
+}
+
+/// Runs a binary of a release for aarch64, under qemu elsewhere.
+fn on_arm(binary: &Path, arguments: &[&str]) -> Result<Output> {
+    let mut command = program::command("aarch64", binary);
+    command.args(arguments).output().context("qemu")
+}

@@ -1,0 +1,350 @@
+//! The OCI image: its content, and podman runs it with the privileges that the documents name.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::harness::{require, wait_until};
+use ros2probe_testing::repository as sources;
+use serde_json::Value;
+
+use super::{VERSION, all, on_arm, package, packaging, published, refuse, succeed, tool};
+
+/// Maximum size of the image of one architecture, as registries transfer it.
+const MAX_BYTES: u64 = 30 * 1024 * 1024;
+const PROGRAM: &str = "usr/bin/rp";
+const USER: u32 = 65532;
+
+fn image() -> Result<PathBuf> {
+    Ok(published()?.join(format!("ros2probe-{VERSION}-image.tar")))
+}
+
+/// Returns the capabilities that the unit grants, without their prefix.
+fn capabilities() -> Result<Vec<String>> {
+    let unit = fs::read_to_string(sources("systemd/ros2probe.service"))?;
+    let set = unit
+        .lines()
+        .find_map(|line| line.strip_prefix("CapabilityBoundingSet="))
+        .context("the unit bounds nothing")?;
+    Ok(set
+        .split(' ')
+        .map(|name| name.trim_start_matches("CAP_").to_owned())
+        .collect())
+}
+
+/// An unpacked image layout.
+struct Layout {
+    directory: tempfile::TempDir,
+}
+
+impl Layout {
+    fn open() -> Result<Self> {
+        let directory = tempfile::tempdir()?;
+        let mut tar = Command::new("tar");
+        tar.arg("-x").arg("-f").arg(image()?);
+        succeed(tar.arg("-C").arg(directory.path()))?;
+        Ok(Self { directory })
+    }
+
+    /// Returns the path of the blob that a descriptor names.
+    fn blob(&self, descriptor: &Value) -> Result<PathBuf> {
+        let digest = descriptor["digest"].as_str().context("no digest")?;
+        let name = digest.strip_prefix("sha256:").context("not SHA-256")?;
+        let path = self.directory.path().join("blobs/sha256").join(name);
+        let sum = succeed(Command::new("sha256sum").arg(&path))?;
+        ensure!(sum.starts_with(name), "{sum} is not {name}");
+        ensure!(
+            Some(fs::metadata(&path)?.len()) == descriptor["size"].as_u64(),
+            "{descriptor}"
+        );
+        Ok(path)
+    }
+
+    fn json(&self, descriptor: &Value) -> Result<Value> {
+        Ok(serde_json::from_slice(&fs::read(self.blob(descriptor)?)?)?)
+    }
+
+    /// Returns the manifest of each architecture.
+    fn manifests(&self) -> Result<BTreeMap<String, Value>> {
+        let index = fs::read(self.directory.path().join("index.json"))?;
+        let index: Value = serde_json::from_slice(&index)?;
+        let images = self.json(&index["manifests"][0])?;
+        let images = images["manifests"].as_array().context("no index")?;
+        let mut found = BTreeMap::new();
+        for descriptor in images {
+            let architecture = descriptor["platform"]["architecture"].as_str();
+            let architecture = architecture.context("no architecture")?.to_owned();
+            found.insert(architecture, self.json(descriptor)?);
+        }
+        Ok(found)
+    }
+}
+
+#[test]
+#[ignore = "looks at a release: make release"]
+fn the_image_has_the_files_of_the_package_for_both_architectures() -> Result<()> {
+    let layout = Layout::open()?;
+    let manifests = layout.manifests()?;
+    let architectures: Vec<&String> = manifests.keys().collect();
+    ensure!(architectures == ["amd64", "arm64"], "{architectures:?}");
+    for (architecture, manifest) in &manifests {
+        let layers = manifest["layers"].as_array().context("no layers")?;
+        let bytes: u64 = layers
+            .iter()
+            .filter_map(|layer| layer["size"].as_u64())
+            .sum();
+        ensure!(bytes < MAX_BYTES, "{architecture}: {bytes} bytes");
+        let config = layout.json(&manifest["config"])?;
+        ensure!(config["architecture"] == **architecture, "{config}");
+        ensure!(
+            config["config"]["User"] == format!("{USER}:{USER}"),
+            "{config}"
+        );
+        ensure!(
+            config["config"]["Entrypoint"][0] == "/usr/bin/rp",
+            "{config}"
+        );
+        let labels = &manifest["annotations"];
+        ensure!(
+            labels["org.opencontainers.image.version"] == VERSION,
+            "{labels}"
+        );
+
+        let root = tempfile::tempdir()?;
+        let mut tar = Command::new("tar");
+        tar.args([
+            "--extract",
+            "--gzip",
+            "--numeric-owner",
+            "--same-owner",
+            "--xattrs",
+        ]);
+        tar.arg("--xattrs-include=*")
+            .arg("--file")
+            .arg(layout.blob(&layers[0])?);
+        succeed(tar.arg("--directory").arg(root.path()))?;
+        contains_the_package(root.path(), architecture)?;
+    }
+    Ok(())
+}
+
+fn contains_the_package(root: &Path, architecture: &str) -> Result<()> {
+    let unpacked = tempfile::tempdir()?;
+    let mut dpkg = Command::new("dpkg-deb");
+    dpkg.arg("--extract").arg(package(architecture)?);
+    succeed(dpkg.arg(unpacked.path()))?;
+    let mut find = Command::new("find");
+    find.arg(root).args(["-type", "f", "-printf", "%P\\n"]);
+    let found = succeed(&mut find)?;
+    let mut found: Vec<&str> = found.lines().collect();
+    found.sort_unstable();
+    let expected = [
+        "etc/ros2probe/ros2probe.yaml",
+        PROGRAM,
+        "usr/share/doc/ros2probe/copyright",
+        "usr/share/doc/ros2probe/libraries.gz",
+    ];
+    ensure!(found == expected, "{found:?}");
+    for path in expected {
+        let same = fs::read(root.join(path))? == fs::read(unpacked.path().join(path))?;
+        ensure!(same, "{architecture}: {path} is not the package's");
+    }
+    for path in ["var/lib/ros2probe", "run/ros2probe"] {
+        let metadata = fs::metadata(root.join(path))?;
+        let found = (metadata.uid(), metadata.gid(), metadata.mode() & 0o777);
+        ensure!(found == (USER, USER, 0o750), "{path}: {found:?}");
+    }
+    let granted = succeed(Command::new("getcap").arg(root.join(PROGRAM)))?;
+    let (_, granted) = granted.trim().rsplit_once(' ').context("no capability")?;
+    let (names, kind) = granted.split_once('=').context("not permitted")?;
+    let mut names: Vec<String> = names
+        .split(',')
+        .map(|name| name.trim_start_matches("cap_").to_uppercase())
+        .collect();
+    let mut expected = capabilities()?;
+    names.sort();
+    expected.sort();
+    ensure!(names == expected && kind == "ep", "{granted}");
+    if architecture == "arm64" {
+        let version = on_arm(&root.join(PROGRAM), &["--version"])?;
+        ensure!(
+            version.stdout == format!("rp {VERSION}\n").as_bytes(),
+            "{version:?}"
+        );
+    }
+    Ok(())
+}
+
+#[test]
+#[ignore = "looks at a release: make release"]
+fn the_same_packages_make_the_same_image() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let again = directory.path().join("image.tar");
+    let commit = succeed(
+        Command::new("git")
+            .args(["rev-parse", "HEAD"])
+            .current_dir(sources("")),
+    )?;
+    let mut script = packaging("image.py")?;
+    script.arg(&again).arg(commit.trim());
+    // The order of the packages does not matter.
+    succeed(script.args([package("arm64")?, package("amd64")?]))?;
+    ensure!(fs::read(again)? == fs::read(image()?)?, "the images differ");
+    Ok(())
+}
+
+#[test]
+#[ignore = "looks at a release: make release"]
+fn skopeo_reads_both_architectures() -> Result<()> {
+    for architecture in ["amd64", "arm64"] {
+        let mut skopeo = Command::new("skopeo");
+        skopeo.args([
+            "inspect",
+            "--override-os",
+            "linux",
+            "--override-arch",
+            architecture,
+        ]);
+        let said = succeed(skopeo.arg(format!("oci-archive:{}", image()?.display())))?;
+        let image: Value = serde_json::from_str(&said)?;
+        ensure!(image["Architecture"] == architecture, "{image}");
+        ensure!(image["Labels"]["org.opencontainers.image.title"] == "ros2probe");
+    }
+    Ok(())
+}
+
+/// podman with a storage of its own. It runs in a mount namespace that has only version 2 of the
+/// control groups, and puts containers into no group: both need rights that this machine may lack.
+struct Podman {
+    storage: tempfile::TempDir,
+    image: String,
+}
+
+/// The privileges of the documents' `docker run`, but with a network and process ids of its own. The
+/// seccomp profile of Debian 12 permits `bpf` with CAP_SYS_ADMIN only.
+const ISOLATED: [&str; 9] = [
+    "--cgroups=disabled",
+    "--network=none",
+    "--read-only",
+    "--cap-drop=ALL",
+    "--security-opt=seccomp=unconfined",
+    "--ulimit=nofile=1024:1024",
+    "--ulimit=nproc=1024:1024",
+    "--volume=/sys/fs/cgroup:/sys/fs/cgroup:ro",
+    "--volume=/dev/shm:/dev/shm:ro",
+];
+
+impl Podman {
+    fn load() -> Result<Self> {
+        require()?;
+        let storage = tempfile::tempdir()?;
+        let mut podman = Self {
+            storage,
+            image: String::new(),
+        };
+        let said = succeed(podman.command("load").arg("--input").arg(image()?))?;
+        let (_, name) = said.trim().rsplit_once(' ').context("not loaded")?;
+        podman.image = name.to_owned();
+        ensure!(name.ends_with(&format!("ros2probe:{VERSION}")), "{said}");
+        Ok(podman)
+    }
+
+    fn command(&self, verb: &str) -> Command {
+        let unpacked = tool("usr/bin/podman");
+        let program = match unpacked.exists() {
+            true => unpacked,
+            false => "podman".into(),
+        };
+        let mut command = Command::new("unshare");
+        let unified = "mount -t cgroup2 cgroup2 /sys/fs/cgroup && exec \"$@\"";
+        command
+            .args(["--mount", "sh", "-c", unified, "sh"])
+            .arg(program);
+        for (option, place) in [
+            ("--root", "root"),
+            ("--runroot", "run"),
+            ("--tmpdir", "tmp"),
+        ] {
+            command.arg(option).arg(self.storage.path().join(place));
+        }
+        command.args(["--cgroup-manager=cgroupfs", "--events-backend=none", verb]);
+        command
+    }
+
+    /// Returns `podman run` with these capabilities and options.
+    fn run(&self, capabilities: &[String], options: &[&str], arguments: &[&str]) -> Command {
+        let mut command = self.command("run");
+        command.args(ISOLATED);
+        for capability in capabilities {
+            command.arg(format!("--cap-add={capability}"));
+        }
+        command.args(options).arg(&self.image).args(arguments);
+        command
+    }
+}
+
+#[test]
+#[ignore = "looks at a release: make release"]
+fn podman_runs_the_image_with_exactly_the_documented_capabilities() -> Result<()> {
+    let podman = Podman::load()?;
+    let granted = capabilities()?;
+    let version = succeed(&mut podman.run(&granted, &["--rm"], &["--version"]))?;
+    ensure!(version == format!("rp {VERSION}\n"), "{version}");
+    for missing in &granted {
+        let rest: Vec<String> = granted
+            .iter()
+            .filter(|one| *one != missing)
+            .cloned()
+            .collect();
+        // The kernel does not start a program whose file requires a capability that it cannot get,
+        // not even for root.
+        for user in ["--user=65532", "--user=0"] {
+            let said = refuse(&mut podman.run(&rest, &["--rm", user], &["--version"]))?;
+            ensure!(
+                said.contains("/usr/bin/rp`: Operation not permitted"),
+                "{missing}: {said}"
+            );
+        }
+    }
+    Ok(())
+}
+
+#[test]
+#[ignore = "looks at a release: make release"]
+fn podman_starts_the_agent_which_answers_and_keeps_its_state() -> Result<()> {
+    let podman = Podman::load()?;
+    let options = [
+        "--detach",
+        "--name=agent",
+        "--volume=state:/var/lib/ros2probe",
+        "--volume=run:/run/ros2probe",
+    ];
+    succeed(&mut podman.run(&capabilities()?, &options, &[]))?;
+    let answer = || -> Result<Output> {
+        let mut exec = podman.command("exec");
+        Ok(exec.args(["agent", "rp", "topic", "list"]).output()?)
+    };
+    let log = || succeed(podman.command("logs").arg("agent"));
+    wait_until("an answer", || Ok(answer()?.status.success())).with_context(|| {
+        format!(
+            "{}{}",
+            answer().map_or_else(|e| e.to_string(), |o| all(&o)),
+            log().unwrap_or_default()
+        )
+    })?;
+    let mut stop = podman.command("stop");
+    succeed(stop.args(["--time", "20", "agent"]))?;
+    let mut inspect = podman.command("inspect");
+    let code = succeed(inspect.args(["--format", "{{.State.ExitCode}}", "agent"]))?;
+    ensure!(code.trim() == "0", "{code}{}", log()?);
+    let mut volume = podman.command("volume");
+    let place = succeed(volume.args(["inspect", "--format", "{{.Mountpoint}}", "state"]))?;
+    ensure!(
+        Path::new(place.trim()).join("discovery.json").exists(),
+        "no state in {place}"
+    );
+    Ok(())
+}

@@ -1,0 +1,153 @@
+//! The Python wheels install `rp` and leave nothing when they are removed.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::repository as sources;
+
+use super::{VERSION, on_arm, package, packaging, published, succeed, tool};
+use crate::package::installation::installable;
+
+/// Returns the name of the wheel for a machine.
+fn name(machine: &str) -> String {
+    let platforms = ["manylinux_2_17", "manylinux2014", "musllinux_1_2"];
+    let platforms = platforms.map(|platform| format!("{platform}_{machine}"));
+    format!("ros2probe-{VERSION}-py3-none-{}.whl", platforms.join("."))
+}
+
+/// Makes the wheel of a package.
+fn made(package: &Path, directory: &Path) -> Result<PathBuf> {
+    let mut script = packaging("wheel.py")?;
+    let path = succeed(script.arg(package).arg(directory))?;
+    Ok(PathBuf::from(path.trim()))
+}
+
+/// Returns a fresh Python environment.
+fn environment(directory: &Path) -> Result<PathBuf> {
+    let place = directory.join("environment");
+    succeed(Command::new("python3").args(["-m", "venv"]).arg(&place))?;
+    Ok(place)
+}
+
+fn pip(environment: &Path) -> Command {
+    let mut pip = Command::new(environment.join("bin/pip"));
+    pip.env("PIP_DISABLE_PIP_VERSION_CHECK", "1");
+    pip
+}
+
+/// Returns `pip install` with the wheels of this directory as its only source.
+fn install(environment: &Path, wheels: &Path) -> Command {
+    let mut pip = pip(environment);
+    pip.args(["install", "--no-index", "--find-links"])
+        .arg(wheels);
+    pip
+}
+
+/// Returns the paths below a directory, except compiled Python code.
+fn paths(directory: &Path) -> Result<Vec<String>> {
+    let mut find = Command::new("find");
+    find.arg(directory).args(["-name", "__pycache__", "-prune"]);
+    let mut paths: Vec<String> = succeed(find.args(["-o", "-print"]))?
+        .lines()
+        .map(str::to_owned)
+        .collect();
+    paths.sort();
+    Ok(paths)
+}
+
+#[test]
+fn a_wheel_of_a_package_installs_rp_and_leaves_nothing() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let package = installable(directory.path())?;
+    let wheel = made(&package, directory.path())?;
+    let again = directory.path().join("again");
+    fs::create_dir(&again)?;
+    ensure!(
+        fs::read(&wheel)? == fs::read(made(&package, &again)?)?,
+        "the wheels differ"
+    );
+    installs_and_leaves_nothing(directory.path())
+}
+
+/// Installs the wheel in this directory as users do.
+fn installs_and_leaves_nothing(wheels: &Path) -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let environment = environment(directory.path())?;
+    let before = paths(&environment)?;
+    succeed(install(&environment, wheels).arg("ros2probe"))?;
+    let version = succeed(Command::new(environment.join("bin/rp")).arg("--version"))?;
+    ensure!(version == format!("rp {VERSION}\n"), "{version}");
+    let files = succeed(pip(&environment).args(["show", "--files", "ros2probe"]))?;
+    ensure!(files.contains("../../../bin/rp"), "{files}");
+    let python = files.lines().filter(|file| file.ends_with(".py")).count();
+    ensure!(python == 0, "{files}");
+    succeed(pip(&environment).args(["uninstall", "--yes", "ros2probe"]))?;
+    ensure!(paths(&environment)? == before, "pip left files behind");
+    Ok(())
+}
+
+#[test]
+#[ignore = "looks at a release: make release"]
+fn pip_installs_the_published_wheel_of_this_machine() -> Result<()> {
+    installs_and_leaves_nothing(&published()?)
+}
+
+#[test]
+#[ignore = "looks at a release: make release"]
+fn published_wheels_are_those_of_the_packages_and_follow_the_specification() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    for (machine, architecture) in [("x86_64", "amd64"), ("aarch64", "arm64")] {
+        let wheel = published()?.join(name(machine));
+        let again = made(&package(architecture)?, directory.path())?;
+        ensure!(fs::read(&wheel)? == fs::read(again)?, "{machine}");
+        let mut twine = Command::new(tool("wheels/bin/twine"));
+        let checked = succeed(twine.args(["check", "--strict"]).arg(&wheel))?;
+        ensure!(checked.contains("PASSED"), "{checked}");
+        // W007 and W008 report that no Python module is in the wheel.
+        let mut check = Command::new(tool("wheels/bin/check-wheel-contents"));
+        succeed(check.args(["--ignore", "W007,W008"]).arg(&wheel))?;
+    }
+    Ok(())
+}
+
+#[test]
+#[ignore = "looks at a release: make release"]
+fn pip_of_an_arm_host_chooses_the_other_wheel() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let environment = environment(directory.path())?;
+    for platform in ["manylinux2014_aarch64", "musllinux_1_2_aarch64"] {
+        let place = directory.path().join(platform);
+        let mut install = install(&environment, &published()?);
+        install.args(["--platform", platform, "--only-binary=:all:", "--target"]);
+        succeed(install.arg(&place).arg("ros2probe"))?;
+        let binary = place.join("bin/rp");
+        let released = published()?.join(format!("rp-{VERSION}-aarch64"));
+        let bytes = fs::read(&binary).context(platform)?;
+        ensure!(bytes == fs::read(released)?, "{platform}");
+        let version = on_arm(&binary, &["--version"])?;
+        ensure!(
+            version.stdout == format!("rp {VERSION}\n").as_bytes(),
+            "{version:?}"
+        );
+    }
+    Ok(())
+}
+
+#[test]
+fn links_of_the_readme_are_absolute_in_a_wheel() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let wheel = made(&installable(directory.path())?, directory.path())?;
+    let path = format!("ros2probe-{VERSION}.dist-info/METADATA");
+    let metadata = succeed(Command::new("unzip").arg("-p").arg(&wheel).arg(path))?;
+    let (_, readme) = metadata.split_once("\n\n").context("no description")?;
+    let links: Vec<&str> = readme.split("](").skip(1).collect();
+    ensure!(links.len() > 10, "{} links", links.len());
+    for link in links {
+        ensure!(link.starts_with("http"), "{link:.60}");
+    }
+    let original = fs::read_to_string(sources("README.md"))?;
+    ensure!(readme.lines().count() == original.lines().count());
+    Ok(())
+}
