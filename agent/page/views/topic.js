@@ -96,8 +96,10 @@ function Clocks({ publishers }) {
     ${each.correction_seconds == null
       ? html`The clock of <${Name} text=${each.peer} /> has an unknown offset: latencies from there
         may be wrong by any time.`
-      : html`Add ${duration(each.correction_seconds)} (± ${duration(each.uncertainty_seconds)}) to
-        latencies from <${Name} text=${each.peer} />, because of its clock.`}</p>`)}`;
+      : html`Latencies from <${Name} text=${each.peer} /> ${each.correction_seconds === 0
+        ? 'need no correction'
+        : `are corrected by ${duration(each.correction_seconds)}`}, and wrong by at most
+        ${' '}${duration(each.uncertainty_seconds)}: its clock.`}</p>`)}`;
 }
 
 /** @param {{topic: import('../state.js').Topic, scope: string,
