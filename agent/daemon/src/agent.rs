@@ -327,13 +327,17 @@ pub fn run(options: Options) -> Result<()> {
         context: agent.context,
         powerless,
     };
-    supervise(
+    let ended = supervise(
         supervisor,
         surfaces,
         (worker, agent.run),
         responder,
         options.report,
-    )?;
+    );
+    if let Some(private) = &options.private {
+        private.clean_up();
+    }
+    ended?;
     if options.report {
         print!("{}", Exposition::new(sources).render(Format::Classic)?);
     }

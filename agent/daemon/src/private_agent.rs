@@ -70,6 +70,16 @@ impl PrivateAgent {
     pub(crate) fn end_with_parent(&self) -> io::Result<()> {
         end_with_parent(self.parent, Signal::TERM)
     }
+
+    /// Removes the directory at the end of an agent whose parent has ended.
+    pub(crate) fn clean_up(&self) {
+        if is_child_of(self.parent) {
+            return;
+        }
+        if let Err(error) = std::fs::remove_dir_all(&self.directory) {
+            tracing::warn!(%error, "the directory of the command remains");
+        }
+    }
 }
 
 /// Makes the kernel send `signal` to this process when its parent ends.
@@ -80,10 +90,16 @@ impl PrivateAgent {
 pub fn end_with_parent(parent: i32, signal: Signal) -> io::Result<()> {
     set_parent_process_death_signal(Some(signal))?;
     // The parent may have ended before the call.
-    match getppid() == Pid::from_raw(parent) {
+    match is_child_of(parent) {
         true => Ok(()),
         false => Err(io::Error::other("the command that started it has ended")),
     }
+}
+
+/// Returns whether `parent` is the parent of this process.
+#[must_use]
+pub fn is_child_of(parent: i32) -> bool {
+    getppid() == Pid::from_raw(parent)
 }
 
 #[cfg(test)]

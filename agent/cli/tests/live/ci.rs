@@ -2,7 +2,8 @@
 //! Needs root.
 
 use std::ffi::OsStr;
-use std::fs::{self, File};
+use std::fs::{self, File, Permissions};
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::time::Duration;
@@ -11,6 +12,7 @@ use anyhow::{Context as _, Result, ensure};
 use quick_xml::Reader;
 use quick_xml::escape::unescape;
 use quick_xml::events::{BytesStart, Event};
+use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, at_the_sockets_of};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{Link, Namespace};
@@ -45,7 +47,20 @@ impl Place {
     fn new(settings: &str) -> Result<Self> {
         let directory = tempfile::tempdir()?;
         fs::write(directory.path().join("watchlist.yaml"), settings)?;
+        // An agent of root may have another user.
+        let temporary = directory.path().join("temporary");
+        fs::create_dir(&temporary)?;
+        for (path, mode) in [(directory.path(), 0o755), (&temporary, 0o777)] {
+            fs::set_permissions(path, Permissions::from_mode(mode))?;
+        }
         Ok(Self(directory))
+    }
+
+    /// Checks that no temporary file is left.
+    fn is_clean(&self) -> Result<()> {
+        let left: Vec<_> = fs::read_dir(self.path("temporary"))?.collect();
+        ensure!(left.is_empty(), "{left:?}");
+        Ok(())
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -68,7 +83,10 @@ impl Place {
     fn start(&self, host: &Namespace, options: &[&str], script: &str) -> Result<Process> {
         let said = File::create(self.path("said"))?;
         let arguments = self.arguments(options, script);
-        Process::start_with(&host.on_network(), RP, arguments, said.into())
+        let mut prefix = host.on_network();
+        let temporary = format!("TMPDIR={}", self.path("temporary").display());
+        prefix.extend(["env".to_owned(), temporary]);
+        Process::start_with(&prefix, RP, arguments, said.into())
     }
 
     /// Waits for the end of `rp ci`, and checks its exit code.
@@ -76,6 +94,7 @@ impl Place {
         let status = process.wait(PATIENCE)?;
         let said = fs::read_to_string(self.path("said"))?;
         ensure!(status.code() == Some(code), "{status}: {said}");
+        self.is_clean()?;
         Cases::read(&self.path("out/junit.xml"))
     }
 }
@@ -315,7 +334,8 @@ fn children_end_with_an_rp_ci_that_is_killed() -> Result<()> {
     wait_until("no process is left", || {
         let left = fs::read_to_string(host.cgroup().join("cgroup.procs"))?;
         Ok(left.trim().is_empty())
-    })
+    })?;
+    place.is_clean()
 }
 
 #[test]
@@ -350,10 +370,7 @@ fn several_runs_do_not_disturb_each_other_nor_an_installed_agent() -> Result<()>
 fn a_missing_capability_is_reported_before_the_command_runs() -> Result<()> {
     let place = Place::new("")?;
     let marker = place.path("ran");
-    fs::set_permissions(
-        place.0.path(),
-        std::os::unix::fs::PermissionsExt::from_mode(0o777),
-    )?;
+    fs::set_permissions(place.0.path(), Permissions::from_mode(0o777))?;
     let Output { status, stderr, .. } = Command::new("setpriv")
         .args(["--reuid=65534", "--regid=65534", "--clear-groups"])
         .args([OsStr::new(RP), OsStr::new("ci"), OsStr::new("-o")])
@@ -445,5 +462,27 @@ fn the_action_runs_rp_ci_with_its_inputs_and_keeps_the_status() -> Result<()> {
         output.status.code() == Some(127) && said.contains("not installed"),
         "{said}"
     );
+    Ok(())
+}
+
+#[test]
+fn an_agent_that_is_killed_fails_the_run_but_not_the_command() -> Result<()> {
+    let host = Namespace::alone()?;
+    let place = Place::new(&at_the_sockets_of(&host))?;
+    let mut process = place.start(&host, &["--settle", "0"], "echo began; sleep 5; exit 0")?;
+    process.wait_for("began", PATIENCE)?;
+    let group = fs::read_to_string(host.cgroup().join("cgroup.procs"))?;
+    let agent = group.lines().find(|id| {
+        let line = fs::read(format!("/proc/{id}/cmdline")).unwrap_or_default();
+        line.windows(9).any(|part| part == b"--private")
+    });
+    harness::run(&format!("kill -KILL {}", agent.context("no agent")?))?;
+    let failed = place.end(&mut process, CONDITION_FAILED)?.failed();
+    ensure!(
+        failed.contains(&"observation agent".to_owned()),
+        "{failed:?}"
+    );
+    let said = fs::read_to_string(place.path("said"))?;
+    ensure!(said.contains("signal 9 ended it"), "{said}");
     Ok(())
 }

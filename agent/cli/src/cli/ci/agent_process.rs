@@ -5,7 +5,7 @@ use std::fs::{self, File};
 use std::io;
 use std::net::SocketAddr;
 use std::os::unix::fs::chown;
-use std::os::unix::process::CommandExt as _;
+use std::os::unix::process::{CommandExt as _, ExitStatusExt as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::Receiver;
@@ -174,8 +174,14 @@ impl AgentProcess {
         !matches!(self.child.try_wait(), Ok(None))
     }
 
-    /// Returns the last line of the log, without the name of the program.
-    pub(super) fn reason(&self) -> Option<String> {
+    /// Returns the signal that ended the agent, or the last line of its log without the name of the
+    /// program.
+    pub(super) fn reason(&mut self) -> Option<String> {
+        if let Ok(Some(status)) = self.child.try_wait()
+            && let Some(signal) = status.signal()
+        {
+            return Some(format!("signal {signal} ended it"));
+        }
         let bytes = ros2probe_daemon::file::read(&self.log, LOG_BYTES).ok()?;
         let text = String::from_utf8_lossy(&bytes).into_owned();
         let line = text.lines().rfind(|line| !line.trim().is_empty())?;

@@ -1,7 +1,7 @@
 //! The output directory. It is checked before the command runs, and files of an earlier run are
 //! replaced.
 
-use std::fs;
+use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -60,7 +60,9 @@ impl Artefacts {
             fs::create_dir(&bag)?;
             for file in fs::read_dir(recording)? {
                 let file = file?;
-                fs::copy(file.path(), bag.join(file.file_name()))?;
+                // The permissions are those of the other files, not those of the agent.
+                let mut copy = File::create_new(bag.join(file.file_name()))?;
+                io::copy(&mut File::open(file.path())?, &mut copy)?;
             }
             Ok(true)
         };

@@ -9,9 +9,9 @@ use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
-use ros2probe_daemon::private_agent::end_with_parent;
+use ros2probe_daemon::private_agent::{end_with_parent, is_child_of};
 use rustix::fs::{Access, access};
-use rustix::process::{Pid, Signal, getpid, getppid, kill_process, kill_process_group};
+use rustix::process::{Pid, Signal, getpid, kill_process, kill_process_group};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::time::timeout;
 
@@ -158,7 +158,7 @@ pub(super) fn run(parent: i32, command: &[OsString]) -> Result<ExitCode> {
                 _ = interrupts.recv() => send(Signal::INT),
                 _ = ends.recv() => {
                     send(Signal::TERM);
-                    if getppid() == Pid::from_raw(parent) {
+                    if is_child_of(parent) {
                         continue;
                     }
                     // Members of the group may outlive the command.
