@@ -31,7 +31,7 @@ fn main() -> ExitCode {
     declare_command();
     let done = |done: Result<()>| done.map(|()| ExitCode::SUCCESS);
     let ended = match Arguments::parse().command {
-        None => cli::help(&[]),
+        None => cli::welcome(),
         Some(Command::Run(options)) => done(agent::run(options.into())),
         Some(Command::CheckConfig { file }) => done(check_config(&file)),
         Some(Command::Ci(options)) => options.run(),

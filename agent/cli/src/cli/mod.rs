@@ -32,6 +32,7 @@ mod shared;
 mod tf;
 mod top;
 mod topic;
+mod welcome;
 mod why;
 
 use std::path::PathBuf;
@@ -46,6 +47,7 @@ pub(crate) use ci::{CannotStart, Ci};
 pub(crate) use discover::Discover;
 pub(crate) use output::{Output, UserError, is_broken_pipe};
 pub(crate) use run::Run;
+pub(crate) use welcome::print as welcome;
 
 /// Watches a ROS 2 robot from copies of its DDS traffic, without joining it.
 #[derive(Debug, Parser)]

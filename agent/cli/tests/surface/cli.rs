@@ -326,3 +326,23 @@ fn within(mut command: Command, most: Duration) -> (Output, Duration) {
     child.kill().unwrap();
     (child.wait_with_output().unwrap(), begin.elapsed())
 }
+
+#[test]
+fn rp_without_a_command_prints_what_to_do_next_and_all_commands() {
+    let output = run(&[]);
+    assert!(output.status.success(), "{output:?}");
+    let text = String::from_utf8(output.stdout).unwrap();
+    let (steps, commands) = text.split_once("\n\n").unwrap();
+    let mut lines = steps.lines();
+    let sentence = lines.next().unwrap();
+    assert!(
+        sentence.contains("agent") && sentence.ends_with('.'),
+        "{text}"
+    );
+    assert!(lines.all(|line| line.starts_with("  ")), "{text}");
+    assert!(steps.lines().count() <= 4, "{text}");
+    assert!(
+        commands.contains("Usage: rp") && commands.contains("  ci "),
+        "{text}"
+    );
+}
