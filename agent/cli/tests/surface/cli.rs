@@ -346,3 +346,20 @@ fn rp_without_a_command_prints_what_to_do_next_and_all_commands() {
         "{text}"
     );
 }
+
+#[test]
+fn doctor_changes_nothing_without_root_and_without_an_answer() {
+    let mut command = Command::new("setpriv");
+    command
+        .args(["--reuid=65534", "--regid=65534", "--clear-groups"])
+        .arg(env!("CARGO_BIN_EXE_rp"))
+        .args(["doctor", "--fix", "--yes"]);
+    let output = command.stdin(Stdio::null()).output().unwrap();
+    fails_with(&output, 1, &["run `sudo rp doctor --fix`"]);
+    let output = run(&["doctor", "--fix"]);
+    fails_with(&output, 1, &["is not a terminal: pass --yes"]);
+    for other in [["--json", "--fix"], ["--yes", "--verbose"]] {
+        let output = run(&["doctor", other[0], other[1]]);
+        assert_eq!(output.status.code(), Some(2), "{output:?}");
+    }
+}
