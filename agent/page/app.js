@@ -93,6 +93,7 @@ function App() {
     }
     first.current = false;
   }, [place]);
+  useEffect(() => reveal(main.current, route?.query.part), [place, route?.query.part]);
   return html`
     <a class="skip" href="#main" onClick=${(/** @type {Event} */ event) => {
       event.preventDefault();
@@ -110,6 +111,52 @@ function App() {
     ${dialog === 'search' && html`<${Search} close=${() => show(null)} />`}
     ${dialog === 'keys' && html`<${Keys} views=${VIEWS} close=${() => show(null)} />`}
     ${dialog === 'token' && html`<${Token} close=${() => show(null)} />`}`;
+}
+
+/** Time in which the part of a view must arrive, and then the parts above it. */
+const [ARRIVES_MS, SETTLES_MS] = [15000, 2500];
+
+/**
+ * Scrolls to a part of a view, and again while parts above it arrive, until the user moves. Returns a
+ * function that ends this.
+ * @param {HTMLElement|null} main
+ * @param {string|undefined} id of an element
+ */
+function reveal(main, id) {
+  if (!main || !id) return undefined;
+  /** @type {Element|null} */
+  let found = null;
+  const show = () => {
+    const own = document.getElementById(id);
+    if (!own || !main.contains(own)) return;
+    const place = own.closest('section[aria-labelledby]') ?? own;
+    const isSection = place.getAttribute('aria-labelledby') === id;
+    const target = isSection ? place : own;
+    if (target !== found) {
+      found?.removeAttribute('data-revealed');
+      target.setAttribute('data-revealed', '');
+      own.setAttribute('tabindex', '-1');
+      own.focus({ preventScroll: true });
+      found = target;
+      clearTimeout(timer);
+      timer = setTimeout(stop, SETTLES_MS);
+    }
+    target.scrollIntoView({ block: isSection ? 'start' : 'center' });
+  };
+  const observer = new MutationObserver(show);
+  const stop = () => {
+    observer.disconnect();
+    clearTimeout(timer);
+    for (const name of ['wheel', 'touchmove', 'keydown', 'pointerdown']) removeEventListener(name, stop);
+  };
+  for (const name of ['wheel', 'touchmove', 'keydown', 'pointerdown']) addEventListener(name, stop);
+  let timer = setTimeout(stop, ARRIVES_MS);
+  observer.observe(main, { childList: true, subtree: true });
+  show();
+  return () => {
+    stop();
+    found?.removeAttribute('data-revealed');
+  };
 }
 
 /** @param {{route: import('./router.js').Route|null}} props */

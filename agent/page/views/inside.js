@@ -25,7 +25,7 @@ export function Inside({ inside, name, domain, picked = null }) {
   const shown = inside ? tables(inside) : [];
   const isShown = shown.length > 0 || inside?.lifecycle_state;
   if (!observes && !isShown) {
-    return html`<p><button type="button" onClick=${() => observe(true)}>Observe calls</button>${' '}
+    return html`<p id="inside"><button type="button" onClick=${() => observe(true)}>Observe calls</button>${' '}
       <span class="dim">Callbacks and queues inside the processes, while this view is open. Each call
       costs its process some microseconds.</span></p>`;
   }

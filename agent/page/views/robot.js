@@ -1,7 +1,7 @@
 // What the robot itself says: logs, diagnostics, transforms, parameters, calls, and clocks.
 
 import { age, clock, count, duration, rate, several } from '../format.js';
-import { address, nodeAddress } from '../router.js';
+import { address, clockId, frameId, nodeAddress } from '../router.js';
 import { replaceAddress, state, useLive, usePoll } from '../store.js';
 import { sorted, Table } from '../table.js';
 import { roots } from '../transforms.js';
@@ -149,22 +149,25 @@ function Transforms() {
       <h2><${Name} text=${tree.namespace || '/'} />${inDomain(tree.domain_id)}</h2>
       ${tree.unread_static_publishers > 0 && html`<p class="dim">Static transforms of ${several(
         tree.unread_static_publishers, 'publisher')} are missing: the agent came later.</p>`}
-      ${roots(tree.edges).map((root) => html`<${Frame} key=${root.name} frame=${root} />`)}</section>`)
+      ${roots(tree.edges).map((root) => html`<${Frame} key=${root.name} frame=${root}
+        tree=${tree} />`)}</section>`)
       : html`<${Nothing} answer=${answer} part="transforms">No message of <code>/tf</code> so far. A
         message that no subscription requests is not sent.</${Nothing}>`}`;
 }
 
-/** A frame, and the frames below it. @param {{frame: import('../transforms.js').Frame}} props */
-function Frame({ frame }) {
+/** A frame, and the frames below it. @param {{frame: import('../transforms.js').Frame, tree: any}} props */
+function Frame({ frame, tree }) {
   const { edge } = frame;
   const nodes = (edge?.broadcasters ?? []).map((/** @type {any} */ each) => each.ros_node ?? each.writer);
-  return html`<ul class="frames"><li><${Name} text=${frame.name} />
+  return html`<ul class="frames"><li id=${frameId(tree.domain_id,
+    tree.namespace, frame.name)}><${Name} text=${frame.name} />
     ${edge && html` <span class="dim">${edge.is_static ? 'static' : `${rate(edge.rate_hz)}, ${duration(
       Math.max(0, state.time - edge.timestamp_seconds))} ago`}${' '}
       <${Name} text=${nodes.join(', ')} />
       <span title="x, y and z in metres"> (${edge.translation.map((/** @type {number} */ each) =>
         each.toFixed(2)).join(', ')})</span></span>`}
-    ${frame.children.map((child) => html`<${Frame} key=${child.name} frame=${child} />`)}</li></ul>`;
+    ${frame.children.map((child) => html`<${Frame} key=${child.name} frame=${child}
+      tree=${tree} />`)}</li></ul>`;
 }
 
 /** @param {Props} props */
@@ -284,7 +287,8 @@ function Clocks() {
     <thead><tr><th scope="col">Host</th><th scope="col">Address</th>
       <th scope="col" class="number">Ahead at least</th><th scope="col" class="number">At most</th>
       <th scope="col" class="number">Steps</th></tr></thead>
-    <tbody>${peers.map((/** @type {any} */ each) => html`<tr key=${each.address}>
+    <tbody>${peers.map((/** @type {any} */ each) => html`<tr key=${each.address}
+      id=${clockId(each.peer)}>
       <th scope="row"><${Name} text=${each.peer} /></th><td>${each.address}</td>
       <td class="number">${duration(each.ahead_at_least_seconds)}</td>
       <td class="number">${each.ahead_at_most_seconds == null ? 'unknown'
