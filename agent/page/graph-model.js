@@ -371,6 +371,18 @@ function namespaces(vertices) {
 }
 
 /**
+ * Returns a function that returns the participant of a node, the first one if it has several, or of
+ * a vertex without a node.
+ * @param {import('./state.js').State} state
+ * @returns {(vertex: Vertex) => import('./state.js').Participant|undefined}
+ */
+export function participantsOf(state) {
+  const byGuid = new Map([...state.participants.values()].map((each) => [each.guid, each]));
+  return (each) => (each.kind === 'participant' ? byGuid.get(nameOf(each.key))
+    : state.participants.get(state.nodes.get(each.node ?? -1)?.participants[0] ?? -1));
+}
+
+/**
  * Returns boxes of hosts, and of processes with at least two nodes.
  * @param {import('./state.js').State} state
  * @param {Map<string, Vertex>} vertices
@@ -381,11 +393,9 @@ function processes(state, vertices) {
   const boxes = new Map();
   /** @type {Map<string, number>} */
   const sizes = new Map();
-  const byGuid = new Map([...state.participants.values()].map((each) => [each.guid, each]));
+  const participants = participantsOf(state);
   const place = (/** @type {Vertex} */ each) => {
-    const node = each.node == null ? null : state.nodes.get(each.node);
-    const participant = node ? state.participants.get(node.participants[0])
-      : byGuid.get(nameOf(each.key));
+    const participant = participants(each);
     if (!participant) return null;
     const host = participant.host ?? 'unknown host';
     const { pid, process } = participant;

@@ -1,8 +1,9 @@
 // The graph: nodes and topics from left to right, with traffic and failures.
 
 import { useEffect, useMemo, useRef, useState } from '../vendor/hooks.mjs';
-import { bandwidth, count, date, rate, several, shortened, visible } from '../format.js';
-import { build, differences, dot, MANY_NODES, MOST_LABEL, nameOf } from '../graph-model.js';
+import { bandwidth, count, date, duration, rate, several, shortened, visible } from '../format.js';
+import { build, differences, dot, MANY_NODES, MOST_LABEL, nameOf, participantsOf }
+  from '../graph-model.js';
 import { address, nodeAddress, topicAddress } from '../router.js';
 import { State } from '../state.js';
 import { replaceAddress, state, useLive, usePoll } from '../store.js';
@@ -87,14 +88,16 @@ const TINTS = /** @type {[string, string][]} */ ([['', 'health'], ['rate', 'rate
 const BEFORE = /** @type {[number, string][]} */ ([[60, 'a minute before'],
   [600, 'ten minutes before'], [3600, 'an hour before'], [86400, 'a day before']]);
 /** Hues of processes and hosts. */
-const HUES = 9;
+const HUES = 12;
+/** Most names in a legend. */
+const MOST_NAMES = 40;
 
-/** Returns a hue for a name. @param {string} name */
-function hueOf(name) {
-  let sum = 0;
-  for (const character of name) sum = (sum * 31 + (character.codePointAt(0) ?? 0)) % 65521;
-  return `hsl(${(sum % HUES) * (360 / HUES)} 65% 50%)`;
-}
+/** Values at both ends of a logarithmic scale of colours, and how they are printed. */
+const SCALES = /** @type {Record<string, {low: number, decades: number, what: string,
+  print: (value: number) => string}>} */ ({
+  rate: { low: 1, decades: 3, what: 'Messages a second of a topic', print: rate },
+  latency: { low: 1e-4, decades: 4, what: 'p99 latency of a topic', print: duration },
+});
 
 /** Returns a colour between green and red on a logarithmic scale. @param {number} part 0 to 1 */
 function heat(part) {
@@ -102,20 +105,81 @@ function heat(part) {
 }
 
 /**
- * Returns the colour of a vertex; null for that of its health.
- * @param {import('../graph-model.js').Vertex} vertex
- * @param {string} tint
+ * Returns a hue for each name. While there are hues left, each name has its own, which depends on the
+ * names before it as little as possible.
+ * @param {string[]} names
  */
-function tintOf(vertex, tint) {
-  if (vertex.topic != null) {
-    const { rate: hertz, p99 } = state.figuresOf(vertex.topic);
-    if (tint === 'rate' && hertz) return heat(Math.log10(Math.max(1, hertz)) / 3);
-    if (tint === 'latency' && p99) return heat(Math.log10(p99 / 1e-4) / 4);
+export function huesOf(names) {
+  const taken = new Set();
+  return new Map([...new Set(names)].sort().map((name) => {
+    let slot = 0;
+    for (const character of name) slot = (slot * 31 + (character.codePointAt(0) ?? 0)) % 65521;
+    slot %= HUES;
+    while (taken.size < HUES && taken.has(slot)) slot = (slot + 1) % HUES;
+    taken.add(slot);
+    return [name, `hsl(${slot * (360 / HUES)} 65% 50%)`];
+  }));
+}
+
+/**
+ * Returns the colours of vertices besides those of their health, and the legend that explains them.
+ * An edge that stands for topics has the colour of its highest value.
+ * @param {import('../graph-model.js').Vertex[]} vertices
+ * @param {string} tint
+ * @returns {{of: (vertex: import('../graph-model.js').Vertex) => string|null,
+ *   ofEdge: (edge: import('../graph-model.js').Edge) => string|null, what: string,
+ *   legend: {colour: string, words: string}[]}}
+ */
+export function tinted(vertices, tint) {
+  const scale = SCALES[tint];
+  if (scale) {
+    const { low, decades, what, print } = scale;
+    const most = (/** @type {number[]} */ topics) => {
+      const values = topics.map((id) => state.figuresOf(id)[tint === 'rate' ? 'rate' : 'p99'] ?? 0);
+      const value = Math.max(0, ...values);
+      return value > 0 ? heat(Math.log10(value / low) / decades) : null;
+    };
+    const legend = Array.from({ length: decades + 1 }, (_, at) => ({ colour: heat(at / decades),
+      words: `${at === decades ? 'at least ' : at ? '' : 'at most '}${print(low * 10 ** at)}` }));
+    return { legend, what: `${what}, without a colour if it is not measured`,
+      of: (vertex) => (vertex.topic == null ? null : most([vertex.topic])),
+      ofEdge: (edge) => (edge.kind === 'pair' ? most(edge.topics) : null) };
   }
-  if (vertex.node == null) return null;
-  const own = state.participants.get(state.nodes.get(vertex.node)?.participants[0] ?? -1);
-  if (tint === 'host') return hueOf(own?.host ?? '');
-  return tint === 'process' ? hueOf(`${own?.host} ${own?.pid}`) : null;
+  const participants = participantsOf(state);
+  const name = (/** @type {import('../graph-model.js').Vertex} */ vertex) => {
+    const own = participants(vertex);
+    if (!own) return null;
+    const host = own.host ?? 'unknown host';
+    if (tint === 'host') return host;
+    return own.pid == null ? `unknown process on ${host}`
+      : `${[own.process, own.pid].filter((part) => part != null).join(' ')} on ${host}`;
+  };
+  /** @type {Map<string, number>} */
+  const nodes = new Map();
+  for (const own of ['process', 'host'].includes(tint) ? vertices.map(name) : []) {
+    if (own != null) nodes.set(own, (nodes.get(own) ?? 0) + 1);
+  }
+  const hues = huesOf([...nodes.keys()]);
+  return {
+    of: (vertex) => hues.get(name(vertex) ?? '') ?? null,
+    ofEdge: () => null,
+    what: tint === 'host' ? 'Hosts of nodes' : 'Processes of nodes',
+    legend: [...hues].map(([own, colour]) => ({ colour,
+      words: `${own}: ${several(nodes.get(own) ?? 0, 'node')}` })),
+  };
+}
+
+/** What the colours of vertices mean. @param {{tint: string, colours: ReturnType<typeof tinted>}} props */
+function Scale({ tint, colours }) {
+  const { what, legend } = colours;
+  if (!tint) {
+    return html`<p class="scale dim">Health: <${Mark} severity="error" /> an error, <${Mark}
+      severity="warning" /> a warning, without a mark no finding.</p>`;
+  }
+  return html`<p class="scale"><span class="dim">${what}:</span>${legend.slice(0, MOST_NAMES).map(
+    ({ colour, words }) => html`<span key=${words}><i style=${`--tint: ${colour}`} /> <${Name}
+      text=${words} /></span>`)}${legend.length > MOST_NAMES && html`<span>${count(
+    legend.length - MOST_NAMES)} more</span>`}</p>`;
 }
 
 /** Seconds after which a moment that is missing is requested again. */
@@ -232,6 +296,8 @@ export function Graph({ query }) {
     || graph.edges.some((/** @type {any} */ each) => each.id === chosen);
   const drawing = useRef(/** @type {SVGSVGElement|null} */ (null));
   const host = state.open?.host ?? 'robot';
+  const tint = TINTS.some(([each]) => each === query.tint) ? query.tint : '';
+  const colours = tinted(graph.vertices, tint);
   const vertexNames = new Map(graph.vertices.map(
     (/** @type {any} */ each) => [each.key, each.name]));
   return html`<h1 tabindex="-1">Graph</h1>
@@ -250,7 +316,7 @@ export function Graph({ query }) {
         <label key=${key}><input type="checkbox" checked=${Boolean(query[key])}
           onChange=${(/** @type {any} */ event) => change({ [key]: event.target.checked })} />
           ${title}</label>`)}
-      <label>Colour <select value=${query.tint ?? ''}
+      <label>Colour <select value=${tint}
         onChange=${(/** @type {any} */ event) => change({ tint: event.target.value })}>
         ${TINTS.map(([tint, title]) => html`<option value=${tint}>${title}</option>`)}</select></label>
       ${state.open?.keeps_history && html`<label>Compare with <select value=${String(against || '')}
@@ -285,11 +351,12 @@ export function Graph({ query }) {
     ${failed && html`<p class="problem">${failed}</p>`}
     ${!graph.vertices.length && html`<p class="empty">${focus
       ? 'The selected node or topic does not exist now.' : 'No node is known.'}</p><${Incomplete} missing="the graph lacks them" />`}
+    ${graph.vertices.length > 0 && html`<${Scale} tint=${tint} colours=${colours} />`}
     ${picture && graph.vertices.length > 0 && html`<div class="graph ${isPicked
       ? 'beside' : ''}">
       <${Drawing} graph=${graph} picture=${picture} chosen=${chosen} choose=${choose}
         toggle=${toggle} own=${drawing} marks=${marks} scene=${scene} raise=${raise} goTo=${camera}
-        tint=${query.tint ?? ''} came=${compared.found?.came ?? []} />
+        colours=${colours} came=${compared.found?.came ?? []} />
       <${Panel} graph=${graph} chosen=${chosen} change=${change} toggle=${toggle}
         choose=${choose} names=${vertexNames} chains=${chains.data?.chains ?? []} /></div>`}
     <${Legend} />`;
@@ -415,12 +482,12 @@ function label(edge) {
  * @param {{graph: import('../graph-model.js').Graph, picture: Picture, chosen: string|null,
  *   choose: (key: string|null) => void, toggle: (key: string) => void, own: any,
  *   marks: {vertices: Map<string, number>, edges: Set<string>}|null, scene: string,
- *   raise: () => boolean, goTo: any, tint: string, came: string[]}} props
+ *   raise: () => boolean, goTo: any, colours: ReturnType<typeof tinted>, came: string[]}} props
  *   `marks` are the vertices and edges of a chain; a new `scene` is shown like the first one;
  *   `raise` folds more, and returns whether it can; `goTo` receives a function that moves to a vertex
  */
-function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, raise, goTo, tint,
-  came }) {
+function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, raise, goTo,
+  colours, came }) {
   const stage = useRef(/** @type {SVGGElement|null} */ (null));
   const camera = useRef(/** @type {Camera|null} */ (null));
   useEffect(() => {
@@ -511,9 +578,10 @@ function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, ra
         const active = chosen != null && (edge.from === chosen || edge.to === chosen
           || edge.id === chosen);
         const { x, y } = middleOf(points);
-        return html`<g key=${edge.id} class="edge ${way(edge.passages, edge.kind)} ${health} ${active
-          ? 'active' : ''} ${measured ? '' : 'unmeasured'} ${isPassed ? 'passed' : ''}"
-          onClick=${() => choose(edge.id)}>
+        const tint = colours.ofEdge(edge);
+        return html`<g key=${edge.id} style=${tint ? `--tint: ${tint}` : undefined} class="edge ${way(edge.passages, edge.kind)} ${health} ${active
+          ? 'active' : ''} ${measured ? '' : 'unmeasured'} ${isPassed ? 'passed' : ''} ${
+          tint ? 'tinted' : ''}" onClick=${() => choose(edge.id)}>
           ${few && html`<path class="touch" d=${curve(points)} />`}
           <path class="line" d=${curve(points)} stroke-width=${Math.max(
             isPassed ? 3 : 0, thickness(bytes)).toFixed(1)}
@@ -530,7 +598,7 @@ function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, ra
       ${shown.filter((each) => each.kind !== 'box' || each.closed).map((each) => html`<${Shape}
         key=${each.key} vertex=${each} at=${picture.at.get(each.key)} nodes=${nodes}
         chosen=${chosen === each.key} roving=${roving === each.key} choose=${choose}
-        toggle=${toggle} camera=${camera} tint=${tint && tintOf(each, tint)}
+        toggle=${toggle} camera=${camera} tint=${colours.of(each)}
         came=${came.includes(each.key)} position=${marks?.vertices.get(each.key)}
         positions=${marks?.vertices.size} />`)}
     </g></svg>
