@@ -6,7 +6,7 @@ import { keepToken, token } from './api.js';
 import { count, date, visible } from './format.js';
 import { address, parse, tokenOf } from './router.js';
 import { Keys, Search, Token } from './dialogs.js';
-import { kept, keep, state, stream, useLive, useRoute } from './store.js';
+import { kept, keep, state, stream, useLive, useRoute, useScripts } from './store.js';
 import { html, Mark } from './ui.js';
 import { PresentOnly, TimeBar } from './timebar.js';
 import { Agent } from './views/agent.js';
@@ -51,6 +51,7 @@ function applyTheme(name) {
 
 function App() {
   useLive();
+  useScripts();
   const route = useRoute();
   const [dialog, show] = useState(/** @type {string|null} */ (null));
   const main = useRef(/** @type {HTMLElement|null} */ (null));
@@ -277,7 +278,7 @@ function News() {
       !before.has(finding.id) && finding.severity !== 'note');
     if (!fresh.length) return;
     const more = fresh.length > 1 ? ` And ${count(fresh.length - 1)} more.` : '';
-    say(`New finding: ${visible(fresh[0].text)}.${more}`);
+    say(`New finding: ${visible(state.withScripts(fresh[0].text))}.${more}`);
   }, [ids, state.batches > 0]);
   return html`<div class="reader-only" role="status" aria-live="polite">${text}</div>`;
 }

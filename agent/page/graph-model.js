@@ -1,7 +1,7 @@
 // Converts the state to the graph view's vertices, edges and boxes.
 // Figures are not used here, so that they change the look but never the layout.
 
-import { shortened, visible } from './format.js';
+import { groupOf, shortened, visible } from './format.js';
 
 /** Number of nodes above which namespace boxes are initially closed. */
 export const MANY_NODES = 60;
@@ -383,7 +383,8 @@ export function participantsOf(state) {
 }
 
 /**
- * Returns boxes of hosts, and of processes with at least two nodes.
+ * Returns boxes of hosts, and in them of containers, systemd units and processes with at least two
+ * nodes.
  * @param {import('./state.js').State} state
  * @param {Map<string, Vertex>} vertices
  * @returns {Map<string, Vertex>}
@@ -391,38 +392,40 @@ export function participantsOf(state) {
 function processes(state, vertices) {
   /** @type {Map<string, Vertex>} */
   const boxes = new Map();
-  /** @type {Map<string, number>} */
-  const sizes = new Map();
   const participants = participantsOf(state);
   const place = (/** @type {Vertex} */ each) => {
     const participant = participants(each);
     if (!participant) return null;
     const host = participant.host ?? 'unknown host';
-    const { pid, process } = participant;
-    const inner = pid == null ? null : `box:${host} ${pid}`;
-    const name = [process, pid].filter((part) => part != null).join(' ');
-    return { host, inner, name };
+    const group = groupOf(participant.cgroup);
+    return { host, group: group && `box:${host} ${group}`, groupName: group,
+      process: participant.pid == null ? '' : `box:${host} ${participant.pid}`,
+      name: state.processName(participant) };
   };
-  const owners = [...vertices.values()].filter((each) =>
-    each.kind === 'node' || each.kind === 'participant');
-  const places = owners.map((each) => ({ each, at: place(each) }));
+  /** @type {Map<string, number>} */
+  const sizes = new Map();
+  /** Groups of each host. @type {Map<string, Set<string>>} */
+  const groups = new Map();
+  const places = [...vertices.values()].filter((each) =>
+    each.kind === 'node' || each.kind === 'participant').map((each) => ({ each, at: place(each) }));
   for (const { at } of places) {
-    if (at?.inner) sizes.set(at.inner, (sizes.get(at.inner) ?? 0) + 1);
+    if (!at) continue;
+    groups.set(at.host, (groups.get(at.host) ?? new Set()).add(at.group));
+    for (const key of [at.group, at.process]) sizes.set(key, (sizes.get(key) ?? 0) + 1);
   }
   for (const { each, at } of places) {
     if (!at) continue;
-    const host = `box:${at.host}`;
-    if (!boxes.has(host)) boxes.set(host, vertex(host, 'box', at.host));
-    each.parent = host;
-    if (!at.inner) continue;
-    if ((sizes.get(at.inner) ?? 0) < 2) {
-      each.detail = at.name;
-      continue;
-    }
-    if (!boxes.has(at.inner)) {
-      boxes.set(at.inner, vertex(at.inner, 'box', at.name, { parent: host }));
-    }
-    each.parent = at.inner;
+    const enter = (/** @type {string} */ key, /** @type {string} */ name) => {
+      if (!boxes.has(key)) boxes.set(key, vertex(key, 'box', name, { parent: each.parent }));
+      each.parent = key;
+    };
+    enter(`box:${at.host}`, at.host);
+    // A container or unit with all nodes of the host would be drawn as the host.
+    const isPart = (groups.get(at.host)?.size ?? 0) > 1;
+    if (at.group && isPart && (sizes.get(at.group) ?? 0) > 1) enter(at.group, at.groupName);
+    if (!at.process) continue;
+    if ((sizes.get(at.process) ?? 0) > 1) enter(at.process, at.name);
+    else each.detail = at.name;
   }
   return boxes;
 }

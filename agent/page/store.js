@@ -33,6 +33,18 @@ export function useLive() {
   return state;
 }
 
+/** Requests the scripts of processes after each change of the graph. */
+export function useScripts() {
+  const known = stream.status === 'live' ? state.structure : null;
+  useEffect(() => {
+    if (known == null) return undefined;
+    const abort = new AbortController();
+    json('processes', { signal: abort.signal }).then(({ processes }) => state.takeProcesses(processes))
+      .catch(() => { /* Processes then have the names of their programs. */ });
+    return () => abort.abort();
+  }, [known]);
+}
+
 /** Returns the route of the address, and keeps its time. */
 function routeNow() {
   const route = parse(location.hash);

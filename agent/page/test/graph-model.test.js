@@ -209,3 +209,20 @@ test('differences name nodes, connections and QoS by names that a restart keeps'
   });
   assert.deepEqual(differences(now, now), { came: [], gone: [], joined: [], left: [], changed: [] });
 });
+
+test('containers and units are boxes, and processes have the name of their script', () => {
+  const state = robot(['/a', '/b', '/c', '/d', '/e'], []);
+  for (const own of state.participants.values()) {
+    own.host = 'base';
+    own.process = 'python3';
+  }
+  const [one, two, three] = [1, 2, 3].map((id) => /** @type {any} */ (state.participants.get(id)));
+  two.cgroup = three.cgroup = `/docker/${'0123456789ab'.padEnd(64, '0')}`;
+  state.takeProcesses([{ process_id: two.pid, process: 'python3', script: 'robot.py' }]);
+  const boxes = () => build(state, { ...ALL, boxes: 'process' }).vertices
+    .filter((each) => each.kind === 'box').map((each) => `${each.parent}: ${each.name}`).sort();
+  assert.deepEqual(boxes(), ['box:base container 0123456789ab: python3 3',
+    'box:base container 0123456789ab: robot.py 2', 'box:base: container 0123456789ab', 'null: base']);
+  one.cgroup = two.cgroup;
+  assert.deepEqual(boxes(), ['box:base: python3 3', 'box:base: robot.py 2', 'null: base']);
+});

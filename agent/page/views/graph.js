@@ -152,7 +152,7 @@ export function tinted(vertices, tint) {
     const host = own.host ?? 'unknown host';
     if (tint === 'host') return host;
     return own.pid == null ? `unknown process on ${host}`
-      : `${[own.process, own.pid].filter((part) => part != null).join(' ')} on ${host}`;
+      : `${state.processName(own)} on ${host}`;
   };
   /** @type {Map<string, number>} */
   const nodes = new Map();
@@ -173,8 +173,8 @@ export function tinted(vertices, tint) {
 function Scale({ tint, colours }) {
   const { what, legend } = colours;
   if (!tint) {
-    return html`<p class="scale dim">Health: <${Mark} severity="error" /> an error, <${Mark}
-      severity="warning" /> a warning, without a mark no finding.</p>`;
+    return html`<p class="scale dim"><span>Health: <${Mark} severity="error" /> an error, <${Mark}
+      severity="warning" /> a warning, without a mark no finding.</span></p>`;
   }
   return html`<p class="scale"><span class="dim">${what}:</span>${legend.slice(0, MOST_NAMES).map(
     ({ colour, words }) => html`<span key=${words}><i style=${`--tint: ${colour}`} /> <${Name}
@@ -805,7 +805,7 @@ function Panel({ graph, chosen, change, toggle, choose, names, chains }) {
       ${state.findings.filter((finding) => (topic && finding.topic === topic.id)
         || (node && finding.node === node.id)).slice(0, 8).map((finding) => html`<p
         key=${finding.id}><${Mark} severity=${finding.severity} /> <${Sentence}
-        text=${finding.text} /></p>`)}
+        text=${state.withScripts(finding.text)} /></p>`)}
       ${through.length > 0 && html`<p>In ${through.length === 1 ? 'the chain' : 'the chains'}${' '}
         <${ChainLinks} chains=${through} filter=${place?.name ?? ''} />${' '}
         <button type="button" class="small" onClick=${() => change({ ...NO_CHAIN,

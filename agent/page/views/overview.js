@@ -101,8 +101,8 @@ function now(finding) {
 /** Returns a finding's text without its leading topic name. @param {any} finding */
 function rest(finding) {
   const name = state.topics.get(finding.topic)?.name;
-  return name && finding.text.startsWith(`${name} `) ? finding.text.slice(name.length + 1)
-    : finding.text;
+  const text = state.withScripts(finding.text);
+  return name && text.startsWith(`${name} `) ? text.slice(name.length + 1) : text;
 }
 
 /**

@@ -253,7 +253,8 @@ function Waterfall({ details }) {
         ? 'bad' : ''}">${(lost ?? 0) > 0 ? html`<${Mark} severity="warning" /> ` : ''}${count(
         lost)}</td>`;
       const who = each.nodes.length ? each.nodes.join(', ')
-        : each.process ? `${each.process} ${each.process_id}` : each.subscriber || each.destination;
+        : each.process ? state.processName({ process: each.process, pid: each.process_id })
+          : each.subscriber || each.destination;
       return html`<tr key=${`${each.writer} ${each.destination} ${each.subscriber}`}>
         <th scope="row"><${Name} text=${owners.get(each.writer) ?? each.writer} /> → <${Name}
           text=${who} /></th>
