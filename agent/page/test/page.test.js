@@ -6,7 +6,8 @@ import { fileURLToPath } from 'node:url';
 import { gzipSync } from 'node:zlib';
 
 const PAGE = join(dirname(fileURLToPath(import.meta.url)), '..');
-const MOST_BYTES = 160_000;
+/** Over a weak radio link of 1 Mbit/s, a page of this size loads in 1.5 s. */
+const MOST_BYTES = 190_000;
 
 /** Files that the agent serves. */
 const served = readdirSync(PAGE, { recursive: true, withFileTypes: true })
@@ -17,7 +18,7 @@ const served = readdirSync(PAGE, { recursive: true, withFileTypes: true })
 const text = (/** @type {string} */ path) => readFileSync(join(PAGE, path), 'utf8');
 const own = served.filter((path) => !path.startsWith('vendor/'));
 
-test('the whole page is at most 160 KB, compressed', (context) => {
+test('the whole page is at most 190 KB, compressed', (context) => {
   let total = 0;
   for (const path of served) total += gzipSync(readFileSync(join(PAGE, path)), { level: 9 }).length;
   context.diagnostic(`${served.length} files, ${total} bytes compressed`);

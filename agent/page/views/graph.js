@@ -2,7 +2,7 @@
 
 import { useEffect, useMemo, useRef, useState } from '../vendor/hooks.mjs';
 import { bandwidth, count, date, duration, rate, several, shortened, visible } from '../format.js';
-import { build, differences, dot, MANY_NODES, MOST_LABEL, nameOf, participantsOf }
+import { build, differences, dot, MANY_NODES, markOf, MOST_LABEL, nameOf, participantsOf }
   from '../graph-model.js';
 import { address, nodeAddress, topicAddress } from '../router.js';
 import { State } from '../state.js';
@@ -49,6 +49,11 @@ function load(edge) {
   }
   return { bytes, hertz, measured, severity };
 }
+
+/** Signs and words of what came, went or changed since a moment before. */
+const CHANGES = /** @type {Record<string, [string, string]>} */ ({
+  came: ['+', 'new'], gone: ['−', 'went'], changed: ['≠', 'changed'],
+});
 
 const ORDER = ['error', 'warning', 'note', 'good'];
 
@@ -219,11 +224,14 @@ function Differences({ found, failed, since }) {
   if (failed) return html`<p class="problem">Nothing to compare with: ${failed}</p>`;
   if (!found) return null;
   const lists = /** @type {[string, string[]][]} */ ([['New nodes', found.came.map(nameOf)],
-    ['Nodes that went', found.gone.map(nameOf)], ['New', found.joined], ['Ended', found.left],
+    ['Nodes that went', found.gone.map(nameOf)], ['New topics', found.cameTopics.map(nameOf)],
+    ['Topics that went', found.goneTopics.map(nameOf)], ['New', found.joined], ['Ended', found.left],
     ['Other QoS', found.changed]]);
   const known = lists.filter(([, list]) => list.length);
   return html`<section aria-label="Differences" class="differences">
-    <p>Since ${date(since)}: ${known.length ? '' : 'the same nodes, topics and QoS.'}</p>
+    <p>Since ${date(since)}: ${known.length
+      ? html`in the graph, <strong>+</strong> is new, <strong>−</strong> went, and <strong>≠</strong> has
+        other QoS or other ends.` : 'the same nodes, topics and QoS.'}</p>
     ${known.map(([title, list]) => html`<details key=${title} open=${list.length <= 5}>
       <summary>${title} (${count(list.length)})</summary><ul class="plain">${list.slice(0, 200).map((text) =>
         html`<li key=${text}><${Name} text=${text} /></li>`)}</ul></details>`)}</section>`;
@@ -268,11 +276,12 @@ export function Graph({ query }) {
   options.fold = level;
   const against = Number(query.against) || 0;
   const compared = useDifferences(state.open?.keeps_history ? against : 0);
-  const graph = useMemo(() => build(state, options, joints), [
-    state.structure, JSON.stringify(query), asked.data, trail, level]);
+  const drawn = compared.found?.both ?? state;
+  const graph = useMemo(() => build(drawn, options, joints), [
+    drawn, state.structure, JSON.stringify(query), asked.data, trail, level]);
   const raise = () => {
     for (let next = level + 1; isAutomatic && next <= MOST_FOLDED; next += 1) {
-      const folded = build(state, { ...options, fold: next }, joints);
+      const folded = build(drawn, { ...options, fold: next }, joints);
       if (folded.signature !== graph.signature) {
         setFolding({ scene, level: next });
         return true;
@@ -356,7 +365,7 @@ export function Graph({ query }) {
       ? 'beside' : ''}">
       <${Drawing} graph=${graph} picture=${picture} chosen=${chosen} choose=${choose}
         toggle=${toggle} own=${drawing} marks=${marks} scene=${scene} raise=${raise} goTo=${camera}
-        colours=${colours} came=${compared.found?.came ?? []} />
+        colours=${colours} changes=${compared.found} />
       <${Panel} graph=${graph} chosen=${chosen} change=${change} toggle=${toggle}
         choose=${choose} names=${vertexNames} chains=${chains.data?.chains ?? []} /></div>`}
     <${Legend} />`;
@@ -482,12 +491,13 @@ function label(edge) {
  * @param {{graph: import('../graph-model.js').Graph, picture: Picture, chosen: string|null,
  *   choose: (key: string|null) => void, toggle: (key: string) => void, own: any,
  *   marks: {vertices: Map<string, number>, edges: Set<string>}|null, scene: string,
- *   raise: () => boolean, goTo: any, colours: ReturnType<typeof tinted>, came: string[]}} props
+ *   raise: () => boolean, goTo: any, colours: ReturnType<typeof tinted>,
+ *   changes: ReturnType<typeof differences>|null}} props
  *   `marks` are the vertices and edges of a chain; a new `scene` is shown like the first one;
  *   `raise` folds more, and returns whether it can; `goTo` receives a function that moves to a vertex
  */
 function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, raise, goTo,
-  colours, came }) {
+  colours, changes }) {
   const stage = useRef(/** @type {SVGGElement|null} */ (null));
   const camera = useRef(/** @type {Camera|null} */ (null));
   useEffect(() => {
@@ -579,27 +589,29 @@ function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, ra
           || edge.id === chosen);
         const { x, y } = middleOf(points);
         const tint = colours.ofEdge(edge);
+        const mark = changes && markOf(edge, changes.guids);
         return html`<g key=${edge.id} style=${tint ? `--tint: ${tint}` : undefined} class="edge ${way(edge.passages, edge.kind)} ${health} ${active
           ? 'active' : ''} ${measured ? '' : 'unmeasured'} ${isPassed ? 'passed' : ''} ${
-          tint ? 'tinted' : ''}" onClick=${() => choose(edge.id)}>
+          tint ? 'tinted' : ''} ${mark ?? ''}" onClick=${() => choose(edge.id)}>
           ${few && html`<path class="touch" d=${curve(points)} />`}
           <path class="line" d=${curve(points)} stroke-width=${Math.max(
             isPassed ? 3 : 0, thickness(bytes)).toFixed(1)}
             marker-end="url(#arrow-${isPassed ? 'passed' : health})" />
           ${(health === 'error' || health === 'warning') && edge.kind !== 'feeds' && html`<text
             class="sign ${health}" x=${x} y=${y + 4}>${health === 'error' ? '✖' : '▲'}</text>`}
+          ${mark && html`<text class="sign ${mark}" x=${x} y=${y - 6}>${CHANGES[mark][0]}</text>`}
           ${edge.kind === 'pair' && (labelled.has(edge.id) || active) && html`<text class="edge-label" x=${x}
             y=${y - 5}>${edge.topics.length === 1
               ? shortened(state.topics.get(edge.topics[0])?.name, 24)
               : several(edge.topics.length, 'topic')}${measured
               ? ` ${rate(load(edge).hertz)}` : ''}</text>`}
-          <title>${label(edge)}</title></g>`;
+          <title>${mark ? `${CHANGES[mark][1]}: ` : ''}${label(edge)}</title></g>`;
       })}
       ${shown.filter((each) => each.kind !== 'box' || each.closed).map((each) => html`<${Shape}
         key=${each.key} vertex=${each} at=${picture.at.get(each.key)} nodes=${nodes}
         chosen=${chosen === each.key} roving=${roving === each.key} choose=${choose}
         toggle=${toggle} camera=${camera} tint=${colours.of(each)}
-        came=${came.includes(each.key)} position=${marks?.vertices.get(each.key)}
+        mark=${changes && markOfVertex(each, changes.vertices)} position=${marks?.vertices.get(each.key)}
         positions=${marks?.vertices.size} />`)}
     </g></svg>
     <div class="zoom"><button type="button" aria-label="Zoom in"
@@ -711,19 +723,19 @@ const SIGNS = /** @type {Record<string, string>} */ ({ error: '✖', warning: '�
 
 /** @param {any} props */
 function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera, position,
-  positions, tint, came }) {
+  positions, tint, mark }) {
   const figures = vertex.topic == null ? null : state.figuresOf(vertex.topic);
   const flags = vertex.topic == null ? [] : state.flagsOf(vertex.topic);
   let severity = vertex.topic != null ? worst(flags) : nodes.get(vertex.node) ?? 'good';
   if (vertex.closed) {
     for (const key of vertex.members) severity = worse(severity, healthOf(key, nodes));
   }
-  const detail = vertex.closed ? several(vertex.count, 'node')
+  const detail = mark === 'gone' && figures ? CHANGES.gone[1] : vertex.closed ? several(vertex.count, 'node')
     : figures ? (figures.rate == null ? 'not measured'
       : `${rate(figures.rate)} · ${bandwidth(figures.bandwidth)}`)
       : shortened(vertex.detail, MOST_LABEL);
   const label = shortened(vertex.name, MOST_LABEL);
-  const closing = vertex.closed ? '▸ ' : '';
+  const closing = (vertex.closed ? '▸ ' : '') + (mark ? `${CHANGES[mark][0]} ` : '');
   const [left, top] = [at.x - at.w / 2, at.y - at.h / 2];
   const sign = SIGNS[severity];
   const press = () => {
@@ -732,9 +744,9 @@ function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera, posi
     else choose(vertex.key);
   };
   const words = (sign ? `, with ${severity === 'error' ? 'an error' : 'a warning'}` : '')
-    + (position ? `, ${position} of ${positions} in the chain` : '');
+    + (mark ? `, ${CHANGES[mark][1]}` : '') + (position ? `, ${position} of ${positions} in the chain` : '');
   return html`<g class="vertex ${vertex.kind} ${severity} ${chosen ? 'chosen' : ''} ${position
-    ? 'passed' : ''} ${tint ? 'tinted' : ''} ${came ? 'came' : ''}" role="button"
+    ? 'passed' : ''} ${tint ? 'tinted' : ''} ${mark ?? ''}" role="button"
     style=${tint ? `--tint: ${tint}` : undefined}
     tabindex=${roving ? 0 : -1} data-key=${vertex.key} onClick=${press}
     aria-expanded=${vertex.closed ? 'false' : undefined}
@@ -755,6 +767,16 @@ function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera, posi
       && html`<tspan class="detail" x=${left + 12} y=${top + 32}>${detail}</tspan>`}</text>
     ${sign && html`<text class="sign ${severity}" aria-hidden="true" x=${left + at.w - 9} y=${top + 14}>${sign}</text>`}
     ${label !== visible(vertex.name) && html`<title>${visible(vertex.name)}</title>`}</g>`;
+}
+
+/**
+ * Returns the mark of a vertex. A closed box has changed if a part of it has.
+ * @param {import('../graph-model.js').Vertex} vertex
+ * @param {Map<string, import('../graph-model.js').Mark>} marks
+ */
+function markOfVertex(vertex, marks) {
+  return marks.get(vertex.key) ?? (vertex.closed && vertex.members.some((key) => marks.has(key))
+    ? 'changed' : null);
 }
 
 /** @param {string} key @param {Map<number, string>} nodes */
@@ -783,6 +805,7 @@ function Panel({ graph, chosen, change, toggle, choose, names, chains }) {
     <ul>${edges.slice(0, 40).map((each) => html`<li key=${each.id}>${link(each[side])}
       <span class="dim">${wayWords(each)}${each.topics.length > 1
         ? `, ${several(each.topics.length, 'topic')}` : ''}</span></li>`)}</ul>`;
+  const went = vertex && (vertex.node ?? vertex.topic ?? 0) < 0;
   const topic = vertex?.topic != null ? state.topics.get(vertex.topic) : null;
   const node = vertex?.node != null ? state.nodes.get(vertex.node) : null;
   const figures = topic && state.figuresOf(topic.id);
@@ -793,6 +816,7 @@ function Panel({ graph, chosen, change, toggle, choose, names, chains }) {
   return html`<aside class="panel" id="graph-panel" tabindex="-1" aria-label="Details">
     <h2>${title} <button type="button" class="small" aria-label="Close the details"
       onClick=${() => choose(null)}>×</button></h2>
+    ${went && html`<p>It went since the moment that is compared.</p>`}
     ${vertex && html`<p>${topic && html`<a href=${topicAddress(topic)}>Open the topic</a> `}
       ${node && html`<a href=${nodeAddress(node)}>Open the node</a> `}
       ${vertex.kind !== 'box' && html`<button type="button"

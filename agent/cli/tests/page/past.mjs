@@ -70,5 +70,9 @@ await scenario(async (open) => {
   const differences = page.getByRole('region', { name: 'Differences' });
   await reads(differences, /New nodes[^]*\/other/);
   await reads(differences, /Nodes that went[^]*\/lidar/);
-  await there(page.locator('.vertex.came'));
+  for (const what of ['.vertex.node.came', '.vertex.node.gone', '.vertex.topic.came', '.edge.came', '.edge.gone']) {
+    await there(page.locator(what));
+  }
+  await there(page.getByRole('button', { name: /^− \/lidar .*, went/ }));
+  await tab.inked();
 });
