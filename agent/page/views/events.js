@@ -73,11 +73,9 @@ function ownersNow() {
   return owners;
 }
 
-/** @param {{query: Record<string, string>}} props */
-export function Events({ query }) {
-  useLive();
+/** Requests the events that the agent keeps, once a run, and returns why they are missing. */
+export function useEarlier() {
   const [failed, fail] = useState('');
-  const [held, hold] = useState(/** @type {import('../state.js').Event[]|null} */ (null));
   const run = state.open?.run;
   useEffect(() => {
     const abort = new AbortController();
@@ -90,6 +88,14 @@ export function Events({ query }) {
       .catch((error) => { if (!abort.signal.aborted) fail(error.message); });
     return () => abort.abort();
   }, [run]);
+  return failed;
+}
+
+/** @param {{query: Record<string, string>}} props */
+export function Events({ query }) {
+  useLive();
+  const failed = useEarlier();
+  const [held, hold] = useState(/** @type {import('../state.js').Event[]|null} */ (null));
   const { filter = '', severity = '' } = query;
   const change = (/** @type {Record<string, any>} */ more) => replaceAddress(
     address('events', null, { ...query, ...more }));
