@@ -119,6 +119,16 @@ export function useEvents(shown) {
   });
 }
 
+/**
+ * Returns the events that matter for a topic: its own ones, and warnings and errors of no topic.
+ * @param {import('./state.js').Event[]} events
+ * @param {string} topic
+ */
+export function eventsOf(events, topic) {
+  return events.filter(({ attributes, severity }) => attributes.topic === topic
+    || (attributes.topic == null && severity !== 'INFO'));
+}
+
 /** Returns the marks of events in a chart. @param {import('./state.js').Event[]} events */
 export function marksOf(events) {
   return events.map(({ time, severity }) => ({ time: Date.parse(time) / 1000, severity }));

@@ -104,7 +104,8 @@ test('text has a contrast of 4.5, lines of 3, in both themes', () => {
         assert.ok(found >= 4.5, `${ink} on ${paper}: ${found.toFixed(2)}`);
       }
     }
-    for (const line of ['--line-1', '--line-2', '--line-3', '--line-4', '--edge', '--focus']) {
+    for (const line of ['--line-1', '--line-2', '--line-3', '--line-4', '--line-5',
+      '--line-6', '--edge', '--focus']) {
       assert.ok(contrast(theme[line], theme['--paper']) >= 3, line);
     }
     assert.ok(contrast(theme['--accent-ink'], theme['--accent']) >= 4.5);

@@ -9,7 +9,7 @@ import { topicKey } from '../graph-model.js';
 import { LiveMessage } from '../message.js';
 import { Endpoints, Offered } from '../qos.js';
 import { state, stream, useLive, usePoll } from '../store.js';
-import { inWords, marksOf, useEvents, useHistory, useTime, zoom } from '../timebar.js';
+import { eventsOf, inWords, marksOf, useEvents, useHistory, useTime, zoom } from '../timebar.js';
 import { Badges, Failed, Figure, html, Mark, Name, PASSAGES, Text } from '../ui.js';
 import { InChains } from './chains.js';
 import { Inside } from './inside.js';
@@ -32,6 +32,7 @@ export function Topic({ name, query }) {
   const topic = state.topicNamed(name, domain);
   const scope = topic ? `?domain_id=${topic.domain}` : domain == null ? '' : `?domain_id=${domain}`;
   const [picked, pick] = useState(/** @type {{time: number, topic?: number}|null} */ (null));
+  const known = useEvents(useTime());
   const details = usePoll(topic ? named('topics', apiName(topic), scope) : null, 2000);
   if (!topic) {
     return html`<h1 tabindex="-1"><${Name} text=${name} /></h1>
@@ -39,6 +40,7 @@ export function Topic({ name, query }) {
         : 'at that time'}.${' '}
       <a href=${address('topics')}>All topics</a></p>`;
   }
+  const events = eventsOf(known, topic.name);
   const figures = state.figuresOf(topic.id);
   const findings = state.findings.filter((finding) => finding.topic === topic.id);
   const reasons = details.data?.reasons ?? [];
@@ -58,6 +60,8 @@ export function Topic({ name, query }) {
       </ul>`}
     ${details.data?.source === 'inside' && html`<p class="dim">Rate and messages come from inside
       the processes; the network shows none, and sizes are unknown.</p>`}
+    ${stream.at == null && html`<${LiveMessage} key=${`message ${topic.id}`} topic=${topic} scope=${scope}
+      name=${apiName(topic)} events=${events} />`}
     <div class="figures">
       <${Figure} label="rate" value=${rate(figures.rate)} />
       <${Figure} label="bandwidth" value=${bandwidth(figures.bandwidth)} />
@@ -68,8 +72,7 @@ export function Topic({ name, query }) {
       <${Figure} label="last message" value=${clock(figures.last)} />
     </div>
     <${Clocks} publishers=${details.data?.publishers ?? []} />
-    ${stream.at == null && html`<${LiveMessage} key=${`message ${topic.id}`} topic=${topic} scope=${scope} name=${apiName(topic)} />`}
-    <${Charts} key=${topic.id} topic=${topic} scope=${scope} pick=${(/** @type {{time: number}} */
+    <${Charts} key=${topic.id} topic=${topic} scope=${scope} events=${events} pick=${(/** @type {{time: number}} */
       { time }) => pick({ time, topic: topic.id })} />
     <${Failed} problem=${details.problem} what="No details" />
     ${details.data && html`
@@ -100,17 +103,15 @@ function Clocks({ publishers }) {
         latencies from <${Name} text=${each.peer} />, because of its clock.`}</p>`)}`;
 }
 
-/** @param {{topic: import('../state.js').Topic, scope: string,
+/** @param {{topic: import('../state.js').Topic, scope: string, events: import('../state.js').Event[],
  *   pick: (picked: {time: number}) => void}} props */
-function Charts({ topic, scope, pick }) {
+function Charts({ topic, scope, events, pick }) {
   const shown = useTime();
   const path = named('topics', apiName(topic), `/history${scope}`);
   const isLive = shown.at == null && shown.span === LIVE_SPAN;
   const latest = useLatest(isLive ? path : null, topic);
   const past = useHistory(isLive ? null : path, shown);
   const columns = isLive ? latest : COLUMNS.map((column) => past.data?.[column] ?? []);
-  const events = useEvents(shown).filter((event) => event.attributes.topic === topic.name
-    || (event.attributes.topic == null && event.severity !== 'INFO'));
   const marks = marksOf(events);
   const [times, rates, sizes, lost, half, most, gapHalf, gapMost] = columns;
   const title = inWords(shown);

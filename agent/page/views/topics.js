@@ -21,7 +21,7 @@ const ONLY = /** @type {Record<string, [string, (topic: any) => boolean]>} */ ({
 /** Switches measuring on or off. @param {import('../state.js').Topic} topic */
 export function watch(topic) {
   const path = `${named('watch', watchName(topic))}?domain_id=${topic.domain}`;
-  return topic.measured ? remove(path) : post(path);
+  return topic.measured && topic.watched !== 0 ? remove(path) : post(path);
 }
 
 // A topic without a ROS name is watched by its DDS name.
@@ -41,7 +41,8 @@ function fixed(topic) {
 /** @param {{topic: import('../state.js').Topic}} props */
 export function Measure({ topic }) {
   const why = fixed(topic);
-  const on = topic.measured;
+  // Without a watch, a topic is measured while its messages are shown or recorded.
+  const on = topic.measured && topic.watched !== 0;
   if (why) return html`<span title=${why} class="dim">on (${topic.watched & 4 ? 'pattern'
     : (topic.watched & 3) === 1 ? 'configuration' : 'command line'})</span>`;
   return html`<${Act} action=${() => watch(topic)} pressed=${on} kind="switch"

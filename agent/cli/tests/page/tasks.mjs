@@ -33,7 +33,6 @@ const TASKS = {
     await tab.page.keyboard.type('/imu');
     await tab.page.keyboard.press('Enter');
     const section = tab.page.locator('section[aria-labelledby="live"]');
-    await click(section.getByRole('button', { name: 'Show messages' }));
     await click(section.getByRole('button', { name: 'Plot linear_acceleration.z' }));
     await there(section.getByRole('img', { name: /^linear_acceleration.z/ }));
   },
