@@ -1,4 +1,5 @@
 import assert from 'node:assert/strict';
+import { readFileSync } from 'node:fs';
 import { test } from 'node:test';
 import * as format from '../format.js';
 
@@ -103,4 +104,15 @@ test('a control group is named by its container or its unit', () => {
   }
   assert.equal(format.groupOf('/system.slice/robot.service/nodes'), 'robot.service');
   for (const path of ['/', '/user.slice/session-3.scope', `/${id}0`, null]) assert.equal(format.groupOf(path), '');
+});
+
+test('every event of the documentation has words', () => {
+  const rows = readFileSync(new URL('../../../docs/events.md', import.meta.url), 'utf8')
+    .matchAll(/^\| `(ros2[a-z._]+)` \|/gm);
+  const names = [...rows].map(([, name]) => name);
+  assert.ok(names.length > 20);
+  assert.deepEqual(names.filter((name) => !format.EVENTS[name]), []);
+  assert.equal(format.eventWords({ name: 'ros2.graph.diagnosed', attributes: { diagnosis: 'slow_callback' } }),
+    'finding: slow callback');
+  assert.equal(format.eventWords({ name: 'ros2.new.thing_done', attributes: {} }), 'new thing done');
 });

@@ -3,7 +3,7 @@
 import { useEffect, useRef, useState } from '../vendor/hooks.mjs';
 import { json, named } from '../api.js';
 import { Chart } from '../chart.js';
-import { bandwidth, clock, count, date, duration, percent, rate, several } from '../format.js';
+import { bandwidth, clock, count, date, duration, eventWords, percent, rate, several } from '../format.js';
 import { address } from '../router.js';
 import { topicKey } from '../graph-model.js';
 import { LiveMessage } from '../message.js';
@@ -150,7 +150,7 @@ function Marked({ events }) {
   if (!events.length) return null;
   return html`<details><summary>${several(events.length, 'event')} in this time</summary>
     <ul class="plain">${events.slice(-MOST_MARKED).map((event) => html`<li key=${event.id}>
-      ${date(Date.parse(event.time) / 1000)} ${event.name}</li>`)}</ul></details>`;
+      ${date(Date.parse(event.time) / 1000)} ${eventWords(event)}</li>`)}</ul></details>`;
 }
 
 /**

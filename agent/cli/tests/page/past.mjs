@@ -48,7 +48,7 @@ await scenario(async (open) => {
 
   // Events and processes of that time.
   await page.getByRole('link', { name: 'Events', exact: true }).first().click();
-  await reads(page.locator('main'), 'ros2.node.discovered');
+  await reads(page.locator('main'), 'node appeared');
   await page.getByRole('navigation').getByRole('link', { name: 'Nodes' }).click();
   await page.getByRole('link', { name: '/lidar', exact: true }).first().click();
   await there(page.locator('.chart').filter({ has: page.getByRole('heading', { name: 'CPU' }) }));

@@ -221,11 +221,11 @@ async function nodes(tab) {
 async function events(tab) {
   await tab.page.getByRole('link', { name: 'Events', exact: true }).click();
   await tab.heading('Events');
-  await tab.shows('ros2.node.');
+  await tab.shows('node appeared');
   const rows = () => tab.page.locator('main tbody tr').count();
   // Endpoints come by the dozen with each node and are hidden at first.
   const notable = await rows();
-  assert.equal(await tab.page.getByText('ros2.endpoint.discovered').count(), 0);
+  assert.equal(await tab.page.getByText('endpoint appeared').count(), 0);
   await tab.page.getByRole('combobox', { name: /^Show/ }).last().selectOption('ALL');
   const all = await until('all events', async () => (await rows()) > notable && rows());
   await tab.page.getByLabel('Filter').fill('/lidar');

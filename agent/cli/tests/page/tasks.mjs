@@ -56,7 +56,7 @@ const TASKS = {
     await field.fill(value);
     await reads(tab.page.locator('.notice'), 'The robot as it was');
     await click(tab.page.getByRole('navigation').getByRole('link', { name: 'Events' }));
-    await reads(tab.page.locator('main'), 'ros2.node.discovered');
+    await reads(tab.page.locator('main'), 'node appeared');
   },
   async 'share this view'(tab, click) {
     await click(tab.page.getByRole('navigation').getByRole('link', { name: 'Topics' }));
