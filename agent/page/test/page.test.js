@@ -111,3 +111,11 @@ test('text has a contrast of 4.5, lines of 3, in both themes', () => {
     assert.ok(contrast(theme['--accent-ink'], theme['--accent']) >= 4.5);
   }
 });
+
+test('nothing is explained only by a tooltip, which keys and touch do not open', () => {
+  // A shortened name has its whole text in other places: in its view, or below it.
+  const known = { 'ui.js': 1, 'views/events.js': 1 };
+  const found = Object.fromEntries(own.filter((path) => path.endsWith('.js')).map((path) =>
+    [path, [...text(path).matchAll(/<[a-z][^<>]*?\stitle=/g)].length]).filter(([, number]) => number));
+  assert.deepEqual(found, known);
+});

@@ -8,7 +8,7 @@ import { replaceAddress, state, useLive, usePoll } from '../store.js';
 import { sorted, Table } from '../table.js';
 import { inWords, useEvents, useTime } from '../timebar.js';
 import { roots } from '../transforms.js';
-import { Failed, Filter, html, Mark, matches, Name } from '../ui.js';
+import { Failed, Filter, html, Long, Mark, matches, Name } from '../ui.js';
 import { useEarlier } from './events.js';
 import { Findings } from './overview.js';
 
@@ -171,7 +171,8 @@ function Logs({ query, change }) {
         <td class="number">${clock(each.timestamp_seconds)}</td>
         <td class="level"><${Mark} severity=${SEVERITY[each.level]} /> ${each.level}</td>
         <th scope="row"><${Node} name=${each.ros_node} domain=${each.domain_id} /></th>
-        <td title=${`${each.file}:${each.line} ${each.function}`}><${Name} text=${each.text} /></td>
+        <td>${each.file ? html`<details><summary><${Name} text=${each.text} /></summary><span class="dim"><${Name}
+          text=${`${each.file}:${each.line} ${each.function}`} /></span></details>` : html`<${Name} text=${each.text} />`}</td>
         </tr>`)}</tbody></table></div>
       ${rows.length >= MOST_SHOWN && html`<p class="dim">The latest ${count(MOST_SHOWN)}${filter
         ? ` of ${count(rows.length)}` : `; a filter searches the latest ${count(MOST_KEPT)}`}.</p>`}`
@@ -298,7 +299,7 @@ function Diagnostics({ query, change }) {
   };
   const since = (/** @type {Part} */ row) => row.status && row.status.since_seconds;
   const columns = [
-    { key: 'level', title: 'Level', by: (/** @type {any} */ row) => LEVELS.indexOf(row.level),
+    { key: 'level', title: 'Level', meaning: 'A part has the worst level of those below it. Stale: its messages ceased, or a monitor reports that.', by: (/** @type {any} */ row) => LEVELS.indexOf(row.level),
       cell: (/** @type {any} */ row) => html`<${Mark} severity=${SEVERITY[row.level]} /> ${row.level}` },
     { key: 'name', title: 'Part', header: true, by: (/** @type {any} */ row) => row.name,
       cell: (/** @type {any} */ row) => html`<span class="depth-${Math.min(8, row.depth)}">${
@@ -312,7 +313,7 @@ function Diagnostics({ query, change }) {
     { key: 'node', title: 'Node', kind: 'wide', by: (/** @type {any} */ row) => row.status?.ros_node,
       cell: (/** @type {any} */ row) => row.status && html`<${Node} name=${row.status.ros_node}
         domain=${row.status.domain_id} />` },
-    { key: 'since', title: 'For', kind: 'number', by: (/** @type {any} */ row) => (row.status ? -since(row) : null),
+    { key: 'since', title: 'For', meaning: 'How long the part has this level.', kind: 'number', by: (/** @type {any} */ row) => (row.status ? -since(row) : null),
       cell: (/** @type {any} */ row) => row.status && age(state.time - since(row)) },
     { key: 'last', title: 'Last', kind: 'number wide', by: (/** @type {any} */ row) =>
       (row.status ? -row.status.timestamp_seconds : null),
@@ -331,8 +332,7 @@ function Diagnostics({ query, change }) {
     ${all.length ? html`<${Table} label="Diagnostics" columns=${columns} rows=${rows} sort=${sort}
         keyOf=${(/** @type {any} */ row) => row.status && !isTree ? row.path : `${row.path} ${row.status?.hardware_id ?? ''}`}
         onSort=${(/** @type {string} */ key) => change({ sort: key })} />
-        <p class="dim">A part has the worst level of those below it. <strong>stale</strong>: its messages
-        ceased, or a monitor reports that.</p>`
+`
       : html`<${Nothing} answer=${answer} part="diagnostics">No message of <code>/diagnostics</code> so
         far. A message that no subscription requests is not sent.</${Nothing}>`}`;
 }
@@ -429,7 +429,7 @@ function Parameters({ query, change }) {
         domain=${row.domain_id} />${inDomain(row.domain_id)}` },
     { key: 'name', title: 'Parameter', by: (/** @type {any} */ row) => row.name,
       cell: (/** @type {any} */ row) => html`<${Name} text=${row.name} />` },
-    { key: 'value', title: 'Last known value', cell: (/** @type {any} */ row) => html`<${Name}
+    { key: 'value', title: 'Last known value', cell: (/** @type {any} */ row) => html`<${Long}
       text=${row.value} most=${120} />` },
     { key: 'time', title: 'Seen', kind: 'number wide', by: (/** @type {any} */ row) =>
       row.timestamp_seconds, cell: (/** @type {any} */ row) => clock(row.timestamp_seconds) },
@@ -444,8 +444,8 @@ function Parameters({ query, change }) {
         <tr key=${`${each.timestamp_seconds} ${at}`}><td class="number">${clock(each.timestamp_seconds)}</td>
         <th scope="row"><${Node} name=${each.ros_node} domain=${each.domain_id} /> <${Name}
           text=${each.name} /></th>
-        <td>${each.before == null ? '–' : html`<${Name} text=${each.before} most=${60} />`}</td>
-        <td>${each.value == null ? 'removed' : html`<${Name} text=${each.value} most=${60} />`}</td>
+        <td>${each.before == null ? '–' : html`<${Long} text=${each.before} most=${60} />`}</td>
+        <td>${each.value == null ? 'removed' : html`<${Long} text=${each.value} most=${60} />`}</td>
         <td><${Node} name=${each.requested_by} domain=${each.domain_id} /></td></tr>`)}</tbody>
       </table></div></section>`}
     ${all.length ? html`<section aria-labelledby="values"><h2 id="values">Values</h2>
@@ -494,12 +494,12 @@ function Services({ query, change }) {
   const actions = usePoll('actions', EVERY_MS);
   const rows = (services.data?.services ?? []).filter((/** @type {any} */ row) =>
     (!row.hidden || filter) && matches(filter, `${row.name} ${row.types.join(' ')}`));
-  const number = (/** @type {string} */ key, /** @type {string} */ title, kind = 'number') => ({
-    key, title, kind, by: (/** @type {any} */ row) => row.calls?.[key],
+  const number = (/** @type {string} */ key, /** @type {string} */ title, /** @type {string} */ meaning,
+    kind = 'number') => ({ key, title, meaning, kind, by: (/** @type {any} */ row) => row.calls?.[key],
     cell: (/** @type {any} */ row) => count(row.calls?.[key] ?? null),
   });
-  const time = (/** @type {string} */ key, /** @type {string} */ title) => ({
-    key, title, kind: 'number wide', by: (/** @type {any} */ row) => row.calls?.[key],
+  const time = (/** @type {string} */ key, /** @type {string} */ title, /** @type {string} */ meaning) => ({
+    key, title, meaning, kind: 'number wide', by: (/** @type {any} */ row) => row.calls?.[key],
     cell: (/** @type {any} */ row) => duration(row.calls?.[key]),
   });
   const { current } = useRef(new Rates());
@@ -513,14 +513,16 @@ function Services({ query, change }) {
       cell: (/** @type {any} */ row) => html`<${Name} text=${row.name} />${inDomain(row.domain_id)}` },
     { key: 'servers', title: 'Server', kind: 'wide', cell: (/** @type {any} */ row) => html`<${Name}
       text=${nodesOf(row.servers) || 'none'} />` },
-    { key: 'clients', title: 'Clients', kind: 'wide', cell: (/** @type {any} */ row) => html`<${Name}
+    { key: 'clients', title: 'Clients', kind: 'wide', cell: (/** @type {any} */ row) => html`<${Long}
       text=${nodesOf(row.clients)} most=${60} />` },
-    number('requests', 'Requests'),
-    { key: 'rate', title: 'Rate', kind: 'number', by: rateOf, cell: (/** @type {any} */ row) => rate(rateOf(row)) },
-    number('answered', 'Answered', 'number wide'),
-    { ...number('hanging', 'Hanging'), cell: (/** @type {any} */ row) => ((row.calls?.hanging ?? 0) > 0
+    number('requests', 'Requests', 'Calls since the agent started; a dash: none was seen.'),
+    { key: 'rate', title: 'Rate', kind: 'number', by: rateOf,
+      meaning: 'Calls a second over the last half minute, as this page counts them.', cell: (/** @type {any} */ row) => rate(rateOf(row)) },
+    number('answered', 'Answered', 'Calls whose reply reached the client.', 'number wide'),
+    { ...number('hanging', 'Hanging', 'Calls that wait for a reply longer than service_timeout_s.'), cell: (/** @type {any} */ row) => ((row.calls?.hanging ?? 0) > 0
       ? html`<${Mark} severity="warning" /> ${count(row.calls.hanging)}` : count(row.calls?.hanging ?? null)) },
-    time('latency_p50_seconds', 'p50'), time('latency_p99_seconds', 'p99'),
+    time('latency_p50_seconds', 'p50', 'Half of the latest 1024 replies came faster.'),
+    time('latency_p99_seconds', 'p99', 'Of 100 replies, 99 came faster.'),
   ];
   const goals = (actions.data?.actions ?? []).filter((/** @type {any} */ row) => matches(filter, row.name));
   const results = ['accepted', 'succeeded', 'canceled', 'aborted', 'rejected', 'open'];

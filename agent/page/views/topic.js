@@ -51,7 +51,7 @@ export function Topic({ name, query }) {
       <span class="dim">Measure</span> <${Measure} topic=${topic} />
       <a href=${address('graph', null, { focus: topicKey(topic), hops: 1 })}>In the graph</a>
       <a href=${address('events', null, { filter: topic.name })}>Events</a></p>
-    <p><${Badges} flags=${state.flagsOf(topic.id)} /></p>
+    <p><${Badges} flags=${state.flagsOf(topic.id)} explained /></p>
     <${InChains} domain=${topic.domain} topic=${topic.name} />
     ${findings.length > 0 && html`<section aria-label="Findings"><${Findings} list=${findings} />
       </section>`}
