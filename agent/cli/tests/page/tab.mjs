@@ -239,6 +239,33 @@ export class Tab {
     return edges.reduce((sum, [style]) => ({ ...sum, [style]: (sum[style] ?? 0) + 1 }), {});
   }
 
+  /** Fails if a text of the graph has less than 11 pixels, or none is in the window. Returns the smallest size. */
+  async legible(what) {
+    const sizes = await this.page.locator('.canvas text').evaluateAll((all) => all.map((text) => {
+      const { left, right, top, bottom } = text.getBoundingClientRect();
+      const canvas = text.closest('.canvas').getBoundingClientRect();
+      const isIn = right > canvas.left && left < canvas.right && bottom > canvas.top && top < canvas.bottom;
+      return [parseFloat(getComputedStyle(text).fontSize) * text.getScreenCTM().a, isIn, text.textContent];
+    }));
+    assert.ok(sizes.some(([, isIn]) => isIn), `${what}: no text is in the window`);
+    // The size is stored with four digits.
+    assert.deepEqual(sizes.filter(([size]) => size < 10.99), [], `${what}: text below 11 pixels`);
+    return Math.min(...sizes.map(([size]) => size));
+  }
+
+  /** Waits until the picture of the graph stays as it is. */
+  async drawn() {
+    let before = null;
+    await until('a picture that stays', async () => {
+      const now = await this.page.locator('.canvas svg').evaluate((svg) => `${svg.querySelector('g').getAttribute(
+        'transform')} ${[...svg.querySelectorAll('.vertex rect')].map((rect) => rect.getAttribute('x'))}`);
+      const isSame = now === before && now.length > 40;
+      before = now;
+      await new Promise((wake) => setTimeout(wake, 700));
+      return isSame;
+    });
+  }
+
   /** Fails if the page scrolls sideways, with the names of elements that are too wide. */
   async narrow(what) {
     const wide = await this.page.evaluate(() => {
