@@ -1,7 +1,7 @@
 // One topic: its figures over time, its endpoints and their QoS, its losses, and its messages.
 
-import { useEffect, useRef, useState } from '../vendor/hooks.mjs';
-import { json, named } from '../api.js';
+import { useRef, useState } from '../vendor/hooks.mjs';
+import { named } from '../api.js';
 import { Chart } from '../chart.js';
 import { bandwidth, clock, count, date, duration, eventWords, percent, rate, several } from '../format.js';
 import { address } from '../router.js';
@@ -160,41 +160,23 @@ function Marked({ events }) {
  * @param {import('../state.js').Topic} topic
  */
 function useLatest(path, topic) {
-  const columns = useRef(/** @type {(number|null)[][]} */ (COLUMNS.map(() => [])));
-  const [, draw] = useState(0);
-  useEffect(() => {
-    if (path == null) return undefined;
-    const abort = new AbortController();
-    let timer = 0;
-    const ask = async () => {
-      if (stream.status === 'live' && document.visibilityState !== 'hidden') {
-        try {
-          const history = await json(path, { signal: abort.signal });
-          columns.current = COLUMNS.map((column) => history[column] ?? []);
-          draw((/** @type {number} */ value) => value + 1);
-        } catch {
-          // The stream's figures continue; the next request may succeed.
-        }
-      }
-      if (!abort.signal.aborted) timer = setTimeout(ask, HISTORY_AGAIN_MS);
-    };
-    ask();
-    return () => {
-      clearTimeout(timer);
-      abort.abort();
-    };
-  }, [path]);
-  const [times] = columns.current;
+  const { data } = usePoll(path, HISTORY_AGAIN_MS);
+  const latest = useRef({ data, columns: /** @type {(number|null)[][]} */ (COLUMNS.map(() => [])) });
+  if (data && data !== latest.current.data) {
+    latest.current = { data, columns: COLUMNS.map((column) => [...(data[column] ?? [])]) };
+  }
+  const { columns } = latest.current;
+  const [times] = columns;
   const { rate: hertz, bandwidth: size, lostNow, p50, p99 } = state.figuresOf(topic.id);
   const last = times[times.length - 1] ?? 0;
   if (path != null && hertz != null && state.time >= Number(last) + 0.9) {
     [state.time, hertz, size, lostNow, p50, p99, null, null].forEach((value, at) => {
-      const own = columns.current[at];
+      const own = columns[at];
       own.push(value);
       if (own.length > (state.open?.history_seconds ?? LIVE_SPAN)) own.shift();
     });
   }
-  return columns.current;
+  return columns;
 }
 
 /** The definition of the topic's type, requested when it is opened. @param {{path: string}} props */
