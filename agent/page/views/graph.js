@@ -280,7 +280,9 @@ export function Graph({ query }) {
   const graph = useMemo(() => build(drawn, options, joints), [
     drawn, state.structure, JSON.stringify(query), asked.data, trail, level]);
   const raise = () => {
-    for (let next = level + 1; isAutomatic && next <= MOST_FOLDED; next += 1) {
+    // A topic in focus is not folded into an edge.
+    const most = focus?.startsWith('topic:') ? MOST_FOLDED - 1 : MOST_FOLDED;
+    for (let next = level + 1; isAutomatic && next <= most; next += 1) {
       const folded = build(drawn, { ...options, fold: next }, joints);
       if (folded.signature !== graph.signature) {
         setFolding({ scene, level: next });
@@ -802,7 +804,7 @@ function Panel({ graph, chosen, change, toggle, choose, names, chains }) {
     onClick=${() => choose(key)}><${Name} text=${names.get(key) ?? key} /></button>`;
   const sides = (/** @type {string} */ name, /** @type {any[]} */ edges,
     /** @type {'from'|'to'} */ side) => edges.length > 0 && html`<h3>${name} (${count(edges.length)})</h3>
-    <ul>${edges.slice(0, 40).map((each) => html`<li key=${each.id}>${link(each[side])}
+    <ul>${edges.slice(0, 40).map((each) => html`<li key=${each.id}>${link(each[side])}${' '}
       <span class="dim">${wayWords(each)}${each.topics.length > 1
         ? `, ${several(each.topics.length, 'topic')}` : ''}</span></li>`)}</ul>`;
   const went = vertex && (vertex.node ?? vertex.topic ?? 0) < 0;

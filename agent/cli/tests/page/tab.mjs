@@ -77,6 +77,11 @@ async function edited(route) {
   await route.fulfill({ response, body: readFileSync(`${EDITED}/${path}`) });
 }
 
+/** Lets the pages of a context have the edited files, if there are any. */
+export async function withEdited(context) {
+  if (EDITED) await context.route('**/page/**', edited);
+}
+
 let lines = null;
 
 /** Sends a command to the Rust test and returns the answer. */
@@ -299,7 +304,7 @@ export async function scenario(story) {
       acceptDownloads: true, reducedMotion: 'reduce',
     });
     own.setDefaultTimeout(PATIENCE_MS);
-    if (EDITED) await own.route('**/page/**', edited);
+    await withEdited(own);
     const page = await own.newPage();
     const tab = new Tab(page, address);
     tabs.push(tab);
