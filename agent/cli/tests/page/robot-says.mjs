@@ -30,6 +30,13 @@ await scenario(async (open) => {
   await reads(first, 'battery');
   await first.locator('summary').click();
   await reads(first, /Voltage \(V\) 11\.9/);
+  // The finding about a transform leads to its edge, and the one about a battery to its part.
+  await tab.go(`#/robot/transforms?part=${encodeURIComponent('frame 0  base_link')}`);
+  await reads(tab.page.locator('[data-revealed]'), /^base_link/);
+  await tab.go('');
+  await tab.page.locator('.findings li', { hasText: 'battery' }).getByRole('link').click();
+  await tab.heading('Diagnostics');
+  await reads(tab.page.locator('main tbody tr[data-row]'), 'battery');
   // Filters are in the address.
   await tab.go('#/robot/logs?filter=spin');
   await reads(tab.page.locator('main table').first(), /spinning/);
