@@ -139,7 +139,7 @@ function Charts({ topic, scope, events, pick }) {
     ${chart({ title: 'Latency', print: duration, lines: [
       { label: 'p50', colour: '--line-1', values: half },
       { label: 'p99', colour: '--line-3', values: most }],
-      note: `From the writer’s timestamp to the capture; between hosts it needs equal clocks.${
+      note: `From the writer’s timestamp to the capture; between hosts it is corrected by the known offset of their clocks.${
         shown.at == null ? ` A click, or Enter at the cursor, observes calls and lists the late ones of
         that time` : ''}`, pick: shown.at == null ? pick : undefined })}
     ${chart({ title: 'Lost messages', print: count, whole: true,
