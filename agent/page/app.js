@@ -6,7 +6,7 @@ import { keepToken, token } from './api.js';
 import { count, date, visible } from './format.js';
 import { address, parse, tokenOf } from './router.js';
 import { Keys, Search, Token } from './dialogs.js';
-import { kept, keep, state, stream, useLive, useRoute } from './store.js';
+import { kept, keep, state, stream, useLive, useRoute, useScripts } from './store.js';
 import { html, Mark } from './ui.js';
 import { PresentOnly, TimeBar } from './timebar.js';
 import { Agent } from './views/agent.js';
@@ -51,6 +51,7 @@ function applyTheme(name) {
 
 function App() {
   useLive();
+  useScripts();
   const route = useRoute();
   const [dialog, show] = useState(/** @type {string|null} */ (null));
   const main = useRef(/** @type {HTMLElement|null} */ (null));
@@ -93,6 +94,7 @@ function App() {
     }
     first.current = false;
   }, [place]);
+  useEffect(() => reveal(main.current, route?.query.part), [place, route?.query.part]);
   return html`
     <a class="skip" href="#main" onClick=${(/** @type {Event} */ event) => {
       event.preventDefault();
@@ -110,6 +112,52 @@ function App() {
     ${dialog === 'search' && html`<${Search} close=${() => show(null)} />`}
     ${dialog === 'keys' && html`<${Keys} views=${VIEWS} close=${() => show(null)} />`}
     ${dialog === 'token' && html`<${Token} close=${() => show(null)} />`}`;
+}
+
+/** Time in which the part of a view must arrive, and then the parts above it. */
+const [ARRIVES_MS, SETTLES_MS] = [15000, 2500];
+
+/**
+ * Scrolls to a part of a view, and again while parts above it arrive, until the user moves. Returns a
+ * function that ends this.
+ * @param {HTMLElement|null} main
+ * @param {string|undefined} id of an element
+ */
+function reveal(main, id) {
+  if (!main || !id) return undefined;
+  /** @type {Element|null} */
+  let found = null;
+  const show = () => {
+    const own = document.getElementById(id);
+    if (!own || !main.contains(own)) return;
+    const place = own.closest('section[aria-labelledby]') ?? own;
+    const isSection = place.getAttribute('aria-labelledby') === id;
+    const target = isSection ? place : own;
+    if (target !== found) {
+      found?.removeAttribute('data-revealed');
+      target.setAttribute('data-revealed', '');
+      own.setAttribute('tabindex', '-1');
+      own.focus({ preventScroll: true });
+      found = target;
+      clearTimeout(timer);
+      timer = setTimeout(stop, SETTLES_MS);
+    }
+    target.scrollIntoView({ block: isSection ? 'start' : 'center' });
+  };
+  const observer = new MutationObserver(show);
+  const stop = () => {
+    observer.disconnect();
+    clearTimeout(timer);
+    for (const name of ['wheel', 'touchmove', 'keydown', 'pointerdown']) removeEventListener(name, stop);
+  };
+  for (const name of ['wheel', 'touchmove', 'keydown', 'pointerdown']) addEventListener(name, stop);
+  let timer = setTimeout(stop, ARRIVES_MS);
+  observer.observe(main, { childList: true, subtree: true });
+  show();
+  return () => {
+    stop();
+    found?.removeAttribute('data-revealed');
+  };
 }
 
 /** @param {{route: import('./router.js').Route|null}} props */
@@ -230,7 +278,7 @@ function News() {
       !before.has(finding.id) && finding.severity !== 'note');
     if (!fresh.length) return;
     const more = fresh.length > 1 ? ` And ${count(fresh.length - 1)} more.` : '';
-    say(`New finding: ${visible(fresh[0].text)}.${more}`);
+    say(`New finding: ${visible(state.withScripts(fresh[0].text))}.${more}`);
   }, [ids, state.batches > 0]);
   return html`<div class="reader-only" role="status" aria-live="polite">${text}</div>`;
 }

@@ -203,6 +203,30 @@ export function Chart({ title, times, lines, print, note, whole, fitted, pick, s
 }
 
 /**
+ * A bar for each step of a time, whose parts have the colours of a legend.
+ * @param {{label: string, bars: (number[]|null)[], kinds: [string, string][], words: string}} props
+ *   `bars` are the values of each kind, null while unknown; `kinds` are words and CSS variables;
+ *   `words` say what one bar and the range are
+ */
+export function Bars({ label, bars, kinds, words }) {
+  const sums = kinds.map((_, kind) => bars.reduce((sum, bar) => sum + (bar?.[kind] ?? 0), 0));
+  const highest = Math.max(1, ...bars.map((bar) => (bar ?? []).reduce((sum, value) => sum + value, 0)));
+  const text = kinds.map(([kind], at) => `${sums[at]} ${kind}`).join(', ');
+  return html`<figure class="bars"><svg class="timeline" viewBox="0 0 ${10 * bars.length} 100" role="img"
+      preserveAspectRatio="none" aria-label="${label}: ${text}. ${words}">${bars.flatMap((bar, place) => {
+    let top = 100;
+    return (bar ?? []).map((value, kind) => {
+      const height = (100 * value) / highest;
+      top -= height;
+      return html`<rect key=${`${place} ${kind}`} x=${10 * place + 1} width="8" y=${top} height=${height}
+        style="fill: var(${kinds[kind][1]})" />`;
+    });
+  })}</svg><figcaption><span>${kinds.map(([kind, variable], at) => html`<span key=${kind} class="cause"
+      style="--cause: var(${variable})">${kind} ${sums[at]}</span>`)}</span>
+    <span class="dim">${words}; the highest bar is ${highest}</span></figcaption></figure>`;
+}
+
+/**
  * A table of every tenth value, the latest first.
  * @param {{title: string, times: number[], lines: Line[],
  *   print: (value: number|null) => string}} props

@@ -76,9 +76,10 @@ function search(words, services) {
   const domain = (/** @type {{domain: number}} */ thing) =>
     (state.hasDomains() ? `domain ${thing.domain}` : '');
   for (const finding of state.findings) {
-    if (matches(words, finding.text)) {
+    const name = state.withScripts(finding.text);
+    if (matches(words, name)) {
       const [href] = placeOf(finding) ?? [address('')];
-      found.push({ kind: 'finding', name: finding.text, more: '', href });
+      found.push({ kind: 'finding', name, more: '', href });
     }
   }
   for (const node of state.nodes.values()) {

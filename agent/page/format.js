@@ -198,6 +198,53 @@ export function shortened(text, most) {
   return `${characters.slice(0, head).join('')}…${end.join('')}`;
 }
 
+/**
+ * Returns the container or the systemd unit of a control group: "container 0123456789ab",
+ * "robot.service"; empty for other groups.
+ * @param {string|null|undefined} path
+ */
+export function groupOf(path) {
+  const parts = (path ?? '').split('/').reverse();
+  for (const part of parts) {
+    const [, id] = /^(?:.*[-:])?([0-9a-f]{12})[0-9a-f]{52}(?:\.scope)?$/.exec(part) ?? [];
+    if (id) return `container ${id}`;
+  }
+  return parts.find((part) => part.endsWith('.service')) ?? '';
+}
+
+/** Words for each event. */
+export const EVENTS = /** @type {Record<string, string>} */ ({
+  'ros2.participant.discovered': 'participant appeared', 'ros2.participant.changed': 'participant changed',
+  'ros2.participant.lost': 'participant left', 'ros2.endpoint.discovered': 'endpoint appeared',
+  'ros2.endpoint.changed': 'endpoint changed', 'ros2.endpoint.lost': 'endpoint left',
+  'ros2.node.discovered': 'node appeared', 'ros2.node.lost': 'node left',
+  'ros2.node.lifecycle_transition': 'lifecycle state changed',
+  'ros2.robot.diagnostic_changed': 'diagnostic level changed',
+  'ros2.robot.parameter_changed': 'parameter changed', 'ros2.robot.transform_jumped': 'transform jumped',
+  'ros2.message.lost': 'messages lost', 'ros2.topic.expectation_changed': 'expectation of a watch',
+  'ros2.topic.silent': 'topic silent', 'ros2.qos.incompatible': 'QoS incompatible',
+  'ros2.qos.resolved': 'QoS compatible again', 'ros2.graph.diagnosed': 'finding',
+  'ros2.graph.resolved': 'finding resolved', 'ros2.service.call_hanging': 'call hangs',
+  'ros2.service.call_resolved': 'call hangs no longer', 'ros2probe.agent.started': 'agent started',
+  'ros2probe.capture.dropped': 'agent dropped packets', 'ros2probe.capture.blind': 'agent sees nothing',
+  'ros2probe.capture.seeing': 'agent sees the robot again',
+  'ros2probe.config.reloaded': 'configuration applied',
+  'ros2probe.config.reload_failed': 'configuration rejected', 'ros2probe.watch.added': 'watch added',
+  'ros2probe.watch.removed': 'watch removed', 'ros2probe.recording.started': 'recording started',
+  'ros2probe.recording.ended': 'recording ended', 'ros2probe.snapshot.taken': 'snapshot taken',
+  'ros2probe.events.suppressed': 'too many events',
+});
+
+/**
+ * Returns an event in words: "node appeared", "finding: slow callback".
+ * @param {{name: string, attributes: Record<string, unknown>}} event
+ */
+export function eventWords({ name, attributes }) {
+  const words = EVENTS[name] ?? name.replace(/^ros2(probe)?\./, '').replace(/[._]/g, ' ');
+  const { diagnosis } = attributes;
+  return typeof diagnosis === 'string' ? `${words}: ${diagnosis.replaceAll('_', ' ')}` : words;
+}
+
 /** What became of the last message of a transient-local writer, by its state in the API. */
 const LATCHED = /** @type {Record<string, string>} */ ({
   kept: 'kept for recordings and viewers',

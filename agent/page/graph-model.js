@@ -1,7 +1,7 @@
 // Converts the state to the graph view's vertices, edges and boxes.
 // Figures are not used here, so that they change the look but never the layout.
 
-import { shortened, visible } from './format.js';
+import { groupOf, shortened, visible } from './format.js';
 
 /** Number of nodes above which namespace boxes are initially closed. */
 export const MANY_NODES = 60;
@@ -125,48 +125,125 @@ function leavesOf(state, vertices, edges, options) {
 }
 
 /**
- * Returns each node and each end of a topic by a name that a restart keeps, with its QoS.
+ * @typedef {'came'|'gone'|'changed'} Mark
+ * @typedef {{text: string, qos: string, node: string, topic: string, side: 'publishers'|'subscriptions',
+ *   endpoints: import('./state.js').Endpoint[]}} End endpoints of one node at one topic
+ */
+
+/**
+ * Returns each node, each topic, and each end of a topic by a name that a restart keeps.
  * @param {import('./state.js').State} state
  */
 function named(state) {
-  const nodes = new Set([...state.nodes.values()].filter((node) => !node.hidden).map(nodeKey));
-  /** @type {Map<string, string>} */
+  const nodes = new Map([...state.nodes.values()].filter((node) => !node.hidden)
+    .map((node) => [nodeKey(node), node]));
+  const topics = new Map([...state.topics.values()].filter((topic) => !topic.hidden && !topic.vanished)
+    .map((topic) => [topicKey(topic), topic]));
+  /** @type {Map<string, End>} */
   const ends = new Map();
-  for (const topic of state.topics.values()) {
-    if (topic.hidden || topic.vanished) continue;
+  for (const [topic, { name, ...own }] of topics) {
     for (const [side, word] of /** @type {const} */ ([['publishers', 'publishes'],
       ['subscriptions', 'subscribes to']])) {
-      for (const endpoint of topic[side]) {
-        const { key, node, name } = state.ownerOf(endpoint);
-        if (!node || node.hidden || !key) continue;
-        ends.set(`${name} ${word} ${topic.name}`, `${endpoint.reliability}, ${endpoint.durability}`);
+      for (const endpoint of own[side]) {
+        const owner = state.ownerOf(endpoint);
+        if (!owner.node || owner.node.hidden) continue;
+        const key = `${owner.key} ${side} ${topic}`;
+        const qos = `${endpoint.reliability}, ${endpoint.durability}`;
+        const known = ends.get(key) ?? { text: `${owner.name} ${word} ${name}`, qos, node: owner.key,
+          topic, side, endpoints: [] };
+        ends.set(key, { ...known, qos, endpoints: [...known.endpoints, endpoint] });
       }
     }
   }
-  return { nodes, ends };
+  return { nodes, topics, ends };
 }
 
 /**
  * Returns what came, went or changed its QoS between two states.
  * @param {import('./state.js').State} before
  * @param {import('./state.js').State} now
- * @returns {{came: string[], gone: string[], joined: string[], left: string[], changed: string[]}}
- *   `came` and `gone` are keys of nodes; the others are sentences about nodes that were there before
- *   and are there now
+ * @returns {{came: string[], gone: string[], cameTopics: string[], goneTopics: string[],
+ *   joined: string[], left: string[], changed: string[], vertices: Map<string, Mark>,
+ *   guids: Map<string, Mark>, both: import('./state.js').State}}
+ *   `came`, `gone`, `cameTopics` and `goneTopics` are keys; the next three are sentences about nodes
+ *   that were there before and are there now. `vertices` and `guids` are the marks of all of them, and
+ *   `both` is the state now with what went.
  */
 export function differences(before, now) {
   const [one, other] = [named(before), named(now)];
-  const came = [...other.nodes].filter((key) => !one.nodes.has(key));
-  const gone = [...one.nodes].filter((key) => !other.nodes.has(key));
-  const names = new Set([...came, ...gone].map(nameOf));
-  const stayed = (/** @type {string} */ end) => !names.has(end.split(' ')[0]);
-  const missing = (/** @type {Map<string, string>} */ all, /** @type {Map<string, string>} */ from) =>
-    [...all.keys()].filter((end) => !from.has(end) && stayed(end));
+  /** @template T @param {Map<string, T>} all @param {Map<string, T>} from @returns {[string, T][]} */
+  const missing = (all, from) => [...all].filter(([key]) => !from.has(key));
+  const keys = (/** @type {[string, any][]} */ list) => list.map(([key]) => key);
+  const [came, gone] = [missing(other.nodes, one.nodes), missing(one.nodes, other.nodes)];
+  const [cameTopics, goneTopics] = [missing(other.topics, one.topics), missing(one.topics, other.topics)];
+  const [joined, left] = [missing(other.ends, one.ends), missing(one.ends, other.ends)];
+  const changed = [...other.ends].filter(([key, { qos }]) => (one.ends.get(key)?.qos ?? qos) !== qos);
+  /** @type {Map<string, Mark>} */
+  const vertices = new Map([
+    ...changed.map(([, end]) => /** @type {[string, Mark]} */ ([end.topic, 'changed'])),
+    ...[...came, ...cameTopics].map(([key]) => /** @type {[string, Mark]} */ ([key, 'came'])),
+    ...[...gone, ...goneTopics].map(([key]) => /** @type {[string, Mark]} */ ([key, 'gone']))]);
+  /** @type {Map<string, Mark>} */
+  const guids = new Map();
+  for (const [mark, ends] of /** @type {[Mark, [string, End][]][]} */ ([['came', joined], ['gone', left],
+    ['changed', changed]])) {
+    for (const [, { endpoints }] of ends) {
+      for (const { guid } of endpoints) guids.set(mark === 'gone' ? `gone ${guid}` : guid, mark);
+    }
+  }
+  const stayed = (/** @type {[string, End]} */ [, end]) => !['came', 'gone'].includes(vertices.get(end.node) ?? '');
+  const texts = (/** @type {[string, End][]} */ ends) => ends.filter(stayed).map(([, end]) => end.text);
   return {
-    came, gone, joined: missing(other.ends, one.ends), left: missing(one.ends, other.ends),
-    changed: [...other.ends].filter(([end, qos]) => one.ends.has(end) && one.ends.get(end) !== qos)
-      .map(([end, qos]) => `${end}: ${one.ends.get(end)} → ${qos}`),
+    came: keys(came), gone: keys(gone), cameTopics: keys(cameTopics), goneTopics: keys(goneTopics),
+    joined: texts(joined), left: texts(left),
+    changed: changed.map(([key, { text, qos }]) => `${text}: ${one.ends.get(key)?.qos} → ${qos}`),
+    vertices, guids, both: withGone(now, gone.map(([, node]) => node),
+      goneTopics.map(([, topic]) => topic), left.map(([, end]) => end)),
   };
+}
+
+/**
+ * Returns a state with nodes, topics and ends that it no longer has. Their numbers are negative, so
+ * that they have neither figures nor findings.
+ * @param {import('./state.js').State} now
+ * @param {import('./state.js').Node[]} nodes
+ * @param {import('./state.js').Topic[]} topics
+ * @param {End[]} ends
+ */
+function withGone(now, nodes, topics, ends) {
+  const both = /** @type {import('./state.js').State} */ (
+    Object.assign(Object.create(Object.getPrototypeOf(now)), now));
+  both.nodes = new Map(now.nodes);
+  for (const node of nodes) both.nodes.set(-node.id, { ...node, id: -node.id, participants: [] });
+  both.topics = new Map([...now.topics].map(([id, topic]) => [id, { ...topic,
+    publishers: [...topic.publishers], subscriptions: [...topic.subscriptions] }]));
+  for (const topic of topics) {
+    both.topics.set(-topic.id, { ...topic, id: -topic.id, publishers: [], subscriptions: [] });
+  }
+  const byKey = new Map([...[...both.nodes.values()].map((node) => /** @type {[string, any]} */ (
+    [nodeKey(node), node])), ...[...both.topics.values()].map((topic) => /** @type {[string, any]} */ (
+    [topicKey(topic), topic]))]);
+  for (const { node, topic, side, endpoints } of ends) {
+    for (const endpoint of endpoints) {
+      byKey.get(topic)?.[side].push({ ...endpoint, topic: byKey.get(topic).id,
+        node: byKey.get(node)?.id ?? 0, guid: `gone ${endpoint.guid}` });
+    }
+  }
+  return both;
+}
+
+/**
+ * Returns the mark of an edge by those of its endpoints.
+ * @param {Edge} edge
+ * @param {Map<string, Mark>} guids
+ * @returns {Mark|null}
+ */
+export function markOf(edge, guids) {
+  const marks = new Set(edge.guids.map((guid) => guids.get(guid) ?? null));
+  // A pair of nodes at one topic comes and goes with either end.
+  if (edge.kind === 'pair' && edge.topics.length === 1) marks.delete(null);
+  const [first = null] = marks;
+  return marks.size > 1 ? 'changed' : first;
 }
 
 /**
@@ -371,7 +448,20 @@ function namespaces(vertices) {
 }
 
 /**
- * Returns boxes of hosts, and of processes with at least two nodes.
+ * Returns a function that returns the participant of a node, the first one if it has several, or of
+ * a vertex without a node.
+ * @param {import('./state.js').State} state
+ * @returns {(vertex: Vertex) => import('./state.js').Participant|undefined}
+ */
+export function participantsOf(state) {
+  const byGuid = new Map([...state.participants.values()].map((each) => [each.guid, each]));
+  return (each) => (each.kind === 'participant' ? byGuid.get(nameOf(each.key))
+    : state.participants.get(state.nodes.get(each.node ?? -1)?.participants[0] ?? -1));
+}
+
+/**
+ * Returns boxes of hosts, and in them of containers, systemd units and processes with at least two
+ * nodes.
  * @param {import('./state.js').State} state
  * @param {Map<string, Vertex>} vertices
  * @returns {Map<string, Vertex>}
@@ -379,40 +469,40 @@ function namespaces(vertices) {
 function processes(state, vertices) {
   /** @type {Map<string, Vertex>} */
   const boxes = new Map();
-  /** @type {Map<string, number>} */
-  const sizes = new Map();
-  const byGuid = new Map([...state.participants.values()].map((each) => [each.guid, each]));
+  const participants = participantsOf(state);
   const place = (/** @type {Vertex} */ each) => {
-    const node = each.node == null ? null : state.nodes.get(each.node);
-    const participant = node ? state.participants.get(node.participants[0])
-      : byGuid.get(nameOf(each.key));
+    const participant = participants(each);
     if (!participant) return null;
     const host = participant.host ?? 'unknown host';
-    const { pid, process } = participant;
-    const inner = pid == null ? null : `box:${host} ${pid}`;
-    const name = [process, pid].filter((part) => part != null).join(' ');
-    return { host, inner, name };
+    const group = groupOf(participant.cgroup);
+    return { host, group: group && `box:${host} ${group}`, groupName: group,
+      process: participant.pid == null ? '' : `box:${host} ${participant.pid}`,
+      name: state.processName(participant) };
   };
-  const owners = [...vertices.values()].filter((each) =>
-    each.kind === 'node' || each.kind === 'participant');
-  const places = owners.map((each) => ({ each, at: place(each) }));
+  /** @type {Map<string, number>} */
+  const sizes = new Map();
+  /** Groups of each host. @type {Map<string, Set<string>>} */
+  const groups = new Map();
+  const places = [...vertices.values()].filter((each) =>
+    each.kind === 'node' || each.kind === 'participant').map((each) => ({ each, at: place(each) }));
   for (const { at } of places) {
-    if (at?.inner) sizes.set(at.inner, (sizes.get(at.inner) ?? 0) + 1);
+    if (!at) continue;
+    groups.set(at.host, (groups.get(at.host) ?? new Set()).add(at.group));
+    for (const key of [at.group, at.process]) sizes.set(key, (sizes.get(key) ?? 0) + 1);
   }
   for (const { each, at } of places) {
     if (!at) continue;
-    const host = `box:${at.host}`;
-    if (!boxes.has(host)) boxes.set(host, vertex(host, 'box', at.host));
-    each.parent = host;
-    if (!at.inner) continue;
-    if ((sizes.get(at.inner) ?? 0) < 2) {
-      each.detail = at.name;
-      continue;
-    }
-    if (!boxes.has(at.inner)) {
-      boxes.set(at.inner, vertex(at.inner, 'box', at.name, { parent: host }));
-    }
-    each.parent = at.inner;
+    const enter = (/** @type {string} */ key, /** @type {string} */ name) => {
+      if (!boxes.has(key)) boxes.set(key, vertex(key, 'box', name, { parent: each.parent }));
+      each.parent = key;
+    };
+    enter(`box:${at.host}`, at.host);
+    // A container or unit with all nodes of the host would be drawn as the host.
+    const isPart = (groups.get(at.host)?.size ?? 0) > 1;
+    if (at.group && isPart && (sizes.get(at.group) ?? 0) > 1) enter(at.group, at.groupName);
+    if (!at.process) continue;
+    if ((sizes.get(at.process) ?? 0) > 1) enter(at.process, at.name);
+    else each.detail = at.name;
   }
   return boxes;
 }

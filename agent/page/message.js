@@ -8,6 +8,7 @@ import { bytes, clock, count, visible } from './format.js';
 import { Preview } from './preview.js';
 import { Lines } from './state.js';
 import { state, stream, useKept } from './store.js';
+import { marksOf } from './timebar.js';
 import { AskButton, Failed, html, Mark, Name, Text } from './ui.js';
 
 const HERTZ = 5;
@@ -99,21 +100,44 @@ export function sinceFirst(values) {
   return values.map((value) => (value == null ? null : value - first));
 }
 
-/** @param {{topic: import('./state.js').Topic, scope: string, name: string}} props */
-export function LiveMessage({ topic, scope, name }) {
-  const [open, turn] = useState(false);
+/** Colours of plotted fields, as CSS variables. */
+const COLOURS = [1, 2, 3, 4, 5, 6].map((number) => `--line-${number}`);
+
+/**
+ * Returns the lines of each chart of fields.
+ * @param {[string, (number|null)[]][]} fields paths and values
+ * @param {boolean} isApart whether each field has a chart of its own
+ * @param {boolean} isRelative whether lines begin at zero
+ * @returns {import('./chart.js').Line[][]}
+ */
+export function plotsOf(fields, isApart, isRelative) {
+  const lines = fields.map(([label, values], at) => ({ label, colour: COLOURS[at % COLOURS.length],
+    values: isRelative ? sinceFirst(values) : values }));
+  return isApart ? lines.map((line) => [line]) : lines.length ? [lines] : [];
+}
+
+/** @param {{topic: import('./state.js').Topic, scope: string, name: string,
+ *   events: import('./state.js').Event[]}} props */
+export function LiveMessage({ topic, scope, name, events }) {
+  // A capture that was read to its end has no more messages.
+  const [wanted, want] = useKept('live message', true);
+  const [open, turn] = useState(wanted && !state.replay?.finished);
   const may = state.may('all');
   return html`<section aria-labelledby="live"><h2 id="live">Live message</h2>
     ${!may && html`<p>Messages may contain anything the robot sees. Showing them needs a token with the
       right <strong>all</strong>: run <code>rp page</code> on the robot. <${AskButton} /></p>`}
-    ${may && html`<p><button type="button" aria-expanded=${open} onClick=${() => turn(!open)}>${open
+    ${may && html`<p><button type="button" aria-expanded=${open} onClick=${() => {
+      turn(!open);
+      want(!open);
+    }}>${open
       ? 'Close' : 'Show messages'}</button> <span class="dim">at most ${HERTZ} per second; the topic
       is measured while they are shown</span></p>`}
-    ${may && open && html`<${Follow} scope=${scope} name=${name} topic=${topic} />`}</section>`;
+    ${may && open && html`<${Follow} scope=${scope} name=${name} topic=${topic} events=${events} />`}</section>`;
 }
 
-/** @param {{scope: string, name: string, topic: import('./state.js').Topic}} props */
-function Follow({ scope, name, topic }) {
+/** @param {{scope: string, name: string, topic: import('./state.js').Topic,
+ *   events: import('./state.js').Event[]}} props */
+function Follow({ scope, name, topic, events }) {
   const [type, setType] = useState(/** @type {any} */ (null));
   const [message, setMessage] = useState(/** @type {any} */ (null));
   const [problem, refuse] = useState(/** @type {Refusal|null} */ (null));
@@ -121,6 +145,7 @@ function Follow({ scope, name, topic }) {
   const [toggled, setToggled] = useState(/** @type {Set<string>} */ (new Set()));
   const [plotted, plot] = useKept(`plot ${topic.types[0]}`, /** @type {string[]} */ ([]));
   const [isRelative, setRelative] = useKept('relative plots', false);
+  const [isApart, setApart] = useKept('one chart each', true);
   const [run, again] = useState(0);
   const points = useRef({ times: /** @type {number[]} */ ([]),
     values: /** @type {Map<string, (number|null)[]>} */ (new Map()) });
@@ -185,7 +210,9 @@ function Follow({ scope, name, topic }) {
     ? plotted.filter((each) => each !== path) : [...plotted, path].slice(-6));
   const lines = message?.value != null ? flatten(message.value, toggled) : [];
   const { times, values } = points.current;
-  const colours = ['--line-1', '--line-2', '--line-3', '--line-4', '--line-1', '--line-2'];
+  const plots = plotsOf(plotted.filter((path) => values.has(path)).map((path) =>
+    [path, values.get(path) ?? []]), isApart, isRelative);
+  const marks = marksOf(events);
   return html`
     <${Failed} problem=${problem} what="No messages" />
     ${end && html`<p class="problem"><${Mark} severity="warning" /> The messages end: ${end}.${' '}
@@ -198,22 +225,25 @@ function Follow({ scope, name, topic }) {
         ? 'Nobody subscribes, so nothing is sent.' : 'Waiting for a message …'}</p>`}
     ${plotted.length > 0 && html`<p><label><input type="checkbox" checked=${isRelative}
       onChange=${(/** @type {any} */ event) => setRelative(event.target.checked)} />
-      Changes since the first value</label></p>`}
-    ${plotted.map((path, at) => values.has(path) && html`<${Chart} key=${path} title=${path}
-      times=${times} print=${printNumber} fitted lines=${[{ label: path, colour: colours[at],
-        values: isRelative ? sinceFirst(values.get(path) ?? []) : values.get(path) ?? [] }]} />`)}
+      Changes since the first value</label>${plotted.length > 1 && html` <label><input type="checkbox"
+        checked=${isApart} onChange=${(/** @type {any} */ event) => setApart(event.target.checked)} />
+        One chart each</label>`}</p>`}
+    ${plots.length > 0 && html`<div class="charts">${plots.map((lines) => html`<${Chart}
+      key=${lines[0].label} title=${lines.map(({ label }) => label).join(', ')} times=${times}
+      print=${printNumber} fitted marks=${marks} range="the last messages" lines=${lines} />`)}</div>`}
     ${message && html`<p class="dim">${clock(message.time)}, ${bytes(message.bytes)}${
       message.sequence_number != null ? `, number ${count(message.sequence_number)}` : ''}${
       message.node ? html` by <${Name} text=${message.node} />` : ''}${message.skipped
       ? `, ${count(message.skipped)} not shown before it` : ''}</p>`}
-    ${message && html`<${Preview} preview=${message.preview} error=${message.preview_error} />`}
     ${message?.error && html`<p><${Mark} severity="warning" /> <${Name} text=${message.error} /></p>`}
+    <div class="message">${message && html`<${Preview} preview=${message.preview}
+      error=${message.preview_error} />`}
     ${lines.length > 0 && html`<div class="scroll tree" tabindex="0" role="group"
       aria-label="Fields of the message"><table><thead><tr><th scope="col">Field</th>
       <th scope="col">Value</th><th scope="col"><span class="reader-only">Plot</span></th></tr></thead>
       <tbody>${lines.map((line) => html`<${FieldRow} key=${line.path} line=${line}
         closed=${line.closed} toggle=${toggle} choose=${choose}
-        plotted=${plotted.includes(line.path)} />`)}</tbody></table></div>`}
+        plotted=${plotted.includes(line.path)} />`)}</tbody></table></div>`}</div>
     ${lines.length >= MOST_LINES && html`<p class="dim">The first ${count(MOST_LINES)} fields.</p>`}
     ${type?.definition && html`<details><summary>Definition of <${Name} text=${type.name} /></summary>
       <${Text} text=${type.definition} />

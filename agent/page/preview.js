@@ -42,6 +42,11 @@ export function fromAbove(places) {
   return { metres, to: (x, y) => [SIDE / 2 + (-y - middle) * scale, SIDE / 2 - (x - centre) * scale] };
 }
 
+/** Formats a width in metres; one beyond a robot's world has an exponent. @param {number} metres */
+export function widthOf(metres) {
+  return metres < 1e5 ? metres.toFixed(1) : metres.toExponential(1);
+}
+
 /** Returns a cleared canvas's context. @param {HTMLCanvasElement} canvas @param {number} width @param {number} height */
 function cleared(canvas, width, height) {
   [canvas.width, canvas.height] = [width, height];
@@ -147,7 +152,7 @@ export function Preview({ preview, error }) {
   const words = picture ? `${picture.source.join(' × ')} pixels`
     : encoded ? `an image in ${encoded.format}`
       : points ? `${count(points.length)} of ${count(preview.points.total)} points from above, ${
-        fromAbove([...points, [0, 0, 0]]).metres.toFixed(1)} m wide; colours are heights`
+        widthOf(fromAbove([...points, [0, 0, 0]]).metres)} m wide; colours are heights`
         : `${count(poses.length)} ${poses.length === 1 ? 'pose, and the way to it' : 'poses'} from above`;
   return html`<figure class="preview"><canvas ref=${canvas} role="img" aria-label="Preview: ${words}" />
     <figcaption class="dim">${words}</figcaption></figure>`;

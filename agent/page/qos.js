@@ -1,6 +1,6 @@
 // Offered and requested QoS of endpoints, side by side, with incompatible policies marked.
 
-import { count, duration, lastMessage, rate } from './format.js';
+import { count, duration, groupOf, lastMessage, rate } from './format.js';
 import { address } from './router.js';
 import { html, Mark, Name } from './ui.js';
 import { state } from './store.js';
@@ -39,9 +39,9 @@ export function Endpoints({ details, topic }) {
     const own = (publishes ? topic.publishers : topic.subscriptions)
       .find((each) => each.guid === endpoint.guid);
     const participant = own && state.participants.get(own.participant);
-    const place = [participant?.process, participant?.pid].filter((part) => part != null).join(' ');
     return html`<tr key=${endpoint.guid}><th scope="row"><${Owner} endpoint=${endpoint} /></th>
-      <td><${Name} text=${[participant?.host, place].filter(Boolean).join(', ') || 'unknown'} /></td>
+      <td><${Name} text=${[participant?.host, state.processName(participant),
+        groupOf(participant?.cgroup)].filter(Boolean).join(', ') || 'unknown'} /></td>
       <td>${endpoint.vendor ?? ''}</td>
       <td><${Name} text=${endpoint.message_type} /></td>
       ${hasBuffers && html`<td><${Name} text=${endpoint.backends.join(', ')} /></td>`}

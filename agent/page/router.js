@@ -63,22 +63,82 @@ export function nodeAddress(node) {
   return address('nodes', node.name, { domain: node.domain });
 }
 
-/** Parts of the view of the robot by the kind of a finding. */
-const PARTS = /** @type {Record<string, [string, string]>} */ ({
-  log_errors: ['logs', 'Logs'], diagnostic_error: ['diagnostics', 'Diagnostics'],
-  transform_fault: ['transforms', 'Transforms'], parameter_drift: ['parameters', 'Parameters'],
-  mixed_time: ['parameters', 'Parameters'], hanging_call: ['services', 'Services'],
-  clocks_apart: ['clocks', 'Clocks'],
+/** Sections of the view of a topic by the kind of a finding. */
+const SECTIONS = /** @type {Record<string, string>} */ ({
+  loss: 'waterfall', watch_violated: 'course', watch_silent: 'course', wrong_stamps: 'course',
+  qos_incompatible: 'qos', type_conflict: 'endpoints', type_hash_conflict: 'endpoints',
+  unmatched_publisher: 'endpoints', unmatched_subscription: 'endpoints', near_miss: 'endpoints',
+  buffers_by_cpu: 'endpoints', slow_callback: 'inside', executor_wait: 'inside',
+  late_callback: 'inside', intra_process_overflow: 'inside', reader_queue_overflow: 'inside',
 });
 
 /**
- * Returns address and title of the part of the robot that a finding is about, or null.
- * @param {string} kind
+ * Returns the section of a topic that a finding is about, or undefined.
+ * @param {{kind: string, text: string}} finding
+ */
+function sectionOf({ kind, text }) {
+  // An expectation names its limits: only that of losses is not a figure over time.
+  if (kind === 'watch_violated' && /a loss of at most/.test(text)) return 'waterfall';
+  if (kind === 'watch_violated' && /at least \d+ (publisher|subscriber)/.test(text)) return 'endpoints';
+  return SECTIONS[kind];
+}
+
+/**
+ * Returns address and title of the part of the robot or of the agent that a finding is about, or
+ * null. The id of a finding has the names that its text only mentions.
+ * @param {{kind: string, id: string}} finding
+ * @param {{name: string}|null} node
  * @returns {[string, string]|null}
  */
-export function partAddress(kind) {
-  const found = PARTS[kind];
-  return found ? [address('robot', found[0]), found[1]] : null;
+function partAddress({ kind, id }, node) {
+  const [, domain, first, ...more] = id.split('|');
+  const robot = (/** @type {string} */ part, /** @type {string} */ title,
+    /** @type {Record<string, string|undefined>} */ query = {}) =>
+    /** @type {[string, string]} */ ([address('robot', part, query), title]);
+  switch (kind) {
+    case 'log_errors': return robot('logs', node ? `Logs of ${node.name}` : 'Logs',
+      { filter: node?.name, level: 'error' });
+    case 'diagnostic_error': return robot('diagnostics', 'Diagnostics', { filter: more[0] });
+    case 'transform_fault': return robot('transforms', 'Transforms',
+      { part: frameId(Number(domain), first ?? '', more.slice(0, -1).join('|')) });
+    case 'parameter_drift': return robot('parameters', 'Parameters',
+      { filter: [node?.name, ...more].join(' ').trim() });
+    case 'mixed_time': return robot('parameters', 'Parameters', { filter: 'use_sim_time' });
+    case 'hanging_call': return robot('services', 'Services',
+      { filter: first?.replace(/^r[qr]\//, '/').replace(/Re(quest|ply)$/, '') });
+    case 'clocks_apart': return robot('clocks', 'Clocks', { part: clockId(domain ?? '') });
+    case 'lossy_link': return [address('nodes', null, { part: 'links' }), 'TCP links'];
+    case 'agent_drops': return [address('agent', null, { part: 'drops' }), 'Agent'];
+    case 'topics_rejected': return [address('agent', null, { part: 'limits' }), 'Agent'];
+    default: return null;
+  }
+}
+
+/** Returns the id of a frame's element. @param {number} domain @param {string} namespace @param {string} name */
+export function frameId(domain, namespace, name) {
+  return `frame ${domain} ${namespace} ${name}`;
+}
+
+/** Returns the id of the element of a host's clock. @param {string} peer */
+export function clockId(peer) {
+  return `clock ${peer}`;
+}
+
+/**
+ * Returns address and title of the section that a finding is about; null if it is the agent.
+ * @param {{kind: string, id: string, text: string}} finding
+ * @param {{name: string, domain: number}|null} topic
+ * @param {{name: string, domain: number}|null} node
+ * @returns {[string, string]|null}
+ */
+export function findingAddress(finding, topic, node) {
+  if (finding.kind === 'slow_chain') return [address('chains', null, { filter: topic?.name }), 'Chains'];
+  const part = sectionOf(finding);
+  if (topic) return [address('topics', topic.name, { domain: topic.domain, part }), topic.name];
+  const place = partAddress(finding, node);
+  if (place || !node) return place;
+  return [address('nodes', node.name, { domain: node.domain,
+    part: finding.kind.startsWith('duplicate') || finding.kind.startsWith('node_in_') ? 'where' : part }), node.name];
 }
 
 /**

@@ -65,6 +65,8 @@ export class State {
   /** @type {Map<number, Topic>} */ topics = new Map();
   /** Changes with the structure of the graph, not with its figures. */
   structure = 0;
+  /** Programs and scripts of interpreters, by process id. */
+  scripts = /** @type {Map<number, {process: string, script: string}>} */ (new Map());
   /** @type {Map<number, Figures>} */ figures = new Map();
   /** @type {Map<number, Series>} */ series = new Map();
   /** @type {{rate: number, bandwidth: number, lost: number, measured: number}} */
@@ -86,7 +88,7 @@ export class State {
 
   /** Resets the state for another run of the agent. */
   clear() {
-    Object.assign(this, new State(), { structure: this.structure + 1 });
+    Object.assign(this, new State(), { structure: this.structure + 1, scripts: this.scripts });
   }
 
   /**
@@ -153,6 +155,33 @@ export class State {
     for (const kept of [this.figures, this.series]) {
       for (const id of kept.keys()) if (!this.topics.has(id)) kept.delete(id);
     }
+  }
+
+  /** Takes the scripts that interpreters run. @param {any[]} processes as `GET /processes` has them */
+  takeProcesses(processes) {
+    const before = JSON.stringify([...this.scripts]);
+    for (const { process_id: pid, process, script } of processes) {
+      if (script) this.scripts.set(pid, { process, script });
+      else this.scripts.delete(pid);
+    }
+    if (JSON.stringify([...this.scripts]) !== before) this.structure += 1;
+  }
+
+  /**
+   * Returns script or program of a process with its id: "robot.py 4711"; empty if it is unknown.
+   * @param {{pid: number|null, process: string|null}|null|undefined} process
+   */
+  processName(process) {
+    const name = [process?.process, process?.pid].filter((part) => part != null).join(' ');
+    return this.withScripts(name);
+  }
+
+  /** Returns a text with the scripts of the processes that it names. @param {string} text */
+  withScripts(text) {
+    return text.replace(/(\S+) (\(?)(\d+)\b/g, (whole, name, open, pid) => {
+      const own = this.scripts.get(Number(pid));
+      return own && (name === 'process' || name === own.process) ? `${own.script} ${open}${pid}` : whole;
+    });
   }
 
   /** @param {any} values */
@@ -275,7 +304,7 @@ export class State {
     if (node) return { key: `node:${node.domain}:${node.name}`, name: node.name, node };
     const participant = this.participants.get(endpoint.participant);
     const guid = participant?.guid ?? endpoint.guid;
-    const name = participant?.process ? `${participant.process} (no node)` : guid;
+    const name = participant?.process ? `${this.processName(participant).replace(/ \d+$/, '')} (no node)` : guid;
     return { key: `participant:${participant?.domain ?? 0}:${guid}`, name, node: null };
   }
 

@@ -33,6 +33,18 @@ export function useLive() {
   return state;
 }
 
+/** Requests the scripts of processes after each change of the graph. */
+export function useScripts() {
+  const known = stream.status === 'live' ? state.structure : null;
+  useEffect(() => {
+    if (known == null) return undefined;
+    const abort = new AbortController();
+    json('processes', { signal: abort.signal }).then(({ processes }) => state.takeProcesses(processes))
+      .catch(() => { /* Processes then have the names of their programs. */ });
+    return () => abort.abort();
+  }, [known]);
+}
+
 /** Returns the route of the address, and keeps its time. */
 function routeNow() {
   const route = parse(location.hash);
@@ -58,49 +70,62 @@ export function replaceAddress(to) {
 }
 
 /**
- * Requests an endpoint periodically while the view is shown and the stream runs. It has the present,
- * so a moment in the past needs no request.
+ * Requests something while the tab is visible, and again if it changes with time. The answer stays
+ * until the next one of the same path.
  * @param {string|null} path null sends no request
+ * @param {string} part what of the path is requested; after an error, no other part stays
  * @param {number} every milliseconds; 0 sends one request
+ * @param {(signal: AbortSignal) => Promise<any>} ask
+ * @param {() => boolean} may whether requests make sense now
  * @returns {{data: any, problem: Refusal|null, refresh: () => void}}
  */
-export function usePoll(path, every) {
+export function useRequest(path, part, every, ask, may) {
   const [answer, take] = useState(
-    /** @type {{path: string|null, data: any, problem: Refusal|null}} */
-    ({ path: null, data: null, problem: null }),
+    /** @type {{path: string|null, part: string, data: any, problem: Refusal|null}} */
+    ({ path: null, part: '', data: null, problem: null }),
   );
   const again = useRef(() => {});
-  const past = stream.at != null;
   useEffect(() => {
-    if (path == null || past) return undefined;
+    if (path == null) return undefined;
     const abort = new AbortController();
     let timer = 0;
-    const ask = async () => {
+    const request = async () => {
       clearTimeout(timer);
-      if (document.visibilityState !== 'hidden' && stream.status !== 'paused') {
+      if (document.visibilityState !== 'hidden' && may()) {
         try {
-          take({ path, data: await json(path, { signal: abort.signal }), problem: null });
+          take({ path, part, data: await ask(abort.signal), problem: null });
         } catch (error) {
           if (abort.signal.aborted) return;
           const problem = error instanceof Refusal ? error : new Refusal(0, String(error));
-          take((/** @type {any} */ before) => ({ path, data: before.path === path ? before.data : null, problem }));
+          take((/** @type {any} */ before) => ({ path, part, problem,
+            data: before.path === path && before.part === part ? before.data : null }));
         }
       }
-      if (every > 0 && !abort.signal.aborted) timer = setTimeout(ask, every);
+      if (every > 0 && !abort.signal.aborted) timer = setTimeout(request, every);
     };
-    again.current = ask;
-    ask();
+    again.current = request;
+    request();
     return () => {
       clearTimeout(timer);
       abort.abort();
     };
-  }, [path, every, past]);
-  const own = answer.path === path && !past;
+  }, [path, part, every]);
+  const own = answer.path === path && path != null;
   return {
     data: own ? answer.data : null,
     problem: own ? answer.problem : null,
     refresh: () => again.current(),
   };
+}
+
+/**
+ * Requests an endpoint periodically. It has the present, so a moment in the past needs no request.
+ * @param {string|null} path null sends no request
+ * @param {number} every milliseconds; 0 sends one request
+ */
+export function usePoll(path, every) {
+  return useRequest(stream.at == null ? path : null, '', every, (signal) => json(String(path), { signal }),
+    () => stream.status !== 'paused');
 }
 
 /**

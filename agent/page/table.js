@@ -2,7 +2,7 @@
 // It scrolls with the window, so that it is usable on a phone and at 400 % zoom.
 
 import { useEffect, useLayoutEffect, useRef, useState } from './vendor/hooks.mjs';
-import { html } from './ui.js';
+import { html, Meanings } from './ui.js';
 
 /** Rows rendered above and below the visible ones. */
 const SPARE = 12;
@@ -10,8 +10,9 @@ const SPARE = 12;
 /**
  * @template T
  * @typedef {{key: string, title: string, cell: (row: T) => any, by?: (row: T) => any,
- *   kind?: string, header?: boolean}} Column
- *   `by` returns the sort key; `kind` is a class: `number`, `wide` (hidden on a phone).
+ *   kind?: string, header?: boolean, meaning?: string}} Column
+ *   `by` returns the sort key; `kind` is a class: `number`, `wide` (hidden on a phone). `meaning`
+ *   explains the column below the table.
  */
 
 /**
@@ -43,9 +44,11 @@ function compare(a, b, down) {
 
 /**
  * @param {{label: string, columns: Column<any>[], rows: any[], keyOf: (row: any) => string,
- *   sort: string, onSort: (sort: string) => void, rowClass?: (row: any) => string}} props
+ *   sort: string, onSort: (sort: string) => void, rowClass?: (row: any) => string,
+ *   meanings?: [any, string][]}} props
+ *   `meanings` explains states in the table.
  */
-export function Table({ label, columns, rows, keyOf, sort, onSort, rowClass }) {
+export function Table({ label, columns, rows, keyOf, sort, onSort, rowClass, meanings = [] }) {
   const body = useRef(/** @type {HTMLElement|null} */ (null));
   /** Heights in pixels of rendered rows, by key: names wrap, so rows differ. */
   const heights = useRef(/** @type {Map<string, number>} */ (new Map()));
@@ -132,6 +135,8 @@ export function Table({ label, columns, rows, keyOf, sort, onSort, rowClass }) {
   const space = (/** @type {any[]} */ left) => left.length > 0
     && html`<tr aria-hidden="true" class="space"><td colspan=${columns.length}
       style=${{ height: `${total(left)}px` }}></td></tr>`;
+  const explained = columns.filter((column) => column.meaning).map(({ title, meaning }) =>
+    /** @type {[any, string]} */ ([title, meaning]));
   return html`<div class="table" onKeyDown=${walk}>
     <table aria-label=${label} aria-rowcount=${rows.length + 1}>
     <thead><tr aria-rowindex="1">${head}</tr></thead>
@@ -143,5 +148,6 @@ export function Table({ label, columns, rows, keyOf, sort, onSort, rowClass }) {
           ? html`<th scope="row" class=${column.kind ?? ''}>${column.cell(row)}</th>`
           : html`<td class=${column.kind ?? ''}>${column.cell(row)}</td>`))}</tr>`)}
       ${space(rows.slice(last))}
-    </tbody></table></div>`;
+    </tbody></table></div>
+    ${explained.length + meanings.length > 0 && html`<${Meanings} rows=${[...explained, ...meanings]} />`}`;
 }

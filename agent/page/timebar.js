@@ -1,11 +1,11 @@
 // The time that the page shows: the present, or a part of the last days. It is part of every address.
 
 import { useEffect, useState } from './vendor/hooks.mjs';
-import { json, post, Refusal, request } from './api.js';
+import { json, post, request } from './api.js';
 import { date, duration, percent } from './format.js';
 import { address } from './router.js';
 import { Lines } from './state.js';
-import { state, stream, useLive, useRoute } from './store.js';
+import { state, stream, useLive, useRequest, useRoute } from './store.js';
 import { html } from './ui.js';
 
 /** Times to choose from, in seconds. */
@@ -62,39 +62,16 @@ export function inWords({ span, at }) {
 }
 
 /**
- * Requests a part of the history, again while its end is the present. Until an answer arrives, the
- * previous one stays.
+ * Requests a part of the history, again while its end is the present.
  * @param {string|null} path null sends no request
  * @param {Shown} shown
  * @param {(path: string, options: RequestInit) => Promise<any>} [ask]
- * @returns {{data: any, problem: Refusal|null}}
  */
 export function useHistory(path, { span, at }, ask = json) {
-  const [answer, take] = useState(/** @type {any} */ ({ path: null, data: null, problem: null }));
-  useEffect(() => {
-    if (path == null) return undefined;
-    const abort = new AbortController();
-    let timer = 0;
-    const poll = async () => {
-      if (document.visibilityState !== 'hidden' && (at != null || stream.status === 'live')) {
-        const to = at ?? Math.floor(state.time);
-        const times = `${path.includes('?') ? '&' : '?'}from=${to - span}&to=${to}`;
-        try {
-          take({ path, data: await ask(path + times, { signal: abort.signal }), problem: null });
-        } catch (error) {
-          if (abort.signal.aborted) return;
-          take({ path, data: null, problem: error instanceof Refusal ? error : null });
-        }
-      }
-      if (at == null && !abort.signal.aborted) timer = setTimeout(poll, AGAIN_MS);
-    };
-    poll();
-    return () => {
-      clearTimeout(timer);
-      abort.abort();
-    };
-  }, [path, span, at]);
-  return answer.path === path ? answer : { data: null, problem: null };
+  return useRequest(path, `${span} ${at}`, at == null ? AGAIN_MS : 0, (signal) => {
+    const to = at ?? Math.floor(state.time);
+    return ask(`${path}${path?.includes('?') ? '&' : '?'}from=${to - span}&to=${to}`, { signal });
+  }, () => at != null || stream.status === 'live');
 }
 
 /** Requests lines of JSON. @param {string} path @param {RequestInit} options */
@@ -117,6 +94,16 @@ export function useEvents(shown) {
     const time = Date.parse(event.time) / 1000;
     return time > to - shown.span && time <= to + 1;
   });
+}
+
+/**
+ * Returns the events that matter for a topic: its own ones, and warnings and errors of no topic.
+ * @param {import('./state.js').Event[]} events
+ * @param {string} topic
+ */
+export function eventsOf(events, topic) {
+  return events.filter(({ attributes, severity }) => attributes.topic === topic
+    || (attributes.topic == null && severity !== 'INFO'));
 }
 
 /** Returns the marks of events in a chart. @param {import('./state.js').Event[]} events */

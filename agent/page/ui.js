@@ -77,13 +77,36 @@ export const PASSAGES = /** @type {Record<string, string>} */ ({
   tcp: 'TCP',
 });
 
-/** @param {{flags: string[]}} props */
-export function Badges({ flags }) {
+/**
+ * The states of a topic. Views of several topics explain them once, see `Meanings`.
+ * @param {{flags: string[], explained?: boolean}} props
+ */
+export function Badges({ flags, explained = false }) {
   return flags.map((flag) => {
-    const [severity, word, meaning] = FLAGS[flag] ?? ['note', flag, flag];
-    return html`<span class="badge ${severity}" title=${meaning}
-      ><${Mark} severity=${severity} /> ${word}</span> `;
+    const [severity, word, meaning] = FLAGS[flag] ?? ['note', flag, ''];
+    return html`<span class="badge ${severity}"><${Mark} severity=${severity} /> ${word}</span> ${explained
+      && html`<span class="dim">${meaning} </span>`}`;
   });
+}
+
+/** Each state of a topic with its meaning. */
+export const FLAG_MEANINGS = /** @type {[any, string][]} */ (Object.entries(FLAGS).map(
+  ([flag, [, , meaning]]) => [html`<${Badges} flags=${[flag]} />`, meaning]));
+
+/** Explains columns and states of a table. @param {{rows: [any, string][]}} props */
+export function Meanings({ rows }) {
+  return html`<details class="meanings"><summary>What the columns and states mean</summary><dl>${rows.map(
+    ([term, meaning]) => html`<div><dt>${term}</dt><dd>${meaning}</dd></div>`)}</dl></details>`;
+}
+
+/**
+ * A text from the network that opens if it is long.
+ * @param {{text: string, most: number}} props
+ */
+export function Long({ text, most }) {
+  if (shortened(text, most) === visible(text)) return html`<${Name} text=${text} />`;
+  return html`<details><summary><bdi class="name" dir="ltr">${shortened(text, most)}</bdi></summary><${Name}
+    text=${text} /></details>`;
 }
 
 /** Returns the worst flag: `error`, `warning`, `note` or `good`. @param {string[]} flags */

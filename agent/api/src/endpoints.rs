@@ -57,16 +57,17 @@ pub struct Endpoint<'a> {
     pub latched: Option<Latched>,
 }
 
-/// The clock of the host of a writer. Its latencies are wrong by the correction.
+/// The clock of the host of a writer. The agent corrects latencies by it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct WriterClock<'a> {
     /// Name of the host, or its address.
     pub peer: Cow<'a, str>,
-    /// Seconds to add to a latency of this writer; null while the offset of the clocks is unknown.
+    /// Seconds that the agent adds to latencies of this writer: 0 if the clocks may agree, null while
+    /// their offset is unknown.
     pub correction_seconds: Option<f64>,
-    /// The correction is wrong by at most this time.
+    /// Greatest error of the corrected latencies.
     pub uncertainty_seconds: Option<f64>,
 }
 

@@ -218,3 +218,99 @@ pub struct WatchRequest {
     #[cfg_attr(feature = "openapi", schema(minimum = 1, maximum = 10_000))]
     pub subscribers: Option<u32>,
 }
+
+impl Expectations {
+    /// Returns the keys of the configuration that are set, in the order of the fields.
+    #[must_use]
+    pub fn keys(&self) -> Vec<&'static str> {
+        let keys = [
+            ("min_rate_hz", self.min_rate_hz.is_some()),
+            ("max_rate_hz", self.max_rate_hz.is_some()),
+            ("max_loss_ratio", self.max_loss_ratio.is_some()),
+            ("max_latency_ms", self.max_latency_ms.is_some()),
+            ("max_silence_s", self.max_silence_s.is_some()),
+            ("publishers", self.publishers.is_some()),
+            ("subscribers", self.subscribers.is_some()),
+        ];
+        let set = keys.into_iter().filter(|(_, is_set)| *is_set);
+        set.map(|(key, _)| key).collect()
+    }
+
+    /// Returns the expectation of this key in words.
+    #[must_use]
+    pub fn in_words(&self, key: &str) -> String {
+        let number = |limit: Option<f64>| limit.unwrap_or_default();
+        let several = |limit: Option<u32>, noun: &str| match limit.unwrap_or_default() {
+            1 => format!("at least 1 {noun}"),
+            count => format!("at least {count} {noun}s"),
+        };
+        match key {
+            "min_rate_hz" => format!("at least {} Hz", number(self.min_rate_hz)),
+            "max_rate_hz" => format!("at most {} Hz", number(self.max_rate_hz)),
+            "max_loss_ratio" => {
+                // Without the digits that no double has.
+                let percent = (number(self.max_loss_ratio) * 1e6).round() / 1e4;
+                format!("a loss of at most {percent} %")
+            }
+            "max_latency_ms" => format!("a latency of at most {} ms", number(self.max_latency_ms)),
+            "max_silence_s" => {
+                format!("a message at least every {} s", number(self.max_silence_s))
+            }
+            "publishers" => several(self.publishers, "publisher"),
+            "subscribers" => several(self.subscribers, "subscriber"),
+            _ => key.to_owned(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_expectation_has_words_with_its_limit() {
+        let expectations = Expectations {
+            min_rate_hz: Some(85.0),
+            max_rate_hz: Some(95.0),
+            window_s: Some(2),
+            max_loss_ratio: Some(0.01),
+            max_latency_ms: Some(20.0),
+            max_silence_s: Some(1.5),
+            publishers: Some(2),
+            subscribers: Some(3),
+        };
+        let words = expectations.keys().into_iter();
+        let words: Vec<_> = words.map(|key| expectations.in_words(key)).collect();
+        assert_eq!(
+            words,
+            [
+                "at least 85 Hz",
+                "at most 95 Hz",
+                "a loss of at most 1 %",
+                "a latency of at most 20 ms",
+                "a message at least every 1.5 s",
+                "at least 2 publishers",
+                "at least 3 subscribers",
+            ]
+        );
+    }
+
+    #[test]
+    fn limits_have_no_digits_of_rounding_and_one_publisher_is_singular() {
+        let expectations = Expectations {
+            max_loss_ratio: Some(0.07),
+            max_latency_ms: Some(1.1),
+            publishers: Some(1),
+            ..Expectations::default()
+        };
+        let words = ["max_loss_ratio", "max_latency_ms", "publishers"];
+        assert_eq!(
+            words.map(|key| expectations.in_words(key)),
+            [
+                "a loss of at most 7 %",
+                "a latency of at most 1.1 ms",
+                "at least 1 publisher"
+            ]
+        );
+    }
+}

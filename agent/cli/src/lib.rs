@@ -3,6 +3,7 @@
 //! - [`client`] reaches an agent at a socket or an address, or replays a capture in this process.
 //! - [`ros2`] formats answers as `ros2 topic`, `ros2 node`, `ros2 bag info` and others do.
 //! - [`learn`] chooses expectations from the figures of a healthy robot.
+//! - [`ci`] judges a robot while a command runs, and writes the reports.
 //! - [`discover`] requests announcements from running participants and routers.
 //! - [`inside`] formats figures of calls inside processes.
 //! - [`top`] is the screen of `rp top`, [`doctor`] the checks of `rp doctor`.
@@ -18,6 +19,7 @@
 #![forbid(unsafe_code)]
 
 pub mod chain;
+pub mod ci;
 pub mod client;
 pub mod discover;
 pub mod doctor;

@@ -19,7 +19,7 @@ use ros2probe_daemon::escape::visible_lines;
 use ros2probe_daemon::privilege::{CapabilitiesRemain, ConfineError, Missing};
 use ros2probe_metrics::otlp::SettingsError;
 
-use cli::{Arguments, Command, UserError};
+use cli::{Arguments, CannotStart, Command, UserError};
 
 /// `EX_NOPERM` and `EX_CONFIG` of sysexits.h.
 const NO_PERMISSION: u8 = 77;
@@ -31,9 +31,10 @@ fn main() -> ExitCode {
     declare_command();
     let done = |done: Result<()>| done.map(|()| ExitCode::SUCCESS);
     let ended = match Arguments::parse().command {
-        None => cli::help(&[]),
+        None => cli::welcome(),
         Some(Command::Run(options)) => done(agent::run(options.into())),
         Some(Command::CheckConfig { file }) => done(check_config(&file)),
+        Some(Command::Ci(options)) => options.run(),
         Some(Command::Attach(options)) => done(options.run()),
         Some(Command::Discover(options)) => done(ask::discover(&options)),
         Some(Command::Completions(completions)) => completions.print(),
@@ -72,7 +73,12 @@ fn message(error: &anyhow::Error) -> String {
 }
 
 fn exit_code(error: &anyhow::Error) -> ExitCode {
-    if error.is::<Missing>() || error.is::<CapabilitiesRemain>() || error.is::<ConfineError>() {
+    if let Some(error) = error.downcast_ref::<CannotStart>() {
+        ExitCode::from(error.code)
+    } else if error.is::<Missing>()
+        || error.is::<CapabilitiesRemain>()
+        || error.is::<ConfineError>()
+    {
         ExitCode::from(NO_PERMISSION)
     } else if error.is::<ConfigError>() || error.is::<SettingsError>() {
         ExitCode::from(BAD_CONFIG)

@@ -21,6 +21,7 @@ use tokio_util::sync::CancellationToken;
 use crate::config::{Access, Config, ConfigError, PageChoice, RetainChoice, Watch};
 use crate::events::EventLog;
 use crate::logging::Log;
+use crate::private_agent::PrivateAgent;
 use crate::privilege::{self, Identity, Role, Sandbox, Unprivileged};
 use crate::recording::{self, Recordings, Refusal, Snapshots};
 use crate::run::replay::Replay;
@@ -68,6 +69,8 @@ pub struct Options {
     pub foxglove: Option<Listen>,
     /// Rights of loopback clients instead of the configured ones.
     pub api_loopback: Option<Access>,
+    /// The command that starts the agent for itself, if any.
+    pub private: Option<PrivateAgent>,
     /// Examines this host for clients.
     pub doctor: Doctor,
 }
@@ -218,7 +221,11 @@ impl Components<'_> {
 ///
 /// Returns the reason why the agent could not start or had to stop.
 pub fn run(options: Options) -> Result<()> {
-    let (configured, file) = configuration(options.config.as_deref())?;
+    let (configured, file) = match (&options.config, &options.private) {
+        // The configuration of the installed agent does not apply.
+        (None, Some(_)) => (Config::default(), None),
+        (file, _) => configuration(file.as_deref())?,
+    };
     let config = overridden(&configured, &options);
     let log = Log::start(config.log, config.otlp.log);
     let export = export(&config)?;
@@ -237,6 +244,10 @@ pub fn run(options: Options) -> Result<()> {
         if let Err(error) = hide_memory() {
             tracing::warn!(%error, "processes of the same user can read the agent's memory");
         }
+    }
+    if let Some(private) = &options.private {
+        let ended = private.end_with_parent();
+        ended.context("cannot end with the command that started it")?;
     }
     control::open_socket(&mut control, &config.api)?;
     let viewers = foxglove::Server::open(&config.foxglove, &config.api, &sources.viewers)?;
@@ -316,13 +327,17 @@ pub fn run(options: Options) -> Result<()> {
         context: agent.context,
         powerless,
     };
-    supervise(
+    let ended = supervise(
         supervisor,
         surfaces,
         (worker, agent.run),
         responder,
         options.report,
-    )?;
+    );
+    if let Some(private) = &options.private {
+        private.clean_up();
+    }
+    ended?;
     if options.report {
         print!("{}", Exposition::new(sources).render(Format::Classic)?);
     }
@@ -332,6 +347,9 @@ pub fn run(options: Options) -> Result<()> {
 /// Returns the configuration with the overrides of the command line.
 fn overridden(configured: &Config, options: &Options) -> Config {
     let mut config = configured.clone();
+    if let Some(private) = &options.private {
+        private.apply(&mut config);
+    }
     if let Some(listen) = options.metrics {
         config.metrics.listen = listen.0;
     } else if options.report {

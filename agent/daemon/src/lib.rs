@@ -33,6 +33,7 @@ pub mod limit_facts;
 pub mod logging;
 mod memory;
 pub mod missed_announcements;
+pub mod private_agent;
 pub mod privilege;
 pub mod recording;
 pub mod replay_pace;

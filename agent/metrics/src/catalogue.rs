@@ -313,15 +313,23 @@ pub const TOPIC_INTERARRIVAL: Metric = Metric::histogram(
 pub const TOPIC_LATENCY: Metric = Metric::histogram(
     "ros2_topic_latency_seconds",
     TOPIC,
-    "Time from the writer's timestamp to the capture; across hosts it requires synchronised \
-     clocks.",
+    "Time from the writer's timestamp to the capture, corrected by the known offset between the \
+     clocks of both hosts.",
 )
 .unit("seconds");
+pub const TOPIC_LATENCY_UNCERTAINTY: Metric = Metric::gauge(
+    "ros2_topic_latency_uncertainty_seconds",
+    TOPIC,
+    "Greatest error of latencies of publishers on other hosts; infinite while the offset of a \
+     clock is unknown, absent for publishers of this host.",
+)
+.unit("seconds")
+.experimental();
 pub const TOPIC_HEADER_LATENCY: Metric = Metric::histogram(
     "ros2_topic_header_latency_seconds",
     TOPIC,
-    "Time from the message's Header.stamp to the capture; across hosts it requires synchronised \
-     clocks.",
+    "Time from the message's Header.stamp to the capture, corrected like \
+     ros2_topic_latency_seconds.",
 )
 .unit("seconds");
 pub const TOPIC_NEGATIVE_LATENCY: Metric = Metric::counter(
@@ -462,6 +470,7 @@ pub const CATALOGUE: &[Metric] = &[
     TOPIC_LAST_MESSAGE,
     TOPIC_RATE,
     TOPIC_BANDWIDTH,
+    TOPIC_LATENCY_UNCERTAINTY,
     TOPIC_NEGATIVE_LATENCY,
     TOPIC_IMPLAUSIBLE_LATENCY,
     TOPIC_DOUBTED_JUMPS,

@@ -4,7 +4,7 @@ import { test } from 'node:test';
 globalThis.document = /** @type {any} */ ({ addEventListener() {}, baseURI: 'http://x/' });
 globalThis.window = /** @type {any} */ ({ addEventListener() {} });
 globalThis.sessionStorage = /** @type {any} */ ({ getItem: () => null });
-const { attributesText, parseEvents } = await import('../views/events.js');
+const { attributesText, namesOf, parseEvents } = await import('../views/events.js');
 
 test('events of a stream that has ended, without comments and lags', () => {
   const text = ': ros2probe\nretry: 2000\nid: a-0\n\nevent: ros2.x\nid: a-1\ndata: {"id":"a-1"}\n\n'
@@ -14,12 +14,27 @@ test('events of a stream that has ended, without comments and lags', () => {
 });
 
 test('attributes stay text', () => {
-  assert.equal(attributesText({ topic: '/a\u202eb', count: 3, list: ['<b>'] }),
-    'topic: /a\\u{202e}b, count: 3, list: ["<b>"]');
+  assert.equal(attributesText({ topic: '/a\u202eb', count: 3, list: ['<b>', 'x'], ros_node: '/n' }),
+    'topic: /a\\u{202e}b, count: 3, list: <b>, x, node: /n');
 });
 
 test('a GUID with a known name becomes that name', () => {
-  const names = new Map([['01', '/lidar']]);
-  assert.equal(attributesText({ writer: '01', reader: '02', count: 1 }, names),
-    'writer: /lidar, reader: 02, count: 1');
+  const nameOf = (/** @type {string} */ guid) => ({ '01': '/lidar' })[guid];
+  assert.equal(attributesText({ writer: '01', reader: '02', first_sequence_number: 1, participants: ['01'] }, nameOf),
+    'writer: /lidar, reader: 02, first sequence number: 1, participants: /lidar');
+});
+
+test('departed endpoints and participants have the names that events carry', () => {
+  const event = (/** @type {string} */ name, /** @type {any} */ attributes) => /** @type {any} */ ({ name, attributes });
+  const nameOf = namesOf([
+    event('ros2.node.discovered', { ros_node: '/lidar', participant: 'aa.1c1' }),
+    event('ros2.node.discovered', { ros_node: '/a', participant: 'bb.1c1' }),
+    event('ros2.node.lost', { ros_node: '/b', participant: 'bb.1c1' }),
+    event('ros2.message.lost', { ros_node: '/b', writer: 'bb.103' }),
+    event('ros2.endpoint.lost', { endpoint: 'cc.103', topic: '/points', role: 'writer' }),
+    event('ros2.participant.lost', { participant: 'dd.1c1', process: 'rviz2', host: 'desk' }),
+  ], new Map([['ee.103', '/now']]));
+  assert.deepEqual(['aa.1c1', 'aa.103', 'bb.103', 'bb.203', 'cc.103', 'dd.1c1', 'ee.103', 'ff.103', 'text'].map(nameOf),
+    ['/lidar', '/lidar', '/b', 'participant of /a and others', 'writer of /points', 'rviz2 on desk', '/now',
+      undefined, undefined]);
 });

@@ -1,4 +1,5 @@
 import assert from 'node:assert/strict';
+import { readFileSync } from 'node:fs';
 import { test } from 'node:test';
 import * as format from '../format.js';
 
@@ -93,4 +94,25 @@ test('the last message of a publisher is kept, or the reason is given', () => {
     'too large to be kept (54.0 MB)');
   assert.equal(format.lastMessage({ state: 'unseen', bytes: null }), 'not seen by the agent');
   assert.equal(format.lastMessage({ state: 'of a newer agent', bytes: null }), 'of a newer agent');
+});
+
+test('a control group is named by its container or its unit', () => {
+  const id = '0123456789ab'.padEnd(64, 'c');
+  for (const path of [`/system.slice/docker-${id}.scope`, `/docker/${id}/system.slice/x.service`,
+    `/kubepods.slice/cri-containerd-${id}.scope`, `/machine.slice/libpod-${id}.scope/container`]) {
+    assert.equal(format.groupOf(path), 'container 0123456789ab', path);
+  }
+  assert.equal(format.groupOf('/system.slice/robot.service/nodes'), 'robot.service');
+  for (const path of ['/', '/user.slice/session-3.scope', `/${id}0`, null]) assert.equal(format.groupOf(path), '');
+});
+
+test('every event of the documentation has words', () => {
+  const rows = readFileSync(new URL('../../../docs/events.md', import.meta.url), 'utf8')
+    .matchAll(/^\| `(ros2[a-z._]+)` \|/gm);
+  const names = [...rows].map(([, name]) => name);
+  assert.ok(names.length > 20);
+  assert.deepEqual(names.filter((name) => !format.EVENTS[name]), []);
+  assert.equal(format.eventWords({ name: 'ros2.graph.diagnosed', attributes: { diagnosis: 'slow_callback' } }),
+    'finding: slow callback');
+  assert.equal(format.eventWords({ name: 'ros2.new.thing_done', attributes: {} }), 'new thing done');
 });

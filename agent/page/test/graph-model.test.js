@@ -1,6 +1,6 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
-import { build, differences, dot, isHub } from '../graph-model.js';
+import { build, differences, dot, isHub, markOf, nameOf } from '../graph-model.js';
 import { layout } from '../layout.js';
 import { State } from '../state.js';
 
@@ -201,11 +201,46 @@ test('differences name nodes, connections and QoS by names that a restart keeps'
     ['/y', ['/came'], []], ['/z', ['/a'], []]]);
   const [topic] = [...now.topics.values()].filter((each) => each.name === '/x');
   topic.publishers[0].reliability = 'BEST_EFFORT';
-  assert.deepEqual(differences(before, now), {
-    came: ['node:0:/came'], gone: ['node:0:/gone'],
+  const { vertices, guids, both, ...found } = differences(before, now);
+  assert.deepEqual(found, {
+    came: ['node:0:/came'], gone: ['node:0:/gone'], cameTopics: ['topic:0:/w'], goneTopics: [],
     joined: ['/b publishes /w', '/a subscribes to /w'],
     left: ['/b subscribes to /y', '/b subscribes to /z'],
     changed: ['/a publishes /x: RELIABLE, VOLATILE → BEST_EFFORT, VOLATILE'],
   });
-  assert.deepEqual(differences(now, now), { came: [], gone: [], joined: [], left: [], changed: [] });
+  assert.deepEqual([...vertices].sort(), [['node:0:/came', 'came'], ['node:0:/gone', 'gone'],
+    ['topic:0:/w', 'came'], ['topic:0:/x', 'changed']]);
+  const same = differences(now, now);
+  assert.deepEqual([...Object.values(same)].filter((each) => Array.isArray(each) && each.length), []);
+  assert.equal(same.vertices.size + same.guids.size, 0);
+  // The graph of both has what went, and marks of edges.
+  const graph = build(both, ALL);
+  assert.ok(graph.vertices.some((each) => each.key === 'node:0:/gone' && (each.node ?? 0) < 0));
+  const marks = Object.fromEntries(graph.edges.map((edge) =>
+    [`${nameOf(edge.from)} ${nameOf(edge.to)}`, markOf(edge, guids)]));
+  assert.deepEqual(marks, { '/a /x': 'changed', '/x /b': null, '/a /z': null, '/z /b': 'gone',
+    '/b /w': 'came', '/w /a': 'came', '/gone /y': 'gone', '/came /y': 'came', '/y /b': 'gone' });
+  assert.equal(build(now, ALL).vertices.some((each) => each.name === '/gone'), false);
+  // Between nodes, an edge comes and goes with either end.
+  const pairs = build(both, { ...ALL, mode: 'nodes' }).edges;
+  assert.deepEqual(Object.fromEntries(pairs.map((edge) =>
+    [`${nameOf(edge.from)} ${nameOf(edge.to)}`, markOf(edge, guids)])), { '/a /b': 'changed',
+    '/b /a': 'came', '/gone /b': 'gone', '/came /b': 'changed' });
+});
+
+test('containers and units are boxes, and processes have the name of their script', () => {
+  const state = robot(['/a', '/b', '/c', '/d', '/e'], []);
+  for (const own of state.participants.values()) {
+    own.host = 'base';
+    own.process = 'python3';
+  }
+  const [one, two, three] = [1, 2, 3].map((id) => /** @type {any} */ (state.participants.get(id)));
+  two.cgroup = three.cgroup = `/docker/${'0123456789ab'.padEnd(64, '0')}`;
+  state.takeProcesses([{ process_id: two.pid, process: 'python3', script: 'robot.py' }]);
+  const boxes = () => build(state, { ...ALL, boxes: 'process' }).vertices
+    .filter((each) => each.kind === 'box').map((each) => `${each.parent}: ${each.name}`).sort();
+  assert.deepEqual(boxes(), ['box:base container 0123456789ab: python3 3',
+    'box:base container 0123456789ab: robot.py 2', 'box:base: container 0123456789ab', 'null: base']);
+  one.cgroup = two.cgroup;
+  assert.deepEqual(boxes(), ['box:base: python3 3', 'box:base: robot.py 2', 'null: base']);
 });

@@ -4,8 +4,9 @@ import { test } from 'node:test';
 // message.js imports rendering modules, which access a document when they are loaded.
 globalThis.document = /** @type {any} */ ({ addEventListener() {}, baseURI: 'http://x/' });
 globalThis.window = /** @type {any} */ ({ addEventListener() {} });
+globalThis.location = /** @type {any} */ ({ hash: '' });
 globalThis.sessionStorage = /** @type {any} */ ({ getItem: () => null });
-const { flatten, numberAt, sinceFirst } = await import('../message.js');
+const { flatten, numberAt, plotsOf, sinceFirst } = await import('../message.js');
 
 const IMU = {
   header: { stamp: { sec: 5, nanosec: 7 }, frame_id: 'imu' },
@@ -47,4 +48,16 @@ test('numbers are found by their path, and nothing else is', () => {
 test('changes count from the first value, and gaps stay', () => {
   assert.deepEqual(sinceFirst([null, 5, 7, null, 4]), [null, 0, 2, null, -1]);
   assert.deepEqual(sinceFirst([]), []);
+});
+
+test('fields have a chart each, or one together in different colours', () => {
+  const fields = /** @type {[string, number[]][]} */ (
+    ['a', 'b', 'c', 'd', 'e', 'f'].map((path) => [path, [5, 7]]));
+  assert.deepEqual(plotsOf(fields, true, false).map((lines) => lines.map(({ label }) => label)),
+    [['a'], ['b'], ['c'], ['d'], ['e'], ['f']]);
+  const [together, ...more] = plotsOf(fields, false, true);
+  assert.equal(more.length, 0);
+  assert.equal(new Set(together.map(({ colour }) => colour)).size, 6);
+  assert.deepEqual(together[5].values, [0, 2]);
+  assert.deepEqual(plotsOf([], false, false), []);
 });

@@ -6,6 +6,7 @@ globalThis.window = /** @type {any} */ ({ addEventListener() {} });
 globalThis.location = /** @type {any} */ ({ hash: '' });
 const { grouped, Incomplete } = await import('../views/overview.js');
 const { state } = await import('../store.js');
+const { Badges, FLAG_MEANINGS, FLAGS, Meanings } = await import('../ui.js');
 
 test('endpoints of a topic without a counterpart are one finding, others stay', () => {
   const finding = (/** @type {string} */ kind, /** @type {number|null} */ topic) => ({ kind, topic });
@@ -32,5 +33,13 @@ test('a page without topics says that writers send whose announcement was missed
   const shown = JSON.stringify(Incomplete({ missing: 'this lacks them' }));
   for (const part of ['Writers are active', 'this lacks them', 'sudo rp discover --all']) {
     assert.ok(shown.includes(part), `${part}: ${shown}`);
+  }
+});
+
+test('every state of a topic is explained where keys and touch reach it', () => {
+  const below = JSON.stringify(Meanings({ rows: FLAG_MEANINGS }));
+  for (const [flag, [, , meaning]] of Object.entries(FLAGS)) {
+    assert.ok(meaning && below.includes(meaning), flag);
+    assert.ok(JSON.stringify(Badges({ flags: [flag], explained: true })).includes(meaning), flag);
   }
 });

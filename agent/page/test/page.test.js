@@ -6,7 +6,8 @@ import { fileURLToPath } from 'node:url';
 import { gzipSync } from 'node:zlib';
 
 const PAGE = join(dirname(fileURLToPath(import.meta.url)), '..');
-const MOST_BYTES = 160_000;
+/** Over a weak radio link of 1 Mbit/s, a page of this size loads in 1.5 s. */
+const MOST_BYTES = 190_000;
 
 /** Files that the agent serves. */
 const served = readdirSync(PAGE, { recursive: true, withFileTypes: true })
@@ -17,7 +18,7 @@ const served = readdirSync(PAGE, { recursive: true, withFileTypes: true })
 const text = (/** @type {string} */ path) => readFileSync(join(PAGE, path), 'utf8');
 const own = served.filter((path) => !path.startsWith('vendor/'));
 
-test('the whole page is at most 160 KB, compressed', (context) => {
+test('the whole page is at most 190 KB, compressed', (context) => {
   let total = 0;
   for (const path of served) total += gzipSync(readFileSync(join(PAGE, path)), { level: 9 }).length;
   context.diagnostic(`${served.length} files, ${total} bytes compressed`);
@@ -103,9 +104,18 @@ test('text has a contrast of 4.5, lines of 3, in both themes', () => {
         assert.ok(found >= 4.5, `${ink} on ${paper}: ${found.toFixed(2)}`);
       }
     }
-    for (const line of ['--line-1', '--line-2', '--line-3', '--line-4', '--edge', '--focus']) {
+    for (const line of ['--line-1', '--line-2', '--line-3', '--line-4', '--line-5',
+      '--line-6', '--edge', '--focus']) {
       assert.ok(contrast(theme[line], theme['--paper']) >= 3, line);
     }
     assert.ok(contrast(theme['--accent-ink'], theme['--accent']) >= 4.5);
   }
+});
+
+test('nothing is explained only by a tooltip, which keys and touch do not open', () => {
+  // A shortened name has its whole text in other places: in its view, or below it.
+  const known = { 'ui.js': 1, 'views/events.js': 1 };
+  const found = Object.fromEntries(own.filter((path) => path.endsWith('.js')).map((path) =>
+    [path, [...text(path).matchAll(/<[a-z][^<>]*?\stitle=/g)].length]).filter(([, number]) => number));
+  assert.deepEqual(found, known);
 });

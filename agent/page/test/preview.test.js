@@ -6,7 +6,7 @@ globalThis.document = /** @type {any} */ ({ addEventListener() {}, baseURI: 'htt
 globalThis.window = /** @type {any} */ ({ addEventListener() {} });
 globalThis.sessionStorage = /** @type {any} */ ({ getItem: () => null });
 const { flatten } = await import('../message.js');
-const { fromAbove, pointsOf } = await import('../preview.js');
+const { fromAbove, pointsOf, widthOf } = await import('../preview.js');
 
 test('points are read as little-endian floats, and an incomplete one is left out', () => {
   const floats = new Float32Array([1, 2, 3, -4, 5.5, 6]);
@@ -33,4 +33,8 @@ test('a long array is closed until it is opened', () => {
   assert.deepEqual(paths(), ['ranges', 'short', 'short[0]', 'short[1]']);
   assert.equal(paths('ranges').length, 104);
   assert.deepEqual(paths('short'), ['ranges', 'short']);
+});
+
+test('a width beyond the world of robots stays short', () => {
+  assert.deepEqual([5.44, 99999, 5.445e38].map(widthOf), ['5.4', '99999.0', '5.4e+38']);
 });

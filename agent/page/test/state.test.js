@@ -160,3 +160,24 @@ test('lines are cut anywhere', () => {
   }
   assert.throws(() => new Lines().take('{"a":\n'), SyntaxError);
 });
+
+test('processes have the name of their script, in texts of the agent too', () => {
+  const state = ready();
+  const { structure } = state;
+  state.takeProcesses([{ process_id: 4711, process: 'driver', script: 'lidar.py' },
+    { process_id: 12, process: 'rviz2', script: null }]);
+  assert.equal(state.structure, structure + 1);
+  const participant = state.participants.get(1);
+  assert.equal(state.processName(participant), 'lidar.py 4711');
+  assert.equal(state.processName({ pid: 12, process: 'rviz2' }), 'rviz2 12');
+  assert.equal(state.processName({ pid: null, process: null }), '');
+  assert.equal(state.ownerOf(/** @type {any} */ ({ node: 0, participant: 1 })).name, 'lidar.py (no node)');
+  assert.equal(state.withScripts('Calls of driver (4711), in process 4711, of process 47111, driver 12'),
+    'Calls of lidar.py (4711), in lidar.py 4711, of process 47111, driver 12');
+  // The id belongs to another program now.
+  state.takeProcesses([{ process_id: 4711, process: 'bash', script: null }]);
+  assert.equal(state.processName({ pid: 4711, process: 'bash' }), 'bash 4711');
+  const again = state.structure;
+  state.takeProcesses([]);
+  assert.equal(state.structure, again);
+});

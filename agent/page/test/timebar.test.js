@@ -8,7 +8,7 @@ Object.assign(globalThis, {
   document: { addEventListener() {}, visibilityState: 'visible' },
   window: { addEventListener() {} },
 });
-const { inWords, showTime, timeOf } = await import('../timebar.js');
+const { eventsOf, inWords, marksOf, showTime, timeOf } = await import('../timebar.js');
 
 test('the time of an address is bounded', () => {
   assert.deepEqual(timeOf({}), { span: 600, at: null });
@@ -40,4 +40,13 @@ test('a change of the time keeps the rest of the address', () => {
 test('a time is named', () => {
   assert.equal(inWords({ span: 3600, at: null }), 'The last hour');
   assert.match(inWords({ span: 60, at: 1790000000 }), / to /);
+});
+
+test('the events of a topic mark its charts, and warnings about no topic', () => {
+  const event = (/** @type {string} */ severity, /** @type {string|undefined} */ topic) => /** @type {any} */ (
+    { severity, time: '1970-01-01T00:00:05Z', attributes: { topic } });
+  const all = [event('INFO', '/a'), event('WARN', '/b'), event('ERROR', undefined), event('INFO', undefined)];
+  const own = eventsOf(all, '/a');
+  assert.deepEqual(own, [all[0], all[2]]);
+  assert.deepEqual(marksOf(own), [{ time: 5, severity: 'INFO' }, { time: 5, severity: 'ERROR' }]);
 });

@@ -9,9 +9,9 @@ const SOURCES = /** @type {Record<string, string>} */ ({
   host: 'the sockets of this host', wire: 'network interfaces', replay: 'a capture file',
 });
 
-/** @param {{title: string, rows: [any, any][]}} props */
-function Facts({ title, rows }) {
-  return html`<section aria-label=${title}><h2>${title}</h2><table class="short" aria-label=${title}><tbody>
+/** @param {{title: string, rows: [any, any][], id?: string}} props */
+function Facts({ title, rows, id }) {
+  return html`<section aria-label=${title} id=${id}><h2>${title}</h2><table class="short" aria-label=${title}><tbody>
     ${rows.map(([name, value]) => html`<tr key=${name}><th scope="row">${name}</th>
       <td>${value}</td></tr>`)}</tbody></table></section>`;
 }
@@ -62,7 +62,7 @@ export function Agent() {
       <tr key=${each.ability}><th scope="row"><${Mark} severity=${each.able ? 'good' : 'note'} /> ${
         each.ability.replaceAll('_', ' ')}</th><td>${each.able ? 'yes' : each.reason
         ? html`no: <${Name} text=${each.reason} />` : 'no'}</td></tr>`)}</tbody></table></section>
-    <${Facts} title="Not counted or dropped" rows=${drops.map(([name, value]) => [name,
+    <${Facts} id="drops" title="Not counted or dropped" rows=${drops.map(([name, value]) => [name,
       html`${value ? html`<${Mark} severity="warning" /> ` : ''}${count(value)}`])} />
     <section aria-labelledby="limits"><h2 id="limits">Limits in use</h2><div class="scroll"
       tabindex="0" role="group" aria-labelledby="limits"><table><thead><tr><th scope="col">Limit</th>

@@ -21,11 +21,15 @@ const STATES = /** @type {Record<string, [string, string]>} */ ({
   idle: ['note', 'No message passed the chain in the last 10 s.'],
 });
 
+/** Each state with its meaning. */
+const MEANINGS = /** @type {[string, string][]} */ (Object.entries(STATES).map(([state, [, meaning]]) =>
+  [state, meaning]));
+
 /** @param {{expected: import('../chains.js').Expected|null}} props */
 function ChainState({ expected }) {
   if (!expected) return null;
-  const [severity, meaning] = STATES[expected.state] ?? ['note', ''];
-  return html`<span class="badge ${severity}" title=${meaning}><${Mark} severity=${severity} />${' '}
+  const [severity] = STATES[expected.state] ?? ['note', ''];
+  return html`<span class="badge ${severity}"><${Mark} severity=${severity} />${' '}
     <${Name} text=${expected.state} /></span>`;
 }
 
@@ -60,19 +64,23 @@ export function Chains({ query }) {
     { key: 'state', title: 'State', by: (/** @type {any} */ row) =>
       row.expected && ['slow', 'idle', 'ok'].indexOf(row.expected.state),
       cell: (/** @type {any} */ row) => html`<${ChainState} expected=${row.expected} />` },
-    { key: 'limit', title: 'Limit', kind: 'number wide',
+    { key: 'limit', title: 'Limit',
+      meaning: 'The maximum latency that the configuration expects (max_latency_ms).', kind: 'number wide',
       by: (/** @type {any} */ row) => limitOf(row.expected),
       cell: (/** @type {any} */ row) => duration(limitOf(row.expected)) },
-    { key: 'p50', title: 'p50', kind: 'number',
+    { key: 'p50', title: 'p50',
+      meaning: 'Half of the messages passed the chain faster.', kind: 'number',
       by: (/** @type {any} */ row) => row.latency?.p50_seconds,
       cell: (/** @type {any} */ row) => duration(row.latency?.p50_seconds) },
-    { key: 'p99', title: 'p99', kind: 'number',
+    { key: 'p99', title: 'p99',
+      meaning: 'Of 100 messages, 99 passed the chain faster.', kind: 'number',
       by: (/** @type {any} */ row) => row.latency?.p99_seconds,
       cell: (/** @type {any} */ row) => duration(row.latency?.p99_seconds) },
     { key: 'hops', title: 'Hops', kind: 'number wide',
       by: (/** @type {any} */ row) => row.chain?.hops.length,
       cell: (/** @type {any} */ row) => count(row.chain?.hops.length) },
-    { key: 'bottleneck', title: 'Bottleneck', kind: 'wide', cell: (/** @type {any} */ row) => {
+    { key: 'bottleneck', title: 'Bottleneck',
+      meaning: 'The node that takes most of the time.', kind: 'wide', cell: (/** @type {any} */ row) => {
       const hop = row.chain && slowest(row.chain);
       return hop && html`<${Name} text=${hop.node ?? 'unknown node'} most=${60} />`;
     } },
@@ -82,7 +90,8 @@ export function Chains({ query }) {
     { key: 'last', title: 'Last', kind: 'number wide',
       by: (/** @type {any} */ row) => row.chain?.last_seen_seconds,
       cell: (/** @type {any} */ row) => clock(row.chain?.last_seen_seconds) },
-    { key: 'method', title: 'Method', kind: 'wide', by: (/** @type {any} */ row) => row.method,
+    { key: 'method', title: 'Method',
+      meaning: 'How messages are followed: by their stamps, or by calls inside processes.', kind: 'wide', by: (/** @type {any} */ row) => row.method,
       cell: (/** @type {any} */ row) => html`<${Name} text=${row.method ?? ''} />` },
   ];
   return html`<h1 tabindex="-1">Chains</h1>
@@ -91,7 +100,7 @@ export function Chains({ query }) {
     <div class="controls"><${Filter} label="Filter" value=${filter} found=${rows.length}
       noun="chain" change=${(/** @type {string} */ text) => change({ filter: text })} /></div>
     <${Failed} problem=${problem} what=${data ? 'The chains are not updated' : 'No chains'} />
-    ${data && rows.length > 0 && html`<${Table} label="Chains" columns=${columns}
+    ${data && rows.length > 0 && html`<${Table} label="Chains" columns=${columns} meanings=${MEANINGS}
       rows=${sorted(rows, columns, sort)} sort=${sort}
       keyOf=${(/** @type {any} */ row) => row.key}
       rowClass=${(/** @type {any} */ row) => (row.expected?.state === 'slow' ? 'bad' : '')}

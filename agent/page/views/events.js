@@ -2,7 +2,7 @@
 
 import { useEffect, useState } from '../vendor/hooks.mjs';
 import { request } from '../api.js';
-import { clock, count, date, several, visible } from '../format.js';
+import { clock, count, date, eventWords, several, visible } from '../format.js';
 import { address } from '../router.js';
 import { replaceAddress, state, useLive } from '../store.js';
 import { inWords, useEvents, useTime } from '../timebar.js';
@@ -34,16 +34,20 @@ export function parseEvents(text) {
   return events;
 }
 
+/** Attributes that other parts of an event's line show. */
+const SHOWN = ['topic', 'diagnosis'];
+
 /**
  * Formats an event's attributes. A GUID with a known name becomes that name.
  * @param {Record<string, unknown>} attributes
- * @param {Map<string, string>} [names]
+ * @param {(guid: string) => string|undefined} [nameOf]
  */
-export function attributesText(attributes, names) {
-  return Object.entries(attributes).map(([name, value]) => {
-    const text = typeof value === 'string' ? names?.get(value) ?? value : JSON.stringify(value);
-    return `${visible(name)}: ${visible(text)}`;
-  }).join(', ');
+export function attributesText(attributes, nameOf) {
+  const text = (/** @type {unknown} */ value) =>
+    (typeof value === 'string' ? nameOf?.(value) ?? value : JSON.stringify(value));
+  return Object.entries(attributes).map(([name, value]) => `${visible(name === 'ros_node' ? 'node'
+    : name.replaceAll('_', ' '))}: ${visible(Array.isArray(value) ? value.map(text).join(', ') : text(value))}`)
+    .join(', ');
 }
 
 /** Names of endpoints and participants by GUID, also of departed ones. */
@@ -53,31 +57,56 @@ const MOST_OWNERS = 20000;
 /** Adds the present endpoints and participants, and returns all names. */
 function ownersNow() {
   if (owners.size > MOST_OWNERS) owners.clear();
-  /** @type {Map<number, string[]>} */
-  const nodes = new Map();
   for (const node of state.nodes.values()) {
     for (const id of node.participants) {
       const participant = state.participants.get(id);
       if (participant) owners.set(participant.guid, node.name);
-      nodes.set(id, [...nodes.get(id) ?? [], node.name]);
     }
   }
   for (const topic of state.topics.values()) {
     for (const endpoint of [...topic.publishers, ...topic.subscriptions]) {
       const { name, node } = state.ownerOf(endpoint);
-      const [one, ...others] = nodes.get(endpoint.participant) ?? [];
       if (node) owners.set(endpoint.guid, name);
-      else if (one) owners.set(endpoint.guid, `participant of ${one}${others.length ? ' and others' : ''}`);
     }
   }
   return owners;
 }
 
-/** @param {{query: Record<string, string>}} props */
-export function Events({ query }) {
-  useLive();
+/** Returns the part of a GUID that all endpoints of a participant share. @param {string} guid */
+const prefixOf = (guid) => guid.slice(0, guid.lastIndexOf('.'));
+
+/**
+ * Returns a function that names a GUID: by its node, else by the nodes of its participant, else by its
+ * topic or its process. Departed ones have the names that events carry.
+ * @param {import('../state.js').Event[]} events
+ * @param {Map<string, string>} known names of present endpoints and participants
+ * @returns {(guid: string) => string|undefined}
+ */
+export function namesOf(events, known) {
+  const names = new Map(known);
+  /** @type {Map<string, Set<string>>} */
+  const nodes = new Map();
+  /** @type {Map<string, string>} */
+  const others = new Map();
+  for (const { name, attributes } of events) {
+    const { participant, ros_node: node, writer, endpoint, topic, role, process, host } = (
+      /** @type {Record<string, any>} */ (attributes));
+    if (/^ros2\.node\./.test(name) && participant && node) {
+      nodes.set(prefixOf(participant), (nodes.get(prefixOf(participant)) ?? new Set()).add(node));
+    }
+    if (name === 'ros2.message.lost' && writer && node) names.set(writer, node);
+    if (endpoint) others.set(endpoint, `${role} of ${topic}`);
+    else if (participant && (process || host)) others.set(participant, [process, host].filter(Boolean).join(' on '));
+  }
+  return (guid) => {
+    const [one, ...more] = nodes.get(prefixOf(guid)) ?? [];
+    return names.get(guid) ?? (one && (more.length ? `participant of ${one} and others` : one)) ?? others.get(guid);
+  };
+}
+
+/** Requests the events that the agent keeps, once a run, and returns why they are missing. */
+export function useEarlier() {
   const [failed, fail] = useState('');
-  const [held, hold] = useState(/** @type {import('../state.js').Event[]|null} */ (null));
   const run = state.open?.run;
   useEffect(() => {
     const abort = new AbortController();
@@ -90,17 +119,26 @@ export function Events({ query }) {
       .catch((error) => { if (!abort.signal.aborted) fail(error.message); });
     return () => abort.abort();
   }, [run]);
+  return failed;
+}
+
+/** @param {{query: Record<string, string>}} props */
+export function Events({ query }) {
+  useLive();
+  const failed = useEarlier();
+  const [held, hold] = useState(/** @type {import('../state.js').Event[]|null} */ (null));
   const { filter = '', severity = '' } = query;
   const change = (/** @type {Record<string, any>} */ more) => replaceAddress(
     address('events', null, { ...query, ...more }));
-  const names = ownersNow();
   const shown = useTime();
   const past = useEvents(shown);
   const isPast = shown.at != null || (query.span != null && state.open?.keeps_history);
+  // Events before the shown ones name what they mention.
+  const names = namesOf([...past, ...state.events], ownersNow());
   const rows = (isPast ? past : held ?? state.events).filter((/** @type {any} */ event) =>
     (severity || filter || !ROUTINE.test(event.name))
     && (!severity || severity === 'ALL' || event.severity === severity || (severity === 'WARN' && event.severity === 'ERROR'))
-    && (!filter || matches(filter, `${event.name} ${attributesText(event.attributes)} ${
+    && (!filter || matches(filter, `${event.name} ${eventWords(event)} ${attributesText(event.attributes)} ${
       attributesText(event.attributes, names)}`))).reverse();
   const fresh = held ? state.events.length - held.length : 0;
   return html`<h1 tabindex="-1">Events</h1>
@@ -124,17 +162,19 @@ export function Events({ query }) {
       <tbody>${rows.slice(0, MOST_SHOWN).map((/** @type {any} */ event) => html`<tr key=${event.id}>
         <td class="number"><time datetime=${event.time} title=${event.time}>${(isPast ? date : clock)(
           Date.parse(event.time) / 1000)}</time></td>
-        <th scope="row"><${Mark} severity=${SEVERITY[event.severity] ?? 'note'} /> ${event.name}</th>
+        <th scope="row"><${Mark} severity=${SEVERITY[event.severity] ?? 'note'} /> ${eventWords(event)}</th>
         <td><${Attributes} event=${event} names=${names} /></td></tr>`)}</tbody></table></div>
       ${rows.length > MOST_SHOWN && html`<p class="dim">The latest ${count(MOST_SHOWN)} of ${count(
         rows.length)}.</p>`}`
       : html`<p class="empty">${state.events.length ? 'No event matches.' : 'No event yet.'}</p>`}`;
 }
 
-/** @param {{event: import('../state.js').Event, names: Map<string, string>}} props */
+/** @param {{event: import('../state.js').Event, names: (guid: string) => string|undefined}} props */
 function Attributes({ event, names }) {
-  const { topic, ...rest } = event.attributes;
+  const { topic } = event.attributes;
+  const rest = Object.fromEntries(Object.entries(event.attributes).filter(([name]) =>
+    !SHOWN.includes(name) && (name !== 'domain_id' || state.hasDomains())));
   const link = typeof topic === 'string' && html`<a href=${address('topics', topic, {
     domain: /** @type {any} */ (event.attributes).domain_id })}><${Name} text=${topic} /></a> `;
-  return html`${link}<bdi dir="ltr" title=${attributesText(rest)}>${attributesText(rest, names)}</bdi>`;
+  return html`${link}<bdi dir="ltr">${attributesText(rest, names)}</bdi>`;
 }

@@ -1,8 +1,9 @@
 // The graph: nodes and topics from left to right, with traffic and failures.
 
 import { useEffect, useMemo, useRef, useState } from '../vendor/hooks.mjs';
-import { bandwidth, count, date, rate, several, shortened, visible } from '../format.js';
-import { build, differences, dot, MANY_NODES, MOST_LABEL, nameOf } from '../graph-model.js';
+import { bandwidth, count, date, duration, rate, several, shortened, visible } from '../format.js';
+import { build, differences, dot, MANY_NODES, markOf, MOST_LABEL, nameOf, participantsOf }
+  from '../graph-model.js';
 import { address, nodeAddress, topicAddress } from '../router.js';
 import { State } from '../state.js';
 import { replaceAddress, state, useLive, usePoll } from '../store.js';
@@ -49,6 +50,11 @@ function load(edge) {
   return { bytes, hertz, measured, severity };
 }
 
+/** Signs and words of what came, went or changed since a moment before. */
+const CHANGES = /** @type {Record<string, [string, string]>} */ ({
+  came: ['+', 'new'], gone: ['−', 'went'], changed: ['≠', 'changed'],
+});
+
 const ORDER = ['error', 'warning', 'note', 'good'];
 
 /** @param {string} one @param {string} other */
@@ -87,14 +93,16 @@ const TINTS = /** @type {[string, string][]} */ ([['', 'health'], ['rate', 'rate
 const BEFORE = /** @type {[number, string][]} */ ([[60, 'a minute before'],
   [600, 'ten minutes before'], [3600, 'an hour before'], [86400, 'a day before']]);
 /** Hues of processes and hosts. */
-const HUES = 9;
+const HUES = 12;
+/** Most names in a legend. */
+const MOST_NAMES = 40;
 
-/** Returns a hue for a name. @param {string} name */
-function hueOf(name) {
-  let sum = 0;
-  for (const character of name) sum = (sum * 31 + (character.codePointAt(0) ?? 0)) % 65521;
-  return `hsl(${(sum % HUES) * (360 / HUES)} 65% 50%)`;
-}
+/** Values at both ends of a logarithmic scale of colours, and how they are printed. */
+const SCALES = /** @type {Record<string, {low: number, decades: number, what: string,
+  print: (value: number) => string}>} */ ({
+  rate: { low: 1, decades: 3, what: 'Messages a second of a topic', print: rate },
+  latency: { low: 1e-4, decades: 4, what: 'p99 latency of a topic', print: duration },
+});
 
 /** Returns a colour between green and red on a logarithmic scale. @param {number} part 0 to 1 */
 function heat(part) {
@@ -102,20 +110,81 @@ function heat(part) {
 }
 
 /**
- * Returns the colour of a vertex; null for that of its health.
- * @param {import('../graph-model.js').Vertex} vertex
- * @param {string} tint
+ * Returns a hue for each name. While there are hues left, each name has its own, which depends on the
+ * names before it as little as possible.
+ * @param {string[]} names
  */
-function tintOf(vertex, tint) {
-  if (vertex.topic != null) {
-    const { rate: hertz, p99 } = state.figuresOf(vertex.topic);
-    if (tint === 'rate' && hertz) return heat(Math.log10(Math.max(1, hertz)) / 3);
-    if (tint === 'latency' && p99) return heat(Math.log10(p99 / 1e-4) / 4);
+export function huesOf(names) {
+  const taken = new Set();
+  return new Map([...new Set(names)].sort().map((name) => {
+    let slot = 0;
+    for (const character of name) slot = (slot * 31 + (character.codePointAt(0) ?? 0)) % 65521;
+    slot %= HUES;
+    while (taken.size < HUES && taken.has(slot)) slot = (slot + 1) % HUES;
+    taken.add(slot);
+    return [name, `hsl(${slot * (360 / HUES)} 65% 50%)`];
+  }));
+}
+
+/**
+ * Returns the colours of vertices besides those of their health, and the legend that explains them.
+ * An edge that stands for topics has the colour of its highest value.
+ * @param {import('../graph-model.js').Vertex[]} vertices
+ * @param {string} tint
+ * @returns {{of: (vertex: import('../graph-model.js').Vertex) => string|null,
+ *   ofEdge: (edge: import('../graph-model.js').Edge) => string|null, what: string,
+ *   legend: {colour: string, words: string}[]}}
+ */
+export function tinted(vertices, tint) {
+  const scale = SCALES[tint];
+  if (scale) {
+    const { low, decades, what, print } = scale;
+    const most = (/** @type {number[]} */ topics) => {
+      const values = topics.map((id) => state.figuresOf(id)[tint === 'rate' ? 'rate' : 'p99'] ?? 0);
+      const value = Math.max(0, ...values);
+      return value > 0 ? heat(Math.log10(value / low) / decades) : null;
+    };
+    const legend = Array.from({ length: decades + 1 }, (_, at) => ({ colour: heat(at / decades),
+      words: `${at === decades ? 'at least ' : at ? '' : 'at most '}${print(low * 10 ** at)}` }));
+    return { legend, what: `${what}, without a colour if it is not measured`,
+      of: (vertex) => (vertex.topic == null ? null : most([vertex.topic])),
+      ofEdge: (edge) => (edge.kind === 'pair' ? most(edge.topics) : null) };
   }
-  if (vertex.node == null) return null;
-  const own = state.participants.get(state.nodes.get(vertex.node)?.participants[0] ?? -1);
-  if (tint === 'host') return hueOf(own?.host ?? '');
-  return tint === 'process' ? hueOf(`${own?.host} ${own?.pid}`) : null;
+  const participants = participantsOf(state);
+  const name = (/** @type {import('../graph-model.js').Vertex} */ vertex) => {
+    const own = participants(vertex);
+    if (!own) return null;
+    const host = own.host ?? 'unknown host';
+    if (tint === 'host') return host;
+    return own.pid == null ? `unknown process on ${host}`
+      : `${state.processName(own)} on ${host}`;
+  };
+  /** @type {Map<string, number>} */
+  const nodes = new Map();
+  for (const own of ['process', 'host'].includes(tint) ? vertices.map(name) : []) {
+    if (own != null) nodes.set(own, (nodes.get(own) ?? 0) + 1);
+  }
+  const hues = huesOf([...nodes.keys()]);
+  return {
+    of: (vertex) => hues.get(name(vertex) ?? '') ?? null,
+    ofEdge: () => null,
+    what: tint === 'host' ? 'Hosts of nodes' : 'Processes of nodes',
+    legend: [...hues].map(([own, colour]) => ({ colour,
+      words: `${own}: ${several(nodes.get(own) ?? 0, 'node')}` })),
+  };
+}
+
+/** What the colours of vertices mean. @param {{tint: string, colours: ReturnType<typeof tinted>}} props */
+function Scale({ tint, colours }) {
+  const { what, legend } = colours;
+  if (!tint) {
+    return html`<p class="scale dim"><span>Health: <${Mark} severity="error" /> an error, <${Mark}
+      severity="warning" /> a warning, without a mark no finding.</span></p>`;
+  }
+  return html`<p class="scale"><span class="dim">${what}:</span>${legend.slice(0, MOST_NAMES).map(
+    ({ colour, words }) => html`<span key=${words}><i style=${`--tint: ${colour}`} /> <${Name}
+      text=${words} /></span>`)}${legend.length > MOST_NAMES && html`<span>${count(
+    legend.length - MOST_NAMES)} more</span>`}</p>`;
 }
 
 /** Seconds after which a moment that is missing is requested again. */
@@ -155,11 +224,14 @@ function Differences({ found, failed, since }) {
   if (failed) return html`<p class="problem">Nothing to compare with: ${failed}</p>`;
   if (!found) return null;
   const lists = /** @type {[string, string[]][]} */ ([['New nodes', found.came.map(nameOf)],
-    ['Nodes that went', found.gone.map(nameOf)], ['New', found.joined], ['Ended', found.left],
+    ['Nodes that went', found.gone.map(nameOf)], ['New topics', found.cameTopics.map(nameOf)],
+    ['Topics that went', found.goneTopics.map(nameOf)], ['New', found.joined], ['Ended', found.left],
     ['Other QoS', found.changed]]);
   const known = lists.filter(([, list]) => list.length);
   return html`<section aria-label="Differences" class="differences">
-    <p>Since ${date(since)}: ${known.length ? '' : 'the same nodes, topics and QoS.'}</p>
+    <p>Since ${date(since)}: ${known.length
+      ? html`in the graph, <strong>+</strong> is new, <strong>−</strong> went, and <strong>≠</strong> has
+        other QoS or other ends.` : 'the same nodes, topics and QoS.'}</p>
     ${known.map(([title, list]) => html`<details key=${title} open=${list.length <= 5}>
       <summary>${title} (${count(list.length)})</summary><ul class="plain">${list.slice(0, 200).map((text) =>
         html`<li key=${text}><${Name} text=${text} /></li>`)}</ul></details>`)}</section>`;
@@ -204,11 +276,14 @@ export function Graph({ query }) {
   options.fold = level;
   const against = Number(query.against) || 0;
   const compared = useDifferences(state.open?.keeps_history ? against : 0);
-  const graph = useMemo(() => build(state, options, joints), [
-    state.structure, JSON.stringify(query), asked.data, trail, level]);
+  const drawn = compared.found?.both ?? state;
+  const graph = useMemo(() => build(drawn, options, joints), [
+    drawn, state.structure, JSON.stringify(query), asked.data, trail, level]);
   const raise = () => {
-    for (let next = level + 1; isAutomatic && next <= MOST_FOLDED; next += 1) {
-      const folded = build(state, { ...options, fold: next }, joints);
+    // A topic in focus is not folded into an edge.
+    const most = focus?.startsWith('topic:') ? MOST_FOLDED - 1 : MOST_FOLDED;
+    for (let next = level + 1; isAutomatic && next <= most; next += 1) {
+      const folded = build(drawn, { ...options, fold: next }, joints);
       if (folded.signature !== graph.signature) {
         setFolding({ scene, level: next });
         return true;
@@ -232,6 +307,8 @@ export function Graph({ query }) {
     || graph.edges.some((/** @type {any} */ each) => each.id === chosen);
   const drawing = useRef(/** @type {SVGSVGElement|null} */ (null));
   const host = state.open?.host ?? 'robot';
+  const tint = TINTS.some(([each]) => each === query.tint) ? query.tint : '';
+  const colours = tinted(graph.vertices, tint);
   const vertexNames = new Map(graph.vertices.map(
     (/** @type {any} */ each) => [each.key, each.name]));
   return html`<h1 tabindex="-1">Graph</h1>
@@ -250,7 +327,7 @@ export function Graph({ query }) {
         <label key=${key}><input type="checkbox" checked=${Boolean(query[key])}
           onChange=${(/** @type {any} */ event) => change({ [key]: event.target.checked })} />
           ${title}</label>`)}
-      <label>Colour <select value=${query.tint ?? ''}
+      <label>Colour <select value=${tint}
         onChange=${(/** @type {any} */ event) => change({ tint: event.target.value })}>
         ${TINTS.map(([tint, title]) => html`<option value=${tint}>${title}</option>`)}</select></label>
       ${state.open?.keeps_history && html`<label>Compare with <select value=${String(against || '')}
@@ -285,11 +362,12 @@ export function Graph({ query }) {
     ${failed && html`<p class="problem">${failed}</p>`}
     ${!graph.vertices.length && html`<p class="empty">${focus
       ? 'The selected node or topic does not exist now.' : 'No node is known.'}</p><${Incomplete} missing="the graph lacks them" />`}
+    ${graph.vertices.length > 0 && html`<${Scale} tint=${tint} colours=${colours} />`}
     ${picture && graph.vertices.length > 0 && html`<div class="graph ${isPicked
       ? 'beside' : ''}">
       <${Drawing} graph=${graph} picture=${picture} chosen=${chosen} choose=${choose}
         toggle=${toggle} own=${drawing} marks=${marks} scene=${scene} raise=${raise} goTo=${camera}
-        tint=${query.tint ?? ''} came=${compared.found?.came ?? []} />
+        colours=${colours} changes=${compared.found} />
       <${Panel} graph=${graph} chosen=${chosen} change=${change} toggle=${toggle}
         choose=${choose} names=${vertexNames} chains=${chains.data?.chains ?? []} /></div>`}
     <${Legend} />`;
@@ -415,12 +493,13 @@ function label(edge) {
  * @param {{graph: import('../graph-model.js').Graph, picture: Picture, chosen: string|null,
  *   choose: (key: string|null) => void, toggle: (key: string) => void, own: any,
  *   marks: {vertices: Map<string, number>, edges: Set<string>}|null, scene: string,
- *   raise: () => boolean, goTo: any, tint: string, came: string[]}} props
+ *   raise: () => boolean, goTo: any, colours: ReturnType<typeof tinted>,
+ *   changes: ReturnType<typeof differences>|null}} props
  *   `marks` are the vertices and edges of a chain; a new `scene` is shown like the first one;
  *   `raise` folds more, and returns whether it can; `goTo` receives a function that moves to a vertex
  */
-function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, raise, goTo, tint,
-  came }) {
+function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, raise, goTo,
+  colours, changes }) {
   const stage = useRef(/** @type {SVGGElement|null} */ (null));
   const camera = useRef(/** @type {Camera|null} */ (null));
   useEffect(() => {
@@ -511,27 +590,30 @@ function Drawing({ graph, picture, chosen, choose, toggle, own, marks, scene, ra
         const active = chosen != null && (edge.from === chosen || edge.to === chosen
           || edge.id === chosen);
         const { x, y } = middleOf(points);
-        return html`<g key=${edge.id} class="edge ${way(edge.passages, edge.kind)} ${health} ${active
-          ? 'active' : ''} ${measured ? '' : 'unmeasured'} ${isPassed ? 'passed' : ''}"
-          onClick=${() => choose(edge.id)}>
+        const tint = colours.ofEdge(edge);
+        const mark = changes && markOf(edge, changes.guids);
+        return html`<g key=${edge.id} style=${tint ? `--tint: ${tint}` : undefined} class="edge ${way(edge.passages, edge.kind)} ${health} ${active
+          ? 'active' : ''} ${measured ? '' : 'unmeasured'} ${isPassed ? 'passed' : ''} ${
+          tint ? 'tinted' : ''} ${mark ?? ''}" onClick=${() => choose(edge.id)}>
           ${few && html`<path class="touch" d=${curve(points)} />`}
           <path class="line" d=${curve(points)} stroke-width=${Math.max(
             isPassed ? 3 : 0, thickness(bytes)).toFixed(1)}
             marker-end="url(#arrow-${isPassed ? 'passed' : health})" />
           ${(health === 'error' || health === 'warning') && edge.kind !== 'feeds' && html`<text
             class="sign ${health}" x=${x} y=${y + 4}>${health === 'error' ? '✖' : '▲'}</text>`}
+          ${mark && html`<text class="sign ${mark}" x=${x} y=${y - 6}>${CHANGES[mark][0]}</text>`}
           ${edge.kind === 'pair' && (labelled.has(edge.id) || active) && html`<text class="edge-label" x=${x}
             y=${y - 5}>${edge.topics.length === 1
               ? shortened(state.topics.get(edge.topics[0])?.name, 24)
               : several(edge.topics.length, 'topic')}${measured
               ? ` ${rate(load(edge).hertz)}` : ''}</text>`}
-          <title>${label(edge)}</title></g>`;
+          <title>${mark ? `${CHANGES[mark][1]}: ` : ''}${label(edge)}</title></g>`;
       })}
       ${shown.filter((each) => each.kind !== 'box' || each.closed).map((each) => html`<${Shape}
         key=${each.key} vertex=${each} at=${picture.at.get(each.key)} nodes=${nodes}
         chosen=${chosen === each.key} roving=${roving === each.key} choose=${choose}
-        toggle=${toggle} camera=${camera} tint=${tint && tintOf(each, tint)}
-        came=${came.includes(each.key)} position=${marks?.vertices.get(each.key)}
+        toggle=${toggle} camera=${camera} tint=${colours.of(each)}
+        mark=${changes && markOfVertex(each, changes.vertices)} position=${marks?.vertices.get(each.key)}
         positions=${marks?.vertices.size} />`)}
     </g></svg>
     <div class="zoom"><button type="button" aria-label="Zoom in"
@@ -643,19 +725,19 @@ const SIGNS = /** @type {Record<string, string>} */ ({ error: '✖', warning: '�
 
 /** @param {any} props */
 function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera, position,
-  positions, tint, came }) {
+  positions, tint, mark }) {
   const figures = vertex.topic == null ? null : state.figuresOf(vertex.topic);
   const flags = vertex.topic == null ? [] : state.flagsOf(vertex.topic);
   let severity = vertex.topic != null ? worst(flags) : nodes.get(vertex.node) ?? 'good';
   if (vertex.closed) {
     for (const key of vertex.members) severity = worse(severity, healthOf(key, nodes));
   }
-  const detail = vertex.closed ? several(vertex.count, 'node')
+  const detail = mark === 'gone' && figures ? CHANGES.gone[1] : vertex.closed ? several(vertex.count, 'node')
     : figures ? (figures.rate == null ? 'not measured'
       : `${rate(figures.rate)} · ${bandwidth(figures.bandwidth)}`)
       : shortened(vertex.detail, MOST_LABEL);
   const label = shortened(vertex.name, MOST_LABEL);
-  const closing = vertex.closed ? '▸ ' : '';
+  const closing = (vertex.closed ? '▸ ' : '') + (mark ? `${CHANGES[mark][0]} ` : '');
   const [left, top] = [at.x - at.w / 2, at.y - at.h / 2];
   const sign = SIGNS[severity];
   const press = () => {
@@ -664,9 +746,9 @@ function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera, posi
     else choose(vertex.key);
   };
   const words = (sign ? `, with ${severity === 'error' ? 'an error' : 'a warning'}` : '')
-    + (position ? `, ${position} of ${positions} in the chain` : '');
+    + (mark ? `, ${CHANGES[mark][1]}` : '') + (position ? `, ${position} of ${positions} in the chain` : '');
   return html`<g class="vertex ${vertex.kind} ${severity} ${chosen ? 'chosen' : ''} ${position
-    ? 'passed' : ''} ${tint ? 'tinted' : ''} ${came ? 'came' : ''}" role="button"
+    ? 'passed' : ''} ${tint ? 'tinted' : ''} ${mark ?? ''}" role="button"
     style=${tint ? `--tint: ${tint}` : undefined}
     tabindex=${roving ? 0 : -1} data-key=${vertex.key} onClick=${press}
     aria-expanded=${vertex.closed ? 'false' : undefined}
@@ -687,6 +769,16 @@ function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera, posi
       && html`<tspan class="detail" x=${left + 12} y=${top + 32}>${detail}</tspan>`}</text>
     ${sign && html`<text class="sign ${severity}" aria-hidden="true" x=${left + at.w - 9} y=${top + 14}>${sign}</text>`}
     ${label !== visible(vertex.name) && html`<title>${visible(vertex.name)}</title>`}</g>`;
+}
+
+/**
+ * Returns the mark of a vertex. A closed box has changed if a part of it has.
+ * @param {import('../graph-model.js').Vertex} vertex
+ * @param {Map<string, import('../graph-model.js').Mark>} marks
+ */
+function markOfVertex(vertex, marks) {
+  return marks.get(vertex.key) ?? (vertex.closed && vertex.members.some((key) => marks.has(key))
+    ? 'changed' : null);
 }
 
 /** @param {string} key @param {Map<number, string>} nodes */
@@ -712,9 +804,10 @@ function Panel({ graph, chosen, change, toggle, choose, names, chains }) {
     onClick=${() => choose(key)}><${Name} text=${names.get(key) ?? key} /></button>`;
   const sides = (/** @type {string} */ name, /** @type {any[]} */ edges,
     /** @type {'from'|'to'} */ side) => edges.length > 0 && html`<h3>${name} (${count(edges.length)})</h3>
-    <ul>${edges.slice(0, 40).map((each) => html`<li key=${each.id}>${link(each[side])}
+    <ul>${edges.slice(0, 40).map((each) => html`<li key=${each.id}>${link(each[side])}${' '}
       <span class="dim">${wayWords(each)}${each.topics.length > 1
         ? `, ${several(each.topics.length, 'topic')}` : ''}</span></li>`)}</ul>`;
+  const went = vertex && (vertex.node ?? vertex.topic ?? 0) < 0;
   const topic = vertex?.topic != null ? state.topics.get(vertex.topic) : null;
   const node = vertex?.node != null ? state.nodes.get(vertex.node) : null;
   const figures = topic && state.figuresOf(topic.id);
@@ -725,6 +818,7 @@ function Panel({ graph, chosen, change, toggle, choose, names, chains }) {
   return html`<aside class="panel" id="graph-panel" tabindex="-1" aria-label="Details">
     <h2>${title} <button type="button" class="small" aria-label="Close the details"
       onClick=${() => choose(null)}>×</button></h2>
+    ${went && html`<p>It went since the moment that is compared.</p>`}
     ${vertex && html`<p>${topic && html`<a href=${topicAddress(topic)}>Open the topic</a> `}
       ${node && html`<a href=${nodeAddress(node)}>Open the node</a> `}
       ${vertex.kind !== 'box' && html`<button type="button"
@@ -737,7 +831,7 @@ function Panel({ graph, chosen, change, toggle, choose, names, chains }) {
       ${state.findings.filter((finding) => (topic && finding.topic === topic.id)
         || (node && finding.node === node.id)).slice(0, 8).map((finding) => html`<p
         key=${finding.id}><${Mark} severity=${finding.severity} /> <${Sentence}
-        text=${finding.text} /></p>`)}
+        text=${state.withScripts(finding.text)} /></p>`)}
       ${through.length > 0 && html`<p>In ${through.length === 1 ? 'the chain' : 'the chains'}${' '}
         <${ChainLinks} chains=${through} filter=${place?.name ?? ''} />${' '}
         <button type="button" class="small" onClick=${() => change({ ...NO_CHAIN,

@@ -2,7 +2,7 @@
 
 import { percent } from '../format.js';
 import { tables, waiting } from '../inside.js';
-import { usePoll } from '../store.js';
+import { state, usePoll } from '../store.js';
 import { Failed, html, Name } from '../ui.js';
 import { useEffect, useState } from '../vendor/hooks.mjs';
 import { Late } from './late.js';
@@ -25,7 +25,7 @@ export function Inside({ inside, name, domain, picked = null }) {
   const shown = inside ? tables(inside) : [];
   const isShown = shown.length > 0 || inside?.lifecycle_state;
   if (!observes && !isShown) {
-    return html`<p><button type="button" onClick=${() => observe(true)}>Observe calls</button>${' '}
+    return html`<p id="inside"><button type="button" onClick=${() => observe(true)}>Observe calls</button>${' '}
       <span class="dim">Callbacks and queues inside the processes, while this view is open. Each call
       costs its process some microseconds.</span></p>`;
   }
@@ -42,7 +42,7 @@ export function Inside({ inside, name, domain, picked = null }) {
       (name, at) => html`<th scope="col" class=${at > 1 ? 'number' : ''}>${name}</th>`)}</tr></thead>
       <tbody>${rows.map((row, place) => html`<tr key=${place}>${row.map((cell, at) => at === 0
         ? html`<th scope="row"><${Name} text=${cell} /></th>` : at === 1
-          ? html`<td><${Name} text=${cell} /></td>` : html`<td class="number">${cell}</td>`)}</tr>`)}
+          ? html`<td><${Name} text=${state.withScripts(cell)} /></td>` : html`<td class="number">${cell}</td>`)}</tr>`)}
       </tbody></table></div>`)}
     ${observes ? html`<${Late} answer=${late} picked=${picked} />`
       : html`<p><button type="button" onClick=${() => observe(true)}>Why late?</button></p>`}</section>`;

@@ -2,6 +2,7 @@
 
 import { clock } from '../format.js';
 import { callsOf, causes, closest, missing, timeline, WIDTH, worst } from '../late.js';
+import { state } from '../store.js';
 import { Failed, html, Name } from '../ui.js';
 import { useEffect, useRef, useState } from '../vendor/hooks.mjs';
 
@@ -32,7 +33,7 @@ export function Late({ answer, picked = null }) {
       <th scope="col" class="number">Late</th><th scope="col" class="number">Time</th>
       <th scope="col">Parts</th></tr></thead><tbody>${calls.map((/** @type {any} */ it, /** @type {number} */
         place) => html`<tr key=${place}><th scope="row"><${Name} text=${it.callback} /></th>
-        <td><${Name} text=${it.who} /></td><td class="number">${it.late}</td>
+        <td><${Name} text=${state.withScripts(it.who)} /></td><td class="number">${it.late}</td>
         <td class="number">${it.total}</td><td><${Parts} call=${it} /></td></tr>`)}
       </tbody></table></div>`}</section>`;
 }
@@ -83,7 +84,7 @@ function Timeline({ why, picked }) {
       <caption>${bar.label}</caption><thead><tr><th scope="col">Time</th><th scope="col">Callback</th>
       <th scope="col">Node</th><th scope="col" class="number">Length</th><th scope="col">Why</th></tr>
       </thead><tbody>${callsOf(bar).map((it, place) => html`<tr key=${place}><th scope="row">${it.time}
-        </th><td><${Name} text=${it.callback} /></td><td><${Name} text=${it.who} /></td>
+        </th><td><${Name} text=${it.callback} /></td><td><${Name} text=${state.withScripts(it.who)} /></td>
         <td class="number">${it.total}</td><td>${it.example ? html`<${Parts} call=${it.example} />`
           : html`<${Name} text=${it.words} />`}</td></tr>`)}</tbody></table></div>`}`;
 }

@@ -2,7 +2,7 @@
 
 import { useRef } from '../vendor/hooks.mjs';
 import { named } from '../api.js';
-import { bytes, calls, count, date, duration, percent, several } from '../format.js';
+import { bytes, calls, count, date, duration, groupOf, percent, several } from '../format.js';
 import { nodeKey } from '../graph-model.js';
 import { address } from '../router.js';
 import { Chart } from '../chart.js';
@@ -83,10 +83,8 @@ export function Nodes({ query }) {
   const joined = ends();
   const participant = (/** @type {any} */ node) => state.participants.get(node.participants[0]);
   const process = (/** @type {any} */ node) => byId.get(participant(node)?.pid ?? -1);
-  const where = (/** @type {any} */ node) => {
-    const own = participant(node);
-    return [process(node)?.script ?? own?.process, own?.pid].filter((part) => part != null).join(' ');
-  };
+  const where = (/** @type {any} */ node) => [state.processName(participant(node)),
+    groupOf(participant(node)?.cgroup)].filter(Boolean).join(', ');
   const number = (/** @type {any} */ node, /** @type {'publishers'|'subscriptions'} */ side) =>
     joined.get(node.id)?.[side].size ?? 0;
   const worstOf = (/** @type {any} */ node) => {
@@ -107,11 +105,14 @@ export function Nodes({ query }) {
     { key: 'host', title: 'Host', kind: 'wide',
       by: (/** @type {any} */ node) => participant(node)?.host,
       cell: (/** @type {any} */ node) => html`<${Name} text=${participant(node)?.host ?? 'unknown'} />` },
-    { key: 'process', title: 'Process', by: where,
+    { key: 'process', title: 'Process',
+      meaning: 'Script or program with its id, and its container or systemd unit.', by: where,
       cell: (/** @type {any} */ node) => html`<${Name} text=${where(node) || 'unknown'} />` },
-    { key: 'cpu', title: 'CPU', kind: 'number', by: (/** @type {any} */ node) => process(node)?.part,
+    { key: 'cpu', title: 'CPU',
+      meaning: 'CPU time by time: 100 % is one busy core. Nodes of one process share the value.', kind: 'number', by: (/** @type {any} */ node) => process(node)?.part,
       cell: (/** @type {any} */ node) => percent(process(node)?.part) },
-    { key: 'memory', title: 'Memory', kind: 'number',
+    { key: 'memory', title: 'Memory',
+      meaning: 'Resident memory of the process.', kind: 'number',
       by: (/** @type {any} */ node) => process(node)?.memory_bytes,
       cell: (/** @type {any} */ node) => bytes(process(node)?.memory_bytes) },
     { key: 'publishers', title: 'Publishes', kind: 'number wide',
@@ -227,14 +228,15 @@ export function NodeView({ name, query }) {
       <th scope="col">Started</th><th scope="col">Control group</th><th scope="col">Participant</th></tr></thead>
     <tbody>${instances.map((own) => {
       const process = own && byId.get(own.pid ?? -1);
-      return own && html`<tr key=${own.guid}><th scope="row"><${Name} text=${[process?.script ?? own.process, own.pid]
-        .filter((part) => part != null).join(' ') || 'unknown'} /></th>
+      return own && html`<tr key=${own.guid}><th scope="row"><${Name}
+        text=${state.processName(own) || 'unknown'} /></th>
         <td><${Name} text=${own.host ?? 'unknown'} /></td>
         <td class="number">${percent(process?.part)}</td>
         <td class="number">${bytes(process?.memory_bytes)}</td>
         <td class="number">${count(process?.threads)}</td>
         <td>${date(process?.started_timestamp_seconds)}</td>
-        <td><${Name} text=${own.cgroup ?? ''} /></td>
+        <td>${groupOf(own.cgroup) && html`<${Name} text=${groupOf(own.cgroup)} /><br />`}<span
+          class="dim"><${Name} text=${own.cgroup ?? ''} /></span></td>
         <td>${own.vendor ?? ''} <${Name} text=${own.guid} /></td></tr>`;
     })}</tbody></table></div></section>
     <${ProcessCharts} ids=${instances.map((own) => own?.pid)} />

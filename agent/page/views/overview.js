@@ -1,7 +1,7 @@
 // Findings with their age and remedy, then totals, then the agent's blind spots.
 
 import { age, bandwidth, clock, count, duration, percent, rate, several } from '../format.js';
-import { address, nodeAddress, partAddress, topicAddress } from '../router.js';
+import { address, findingAddress } from '../router.js';
 import { state, useLive } from '../store.js';
 import { Figure, html, Mark, Name, Sentence, TopicLink, worst, Badges } from '../ui.js';
 
@@ -101,23 +101,17 @@ function now(finding) {
 /** Returns a finding's text without its leading topic name. @param {any} finding */
 function rest(finding) {
   const name = state.topics.get(finding.topic)?.name;
-  return name && finding.text.startsWith(`${name} `) ? finding.text.slice(name.length + 1)
-    : finding.text;
+  const text = state.withScripts(finding.text);
+  return name && text.startsWith(`${name} `) ? text.slice(name.length + 1) : text;
 }
 
 /**
- * Returns address and title of the view of a finding's subject; null if it is the agent.
+ * Returns address and title of the section that a finding is about; null if it is the agent.
  * @param {import('../state.js').Finding} finding
- * @returns {[string, string]|null}
  */
 export function placeOf(finding) {
-  const topic = finding.topic == null ? null : state.topics.get(finding.topic);
-  if (finding.kind === 'slow_chain') {
-    return [address('chains', null, { filter: topic?.name }), 'Chains'];
-  }
-  if (topic) return [topicAddress(topic), topic.name];
-  const node = finding.node == null ? null : state.nodes.get(finding.node);
-  return node ? [nodeAddress(node), node.name] : partAddress(finding.kind);
+  return findingAddress(finding, state.topics.get(finding.topic ?? -1) ?? null,
+    state.nodes.get(finding.node ?? -1) ?? null);
 }
 
 /** A link to a finding's subject. @param {{finding: import('../state.js').Finding}} props */

@@ -41,8 +41,8 @@ export function Recordings() {
         <th scope="col">Files</th></tr></thead>
       <tbody>${data.kept.map((/** @type {any} */ each) => html`<tr key=${each.name}>
         <th scope="row"><${Name} text=${each.name} />${each.is_complete ? '' : html`
-          <span class="badge warning" title="It was cut off: rp bag reindex writes its metadata"><${Mark}
-          severity="warning" /> cut off</span>`}</th>
+          <span class="badge warning"><${Mark} severity="warning" /> cut off</span> <span class="dim"><code>rp bag
+          reindex</code> writes its metadata</span>`}</th>
         <td>${date(each.modified_timestamp_seconds)}</td>
         <td class="number">${bytes(each.file_bytes)}</td>
         <td>${each.trigger ? html`<${Incident} trigger=${each.trigger} />` : 'none'}</td>
@@ -82,7 +82,7 @@ function Incident({ trigger }) {
   const time = { at: end, span: end - Math.floor(at) + AROUND };
   return html`<a href=${trigger.topic == null ? address('', null, time)
     : address('topics', trigger.topic, { ...time, domain: trigger.domain_id })}
-    title="The robot as it was at ${trigger.event}">${words}</a>`;
+    >${words}</a>: the robot as it was`;
 }
 
 /** @param {{name: string, again: () => void}} props */

@@ -1,15 +1,15 @@
 // One topic: its figures over time, its endpoints and their QoS, its losses, and its messages.
 
-import { useEffect, useRef, useState } from '../vendor/hooks.mjs';
-import { json, named } from '../api.js';
+import { useRef, useState } from '../vendor/hooks.mjs';
+import { named } from '../api.js';
 import { Chart } from '../chart.js';
-import { bandwidth, clock, count, date, duration, percent, rate, several } from '../format.js';
+import { bandwidth, clock, count, date, duration, eventWords, percent, rate, several } from '../format.js';
 import { address } from '../router.js';
 import { topicKey } from '../graph-model.js';
 import { LiveMessage } from '../message.js';
 import { Endpoints, Offered } from '../qos.js';
 import { state, stream, useLive, usePoll } from '../store.js';
-import { inWords, marksOf, useEvents, useHistory, useTime, zoom } from '../timebar.js';
+import { eventsOf, inWords, marksOf, useEvents, useHistory, useTime, zoom } from '../timebar.js';
 import { Badges, Failed, Figure, html, Mark, Name, PASSAGES, Text } from '../ui.js';
 import { InChains } from './chains.js';
 import { Inside } from './inside.js';
@@ -32,6 +32,7 @@ export function Topic({ name, query }) {
   const topic = state.topicNamed(name, domain);
   const scope = topic ? `?domain_id=${topic.domain}` : domain == null ? '' : `?domain_id=${domain}`;
   const [picked, pick] = useState(/** @type {{time: number, topic?: number}|null} */ (null));
+  const known = useEvents(useTime());
   const details = usePoll(topic ? named('topics', apiName(topic), scope) : null, 2000);
   if (!topic) {
     return html`<h1 tabindex="-1"><${Name} text=${name} /></h1>
@@ -39,6 +40,7 @@ export function Topic({ name, query }) {
         : 'at that time'}.${' '}
       <a href=${address('topics')}>All topics</a></p>`;
   }
+  const events = eventsOf(known, topic.name);
   const figures = state.figuresOf(topic.id);
   const findings = state.findings.filter((finding) => finding.topic === topic.id);
   const reasons = details.data?.reasons ?? [];
@@ -49,7 +51,7 @@ export function Topic({ name, query }) {
       <span class="dim">Measure</span> <${Measure} topic=${topic} />
       <a href=${address('graph', null, { focus: topicKey(topic), hops: 1 })}>In the graph</a>
       <a href=${address('events', null, { filter: topic.name })}>Events</a></p>
-    <p><${Badges} flags=${state.flagsOf(topic.id)} /></p>
+    <p><${Badges} flags=${state.flagsOf(topic.id)} explained /></p>
     <${InChains} domain=${topic.domain} topic=${topic.name} />
     ${findings.length > 0 && html`<section aria-label="Findings"><${Findings} list=${findings} />
       </section>`}
@@ -58,6 +60,8 @@ export function Topic({ name, query }) {
       </ul>`}
     ${details.data?.source === 'inside' && html`<p class="dim">Rate and messages come from inside
       the processes; the network shows none, and sizes are unknown.</p>`}
+    ${stream.at == null && html`<${LiveMessage} key=${`message ${topic.id}`} topic=${topic} scope=${scope}
+      name=${apiName(topic)} events=${events} />`}
     <div class="figures">
       <${Figure} label="rate" value=${rate(figures.rate)} />
       <${Figure} label="bandwidth" value=${bandwidth(figures.bandwidth)} />
@@ -68,8 +72,7 @@ export function Topic({ name, query }) {
       <${Figure} label="last message" value=${clock(figures.last)} />
     </div>
     <${Clocks} publishers=${details.data?.publishers ?? []} />
-    ${stream.at == null && html`<${LiveMessage} key=${`message ${topic.id}`} topic=${topic} scope=${scope} name=${apiName(topic)} />`}
-    <${Charts} key=${topic.id} topic=${topic} scope=${scope} pick=${(/** @type {{time: number}} */
+    <${Charts} key=${topic.id} topic=${topic} scope=${scope} events=${events} pick=${(/** @type {{time: number}} */
       { time }) => pick({ time, topic: topic.id })} />
     <${Failed} problem=${details.problem} what="No details" />
     ${details.data && html`
@@ -96,21 +99,21 @@ function Clocks({ publishers }) {
     ${each.correction_seconds == null
       ? html`The clock of <${Name} text=${each.peer} /> has an unknown offset: latencies from there
         may be wrong by any time.`
-      : html`Add ${duration(each.correction_seconds)} (± ${duration(each.uncertainty_seconds)}) to
-        latencies from <${Name} text=${each.peer} />, because of its clock.`}</p>`)}`;
+      : html`Latencies from <${Name} text=${each.peer} /> ${each.correction_seconds === 0
+        ? 'need no correction'
+        : `are corrected by ${duration(each.correction_seconds)}`}, and wrong by at most
+        ${' '}${duration(each.uncertainty_seconds)}: its clock.`}</p>`)}`;
 }
 
-/** @param {{topic: import('../state.js').Topic, scope: string,
+/** @param {{topic: import('../state.js').Topic, scope: string, events: import('../state.js').Event[],
  *   pick: (picked: {time: number}) => void}} props */
-function Charts({ topic, scope, pick }) {
+function Charts({ topic, scope, events, pick }) {
   const shown = useTime();
   const path = named('topics', apiName(topic), `/history${scope}`);
   const isLive = shown.at == null && shown.span === LIVE_SPAN;
   const latest = useLatest(isLive ? path : null, topic);
   const past = useHistory(isLive ? null : path, shown);
   const columns = isLive ? latest : COLUMNS.map((column) => past.data?.[column] ?? []);
-  const events = useEvents(shown).filter((event) => event.attributes.topic === topic.name
-    || (event.attributes.topic == null && event.severity !== 'INFO'));
   const marks = marksOf(events);
   const [times, rates, sizes, lost, half, most, gapHalf, gapMost] = columns;
   const title = inWords(shown);
@@ -136,7 +139,7 @@ function Charts({ topic, scope, pick }) {
     ${chart({ title: 'Latency', print: duration, lines: [
       { label: 'p50', colour: '--line-1', values: half },
       { label: 'p99', colour: '--line-3', values: most }],
-      note: `From the writer’s timestamp to the capture; between hosts it needs equal clocks.${
+      note: `From the writer’s timestamp to the capture; between hosts it is corrected by the known offset of their clocks.${
         shown.at == null ? ` A click, or Enter at the cursor, observes calls and lists the late ones of
         that time` : ''}`, pick: shown.at == null ? pick : undefined })}
     ${chart({ title: 'Lost messages', print: count, whole: true,
@@ -149,7 +152,7 @@ function Marked({ events }) {
   if (!events.length) return null;
   return html`<details><summary>${several(events.length, 'event')} in this time</summary>
     <ul class="plain">${events.slice(-MOST_MARKED).map((event) => html`<li key=${event.id}>
-      ${date(Date.parse(event.time) / 1000)} ${event.name}</li>`)}</ul></details>`;
+      ${date(Date.parse(event.time) / 1000)} ${eventWords(event)}</li>`)}</ul></details>`;
 }
 
 /**
@@ -159,41 +162,23 @@ function Marked({ events }) {
  * @param {import('../state.js').Topic} topic
  */
 function useLatest(path, topic) {
-  const columns = useRef(/** @type {(number|null)[][]} */ (COLUMNS.map(() => [])));
-  const [, draw] = useState(0);
-  useEffect(() => {
-    if (path == null) return undefined;
-    const abort = new AbortController();
-    let timer = 0;
-    const ask = async () => {
-      if (stream.status === 'live' && document.visibilityState !== 'hidden') {
-        try {
-          const history = await json(path, { signal: abort.signal });
-          columns.current = COLUMNS.map((column) => history[column] ?? []);
-          draw((/** @type {number} */ value) => value + 1);
-        } catch {
-          // The stream's figures continue; the next request may succeed.
-        }
-      }
-      if (!abort.signal.aborted) timer = setTimeout(ask, HISTORY_AGAIN_MS);
-    };
-    ask();
-    return () => {
-      clearTimeout(timer);
-      abort.abort();
-    };
-  }, [path]);
-  const [times] = columns.current;
+  const { data } = usePoll(path, HISTORY_AGAIN_MS);
+  const latest = useRef({ data, columns: /** @type {(number|null)[][]} */ (COLUMNS.map(() => [])) });
+  if (data && data !== latest.current.data) {
+    latest.current = { data, columns: COLUMNS.map((column) => [...(data[column] ?? [])]) };
+  }
+  const { columns } = latest.current;
+  const [times] = columns;
   const { rate: hertz, bandwidth: size, lostNow, p50, p99 } = state.figuresOf(topic.id);
   const last = times[times.length - 1] ?? 0;
   if (path != null && hertz != null && state.time >= Number(last) + 0.9) {
     [state.time, hertz, size, lostNow, p50, p99, null, null].forEach((value, at) => {
-      const own = columns.current[at];
+      const own = columns[at];
       own.push(value);
       if (own.length > (state.open?.history_seconds ?? LIVE_SPAN)) own.shift();
     });
   }
-  return columns.current;
+  return columns;
 }
 
 /** The definition of the topic's type, requested when it is opened. @param {{path: string}} props */
@@ -253,7 +238,8 @@ function Waterfall({ details }) {
         ? 'bad' : ''}">${(lost ?? 0) > 0 ? html`<${Mark} severity="warning" /> ` : ''}${count(
         lost)}</td>`;
       const who = each.nodes.length ? each.nodes.join(', ')
-        : each.process ? `${each.process} ${each.process_id}` : each.subscriber || each.destination;
+        : each.process ? state.processName({ process: each.process, pid: each.process_id })
+          : each.subscriber || each.destination;
       return html`<tr key=${`${each.writer} ${each.destination} ${each.subscriber}`}>
         <th scope="row"><${Name} text=${owners.get(each.writer) ?? each.writer} /> → <${Name}
           text=${who} /></th>

@@ -5,7 +5,7 @@ import { bandwidth, count, duration, percent, rate, visible } from '../format.js
 import { address } from '../router.js';
 import { replaceAddress, state, useLive } from '../store.js';
 import { sorted, Table } from '../table.js';
-import { Act, Badges, FLAGS, Filter, html, matches, Name, Spark, TopicLink, worst } from '../ui.js';
+import { Act, Badges, FLAGS, FLAG_MEANINGS, Filter, html, matches, Name, Spark, TopicLink, worst } from '../ui.js';
 import { Incomplete } from './overview.js';
 
 const SEVERITY = /** @type {Record<string, number>} */ ({ error: 0, warning: 1, note: 2, good: 3 });
@@ -21,7 +21,7 @@ const ONLY = /** @type {Record<string, [string, (topic: any) => boolean]>} */ ({
 /** Switches measuring on or off. @param {import('../state.js').Topic} topic */
 export function watch(topic) {
   const path = `${named('watch', watchName(topic))}?domain_id=${topic.domain}`;
-  return topic.measured ? remove(path) : post(path);
+  return topic.measured && topic.watched !== 0 ? remove(path) : post(path);
 }
 
 // A topic without a ROS name is watched by its DDS name.
@@ -29,21 +29,21 @@ function watchName(/** @type {import('../state.js').Topic} */ topic) {
   return topic.kind === 'dds' ? topic.ddsName : topic.name;
 }
 
-/** Returns why measuring cannot be switched off here, or null. @param {any} topic */
+/** Returns what measures a topic and cannot be switched off here, or null. @param {any} topic */
 function fixed(topic) {
   if (!topic.measured || topic.watched === 0) return null;
-  if (topic.watched & 4) return 'A watch with a pattern measures it.';
-  if ((topic.watched & 3) === 1) return 'The configuration measures it.';
-  if ((topic.watched & 3) === 2) return 'The command line of the agent measures it.';
+  if (topic.watched & 4) return 'pattern';
+  if ((topic.watched & 3) === 1) return 'configuration';
+  if ((topic.watched & 3) === 2) return 'command line';
   return null;
 }
 
 /** @param {{topic: import('../state.js').Topic}} props */
 export function Measure({ topic }) {
   const why = fixed(topic);
-  const on = topic.measured;
-  if (why) return html`<span title=${why} class="dim">on (${topic.watched & 4 ? 'pattern'
-    : (topic.watched & 3) === 1 ? 'configuration' : 'command line'})</span>`;
+  // Without a watch, a topic is measured while its messages are shown or recorded.
+  const on = topic.measured && topic.watched !== 0;
+  if (why) return html`<span class="dim">on (${why})</span>`;
   return html`<${Act} action=${() => watch(topic)} pressed=${on} kind="switch"
     disabled=${!state.may('watch')} label="${on ? 'on' : 'off'}: measure ${visible(topic.name)}">${on ? 'on' : 'off'}</${Act}>`;
 }
@@ -77,24 +77,31 @@ export function Topics({ query }) {
     { key: 'state', title: 'State',
       by: (/** @type {any} */ topic) => SEVERITY[worst(state.flagsOf(topic.id))],
       cell: (/** @type {any} */ topic) => html`<${Badges} flags=${state.flagsOf(topic.id)} />` },
-    { key: 'rate', title: 'Rate', kind: 'number', by: (/** @type {any} */ topic) =>
+    { key: 'rate', title: 'Rate',
+      meaning: 'Messages a second over the last seconds; a dash: not measured.', kind: 'number', by: (/** @type {any} */ topic) =>
       figures(topic).rate, cell: (/** @type {any} */ topic) => rate(figures(topic).rate) },
-    { key: 'course', title: '10 min', kind: 'wide',
+    { key: 'course', title: '10 min',
+      meaning: 'The rate over the last ten minutes.', kind: 'wide',
       cell: (/** @type {any} */ topic) => topic.measured
         && html`<${Spark} points=${state.pointsOf(topic.id)} />` },
-    { key: 'bandwidth', title: 'Bandwidth', kind: 'number wide',
+    { key: 'bandwidth', title: 'Bandwidth',
+      meaning: 'Bytes of payload a second.', kind: 'number wide',
       by: (/** @type {any} */ topic) => figures(topic).bandwidth,
       cell: (/** @type {any} */ topic) => bandwidth(figures(topic).bandwidth) },
-    { key: 'loss', title: 'Loss', kind: 'number wide', by: loss,
+    { key: 'loss', title: 'Loss',
+      meaning: 'Share of the messages that the subscriber with most losses did not receive.', kind: 'number wide', by: loss,
       cell: (/** @type {any} */ topic) => percent(loss(topic)) },
-    { key: 'latency', title: 'p99 latency', kind: 'number wide',
+    { key: 'latency', title: 'p99 latency',
+      meaning: 'Of 100 messages, 99 arrived faster: from the timestamp of the writer to the capture.', kind: 'number wide',
       by: (/** @type {any} */ topic) => figures(topic).p99,
       cell: (/** @type {any} */ topic) => duration(figures(topic).p99) },
-    { key: 'ends', title: 'Pub/Sub', kind: 'number wide',
+    { key: 'ends', title: 'Pub/Sub',
+      meaning: 'Number of publishers and of subscriptions.', kind: 'number wide',
       by: (/** @type {any} */ topic) => topic.publishers.length + topic.subscriptions.length,
       cell: (/** @type {any} */ topic) =>
         `${count(topic.publishers.length)}/${count(topic.subscriptions.length)}` },
-    { key: 'measured', title: 'Measure', by: (/** @type {any} */ topic) => (topic.measured ? 0 : 1),
+    { key: 'measured', title: 'Measure',
+      meaning: 'Whether a watch measures the topic. Watches of a pattern, of the configuration and of the command line cannot be switched off here.', by: (/** @type {any} */ topic) => (topic.measured ? 0 : 1),
       cell: (/** @type {any} */ topic) => html`<${Measure} topic=${topic} />` },
   ];
   return html`<h1 tabindex="-1">Topics</h1>
@@ -111,7 +118,7 @@ export function Topics({ query }) {
       <a href=${address('graph')}>Show as a graph</a>
     </div>
     <${Table} label="Topics" columns=${columns} rows=${sorted(rows, columns, sort)} sort=${sort}
-      keyOf=${(/** @type {any} */ topic) => topic.id}
+      keyOf=${(/** @type {any} */ topic) => topic.id} meanings=${FLAG_MEANINGS}
       onSort=${(/** @type {string} */ next) => change({ sort: next })} />
     ${!rows.length && html`<p class="empty">${state.topics.size
       ? 'No topic matches.' : 'No topic is known.'}</p>`}

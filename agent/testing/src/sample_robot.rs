@@ -143,7 +143,10 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             announces_by_tcp: false,
             announces_unseen: false,
             restored: false,
-            addresses: Addresses::default(),
+            addresses: Addresses {
+                metatraffic: Box::default(),
+                default: Box::new([([10, 0, 0, 2], 7411).into()]),
+            },
         }],
         sockets: vec![SocketFacts {
             cookie: 77,

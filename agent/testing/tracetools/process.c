@@ -126,7 +126,6 @@ static void be_late(const char *what, long us, const char *path) {
     if (!strcmp(what, "sleep")) usleep(us);
     else if (!strcmp(what, "compute")) pass(us);
     else if (!strcmp(what, "lock")) {
-        while (!pthread_mutex_trylock(&lock)) { pthread_mutex_unlock(&lock); usleep(100); }
         pthread_mutex_lock(&lock);
         pthread_mutex_unlock(&lock);
     } else if (!strcmp(what, "disk")) write_to_disk(path, us);
@@ -319,6 +318,11 @@ int main(int argc, char **argv) {
             }
             long long sums[2] = { 0, 0 };
             for (long i = 0; i < n; i++) {
+                /* The callback begins while the lock is held: it waits for nothing else. */
+                while (!strcmp(what, "lock") && !pthread_mutex_trylock(&lock)) {
+                    pthread_mutex_unlock(&lock);
+                    usleep(100);
+                }
                 ros_trace_rclcpp_executor_get_next_ready();
                 ros_trace_rclcpp_executor_execute(&unnamed);
                 add_schedstat(sums, -1);

@@ -5,6 +5,7 @@ mod action;
 mod attach;
 mod bag;
 mod chain;
+mod ci;
 mod convert;
 mod diag;
 mod discover;
@@ -31,6 +32,7 @@ mod shared;
 mod tf;
 mod top;
 mod topic;
+mod welcome;
 mod why;
 
 use std::path::PathBuf;
@@ -41,9 +43,11 @@ use clap::{CommandFactory as _, Parser, Subcommand};
 use ros2probe_daemon::agent::DEFAULT_CONFIG;
 
 pub(crate) use attach::Attach;
+pub(crate) use ci::{CannotStart, Ci};
 pub(crate) use discover::Discover;
 pub(crate) use output::{Output, UserError, is_broken_pipe};
 pub(crate) use run::Run;
+pub(crate) use welcome::print as welcome;
 
 /// Watches a ROS 2 robot from copies of its DDS traffic, without joining it.
 #[derive(Debug, Parser)]
@@ -65,6 +69,8 @@ pub(crate) enum Command {
         #[arg(default_value = DEFAULT_CONFIG)]
         file: PathBuf,
     },
+    /// Run a test of a robot in CI, and fail on loss, findings and violated expectations
+    Ci(Ci),
     /// Request that participants repeat their announcements: the only command that sends
     Discover(Discover),
     /// Run the privileged broker that attaches uprobes for the agent

@@ -8,6 +8,8 @@ use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use ros2probe::client::Compressed;
 use ros2probe_daemon::agent::{Listen, Options, Speed};
 use ros2probe_daemon::config::{Access, Watch};
+use ros2probe_daemon::private_agent::PrivateAgent;
+use ros2probe_wire::DomainId;
 
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -57,11 +59,26 @@ pub(crate) struct Run {
         overrides_with = "api_loopback"
     )]
     pub(crate) api_loopback: Option<Access>,
+    /// Run for one command: socket and bags in this directory, no saved state
+    #[arg(long, hide = true, value_name = "DIR", requires_all = ["domain", "parent"])]
+    pub(crate) private: Option<PathBuf>,
+    /// The only domain that a private agent measures
+    #[arg(long, hide = true, value_name = "N", requires = "private")]
+    pub(crate) domain: Option<u16>,
+    /// Process id of the command that a private agent ends with
+    #[arg(long, hide = true, value_name = "PID", requires = "private")]
+    pub(crate) parent: Option<i32>,
 }
 
 impl From<Run> for Options {
     fn from(run: Run) -> Self {
+        let command = run.private.zip(run.domain).zip(run.parent);
         Self {
+            private: command.map(|((directory, domain_id), parent)| PrivateAgent {
+                directory,
+                domain_id: DomainId(domain_id.into()),
+                parent,
+            }),
             config: run.config,
             replay: run.replay,
             speed: run.speed,

@@ -228,7 +228,7 @@ fn assemble(
 ) -> io::Result<AssembledAgent> {
     let source = Source::Replay(Box::new(replay));
     let sources = MetricSources::new(source.kind(), Settings::new(config));
-    let everything = measured.then(|| Watch::named("/**").ok()).flatten();
+    let everything = measured.then(Watch::everything);
     let watches = Watches::new(
         Arc::clone(&sources.limits),
         Arc::clone(&sources.events),

@@ -9,6 +9,7 @@ pub mod answers;
 pub mod buffers;
 pub mod cgroup;
 pub mod clock;
+pub mod fix;
 pub mod graph;
 pub mod host_state;
 pub mod interfaces;

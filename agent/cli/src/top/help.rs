@@ -21,8 +21,8 @@ rp top: a robot's topics as its agent sees them     any key: back
 
  HZ B/S     of the last seconds          WANTED   what a watch expects of HZ
  LOSS       of 30 s, of the subscriber that lost most
- MED P99    from the writer's timestamp to the capture; across hosts this needs
-            synchronised clocks          P/S      publishers/subscribers
+ MED P99    from the writer's timestamp to the capture; the known offset
+            of clocks is added           P/S      publishers/subscribers
  LATE       late calls of callbacks in the last minute: rp why
  STATE      ok, quiet (no message), no pub, no sub, unwatched (not measured),
             gone; with !: slow fast late loss silent against what is expected,

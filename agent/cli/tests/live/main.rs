@@ -12,6 +12,7 @@ mod attach;
 mod between_robots;
 mod browser;
 mod buffers;
+mod ci;
 mod clocks;
 mod counts;
 mod dashboards;

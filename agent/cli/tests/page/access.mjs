@@ -31,7 +31,6 @@ async function unfold(tab) {
   if (await definition.count()) {
     await definition.click();
     await tab.page.locator('section[aria-labelledby="definition"] pre').waitFor();
-    await tab.page.getByRole('button', { name: 'Show messages' }).click();
     await tab.page.locator('.tree').waitFor();
     await tab.page.locator('.chart').first().getByRole('button', { name: 'Table' }).click();
   }

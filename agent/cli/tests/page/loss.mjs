@@ -20,6 +20,10 @@ await scenario(async (open) => {
   const finding = findings.locator('li', { hasText: /los(t|es)/ }).first();
   await finding.getByRole('link').first().click();
   await tab.page.locator('.plot canvas').first().waitFor();
+  // The finding leads to the section of the losses, below the charts.
+  await until('the section in the window', () => tab.page.locator('section[aria-labelledby="waterfall"]')
+    .evaluate((section) => section.hasAttribute('data-revealed')
+      && section.getBoundingClientRect().top < innerHeight && scrollY > 0));
 
   await reads(tab.page.locator('.figure', { hasText: /^lost/ }).locator('.value'), /[1-9]/);
   const chart = tab.page.getByRole('img', { name: /^Lost messages/ });

@@ -9,8 +9,8 @@ await scenario(async (open) => {
   await tab.live();
   const section = tab.page.locator('section[aria-labelledby="live"]');
   const followed = () => tab.requests.filter((request) => request.url().includes('/messages?')).length;
-  assert.equal(followed(), 0, 'nothing is decoded before it is wanted');
-  await section.getByRole('button', { name: 'Show messages' }).click();
+  // The message is the first section, and open.
+  assert.equal(await tab.page.locator('main h2').first().innerText(), 'Live message');
   const tree = section.getByRole('group', { name: 'Fields of the message' });
   await tree.waitFor();
   const field = (name) => tree.locator('tr', { has: tab.page.getByRole('rowheader', { name, exact: true }) });
@@ -37,6 +37,14 @@ await scenario(async (open) => {
   await values.getByRole('button', { name: 'Table' }).click();
   await until('its values', async () => (await values.locator('tbody tr').count()) >= 1);
   await tab.accessible('a message with a chart');
+  // Several fields have a chart each, or one together.
+  await tree.getByRole('button', { name: 'Plot linear_acceleration.x' }).click();
+  const plots = section.locator('figure.chart');
+  await until('two charts', async () => (await plots.count()) === 2);
+  await section.getByLabel('One chart each').uncheck();
+  await until('one chart', async () => (await plots.count()) === 1);
+  await reads(plots, 'linear_acceleration.z, linear_acceleration.x');
+  await section.getByLabel('One chart each').check();
 
   // At most five messages per second are shown, and the number of omitted messages.
   await until('what was not shown', async () => /\d+ not shown before it/
@@ -45,5 +53,9 @@ await scenario(async (open) => {
   assert.equal((await ask('streams')).messages, 1);
   await section.getByRole('button', { name: 'Close' }).click();
   await until('the agent is left alone', async () => (await ask('streams')).messages === 0);
+  assert.equal(followed(), 1);
+  // The next topic stays closed, too.
+  await tab.go('#/topics/%2Fscan?domain=0');
+  await section.getByRole('button', { name: 'Show messages' }).waitFor();
   assert.equal(followed(), 1);
 });

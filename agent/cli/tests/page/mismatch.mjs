@@ -17,6 +17,8 @@ await scenario(async (open) => {
   const qos = tab.page.locator('section[aria-labelledby="qos"]');
   await qos.waitFor();
   await reads(qos, /offers less than .* requests: reliability/);
+  await until('the section in the window', () => qos.evaluate((section) =>
+    section.hasAttribute('data-revealed') && section.getBoundingClientRect().top < innerHeight && scrollY > 0));
   const row = qos.locator('tr', { hasText: 'Reliability' });
   const cells = await row.locator('td').evaluateAll((all) => all.map((cell) =>
     [cell.className, cell.textContent.replace(/^✖error/, '').trim()]));

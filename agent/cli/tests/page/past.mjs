@@ -48,7 +48,7 @@ await scenario(async (open) => {
 
   // Events and processes of that time.
   await page.getByRole('link', { name: 'Events', exact: true }).first().click();
-  await reads(page.locator('main'), 'ros2.node.discovered');
+  await reads(page.locator('main'), 'node appeared');
   await page.getByRole('navigation').getByRole('link', { name: 'Nodes' }).click();
   await page.getByRole('link', { name: '/lidar', exact: true }).first().click();
   await there(page.locator('.chart').filter({ has: page.getByRole('heading', { name: 'CPU' }) }));
@@ -70,5 +70,9 @@ await scenario(async (open) => {
   const differences = page.getByRole('region', { name: 'Differences' });
   await reads(differences, /New nodes[^]*\/other/);
   await reads(differences, /Nodes that went[^]*\/lidar/);
-  await there(page.locator('.vertex.came'));
+  for (const what of ['.vertex.node.came', '.vertex.node.gone', '.vertex.topic.came', '.edge.came', '.edge.gone']) {
+    await there(page.locator(what));
+  }
+  await there(page.getByRole('button', { name: /^− \/lidar .*, went/ }));
+  await tab.inked();
 });

@@ -21,7 +21,6 @@ await scenario(async (open) => {
   for (const [topic, words, pixels, folded] of TOPICS) {
     await tab.go(`#/topics/${encodeURIComponent(topic)}?domain=0`);
     const section = tab.page.locator('section[aria-labelledby="live"]');
-    await section.getByRole('button', { name: 'Show messages' }).click();
     const canvas = section.locator('canvas[aria-label^="Preview"]');
     await reads(section, words);
     const colour = (x, y) => canvas.evaluate((own, [left, top]) =>

@@ -5,9 +5,9 @@ import { reads, scenario, there } from './tab.mjs';
 
 /** The path of each view, and texts that it shows. */
 const PARTS = [
-  ['logs', [/error\s+\/lidar\s+no echo from <b>sector<\/b> 3/, /1 info/]],
+  ['logs', [/error\s+\/lidar\s+no echo from <b>sector<\/b> 3/, /1 info/, /errors 1[^]*a bar is a minute/]],
   ['diagnostics', [/error\s+battery\s+nearly empty/, /ok\s+lidar: connection/]],
-  ['transforms', [/map\s+odom[^]*\/ekf \(1\.50, 0\.00, 0\.00\)\s+base_link/]],
+  ['transforms', [/map\s+odom[^]*\/ekf\s+\(1\.50, 0\.00, 0\.00\)\s+base_link/, /Age of stamp/, /Jumps/]],
   ['parameters', [/\/planner speed\s+5\s+7/, /\/planner\s+speed\s+7/]],
   ['services', [/No service so far|Services/]],
   ['clocks', [/No message of another host|Ahead at least/]],
@@ -30,6 +30,13 @@ await scenario(async (open) => {
   await reads(first, 'battery');
   await first.locator('summary').click();
   await reads(first, /Voltage \(V\) 11\.9/);
+  // The finding about a transform leads to its edge, and the one about a battery to its part.
+  await tab.go(`#/robot/transforms?part=${encodeURIComponent('frame 0  base_link')}`);
+  await reads(tab.page.locator('[data-revealed]'), /^base_link/);
+  await tab.go('');
+  await tab.page.locator('.findings li', { hasText: 'battery' }).getByRole('link').click();
+  await tab.heading('Diagnostics');
+  await reads(tab.page.locator('main tbody tr[data-row]'), 'battery');
   // Filters are in the address.
   await tab.go('#/robot/logs?filter=spin');
   await reads(tab.page.locator('main table').first(), /spinning/);

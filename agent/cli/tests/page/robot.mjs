@@ -3,6 +3,7 @@
 
 import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
+import { show } from './scenes.mjs';
 import { ask, gone, reads, scenario, there, until } from './tab.mjs';
 
 const LIDAR = process.argv[3];
@@ -148,8 +149,8 @@ async function graph(tab) {
   await until('a larger picture', async () => (await scale()) !== before);
   await tab.page.getByRole('button', { name: 'Fit' }).click();
   // Names are legible, a field finds a vertex, and colours can mean something else.
-  const legible = async () => 12 * Number(/scale\(([\d.]+)\)/.exec(await scale())[1]);
-  assert.ok(await legible() >= 10.9, `${await legible()} px`);
+  await tab.drawn();
+  await tab.legible('the graph of the robot');
   await tab.page.getByRole('button', { name: 'Close the details' }).click();
   await gone(tab.page.locator('#graph-panel'));
   await tab.page.getByLabel('Find', { exact: true }).fill('imu_dri');
@@ -201,6 +202,28 @@ async function graph(tab) {
   await until('hubs', async () => (await tab.page.locator('.edge').count()) > 0);
 }
 
+/** Graphs of larger robots, on a laptop and on a phone: legible at first, and each edge is drawn. */
+async function graphs(_, open, browser) {
+  for (const [nodes, query, boxes] of [[60, '', 1], [200, '', 20], [200, '?fold=none&boxes=process', 50]]) {
+    for (const [width, height] of [[1280, 800], [390, 844]]) {
+      const context = await browser.newContext({ viewport: { width, height }, reducedMotion: 'reduce' });
+      await show(context, nodes);
+      const tab = await open({ context, fragment: `#/graph${query}` });
+      await tab.page.locator('.vertex').first().waitFor();
+      await tab.drawn();
+      const what = `${nodes} nodes${query} at ${width} px`;
+      const size = await tab.legible(what);
+      const styles = await tab.inked();
+      const edges = Object.values(styles).reduce((sum, each) => sum + each, 0);
+      const shown = await tab.page.locator('.box, .vertex.box').count();
+      assert.ok(edges >= 15 && shown >= boxes, `${what}: ${edges} edges, ${shown} boxes`);
+      console.log(`${what}: ${size.toFixed(1)} px, ${edges} edges, ${shown} boxes`);
+      await tab.page.close();
+      await context.close();
+    }
+  }
+}
+
 async function nodes(tab) {
   await tab.page.getByRole('link', { name: 'Nodes', exact: true }).click();
   await tab.heading('Nodes');
@@ -221,11 +244,11 @@ async function nodes(tab) {
 async function events(tab) {
   await tab.page.getByRole('link', { name: 'Events', exact: true }).click();
   await tab.heading('Events');
-  await tab.shows('ros2.node.');
+  await tab.shows('node appeared');
   const rows = () => tab.page.locator('main tbody tr').count();
   // Endpoints come by the dozen with each node and are hidden at first.
   const notable = await rows();
-  assert.equal(await tab.page.getByText('ros2.endpoint.discovered').count(), 0);
+  assert.equal(await tab.page.getByText('endpoint appeared').count(), 0);
   await tab.page.getByRole('combobox', { name: /^Show/ }).last().selectOption('ALL');
   const all = await until('all events', async () => (await rows()) > notable && rows());
   await tab.page.getByLabel('Filter').fill('/lidar');
@@ -306,12 +329,12 @@ async function links(tab) {
   }
 }
 
-await scenario(async (open) => {
+await scenario(async (open, browser) => {
   const tab = await open();
   await tab.live();
-  for (const part of [overview, topics, topic, graph, nodes, events, agent, keys, links]) {
+  for (const part of [overview, topics, topic, graph, graphs, nodes, events, agent, keys, links]) {
     const began = Date.now();
-    await part(tab);
+    await part(tab, open, browser);
     console.log(`${part.name}: ${Date.now() - began} ms`);
   }
 });

@@ -77,6 +77,11 @@ async function edited(route) {
   await route.fulfill({ response, body: readFileSync(`${EDITED}/${path}`) });
 }
 
+/** Lets the pages of a context have the edited files, if there are any. */
+export async function withEdited(context) {
+  if (EDITED) await context.route('**/page/**', edited);
+}
+
 let lines = null;
 
 /** Sends a command to the Rust test and returns the answer. */
@@ -239,6 +244,33 @@ export class Tab {
     return edges.reduce((sum, [style]) => ({ ...sum, [style]: (sum[style] ?? 0) + 1 }), {});
   }
 
+  /** Fails if a text of the graph has less than 11 pixels, or none is in the window. Returns the smallest size. */
+  async legible(what) {
+    const sizes = await this.page.locator('.canvas text').evaluateAll((all) => all.map((text) => {
+      const { left, right, top, bottom } = text.getBoundingClientRect();
+      const canvas = text.closest('.canvas').getBoundingClientRect();
+      const isIn = right > canvas.left && left < canvas.right && bottom > canvas.top && top < canvas.bottom;
+      return [parseFloat(getComputedStyle(text).fontSize) * text.getScreenCTM().a, isIn, text.textContent];
+    }));
+    assert.ok(sizes.some(([, isIn]) => isIn), `${what}: no text is in the window`);
+    // The size is stored with four digits.
+    assert.deepEqual(sizes.filter(([size]) => size < 10.99), [], `${what}: text below 11 pixels`);
+    return Math.min(...sizes.map(([size]) => size));
+  }
+
+  /** Waits until the picture of the graph stays as it is. */
+  async drawn() {
+    let before = null;
+    await until('a picture that stays', async () => {
+      const now = await this.page.locator('.canvas svg').evaluate((svg) => `${svg.querySelector('g').getAttribute(
+        'transform')} ${[...svg.querySelectorAll('.vertex rect')].map((rect) => rect.getAttribute('x'))}`);
+      const isSame = now === before && now.length > 40;
+      before = now;
+      await new Promise((wake) => setTimeout(wake, 700));
+      return isSame;
+    });
+  }
+
   /** Fails if the page scrolls sideways, with the names of elements that are too wide. */
   async narrow(what) {
     const wide = await this.page.evaluate(() => {
@@ -272,7 +304,7 @@ export async function scenario(story) {
       acceptDownloads: true, reducedMotion: 'reduce',
     });
     own.setDefaultTimeout(PATIENCE_MS);
-    if (EDITED) await own.route('**/page/**', edited);
+    await withEdited(own);
     const page = await own.newPage();
     const tab = new Tab(page, address);
     tabs.push(tab);

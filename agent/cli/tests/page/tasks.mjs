@@ -33,7 +33,6 @@ const TASKS = {
     await tab.page.keyboard.type('/imu');
     await tab.page.keyboard.press('Enter');
     const section = tab.page.locator('section[aria-labelledby="live"]');
-    await click(section.getByRole('button', { name: 'Show messages' }));
     await click(section.getByRole('button', { name: 'Plot linear_acceleration.z' }));
     await there(section.getByRole('img', { name: /^linear_acceleration.z/ }));
   },
@@ -57,7 +56,7 @@ const TASKS = {
     await field.fill(value);
     await reads(tab.page.locator('.notice'), 'The robot as it was');
     await click(tab.page.getByRole('navigation').getByRole('link', { name: 'Events' }));
-    await reads(tab.page.locator('main'), 'ros2.node.discovered');
+    await reads(tab.page.locator('main'), 'node appeared');
   },
   async 'share this view'(tab, click) {
     await click(tab.page.getByRole('navigation').getByRole('link', { name: 'Topics' }));

@@ -29,6 +29,8 @@ await scenario(async (open) => {
   // The view of the topic has the same button with the same effect.
   await tab.page.getByRole('link', { name: '/scan', exact: true }).click();
   await tab.page.locator('.plot canvas').first().waitFor();
+  // Its messages are open at first, and are measured without a watch.
+  await tab.page.locator('section[aria-labelledby="live"]').getByRole('button', { name: 'Close' }).click();
   await tab.page.getByRole('button', { name: 'on: measure /scan' }).click();
   await tab.page.getByRole('button', { name: 'off: measure /scan' }).waitFor();
   await until('the kernel forgets the writer', async () => {

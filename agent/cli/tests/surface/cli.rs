@@ -326,3 +326,40 @@ fn within(mut command: Command, most: Duration) -> (Output, Duration) {
     child.kill().unwrap();
     (child.wait_with_output().unwrap(), begin.elapsed())
 }
+
+#[test]
+fn rp_without_a_command_prints_what_to_do_next_and_all_commands() {
+    let output = run(&[]);
+    assert!(output.status.success(), "{output:?}");
+    let text = String::from_utf8(output.stdout).unwrap();
+    let (steps, commands) = text.split_once("\n\n").unwrap();
+    let mut lines = steps.lines();
+    let sentence = lines.next().unwrap();
+    assert!(
+        sentence.contains("agent") && sentence.ends_with('.'),
+        "{text}"
+    );
+    assert!(lines.all(|line| line.starts_with("  ")), "{text}");
+    assert!(steps.lines().count() <= 4, "{text}");
+    assert!(
+        commands.contains("Usage: rp") && commands.contains("  ci "),
+        "{text}"
+    );
+}
+
+#[test]
+fn doctor_changes_nothing_without_root_and_without_an_answer() {
+    let mut command = Command::new("setpriv");
+    command
+        .args(["--reuid=65534", "--regid=65534", "--clear-groups"])
+        .arg(env!("CARGO_BIN_EXE_rp"))
+        .args(["doctor", "--fix", "--yes"]);
+    let output = command.stdin(Stdio::null()).output().unwrap();
+    fails_with(&output, 1, &["run `sudo rp doctor --fix`"]);
+    let output = run(&["doctor", "--fix"]);
+    fails_with(&output, 1, &["is not a terminal: pass --yes"]);
+    for other in [["--json", "--fix"], ["--yes", "--verbose"]] {
+        let output = run(&["doctor", other[0], other[1]]);
+        assert_eq!(output.status.code(), Some(2), "{output:?}");
+    }
+}

@@ -16,6 +16,7 @@ mod bag;
 mod bag_chains;
 mod caps;
 mod chains;
+mod ci;
 mod cli;
 mod config;
 mod coverage;

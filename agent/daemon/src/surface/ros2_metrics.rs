@@ -1,7 +1,7 @@
 //! Metrics of the robot: graph, topics, watchlist (`ros2_*`).
 
 use std::borrow::Cow;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::fmt;
 use std::sync::Arc;
 
@@ -10,15 +10,16 @@ use crate::settings_cell::Settings;
 use ros2probe_metrics::catalogue::{self as metric, Metric};
 use ros2probe_metrics::metric_sink::{Family, Label, MetricSink, Number};
 use ros2probe_metrics::series_name::series_name;
+use ros2probe_model::derive::clocks::seconds;
 use ros2probe_model::facts::histogram::Histogram;
 use ros2probe_model::facts::names::TypeName;
 use ros2probe_model::facts::topic_kind::TopicKind;
 use ros2probe_model::report::snapshot::UnknownWriterFacts;
 use ros2probe_model::report::snapshot::{
-    EndpointFacts, Measurement, ProcessFacts, SampledFacts, Snapshot, TopicFacts, WatchFacts,
-    WatchState,
+    EndpointFacts, Measurement, PeerClock, ProcessFacts, SampledFacts, Snapshot, TopicFacts,
+    WatchFacts, WatchState,
 };
-use ros2probe_wire::DomainId;
+use ros2probe_wire::{DomainId, GuidPrefix};
 
 /// Maximum number of unknown writers with their own series.
 const MAX_UNKNOWN_WRITERS: usize = 32;
@@ -333,6 +334,20 @@ pub(super) fn topics(
     sink.family(&metric::TOPIC_BANDWIDTH, |family| {
         per_second(family, rows, TopicFacts::bandwidth)
     })?;
+    let clocks = snapshot.peer_clocks();
+    sink.family(&metric::TOPIC_LATENCY_UNCERTAINTY, |family| {
+        rows.iter()
+            .filter(|_| !clocks.is_empty())
+            .try_for_each(|row| {
+                match row
+                    .facts
+                    .and_then(|facts| latency_uncertainty(facts, &clocks))
+                {
+                    Some(uncertainty) => family.sample(&row.labels(), uncertainty),
+                    None => Ok(()),
+                }
+            })
+    })?;
     let doubts: [(&Metric, Count); 3] = [
         (&metric::TOPIC_NEGATIVE_LATENCY, |measured| {
             measured.negative_latency
@@ -351,6 +366,19 @@ pub(super) fn topics(
     }
     sampled(sink, rows)?;
     histograms(sink, rows, settings)
+}
+
+/// Returns the greatest error of latencies of a measured topic's publishers on other hosts, in
+/// seconds.
+fn latency_uncertainty(
+    facts: &TopicFacts,
+    clocks: &HashMap<GuidPrefix, &PeerClock>,
+) -> Option<f64> {
+    facts.measurement.as_ref()?;
+    let publishers = facts.publishers.iter();
+    let clocks = publishers.filter_map(|publisher| clocks.get(&publisher.guid.prefix));
+    let errors = clocks.map(|clock| clock.correction().map_or(f64::INFINITY, |it| seconds(it.1)));
+    errors.max_by(f64::total_cmp)
 }
 
 /// Returns whether the size of the messages is known: calls inside processes do not show it.

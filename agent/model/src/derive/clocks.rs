@@ -55,6 +55,8 @@ pub struct Clocks {
     others: Others,
     /// Name that participants of this host announce.
     name: Option<Arc<str>>,
+    /// Whether latencies of a peer's messages are corrected.
+    is_corrected: bool,
     revision: u64,
 }
 
@@ -64,6 +66,8 @@ struct Peer {
     evidence: Evidence,
     /// The finding, as it began.
     apart: Option<Range>,
+    /// Nanoseconds that are added to latencies of its messages.
+    correction: i64,
 }
 
 /// Latest messages of a writer and the times at which they first left.
@@ -134,6 +138,14 @@ impl PeerClock {
         let (least, most) = (self.ahead.0?, self.ahead.1?);
         let range = Range { least, most };
         Some((range.middle(), range.uncertainty()))
+    }
+
+    /// Returns nanoseconds that are added to latencies of its messages, and the greatest error that
+    /// remains; `None` while the offset is unknown.
+    #[must_use]
+    pub fn correction(&self) -> Option<(i64, i64)> {
+        let (least, most) = (self.ahead.0?, self.ahead.1?);
+        Some(Range { least, most }.correction())
     }
 }
 
@@ -242,6 +254,23 @@ impl Clocks {
             }
         }
         self.revision += changes;
+    }
+
+    /// Updates the corrections of latencies. Returns whether a peer has one, or had one before.
+    pub fn correct(&mut self, now: ModelTime, clock: WallClock) -> bool {
+        let was_corrected = std::mem::take(&mut self.is_corrected);
+        for peer in self.peers.values_mut() {
+            let range = peer.evidence.range(now, clock);
+            peer.correction = range.map_or(0, |range| range.correction().0);
+            self.is_corrected |= peer.correction != 0;
+        }
+        was_corrected || self.is_corrected
+    }
+
+    /// Returns nanoseconds to add to latencies of a peer's messages.
+    #[must_use]
+    pub fn correction(&self, peer: IpAddr) -> i64 {
+        self.peers.get(&peer).map_or(0, |peer| peer.correction)
     }
 
     /// Returns the number of changes of [`Self::findings`].

@@ -35,7 +35,8 @@ pub struct Measurement {
     pub bandwidth: f64,
     /// Seconds between consecutive samples of one writer.
     pub interarrival: Histogram,
-    /// Capture time minus INFO_TS in seconds. Across hosts it requires synchronised clocks.
+    /// Capture time minus INFO_TS in seconds, corrected by the known offset between the clocks of
+    /// both hosts.
     pub source_latency: Histogram,
     /// Capture time minus `std_msgs/Header.stamp` in seconds, if the type begins with a header.
     pub header_latency: Histogram,

@@ -159,15 +159,23 @@ impl Watch {
     /// Fails if `pattern` is neither a ROS name nor a glob.
     pub fn named(pattern: &str) -> Result<Self, PatternError> {
         check_pattern(pattern)?;
-        let pattern = pattern.to_owned();
         Ok(Self {
-            pattern,
+            pattern: pattern.to_owned(),
+            ..Self::everything()
+        })
+    }
+
+    /// Returns a watch of every topic in every domain.
+    #[must_use]
+    pub fn everything() -> Self {
+        Self {
+            pattern: "/**".to_owned(),
             domain_id: None,
             expectations: Expectations::default(),
             per_subscriber: false,
             trace: 0.0,
             retain: Retain::None,
-        })
+        }
     }
 
     /// Returns whether the pattern is an exact name rather than a glob.

@@ -343,6 +343,13 @@ impl Profiler {
         }
     }
 
+    /// Sets the nanoseconds by which the clock of each writer's host is ahead.
+    pub fn set_clocks(&mut self, ahead: impl Fn(&Guid) -> i64) {
+        for (guid, measured) in &mut self.writers {
+            measured.writer.set_clock(ahead(guid));
+        }
+    }
+
     /// Updates the properties of a writer from discovery.
     pub fn learn(&mut self, guid: Guid, traits: Traits) {
         if let Some(measured) = self.writers.get_mut(&guid) {

@@ -99,6 +99,8 @@ pub struct Writer {
     last_message: Option<ModelTime>,
     negative_latency: u64,
     implausible_latency: u64,
+    /// Nanoseconds by which the clock of its host is ahead.
+    clock_ahead: i64,
     /// State of a writer that was sampled in shared memory.
     sampled: Option<Box<Sampled>>,
     /// Time of the last observation from a uprobe in the writer's own process.
@@ -134,6 +136,7 @@ impl Writer {
             last_message: None,
             negative_latency: 0,
             implausible_latency: 0,
+            clock_ahead: 0,
             sampled: None,
             exact: None,
         }
@@ -142,6 +145,11 @@ impl Writer {
     /// Updates the properties from discovery.
     pub const fn learn(&mut self, traits: Traits) {
         self.traits = traits;
+    }
+
+    /// Sets the nanoseconds by which the clock of its host is ahead of this host's.
+    pub const fn set_clock(&mut self, ahead: i64) {
+        self.clock_ahead = ahead;
     }
 
     /// Begins the counts per second at `now`, when the kernel begins to capture all samples of the

@@ -226,7 +226,10 @@ impl Observer {
     pub fn input(&mut self, input: Input<'_>) {
         match input {
             Input::Time(now) => self.advance(self.graph.wall_clock.model_time(now)),
-            Input::ClockSet(step) => self.graph.wall_clock.set(step),
+            Input::ClockSet(step) => {
+                self.graph.wall_clock.set(step);
+                self.correct_latencies(self.clock);
+            }
             Input::ViewBegan(at) => self.view_began = self.graph.wall_clock.model_time(at),
             Input::Datagram {
                 envelope,

@@ -5,13 +5,14 @@
 
 mod delivery;
 
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use ros2probe_wire::backends::Backends;
 use ros2probe_wire::discovery::{EquivalenceHash, TypeHash};
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{DomainId, Guid, RtpsDuration, Timestamp};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix, RtpsDuration, Timestamp};
 
 pub use crate::derive::chain::path::{ChainFacts, ChainsFacts};
 pub use crate::derive::clocks::{ClockFacts, ClockOffset, PeerClock};
@@ -129,6 +130,21 @@ impl Snapshot {
     #[must_use]
     pub const fn wall_time(&self, at: ModelTime) -> Timestamp {
         self.wall_clock.wall_time(at)
+    }
+
+    /// Returns the clocks of participants on other hosts. A participant has none if no message of
+    /// its host arrived, or if clocks are not compared.
+    #[must_use]
+    pub fn peer_clocks(&self) -> HashMap<GuidPrefix, &PeerClock> {
+        let mut clocks = HashMap::new();
+        for participant in &self.participants {
+            let address = participant.addresses.reachable();
+            let mut peers = self.clocks.peers.iter();
+            if let Some(peer) = peers.find(|peer| Some(peer.address) == address) {
+                clocks.insert(participant.guid.prefix, peer);
+            }
+        }
+        clocks
     }
 }
 

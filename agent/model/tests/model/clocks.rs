@@ -383,6 +383,53 @@ fn a_step_of_this_hosts_clock_moves_the_offset_at_once() {
 }
 
 #[test]
+fn latencies_are_corrected_by_a_known_offset_and_only_by_that() {
+    for ahead in [-3_000_000_000, -20_000_000, 20_000_000, 5_000_000_000_000] {
+        let mut pair = Pair::new();
+        pair.talk(Clock::ahead(ahead), 6, |_| {});
+        let (correction, error) = pair.peer().correction().unwrap();
+        assert!((correction - ahead).abs() <= error && error < 1_000_000);
+        let before = pair.host.measurement();
+        pair.talk(Clock::ahead(ahead), 10, |_| {});
+        let after = pair.host.measurement();
+        let counted = after.source_latency.count() - before.source_latency.count();
+        assert_eq!(
+            (counted, after.negative_latency),
+            (500, before.negative_latency)
+        );
+        // The way takes 0.15 to 2.15 ms.
+        let sum = after.source_latency.sum() - before.source_latency.sum();
+        let mean = sum / 500.0;
+        assert!((0.000_15..0.001_6).contains(&mean), "{mean} s, {ahead}");
+    }
+    // Clocks that may agree are not corrected.
+    let mut pair = Pair::new();
+    pair.talk(Clock::ahead(0), 10, |_| {});
+    let (correction, error) = pair.peer().correction().unwrap();
+    let (offset, uncertainty) = pair.offset();
+    assert_eq!((correction, error), (0, offset.abs() + uncertainty));
+    let measured = pair.host.measurement().source_latency;
+    let (least, _) = measured.range().unwrap();
+    assert!((least - 0.000_15).abs() < 0.000_01, "{least}");
+}
+
+#[test]
+fn a_step_of_this_hosts_clock_corrects_latencies_at_once() {
+    let mut pair = Pair::new();
+    pair.talk(Clock::ahead(0), 10, |_| {});
+    let before = pair.host.measurement();
+    let step = 2 * SECOND.cast_signed();
+    pair.host.observer.input(Input::ClockSet(step));
+    // The stamps of Alice are behind from now on, and the receipt has the new time.
+    let clock = Clock::ahead(-step);
+    pair.talk(clock, 10, |_| {});
+    let after = pair.host.measurement();
+    assert_eq!(after.negative_latency, before.negative_latency);
+    let (_, most) = after.source_latency.range().unwrap();
+    assert!(most < 0.01, "{most}");
+}
+
+#[test]
 fn pairs_of_peers_follow_from_differences() {
     let carol = GuidPrefix(*b"\x01\x10carol-host");
     let mut pair = Pair::new();

@@ -6,8 +6,7 @@ use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
 use ros2probe_model::facts::diagnosis::Diagnosis;
 use ros2probe_model::report::snapshot::{
-    ClockFacts, EndpointFacts, ParticipantFacts, PeerClock, Snapshot, TopicFacts, WatchFacts,
-    WatchedTopicFacts,
+    EndpointFacts, ParticipantFacts, PeerClock, Snapshot, TopicFacts, WatchFacts, WatchedTopicFacts,
 };
 
 /// A watchlist entry and the state of a topic under it.
@@ -17,7 +16,7 @@ pub(super) type Standing<'a> = (&'a WatchFacts, &'a WatchedTopicFacts);
 #[derive(Debug)]
 pub(super) struct Index<'a> {
     participants: HashMap<GuidPrefix, &'a ParticipantFacts>,
-    clocks: &'a ClockFacts,
+    clocks: HashMap<GuidPrefix, &'a PeerClock>,
     findings: HashMap<(DomainId, &'a str), Vec<&'a Diagnosis>>,
     watches: HashMap<(DomainId, &'a str), Vec<Standing<'a>>>,
 }
@@ -45,7 +44,7 @@ impl<'a> Index<'a> {
         }
         Self {
             participants: participants.map(|each| (each.guid.prefix, each)).collect(),
-            clocks: &snapshot.clocks,
+            clocks: snapshot.peer_clocks(),
             findings,
             watches,
         }
@@ -58,9 +57,7 @@ impl<'a> Index<'a> {
     /// Returns what is known of the clock of the host of an endpoint; `None` for this host, and if
     /// clocks are not compared.
     pub(super) fn clock(&self, guid: Guid) -> Option<&'a PeerClock> {
-        let address = self.participant(guid)?.addresses.reachable()?;
-        let mut peers = self.clocks.peers.iter();
-        peers.find(|peer| peer.address == address)
+        self.clocks.get(&guid.prefix).copied()
     }
 
     /// Returns the problems of a topic.

@@ -329,13 +329,13 @@ impl<'a> TopicAnswers<'a> {
     }
 }
 
-/// Returns the correction of latencies from a host with this clock.
+/// Returns how the agent corrects latencies from a host with this clock.
 fn writer_clock(peer: &PeerClock) -> WriterClock<'_> {
-    let offset = peer.offset();
+    let correction = peer.correction();
     WriterClock {
         peer: Cow::Borrowed(&peer.peer),
-        correction_seconds: offset.map(|(ahead, _)| seconds(ahead)),
-        uncertainty_seconds: offset.map(|(_, uncertainty)| seconds(uncertainty)),
+        correction_seconds: correction.map(|(correction, _)| seconds(correction)),
+        uncertainty_seconds: correction.map(|(_, error)| seconds(error)),
     }
 }
 

@@ -1,4 +1,5 @@
-//! Latencies of a writer's samples since INFO_TS and since their header's stamp.
+//! Latencies of a writer's samples since INFO_TS and since their header's stamp. Both come from the
+//! clock of the writer's host.
 
 use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
 
@@ -16,7 +17,10 @@ impl Writer {
         (source, stamp): (RtpsTime, Option<(i32, u32)>),
         (now, wall_clock): (ModelTime, Timestamp),
     ) {
-        let source = source.timestamp();
+        let ahead = self.clock_ahead;
+        let here =
+            |stamp: Timestamp| Timestamp(stamp.0.saturating_add_signed(ahead.saturating_neg()));
+        let source = source.timestamp().map(here);
         if self.traits.keeps_history {
             let old = source.is_none_or(|source| source + HISTORY < wall_clock);
             let first = self.reception.sequence().first();
@@ -26,7 +30,8 @@ impl Writer {
         }
         let stamp = stamp
             .filter(|_| self.traits.has_header)
-            .and_then(|stamp| stamp_time(stamp, wall_clock));
+            .and_then(|stamp| stamp_time(stamp, wall_clock))
+            .map(here);
         let mut negative = false;
         if let Some(source) = source {
             let delay = wall_clock.nanoseconds_since(source);

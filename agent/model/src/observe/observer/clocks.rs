@@ -36,6 +36,8 @@ impl Observer {
             clocks.name(own.find_map(|participant| participant.proxy.host.as_ref()));
         }
         clocks.end_second(now, graph.wall_clock);
+        self.correct_latencies(now);
+        let graph = &self.graph;
         let clocks = graph.topics.iter().map(|(_, topic)| topic);
         let clocks = clocks
             .filter(|topic| *topic.naming.name == *"/clock" && !topic.writers.is_empty())
@@ -66,6 +68,21 @@ impl Observer {
                 .stamps
                 .add(message, (stamp, published), at, topic);
         }
+    }
+
+    /// Corrects latencies of all measured writers on other hosts by the offset of their clocks.
+    pub(super) fn correct_latencies(&mut self, now: ModelTime) {
+        let clocks = &mut self.derive.clocks;
+        if !clocks.correct(now, self.graph.wall_clock) {
+            return;
+        }
+        let participants = self.graph.discovery.participants();
+        self.measure.profiler.set_clocks(|guid| {
+            let participant = participants.get(&guid.prefix);
+            let other = participant.filter(|participant| !participant.local);
+            let address = other.and_then(|participant| participant.addresses.reachable());
+            address.map_or(0, |address| clocks.correction(address))
+        });
     }
 
     fn clock_of_sample(&mut self, sample: &Sample) {

@@ -3,12 +3,12 @@
 
 use std::cmp::Reverse;
 
+use super::super::watch::expectations;
 use super::findings::{Circumstances, finding};
 use super::values::{LOSS, lost_lately};
 use ros2probe_api::live::{Finding, Severity};
 use ros2probe_model::facts::names::NodeName;
 use ros2probe_model::facts::route::Direction;
-use ros2probe_model::facts::watch::Expectations;
 use ros2probe_model::measure::history::Past;
 use ros2probe_model::report::snapshot::{TopicFacts, WatchState};
 
@@ -19,15 +19,16 @@ pub(super) fn of_watches(all: &Circumstances<'_>) -> Vec<Finding> {
         for topic in &watch.topics {
             let (kind, text) = match topic.state {
                 WatchState::Violated => {
-                    let expectations = &watch.watch.expectations;
+                    let expectations = expectations(&watch.watch.expectations);
                     let broken = topic.violations.iter();
-                    let broken = broken.map(|key| expected(key, expectations));
+                    let broken = broken.map(|key| expectations.in_words(key));
                     let broken: Vec<_> = broken.collect();
                     let text = format!("{} is not as expected: {}", topic.topic, broken.join(", "));
                     ("watch_violated", text)
                 }
                 WatchState::Silent => {
-                    let longest = expected("max_silence_s", &watch.watch.expectations);
+                    let expectations = expectations(&watch.watch.expectations);
+                    let longest = expectations.in_words("max_silence_s");
                     let text = format!("{} is silent: {longest} is expected", topic.topic);
                     ("watch_silent", text)
                 }
@@ -48,33 +49,6 @@ pub(super) fn of_watches(all: &Circumstances<'_>) -> Vec<Finding> {
         }
     }
     list
-}
-
-/// Returns an expectation in words, by its key in the configuration.
-fn expected(key: &str, expectations: &Expectations) -> String {
-    let values = expectations.values();
-    let number = |limit: Option<f64>| limit.unwrap_or_default();
-    let several = |limit: Option<u32>, noun: &str| match limit.unwrap_or_default() {
-        1 => format!("at least 1 {noun}"),
-        count => format!("at least {count} {noun}s"),
-    };
-    match key {
-        "min_rate_hz" => format!("at least {} Hz", number(values.min_rate_hz)),
-        "max_rate_hz" => format!("at most {} Hz", number(values.max_rate_hz)),
-        "max_loss_ratio" => {
-            // Without the digits that no double has.
-            let percent = (number(values.max_loss_ratio) * 1e6).round() / 1e4;
-            format!("a loss of at most {percent} %")
-        }
-        "max_latency_ms" => format!("a latency of at most {} ms", number(values.max_latency_ms)),
-        "max_silence_s" => format!(
-            "a message at least every {} s",
-            number(values.max_silence_s)
-        ),
-        "publishers" => several(values.publishers, "publisher"),
-        "subscribers" => several(values.subscribers, "subscriber"),
-        _ => key.to_owned(),
-    }
 }
 
 /// Returns a finding with the cause for each topic that lost messages recently.
@@ -170,59 +144,4 @@ fn began(past: &Past, topic: u32) -> Option<f64> {
         }
     }
     began
-}
-
-#[cfg(test)]
-mod tests {
-    use std::time::Duration;
-
-    use super::*;
-
-    #[test]
-    fn every_expectation_has_words_with_its_limit() {
-        let expectations = Expectations {
-            min_rate_hz: Some(85.0),
-            max_rate_hz: Some(95.0),
-            window_s: None,
-            max_loss_ratio: Some(0.01),
-            max_latency: Some(Duration::from_millis(20)),
-            max_silence: Some(Duration::from_millis(1500)),
-            publishers: Some(2),
-            subscribers: Some(3),
-        };
-        let words = expectations
-            .keys()
-            .map(|(key, _)| expected(key, &expectations));
-        assert_eq!(
-            words,
-            [
-                "at least 85 Hz",
-                "at most 95 Hz",
-                "a loss of at most 1 %",
-                "a latency of at most 20 ms",
-                "a message at least every 1.5 s",
-                "at least 2 publishers",
-                "at least 3 subscribers",
-            ]
-        );
-    }
-
-    #[test]
-    fn limits_have_no_digits_of_rounding_and_one_publisher_is_singular() {
-        let expectations = Expectations {
-            max_loss_ratio: Some(0.07),
-            max_latency: Some(Duration::from_micros(1100)),
-            publishers: Some(1),
-            ..Expectations::default()
-        };
-        let words = ["max_loss_ratio", "max_latency_ms", "publishers"];
-        assert_eq!(
-            words.map(|key| expected(key, &expectations)),
-            [
-                "a loss of at most 7 %",
-                "a latency of at most 1.1 ms",
-                "at least 1 publisher"
-            ]
-        );
-    }
 }
