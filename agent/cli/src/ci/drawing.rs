@@ -8,6 +8,7 @@ use quick_xml::escape::escape;
 
 use super::observation::Observation;
 use super::series::Series;
+use crate::top::text;
 
 /// Maximum number of topics in the drawn graph.
 const MAX_DRAWN: usize = 60;
@@ -109,7 +110,7 @@ pub(super) fn graph(seen: &Observation, marked: &BTreeSet<&str>) -> (String, usi
                 ROW - 4.0,
                 x + 8.0,
                 y + ROW / 2.0 + 4.0,
-                escape(&*shortened(name))
+                escape(&*text::end(name, NAME_CHARACTERS, '…'))
             );
         }
     }
@@ -142,16 +143,6 @@ pub(super) fn graph(seen: &Observation, marked: &BTreeSet<&str>) -> (String, usi
 )]
 const fn to_f64(count: usize) -> f64 {
     count as f64
-}
-
-/// Returns the end of a long name, which distinguishes it.
-fn shortened(name: &str) -> String {
-    let count = name.chars().count();
-    if count <= NAME_CHARACTERS {
-        return name.to_owned();
-    }
-    let end = name.chars().skip(count - NAME_CHARACTERS + 1);
-    std::iter::once('…').chain(end).collect()
 }
 
 #[cfg(test)]

@@ -6,7 +6,6 @@
 mod agent_process;
 mod artefacts;
 mod guard;
-mod signals;
 
 use std::ffi::OsString;
 use std::net::{SocketAddr, TcpListener};
@@ -31,7 +30,7 @@ use rustix::process::Signal;
 use agent_process::AgentProcess;
 use artefacts::Artefacts;
 
-use super::UserError;
+use super::{UserError, interrupt};
 
 pub(crate) use guard::CannotStart;
 
@@ -145,7 +144,7 @@ impl Ci {
                 .with_context(|| format!("cannot serve the page at {address}"))?;
         }
         let artefacts = Artefacts::create(&self.output)?;
-        let signals = signals::listen().context("cannot handle signals")?;
+        let signals = interrupt::signals().context("cannot handle signals")?;
         let expect = self.expect.as_deref();
         let mut process = AgentProcess::start(expect, domain_id, self.page, &artefacts)?;
         let Some(agent) = process.wait_ready(&signals)? else {

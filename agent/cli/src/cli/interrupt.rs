@@ -4,7 +4,9 @@
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, channel};
 
+use rustix::process::Signal;
 use tokio::signal::unix::{SignalKind, signal};
 
 /// ros2cli's default exit code after Ctrl-C.
@@ -38,6 +40,30 @@ pub(crate) fn listen(code: u8) -> io::Result<()> {
 ///
 /// Fails if the signal handlers cannot be installed.
 pub(crate) fn flag() -> io::Result<Arc<AtomicBool>> {
+    let flag = Arc::new(AtomicBool::new(false));
+    let is_set = Arc::clone(&flag);
+    on_each(move |_| {
+        if is_set.swap(true, Ordering::Relaxed) {
+            std::process::exit(INTERRUPTED.into());
+        }
+        true
+    })?;
+    Ok(flag)
+}
+
+/// Returns SIGINT and SIGTERM as they arrive.
+///
+/// # Errors
+///
+/// Fails if the signal handlers cannot be installed.
+pub(crate) fn signals() -> io::Result<Receiver<Signal>> {
+    let (give, signals) = channel();
+    on_each(move |signal| give.send(signal).is_ok())?;
+    Ok(signals)
+}
+
+/// Calls `act` on a thread for each SIGINT and SIGTERM, until it returns false.
+fn on_each(mut act: impl FnMut(Signal) -> bool + Send + 'static) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
         .build()?;
@@ -48,20 +74,17 @@ pub(crate) fn flag() -> io::Result<Arc<AtomicBool>> {
             signal(SignalKind::terminate())?,
         )
     };
-    let flag = Arc::new(AtomicBool::new(false));
-    let is_set = Arc::clone(&flag);
     let wait = async move {
         loop {
-            tokio::select! {
-                _ = interrupts.recv() => {}
-                _ = ends.recv() => {}
-            }
-            if is_set.swap(true, Ordering::Relaxed) {
-                std::process::exit(INTERRUPTED.into());
+            let signal = tokio::select! {
+                _ = interrupts.recv() => Signal::INT,
+                _ = ends.recv() => Signal::TERM,
+            };
+            if !act(signal) {
+                return;
             }
         }
     };
     let thread = std::thread::Builder::new().name("interrupt".to_owned());
-    thread.spawn(move || runtime.block_on(wait))?;
-    Ok(flag)
+    thread.spawn(move || runtime.block_on(wait)).map(drop)
 }
