@@ -336,17 +336,10 @@ pub(super) fn topics(
     })?;
     let clocks = snapshot.peer_clocks();
     sink.family(&metric::TOPIC_LATENCY_UNCERTAINTY, |family| {
-        rows.iter()
-            .filter(|_| !clocks.is_empty())
-            .try_for_each(|row| {
-                match row
-                    .facts
-                    .and_then(|facts| latency_uncertainty(facts, &clocks))
-                {
-                    Some(uncertainty) => family.sample(&row.labels(), uncertainty),
-                    None => Ok(()),
-                }
-            })
+        rows.iter().try_for_each(|row| {
+            let uncertainty = row.facts.and_then(|it| latency_uncertainty(it, &clocks));
+            uncertainty.map_or(Ok(()), |value| family.sample(&row.labels(), value))
+        })
     })?;
     let doubts: [(&Metric, Count); 3] = [
         (&metric::TOPIC_NEGATIVE_LATENCY, |measured| {

@@ -131,15 +131,6 @@ pub struct PeerClock {
 }
 
 impl PeerClock {
-    /// Returns nanoseconds by which it is ahead, and the greatest error of that; `None` while one
-    /// bound has no evidence.
-    #[must_use]
-    pub fn offset(&self) -> Option<(i64, i64)> {
-        let (least, most) = (self.ahead.0?, self.ahead.1?);
-        let range = Range { least, most };
-        Some((range.middle(), range.uncertainty()))
-    }
-
     /// Returns nanoseconds that are added to latencies of its messages, and the greatest error that
     /// remains; `None` while the offset is unknown.
     #[must_use]

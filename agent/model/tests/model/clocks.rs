@@ -98,6 +98,14 @@ impl Pair {
         self.host.put(record);
     }
 
+    /// Ten messages of Alice's arrive each second.
+    fn listen(&mut self, clock: Clock, seconds: u64) {
+        for _ in 0..10 * seconds {
+            self.hear(clock);
+            self.until(self.host.now + SECOND / 10);
+        }
+    }
+
     /// A message of Bob's leaves, and Alice acknowledges it.
     fn speak(&mut self) {
         let sent = self.host.now;
@@ -297,10 +305,7 @@ fn the_heartbeat_that_requests_an_acknowledgement_begins_a_round_trip() {
         // The reader repeats its answer once more, just after another HEARTBEAT.
         pair.send(kind::HEARTBEAT, announced + SECOND);
         pair.acknowledge(announced + SECOND + 10 * MICROSECOND);
-        for _ in 0..30 {
-            pair.hear(clock);
-            pair.until(pair.host.now + SECOND / 10);
-        }
+        pair.listen(clock, 3);
     }
     let (offset, uncertainty) = pair.offset();
     assert!((offset - 500_000).abs() <= uncertainty, "{offset}");
@@ -321,10 +326,7 @@ fn a_burst_of_heartbeats_begins_a_round_trip_with_its_first() {
     }
     // This answers the third one.
     pair.acknowledge(began + 301 * MILLISECOND);
-    for _ in 0..30 {
-        pair.hear(Clock::ahead(0));
-        pair.until(pair.host.now + SECOND / 10);
-    }
+    pair.listen(Clock::ahead(0), 3);
     let (_, uncertainty) = pair.offset();
     assert!(
         (150_000_000..152_000_000).contains(&uncertainty),

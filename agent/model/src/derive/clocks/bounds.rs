@@ -110,14 +110,9 @@ impl Range {
 
     /// Returns the offset by which latencies are corrected, and the greatest error of that. Clocks
     /// that may agree need no correction: their offset is usually far below the uncertainty.
-    pub(super) const fn correction(self) -> (i64, i64) {
+    pub(super) fn correction(self) -> (i64, i64) {
         if self.least_distance() == 0 {
-            let error = if self.most > self.least.saturating_neg() {
-                self.most
-            } else {
-                self.least.saturating_neg()
-            };
-            (0, error)
+            (0, self.most.max(self.least.saturating_neg()))
         } else {
             (self.middle(), self.uncertainty())
         }
