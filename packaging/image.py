@@ -22,9 +22,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from deb import CONFIGURATION, COPYRIGHT, LIBRARIES, PROGRAM, Package
+from sources import REPOSITORY, ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
-REPOSITORY = re.search(r'^repository = "(.*)"$', (ROOT / "Cargo.toml").read_text(), re.M).group(1)
 TIME = int(os.environ["SOURCE_DATE_EPOCH"])
 CREATED = datetime.fromtimestamp(TIME, timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
 USER = 65532

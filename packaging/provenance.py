@@ -9,14 +9,12 @@ the programs that made the files. The same files give the same bytes. Needs Pyth
 import hashlib
 import json
 import os
-import re
 import subprocess
 import sys
 import zlib
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
-REPOSITORY = re.search(r'^repository = "(.*)"$', (ROOT / "Cargo.toml").read_text(), re.M).group(1)
+from sources import REPOSITORY, ROOT
 
 
 def output(*command):

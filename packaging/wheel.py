@@ -18,10 +18,9 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from deb import LIBRARIES, PROGRAM, Package
+from sources import REPOSITORY, ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
 MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
-REPOSITORY = re.search(r'^repository = "(.*)"$', (ROOT / "Cargo.toml").read_text(), re.M).group(1)
 
 METADATA = """\
 Metadata-Version: 2.4
