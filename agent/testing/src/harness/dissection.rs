@@ -102,7 +102,9 @@ pub struct Samples {
 impl Dissection {
     pub fn read(recording: &Path) -> Result<Dissection> {
         let mut tshark = Command::new("tshark");
-        tshark.args(["-n", "-T", "fields", "-r"]).arg(recording);
+        // A participant may send from a port that another protocol has registered.
+        tshark.args(["-n", "-o", "udp.try_heuristic_first:TRUE"]);
+        tshark.args(["-T", "fields", "-r"]).arg(recording);
         for column in COLUMNS {
             tshark.args(["-e", column]);
         }
@@ -334,4 +336,53 @@ fn next<'a, T: std::str::FromStr>(values: &mut impl Iterator<Item = &'a str>) ->
         .parse()
         .ok()
         .with_context(|| format!("{value} is not a number"))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read as _;
+
+    use flate2::read::MultiGzDecoder;
+
+    use super::*;
+
+    /// Lengths of the header of a pcap file, and of the header of each of its packets.
+    const FILE_HEADER: usize = 24;
+    const PACKET_HEADER: usize = 16;
+    /// Places of the UDP source port and checksum, after Ethernet and IPv4 without options.
+    const SOURCE_PORT: usize = 34;
+    const CHECKSUM: usize = 40;
+
+    #[test]
+    fn a_sender_with_the_port_of_another_protocol_is_dissected() -> Result<()> {
+        // EtherNet/IP and TZSP have these ports, which Linux also gives to participants.
+        for port in [44_818, 37_008] {
+            let dissection = sent_from(port)?;
+            let rtps = dissection
+                .frames
+                .iter()
+                .filter(|frame| !frame.prefix.is_empty());
+            assert_eq!(rtps.count(), sent_from(40_000)?.frames.len(), "port {port}");
+        }
+        Ok(())
+    }
+
+    /// Dissects a recording of Cyclone DDS whose datagrams have this source port.
+    fn sent_from(port: u16) -> Result<Dissection> {
+        let compressed = include_bytes!("../../data/cyclonedds11/type-lookup.pcap.gz");
+        let mut recording = Vec::new();
+        MultiGzDecoder::new(&compressed[..]).read_to_end(&mut recording)?;
+        let mut at = FILE_HEADER;
+        while let Some(header) = recording.get(at..at + PACKET_HEADER) {
+            let length = <[u8; 4]>::try_from(&header[8..12]).map(u32::from_le_bytes)?;
+            at += PACKET_HEADER;
+            let packet = &mut recording[at..at + length as usize];
+            packet[SOURCE_PORT..SOURCE_PORT + 2].copy_from_slice(&port.to_be_bytes());
+            packet[CHECKSUM..CHECKSUM + 2].fill(0);
+            at += length as usize;
+        }
+        let file = tempfile::NamedTempFile::new()?;
+        std::fs::write(file.path(), recording)?;
+        Dissection::read(file.path())
+    }
 }
