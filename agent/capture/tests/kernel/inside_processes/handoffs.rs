@@ -167,16 +167,30 @@ fn a_message_for_a_thread_without_a_cpu_names_who_ran_instead() {
         subscriber.process.end("shared");
     }
     let calls = subscriber.robot.round().report.late;
-    assert!(!calls.is_empty());
-    let is_named = |call: &&LateCall| {
+    // On a busy machine, the executor's thread sometimes waits longer for a CPU than this one.
+    let waited = calls.iter().filter(|call| {
+        let receiver = call
+            .handoff
+            .as_ref()
+            .map(|handoff| handoff.receiver.runnable);
+        call.wait
+            .zip(receiver)
+            .is_some_and(|(all, receiver)| receiver * 2 > all)
+    });
+    let waited: Vec<_> = waited.collect();
+    assert!(waited.len() >= 5, "{calls:#?}");
+    // So may programs of others take this CPU: then one of them ran longer than both loops.
+    let is_named = |call: &&&LateCall| {
         let main = call.main_part(ThreadStates::default()).unwrap();
         let named = call.named_by(main);
+        let others = &call.handoff.as_ref().unwrap().others;
+        let longest = others.iter().map(|other| other.duration).max();
         (main.stage, main.cause) == (Stage::Receive, Cause::Runnable)
-            && named.is_some_and(|thread| &*thread.name == "sh")
+            && others.iter().any(|other| &*other.name == "sh")
+            && named.is_some_and(|thread| Some(thread.duration) == longest)
     };
-    // On a busy machine, the executor's thread is sometimes late, too.
-    let named = calls.iter().filter(is_named).count();
-    assert!(named * 4 >= calls.len() * 3, "{calls:#?}");
+    let named = waited.iter().filter(is_named).count();
+    assert!(named * 4 >= waited.len() * 3, "{calls:#?}");
 }
 
 #[test]
