@@ -113,8 +113,10 @@ release() {
         --target-dir "$target/crates" >&2
     cp "$target"/crates/package/*.crate "$out"
 
-    step "notes and provenance"
+    step "notes, feed and provenance"
     notes >"$out/RELEASE-NOTES.md"
+    packaging/feed.py "$version" "$commit" "$out" >"$private/feed"
+    install -m 644 "$private/feed" "$out/release.json"
     packaging/provenance.py "$commit" "$out" >"$private/provenance"
     install -m 644 "$private/provenance" "$out/ros2probe-$version.provenance.json"
 

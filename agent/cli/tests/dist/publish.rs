@@ -2,6 +2,7 @@
 //! projects' programs verify, install and run them: minisign, pip, podman, apt.
 
 mod crates;
+mod feed;
 mod image;
 mod provenance;
 mod repository;
