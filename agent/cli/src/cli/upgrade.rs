@@ -50,8 +50,7 @@ impl Upgrade {
             None => configured(self.config.as_deref())?,
         };
         let program = std::env::current_exe().context("the path of this program")?;
-        let installed = env!("CARGO_PKG_VERSION").parse::<Version>();
-        let installed = installed.map_err(UserError)?;
+        let installed = env!("CARGO_PKG_VERSION").parse::<Version>()?;
         let installation = Installation::find(&program, Path::new("/"));
         let comparison = Comparison::new(installed, &Feed::read(&feed)?, &feed, installation);
         let text = match self.json {
@@ -80,6 +79,5 @@ fn configured(file: Option<&Path>) -> Result<Location> {
         );
         return Err(UserError(text).into());
     };
-    let location = feed.parse::<Location>();
-    location.map_err(|reason| UserError(format!("rp: upgrade.feed: {reason}")).into())
+    feed.parse::<Location>().context("upgrade.feed")
 }

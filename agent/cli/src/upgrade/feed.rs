@@ -7,9 +7,10 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use hyper::Uri;
+use hyper::http::uri::InvalidUri;
 use serde::{Deserialize, Serialize};
 
-use super::fetch;
+use super::fetch::{self, FetchError};
 
 /// Maximum size of a feed, in bytes.
 pub(super) const MAX_BYTES: usize = 1 << 20;
@@ -26,21 +27,57 @@ pub enum FeedError {
         source: io::Error,
     },
     /// The address has no feed.
-    #[error("no feed at {place}: {reason}")]
+    #[error("no feed at {place}")]
     Fetch {
         /// The address.
-        place: String,
+        place: Uri,
         /// Why the request failed.
-        reason: String,
+        source: FetchError,
     },
     /// The content is not a feed.
-    #[error("{place} is not a feed of ros2probe: {reason}")]
+    #[error("{place} is not a feed of ros2probe")]
     Content {
         /// Path or address.
-        place: String,
+        place: Location,
         /// The first mistake.
-        reason: String,
+        source: ContentError,
     },
+}
+
+/// The first mistake in a feed.
+#[derive(Debug, thiserror::Error)]
+pub enum ContentError {
+    /// It is larger than any feed.
+    #[error("it has more than {MAX_BYTES} bytes")]
+    Size,
+    /// It is not JSON, or not of this form.
+    #[error(transparent)]
+    Form(#[from] serde_json::Error),
+    /// A name could be part of another command.
+    #[error("{0:?} is not the name of a file of a release")]
+    Name(String),
+    /// A file has no checksum.
+    #[error("{0} has no checksum")]
+    Checksum(String),
+}
+
+/// A text is not a version.
+#[derive(Debug, thiserror::Error)]
+#[error("{0:?} is not a version, as in 0.2.0")]
+pub struct InvalidVersion(String);
+
+/// A text is neither a path nor an address.
+#[derive(Debug, thiserror::Error)]
+pub enum InvalidLocation {
+    /// The address has another scheme.
+    #[error("must be a path, or begin with https:// or http://")]
+    Scheme,
+    /// The address has a mistake.
+    #[error(transparent)]
+    Address(#[from] InvalidUri),
+    /// The path has a mistake.
+    #[error(transparent)]
+    Path(#[from] io::Error),
 }
 
 /// The newest release.
@@ -89,31 +126,31 @@ impl Feed {
                 })?
             }
             Location::Address(address) => {
-                fetch::fetch(address).map_err(|reason| FeedError::Fetch {
-                    place: address.to_string(),
-                    reason,
+                fetch::fetch(address).map_err(|source| FeedError::Fetch {
+                    place: address.clone(),
+                    source,
                 })?
             }
         };
-        Self::parse(&bytes).map_err(|reason| FeedError::Content {
-            place: location.to_string(),
-            reason,
+        Self::parse(&bytes).map_err(|source| FeedError::Content {
+            place: location.clone(),
+            source,
         })
     }
 
-    fn parse(bytes: &[u8]) -> Result<Self, String> {
+    fn parse(bytes: &[u8]) -> Result<Self, ContentError> {
         if bytes.len() > MAX_BYTES {
-            return Err(format!("it has more than {MAX_BYTES} bytes"));
+            return Err(ContentError::Size);
         }
-        let feed: Self = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
+        let feed: Self = serde_json::from_slice(bytes)?;
         for (name, sum) in &feed.files {
             // Commands contain the name.
             let fits = |c: char| c.is_ascii_alphanumeric() || "._+-".contains(c);
             if !name.starts_with(|c: char| c.is_ascii_alphanumeric()) || !name.chars().all(fits) {
-                return Err(format!("{name:?} is not the name of a file of a release"));
+                return Err(ContentError::Name(name.clone()));
             }
             if sum.len() != 64 || !sum.bytes().all(|byte| byte.is_ascii_hexdigit()) {
-                return Err(format!("{name} has no checksum"));
+                return Err(ContentError::Checksum(name.clone()));
             }
         }
         Ok(feed)
@@ -121,10 +158,10 @@ impl Feed {
 }
 
 impl FromStr for Version {
-    type Err = String;
+    type Err = InvalidVersion;
 
-    fn from_str(text: &str) -> Result<Self, String> {
-        let wrong = || format!("{text:?} is not a version, as in 0.2.0");
+    fn from_str(text: &str) -> Result<Self, InvalidVersion> {
+        let wrong = || InvalidVersion(text.to_owned());
         let mut numbers = [0; 3];
         let mut parts = text.split('.');
         for number in &mut numbers {
@@ -141,9 +178,9 @@ impl FromStr for Version {
 }
 
 impl TryFrom<String> for Version {
-    type Error = String;
+    type Error = InvalidVersion;
 
-    fn try_from(text: String) -> Result<Self, String> {
+    fn try_from(text: String) -> Result<Self, InvalidVersion> {
         text.parse()
     }
 }
@@ -178,19 +215,16 @@ impl Location {
 }
 
 impl FromStr for Location {
-    type Err = String;
+    type Err = InvalidLocation;
 
-    fn from_str(text: &str) -> Result<Self, String> {
+    fn from_str(text: &str) -> Result<Self, InvalidLocation> {
         if !text.contains("://") {
-            return match std::path::absolute(text) {
-                Ok(path) => Ok(Self::Path(path)),
-                Err(error) => Err(error.to_string()),
-            };
+            return Ok(Self::Path(std::path::absolute(text)?));
         }
-        let address: Uri = text.parse().map_err(|error| format!("{error}"))?;
+        let address: Uri = text.parse()?;
         match address.scheme_str() {
             Some("http" | "https") => Ok(Self::Address(address)),
-            _ => Err("must be a path, or begin with https:// or http://".to_owned()),
+            _ => Err(InvalidLocation::Scheme),
         }
     }
 }

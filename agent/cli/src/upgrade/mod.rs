@@ -13,7 +13,8 @@ use std::fmt;
 use ros2probe_daemon::escape::visible;
 use serde::Serialize;
 
-pub use feed::{Feed, FeedError, Location, Version};
+pub use feed::{ContentError, Feed, FeedError, InvalidLocation, InvalidVersion, Location, Version};
+pub use fetch::FetchError;
 pub use installation::Installation;
 
 /// A comparison of this program with a feed.
