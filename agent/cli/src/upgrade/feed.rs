@@ -32,7 +32,7 @@ pub enum FeedError {
         /// The address.
         place: Uri,
         /// Why the request failed.
-        source: FetchError,
+        source: Box<FetchError>,
     },
     /// The content is not a feed.
     #[error("{place} is not a feed of ros2probe")]
@@ -128,7 +128,7 @@ impl Feed {
             Location::Address(address) => {
                 fetch::fetch(address).map_err(|source| FeedError::Fetch {
                     place: address.clone(),
-                    source,
+                    source: Box::new(source),
                 })?
             }
         };
