@@ -116,7 +116,7 @@ dist: ## release both binaries, packages, bills of materials and checksums into 
 	packaging/dist.sh
 	ROS2PROBE_DIST=$(TARGET)/dist ROS2PROBE_PACKAGES=$(TARGET)/dist cargo test --package ros2probe --test dist -- --include-ignored --skip publish::
 
-release: ## what a maintainer publishes, in target/publish: make dist, wheels, image, chart, apt repository, signed; TRIAL=1 without keys (needs root)
+release: ## what a maintainer publishes, in target/publish: make dist, wheels, image, chart, crates, apt repository, signed; TRIAL=1 without keys (needs root)
 	@.ci/prerequisites.sh release
 	@$(if $(TRIAL),,packaging/release.sh --keys)
 	@$(MAKE) --no-print-directory dist

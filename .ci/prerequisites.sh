@@ -184,6 +184,9 @@ python_packages() {
     echo "${versions[*]}" >"$place/versions"
 }
 
+# Validates the workflows and the action against the schemas that this package contains.
+workflows() { python_packages workflows "check-jsonschema==0.39.0"; }
+
 # Validates the bills of materials against the schema of CycloneDX.
 bills() {
     local place=$tools/bills version=11.12.0
@@ -447,6 +450,7 @@ for need; do
         scapy
         cyclonedds
         bags
+        workflows
         types
         page
         helm
@@ -465,6 +469,7 @@ for need; do
         prometheus
         rotel
         bags
+        workflows
         rust
         nextest
         ;;

@@ -40,6 +40,7 @@ def main(commit, directory):
                 "internalParameters": {
                     "SOURCE_DATE_EPOCH": int(os.environ["SOURCE_DATE_EPOCH"]),
                     "programs": {
+                        "cargo": output("cargo", "--version").split()[1],
                         "cargo-deb": output("cargo-deb", "--version").split()[-1],
                         "clang": output("clang", "--version").splitlines()[0],
                         "gzip": output("gzip", "--version").splitlines()[0],

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Makes what a maintainer publishes, in target/publish: the files of `make dist`, Python wheels, an OCI
-# image, a Helm chart, a repository for apt, notes, provenance, checksums, and signatures.
+# image, a Helm chart, crates, a repository for apt, notes, provenance, checksums, and signatures.
 #
 #   packaging/release.sh             sign with the keys of the maintainers
 #   packaging/release.sh --trial     sign with keys that are deleted afterwards
@@ -107,8 +107,16 @@ release() {
     tar --create --directory deploy/helm --sort=name --mtime="@$SOURCE_DATE_EPOCH" --owner=0 --group=0 \
         --numeric-owner --mode=u=rwX,go=rX ros2probe | gzip -9n >"$out/ros2probe-$version.tgz"
 
-    step "notes and provenance"
+    step "crates, each built from its packed files"
+    rm -rf "$target/crates/package"
+    cargo package --workspace --exclude ros2probe-testing --locked ${trial:+--allow-dirty} \
+        --target-dir "$target/crates" >&2
+    cp "$target"/crates/package/*.crate "$out"
+
+    step "notes, feed and provenance"
     notes >"$out/RELEASE-NOTES.md"
+    packaging/feed.py "$version" "$commit" "$out" >"$private/feed"
+    install -m 644 "$private/feed" "$out/release.json"
     packaging/provenance.py "$commit" "$out" >"$private/provenance"
     install -m 644 "$private/provenance" "$out/ros2probe-$version.provenance.json"
 

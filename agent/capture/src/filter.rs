@@ -25,8 +25,9 @@ pub use deliveries::Deliveries;
 pub use host_hook::{CapturedPiece, Links};
 pub use uprobe::{Form, Probes};
 
-/// The object built by `agent-ebpf/build.sh`. It is aligned because the ELF file is read in place.
-static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../agent-ebpf/filter.bpf.o"));
+/// The object built by `agent-ebpf/build.sh`, through a link, which cargo packs as a file. It is
+/// aligned because the ELF file is read in place.
+static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("filter.bpf.o"));
 
 /// Bytes with the alignment of an ELF header.
 #[repr(align(8))]

@@ -6,6 +6,7 @@
 //! - [`ci`] judges a robot while a command runs, and writes the reports.
 //! - [`discover`] requests announcements from running participants and routers.
 //! - [`inside`] formats figures of calls inside processes.
+//! - [`upgrade`] reads a feed of releases, and finds how this program was installed.
 //! - [`top`] is the screen of `rp top`, [`doctor`] the checks of `rp doctor`.
 //!
 //! The commands themselves are in the program (`src/cli/`).
@@ -29,4 +30,5 @@ pub mod learn;
 pub mod ros2;
 pub mod tables;
 pub mod top;
+pub mod upgrade;
 pub mod why;

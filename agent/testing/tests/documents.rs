@@ -149,6 +149,29 @@ fn every_link_leads_to_a_file_and_a_heading() {
 }
 
 #[test]
+fn every_test_that_the_page_of_compatibility_names_exists() {
+    let mut paths = Vec::new();
+    for folder in ["agent", "wire"] {
+        sources(&repository(folder), &mut paths);
+    }
+    let sources: Vec<String> = paths
+        .iter()
+        .map(|path| fs::read_to_string(path).unwrap())
+        .collect();
+    let page = fs::read_to_string(repository("docs/compatibility.md")).unwrap();
+    let is_test = |name: &&str| name.matches('_').count() > 2 && !name.contains([' ', '/', '.']);
+    let mut named = 0;
+    for name in page.split('`').skip(1).step_by(2).filter(is_test) {
+        let function = format!("#[test]\nfn {name}(");
+        let nested = format!("#[test]\n    fn {name}(");
+        let has = |source: &String| source.contains(&function) || source.contains(&nested);
+        assert!(sources.iter().any(has), "{name} is no test");
+        named += 1;
+    }
+    assert!(named > 12, "{named} names");
+}
+
+#[test]
 fn the_summary_lists_every_page_of_the_book() {
     let pages = markdown(&["docs"]);
     let summary = &pages["docs/SUMMARY.md"];

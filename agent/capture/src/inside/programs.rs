@@ -30,7 +30,7 @@ use crate::tracepoints::accounting_offsets;
 use crate::uprobe::attachments::Refusal;
 
 /// The object built by `agent-ebpf/build.sh`. It is aligned because the ELF file is read in place.
-static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../../agent-ebpf/inside.bpf.o"));
+static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("inside.bpf.o"));
 /// The program that links attach. It tail-calls the other programs.
 const DISPATCHER: Dispatcher = Dispatcher {
     program: "called",

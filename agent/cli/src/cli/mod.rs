@@ -32,6 +32,7 @@ mod shared;
 mod tf;
 mod top;
 mod topic;
+mod upgrade;
 mod welcome;
 mod why;
 
@@ -76,6 +77,8 @@ pub(crate) enum Command {
     /// Run the privileged broker that attaches uprobes for the agent
     #[command(after_help = "Without --listen, ros2probe-attach.socket or an agent starts it.")]
     Attach(Attach),
+    /// Check a feed of releases for a newer version
+    Upgrade(upgrade::Upgrade),
     /// Print completions for a shell
     Completions(reference::Completions),
     /// Print or write man pages

@@ -10,6 +10,7 @@
 mod ansible;
 mod binaries;
 mod chart;
+mod crates;
 mod deploy;
 mod package;
 mod publish;

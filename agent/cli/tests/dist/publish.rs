@@ -1,6 +1,8 @@
 //! Files that `make release` creates in `target/publish`, which `ROS2PROBE_DIST` names. Other
 //! projects' programs verify, install and run them: minisign, pip, podman, apt.
 
+mod crates;
+mod feed;
 mod image;
 mod provenance;
 mod repository;

@@ -46,6 +46,7 @@ mod ros2_daemon;
 mod rules;
 mod samples;
 mod top;
+mod upgrade;
 mod web_config;
 
 use std::process::Command;

@@ -30,7 +30,7 @@ use tonic::{Request, Response, Status};
 
 /// Creates a private authority and a certificate for `localhost` that it signs, in the files
 /// `authority`, `certificate` and `key`.
-fn make_certificate(directory: &Path) {
+pub(crate) fn make_certificate(directory: &Path) {
     let make = |name: &str, key: &str, out: &str, more: &[&str]| {
         let made = Command::new("openssl")
             .args(["req", "-x509", "-nodes", "-days", "2", "-newkey", "ec"])

@@ -190,6 +190,7 @@ impl Reader {
                 .collect(),
             diagnostic_values: robot.diagnostic_values.unwrap_or_default(),
             state_directory: state(&shape.state_directory),
+            upgrade_feed: shape.upgrade.and_then(|upgrade| upgrade.feed),
             log: shape.log,
         }
     }
@@ -548,6 +549,15 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
         "api.socket" if !matches!(text, "auto" | "off") && !text.starts_with('/') => Err(
             InvalidText::RelativePath("`/run/ros2probe/api.sock`, `auto` or `off`"),
         ),
+        "upgrade.feed"
+            if !["/", "https://", "http://"]
+                .iter()
+                .any(|start| text.starts_with(start)) =>
+        {
+            Err(InvalidText::Unfit(
+                "an absolute path or an address, as in `https://example.org/release.json`",
+            ))
+        }
         "metrics.web_config" if !text.starts_with('/') => {
             Err(InvalidText::RelativePath("`/etc/ros2probe/web.yml`"))
         }

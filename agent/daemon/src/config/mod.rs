@@ -101,6 +101,8 @@ pub struct Config {
     pub diagnostic_values: Vec<String>,
     /// Directory of the saved discovery state.
     pub state_directory: StateChoice,
+    /// Path or address of the feed of releases, for `rp upgrade --check`.
+    pub upgrade_feed: Option<String>,
     /// Minimum severity that is logged.
     pub log: Level,
 }
@@ -491,6 +493,7 @@ impl Default for Config {
             extractions: Vec::new(),
             diagnostic_values: Vec::new(),
             state_directory: StateChoice::default(),
+            upgrade_feed: None,
             log: Level::default(),
         }
     }

@@ -70,9 +70,21 @@ pub(super) struct ConfigShape {
     /// manager, else /var/lib/ros2probe if it exists and is writable.
     #[serde(default = "defaults::state_directory")]
     pub(super) state_directory: String,
+    /// Newer versions of ros2probe, for `rp upgrade --check`. The agent does not use it.
+    pub(super) upgrade: Option<UpgradeShape>,
     /// Minimum severity of log lines on standard error. Applied on reload.
     #[serde(default)]
     pub(super) log: Level,
+}
+
+/// Where newer versions are announced.
+#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct UpgradeShape {
+    /// The file `release.json` of the newest release: an absolute path, or an address that begins
+    /// with `https://` or `http://`.
+    pub(super) feed: Option<String>,
 }
 
 /// A topic name or glob, or one with a domain and expectations.

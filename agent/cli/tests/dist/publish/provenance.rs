@@ -12,7 +12,7 @@ use serde_json::Value;
 use super::{VERSION, packaging, published, refuse, succeed};
 
 /// Returns the checksum of each published file, by name.
-fn sums(directory: &Path) -> Result<BTreeMap<String, String>> {
+pub(super) fn sums(directory: &Path) -> Result<BTreeMap<String, String>> {
     let text = fs::read_to_string(directory.join("SHA256SUMS"))?;
     let line = |line: &str| Some((line.get(66..)?.to_owned(), line.get(..64)?.to_owned()));
     text.lines()

@@ -7,6 +7,7 @@ use std::process::Command;
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::repository as sources;
 
+use super::feed::upgrade;
 use super::{VERSION, on_arm, package, packaging, published, succeed, tool};
 use crate::package::installation::installable;
 
@@ -83,6 +84,9 @@ fn installs_and_leaves_nothing(wheels: &Path) -> Result<()> {
     ensure!(files.contains("../../../bin/rp"), "{files}");
     let python = files.lines().filter(|file| file.ends_with(".py")).count();
     ensure!(python == 0, "{files}");
+    let said = upgrade(&environment.join("bin/rp"), wheels)?;
+    ensure!(said.contains("installed by a Python wheel in "), "{said}");
+    ensure!(said.contains("bin/python3 -m pip install /"), "{said}");
     succeed(pip(&environment).args(["uninstall", "--yes", "ros2probe"]))?;
     ensure!(paths(&environment)? == before, "pip left files behind");
     Ok(())
