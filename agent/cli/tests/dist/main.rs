@@ -13,4 +13,5 @@ mod chart;
 mod deploy;
 mod package;
 mod publish;
+mod ros;
 mod systemd;
