@@ -4,6 +4,7 @@
 mod image;
 mod provenance;
 mod repository;
+mod ros;
 mod wheel;
 
 use std::path::{Path, PathBuf};
