@@ -246,6 +246,12 @@ helm() {
     return 0
 }
 
+# Builds the packages for ROS, as users and the build farm of ROS do. Debian has ament_cmake.
+ros() {
+    packages ament-cmake cmake make
+    python_packages ros "colcon-core==0.21.3" "colcon-bash==0.5.0" "colcon-ros==0.5.0" "catkin-pkg==1.1.1" "setuptools==79.0.1"
+}
+
 # Unpacks only the program: the package would enable and start a service of podman.
 podman() {
     type -P podman >/dev/null && return
@@ -455,6 +461,7 @@ for need; do
         page
         helm
         packages ansible-core
+        ros
         rust
         nextest
         spelling
@@ -480,6 +487,7 @@ for need; do
         bills
         helm
         packages ansible-core
+        ros
         qemu
         debian
         cargo_deb

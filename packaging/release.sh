@@ -1,6 +1,8 @@
 #!/usr/bin/env bash
-# Makes what a maintainer publishes, in target/publish: the files of `make dist`, Python wheels, an OCI
-# image, a Helm chart, crates, a repository for apt, notes, provenance, checksums, and signatures.
+# Makes what a maintainer publishes, in target/publish. The files of `make dist` come first. The
+# others are wheels, sources of the packages for ROS, an image, a Helm chart, crates and a repository
+# for apt.
+# Notes, provenance, checksums and signatures describe them.
 #
 #   packaging/release.sh             sign with the keys of the maintainers
 #   packaging/release.sh --trial     sign with keys that are deleted afterwards
@@ -99,6 +101,9 @@ release() {
 
     step "Python wheels"
     for package in "${packages[@]}"; do packaging/wheel.py "$package" "$out" >&2; done
+
+    step "packages for ROS"
+    packaging/ros.sh "$out"
 
     step "OCI image"
     packaging/image.py "$out/ros2probe-$version-image.tar" "$commit" "${packages[@]}"

@@ -14,4 +14,5 @@ mod crates;
 mod deploy;
 mod package;
 mod publish;
+mod ros;
 mod systemd;

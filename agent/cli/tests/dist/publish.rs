@@ -6,6 +6,7 @@ mod feed;
 mod image;
 mod provenance;
 mod repository;
+mod ros;
 mod wheel;
 
 use std::path::{Path, PathBuf};

@@ -16,6 +16,7 @@ mod incident;
 mod inside;
 mod installed;
 mod learn;
+mod packages;
 mod quiet;
 mod robot;
 mod ros2_daemon;
