@@ -1,8 +1,7 @@
 #!/usr/bin/env bash
 # Makes what a maintainer publishes, in target/publish. The files of `make dist` come first. The
 # others are wheels, sources of the packages for ROS, an image, a Helm chart, crates and a repository
-# for apt.
-# Notes, provenance, checksums and signatures describe them.
+# for apt. Notes, provenance, checksums and signatures describe them.
 #
 #   packaging/release.sh             sign with the keys of the maintainers
 #   packaging/release.sh --trial     sign with keys that are deleted afterwards
