@@ -27,6 +27,8 @@ pub enum Kind {
     State,
     /// Events, one on each line.
     Events,
+    /// A record of a queue.
+    Queued,
 }
 
 /// A block with its content.
@@ -54,7 +56,13 @@ pub(crate) struct Header {
 }
 
 impl Kind {
-    const ALL: [Self; 4] = [Self::Topics, Self::Processes, Self::State, Self::Events];
+    const ALL: [Self; 5] = [
+        Self::Topics,
+        Self::Processes,
+        Self::State,
+        Self::Events,
+        Self::Queued,
+    ];
 }
 
 impl Block {

@@ -13,6 +13,9 @@ use crate::block::{Block, HEADER, Header, Kind};
 /// Beginning of each file. The last byte is the version of the format.
 const SIGNATURE: [u8; 8] = *b"ros2hst\x01";
 
+/// Place of the first block in a file.
+pub(crate) const FIRST_PLACE: u64 = SIGNATURE.len() as u64;
+
 const NOFOLLOW: i32 = OFlags::NOFOLLOW.bits().cast_signed();
 
 /// A file as far as it is valid.
@@ -37,7 +40,7 @@ impl Blocks {
             path,
             begin,
             end: begin,
-            length: SIGNATURE.len() as u64,
+            length: FIRST_PLACE,
         })
     }
 
@@ -119,16 +122,16 @@ impl Blocks {
 }
 
 /// Reads the headers of a file one after the other.
-struct Reader {
+pub(crate) struct Reader {
     file: File,
     /// Place of the next header.
-    place: u64,
+    pub(crate) place: u64,
     length: u64,
 }
 
 impl Reader {
     /// Opens a file, of which the bytes up to `length` are valid.
-    fn open(path: &Path, length: u64) -> io::Result<Self> {
+    pub(crate) fn open(path: &Path, length: u64) -> io::Result<Self> {
         let mut options = OpenOptions::new();
         let mut file = options.read(true).custom_flags(NOFOLLOW).open(path)?;
         let length = length.min(file.metadata()?.len());
@@ -137,7 +140,7 @@ impl Reader {
         if signature != SIGNATURE {
             return Err(io::Error::from(io::ErrorKind::InvalidData));
         }
-        let place = SIGNATURE.len() as u64;
+        let place = FIRST_PLACE;
         Ok(Self {
             file,
             place,
@@ -146,7 +149,7 @@ impl Reader {
     }
 
     /// Returns the next header of a whole block, with its place.
-    fn next(&mut self) -> Option<(Header, u64)> {
+    pub(crate) fn next(&mut self) -> Option<(Header, u64)> {
         let mut bytes = [0; HEADER];
         self.file.seek(SeekFrom::Start(self.place)).ok()?;
         self.file.read_exact(&mut bytes).ok()?;
@@ -160,7 +163,7 @@ impl Reader {
     }
 
     /// Returns a block; `None` if it is damaged.
-    fn block(&mut self, header: &Header, place: u64) -> Option<Block> {
+    pub(crate) fn block(&mut self, header: &Header, place: u64) -> Option<Block> {
         self.file.seek(SeekFrom::Start(place)).ok()?;
         let mut bytes = Vec::new();
         let length = HEADER as u64 + u64::from(header.stored);

@@ -6,6 +6,8 @@
 //! block that a power cut damaged is skipped, and the rest stays readable. The oldest file of a tier
 //! is deleted when the tier exceeds its part of the limit.
 //!
+//! A [`Queue`] is a directory of the same files, in which records wait for a receiver.
+//!
 //! This crate starts no thread and reads no clock. All times are Unix seconds.
 //!
 //! ```
@@ -29,10 +31,12 @@ mod bytes;
 mod columns;
 mod file;
 mod merge;
+mod queue;
 mod rows;
 mod store;
 
 pub use block::{Block, Kind};
 pub use merge::{merge_by_name, merge_into, merged};
+pub use queue::{Queue, Record};
 pub use rows::{ProcessName, ProcessRow, Series, TopicName, TopicRow};
 pub use store::{Facts, Span, Store, Tier};

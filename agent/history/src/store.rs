@@ -136,7 +136,7 @@ impl Store {
         let Some(begin) = blocks.iter().map(|block| block.begin).min() else {
             return Ok(());
         };
-        self.prepare()?;
+        prepare(&self.directory)?;
         let budget = tier.budget(self.limit);
         let mut file = match self.files(tier).pop() {
             Some(last)
@@ -376,20 +376,20 @@ impl Store {
         let name = format!("{}-{number:010}.{EXTENSION}", tier.name());
         self.directory.join(name)
     }
+}
 
-    /// Creates the directory if it is missing. Fails if little space is free.
-    fn prepare(&self) -> io::Result<()> {
-        let exists = self.directory.is_dir();
-        let parent = self.directory.parent().filter(|_| !exists);
-        let space = rustix::fs::statvfs(parent.unwrap_or(&self.directory))?;
-        if space.f_bavail.saturating_mul(space.f_frsize) < MIN_FREE {
-            return Err(io::Error::from(io::ErrorKind::StorageFull));
-        }
-        if !exists {
-            fs::DirBuilder::new().mode(0o700).create(&self.directory)?;
-        }
-        Ok(())
+/// Creates a directory if it is missing. Fails if little space is free.
+pub(crate) fn prepare(directory: &Path) -> io::Result<()> {
+    let exists = directory.is_dir();
+    let parent = directory.parent().filter(|_| !exists);
+    let space = rustix::fs::statvfs(parent.unwrap_or(directory))?;
+    if space.f_bavail.saturating_mul(space.f_frsize) < MIN_FREE {
+        return Err(io::Error::from(io::ErrorKind::StorageFull));
     }
+    if !exists {
+        fs::DirBuilder::new().mode(0o700).create(directory)?;
+    }
+    Ok(())
 }
 
 /// Returns the tier of a file by its name; `None` for other files.
