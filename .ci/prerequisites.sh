@@ -60,15 +60,30 @@ packages() {
         apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
 }
 
-# Unpacks only the programs: the package would start a server on port 9090 and enable it at boot.
-prometheus() {
-    command -v prometheus >/dev/null && command -v promtool >/dev/null && return
-    [ -x "$tools/usr/bin/promtool" ] && return
+# Unpacks only the programs: the packages would start servers and enable them at boot.
+engine() { # package program...
+    local package=$1 program missing=
+    shift
+    for program; do
+        command -v "$program" >/dev/null || [ -x "$tools/usr/bin/$program" ] || missing=yes
+    done
+    [ "$missing" ] || return 0
     refresh
-    say "unpacking prometheus and promtool into target/tools (nothing is installed or started)"
+    say "unpacking $* into target/tools (nothing is installed or started)"
     mkdir -p "$tools"
-    (cd "$tools" && apt-get -o APT::Sandbox::User=root download -qq prometheus &&
-        dpkg-deb -x prometheus_*.deb . && rm prometheus_*.deb)
+    (cd "$tools" && apt-get -o APT::Sandbox::User=root download -qq "$package" &&
+        dpkg-deb -x "$package"_*.deb . && rm "$package"_*.deb)
+}
+
+prometheus() {
+    engine prometheus prometheus promtool
+}
+
+# The receivers of remote write beside Prometheus, and its alerts.
+engines() {
+    prometheus
+    engine victoria-metrics victoria-metrics
+    engine prometheus-alertmanager prometheus-alertmanager amtool
 }
 
 # The type checker of the dashboards. Without it one test fails and names it.
@@ -449,7 +464,7 @@ for need; do
     test)
         packages "${network_tools[@]}" clang gcc g++ make tshark systemd strace \
             libfastrtps-dev libfastcdr-dev cyclonedds-dev cyclonedds-tools faketime
-        prometheus
+        engines
         schemathesis
         rotel
         zenoh

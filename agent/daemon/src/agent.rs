@@ -39,9 +39,11 @@ use crate::surface::ros2_daemon::Ros2Daemon;
 use crate::surface::{Exposition, Format, MetricSources};
 use crate::watches::Watches;
 use crate::{control, file, memory};
-use ros2probe_metrics::otlp::{
-    self, Exporter, Host, Inputs, NodeLogQueue, NodeLogSink, SpanQueue, SpanSink,
-};
+use ros2probe_metrics::otlp::{self, Host, Inputs, NodeLogQueue, NodeLogSink, SpanQueue, SpanSink};
+use ros2probe_metrics::remote_write;
+
+/// Subdirectory of samples that wait for remote write.
+const QUEUE: &str = "remote_write";
 
 /// Default configuration file.
 pub const DEFAULT_CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
@@ -229,6 +231,7 @@ pub fn run(options: Options) -> Result<()> {
     let config = overridden(&configured, &options);
     let log = Log::start(config.log, config.otlp.log);
     let export = export(&config)?;
+    let remote_write = remote_write(&config)?;
     let mut source = open(&options, &config)?;
     source.announce(&config.capture);
     let mut sources = MetricSources::new(source.kind(), Settings::new(&config));
@@ -275,8 +278,19 @@ pub fn run(options: Options) -> Result<()> {
         node_logs: Arc::clone(&node_logs),
         exports: Arc::clone(&sources.exports),
     };
-    let exporter = export.map(|export| Exporter::start(export, inputs, privilege::spawn_export));
-    let exporter = exporter.transpose()?;
+    let mut exporters = Vec::new();
+    if let Some(settings) = export {
+        exporters.push(otlp::start(settings, inputs, privilege::spawn_export)?);
+    }
+    if let Some(settings) = remote_write {
+        let inputs = remote_write::Inputs {
+            metrics: Arc::new(sources.clone()),
+            figures: Arc::clone(&sources.remote_write),
+            directory: state.directory().map(|state| state.path().join(QUEUE)),
+        };
+        let started = remote_write::start(settings, inputs, privilege::spawn_export);
+        exporters.push(started.context("remote write cannot start")?);
+    }
     let powerless = give_up()?;
     report_listeners(server.as_ref(), &control, viewers.as_ref(), &watches);
 
@@ -317,7 +331,7 @@ pub fn run(options: Options) -> Result<()> {
         reloads: agent.reloads,
         stop,
         log,
-        exporter,
+        exporters,
         ros2_daemon,
     };
     let surfaces = Surfaces {
@@ -384,6 +398,15 @@ fn ros2_daemon(config: &Config, is_report: bool) -> Result<Option<Ros2Daemon>> {
 fn export(config: &Config) -> Result<Option<otlp::Settings>, otlp::SettingsError> {
     let variable = |name: &str| std::env::var(name).ok();
     otlp::Settings::resolve(&config.otlp, &variable, file::read_text, &Host::read())
+}
+
+fn remote_write(config: &Config) -> Result<Option<remote_write::Settings>> {
+    let settings = &config.remote_write;
+    Ok(remote_write::Settings::resolve(
+        settings,
+        file::read_text,
+        &Host::read(),
+    )?)
 }
 
 /// Creates the watches of the configuration and of the command line.

@@ -40,6 +40,7 @@ impl PrivateAgent {
         config.api.socket = SocketChoice::At(self.directory.join(SOCKET));
         config.ros2_daemon.is_on = false;
         config.otlp.endpoint = Endpoint::Off;
+        config.remote_write.url = None;
         config.state_directory = StateChoice::Off;
         config.history_bytes = 0;
         config.recordings.directory = StateChoice::At(self.directory.join(RECORDINGS));
@@ -124,6 +125,7 @@ mod tests {
         let config = applied(
             "metrics: {listen: '0.0.0.0:17400'}\nfoxglove: {listen: '127.0.0.1:8765'}\n\
              ros2_daemon: on\notlp: {endpoint: 'http://collector:4317'}\n\
+             remote_write: {url: 'http://prometheus:9090/api/v1/write'}\n\
              state_directory: /var/lib/ros2probe\n\
              recordings: {max_bytes: 5000000, snapshots: [{name: a, topics: [/a]}]}\n",
         );
@@ -132,6 +134,7 @@ mod tests {
         assert_eq!(config.api.listen, None);
         assert!(!config.ros2_daemon.is_on);
         assert_eq!(config.otlp.endpoint, Endpoint::Off);
+        assert_eq!(config.remote_write.url, None);
         assert_eq!(config.state_directory, StateChoice::Off);
         let inside = |name: &str| Path::new("/tmp/ci").join(name);
         assert_eq!(config.api.socket, SocketChoice::At(inside("api.sock")));

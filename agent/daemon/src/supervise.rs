@@ -23,7 +23,7 @@ use crate::surface::ros2_daemon::{Ros2Daemon, Task};
 use crate::watches::Watches;
 use anyhow::{Context as _, Result, anyhow};
 use ros2probe_api::health::Reloaded;
-use ros2probe_metrics::otlp::Exporter;
+use ros2probe_metrics::export_thread::ExportThread;
 use sd_notify::NotifyState;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::{Notify, oneshot};
@@ -51,7 +51,7 @@ pub(crate) struct Supervisor {
     pub(crate) stop: CancellationToken,
     pub(crate) log: Log,
     /// Exporter of metrics, if one is configured.
-    pub(crate) exporter: Option<Exporter>,
+    pub(crate) exporters: Vec<ExportThread>,
     /// Thread of the ros2 daemon, if it is configured.
     pub(crate) ros2_daemon: Option<Ros2Daemon>,
 }
@@ -181,8 +181,9 @@ impl Supervisor {
         if drained && worker.thread.join().is_err() {
             tracing::error!("the working thread panicked while shutting down");
         }
-        // The exporter ends after the working thread, whose last state is exported.
-        if let Some(exporter) = self.exporter.take() {
+        // Exports end after the working thread, whose last state is exported.
+        self.exporters.iter().for_each(ExportThread::stop);
+        for exporter in self.exporters.drain(..) {
             exporter.finish().await;
         }
         match outcome {

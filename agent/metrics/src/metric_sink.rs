@@ -1,5 +1,5 @@
-//! Metric families and samples, written from facts in the catalogue's order, to the encoder of a
-//! page or as OTLP data points. The code that writes them does not depend on the destination.
+//! Metric families and samples, written from facts in the catalogue's order. The destination is a
+//! page, an export over OTLP, or remote write; the code that writes them does not depend on it.
 //!
 //! No state is kept between two pages: series vanish with their facts.
 
@@ -23,6 +23,7 @@ use ros2probe_wire::rtps::VendorId;
 use crate::catalogue::{Kind, Metric};
 use crate::exemplar_lines::Waiting;
 use crate::otlp::points::Points;
+use crate::remote_write::samples::Samples;
 use ros2probe_model::facts::histogram::{BOUNDS, Histogram};
 
 /// Maximum length of a label value in bytes. ROS allows 255 characters, so longer values are
@@ -61,6 +62,7 @@ pub struct MetricSink<'a>(Out<'a>);
 enum Out<'a> {
     Page(DescriptorEncoder<'a>, Option<Arc<Waiting>>),
     Points(&'a mut Points),
+    Samples(&'a mut Samples),
 }
 
 /// A family in progress; its samples are contiguous.
@@ -72,6 +74,7 @@ pub struct Family<'a> {
 enum FamilyOut<'a> {
     Page(MetricEncoder<'a>, Option<&'a Waiting>),
     Points(&'a mut Points),
+    Samples(&'a mut Samples),
 }
 
 impl<'a> MetricSink<'a> {
@@ -87,6 +90,11 @@ impl<'a> MetricSink<'a> {
     /// Creates the sink of an export.
     pub(crate) const fn points(points: &'a mut Points) -> Self {
         Self(Out::Points(points))
+    }
+
+    /// Creates the sink of remote write.
+    pub(crate) const fn samples(samples: &'a mut Samples) -> Self {
+        Self(Out::Samples(samples))
     }
 
     /// Begins a family; `samples` writes its samples.
@@ -112,6 +120,11 @@ impl<'a> MetricSink<'a> {
                 let out = FamilyOut::Points(points);
                 samples(&mut Family { metric, out })
             }
+            Out::Samples(collected) => {
+                collected.open(metric);
+                let out = FamilyOut::Samples(collected);
+                samples(&mut Family { metric, out })
+            }
         }
     }
 
@@ -134,6 +147,10 @@ impl Family<'_> {
             FamilyOut::Page(family, _) => family,
             FamilyOut::Points(points) => {
                 points.number(labels, value.into());
+                return Ok(());
+            }
+            FamilyOut::Samples(samples) => {
+                samples.number(labels, value.into());
                 return Ok(());
             }
         };
@@ -194,6 +211,10 @@ impl Family<'_> {
                 points.histogram(labels, values, exemplars);
                 Ok(())
             }
+            FamilyOut::Samples(samples) => {
+                samples.histogram(labels, values);
+                Ok(())
+            }
         }
     }
 }
@@ -248,7 +269,7 @@ impl EncodeLabelSet for LabelSet<'_> {
 
 impl Label<'_> {
     /// Writes the value as text.
-    fn write(&self, out: &mut impl fmt::Write) -> fmt::Result {
+    pub(crate) fn write(&self, out: &mut impl fmt::Write) -> fmt::Result {
         match self {
             Self::Text(text) => write_capped(out, text),
             Self::Number(number) => write!(out, "{number}"),

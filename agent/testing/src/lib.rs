@@ -26,6 +26,7 @@ pub mod model;
 pub mod ports;
 pub mod program_run;
 pub mod pseudo_terminal;
+pub mod remote_write;
 pub mod robot_diagnostics;
 pub mod robot_log;
 pub mod robot_parameters;

@@ -40,6 +40,7 @@ mod privilege;
 mod prometheus;
 mod rates;
 mod record;
+mod remote_write;
 mod robot;
 mod robot_parts;
 mod rtps_tcp;

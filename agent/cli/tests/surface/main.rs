@@ -40,6 +40,7 @@ mod otlp_captures;
 mod otlp_tls;
 mod page;
 mod recordings;
+mod remote_write;
 mod replay;
 mod ros2;
 mod ros2_daemon;

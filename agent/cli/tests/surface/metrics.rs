@@ -50,6 +50,7 @@ fn page(snapshot: Snapshot, settings: Settings, format: Format) -> String {
     let state = sources.latest.publish(snapshot, sample_robot::agent());
     sources.limits.note(&state);
     sources.exports.enable(Signal::Metrics);
+    sources.remote_write.enable();
     sources.ros2_daemon.set_port(0, PortState::Listening);
     let state = tempfile::tempdir().unwrap();
     sources.disk_history.keep_in(state.path(), 1 << 20);
@@ -104,6 +105,8 @@ fn page_of(metric: &str) -> &'static str {
     let begins = |prefixes: &[&str]| prefixes.iter().any(|prefix| metric.starts_with(prefix));
     if begins(&["ros2probe_zenoh_"]) {
         "zenoh.md"
+    } else if begins(&["ros2probe_otlp_", "ros2probe_remote_write_"]) {
+        "metrics-exports.md"
     } else if begins(&["ros2probe_", "process_"]) {
         "metrics-agent.md"
     } else if begins(&["ros2_topic_"]) {
@@ -182,6 +185,7 @@ fn the_tables_in_the_book_equal_those_of_the_sources() {
         metrics("metrics-topics.md"),
         metrics("metrics-endpoints.md"),
         metrics("metrics-agent.md"),
+        metrics("metrics-exports.md"),
         metrics("zenoh.md"),
         (
             "events.md",

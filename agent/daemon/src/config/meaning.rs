@@ -17,8 +17,8 @@ use super::document::Node;
 use super::mistake::{Mistakes, Position};
 use super::shape::{
     ApiShape, CaptureShape, ConfigShape, FoxgloveShape, LogLevelShape, MetricsShape, OtlpShape,
-    RecordingsShape, RobotShape, Ros2DaemonShape, SnapshotShape, Switch, WatchEntryShape,
-    WatchShape,
+    RecordingsShape, RemoteWriteShape, RobotShape, Ros2DaemonShape, SnapshotShape, Switch,
+    WatchEntryShape, WatchShape,
 };
 use super::watch::{
     ExpectationValues, Expectations, PatternError, Retain, Watch, check_globs, check_pattern,
@@ -26,11 +26,13 @@ use super::watch::{
 use super::{
     ApiSettings, CaptureSettings, Config, Endpoint, Extraction, FoxgloveSettings, Level, Limits,
     MAX_PARAMETERS, MetricsSettings, OtlpSettings, RecordingLimits, RecordingSettings,
-    Ros2DaemonSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
+    RemoteWriteSettings, Ros2DaemonSettings, ShmSettings, SnapshotSettings, SocketChoice,
+    SourceChoice, StateChoice,
 };
 use crate::events::Trigger;
 use ros2probe_message::filter::{Filter, FilterError};
 use ros2probe_metrics::otlp::otlp_endpoint;
+use ros2probe_metrics::remote_write;
 use ros2probe_model::derive::robot::parameters::ExpectedParameter;
 use ros2probe_model::derive::robot::{Part, Parts};
 
@@ -160,6 +162,7 @@ impl Reader {
             history: Duration::from_secs(page.history_s.into()),
             history_bytes: page.history_bytes,
             otlp: otlp(shape.otlp.unwrap_or_default()),
+            remote_write: self.remote_write(shape.remote_write.unwrap_or_default()),
             recordings: self.recordings(shape.recordings.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             service_timeout: Duration::from_secs_f64(shape.service_timeout_s),
@@ -337,6 +340,36 @@ impl Reader {
         FoxgloveSettings {
             listen,
             origins: shape.origins.unwrap_or(default),
+        }
+    }
+
+    fn remote_write(&mut self, shape: RemoteWriteShape) -> RemoteWriteSettings {
+        let labels = shape.labels.unwrap_or_default();
+        for name in labels.keys().filter(|name| !is_label(name)) {
+            let message = "is no name of a label: letters, digits and `_`, as in `site`";
+            self.wrong(&format!("remote_write.labels.{name}"), message);
+        }
+        if shape.certificate_file.is_some() != shape.key_file.is_some() {
+            self.wrong(
+                "remote_write",
+                "needs both certificate_file and key_file, or neither",
+            );
+        }
+        let default = RemoteWriteSettings::default();
+        let seconds = |seconds: Option<u64>, default| seconds.map_or(default, Duration::from_secs);
+        RemoteWriteSettings {
+            url: shape.url,
+            interval: seconds(shape.interval_s, default.interval),
+            timeout: seconds(shape.timeout_s, default.timeout),
+            instance: shape.instance,
+            labels,
+            headers: shape.headers.unwrap_or_default(),
+            token_file: shape.token_file.map(PathBuf::from),
+            ca_file: shape.ca_file.map(PathBuf::from),
+            certificate_file: shape.certificate_file.map(PathBuf::from),
+            key_file: shape.key_file.map(PathBuf::from),
+            queue_bytes: shape.queue_bytes.unwrap_or(default.queue_bytes),
+            max_bytes_per_second: shape.max_bytes_per_second,
         }
     }
 
@@ -584,6 +617,17 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
         "otlp.headers_file" if !text.starts_with('/') => {
             Err(InvalidText::RelativePath("`/etc/ros2probe/otlp.headers`"))
         }
+        "remote_write.url" if remote_write::receiver(text).is_none() => Err(InvalidText::Unfit(
+            "the URL of a receiver, as in `https://prometheus.example/api/v1/write`",
+        )),
+        "remote_write.token_file"
+        | "remote_write.ca_file"
+        | "remote_write.certificate_file"
+        | "remote_write.key_file"
+            if !text.starts_with('/') =>
+        {
+            Err(InvalidText::RelativePath("`/etc/ros2probe/robot.pem`"))
+        }
         _ => Ok(()),
     }
 }
@@ -599,6 +643,16 @@ fn is_origin(text: &str) -> bool {
         }
         None => false,
     }
+}
+
+/// Returns whether the name is that of a label which no metric has by itself.
+fn is_label(name: &str) -> bool {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || c == '_';
+    (1..=128).contains(&name.len())
+        && name.chars().all(is_plain)
+        && !name.starts_with(|c: char| c.is_ascii_digit())
+        && !name.starts_with("__")
+        && name != "le"
 }
 
 /// Returns whether the name is that of a gauge, and no metric of the agent begins like it.

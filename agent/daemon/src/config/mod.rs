@@ -29,6 +29,7 @@ pub use ros2probe_capture::settings::{
 };
 use ros2probe_message::Dialect;
 pub use ros2probe_metrics::otlp::{Compression, Endpoint, OtlpProtocol, OtlpSettings};
+pub use ros2probe_metrics::remote_write::RemoteWriteSettings;
 pub use ros2probe_model::derive::chain::expected::ExpectedChain;
 pub use ros2probe_model::facts::glob;
 pub use ros2probe_model::facts::limits::{Limit, Limits};
@@ -81,6 +82,8 @@ pub struct Config {
     pub history_bytes: u64,
     /// Exports to an OpenTelemetry receiver.
     pub otlp: OtlpSettings,
+    /// Delivery to a receiver of Prometheus remote write.
+    pub remote_write: RemoteWriteSettings,
     /// Recordings of the agent.
     pub recordings: RecordingSettings,
     /// Time for which a topic without endpoints is still reported.
@@ -404,6 +407,7 @@ impl Config {
                 (self.history, self.history_bytes) != (new.history, new.history_bytes),
             ),
             ("otlp", self.otlp != new.otlp),
+            ("remote_write", self.remote_write != new.remote_write),
             ("recordings", self.recordings != new.recordings),
             ("topic_grace_s", self.topic_grace != new.topic_grace),
             ("retain", self.retain != new.retain),
@@ -483,6 +487,7 @@ impl Default for Config {
             history: Duration::from_secs(defaults::HISTORY_S.into()),
             history_bytes: defaults::HISTORY_BYTES,
             otlp: OtlpSettings::default(),
+            remote_write: RemoteWriteSettings::default(),
             recordings: RecordingSettings::default(),
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
             service_timeout: Duration::from_secs_f64(defaults::service_timeout_s()),

@@ -47,6 +47,9 @@ pub(super) struct ConfigShape {
     /// Pushes metrics, events and traces to an OpenTelemetry receiver over gRPC. The standard
     /// `OTEL_*` variables replace missing keys.
     pub(super) otlp: Option<OtlpShape>,
+    /// Pushes metrics to a receiver of Prometheus remote write. What the receiver lacks waits on
+    /// disk.
+    pub(super) remote_write: Option<RemoteWriteShape>,
     /// Bags written by the agent: on request (`POST /recordings`), and of the last seconds before
     /// an incident.
     pub(super) recordings: Option<RecordingsShape>,
@@ -674,6 +677,45 @@ pub(super) struct OtlpShape {
     pub(super) robot: Option<String>,
     /// Additional attributes of the resource, names and values.
     pub(super) attributes: Option<BTreeMap<String, String>>,
+}
+
+/// Push to a receiver of Prometheus remote write.
+#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct RemoteWriteShape {
+    /// URL of the receiver, e.g. `https://prometheus.example/api/v1/write`. Without it, nothing is
+    /// sent.
+    pub(super) url: Option<String>,
+    /// Interval between samples, in seconds; default 5, as the dashboards expect.
+    #[schemars(range(min = 1, max = 3_600))]
+    pub(super) interval_s: Option<u64>,
+    /// Timeout for the receiver's answer, in seconds; default 30.
+    #[schemars(range(min = 1, max = 300))]
+    pub(super) timeout_s: Option<u64>,
+    /// Name of this robot: the label `instance`; default: the name of the host.
+    pub(super) instance: Option<String>,
+    /// Additional labels of all series, names and values.
+    pub(super) labels: Option<BTreeMap<String, String>>,
+    /// Additional headers of each request. Put secrets into token_file.
+    pub(super) headers: Option<BTreeMap<String, String>>,
+    /// Absolute path of a file with a bearer token. A replaced file applies to the next request.
+    pub(super) token_file: Option<String>,
+    /// Absolute path of a PEM file with the certificate authorities that may sign the receiver's
+    /// certificate; default: those of the system.
+    pub(super) ca_file: Option<String>,
+    /// Absolute path of a PEM file with the certificate of this robot. A replaced file applies to
+    /// the next request.
+    pub(super) certificate_file: Option<String>,
+    /// Absolute path of a PEM file with the key of that certificate.
+    pub(super) key_file: Option<String>,
+    /// Maximum size of the samples that wait in `state_directory`, in bytes; 0 = none, default
+    /// 268435456. The oldest samples are dropped if it is full.
+    #[schemars(range(min = 0, max = 1_099_511_627_776_u64))]
+    pub(super) queue_bytes: Option<u64>,
+    /// Maximum number of bytes of requests per second; by default they have no limit.
+    #[schemars(range(min = 1_000, max = 1_000_000_000))]
+    pub(super) max_bytes_per_second: Option<u64>,
 }
 
 impl Default for CaptureShape {

@@ -19,6 +19,7 @@ use crate::snapshot_cell::State;
 use ros2probe_metrics::catalogue as metric;
 use ros2probe_metrics::metric_sink::{Label, MetricSink};
 use ros2probe_metrics::otlp::{Exports, Outcome, Reason};
+use ros2probe_metrics::remote_write::{Fate, Figures, Request};
 use ros2probe_model::facts::dispatch::MissedReason;
 
 /// Writes the version, source, sandbox, abilities and readiness of the agent.
@@ -368,6 +369,38 @@ pub(super) fn exports(sink: &mut MetricSink<'_>, exports: &Exports) -> fmt::Resu
             }
         }
         Ok(())
+    })
+}
+
+/// Writes the state of remote write; families without samples, if it has no receiver.
+pub(super) fn remote_write(sink: &mut MetricSink<'_>, figures: &Figures) -> fmt::Result {
+    let figures = Some(figures).filter(|figures| figures.is_enabled());
+    sink.family(&metric::REMOTE_WRITE_REQUESTS, |family| {
+        let mut requests = figures.into_iter().flat_map(|figures| {
+            Request::ALL.map(|result| (result.label(), figures.requests(result)))
+        });
+        requests.try_for_each(|(label, count)| family.sample(&[Label::Text(label)], count))
+    })?;
+    sink.family(&metric::REMOTE_WRITE_SAMPLES, |family| {
+        let mut samples = figures
+            .into_iter()
+            .flat_map(|figures| Fate::ALL.map(|fate| (fate.label(), figures.samples(fate))));
+        samples.try_for_each(|(label, count)| family.sample(&[Label::Text(label)], count))
+    })?;
+    let numbers = [
+        (&metric::REMOTE_WRITE_SENT, figures.map(Figures::sent_bytes)),
+        (
+            &metric::REMOTE_WRITE_QUEUE,
+            figures.map(Figures::queue_bytes),
+        ),
+    ];
+    for (metric, value) in numbers {
+        sink.family(metric, |family| {
+            value.map_or(Ok(()), |value| family.sample(&[], value))
+        })?;
+    }
+    sink.family(&metric::REMOTE_WRITE_BEHIND, |family| {
+        figures.map_or(Ok(()), |figures| family.sample(&[], figures.behind()))
     })
 }
 

@@ -28,6 +28,7 @@ use crate::snapshot_cell::SnapshotCell;
 use ros2probe_metrics::metric_sink::MetricSink;
 use ros2probe_metrics::metric_source::MetricSource;
 use ros2probe_metrics::otlp::{Exports, Signal};
+use ros2probe_metrics::remote_write;
 
 /// Input of a collection. Each part has its own writer; only the agent's setup and the collection
 /// of metrics have all parts.
@@ -45,6 +46,8 @@ pub struct MetricSources {
     pub recordings: Arc<RecordingFigures>,
     /// Counters of exports.
     pub exports: Arc<Exports>,
+    /// Counters of remote write.
+    pub remote_write: Arc<remote_write::Figures>,
     /// Viewers.
     pub viewers: Arc<Viewers>,
     /// Ports and requests of the ros2 daemon.
@@ -71,6 +74,7 @@ impl MetricSources {
             settings: Arc::new(SettingsCell::new(settings)),
             recordings: Arc::default(),
             exports: Arc::default(),
+            remote_write: Arc::default(),
             viewers: Arc::default(),
             ros2_daemon: Arc::default(),
             fields: Arc::default(),
@@ -131,6 +135,7 @@ impl MetricSource for MetricSources {
         agent_metrics::events(sink, &self.events, self.lost_lines.load(Ordering::Relaxed))?;
         agent_metrics::recordings(sink, &self.recordings)?;
         agent_metrics::exports(sink, &self.exports)?;
+        agent_metrics::remote_write(sink, &self.remote_write)?;
         agent_metrics::process(sink)
     }
 

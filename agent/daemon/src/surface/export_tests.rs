@@ -23,7 +23,8 @@ use opentelemetry_proto::tonic::common::v1::any_value::Value;
 use opentelemetry_proto::tonic::metrics::v1::metric::Data;
 use opentelemetry_proto::tonic::metrics::v1::number_data_point;
 use ros2probe_metrics::catalogue::CATALOGUE;
-use ros2probe_metrics::otlp::{Exporter, Exports, Host, Inputs, Outcome, Reason, Settings, Signal};
+use ros2probe_metrics::export_thread::ExportThread;
+use ros2probe_metrics::otlp::{self, Exports, Host, Inputs, Outcome, Reason, Settings, Signal};
 use ros2probe_model::facts::calls::report::{
     CallbackReport, Durations, ProcessReport, PublisherReport, Report, ThreadStates, Transition,
     Trigger,
@@ -98,7 +99,7 @@ impl Receiver {
 }
 
 /// Starts an agent of a quiet robot that exports at this interval in seconds.
-fn exporting(address: SocketAddr, interval: u32, more: &str) -> (Arc<Exports>, Exporter) {
+fn exporting(address: SocketAddr, interval: u32, more: &str) -> (Arc<Exports>, ExportThread) {
     let sources = MetricSources::new(
         SourceKind::Replay,
         crate::settings_cell::Settings::default(),
@@ -112,7 +113,7 @@ fn exporting(address: SocketAddr, interval: u32, more: &str) -> (Arc<Exports>, E
     (sources.exports, exporter)
 }
 
-fn start(address: SocketAddr, interval: u32, more: &str, sources: &MetricSources) -> Exporter {
+fn start(address: SocketAddr, interval: u32, more: &str, sources: &MetricSources) -> ExportThread {
     let yaml = format!("otlp: {{endpoint: 'http://{address}', interval_s: {interval}, {more}}}");
     let config = Config::parse(yaml.as_bytes()).unwrap();
     let host = Host::default();
@@ -126,7 +127,7 @@ fn start(address: SocketAddr, interval: u32, more: &str, sources: &MetricSources
         node_logs: Arc::default(),
         exports: Arc::clone(&sources.exports),
     };
-    Exporter::start(settings.unwrap(), inputs, crate::privilege::spawn_export).unwrap()
+    otlp::start(settings.unwrap(), inputs, crate::privilege::spawn_export).unwrap()
 }
 
 /// Returns a snapshot of a managed node, observed from inside its process, whose timer publishes

@@ -251,6 +251,34 @@ pub const OTLP_DROPPED: Metric = Metric::counter(
      superseded (by newer points), refused, rejected (in part) or \
      shutdown.",
 );
+pub const REMOTE_WRITE_REQUESTS: Metric = Metric::counter(
+    "ros2probe_remote_write_requests_total",
+    &["outcome"],
+    "Requests of remote write: delivered, retried or refused; absent without a receiver.",
+);
+pub const REMOTE_WRITE_SAMPLES: Metric = Metric::counter(
+    "ros2probe_remote_write_samples_total",
+    &["outcome"],
+    "Samples of remote write: delivered, refused, or lost by overflow (queue full) or shutdown.",
+);
+pub const REMOTE_WRITE_SENT: Metric = Metric::counter(
+    "ros2probe_remote_write_sent_bytes_total",
+    &[],
+    "Compressed bodies of the requests of remote write, in bytes.",
+)
+.unit("bytes");
+pub const REMOTE_WRITE_QUEUE: Metric = Metric::gauge(
+    "ros2probe_remote_write_queue_bytes",
+    &[],
+    "Samples that wait on disk for remote write, in bytes; at most remote_write.queue_bytes.",
+)
+.unit("bytes");
+pub const REMOTE_WRITE_BEHIND: Metric = Metric::gauge(
+    "ros2probe_remote_write_behind_seconds",
+    &[],
+    "Age of the oldest samples that the receiver does not have; 0 if it has all.",
+)
+.unit("seconds");
 
 pub const SUBSCRIPTIONS: Metric = Metric::gauge(
     "ros2probe_subscriptions",

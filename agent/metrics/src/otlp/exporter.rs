@@ -2,15 +2,12 @@
 
 use std::io;
 use std::sync::Arc;
-use std::thread::{self, JoinHandle};
 use std::time::{Duration, SystemTime};
 
 use opentelemetry::Context;
 use opentelemetry_sdk::logs::LogExporter as _;
 use opentelemetry_sdk::trace::SpanExporter as _;
 use tokio::runtime::{Builder, Runtime};
-use tokio::sync::oneshot;
-use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use super::delivery::{Delivery, Export};
@@ -25,16 +22,8 @@ use super::settings::{Settings, SettingsError, Target};
 use super::traces::{self, SpanExport, SpanQueue, Tracing};
 use super::transport::Transport;
 use crate::event::EventSource;
+use crate::export_thread::{ExportThread, Spawn};
 use crate::metric_source::MetricSource;
-
-/// Maximum time to stop, whatever the receiver does.
-const ENDING: Duration = Duration::from_secs(2);
-
-/// Starts a thread with only the privileges of exports, and returns after all other privileges are
-/// dropped.
-///
-/// Fails if the system cannot create the thread, or if the thread cannot be confined.
-pub type Spawn = fn(thread::Builder, Box<dyn FnOnce() + Send>) -> io::Result<JoinHandle<()>>;
 
 /// Data to export, and the counters of exports.
 #[derive(Debug)]
@@ -53,13 +42,6 @@ pub struct Inputs {
     pub exports: Arc<Exports>,
 }
 
-/// The running thread.
-pub struct Exporter {
-    thread: JoinHandle<()>,
-    stop: CancellationToken,
-    ended: oneshot::Receiver<()>,
-}
-
 /// Why the exporter cannot start.
 #[derive(Debug, thiserror::Error)]
 pub enum StartError {
@@ -74,52 +56,32 @@ pub enum StartError {
     Thread(#[source] io::Error),
 }
 
-impl Exporter {
-    /// Starts exporting in a thread that may open connections, so the caller can drop that
-    /// permission.
-    ///
-    /// # Errors
-    /// Fails if a connection cannot be configured. An unavailable receiver is not an error.
-    pub fn start(settings: Settings, inputs: Inputs, spawn: Spawn) -> Result<Self, StartError> {
-        // Blocking threads resolve names, at most one per signal.
-        let mut runtime = Builder::new_current_thread();
-        let runtime = runtime
-            .max_blocking_threads(Signal::ALL.len())
-            .enable_all()
-            .build();
-        let runtime = runtime.map_err(StartError::Runtime)?;
-        let stop = CancellationToken::new();
-        let reports = Reports::dispatch();
-        let jobs = tracing::dispatcher::with_default(&reports, || {
-            Jobs::new(settings, inputs, &stop, &runtime)
-        })?;
-        let (tell, ended) = oneshot::channel();
-        let thread = thread::Builder::new().name("otlp".to_owned());
-        let work = move || {
-            // Log lines of this thread are not exported: each could cause the next one.
-            let _suppressed = Context::enter_telemetry_suppressed_scope();
-            tracing::dispatcher::with_default(&reports, || runtime.block_on(jobs.run()));
-            // A pending name resolution must not delay the end.
-            runtime.shutdown_background();
-            let _ = tell.send(());
-        };
-        let thread = spawn(thread, Box::new(work)).map_err(StartError::Thread)?;
-        Ok(Self {
-            thread,
-            stop,
-            ended,
-        })
-    }
-
-    /// Exports a last time and stops, within two seconds.
-    pub async fn finish(self) {
-        self.stop.cancel();
-        if timeout(ENDING, self.ended).await.is_err() {
-            tracing::warn!("the last export did not end in time");
-        } else if self.thread.join().is_err() {
-            tracing::error!("the exporting thread panicked");
-        }
-    }
+/// Starts exporting in a thread that may open connections, so the caller can drop that
+/// permission.
+///
+/// # Errors
+/// Fails if a connection cannot be configured. An unavailable receiver is not an error.
+pub fn start(settings: Settings, inputs: Inputs, spawn: Spawn) -> Result<ExportThread, StartError> {
+    // Blocking threads resolve names, at most one per signal.
+    let mut runtime = Builder::new_current_thread();
+    let runtime = runtime
+        .max_blocking_threads(Signal::ALL.len())
+        .enable_all()
+        .build();
+    let runtime = runtime.map_err(StartError::Runtime)?;
+    let stop = CancellationToken::new();
+    let reports = Reports::dispatch();
+    let jobs = tracing::dispatcher::with_default(&reports, || {
+        Jobs::new(settings, inputs, &stop, &runtime)
+    })?;
+    let work = move || {
+        // Log lines of this thread are not exported: each could cause the next one.
+        let _suppressed = Context::enter_telemetry_suppressed_scope();
+        tracing::dispatcher::with_default(&reports, || runtime.block_on(jobs.run()));
+        // A pending name resolution must not delay the end.
+        runtime.shutdown_background();
+    };
+    ExportThread::start("otlp", stop, spawn, work).map_err(StartError::Thread)
 }
 
 /// Work of the thread.

@@ -25,7 +25,7 @@ mod transport;
 mod waiting;
 
 pub use endpoint::otlp_endpoint;
-pub use exporter::{Exporter, Inputs, Spawn, StartError};
+pub use exporter::{Inputs, StartError, start};
 pub use exports::{Exports, Outcome, Reason, Signal};
 pub use node_logs::{NodeLogQueue, NodeLogSink};
 pub use own_log::LogQueue;

@@ -29,6 +29,9 @@ pub enum Kind {
     Server,
     /// Scrapes and pushes, and stores only undelivered samples.
     Agent,
+    /// VictoriaMetrics, which accepts pushed samples and answers the same queries. It reads no
+    /// configuration.
+    VictoriaMetrics,
 }
 
 impl<'a> Prometheus<'a> {
@@ -54,22 +57,41 @@ impl<'a> Prometheus<'a> {
         std::fs::write(&configuration, text)?;
         let data = directory.path().join("data");
         let data = data.display();
-        let own = match kind {
-            Kind::Server => [
-                format!("--storage.tsdb.path={data}"),
-                "--web.enable-remote-write-receiver".to_owned(),
-            ],
-            Kind::Agent => [
-                format!("--storage.agent.path={data}"),
-                "--enable-feature=agent".to_owned(),
-            ],
+        let prometheus = |own: [String; 2]| {
+            own.into_iter().chain([
+                format!("--config.file={}", configuration.display()),
+                "--web.listen-address=0.0.0.0:9090".to_owned(),
+                "--log.level=error".to_owned(),
+            ])
         };
-        let arguments = own.into_iter().chain([
-            format!("--config.file={}", configuration.display()),
-            "--web.listen-address=0.0.0.0:9090".to_owned(),
-            "--log.level=error".to_owned(),
-        ]);
-        let process = Process::start(&host.outside(), "prometheus", arguments).context(INSTALL)?;
+        let (program, arguments): (_, Vec<_>) = match kind {
+            Kind::Server => {
+                let own = [
+                    format!("--storage.tsdb.path={data}"),
+                    "--web.enable-remote-write-receiver".to_owned(),
+                ];
+                ("prometheus", prometheus(own).collect())
+            }
+            Kind::Agent => {
+                let own = [
+                    format!("--storage.agent.path={data}"),
+                    "--enable-feature=agent".to_owned(),
+                ];
+                ("prometheus", prometheus(own).collect())
+            }
+            Kind::VictoriaMetrics => {
+                let own = [
+                    format!("-storageDataPath={data}"),
+                    "-httpListenAddr=0.0.0.0:9090".to_owned(),
+                    "-loggerLevel=ERROR".to_owned(),
+                    // Samples are found as soon as they are stored.
+                    "-search.latencyOffset=0s".to_owned(),
+                    "-search.disableCache".to_owned(),
+                ];
+                ("victoria-metrics", own.into())
+            }
+        };
+        let process = Process::start(&host.outside(), program, arguments).context(INSTALL)?;
         let prometheus = Prometheus {
             host,
             _process: process,

@@ -32,7 +32,8 @@ fn every_limit_of_the_configuration_is_on_the_metrics_page_and_in_health() {
 
 /// Returns the text of the pages of the book that list constants.
 fn pages_of_fixed_caps(root: &Path) -> String {
-    let pages = ["capture", "model", "agent"].map(|page| format!("docs/limits-{page}.md"));
+    let pages =
+        ["capture", "model", "agent", "exports"].map(|page| format!("docs/limits-{page}.md"));
     let text = |page: &String| std::fs::read_to_string(root.join(page)).unwrap();
     pages.iter().map(text).collect()
 }

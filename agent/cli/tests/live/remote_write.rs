@@ -1,0 +1,115 @@
+//! Remote write to real engines. The agent is killed and started again while they are out of reach.
+
+use std::path::Path;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use anyhow::{Result, ensure};
+use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of};
+use ros2probe_testing::harness::loss::Loss;
+use ros2probe_testing::harness::network::Link;
+use ros2probe_testing::harness::prometheus::{Kind, Prometheus};
+
+/// Maximum gap between samples of each second, in seconds, on a busy machine.
+const GAP: f64 = 6.0;
+/// A series that the agent always has.
+const UP: &str = "up{job=\"ros2probe\",instance=\"robot7\",site=\"hall 2\"}";
+
+#[test]
+fn prometheus_gets_the_samples_of_an_outage_in_which_the_agent_was_killed() -> Result<()> {
+    let text = std::fs::read_to_string(
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/prometheus/prometheus.yaml"),
+    )?;
+    let rules = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../dashboards/rules");
+    let text = text.replace("/etc/ros2probe/rules", &rules.display().to_string());
+    samples_survive(Kind::Server, &text)
+}
+
+#[test]
+fn victoria_metrics_gets_the_samples_of_an_outage_in_which_the_agent_was_killed() -> Result<()> {
+    samples_survive(Kind::VictoriaMetrics, "")
+}
+
+fn samples_survive(engine: Kind, text: &str) -> Result<()> {
+    let link = Link::new()?;
+    let directory = tempfile::tempdir()?;
+    let configuration = directory.path().join("ros2probe.yaml");
+    let state = directory.path().join("state");
+    std::fs::create_dir(&state)?;
+    std::fs::write(
+        &configuration,
+        format!(
+            "{}state_directory: {}\n\
+             remote_write: {{url: 'http://{}:9090/api/v1/write', interval_s: 1, timeout_s: 2, \
+             instance: robot7, labels: {{site: hall 2}}}}\n",
+            at_the_sockets_of(&link.robot),
+            state.display(),
+            link.monitor.address()
+        ),
+    )?;
+    let start = || Agent::start(&link.robot, env!("CARGO_BIN_EXE_rp"), &configuration);
+    // The agent comes first, and the engine later.
+    let mut agent = start()?;
+    let began = Instant::now();
+    let behind = |age: f64| {
+        move |page: &ros2probe_testing::harness::agent::Scrape| {
+            let behind = page.value("ros2probe_remote_write_behind_seconds", &[]);
+            behind.is_some_and(|behind| behind > age)
+        }
+    };
+    agent.scrape_until("samples that wait", behind(2.0))?;
+    let engine = Prometheus::run(&link.monitor, engine, text)?;
+    engine.query(UP)?;
+
+    let to_engine = format!("ip daddr {}", link.monitor.address());
+    let outage = Loss::of(&link.robot, &to_engine, 1000)?;
+    agent.scrape_until("samples that wait", behind(4.0))?;
+    let queue = agent.scrape_until("a queue on disk", |page| {
+        let bytes = page.value("ros2probe_remote_write_queue_bytes", &[]);
+        bytes.is_some_and(|bytes| bytes > 0.0)
+    })?;
+    agent.process.signal("KILL")?;
+    agent.process.wait(Duration::from_secs(10))?;
+    let killed = now()?;
+    let agent = start()?;
+    let started = now()?;
+    agent.scrape_until("samples that wait", behind(4.0))?;
+    drop(outage);
+
+    let back = now()?;
+    let deadline = Instant::now() + Duration::from_secs(90);
+    while engine.query(&format!("timestamp({UP})"))? < back {
+        ensure!(Instant::now() < deadline, "nothing comes any more");
+        std::thread::sleep(Duration::from_millis(300));
+    }
+    let window = began.elapsed().as_secs() + 5;
+    let times = engine.times(&format!("{UP}[{window}s]"))?;
+    let first = times.first().copied().unwrap_or_default();
+    ensure!(times.len() > 10, "{times:?}");
+    ensure!(first < killed - 4.0, "samples before the outage: {times:?}");
+    ensure!(times.is_sorted_by(|one, two| one < two), "{times:?}");
+    for pair in times.windows(2) {
+        let around_the_start = pair[0] < started + 2.0 && pair[1] > killed;
+        let longest = match around_the_start {
+            // Only the time without an agent is missing, and the interval before its end.
+            true => GAP + started - killed,
+            false => GAP,
+        };
+        ensure!(pair[1] - pair[0] < longest, "{pair:?} in {times:?}");
+    }
+    let last_before = times.iter().rev().find(|time| **time <= killed);
+    ensure!(
+        last_before.is_some_and(|last| killed - last < GAP),
+        "the last sample before the end at {killed} is {last_before:?}: {}",
+        queue.0
+    );
+    let page = agent.scrape()?;
+    for lost in ["refused", "overflow", "shutdown"] {
+        let samples = page.value("ros2probe_remote_write_samples_total", &[("outcome", lost)]);
+        ensure!(samples == Some(0.0), "{lost}: {samples:?}");
+    }
+    Ok(())
+}
+
+fn now() -> Result<f64> {
+    Ok(SystemTime::now().duration_since(UNIX_EPOCH)?.as_secs_f64())
+}

@@ -1,0 +1,366 @@
+//! The thread of remote write: collections at each interval, and requests until the receiver has
+//! all samples.
+
+use std::io;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use tokio::runtime::Builder;
+use tokio::sync::Notify;
+use tokio::time::{MissedTickBehavior, interval_at, sleep};
+use tokio_util::sync::CancellationToken;
+
+use super::backlog::Backlog;
+use super::client::{Answer, Client};
+use super::figures::{Fate, Figures, Request, now};
+use super::request::{Version, body};
+use super::samples::{Samples, Scrape};
+use super::settings::{Settings, SettingsError};
+use crate::export_thread::{ExportThread, Spawn};
+use crate::metric_sink::MetricSink;
+use crate::metric_source::MetricSource;
+
+/// Pauses before samples are sent again.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
+const LONGEST_PAUSE: Duration = Duration::from_secs(30);
+/// Time for the last requests, of the two seconds for stopping.
+const LAST: Duration = Duration::from_millis(1_400);
+/// Maximum time to wait for fresh figures.
+const REFRESH_TIMEOUT: Duration = Duration::from_millis(500);
+
+/// Data to send, and its counters.
+#[derive(Debug)]
+pub struct Inputs {
+    /// Metrics.
+    pub metrics: Arc<dyn MetricSource>,
+    /// Counters of remote write.
+    pub figures: Arc<Figures>,
+    /// Directory of the queue; `None` = samples wait in memory only.
+    pub directory: Option<PathBuf>,
+}
+
+/// Why remote write cannot start.
+#[derive(Debug, thiserror::Error)]
+pub enum StartError {
+    /// The settings cannot be applied.
+    #[error(transparent)]
+    Settings(#[from] SettingsError),
+    /// The thread cannot be created, or it could not drop its privileges.
+    #[error("cannot start the thread of remote write")]
+    Thread(#[source] io::Error),
+}
+
+/// Starts remote write in a thread that may open connections.
+///
+/// # Errors
+/// Fails if a file of the settings cannot be used. An unavailable receiver is not an error.
+pub fn start(settings: Settings, inputs: Inputs, spawn: Spawn) -> Result<ExportThread, StartError> {
+    let settings = Arc::new(settings);
+    let client = Client::new(Arc::clone(&settings))?;
+    // A blocking thread resolves names.
+    let mut runtime = Builder::new_current_thread();
+    let runtime = runtime.max_blocking_threads(1).enable_all().build();
+    let runtime = runtime.map_err(StartError::Thread)?;
+    let stop = CancellationToken::new();
+    inputs.figures.enable();
+    let job = Job {
+        waiting: Waiting::default(),
+        figures: inputs.figures,
+        stop: stop.clone(),
+        settings,
+    };
+    let work = move || {
+        runtime.block_on(job.run(inputs.metrics, client, inputs.directory));
+        // A pending name resolution must not delay the end.
+        runtime.shutdown_background();
+    };
+    ExportThread::start("remote_write", stop, spawn, work).map_err(StartError::Thread)
+}
+
+struct Job {
+    waiting: Waiting,
+    figures: Arc<Figures>,
+    stop: CancellationToken,
+    settings: Arc<Settings>,
+}
+
+/// The waiting samples, between collections and requests.
+#[derive(Debug, Default)]
+struct Waiting {
+    state: Mutex<State>,
+    added: Notify,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    backlog: Backlog,
+    /// Whether the last request failed.
+    fails: bool,
+    /// Time of the oldest samples in the request.
+    taken: Option<i64>,
+    /// Whether nothing will be added.
+    is_closed: bool,
+}
+
+/// Requests to the receiver, and what is known about it.
+struct Sender<'a> {
+    job: &'a Job,
+    client: Client,
+    version: Version,
+    /// Whether the receiver answered in `version` before.
+    is_known: bool,
+    /// Whether the last request succeeded; `None` before the first.
+    works: Option<bool>,
+    /// Whether a refusal was logged since the last success.
+    is_refusal_logged: bool,
+}
+
+impl Waiting {
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes the oldest samples, or none at the end. Returns `None` while more may come.
+    fn take(&self) -> Option<Vec<Arc<Scrape>>> {
+        let mut state = self.state();
+        let batch = state.backlog.take();
+        state.taken = batch.first().map(|scrape| scrape.at);
+        (!batch.is_empty() || state.is_closed).then_some(batch)
+    }
+
+    fn change(&self, figures: &Figures, change: impl FnOnce(&mut State)) {
+        let mut state = self.state();
+        change(&mut state);
+        let oldest = state.taken.or(state.backlog.oldest_in_memory());
+        figures.waiting(state.backlog.disk_bytes(), oldest);
+        drop(state);
+        self.added.notify_one();
+    }
+}
+
+impl Job {
+    async fn run(self, metrics: Arc<dyn MetricSource>, client: Client, directory: Option<PathBuf>) {
+        if let Some(directory) = directory.filter(|_| self.settings.queue_bytes > 0) {
+            let mut state = self.waiting.state();
+            state.backlog.open(&directory, self.settings.queue_bytes);
+        }
+        let sender = Sender {
+            job: &self,
+            client,
+            version: Version::Two,
+            is_known: false,
+            works: None,
+            is_refusal_logged: false,
+        };
+        let deliver = async {
+            tokio::select! {
+                () = sender.run() => {}
+                () = self.ended() => {}
+            }
+        };
+        tokio::join!(self.collect(&*metrics), deliver);
+        self.waiting.change(&self.figures, |state| {
+            let lost = state.backlog.write();
+            self.figures.count_samples(Fate::Overflow, lost);
+            let dropped = state.backlog.clear();
+            self.figures.count_samples(Fate::Shutdown, dropped);
+        });
+    }
+
+    /// Completes when the time for the last requests is over.
+    async fn ended(&self) {
+        self.stop.cancelled().await;
+        sleep(LAST).await;
+    }
+
+    /// Collects at each interval until the agent stops, and then a last time.
+    async fn collect(&self, metrics: &dyn MetricSource) {
+        let period = self.settings.interval;
+        // The offset spreads the requests of a fleet that was switched on simultaneously.
+        let mut ticks = interval_at(tokio::time::Instant::now() + period / 4, period);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        let mut samples = Samples::default();
+        let mut previous = Duration::ZERO;
+        let mut last = 0;
+        loop {
+            let stops = tokio::select! {
+                _ = ticks.tick() => false,
+                () = self.stop.cancelled() => true,
+            };
+            if !stops {
+                metrics.refresh(REFRESH_TIMEOUT).await;
+            }
+            let begun = Instant::now();
+            samples.begin();
+            // Writing samples to memory cannot fail.
+            let _ = metrics.collect(&mut MetricSink::samples(&mut samples), previous);
+            previous = begun.elapsed();
+            let at = now();
+            let (scrape, refused) = samples.end(if at == last { at + 1 } else { at });
+            last = scrape.at;
+            self.figures.count_samples(Fate::Overflow, refused);
+            self.add(scrape);
+            if stops {
+                break;
+            }
+        }
+        self.add(samples.end_all(last + 1));
+        self.waiting
+            .change(&self.figures, |state| state.is_closed = true);
+    }
+
+    fn add(&self, scrape: Scrape) {
+        self.waiting.change(&self.figures, |state| {
+            let lost = state.backlog.add(scrape, !state.fails);
+            self.figures.count_samples(Fate::Overflow, lost);
+        });
+    }
+
+    /// Takes the oldest samples as soon as there are some; returns none at the end.
+    async fn take(&self) -> Vec<Arc<Scrape>> {
+        loop {
+            let added = self.waiting.added.notified();
+            if let Some(batch) = self.waiting.take() {
+                return batch;
+            }
+            added.await;
+        }
+    }
+}
+
+impl Sender<'_> {
+    /// Sends samples until none can follow.
+    async fn run(mut self) {
+        loop {
+            let batch = self.job.take().await;
+            if batch.is_empty() {
+                return;
+            }
+            self.settle(&batch).await;
+            self.job.waiting.change(&self.job.figures, |state| {
+                state.backlog.delivered();
+                state.taken = None;
+            });
+        }
+    }
+
+    /// Sends samples until the receiver has written or refused each of them.
+    async fn settle(&mut self, batch: &[Arc<Scrape>]) {
+        // A receiver that refuses some samples may refuse the whole request, so parts follow.
+        let mut parts = vec![batch];
+        while let Some(part) = parts.pop() {
+            match self.offer(part).await {
+                Ok(()) => self
+                    .job
+                    .figures
+                    .count_samples(Fate::Delivered, samples(part)),
+                Err((_, None)) if part.len() > 1 => {
+                    let (older, newer) = part.split_at(part.len() / 2);
+                    parts.extend([newer, older]);
+                }
+                Err((reason, written)) => {
+                    self.refused(&reason, samples(part), written.unwrap_or(0));
+                }
+            }
+        }
+    }
+
+    /// Sends samples until the receiver writes or refuses them. An error has its reason, and the
+    /// number of samples that the receiver wrote.
+    async fn offer(&mut self, part: &[Arc<Scrape>]) -> Result<(), (String, Option<u64>)> {
+        let mut pause = FIRST_PAUSE;
+        loop {
+            if let Err(error) = self.client.renew() {
+                self.failed(&error.to_string());
+            }
+            let body = body(part, &self.job.settings.labels, self.version);
+            let length = body.len();
+            let answer = self.client.send(body, self.version).await;
+            let figures = &self.job.figures;
+            match answer {
+                Answer::UnknownVersion if !self.is_known => {
+                    figures.count_request(Request::Retried, length);
+                    self.version = Version::One;
+                    self.is_known = true;
+                }
+                Answer::Accepted => {
+                    figures.count_request(Request::Delivered, length);
+                    self.delivered();
+                    self.limit(length).await;
+                    return Ok(());
+                }
+                Answer::Refused(reason, written) => {
+                    figures.count_request(Request::Refused, length);
+                    self.job.waiting.state().fails = false;
+                    self.limit(length).await;
+                    return Err((reason, written));
+                }
+                Answer::Again(reason, demanded) => {
+                    figures.count_request(Request::Retried, length);
+                    self.failed(&reason);
+                    sleep(demanded.unwrap_or(pause)).await;
+                    pause = (pause * 2).min(LONGEST_PAUSE);
+                }
+                Answer::UnknownVersion => {
+                    figures.count_request(Request::Retried, length);
+                    // Another receiver took its place.
+                    self.version = Version::One;
+                    sleep(pause).await;
+                    pause = (pause * 2).min(LONGEST_PAUSE);
+                }
+            }
+        }
+    }
+
+    /// Waits until the rate of bytes permits the next request.
+    async fn limit(&self, length: usize) {
+        if let Some(rate) = self.job.settings.max_bytes_per_second {
+            let nanoseconds = (length as u64).saturating_mul(1_000_000_000) / rate.max(1);
+            sleep(Duration::from_nanos(nanoseconds)).await;
+        }
+    }
+
+    fn delivered(&mut self) {
+        self.is_known = true;
+        self.is_refusal_logged = false;
+        self.job.waiting.state().fails = false;
+        if self.works != Some(true) {
+            self.works = Some(true);
+            let (url, version) = (&self.job.settings.url, self.version.header());
+            tracing::info!(%url, version, "sending samples by remote write");
+        }
+    }
+
+    /// Logs the first failure until a request succeeds again.
+    fn failed(&mut self, reason: &str) {
+        let is_first = self.works != Some(false);
+        self.works = Some(false);
+        if is_first {
+            let url = &self.job.settings.url;
+            tracing::warn!(%url, reason, "the receiver of remote write is out of reach: samples wait");
+        }
+        // What waits in memory must survive a power cut from now on.
+        self.job.waiting.change(&self.job.figures, |state| {
+            state.fails = true;
+            let lost = state.backlog.write();
+            self.job.figures.count_samples(Fate::Overflow, lost);
+        });
+    }
+
+    /// Counts samples as refused, and logs the first time until a request succeeds again.
+    fn refused(&mut self, reason: &str, samples: u64, written: u64) {
+        let figures = &self.job.figures;
+        figures.count_samples(Fate::Delivered, written.min(samples));
+        figures.count_samples(Fate::Refused, samples.saturating_sub(written));
+        if !std::mem::replace(&mut self.is_refusal_logged, true) {
+            let url = &self.job.settings.url;
+            tracing::warn!(%url, reason, samples, "the receiver of remote write refuses samples");
+        }
+    }
+}
+
+/// Returns the number of samples.
+fn samples(part: &[Arc<Scrape>]) -> u64 {
+    part.iter().map(|scrape| scrape.samples.len() as u64).sum()
+}
