@@ -5,6 +5,7 @@
 //! - [`learn`] chooses expectations from the figures of a healthy robot.
 //! - [`ci`] judges a robot while a command runs, and writes the reports.
 //! - [`discover`] requests announcements from running participants and routers.
+//! - [`fleet`] compares the robots whose agents deliver to an engine.
 //! - [`inside`] formats figures of calls inside processes.
 //! - [`upgrade`] reads a feed of releases, and finds how this program was installed.
 //! - [`top`] is the screen of `rp top`, [`doctor`] the checks of `rp doctor`.
@@ -24,6 +25,7 @@ pub mod ci;
 pub mod client;
 pub mod discover;
 pub mod doctor;
+pub mod fleet;
 pub mod frames;
 pub mod inside;
 pub mod learn;

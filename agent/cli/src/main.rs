@@ -37,6 +37,7 @@ fn main() -> ExitCode {
         Some(Command::Ci(options)) => options.run(),
         Some(Command::Attach(options)) => done(options.run()),
         Some(Command::Discover(options)) => done(ask::discover(&options)),
+        Some(Command::Fleet(fleet)) => fleet.print(),
         Some(Command::Upgrade(upgrade)) => upgrade.print(),
         Some(Command::Completions(completions)) => completions.print(),
         Some(Command::Man(manual)) => manual.print(),

@@ -12,6 +12,7 @@ mod discover;
 mod doctor;
 mod echo;
 mod events;
+mod fleet;
 mod follow;
 mod foxglove;
 mod inside;
@@ -77,6 +78,8 @@ pub(crate) enum Command {
     /// Run the privileged broker that attaches uprobes for the agent
     #[command(after_help = "Without --listen, ros2probe-attach.socket or an agent starts it.")]
     Attach(Attach),
+    /// Show the robots of a fleet from their engine: which is in trouble, and what differs
+    Fleet(fleet::Fleet),
     /// Check a feed of releases for a newer version
     Upgrade(upgrade::Upgrade),
     /// Print completions for a shell

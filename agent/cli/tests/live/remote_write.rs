@@ -1,12 +1,15 @@
 //! Remote write to real engines. The agent is killed and started again while they are out of reach.
 
+use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::path::Path;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use anyhow::{Result, ensure};
+use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of};
 use ros2probe_testing::harness::loss::Loss;
-use ros2probe_testing::harness::network::Link;
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::prometheus::{Kind, Prometheus};
 
 /// Maximum gap between samples of each second, in seconds, on a busy machine.
@@ -27,6 +30,89 @@ fn prometheus_gets_the_samples_of_an_outage_in_which_the_agent_was_killed() -> R
 #[test]
 fn victoria_metrics_gets_the_samples_of_an_outage_in_which_the_agent_was_killed() -> Result<()> {
     samples_survive(Kind::VictoriaMetrics, "")
+}
+
+#[test]
+fn rp_fleet_finds_the_odd_ones_of_ten_robots() -> Result<()> {
+    let centre = Namespace::alone()?;
+    let prometheus = Prometheus::run(&centre, Kind::Server, "global: {scrape_interval: 1s}\n")?;
+    let directory = tempfile::tempdir()?;
+    let mut robots = BTreeMap::new();
+    for number in 1..=10 {
+        let name = format!("robot-{number}");
+        // The seventh robot has another program.
+        let capture = match number {
+            7 => "wire/tests/data/fastdds-samehost-any.pcap.gz",
+            _ => "wire/tests/data/cyclonedds-samehost-any.pcap.gz",
+        };
+        let configuration = directory.path().join(&name);
+        let text = format!(
+            "remote_write: {{url: 'http://127.0.0.1:9090/api/v1/write', interval_s: 1, \
+             instance: {name}}}\n"
+        );
+        std::fs::write(&configuration, text)?;
+        let arguments = ["run", "--foxglove", "off", "--api", "off"]
+            .into_iter()
+            .chain(["--metrics", "127.0.0.1:0", "--config"])
+            .map(OsString::from)
+            .chain([configuration.into(), "--replay".into()])
+            .chain([ros2probe_testing::repository(capture).into()]);
+        let agent = Process::start(&centre.outside(), env!("CARGO_BIN_EXE_rp"), arguments)?;
+        robots.insert(name, agent);
+    }
+    prometheus.wait_for("count(ros2probe_ready{job=\"ros2probe\"} == 1)", 10.0)?;
+    let seen = "count_over_time(ros2probe_ready{instance=\"robot-3\"}[1m]) > bool 8";
+    prometheus.wait_for(seen, 1.0)?;
+    if let Some(mut third) = robots.remove("robot-3") {
+        third.terminate()?;
+    }
+    let fleet = |more: &[&str]| -> Result<(Option<i32>, String)> {
+        let outside = centre.outside();
+        let mut command = std::process::Command::new(&outside[0]);
+        command.args(&outside[1..]).arg(env!("CARGO_BIN_EXE_rp"));
+        command.args([
+            "fleet",
+            "--engine",
+            "http://127.0.0.1:9090",
+            "--reach",
+            "10",
+        ]);
+        let output = command.args(more).output()?;
+        let text = String::from_utf8(output.stdout)? + &String::from_utf8(output.stderr)?;
+        Ok((output.status.code(), text))
+    };
+    let deadline = Instant::now() + Duration::from_secs(40);
+    let text = loop {
+        let (code, text) = fleet(&[])?;
+        if code == Some(3) && text.contains("out of reach") {
+            break text;
+        }
+        ensure!(Instant::now() < deadline, "{code:?}: {text}");
+        std::thread::sleep(Duration::from_secs(1));
+    };
+    let lines: Vec<&str> = text.lines().collect();
+    ensure!(lines[1].starts_with("robot-3   out of reach  "), "{text}");
+    let details = text
+        .split_once("\nrobot-7\n")
+        .map_or("", |(_, details)| details);
+    ensure!(details.contains(" is missing (8 of 9)"), "{text}");
+    ensure!(details.contains(": 0, usually 2 (8 of 9)"), "{text}");
+    let (_, json) = fleet(&["--json"])?;
+    let json: serde_json::Value = serde_json::from_str(&json)?;
+    let all = json["robots"].as_array().context("no robots")?;
+    ensure!(all.len() == 10, "{json}");
+    for robot in all {
+        let odd = robot["differences"]
+            .as_array()
+            .is_some_and(|all| !all.is_empty());
+        ensure!(odd == (robot["name"] == "robot-7"), "{robot}");
+    }
+    let (code, text) = fleet(&["--job", "other"])?;
+    ensure!(
+        code == Some(1) && text.contains("has no robots of the job `other`"),
+        "{text}"
+    );
+    Ok(())
 }
 
 fn samples_survive(engine: Kind, text: &str) -> Result<()> {

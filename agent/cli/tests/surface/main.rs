@@ -28,6 +28,7 @@ mod documents;
 mod doors;
 mod events;
 mod exemplars;
+mod fleet;
 mod foxglove;
 mod fuzz_seeds;
 mod http;

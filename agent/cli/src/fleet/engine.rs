@@ -1,0 +1,227 @@
+//! Queries to an engine with the HTTP API of Prometheus.
+
+use std::error::Error;
+use std::io;
+use std::str::FromStr;
+use std::time::Duration;
+
+use bytes::Bytes;
+use http_body_util::{BodyExt as _, Full, Limited};
+use hyper::header::{AUTHORIZATION, CONTENT_TYPE, HeaderValue, USER_AGENT};
+use hyper::{Request, StatusCode, Uri};
+use hyper_rustls::{HttpsConnector, HttpsConnectorBuilder};
+use hyper_util::client::legacy::Client;
+use hyper_util::client::legacy::connect::HttpConnector;
+use hyper_util::rt::TokioExecutor;
+use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
+use serde::Deserialize;
+use std::collections::BTreeMap;
+use tokio::runtime::{Builder, Runtime};
+use tokio::time::timeout;
+
+/// Maximum wait for an answer.
+const TIMEOUT: Duration = Duration::from_secs(30);
+/// Maximum length of an answer, in bytes.
+const MAX_BYTES: usize = 64 << 20;
+
+/// Labels of a series without its name.
+pub(super) type Labels = BTreeMap<String, String>;
+
+/// A connection to an engine.
+#[derive(Debug)]
+pub struct Engine {
+    query: Uri,
+    token: Option<HeaderValue>,
+    client: Client<HttpsConnector<HttpConnector>, Full<Bytes>>,
+    runtime: Runtime,
+}
+
+/// A text is not the address of an engine.
+#[derive(Debug, thiserror::Error)]
+#[error("`{0}` is not the URL of an engine, as in `http://prometheus.example:9090`")]
+pub struct InvalidAddress(String);
+
+/// An engine gave no usable answer.
+#[derive(Debug, thiserror::Error)]
+pub enum EngineError {
+    /// The address is none.
+    #[error(transparent)]
+    Address(#[from] InvalidAddress),
+    /// The certificate authorities of this host cannot be read, or no runtime starts.
+    #[error("cannot prepare the request")]
+    Prepare(#[source] io::Error),
+    /// The token cannot be part of a request.
+    #[error("the token is not one line of ASCII")]
+    Token,
+    /// The engine cannot be reached.
+    #[error("the connection failed")]
+    Connection(#[source] hyper_util::client::legacy::Error),
+    /// The answer broke off, or is too long.
+    #[error("cannot receive the answer")]
+    Body(#[source] Box<dyn Error + Send + Sync>),
+    /// The answer took too long.
+    #[error("no answer within {} s", TIMEOUT.as_secs())]
+    Slow,
+    /// The engine refuses the query.
+    #[error("the engine answers {0}: {1}")]
+    Status(StatusCode, String),
+    /// The answer is no result of a query.
+    #[error("the answer is not one of Prometheus's query API")]
+    Form(#[source] serde_json::Error),
+}
+
+/// Base address of an engine, without the path of its API.
+#[derive(Clone, Debug)]
+pub(super) struct Address(Uri);
+
+#[derive(Deserialize)]
+struct Answer {
+    data: Data,
+}
+
+#[derive(Deserialize)]
+#[serde(tag = "resultType", content = "result", rename_all = "lowercase")]
+enum Data {
+    Vector(Vec<Sample>),
+}
+
+#[derive(Deserialize)]
+struct Sample {
+    metric: Labels,
+    /// Time in seconds, and the value as text.
+    value: (f64, String),
+}
+
+impl Address {
+    /// Returns the address of queries.
+    fn query(&self) -> Uri {
+        let base = self.0.to_string();
+        let address = format!("{}/api/v1/query", base.trim_end_matches('/'));
+        address.parse().unwrap_or_else(|_| self.0.clone())
+    }
+}
+
+impl FromStr for Address {
+    type Err = InvalidAddress;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let invalid = || InvalidAddress(text.to_owned());
+        let uri: Uri = text.parse().map_err(|_| invalid())?;
+        let is_http = matches!(uri.scheme_str(), Some("http" | "https"));
+        let has_host = uri.host().is_some_and(|host| !host.is_empty());
+        match is_http && has_host && uri.query().is_none() {
+            true => Ok(Self(uri)),
+            false => Err(invalid()),
+        }
+    }
+}
+
+impl Engine {
+    /// Creates a client of the engine at a URL, with a bearer token if it demands one.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the URL or the token is invalid.
+    pub fn new(url: &str, token: Option<&str>) -> Result<Self, EngineError> {
+        let address: Address = url.parse()?;
+        let token = token.map(|token| {
+            let value = HeaderValue::try_from(format!("Bearer {}", token.trim()));
+            value.map_err(|_| EngineError::Token)
+        });
+        let connector = HttpsConnectorBuilder::new()
+            .with_native_roots()
+            .map_err(EngineError::Prepare)?
+            .https_or_http()
+            .enable_http1()
+            .build();
+        let runtime = Builder::new_current_thread().enable_all().build();
+        Ok(Self {
+            query: address.query(),
+            token: token.transpose()?,
+            client: Client::builder(TokioExecutor::new()).build(connector),
+            runtime: runtime.map_err(EngineError::Prepare)?,
+        })
+    }
+
+    /// Returns the current value of each series of an expression.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the engine cannot be reached, or refuses the query.
+    pub(super) fn ask(&self, expression: &str) -> Result<Vec<(Labels, f64)>, EngineError> {
+        let encoded = utf8_percent_encode(expression, NON_ALPHANUMERIC);
+        let mut request = Request::new(Full::new(Bytes::from(format!("query={encoded}"))));
+        *request.method_mut() = hyper::Method::POST;
+        *request.uri_mut() = self.query.clone();
+        let headers = request.headers_mut();
+        let form = HeaderValue::from_static("application/x-www-form-urlencoded");
+        headers.insert(CONTENT_TYPE, form);
+        let agent = HeaderValue::from_static(concat!("rp/", env!("CARGO_PKG_VERSION")));
+        headers.insert(USER_AGENT, agent);
+        if let Some(token) = &self.token {
+            headers.insert(AUTHORIZATION, token.clone());
+        }
+        let answered = async {
+            let answer = self.client.request(request).await;
+            let answer = answer.map_err(EngineError::Connection)?;
+            let status = answer.status();
+            let body = Limited::new(answer.into_body(), MAX_BYTES).collect().await;
+            let body = body.map_err(EngineError::Body)?.to_bytes();
+            if status.is_success() {
+                return Ok(body);
+            }
+            let text = String::from_utf8_lossy(&body);
+            let text = text.trim().chars().take(200).collect();
+            Err(EngineError::Status(status, text))
+        };
+        let body = self.runtime.block_on(async {
+            let answered = timeout(TIMEOUT, answered).await;
+            answered.unwrap_or(Err(EngineError::Slow))
+        })?;
+        read(&body)
+    }
+}
+
+/// Reads the samples of an answer. Values that are no numbers are left out.
+fn read(body: &[u8]) -> Result<Vec<(Labels, f64)>, EngineError> {
+    let answer: Answer = serde_json::from_slice(body).map_err(EngineError::Form)?;
+    let Data::Vector(samples) = answer.data;
+    let samples = samples.into_iter().filter_map(|sample| {
+        let value = sample.value.1.parse().ok()?;
+        Some((sample.metric, value))
+    });
+    Ok(samples.collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_path_of_a_tenant_stays_in_the_address() {
+        let query = |text: &str| text.parse::<Address>().unwrap().query().to_string();
+        assert_eq!(query("http://a:9090"), "http://a:9090/api/v1/query");
+        assert_eq!(
+            query("https://a/prometheus/"),
+            "https://a/prometheus/api/v1/query"
+        );
+        for text in ["", "a:9090", "ftp://a", "http://a/?b=c", "/a"] {
+            assert!(text.parse::<Address>().is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn only_results_of_queries_are_read() {
+        let body = r#"{"status":"success","data":{"resultType":"vector","result":[
+            {"metric":{"instance":"a"},"value":[1.5,"2"]},
+            {"metric":{},"value":[1.5,"NaN"]}]}}"#;
+        let samples = read(body.as_bytes()).unwrap();
+        assert_eq!(
+            samples[0],
+            (Labels::from([("instance".into(), "a".into())]), 2.0)
+        );
+        assert!(samples[1].1.is_nan());
+        assert!(read(b"<html>").is_err());
+        assert!(read(br#"{"data":{"resultType":"matrix","result":[]}}"#).is_err());
+    }
+}

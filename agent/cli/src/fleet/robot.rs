@@ -1,0 +1,289 @@
+//! The state of each robot, from queries about the whole fleet.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use super::differences::{self, Difference, Trait};
+use super::engine::{Engine, EngineError, Labels};
+
+/// Which robots, and how far back.
+#[derive(Clone, Debug)]
+pub struct Question {
+    /// Value of the label `job`.
+    pub job: String,
+    /// Time in hours for which a robot without samples is still listed.
+    pub hours: u32,
+    /// Time in seconds after which a robot without samples is out of reach.
+    pub reach: u32,
+}
+
+/// The robots of a fleet, those in most trouble first.
+#[derive(Debug, Serialize)]
+pub struct Fleet {
+    /// Robots.
+    pub robots: Vec<Robot>,
+}
+
+/// State of a robot, the worst one first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum State {
+    /// No sample arrived lately.
+    OutOfReach,
+    /// Its agent captures no packets, or its figures are old.
+    NotReady,
+    /// Expectations are violated.
+    Violated,
+    /// There are findings about its graph.
+    Findings,
+    /// None of these.
+    Ok,
+}
+
+/// A robot.
+#[derive(Debug, Serialize)]
+pub struct Robot {
+    /// Value of the label `instance`.
+    pub name: String,
+    /// Its state.
+    pub state: State,
+    /// Age of its last sample in seconds.
+    pub age_s: f64,
+    /// Version of its agent.
+    pub version: Option<String>,
+    /// Number of nodes.
+    pub nodes: usize,
+    /// Number of topics.
+    pub topics: usize,
+    /// Fraction of the messages of the last 5 minutes that subscribers lost.
+    pub loss: Option<f64>,
+    /// Violated expectations: topic and expectation.
+    pub violated: Vec<(String, String)>,
+    /// Findings by kind.
+    pub findings: BTreeMap<String, u64>,
+    /// What differs from the other robots.
+    pub differences: Vec<Difference>,
+}
+
+/// Samples of all robots, by robot.
+type ByRobot<T> = BTreeMap<String, T>;
+
+impl State {
+    /// Returns its text.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::OutOfReach => "out of reach",
+            Self::NotReady => "not ready",
+            Self::Violated => "violated",
+            Self::Findings => "findings",
+            Self::Ok => "ok",
+        }
+    }
+}
+
+impl Fleet {
+    /// Queries an engine.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the engine cannot be reached, or refuses a query.
+    pub fn read(engine: &Engine, question: &Question) -> Result<Self, EngineError> {
+        let job = format!("job={}", quoted(&question.job));
+        let ask = |expression: &str| {
+            let expression = expression.replace("$JOB", &job);
+            Ok::<_, EngineError>(by_robot(engine.ask(&expression)?))
+        };
+        let (hours, reach) = (question.hours, f64::from(question.reach));
+        let ages = ask(&format!(
+            "time() - max by (instance) (max_over_time(timestamp(ros2probe_ready{{$JOB}})[10m:5s]) \
+             or max_over_time(timestamp(ros2probe_ready{{$JOB}})[{hours}h:1m]))"
+        ))?;
+        let ready = ask("min by (instance) (ros2probe_ready{$JOB})")?;
+        let versions = ask("ros2probe_build_info{$JOB}")?;
+        let nodes = ask("group by (instance, ros_node) (ros2_node_info{$JOB})")?;
+        let topics = ask(
+            "group by (instance, topic, message_type, reliability, durability) \
+             (ros2_topic_info{$JOB,kind=\"topic\"})",
+        )?;
+        let publishers = ask("sum by (instance, topic) (ros2_topic_publishers{$JOB})")?;
+        let subscriptions = ask("sum by (instance, topic) (ros2_topic_subscriptions{$JOB})")?;
+        let rates = ask("sum by (instance, topic) (rate(ros2_topic_messages_total{$JOB}[2m]))")?;
+        let losses = ask(
+            "sum by (instance) (increase(ros2_topic_subscriber_lost_messages_total{$JOB}[5m])) / \
+             sum by (instance) (increase(ros2_topic_subscriber_expected_messages_total{$JOB}[5m]))",
+        )?;
+        let violated = ask("ros2_watch_expectation_violated{$JOB} == 1")?;
+        let findings = ask("sum by (instance, kind) (ros2_diagnoses{$JOB}) > 0")?;
+
+        let mut traits: ByRobot<BTreeMap<String, Trait>> = BTreeMap::new();
+        for (name, age) in &ages {
+            let is_in_reach = value(age).is_some_and(|age| age < reach);
+            if is_in_reach {
+                let mut of_robot = BTreeMap::new();
+                // A topic without publishers has no type and no quality of service.
+                let mut text = |key: String, text: String| {
+                    if !text.is_empty() {
+                        of_robot.insert(key, Trait::Text(text));
+                    }
+                };
+                for (labels, _) in of(&versions, name) {
+                    text("version of the agent".to_owned(), label(labels, "version"));
+                }
+                for (labels, _) in of(&nodes, name) {
+                    text(
+                        format!("node {}", common(labels, "ros_node", name)),
+                        "present".to_owned(),
+                    );
+                }
+                for (labels, _) in of(&topics, name) {
+                    let topic = common(labels, "topic", name);
+                    for quality in ["message_type", "reliability", "durability"] {
+                        let key = format!("{} of {topic}", quality.replace('_', " "));
+                        text(key, label(labels, quality));
+                    }
+                }
+                for (what, counts) in [
+                    ("publishers", &publishers),
+                    ("subscriptions", &subscriptions),
+                ] {
+                    for (labels, count) in of(counts, name) {
+                        let topic = common(labels, "topic", name);
+                        text(format!("{what} of {topic}"), format!("{count}"));
+                    }
+                }
+                for (labels, rate) in of(&rates, name) {
+                    let key = format!("rate of {}", common(labels, "topic", name));
+                    of_robot.insert(key, Trait::Hertz(*rate));
+                }
+                traits.insert(name.clone(), of_robot);
+            }
+        }
+        let mut differences = differences::find(&traits);
+
+        let mut robots: Vec<_> = ages
+            .iter()
+            .map(|(name, age)| {
+                let violated = of(&violated, name).iter();
+                let violated = violated
+                    .map(|(labels, _)| (label(labels, "topic"), label(labels, "expectation")));
+                let findings = of(&findings, name).iter();
+                #[expect(
+                    clippy::cast_possible_truncation,
+                    clippy::cast_sign_loss,
+                    reason = "a small positive number"
+                )]
+                let findings =
+                    findings.map(|(labels, count)| (label(labels, "kind"), *count as u64));
+                let version = of(&versions, name).first();
+                let mut robot = Robot {
+                    name: name.clone(),
+                    state: State::Ok,
+                    age_s: value(age).unwrap_or(0.0).max(0.0),
+                    version: version.map(|(labels, _)| label(labels, "version")),
+                    nodes: of(&nodes, name).len(),
+                    topics: of(&topics, name).len(),
+                    loss: losses
+                        .get(name)
+                        .and_then(|loss| value(loss))
+                        .filter(|loss| loss.is_finite()),
+                    violated: violated.collect(),
+                    findings: findings.collect(),
+                    differences: differences.remove(name).unwrap_or_default(),
+                };
+                let is_ready = ready.get(name).and_then(|ready| value(ready));
+                robot.state = match robot.age_s < reach {
+                    true => state(&robot, is_ready.is_some_and(|ready| ready > 0.5)),
+                    false => State::OutOfReach,
+                };
+                robot
+            })
+            .collect();
+        robots.sort_by(|one, two| (one.state, &one.name).cmp(&(two.state, &two.name)));
+        Ok(Self { robots })
+    }
+}
+
+/// Returns the state of a robot in reach.
+fn state(robot: &Robot, is_ready: bool) -> State {
+    if !is_ready {
+        State::NotReady
+    } else if !robot.violated.is_empty() {
+        State::Violated
+    } else if !robot.findings.is_empty() {
+        State::Findings
+    } else {
+        State::Ok
+    }
+}
+
+fn by_robot(samples: Vec<(Labels, f64)>) -> ByRobot<Vec<(Labels, f64)>> {
+    let mut robots: ByRobot<Vec<_>> = BTreeMap::new();
+    for (labels, value) in samples {
+        if let Some(robot) = labels.get("instance") {
+            robots
+                .entry(robot.clone())
+                .or_default()
+                .push((labels, value));
+        }
+    }
+    robots
+}
+
+fn of<'a>(samples: &'a ByRobot<Vec<(Labels, f64)>>, robot: &str) -> &'a [(Labels, f64)] {
+    samples.get(robot).map_or(&[], Vec::as_slice)
+}
+
+fn value(samples: &[(Labels, f64)]) -> Option<f64> {
+    samples.first().map(|(_, value)| *value)
+}
+
+fn label(labels: &Labels, name: &str) -> String {
+    labels.get(name).cloned().unwrap_or_default()
+}
+
+/// Returns a name as it is on every robot: the robot's own name in it is `<robot>`, and a number of
+/// three or more digits, as of a process, is `<number>`.
+fn common(labels: &Labels, name: &str, robot: &str) -> String {
+    let text = label(labels, name);
+    let tokens = text.split('/').map(|token| {
+        if token == robot || token == robot.replace(['-', '.'], "_") {
+            "<robot>".to_owned()
+        } else {
+            without_number(token)
+        }
+    });
+    tokens.collect::<Vec<_>>().join("/")
+}
+
+fn without_number(token: &str) -> String {
+    let parts = token.split('_').map(|part| {
+        let is_number = part.len() >= 3 && part.bytes().all(|byte| byte.is_ascii_digit());
+        if is_number { "<number>" } else { part }
+    });
+    parts.collect::<Vec<_>>().join("_")
+}
+
+/// Returns a text as a string of PromQL.
+fn quoted(text: &str) -> String {
+    format!("\"{}\"", text.replace('\\', "\\\\").replace('"', "\\\""))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_a_robot_and_of_a_process_are_the_same_on_every_robot() {
+        let common = |name: &str| {
+            let labels = Labels::from([("topic".to_owned(), name.to_owned())]);
+            super::common(&labels, "topic", "robot-7")
+        };
+        assert_eq!(common("/robot_7/scan"), "/<robot>/scan");
+        assert_eq!(common("/robot-7"), "/<robot>");
+        assert_eq!(common("/launch_ros_4711"), "/launch_ros_<number>");
+        assert_eq!(common("/camera_2/image"), "/camera_2/image");
+        assert_eq!(quoted("a\"b\\"), "\"a\\\"b\\\\\"");
+    }
+}

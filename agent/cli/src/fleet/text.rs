@@ -1,0 +1,140 @@
+//! A fleet as text.
+
+use std::fmt;
+
+use ros2probe_daemon::escape::visible;
+
+use super::robot::{Fleet, Robot, State};
+
+/// Maximum number of printed differences of a robot.
+const SHOWN: usize = 12;
+
+impl fmt::Display for Fleet {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let head = [
+            "ROBOT", "STATE", "SEEN", "NODES", "TOPICS", "LOSS", "VERSION",
+        ];
+        let mut rows = vec![head.map(str::to_owned)];
+        rows.extend(self.robots.iter().map(row));
+        let mut widths = [0; 7];
+        for row in &rows {
+            for (width, cell) in widths.iter_mut().zip(row) {
+                *width = (*width).max(cell.chars().count());
+            }
+        }
+        for row in &rows {
+            let cells = row.iter().zip(widths);
+            let line: String = cells
+                .map(|(cell, width)| format!("{cell:<width$}  "))
+                .collect();
+            writeln!(f, "{}", line.trim_end())?;
+        }
+        for robot in &self.robots {
+            details(f, robot)?;
+        }
+        Ok(())
+    }
+}
+
+fn row(robot: &Robot) -> [String; 7] {
+    let is_known = robot.state != State::OutOfReach;
+    let known = |text: String| if is_known { text } else { "-".to_owned() };
+    [
+        visible(&robot.name).to_string(),
+        robot.state.label().to_owned(),
+        format!("{} ago", duration(robot.age_s)),
+        known(robot.nodes.to_string()),
+        known(robot.topics.to_string()),
+        match robot.loss {
+            Some(loss) if is_known => format!("{:.2} %", loss * 100.0),
+            _ => "-".to_owned(),
+        },
+        robot
+            .version
+            .as_deref()
+            .map_or_else(|| "-".to_owned(), |version| visible(version).to_string()),
+    ]
+}
+
+/// Writes what is wrong with a robot, and what differs from the others.
+fn details(f: &mut fmt::Formatter<'_>, robot: &Robot) -> fmt::Result {
+    if robot.violated.is_empty() && robot.findings.is_empty() && robot.differences.is_empty() {
+        return Ok(());
+    }
+    writeln!(f, "\n{}", visible(&robot.name))?;
+    for (topic, expectation) in &robot.violated {
+        writeln!(
+            f,
+            "  {}: {} is violated",
+            visible(topic),
+            visible(expectation)
+        )?;
+    }
+    for (kind, count) in &robot.findings {
+        writeln!(f, "  {count} x {}", visible(kind))?;
+    }
+    for difference in robot.differences.iter().take(SHOWN) {
+        writeln!(f, "  {}", visible(&difference.to_string()))?;
+    }
+    match robot.differences.len().saturating_sub(SHOWN) {
+        0 => Ok(()),
+        more => writeln!(f, "  ... and {more} more differences (--json)"),
+    }
+}
+
+/// Returns a duration in its largest whole unit.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "a positive number"
+)]
+fn duration(seconds: f64) -> String {
+    match seconds as u64 {
+        seconds @ 0..120 => format!("{seconds} s"),
+        seconds @ 120..7_200 => format!("{} min", seconds / 60),
+        seconds @ 7_200..172_800 => format!("{} h", seconds / 3_600),
+        seconds => format!("{} d", seconds / 86_400),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fleet_is_a_table_and_the_details_of_robots_in_trouble() {
+        let robot = |name: &str, state, age_s| Robot {
+            name: name.to_owned(),
+            state,
+            age_s,
+            version: Some("0.1.0".to_owned()),
+            nodes: 5,
+            topics: 7,
+            loss: Some(0.0125),
+            violated: Vec::new(),
+            findings: [].into(),
+            differences: Vec::new(),
+        };
+        let mut late = robot("robot-2", State::Violated, 4.2);
+        late.violated = vec![("/scan".to_owned(), "min_rate_hz".to_owned())];
+        late.findings = [("qos_incompatible".to_owned(), 2)].into();
+        let fleet = Fleet {
+            robots: vec![
+                robot("robot-10", State::OutOfReach, 4_000.0),
+                late,
+                robot("robot-1", State::Ok, 1.0),
+            ],
+        };
+        let expected = "\
+ROBOT     STATE         SEEN        NODES  TOPICS  LOSS    VERSION
+robot-10  out of reach  66 min ago  -      -       -       0.1.0
+robot-2   violated      4 s ago     5      7       1.25 %  0.1.0
+robot-1   ok            1 s ago     5      7       1.25 %  0.1.0
+
+robot-2
+  /scan: min_rate_hz is violated
+  2 x qos_incompatible
+";
+        assert_eq!(fleet.to_string(), expected);
+    }
+}
