@@ -43,6 +43,11 @@ demo: ## watch a small robot, no ROS needed; DEMO_SECONDS=N ends it (needs root)
 	cargo build --workspace --bin rp --example robot --example demo
 	@$(SUDO) $(TARGET)/debug/examples/demo $(if $(DEMO_SECONDS),--seconds $(DEMO_SECONDS))
 
+fleet: ## watch three robots and their centre with real engines; FLEET_SECONDS=N ends it (needs root)
+	@.ci/prerequisites.sh fleet
+	cargo build --workspace --bin rp --example robot --example fleet
+	@$(SUDO) env PATH=$(PATH) $(TARGET)/debug/examples/fleet $(if $(FLEET_SECONDS),--seconds $(FLEET_SECONDS))
+
 test: ## format, spelling, lints, kernel object, and all tests with real DDS participants (needs root)
 	@.ci/prerequisites.sh test
 	cargo fmt --all --check
@@ -178,4 +183,4 @@ deny: ## licences, sources and known vulnerabilities of dependencies; DENY=bans 
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo test test-fast test-corpus test-ros2 bench-ros2 ebpf run page page-bench screenshots peers arm dist release vm distcheck bench soak fuzz miri book deny prerequisites
+.PHONY: help demo fleet test test-fast test-corpus test-ros2 bench-ros2 ebpf run page page-bench screenshots peers arm dist release vm distcheck bench soak fuzz miri book deny prerequisites

@@ -461,6 +461,11 @@ for need; do
         packages "${network_tools[@]}" gcc libc6-dev
         rust
         ;;
+    fleet)
+        packages "${network_tools[@]}" gcc libc6-dev
+        engines
+        rust
+        ;;
     test)
         packages "${network_tools[@]}" clang gcc g++ make tshark systemd strace \
             libfastrtps-dev libfastcdr-dev cyclonedds-dev cyclonedds-tools faketime

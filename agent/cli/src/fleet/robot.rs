@@ -60,7 +60,7 @@ pub struct Robot {
     pub loss: Option<f64>,
     /// Violated expectations: topic and expectation.
     pub violated: Vec<(String, String)>,
-    /// Findings by kind.
+    /// Findings by kind, without unmatched endpoints, which healthy robots have, too.
     pub findings: BTreeMap<String, u64>,
     /// What differs from the other robots.
     pub differences: Vec<Difference>,
@@ -153,6 +153,12 @@ impl Fleet {
                         text(format!("{what} of {topic}"), format!("{count}"));
                     }
                 }
+                for (labels, count) in of(&findings, name) {
+                    let kind = label(labels, "kind");
+                    if is_usual(&kind) {
+                        text(format!("endpoints with {kind}"), format!("{count}"));
+                    }
+                }
                 for (labels, rate) in of(&rates, name) {
                     let key = format!("rate of {}", common(labels, "topic", name));
                     of_robot.insert(key, Trait::Hertz(*rate));
@@ -174,8 +180,9 @@ impl Fleet {
                     clippy::cast_sign_loss,
                     reason = "a small positive number"
                 )]
-                let findings =
-                    findings.map(|(labels, count)| (label(labels, "kind"), *count as u64));
+                let findings = findings
+                    .map(|(labels, count)| (label(labels, "kind"), *count as u64))
+                    .filter(|(kind, _)| !is_usual(kind));
                 let version = of(&versions, name).first();
                 let mut robot = Robot {
                     name: name.clone(),
@@ -216,6 +223,11 @@ fn state(robot: &Robot, is_ready: bool) -> State {
     } else {
         State::Ok
     }
+}
+
+/// Returns whether findings of this kind are usual on healthy robots.
+fn is_usual(kind: &str) -> bool {
+    kind.starts_with("unmatched_")
 }
 
 fn by_robot(samples: Vec<(Labels, f64)>) -> ByRobot<Vec<(Labels, f64)>> {

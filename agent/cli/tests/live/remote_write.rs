@@ -115,6 +115,38 @@ fn rp_fleet_finds_the_odd_ones_of_ten_robots() -> Result<()> {
     Ok(())
 }
 
+/// `make fleet`: a robot that loses messages between its computers is the one in trouble.
+#[test]
+fn the_fleet_of_make_fleet_shows_the_robot_that_loses_messages() -> Result<()> {
+    let program = Path::new(env!("CARGO_BIN_EXE_rp")).with_file_name("examples/fleet");
+    let output = std::process::Command::new(program)
+        .args(["--seconds", "50"])
+        .output()?;
+    let text = String::from_utf8(output.stdout)?;
+    let errors = String::from_utf8(output.stderr)?;
+    ensure!(output.status.success(), "{errors}\n{text}");
+    let last = text.rsplit("\nROBOT ").next().unwrap_or_default();
+    for robot in ["robot-1 ", "robot-2  violated", "robot-3 "] {
+        ensure!(last.contains(&format!("\n{robot}")), "{robot} in\n{last}");
+    }
+    ensure!(
+        last.contains("  /points: max_loss_ratio is violated\n"),
+        "{last}"
+    );
+    for engine in [
+        "Prometheus",
+        "Alertmanager",
+        "VictoriaMetrics",
+        "robot-1's page",
+    ] {
+        ensure!(
+            text.contains(&format!("  {engine} ")),
+            "{engine} in\n{text}"
+        );
+    }
+    Ok(())
+}
+
 fn samples_survive(engine: Kind, text: &str) -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;

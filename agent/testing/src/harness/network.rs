@@ -14,6 +14,9 @@ use super::{PREFIX, remove_leftovers, require, run};
 /// The interface of every host.
 pub const INTERFACE: &str = "eth0";
 
+/// The interface of a robot to its centre.
+const UPLINK: &str = "uplink";
+
 static NEXT: AtomicU16 = AtomicU16::new(0);
 
 /// One host.
@@ -162,6 +165,55 @@ impl Namespace {
         run(&format!(
             "ip netns exec {name} ethtool -K {interface} tx off"
         ))?;
+        Ok(())
+    }
+}
+
+impl Namespace {
+    /// Joins this host to `centre` by a further link.
+    pub fn join(&self, centre: &Namespace) -> Result<Uplink> {
+        let subnet = next_subnet();
+        let [second, third] = subnet.to_be_bytes();
+        let address = |host| Ipv4Addr::new(10, 100 + second, third, host);
+        let far = format!("to{subnet}");
+        run(&format!(
+            "ip link add {UPLINK} netns {} mtu 1500 type veth peer name {far} mtu 1500 netns {}",
+            self.name, centre.name
+        ))?;
+        for (host, interface, address) in [
+            (self, UPLINK, address(1)),
+            (centre, far.as_str(), address(2)),
+        ] {
+            let name = &host.name;
+            run(&format!(
+                "ip -n {name} addr add {address}/24 dev {interface}"
+            ))?;
+            run(&format!("ip -n {name} link set {interface} up"))?;
+        }
+        Ok(Uplink {
+            host: self.name.clone(),
+            address: address(2),
+        })
+    }
+}
+
+/// A link of a robot to its centre.
+pub struct Uplink {
+    host: String,
+    address: Ipv4Addr,
+}
+
+impl Uplink {
+    /// Returns the address of the centre.
+    #[must_use]
+    pub const fn address(&self) -> Ipv4Addr {
+        self.address
+    }
+
+    /// Cuts or mends the link.
+    pub fn set_up(&self, is_up: bool) -> Result<()> {
+        let state = if is_up { "up" } else { "down" };
+        run(&format!("ip -n {} link set {UPLINK} {state}", self.host))?;
         Ok(())
     }
 }

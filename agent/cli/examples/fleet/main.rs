@@ -1,0 +1,327 @@
+//! `make fleet`: three robots in network namespaces of their own, and a centre with Prometheus,
+//! Alertmanager and VictoriaMetrics. Each robot's agent delivers by remote write. The second robot
+//! loses messages between its two computers. The third one is out of reach for a minute of each two.
+//!
+//! The engines and the page of each robot are relayed to ports of this machine. The summary is the
+//! output of `rp fleet`.
+
+#[path = "../demo/relay.rs"]
+#[expect(dead_code, reason = "the demo relays more")]
+mod relay;
+
+use std::fmt::Write as _;
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitCode};
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, ensure};
+use clap::Parser;
+use ros2probe_testing::harness::agent::{Agent, get};
+use ros2probe_testing::harness::loss::Loss;
+use ros2probe_testing::harness::network::{Link, Namespace, Uplink};
+use ros2probe_testing::harness::peer;
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::repository;
+use tokio::time::{Instant, sleep};
+
+use crate::relay::Relay;
+
+const REFRESH: Duration = Duration::from_secs(5);
+/// Time in reach and out of reach of the third robot.
+const PHASE: Duration = Duration::from_secs(60);
+/// Packets of a thousand that the second robot loses between its computers.
+const LOST: u16 = 2;
+const API: u16 = 17401;
+const PROMETHEUS: u16 = 9090;
+const ALERTMANAGER: u16 = 9093;
+const VICTORIA_METRICS: u16 = 8428;
+
+#[derive(Parser)]
+#[command(
+    about = "Shows a fleet of three robots and its centre; needs root for network namespaces"
+)]
+struct Options {
+    /// End after this many seconds
+    #[arg(long)]
+    seconds: Option<f64>,
+    #[arg(long, hide = true)]
+    relay: Option<PathBuf>,
+    #[arg(long, hide = true, default_value_t = API)]
+    port: u16,
+}
+
+/// A robot: a computer with sensors, and one with the agent.
+struct Robot {
+    name: String,
+    link: Link,
+    uplink: Uplink,
+}
+
+fn main() -> ExitCode {
+    match fleet(&Options::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("fleet: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Runs on one thread: the processes started below live as long as this thread.
+#[tokio::main(flavor = "current_thread")]
+async fn fleet(options: &Options) -> Result<()> {
+    if let Some(socket) = &options.relay {
+        return relay::serve(socket, options.port);
+    }
+    let program = rp()?;
+    let directory = tempfile::tempdir().context("cannot create a directory")?;
+    let centre = Namespace::alone()?;
+    println!("starting the centre: Prometheus, Alertmanager, VictoriaMetrics");
+    let _engines = engines(&centre, directory.path())?;
+    let mut relays = Vec::new();
+    let mut addresses = String::new();
+    for (name, port) in [
+        ("Prometheus", PROMETHEUS),
+        ("Alertmanager", ALERTMANAGER),
+        ("VictoriaMetrics", VICTORIA_METRICS),
+    ] {
+        let relay = Relay::start(&centre, directory.path(), port)?;
+        writeln!(addresses, "  {name:<16} http://{}", relay.address())?;
+        relays.push(relay);
+    }
+
+    let mut robots = Vec::new();
+    for number in 1..=3 {
+        println!("starting robot-{number}");
+        let link = Link::new()?;
+        let uplink = link.robot.join(&centre)?;
+        let name = format!("robot-{number}");
+        robots.push(Robot { name, link, uplink });
+    }
+    let mut running = Vec::new();
+    let mut agents = Vec::new();
+    for robot in &robots {
+        let (main, sensors) = (&robot.link.robot, &robot.link.monitor);
+        let own = directory.path().join(&robot.name);
+        agents.push(agent(robot, &program, &own)?);
+        let relay = Relay::start(main, &own, API)?;
+        let page = format!("{}'s page", robot.name);
+        writeln!(addresses, "  {page:<16} http://{}", relay.address())?;
+        relays.push(relay);
+        for (host, role) in [(sensors, "lidar"), (main, "base"), (main, "monitor")] {
+            running.push(node(host, role)?);
+        }
+    }
+    let lossy = robots.get(1).context("no second robot")?;
+    let _loss = Loss::of(&lossy.link.monitor, "meta l4proto udp", LOST)?;
+    let leaving = robots.get(2).context("no third robot")?;
+
+    let mut end = std::pin::pin!(ended(options.seconds));
+    let mut change = Instant::now() + PHASE;
+    let mut is_in_reach = true;
+    loop {
+        tokio::select! {
+            interrupted = &mut end => {
+                interrupted?;
+                break;
+            }
+            () = sleep(REFRESH) => {}
+        }
+        if Instant::now() > change {
+            change = Instant::now() + PHASE;
+            is_in_reach = !is_in_reach;
+            leaving.uplink.set_up(is_in_reach)?;
+        }
+        show(&centre, &program, &addresses, is_in_reach)?;
+    }
+    println!("\nstopping the robots and the centre");
+    // Samples that wait on the third robot can be delivered now.
+    leaving.uplink.set_up(true)?;
+    drop(relays);
+    for mut node in running {
+        node.terminate()?;
+    }
+    for mut agent in agents {
+        let status = agent.process.terminate()?;
+        ensure!(status.success(), "an agent ended with {status}");
+    }
+    Ok(())
+}
+
+/// Starts the engines of the centre. Prometheus sends all samples to VictoriaMetrics as well.
+fn engines(centre: &Namespace, directory: &Path) -> Result<Vec<Process>> {
+    let shipped = std::fs::read_to_string(repository("deploy/prometheus/prometheus.yaml"))?;
+    let rules = repository("dashboards/rules").display().to_string();
+    let text = shipped.replace("/etc/ros2probe/rules", &rules)
+        + &format!(
+            "\nalerting: {{alertmanagers: [{{static_configs: [{{targets: ['127.0.0.1:{ALERTMANAGER}']}}]}}]}}\n\
+             remote_write: [{{url: 'http://127.0.0.1:{VICTORIA_METRICS}/api/v1/write'}}]\n"
+        );
+    let file = |name: &str| directory.join(name);
+    std::fs::write(file("prometheus.yaml"), text)?;
+    std::fs::write(
+        file("alertmanager.yaml"),
+        "route: {receiver: nobody, group_by: [alertname, instance]}\nreceivers: [{name: nobody}]\n",
+    )?;
+    let option = |name: &str, path: &str| format!("{name}={}", file(path).display());
+    let programs = [
+        (
+            "victoria-metrics",
+            vec![
+                option("-storageDataPath", "victoria-metrics"),
+                format!("-httpListenAddr=127.0.0.1:{VICTORIA_METRICS}"),
+                "-loggerLevel=ERROR".to_owned(),
+            ],
+        ),
+        (
+            "prometheus-alertmanager",
+            vec![
+                option("--config.file", "alertmanager.yaml"),
+                option("--storage.path", "alertmanager"),
+                format!("--web.listen-address=127.0.0.1:{ALERTMANAGER}"),
+                "--cluster.listen-address=".to_owned(),
+                "--log.level=error".to_owned(),
+            ],
+        ),
+        (
+            "prometheus",
+            vec![
+                option("--config.file", "prometheus.yaml"),
+                option("--storage.tsdb.path", "prometheus"),
+                format!("--web.listen-address=0.0.0.0:{PROMETHEUS}"),
+                "--web.enable-remote-write-receiver".to_owned(),
+                "--log.level=error".to_owned(),
+            ],
+        ),
+    ];
+    let [enter, network] = centre.outside();
+    let started = programs.into_iter().map(|(program, arguments)| {
+        let mut words = vec![enter.clone(), network.clone()];
+        words.extend(with_own_files(program));
+        let started = Process::start(&words, program, arguments);
+        started.with_context(|| format!("{program}: run `.ci/prerequisites.sh fleet`"))
+    });
+    started.collect()
+}
+
+/// Returns the command prefix of a program that was unpacked but not installed, and reads files in
+/// `/usr/share`: it sees its own there.
+fn with_own_files(program: &str) -> Vec<String> {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let found = std::env::split_paths(&path).find(|directory| directory.join(program).exists());
+    let share = found
+        .as_deref()
+        .and_then(Path::parent)
+        .map(|root| root.join("share"));
+    match share {
+        Some(share) if share != Path::new("/usr/share") && share.join("prometheus").exists() => {
+            let script = format!(
+                "mount -t overlay overlay -o lowerdir={}:/usr/share /usr/share && exec \"$0\" \"$@\"",
+                share.display()
+            );
+            ["unshare", "--mount", "sh", "-c", &script]
+                .map(str::to_owned)
+                .into()
+        }
+        _ => Vec::new(),
+    }
+}
+
+/// Starts the agent of a robot. Its watchlist is the default one, with an expectation.
+fn agent<'a>(robot: &'a Robot, program: &Path, own: &Path) -> Result<Agent<'a>> {
+    std::fs::create_dir_all(own.join("state"))?;
+    let text = format!(
+        "watch: ['/**', {{topic: /points, max_loss_ratio: 0.01}}]\n\
+         capture: {{source: host, cgroup: {}}}\n\
+         api: {{socket: 'off'}}\n\
+         state_directory: {}\n\
+         remote_write: {{url: 'http://{}:{PROMETHEUS}/api/v1/write', instance: {}}}\n",
+        robot.link.robot.cgroup().display(),
+        own.join("state").display(),
+        robot.uplink.address(),
+        robot.name
+    );
+    let configuration = own.join("ros2probe.yaml");
+    std::fs::write(&configuration, text)?;
+    let log = own.join("agent.log");
+    Agent::start_logging(&robot.link.robot, program, &configuration, &log).with_context(|| {
+        let log = std::fs::read(&log).unwrap_or_default();
+        format!("the agent said: {}", String::from_utf8_lossy(&log).trim())
+    })
+}
+
+fn node(host: &Namespace, role: &str) -> Result<Process> {
+    let mut node = Process::start(&host.inside(), peer::robot()?, ["--role", role])?;
+    node.wait_for("ready", Duration::from_secs(20))?;
+    Ok(node)
+}
+
+/// Prints what `rp fleet` prints in the centre, and the alerts that fire.
+fn show(centre: &Namespace, program: &Path, addresses: &str, is_in_reach: bool) -> Result<()> {
+    let [enter, network] = centre.outside();
+    let engine = format!("http://127.0.0.1:{PROMETHEUS}");
+    let output = Command::new(enter)
+        .arg(network)
+        .arg(program)
+        .args(["fleet", "--reach", "20", "--engine", &engine])
+        .output()?;
+    if std::io::stdout().is_terminal() {
+        // Clears the screen.
+        print!("\x1b[H\x1b[2J");
+    }
+    println!("{addresses}");
+    let link = if is_in_reach { "up" } else { "cut" };
+    println!("the link of robot-3 is {link}\n");
+    print!("{}", String::from_utf8_lossy(&output.stdout));
+    print!("{}", String::from_utf8_lossy(&output.stderr));
+    let alerts = get(
+        centre,
+        &format!("http://127.0.0.1:{ALERTMANAGER}/api/v2/alerts"),
+    )?;
+    let alerts: serde_json::Value = serde_json::from_str(&alerts).context("Alertmanager")?;
+    for alert in alerts.as_array().into_iter().flatten() {
+        let label = |name: &str| alert["labels"][name].as_str().unwrap_or_default();
+        println!(
+            "alert: {} {} {}",
+            label("instance"),
+            label("alertname"),
+            label("topic")
+        );
+    }
+    println!();
+    Ok(())
+}
+
+/// Returns `rp` of the same build.
+fn rp() -> Result<PathBuf> {
+    let program = std::env::current_exe().context("the path of this program")?;
+    let directory = program
+        .ancestors()
+        .nth(2)
+        .context("it is in no directory")?;
+    let program = directory.join("rp");
+    let name = program.display();
+    ensure!(
+        program.exists(),
+        "{name} is missing: run `make fleet`, which builds it"
+    );
+    Ok(program)
+}
+
+async fn ended(after: Option<f64>) -> Result<()> {
+    use tokio::signal::unix::{SignalKind, signal};
+    let mut terminate = signal(SignalKind::terminate())?;
+    let limit = async {
+        match after {
+            Some(seconds) => sleep(Duration::from_secs_f64(seconds.max(0.0))).await,
+            None => std::future::pending().await,
+        }
+    };
+    tokio::select! {
+        interrupted = tokio::signal::ctrl_c() => interrupted?,
+        _ = terminate.recv() => {}
+        () = limit => {}
+    }
+    Ok(())
+}
