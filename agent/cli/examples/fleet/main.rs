@@ -281,7 +281,10 @@ fn show(centre: &Namespace, program: &Path, addresses: &str, is_in_reach: bool) 
     )?;
     let alerts: serde_json::Value = serde_json::from_str(&alerts).context("Alertmanager")?;
     for alert in alerts.as_array().into_iter().flatten() {
-        let label = |name: &str| alert["labels"][name].as_str().unwrap_or_default();
+        let label = |name: &str| {
+            let label = alert.pointer(&format!("/labels/{name}"));
+            label.and_then(|label| label.as_str()).unwrap_or_default()
+        };
         println!(
             "alert: {} {} {}",
             label("instance"),
