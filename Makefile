@@ -48,6 +48,12 @@ fleet: ## watch three robots and their centre with real engines; FLEET_SECONDS=N
 	cargo build --workspace --bin rp --example robot --example fleet
 	@$(SUDO) env PATH=$(PATH) $(TARGET)/debug/examples/fleet $(if $(FLEET_SECONDS),--seconds $(FLEET_SECONDS))
 
+fleet-bench: AGENTS ?= 10,50,100
+fleet-bench: ## what Prometheus and VictoriaMetrics need for AGENTS (10,50,100) agents
+	@.ci/prerequisites.sh fleet
+	cargo build --release --workspace --example fleet_load
+	$(TARGET)/release/examples/fleet_load --agents $(AGENTS)
+
 test: ## format, spelling, lints, kernel object, and all tests with real DDS participants (needs root)
 	@.ci/prerequisites.sh test
 	cargo fmt --all --check
@@ -183,4 +189,4 @@ deny: ## licences, sources and known vulnerabilities of dependencies; DENY=bans 
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo fleet test test-fast test-corpus test-ros2 bench-ros2 ebpf run page page-bench screenshots peers arm dist release vm distcheck bench soak fuzz miri book deny prerequisites
+.PHONY: help demo fleet fleet-bench test test-fast test-corpus test-ros2 bench-ros2 ebpf run page page-bench screenshots peers arm dist release vm distcheck bench soak fuzz miri book deny prerequisites

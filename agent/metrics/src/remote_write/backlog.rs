@@ -376,6 +376,26 @@ mod tests {
     }
 
     #[test]
+    fn samples_wait_in_memory_while_the_disk_cannot_be_written() {
+        let place = tempfile::tempdir().unwrap();
+        let directory = place.path().join("queue");
+        std::fs::write(&directory, "").unwrap();
+        let mut backlog = Backlog::default();
+        backlog.open(&place.path().join("missing"), LIMIT);
+        (1..=3).for_each(|at| assert_eq!(backlog.add(scrape(at), false), 0));
+        assert!(backlog.disk_bytes() > 0);
+        // The storage fails: the directory is no directory any more.
+        std::fs::remove_dir_all(place.path().join("missing")).unwrap();
+        std::fs::rename(&directory, place.path().join("missing")).unwrap();
+        (4..=9).for_each(|at| assert_eq!(backlog.add(scrape(at), false), 0));
+        assert_eq!(backlog.oldest_in_memory(), Some(4));
+        std::fs::remove_file(place.path().join("missing")).unwrap();
+        assert_eq!(backlog.add(scrape(10), false), 0);
+        assert_eq!(backlog.oldest_in_memory(), None);
+        assert_eq!(drained(&mut backlog), (4..=10).collect::<Vec<_>>());
+    }
+
+    #[test]
     fn without_a_disk_the_oldest_samples_are_lost_and_counted() {
         let mut backlog = Backlog::default();
         let wide = |at| Scrape {
