@@ -271,12 +271,32 @@ impl Missing {
             self.command(),
         )
     }
+
+    /// Returns the lines that grant the capabilities to a unit of systemd.
+    fn in_unit(&self) -> String {
+        let names: Vec<_> = self
+            .grant
+            .iter()
+            .copied()
+            .flat_map(capability_names)
+            .collect();
+        let names = names.join(" ");
+        format!(
+            "live capture needs {}: the unit needs `AmbientCapabilities={names}` and \
+             `CapabilityBoundingSet={names}` (`systemctl edit`)",
+            self.needs()
+        )
+    }
 }
 
 impl fmt::Display for Missing {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if is_container() {
             return f.write_str(&self.in_container());
+        }
+        // A service with its own notifications: no shell has this variable.
+        if std::env::var_os("NOTIFY_SOCKET").is_some() {
+            return f.write_str(&self.in_unit());
         }
         f.write_str(&self.in_shell())
     }
@@ -379,6 +399,17 @@ mod tests {
         assert_eq!(
             text(&has(&[CapabilitySet::NET_ADMIN]), false, true),
             "CAP_BPF, CAP_PERFMON are missing: add --cap-add BPF --cap-add PERFMON"
+        );
+    }
+
+    #[test]
+    fn a_unit_gets_the_lines_that_grant_the_capabilities() {
+        let missing = missing(set(&HOST[1..]), &settings(SourceChoice::Host)).unwrap();
+        assert_eq!(
+            missing.in_unit(),
+            "live capture needs CAP_NET_ADMIN for the source `host`: the unit needs \
+             `AmbientCapabilities=CAP_NET_ADMIN CAP_BPF CAP_PERFMON` and \
+             `CapabilityBoundingSet=CAP_NET_ADMIN CAP_BPF CAP_PERFMON` (`systemctl edit`)"
         );
     }
 
