@@ -514,6 +514,8 @@ for need; do
         ;;
     release)
         packages git gnupg minisign apt-utils skopeo libcap2-bin
+        # A robot of Fast DDS, and the containers around it.
+        packages "${network_tools[@]}" g++ make libfastrtps-dev libfastcdr-dev crun jq
         podman
         qemu
         debian

@@ -1,6 +1,6 @@
 //! The files of `deploy/` fit together. Mounted and named files exist, Prometheus accepts its
 //! configurations, and the DaemonSet's container has exactly the privileges that the agent needs.
-//! `publish::image` starts the image of a release.
+//! `publish::containers` starts the image of a release.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -9,6 +9,8 @@ use std::process::Command;
 use anyhow::{Context as _, Result, ensure};
 use serde::Deserialize as _;
 use serde_yaml::Value;
+
+use crate::publish::podman::Options;
 
 /// Features that Debian's `promtool` lacks.
 const NOT_BUILT_IN: &str = "kubernetes_sd_configs";
@@ -327,6 +329,7 @@ fn the_image_has_the_binary_of_make_dist_the_capabilities_of_the_unit_and_no_roo
     image_is_built_for_this_version_without_root(&text)?;
     image_copies_the_binary_and_the_configuration(&text)?;
     ensure!(instructions(&text, "ENTRYPOINT") == [r#"["/usr/bin/rp"]"#]);
+    ensure!(instructions(&text, "ENV") == ["container=oci"]);
     ensure!(
         instructions(&text, "CMD") == [r#"["run", "--config", "/etc/ros2probe/ros2probe.yaml"]"#]
     );
@@ -389,40 +392,29 @@ fn image_copies_the_binary_and_the_configuration(text: &str) -> Result<()> {
     Ok(())
 }
 
-/// Checks that the file's capabilities and those of `docker run` are the unit's.
+/// Checks that the file's capabilities are the unit's, and that each of the documented containers has
+/// those of its source.
 fn capabilities_are_those_of_the_unit(text: &str) -> Result<()> {
     let set = text
         .split("setcap ")
         .nth(1)
-        .and_then(|rest| rest.split("+ep ").next());
+        .and_then(|rest| rest.split("+p ").next());
     let set: BTreeSet<String> = set
         .context("no setcap")?
         .split(',')
         .map(str::to_uppercase)
         .collect();
-    let readme = std::fs::read_to_string(deploy().join("README.md"))?;
-    let run = readme
-        .split("docker run ")
-        .nth(1)
-        .and_then(|rest| rest.split("```").next());
-    let run = run.context("no docker run")?;
-    let added = run
-        .split("--cap-add ")
-        .skip(1)
-        .filter_map(|rest| rest.split(' ').next());
-    let added: BTreeSet<String> = added.map(|name| format!("CAP_{name}")).collect();
     let unit = bounding_set()?;
-    ensure!(
-        set == unit && added == unit,
-        "file {set:?}, container {added:?}, unit {unit:?}"
-    );
-    for option in [
-        "--network host",
-        "--cgroupns host",
-        "--cap-drop ALL",
-        "/var/lib/ros2probe",
+    ensure!(set == unit, "file {set:?}, unit {unit:?}");
+    for (with, other) in [
+        ("--network host", "CAP_NET_RAW"),
+        ("--network container:robot", "CAP_NET_ADMIN"),
     ] {
-        ensure!(run.contains(option), "no {option} in {run}");
+        let words = Options::documented(with)?.0;
+        let added = words.windows(2).filter(|pair| pair[0] == "--cap-add");
+        let added = added.map(|pair| format!("CAP_{}", pair[1]));
+        let added: BTreeSet<String> = added.chain([other.to_owned()]).collect();
+        ensure!(added == unit, "{with} {added:?}, unit {unit:?}");
     }
     Ok(())
 }
@@ -430,7 +422,12 @@ fn capabilities_are_those_of_the_unit(text: &str) -> Result<()> {
 #[test]
 fn every_file_that_the_documents_link_to_exists() -> Result<()> {
     let root = deploy().join("..");
-    for document in ["docs/fleet.md", "deploy/README.md", "dashboards/README.md"] {
+    for document in [
+        "docs/containers.md",
+        "docs/fleet.md",
+        "deploy/README.md",
+        "dashboards/README.md",
+    ] {
         let text = std::fs::read_to_string(root.join(document))?;
         let directory = root.join(document).parent().unwrap().to_owned();
         let links = text
