@@ -10,10 +10,64 @@ use anyhow::{Context as _, Result, ensure};
 use serde::Deserialize as _;
 use serde_yaml::Value;
 
+use crate::package::installation::succeed;
 use crate::publish::podman::Options;
 
 /// Features that Debian's `promtool` lacks.
 const NOT_BUILT_IN: &str = "kubernetes_sd_configs";
+
+#[test]
+fn compose_follows_its_schema() -> Result<()> {
+    let mut check = Command::new(deploy().join("../target/tools/workflows/bin/check-jsonschema"));
+    check.args(["--builtin-schema", "vendor.compose-spec"]);
+    succeed(check.arg(deploy().join("compose.yaml")))
+        .context("`.ci/prerequisites.sh test` installs it")?;
+    Ok(())
+}
+
+/// Returns the options of the agent's container in compose, in the words of `podman run`.
+fn options_of_compose() -> Result<BTreeSet<String>> {
+    let agent = &yaml("compose.yaml")?["services"]["ros2probe"];
+    let mut options = BTreeSet::new();
+    let mut option = |name: &str, value: &Value| -> Result<()> {
+        let value = value.as_str().with_context(|| name.to_owned())?;
+        options.insert(format!("{name} {value}"));
+        Ok(())
+    };
+    option("--network", &agent["network_mode"])?;
+    option("--pid", &agent["pid"])?;
+    option("--cgroupns", &agent["cgroup"])?;
+    for (name, list) in [
+        ("--cap-drop", "cap_drop"),
+        ("--cap-add", "cap_add"),
+        ("--volume", "volumes"),
+    ] {
+        for value in agent[list].as_sequence().context("no list")? {
+            // compose puts the name of the project before that of a volume.
+            match value.as_str().filter(|value| !value.starts_with('/')) {
+                Some(volume) if name == "--volume" => {
+                    option(name, &format!("ros2probe-{volume}").into())?;
+                }
+                _ => option(name, value)?,
+            }
+        }
+    }
+    ensure!(agent["read_only"] == true && agent["ulimits"]["memlock"] == -1);
+    Ok(options)
+}
+
+#[test]
+fn compose_starts_the_agent_with_the_documented_options() -> Result<()> {
+    let words = Options::documented("--network host")?.0;
+    let mut documented = BTreeSet::new();
+    let mut words = words.iter().filter(|word| *word != "--read-only");
+    while let (Some(option), Some(value)) = (words.next(), words.next()) {
+        documented.insert(format!("{option} {value}"));
+    }
+    let compose = options_of_compose()?;
+    ensure!(compose == documented, "{compose:?}, {documented:?}");
+    Ok(())
+}
 
 #[test]
 fn mounts_of_compose_exist_and_images_are_pinned() -> Result<()> {
@@ -30,7 +84,9 @@ fn mounts_of_compose_exist_and_images_are_pinned() -> Result<()> {
             let (source, _) = mount.split_once(':').context("no target")?;
             let there = match source.starts_with('.') {
                 true => deploy().join(source).exists(),
-                false => compose["volumes"].get(source).is_some(),
+                false => {
+                    Path::new(source).is_absolute() || compose["volumes"].get(source).is_some()
+                }
             };
             ensure!(there, "{name:?} mounts {source}, which is not there");
         }
