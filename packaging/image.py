@@ -70,7 +70,7 @@ def layer(package):
     own = ["var/lib/ros2probe", "run/ros2probe"]
     directories = {str(parent) for path in [*files, *own] for parent in Path(path).parents if str(parent) != "."}
     entries = [(path, None, 0o755, 0, {}) for path in directories]
-    entries += [(path, None, 0o750, USER, {}) for path in own]
+    entries += [(path, None, 0o770, USER, {}) for path in own]
     for path, content in files.items():
         program = path == PROGRAM
         attributes = {"security.capability": capabilities()} if program else {}

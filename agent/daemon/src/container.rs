@@ -4,7 +4,7 @@
 use std::fmt;
 use std::fs;
 use std::os::unix::fs::MetadataExt as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use crate::config::{Config, ShmMode, SourceChoice, StateChoice};
 use crate::memory;
@@ -13,6 +13,8 @@ use ros2probe_capture::container::{
     CGROUP_OPTIONS, FIRST_MOUNTS, has_own_network, has_own_processes, is_container, mount_of,
 };
 use rustix::fs::{Access, access, major, minor};
+use rustix::io::Errno;
+use rustix::process::geteuid;
 
 const SHARED_MEMORY: &str = "/dev/shm";
 
@@ -114,34 +116,55 @@ fn unwritable(choice: &StateChoice) -> Option<Restriction> {
         StateChoice::At(path) => path.clone(),
         StateChoice::Auto => PathBuf::from(memory::DEFAULT),
     };
-    (path.exists() && !is_writable(&path)).then(|| Restriction {
+    let directory = fs::metadata(&path).ok()?;
+    let refusal = access(&path, Access::WRITE_OK).err()?;
+    let option = match refusal {
+        Errno::ROFS => format!("--volume ros2probe-state:{}", path.display()),
+        _ => writer(geteuid().as_raw(), &directory),
+    };
+    Some(Restriction {
         check: "state",
         sentence: format!(
             "{} cannot be written, so a restart loses names and added watches",
             path.display()
         ),
-        option: format!("--volume ros2probe-state:{}", path.display()),
+        option,
     })
 }
 
-/// Returns whether this user may write a directory, which a read-only file system denies to root.
-fn is_writable(path: &Path) -> bool {
-    access(path, Access::WRITE_OK).is_ok()
+/// Returns the option for a user that may write a directory: this one, if the group may.
+fn writer(user_id: u32, directory: &fs::Metadata) -> String {
+    let user_id = match directory.mode() & 0o020 {
+        0 => directory.uid(),
+        _ => user_id,
+    };
+    format!("--user {user_id}:{}", directory.gid())
 }
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::PermissionsExt as _;
+
     use super::*;
 
     #[test]
-    fn a_state_directory_that_cannot_be_written_is_named_with_its_option() {
+    fn a_state_directory_of_another_user_is_named_with_a_user_that_may_write_it() {
         let refused = unwritable(&StateChoice::At(PathBuf::from("/proc/sys"))).unwrap();
         assert_eq!(
             refused.to_string(),
-            "/proc/sys cannot be written, so a restart loses names and added watches: add --volume \
-             ros2probe-state:/proc/sys"
+            "/proc/sys cannot be written, so a restart loses names and added watches: add --user 0:0"
         );
         assert_eq!(unwritable(&StateChoice::Off), None);
         assert_eq!(unwritable(&StateChoice::At(PathBuf::from("/tmp"))), None);
+        let directory = tempfile::tempdir().unwrap();
+        let writer = |mode| {
+            fs::set_permissions(directory.path(), fs::Permissions::from_mode(mode)).unwrap();
+            let made = fs::metadata(directory.path()).unwrap();
+            (writer(77, &made), made.uid(), made.gid())
+        };
+        let (option, owner, group) = writer(0o750);
+        assert_eq!(option, format!("--user {owner}:{group}"));
+        let (option, _, group) = writer(0o770);
+        assert_eq!(option, format!("--user 77:{group}"));
     }
 }

@@ -132,7 +132,10 @@ fn containers(answers: &Answers) -> Option<Finding> {
     let finding = finding.elsewhere(
         "AmbientCapabilities=CAP_SYS_PTRACE CAP_CHECKPOINT_RESTORE    # and CapabilityBoundingSet, with systemctl edit ros2probe",
     );
-    Some(finding.elsewhere("--cap-add SYS_PTRACE --user 0    # docker run of the agent's image"))
+    Some(
+        finding
+            .elsewhere("--cap-add SYS_PTRACE --user 0:65532    # docker run of the agent's image"),
+    )
 }
 
 /// Command that makes systemd listen for the broker.

@@ -256,7 +256,7 @@ impl Missing {
         let options: Vec<_> = options.collect();
         let remedy = match lacking.iter().copied().all(is_granted) {
             true if no_new_privs => "remove --security-opt no-new-privileges".to_owned(),
-            true => "add --user 0".to_owned(),
+            true => "add --user 0:65532".to_owned(),
             false => format!("add {}", options.join(" ")),
         };
         let verb = if names.len() == 1 { "is" } else { "are" };
@@ -395,7 +395,10 @@ mod tests {
             text(&bpf, true, true),
             "CAP_BPF is missing: remove --security-opt no-new-privileges"
         );
-        assert_eq!(text(&bpf, true, false), "CAP_BPF is missing: add --user 0");
+        assert_eq!(
+            text(&bpf, true, false),
+            "CAP_BPF is missing: add --user 0:65532"
+        );
         assert_eq!(
             text(&has(&[CapabilitySet::NET_ADMIN]), false, true),
             "CAP_BPF, CAP_PERFMON are missing: add --cap-add BPF --cap-add PERFMON"

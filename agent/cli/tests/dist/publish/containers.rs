@@ -288,6 +288,11 @@ fn refusals(directory: &Path) -> Result<Vec<Refusal>> {
             "/var/lib/ros2probe cannot be written, so a restart loses names and added watches: add \
              --volume ros2probe-state:/var/lib/ros2probe",
         ),
+        refusal(
+            documented()?.with("--user", "0"),
+            "/var/lib/ros2probe cannot be written, so a restart loses names and added watches: add \
+             --user 0:65532",
+        ),
     ])
 }
 

@@ -152,7 +152,7 @@ fn contains_the_package(root: &Path, architecture: &str) -> Result<()> {
     for path in ["var/lib/ros2probe", "run/ros2probe"] {
         let metadata = fs::metadata(root.join(path))?;
         let found = (metadata.uid(), metadata.gid(), metadata.mode() & 0o777);
-        ensure!(found == (USER, USER, 0o750), "{path}: {found:?}");
+        ensure!(found == (USER, USER, 0o770), "{path}: {found:?}");
     }
     let granted = succeed(Command::new("getcap").arg(root.join(PROGRAM)))?;
     let (_, granted) = granted.trim().rsplit_once(' ').context("no capability")?;
