@@ -83,6 +83,7 @@ fn counted(publisher: &mut Peer, topic: &str, agents: &[&Agent<'_>]) -> Result<(
     for agent in agents {
         let page = agent.settled_scrape(topic, MESSAGES)?;
         let counted = page.sum("ros2_topic_messages_total", &[("topic", topic)]);
+        println!("{counted} of {MESSAGES} messages");
         // Polling may miss the first messages and the last ones.
         let expected = MESSAGES as f64 * 0.9..=MESSAGES as f64;
         ensure!(
