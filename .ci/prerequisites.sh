@@ -199,7 +199,7 @@ python_packages() {
     echo "${versions[*]}" >"$place/versions"
 }
 
-# Validates the workflows and the action against the schemas that this package contains.
+# Validates the workflows, the action and the compose file against the schemas that this package contains.
 workflows() { python_packages workflows "check-jsonschema==0.39.0"; }
 
 # Validates the bills of materials against the schema of CycloneDX.
@@ -506,6 +506,7 @@ for need; do
         musl x86_64 aarch64
         bills
         helm
+        workflows
         packages ansible-core
         ros
         qemu
@@ -514,6 +515,8 @@ for need; do
         ;;
     release)
         packages git gnupg minisign apt-utils skopeo libcap2-bin
+        # A robot of Fast DDS, and the containers around it.
+        packages "${network_tools[@]}" g++ make libfastrtps-dev libfastcdr-dev crun jq
         podman
         qemu
         debian

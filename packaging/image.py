@@ -29,16 +29,20 @@ CREATED = datetime.fromtimestamp(TIME, timezone.utc).strftime("%Y-%m-%dT%H:%M:%S
 USER = 65532
 # Numbers of capabilities in linux/capability.h.
 CAPABILITIES = {"CAP_NET_ADMIN": 12, "CAP_NET_RAW": 13, "CAP_PERFMON": 38, "CAP_BPF": 39}
-VERSION_2, EFFECTIVE = 0x02000000, 0x00000001
+VERSION_2 = 0x02000000
 OCI = "application/vnd.oci.image."
 
 
 def capabilities():
-    """Returns security.capability (struct vfs_cap_data, version 2), with the unit's capabilities."""
+    """Returns security.capability (struct vfs_cap_data, version 2), with the unit's capabilities.
+
+    They are permitted and not effective: otherwise the kernel refuses to start the program where a
+    container grants fewer. The program makes them effective itself.
+    """
     unit = (ROOT / "systemd/ros2probe.service").read_text()
     names = re.search(r"^CapabilityBoundingSet=(.*)$", unit, re.M).group(1).split()
     permitted = sum(1 << CAPABILITIES[name] for name in names)
-    return struct.pack("<5I", VERSION_2 | EFFECTIVE, permitted & 0xFFFFFFFF, 0, permitted >> 32, 0)
+    return struct.pack("<5I", VERSION_2, permitted & 0xFFFFFFFF, 0, permitted >> 32, 0)
 
 
 def archive(entries):
@@ -66,7 +70,7 @@ def layer(package):
     own = ["var/lib/ros2probe", "run/ros2probe"]
     directories = {str(parent) for path in [*files, *own] for parent in Path(path).parents if str(parent) != "."}
     entries = [(path, None, 0o755, 0, {}) for path in directories]
-    entries += [(path, None, 0o750, USER, {}) for path in own]
+    entries += [(path, None, 0o770, USER, {}) for path in own]
     for path, content in files.items():
         program = path == PROGRAM
         attributes = {"security.capability": capabilities()} if program else {}
@@ -110,7 +114,7 @@ def manifest(layout, package, annotations):
         "config": {
             "User": f"{USER}:{USER}", "Entrypoint": ["/usr/bin/rp"],
             "Cmd": ["run", "--config", "/etc/ros2probe/ros2probe.yaml"],
-            "Env": ["PATH=/usr/bin"], "WorkingDir": "/", "Labels": annotations,
+            "Env": ["PATH=/usr/bin", "container=oci"], "WorkingDir": "/", "Labels": annotations,
         },
         "rootfs": {"type": "layers", "diff_ids": ["sha256:" + hashlib.sha256(content).hexdigest()]},
         "history": [{"created": CREATED, "created_by": "packaging/image.py"}],

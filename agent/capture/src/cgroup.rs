@@ -10,6 +10,8 @@ use std::os::unix::ffi::OsStringExt as _;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
+use super::container::{CGROUP_OPTIONS, otherwise};
+
 const MOUNTS: &str = "/proc/self/mountinfo";
 /// Inode of the root group, which is its id and the same on every host.
 const ROOT_INODE: u64 = 1;
@@ -21,7 +23,10 @@ pub enum CgroupError {
     #[error("cannot read {MOUNTS}")]
     Mounts(#[source] io::Error),
     /// Only v1 is mounted, or no hierarchy at all.
-    #[error("no cgroup v2 hierarchy is mounted (`rp doctor` shows how)")]
+    #[error(
+        "no cgroup v2 hierarchy is mounted{}",
+        otherwise(CGROUP_OPTIONS, " (`rp doctor` shows how)")
+    )]
     NotMounted,
     /// The directory cannot be opened.
     #[error("cannot open the control group {}", path.display())]

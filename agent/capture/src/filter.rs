@@ -17,8 +17,11 @@ use aya::{Ebpf, EbpfError, EbpfLoader};
 use ros2probe_wire::filter::{Budget, COUNTER_SLOTS, Counter, PORT_CAPACITY};
 use ros2probe_wire::record::{Verdict, guid_words};
 use ros2probe_wire::{Guid, GuidPrefix, Record};
+use rustix::thread::{CapabilitySet, capabilities};
 use zerocopy::FromBytes;
 
+use super::bpf::failed_lookup;
+use super::container::{self, add};
 use super::tracepoints::KernelLayout;
 
 pub use deliveries::Deliveries;
@@ -42,6 +45,18 @@ pub enum FilterError {
     /// The kernel refuses BPF to this process.
     #[error("loading the kernel filter is not permitted")]
     NotPermitted(#[source] io::Error),
+    /// A filter of system calls refuses BPF.
+    #[error(
+        "the seccomp profile refuses the system call bpf{}",
+        add(container::SECCOMP_OPTION)
+    )]
+    Seccomp,
+    /// Capabilities of this user namespace do not apply to BPF.
+    #[error(
+        "a user namespace of its own has no right to load the kernel filter{}",
+        container::otherwise("--userns host, and start the container as root", "")
+    )]
+    UserNamespace,
     /// The system call does not exist.
     #[error("BPF is not available: not supported by this kernel or emulator")]
     NoBpf(#[source] io::Error),
@@ -51,6 +66,9 @@ pub enum FilterError {
     /// The verifier refuses the program.
     #[error("the kernel refuses the filter program")]
     Program(#[source] ProgramError),
+    /// The process may not attach a program to a cgroup.
+    #[error("CAP_NET_ADMIN is missing{}", add("--cap-add NET_ADMIN"))]
+    NetAdmin,
     /// The kernel refuses to attach a program to the cgroup.
     #[error(
         "attaching the host hook to the cgroup needs CAP_NET_ADMIN and no exclusive program on that \
@@ -318,24 +336,47 @@ impl FilterError {
     /// Maps the loader's error, and distinguishes a missing privilege from a defect of the object.
     pub(crate) fn load(error: EbpfError) -> Self {
         if let Some(error) = not_permitted(&error) {
-            Self::NotPermitted(error)
+            Self::refused(error)
         } else if let Some(error) = caused_by(&error, libc::ENOSYS) {
-            Self::NoBpf(error)
+            // Some profiles answer a refused call as a kernel without it does.
+            match is_refused_by_seccomp() {
+                true => Self::Seccomp,
+                false => Self::NoBpf(error),
+            }
         } else {
             Self::Load(error)
         }
     }
 
+    /// Finds what refuses BPF.
+    fn refused(error: io::Error) -> Self {
+        if container::has_own_users() {
+            Self::UserNamespace
+        } else if holds(CapabilitySet::BPF) && is_refused_by_seccomp() {
+            Self::Seccomp
+        } else {
+            Self::NotPermitted(error)
+        }
+    }
+
+    /// Finds what refuses the attachment of a program to the cgroup.
+    pub(super) fn attachment_refused(error: io::Error) -> Self {
+        match holds(CapabilitySet::NET_ADMIN) {
+            true => Self::AttachNotPermitted(error),
+            false => Self::NetAdmin,
+        }
+    }
+
     pub(crate) fn program(error: ProgramError) -> Self {
         match not_permitted(&error) {
-            Some(error) => Self::NotPermitted(error),
+            Some(error) => Self::refused(error),
             None => Self::Program(error),
         }
     }
 
     pub(crate) fn breakpoint_program(error: io::Error) -> Self {
         match error.raw_os_error() {
-            Some(libc::EPERM) => Self::NotPermitted(error),
+            Some(libc::EPERM) => Self::refused(error),
             _ => Self::BreakpointProgram(error),
         }
     }
@@ -345,6 +386,20 @@ impl FilterError {
 /// returns it for a refused program.
 fn not_permitted(error: &(dyn std::error::Error + 'static)) -> Option<io::Error> {
     caused_by(error, libc::EPERM)
+}
+
+/// Returns whether the calling thread has a capability. Like the kernel, `CAP_SYS_ADMIN` includes
+/// `CAP_BPF`.
+pub(crate) fn holds(capability: CapabilitySet) -> bool {
+    let effective = capabilities(None).map_or_else(|_| CapabilitySet::empty(), |s| s.effective);
+    let wider = capability == CapabilitySet::BPF && effective.contains(CapabilitySet::SYS_ADMIN);
+    wider || effective.contains(capability)
+}
+
+/// Returns whether a filter of system calls refuses every call of bpf. The calling thread has
+/// `CAP_BPF`, so that the kernel itself would permit a lookup.
+fn is_refused_by_seccomp() -> bool {
+    container::is_filtered() && failed_lookup().raw_os_error() != Some(libc::EBADF)
 }
 
 fn caused_by(error: &(dyn std::error::Error + 'static), wanted: i32) -> Option<io::Error> {

@@ -33,6 +33,7 @@ pub mod breakpoints;
 pub mod cgroup;
 pub mod cgroup_paths;
 pub mod clock_step;
+pub mod container;
 pub mod error_chain;
 pub mod filter;
 pub mod filter_reader;

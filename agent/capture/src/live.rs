@@ -16,10 +16,11 @@ use ros2probe_wire::filter::{Budget, Counter};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
+use rustix::thread::CapabilitySet;
 
 use super::clock_step::ClockStep;
 use super::error_chain::in_words;
-use super::filter::{Filter, FilterError};
+use super::filter::{Filter, FilterError, holds};
 use super::filter_reader::{self, FilterReader};
 use super::host_tap::{HostTap, HostTapError};
 use super::interfaces::Selection;
@@ -72,6 +73,12 @@ pub enum CaptureError {
     /// Another network namespace cannot be entered.
     #[error(transparent)]
     Namespace(#[from] NetnsError),
+    /// The host hook is unavailable for this reason, and packet sockets are not permitted either.
+    #[error("{without_host}")]
+    Neither {
+        /// Why the host hook is unavailable.
+        without_host: String,
+    },
     /// An interface glob is invalid.
     #[error("capture.interfaces has an invalid glob")]
     Selection(#[from] globset::Error),
@@ -187,6 +194,16 @@ pub struct DropCount {
     pub dropped: u64,
 }
 
+/// Adds why the host hook is unavailable, if packet sockets are not permitted either.
+fn with_reason(error: CaptureError, without_host: Option<&String>) -> CaptureError {
+    match without_host {
+        Some(reason) if !holds(CapabilitySet::NET_RAW) => CaptureError::Neither {
+            without_host: reason.clone(),
+        },
+        _ => error,
+    }
+}
+
 impl LiveSource {
     /// Opens the configured taps, or the best ones available. Every tap captures when this returns.
     ///
@@ -198,7 +215,8 @@ impl LiveSource {
             None => {
                 let (include, exclude) =
                     (&settings.include_interfaces, &settings.exclude_interfaces);
-                open_wires(settings, limits, Selection::new(include, exclude)?)?
+                open_wires(settings, limits, Selection::new(include, exclude)?)
+                    .map_err(|error| with_reason(error, without_host.as_ref()))?
             }
             Some(_) if settings.mirror_interfaces.is_empty() => Vec::new(),
             Some(_) => {

@@ -22,6 +22,8 @@ use libc::{c_int, socklen_t};
 
 use turns::Turns;
 
+use super::container::add;
+
 pub use block::{Frames, RingFrame};
 pub use turns::Block;
 
@@ -83,7 +85,10 @@ pub struct Statistics {
 #[derive(Debug, thiserror::Error)]
 pub enum RingError {
     /// The process lacks a capability.
-    #[error("not permitted to capture ({call}): CAP_NET_RAW is missing")]
+    #[error(
+        "not permitted to capture ({call}): CAP_NET_RAW is missing{}",
+        add("--cap-add NET_RAW")
+    )]
     NotPermitted {
         /// Name of the system call.
         call: &'static str,

@@ -19,6 +19,7 @@ pub use ros2probe_wire::Expansion;
 use tokio_util::sync::CancellationToken;
 
 use crate::config::{Access, Config, ConfigError, PageChoice, RetainChoice, Watch};
+use crate::container;
 use crate::events::EventLog;
 use crate::logging::Log;
 use crate::private_agent::PrivateAgent;
@@ -234,6 +235,11 @@ pub fn run(options: Options) -> Result<()> {
     let remote_write = remote_write(&config)?;
     let mut source = open(&options, &config)?;
     source.announce(&config.capture);
+    if matches!(source, Source::Live(_)) {
+        for restriction in container::restrictions(&config) {
+            tracing::warn!("{restriction}");
+        }
+    }
     let mut sources = MetricSources::new(source.kind(), Settings::new(&config));
     sources.lost_lines = log.lost_lines();
     let library = Arc::new(library());

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use crate::config::{Access, ApiSettings, SocketChoice};
 use crate::surface::api::Server;
 use anyhow::Result;
+use ros2probe_capture::container::add;
 
 use crate::agent::Listen;
 
@@ -61,7 +62,8 @@ pub(crate) fn open_socket(server: &mut Server, settings: &ApiSettings) -> Result
                 && let Err(error) = server.bind_socket(&path)
             {
                 let reason = format!("{:#}", anyhow::anyhow!(error));
-                tracing::warn!(reason, "the control API has no unix socket");
+                let remedy = add("--volume ros2probe-run:/run/ros2probe");
+                tracing::warn!(reason, "the control API has no unix socket{remedy}");
             }
         }
     }

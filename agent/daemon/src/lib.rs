@@ -23,6 +23,7 @@
 pub mod agent;
 pub mod agent_facts;
 pub mod config;
+pub mod container;
 mod control;
 pub mod disk_history;
 pub mod escape;

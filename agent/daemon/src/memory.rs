@@ -5,13 +5,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::config::{StateChoice, Watch};
+use crate::container;
 use crate::state::{Loaded, Newer, StateDirectory};
 use crate::watches::{self, LoadedWatches, Watches};
 use anyhow::anyhow;
 use ros2probe_model::graph::discovery::Memory;
 
 /// Default directory of the package and of the service manager.
-const DEFAULT: &str = "/var/lib/ros2probe";
+pub(crate) const DEFAULT: &str = "/var/lib/ros2probe";
 /// Variable of the service manager.
 const VARIABLE: &str = "STATE_DIRECTORY";
 /// Subdirectory of recordings.
@@ -19,6 +20,9 @@ const RECORDINGS: &str = "recordings";
 
 /// Opens the state directory; returns `None` if no state is saved.
 pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
+    if container::state(choice).is_some() {
+        return None;
+    }
     let named = std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
     let opened = match (choice, named) {
         (StateChoice::Off, _) => return None,

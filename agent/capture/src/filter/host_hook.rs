@@ -111,7 +111,7 @@ impl Filter {
     /// the datagrams of all sockets created in that cgroup or below.
     ///
     /// # Errors
-    /// Returns [`FilterError::AttachNotPermitted`] without CAP_NET_ADMIN, and
+    /// Returns [`FilterError::NetAdmin`] without CAP_NET_ADMIN, and
     /// [`FilterError::Attach`] if the directory is not such a cgroup or another program on it
     /// excludes further ones. In both cases, nothing is attached.
     pub fn attach(&mut self, cgroup: &File) -> Result<(), FilterError> {
@@ -242,7 +242,7 @@ impl Links {
             .map(|(program, direction)| link(program, cgroup, direction))
             .collect::<io::Result<_>>()
             .map_err(|error| match error.raw_os_error() {
-                Some(libc::EPERM) => FilterError::AttachNotPermitted(error),
+                Some(libc::EPERM) => FilterError::attachment_refused(error),
                 _ => FilterError::Attach(error),
             })
     }

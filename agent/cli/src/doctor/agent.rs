@@ -408,6 +408,7 @@ fn kept(health: &Health) -> Finding {
             restart loses names and added watches";
         Finding::new(AREA, "state", Severity::Warning, sentence)
             .remedy("sudo mkdir -p /var/lib/ros2probe    # or the unit's StateDirectory=ros2probe")
+            .elsewhere("--volume ros2probe-state:/var/lib/ros2probe    # docker run")
     };
     finding.seen(
         health.watches_kept.to_string(),

@@ -10,9 +10,10 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use ros2probe_capture::system::{ClockState, clock_state};
+use ros2probe_daemon::privilege::raise;
 use rustix::param::page_size;
 use rustix::process::{Gid, getegid, geteuid, getgroups};
-use rustix::thread::{CapabilitySet, capabilities};
+use rustix::thread::CapabilitySet;
 
 /// Default maximum size of one file, in bytes.
 const MAX_FILE: u64 = 256 << 10;
@@ -26,7 +27,7 @@ pub struct HostState {
     pub files: Files,
     /// Size of a memory page in bytes.
     pub page_bytes: u64,
-    /// Effective capabilities of this process.
+    /// Effective capabilities of this process, which are all that it may have.
     pub capabilities: CapabilitySet,
     /// Effective user of this process.
     pub user_id: u32,
@@ -65,8 +66,7 @@ impl HostState {
         Self {
             files: Files::below("/"),
             page_bytes: page_size() as u64,
-            capabilities: capabilities(None)
-                .map_or_else(|_| CapabilitySet::empty(), |sets| sets.effective),
+            capabilities: raise().unwrap_or(CapabilitySet::empty()),
             user_id: geteuid().as_raw(),
             group_ids: group_ids(),
             environment: environment(),

@@ -28,8 +28,10 @@ use answers::Answers;
 use host_state::HostState;
 use processes::Processes;
 use ros2probe_api::doctor::{Area, Finding, Report, Severity};
+use ros2probe_capture::container::is_container;
 use ros2probe_capture::error_chain::in_words;
 use ros2probe_daemon::config::{CaptureSettings, Config, ExactChoice, InsideChoice};
+use ros2probe_daemon::container;
 use ros2probe_daemon::privilege;
 use ros2probe_daemon::run;
 use ros2probe_daemon::surface::api::Doctor;
@@ -83,6 +85,7 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
     });
     findings.extend(kernel::check(host, answers.is_some()));
     findings.extend(privileges::check(host, &config.capture, answers));
+    findings.extend(privileges::of_container(container::of_namespaces(config)));
     findings.extend(interfaces::check(host, health, is_local));
     findings.extend(shell::check(host));
     findings.extend(processes.check(host));
@@ -170,7 +173,10 @@ pub fn examine_capture(answers: &Answers, name: &str) -> Report {
 /// uprobes.
 fn tried(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
     if let Some(missing) = privilege::missing(host.capabilities, settings) {
-        return visibility::untried(&format!("lacks {}", missing.needs()));
+        return match is_container() {
+            true => visibility::failed(&missing.to_string()),
+            false => visibility::untried(&format!("lacks {}", missing.needs())),
+        };
     }
     let mut settings = settings.clone();
     settings.shm.exact = ExactChoice::Off;

@@ -6,8 +6,10 @@ use super::answers::Answers;
 use super::host_state::HostState;
 use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
+use ros2probe_capture::container::is_container;
 use ros2probe_capture::uprobe;
 use ros2probe_daemon::config::{CaptureSettings, ExactChoice, InsideChoice, ShmMode};
+use ros2probe_daemon::container::Restriction;
 use ros2probe_daemon::privilege;
 
 const AREA: Area = Area::Privileges;
@@ -60,6 +62,10 @@ fn own(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Findin
             Severity::Ok,
             "this shell lacks the capabilities to capture; the running agent has them".to_owned(),
         ),
+        Some(missing) if is_container() => report(
+            Severity::Note,
+            format!("this container cannot capture: {missing}"),
+        ),
         Some(missing) => report(
             Severity::Note,
             format!("this shell cannot capture: it lacks {}", missing.needs()),
@@ -67,6 +73,21 @@ fn own(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Findin
         .remedy("sudo rp run    # or the service ros2probe")
         .remedy(missing.command()),
     }
+}
+
+/// Returns the findings about the container of this process, each with the option that grants what
+/// is missing.
+pub fn of_container(restrictions: Vec<Restriction>) -> impl Iterator<Item = Finding> {
+    restrictions.into_iter().map(|restriction| {
+        let Restriction {
+            check,
+            sentence,
+            option,
+        } = restriction;
+        let finding = Finding::new(AREA, check, Severity::Warning, sentence);
+        let finding = finding.seen("withheld", "this container");
+        finding.elsewhere(format!("{option}    # docker run"))
+    })
 }
 
 fn of_agent(health: &Health) -> Finding {
@@ -108,9 +129,13 @@ fn containers(answers: &Answers) -> Option<Finding> {
     let sentence = "ROS runs in containers here, but the agent cannot read their shared memory";
     let finding = Finding::new(AREA, "containers", Severity::Warning, sentence);
     let finding = finding.seen("no CAP_SYS_PTRACE", "GET /health capabilities");
-    Some(finding.elsewhere(
+    let finding = finding.elsewhere(
         "AmbientCapabilities=CAP_SYS_PTRACE CAP_CHECKPOINT_RESTORE    # and CapabilityBoundingSet, with systemctl edit ros2probe",
-    ))
+    );
+    Some(
+        finding
+            .elsewhere("--cap-add SYS_PTRACE --user 0:65532    # docker run of the agent's image"),
+    )
 }
 
 /// Command that makes systemd listen for the broker.

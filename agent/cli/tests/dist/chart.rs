@@ -65,6 +65,60 @@ fn the_default_values_render_the_plain_manifests() -> Result<()> {
 }
 
 #[test]
+fn kubernetes_accepts_the_plain_manifests() -> Result<()> {
+    for version in ["1.25.0", "1.37.0"] {
+        let mut validate = Command::new(repository("target/tools/helm/bin/python"));
+        validate.args(["-m", "kubernetes_validate", "--strict", "-k", version]);
+        let validated = succeed(validate.arg(repository("deploy/kubernetes/ros2probe.yaml")))?;
+        let passed = validated.lines().filter(|line| line.contains("passed"));
+        ensure!(passed.count() == plain()?.len(), "{validated}");
+    }
+    Ok(())
+}
+
+/// Adds the rows that the values need in the table: the defaults of one value, or of those in it.
+fn rows(name: &str, value: &Value, found: &mut Vec<String>) -> Result<()> {
+    // Others are free: their content is not the chart's.
+    let parts = ["image", "metrics", "serviceMonitor"];
+    match value.as_mapping().filter(|_| parts.contains(&name)) {
+        Some(parts) => {
+            for (part, value) in parts {
+                let part = part.as_str().context("not text")?;
+                rows(&format!("{name}.{part}"), value, found)?;
+            }
+        }
+        None => {
+            let default = match value.as_str().filter(|text| !text.is_empty()) {
+                Some(text) => text.to_owned(),
+                None => serde_json::to_value(value)?.to_string(),
+            };
+            found.push(format!("| `{name}` | `{default}` | "));
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn the_readme_of_the_chart_has_every_value_with_its_default() -> Result<()> {
+    let values = std::fs::read_to_string(repository("deploy/helm/ros2probe/values.yaml"))?;
+    let values: Value = serde_yaml::from_str(&values)?;
+    let mut expected = Vec::new();
+    for (name, value) in values.as_mapping().context("no values")? {
+        rows(name.as_str().context("not text")?, value, &mut expected)?;
+    }
+    let readme = std::fs::read_to_string(repository("deploy/helm/ros2probe/README.md"))?;
+    let documented: Vec<&str> = readme
+        .lines()
+        .filter(|line| line.starts_with("| `"))
+        .collect();
+    ensure!(documented.len() == expected.len(), "{documented:?}");
+    for (row, start) in documented.iter().zip(&expected) {
+        ensure!(row.starts_with(start), "{row}: {start}");
+    }
+    Ok(())
+}
+
+#[test]
 fn the_chart_has_the_version_of_the_agent() -> Result<()> {
     let text = std::fs::read_to_string(repository("deploy/helm/ros2probe/Chart.yaml"))?;
     let chart: Value = serde_yaml::from_str(&text)?;

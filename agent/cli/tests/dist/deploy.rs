@@ -1,6 +1,6 @@
 //! The files of `deploy/` fit together. Mounted and named files exist, Prometheus accepts its
 //! configurations, and the DaemonSet's container has exactly the privileges that the agent needs.
-//! `publish::image` starts the image of a release.
+//! `publish::containers` starts the image of a release.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -10,8 +10,64 @@ use anyhow::{Context as _, Result, ensure};
 use serde::Deserialize as _;
 use serde_yaml::Value;
 
+use crate::package::installation::succeed;
+use crate::publish::podman::Options;
+
 /// Features that Debian's `promtool` lacks.
 const NOT_BUILT_IN: &str = "kubernetes_sd_configs";
+
+#[test]
+fn compose_follows_its_schema() -> Result<()> {
+    let mut check = Command::new(deploy().join("../target/tools/workflows/bin/check-jsonschema"));
+    check.args(["--builtin-schema", "vendor.compose-spec"]);
+    succeed(check.arg(deploy().join("compose.yaml")))
+        .context("`.ci/prerequisites.sh test` installs it")?;
+    Ok(())
+}
+
+/// Returns the options of the agent's container in compose, in the words of `podman run`.
+fn options_of_compose() -> Result<BTreeSet<String>> {
+    let agent = &yaml("compose.yaml")?["services"]["ros2probe"];
+    let mut options = BTreeSet::new();
+    let mut option = |name: &str, value: &Value| -> Result<()> {
+        let value = value.as_str().with_context(|| name.to_owned())?;
+        options.insert(format!("{name} {value}"));
+        Ok(())
+    };
+    option("--network", &agent["network_mode"])?;
+    option("--pid", &agent["pid"])?;
+    option("--cgroupns", &agent["cgroup"])?;
+    for (name, list) in [
+        ("--cap-drop", "cap_drop"),
+        ("--cap-add", "cap_add"),
+        ("--volume", "volumes"),
+    ] {
+        for value in agent[list].as_sequence().context("no list")? {
+            // compose puts the name of the project before that of a volume.
+            match value.as_str().filter(|value| !value.starts_with('/')) {
+                Some(volume) if name == "--volume" => {
+                    option(name, &format!("ros2probe-{volume}").into())?;
+                }
+                _ => option(name, value)?,
+            }
+        }
+    }
+    ensure!(agent["read_only"] == true && agent["ulimits"]["memlock"] == -1);
+    Ok(options)
+}
+
+#[test]
+fn compose_starts_the_agent_with_the_documented_options() -> Result<()> {
+    let words = Options::documented("--network host")?.0;
+    let mut documented = BTreeSet::new();
+    let mut words = words.iter().filter(|word| *word != "--read-only");
+    while let (Some(option), Some(value)) = (words.next(), words.next()) {
+        documented.insert(format!("{option} {value}"));
+    }
+    let compose = options_of_compose()?;
+    ensure!(compose == documented, "{compose:?}, {documented:?}");
+    Ok(())
+}
 
 #[test]
 fn mounts_of_compose_exist_and_images_are_pinned() -> Result<()> {
@@ -28,7 +84,9 @@ fn mounts_of_compose_exist_and_images_are_pinned() -> Result<()> {
             let (source, _) = mount.split_once(':').context("no target")?;
             let there = match source.starts_with('.') {
                 true => deploy().join(source).exists(),
-                false => compose["volumes"].get(source).is_some(),
+                false => {
+                    Path::new(source).is_absolute() || compose["volumes"].get(source).is_some()
+                }
             };
             ensure!(there, "{name:?} mounts {source}, which is not there");
         }
@@ -327,6 +385,7 @@ fn the_image_has_the_binary_of_make_dist_the_capabilities_of_the_unit_and_no_roo
     image_is_built_for_this_version_without_root(&text)?;
     image_copies_the_binary_and_the_configuration(&text)?;
     ensure!(instructions(&text, "ENTRYPOINT") == [r#"["/usr/bin/rp"]"#]);
+    ensure!(instructions(&text, "ENV") == ["container=oci"]);
     ensure!(
         instructions(&text, "CMD") == [r#"["run", "--config", "/etc/ros2probe/ros2probe.yaml"]"#]
     );
@@ -389,40 +448,29 @@ fn image_copies_the_binary_and_the_configuration(text: &str) -> Result<()> {
     Ok(())
 }
 
-/// Checks that the file's capabilities and those of `docker run` are the unit's.
+/// Checks that the file's capabilities are the unit's, and that each of the documented containers has
+/// those of its source.
 fn capabilities_are_those_of_the_unit(text: &str) -> Result<()> {
     let set = text
         .split("setcap ")
         .nth(1)
-        .and_then(|rest| rest.split("+ep ").next());
+        .and_then(|rest| rest.split("+p ").next());
     let set: BTreeSet<String> = set
         .context("no setcap")?
         .split(',')
         .map(str::to_uppercase)
         .collect();
-    let readme = std::fs::read_to_string(deploy().join("README.md"))?;
-    let run = readme
-        .split("docker run ")
-        .nth(1)
-        .and_then(|rest| rest.split("```").next());
-    let run = run.context("no docker run")?;
-    let added = run
-        .split("--cap-add ")
-        .skip(1)
-        .filter_map(|rest| rest.split(' ').next());
-    let added: BTreeSet<String> = added.map(|name| format!("CAP_{name}")).collect();
     let unit = bounding_set()?;
-    ensure!(
-        set == unit && added == unit,
-        "file {set:?}, container {added:?}, unit {unit:?}"
-    );
-    for option in [
-        "--network host",
-        "--cgroupns host",
-        "--cap-drop ALL",
-        "/var/lib/ros2probe",
+    ensure!(set == unit, "file {set:?}, unit {unit:?}");
+    for (with, other) in [
+        ("--network host", "CAP_NET_RAW"),
+        ("--network container:robot", "CAP_NET_ADMIN"),
     ] {
-        ensure!(run.contains(option), "no {option} in {run}");
+        let words = Options::documented(with)?.0;
+        let added = words.windows(2).filter(|pair| pair[0] == "--cap-add");
+        let added = added.map(|pair| format!("CAP_{}", pair[1]));
+        let added: BTreeSet<String> = added.chain([other.to_owned()]).collect();
+        ensure!(added == unit, "{with} {added:?}, unit {unit:?}");
     }
     Ok(())
 }
@@ -430,7 +478,12 @@ fn capabilities_are_those_of_the_unit(text: &str) -> Result<()> {
 #[test]
 fn every_file_that_the_documents_link_to_exists() -> Result<()> {
     let root = deploy().join("..");
-    for document in ["docs/fleet.md", "deploy/README.md", "dashboards/README.md"] {
+    for document in [
+        "docs/containers.md",
+        "docs/fleet.md",
+        "deploy/README.md",
+        "dashboards/README.md",
+    ] {
         let text = std::fs::read_to_string(root.join(document))?;
         let directory = root.join(document).parent().unwrap().to_owned();
         let links = text

@@ -1,9 +1,11 @@
 //! Files that `make release` creates in `target/publish`, which `ROS2PROBE_DIST` names. Other
 //! projects' programs verify, install and run them: minisign, pip, podman, apt.
 
+mod containers;
 mod crates;
 mod feed;
 mod image;
+pub mod podman;
 mod provenance;
 mod repository;
 mod ros;
@@ -36,6 +38,11 @@ fn published() -> Result<PathBuf> {
 fn package(architecture: &str) -> Result<PathBuf> {
     let name = format!("ros2probe_{VERSION}_{architecture}.deb");
     Ok(published()?.join(name))
+}
+
+/// Returns the image of all architectures.
+fn image() -> Result<PathBuf> {
+    Ok(published()?.join(format!("ros2probe-{VERSION}-image.tar")))
 }
 
 /// Returns a command for a script in `packaging/`, with the time of the release.

@@ -10,6 +10,7 @@ use rustix::thread::{
 };
 
 use crate::config::{CaptureSettings, SourceChoice};
+use ros2probe_capture::container::is_container;
 
 /// Capabilities for attaching programs to a cgroup (`CAP_NET_ADMIN`), for loading them (`CAP_BPF`),
 /// and for tracepoints and iterators (`CAP_PERFMON`). `CAP_PERFMON` also skips Spectre barriers in
@@ -67,18 +68,33 @@ pub enum CapabilitiesRemain {
     Unknown(#[source] Errno),
 }
 
-/// Checks for the capabilities that `settings` require. If the agent selects the source, the
+/// Makes the permitted capabilities of the calling thread effective, and returns them. The file of
+/// the container's image permits capabilities that are not effective when it starts.
+///
+/// # Errors
+///
+/// Fails if the kernel does not report the capabilities.
+pub fn raise() -> Result<CapabilitySet, Errno> {
+    let mut sets = capabilities(None)?;
+    if sets.effective != sets.permitted {
+        sets.effective = sets.permitted;
+        set_capabilities(None, sets)?;
+    }
+    Ok(sets.effective)
+}
+
+/// Raises and checks the capabilities that `settings` require. If the agent selects the source, the
 /// capabilities of one possible source suffice.
 ///
 /// # Errors
 ///
-/// Returns the missing effective capabilities. If they cannot be read, opening the sockets reports
+/// Returns the missing capabilities. If they cannot be read, opening the sockets reports
 /// the error.
 pub fn check(settings: &CaptureSettings) -> Result<(), Missing> {
-    let Ok(sets) = capabilities(None) else {
+    let Ok(effective) = raise() else {
         return Ok(());
     };
-    missing(sets.effective, settings).map_or(Ok(()), Err)
+    missing(effective, settings).map_or(Ok(()), Err)
 }
 
 /// Returns the capabilities that a process with the `effective` ones lacks; `None` if it has all.
@@ -217,16 +233,72 @@ impl Missing {
         let program = program.map_or_else(|_| "rp".to_owned(), |path| path.display().to_string());
         format!("sudo setcap {}+ep {program}", grant.join(","))
     }
-}
 
-impl fmt::Display for Missing {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
+    /// Returns what grants the capabilities of the first possible source to a container, or why this
+    /// process does not have those of its container.
+    #[must_use]
+    pub fn in_container(&self) -> String {
+        let withheld = |one| capability_is_in_bounding_set(one).unwrap_or(false);
+        let no_new_privs = rustix::thread::no_new_privs().unwrap_or(false);
+        self.container_text(withheld, no_new_privs)
+    }
+
+    fn container_text(
+        &self,
+        is_granted: impl Fn(CapabilitySet) -> bool,
+        no_new_privs: bool,
+    ) -> String {
+        let lacking = self.sources.first().map_or(&[][..], |(_, lacking)| lacking);
+        let names: Vec<_> = lacking.iter().copied().flat_map(capability_names).collect();
+        let options = names
+            .iter()
+            .map(|name| format!("--cap-add {}", name.trim_start_matches("CAP_")));
+        let options: Vec<_> = options.collect();
+        let remedy = match lacking.iter().copied().all(is_granted) {
+            true if no_new_privs => "remove --security-opt no-new-privileges".to_owned(),
+            true => "add --user 0:65532".to_owned(),
+            false => format!("add {}", options.join(" ")),
+        };
+        let verb = if names.len() == 1 { "is" } else { "are" };
+        format!("{} {verb} missing: {remedy}", names.join(", "))
+    }
+
+    /// Returns the ways in which a user gets the capabilities.
+    fn in_shell(&self) -> String {
+        format!(
             "live capture needs {}: run `{}`, use sudo, or start the service ros2probe",
             self.needs(),
             self.command(),
         )
+    }
+
+    /// Returns the lines that grant the capabilities to a unit of systemd.
+    fn in_unit(&self) -> String {
+        let names: Vec<_> = self
+            .grant
+            .iter()
+            .copied()
+            .flat_map(capability_names)
+            .collect();
+        let names = names.join(" ");
+        format!(
+            "live capture needs {}: the unit needs `AmbientCapabilities={names}` and \
+             `CapabilityBoundingSet={names}` (`systemctl edit`)",
+            self.needs()
+        )
+    }
+}
+
+impl fmt::Display for Missing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if is_container() {
+            return f.write_str(&self.in_container());
+        }
+        // A service with its own notifications: no shell has this variable.
+        if std::env::var_os("NOTIFY_SOCKET").is_some() {
+            return f.write_str(&self.in_unit());
+        }
+        f.write_str(&self.in_shell())
     }
 }
 
@@ -309,10 +381,62 @@ mod tests {
     }
 
     #[test]
+    fn in_a_container_the_error_is_one_option_of_its_engine() {
+        let has = |capabilities| missing(set(capabilities), &settings(SourceChoice::Auto)).unwrap();
+        let bpf = has(&[CapabilitySet::NET_ADMIN, CapabilitySet::PERFMON]);
+        let text = |missing: &Missing, granted: bool, no_new_privs: bool| {
+            missing.container_text(|_| granted, no_new_privs)
+        };
+        assert_eq!(
+            text(&bpf, false, false),
+            "CAP_BPF is missing: add --cap-add BPF"
+        );
+        assert_eq!(
+            text(&bpf, true, true),
+            "CAP_BPF is missing: remove --security-opt no-new-privileges"
+        );
+        assert_eq!(
+            text(&bpf, true, false),
+            "CAP_BPF is missing: add --user 0:65532"
+        );
+        assert_eq!(
+            text(&has(&[CapabilitySet::NET_ADMIN]), false, true),
+            "CAP_BPF, CAP_PERFMON are missing: add --cap-add BPF --cap-add PERFMON"
+        );
+    }
+
+    #[test]
+    fn a_unit_gets_the_lines_that_grant_the_capabilities() {
+        let missing = missing(set(&HOST[1..]), &settings(SourceChoice::Host)).unwrap();
+        assert_eq!(
+            missing.in_unit(),
+            "live capture needs CAP_NET_ADMIN for the source `host`: the unit needs \
+             `AmbientCapabilities=CAP_NET_ADMIN CAP_BPF CAP_PERFMON` and \
+             `CapabilityBoundingSet=CAP_NET_ADMIN CAP_BPF CAP_PERFMON` (`systemctl edit`)"
+        );
+    }
+
+    #[test]
+    fn permitted_capabilities_become_effective() {
+        let raised = std::thread::spawn(|| {
+            let sets = capabilities(None).unwrap();
+            let lowered = CapabilitySets {
+                effective: CapabilitySet::empty(),
+                ..sets
+            };
+            set_capabilities(None, lowered).unwrap();
+            (raise().unwrap(), sets.permitted)
+        });
+        let (raised, permitted) = raised.join().unwrap();
+        assert!(!permitted.is_empty(), "this takes root: run `make test`");
+        assert_eq!(raised, permitted);
+    }
+
+    #[test]
     fn the_error_names_the_missing_capabilities_and_the_command_that_grants_them() {
         let has = set(&[CapabilitySet::BPF, CapabilitySet::PERFMON]);
         let missing = missing(has, &settings(SourceChoice::Auto)).unwrap();
-        let message = missing.to_string();
+        let message = missing.in_shell();
         assert!(
             message.starts_with(
                 "live capture needs CAP_NET_ADMIN for the source `host`, or CAP_NET_RAW for the \

@@ -14,7 +14,7 @@ mod threads;
 mod user;
 
 pub use capabilities::{
-    CapabilitiesRemain, DropError, Missing, Unprivileged, capability_names, check, missing,
+    CapabilitiesRemain, DropError, Missing, Unprivileged, capability_names, check, missing, raise,
 };
 pub use confinement::{
     ConfineError, Role, Sandbox, SpawnError, confine, give_up, sandbox, spawn, spawn_export,

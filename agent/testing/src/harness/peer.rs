@@ -83,7 +83,8 @@ impl Stack {
     /// The DDS stacks.
     pub const ALL: [Stack; 3] = [Stack::Fast, Stack::Cyclone, Stack::Rust];
 
-    fn program(self) -> Result<PathBuf> {
+    /// Returns the path of its program, or of the interpreter of its script.
+    pub fn program(self) -> Result<PathBuf> {
         match self {
             Stack::Fast => built("fastdds"),
             Stack::Cyclone => built("cyclonedds"),
