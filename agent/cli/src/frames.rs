@@ -506,15 +506,15 @@ mod tests {
             ([0.0, -1.0, 0.0, 0.0], "[0.000, 1.000, 0.000, 0.000]"),
             ([0.0, 0.0, -2.0, 0.0], "[0.000, 0.000, 1.000, 0.000]"),
         ] {
-            let pose = Pose {
+            let edge = TransformEdge {
                 rotation,
-                ..IDENTITY
+                ..edge("map", "camera", 0.0, false)
             };
-            let text = Between {
-                stamp: (0, 0),
-                pose,
-            }
-            .text();
+            let tree = TransformTree {
+                edges: vec![edge],
+                ..TransformTree::default()
+            };
+            let text = Frames::new(&tree).between("map", "camera").unwrap().text();
             let line = format!("- Rotation: in Quaternion {printed}\n");
             assert!(text.contains(&line), "{rotation:?}: {text}");
         }
