@@ -45,10 +45,11 @@ const IDENTITY: Pose = Pose {
 
 impl Pose {
     fn of(edge: &TransformEdge<'_>) -> Self {
-        Self {
+        let pose = Self {
             translation: edge.translation,
             rotation: edge.rotation,
-        }
+        };
+        pose.from_matrix()
     }
 
     /// Returns the pose in the outer frame of a pose in this one.
@@ -84,7 +85,7 @@ impl Pose {
     }
 
     /// Returns the same pose with the unit quaternion that follows from the matrix. Two opposite
-    /// quaternions are one rotation: tf2 keeps the matrix, so its quaternion depends on it alone.
+    /// quaternions are one rotation: tf2 converts each edge and each result to a matrix and back.
     fn from_matrix(&self) -> Self {
         let [[a, b, c], [d, e, f], [g, h, i]] = self.matrix();
         // The divisor is computed from the root that is far from zero. That part becomes positive.

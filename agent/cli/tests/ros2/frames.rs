@@ -17,13 +17,14 @@ use crate::installed;
 
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Pairs of frames with static transforms between them: down, up, across, and at both poles.
-const STATIC: [(&str, &str); 9] = [
+const STATIC: [(&str, &str); 10] = [
     ("base_link", "lidar"),
     ("base_link", "camera"),
     ("base_link", "hand"),
     ("hand", "base_link"),
     ("camera", "hand"),
     ("base_link", "wheel"),
+    ("wheel", "base_link"),
     ("arm", "up"),
     ("arm", "down"),
     ("marker", "map"),
