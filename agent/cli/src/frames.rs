@@ -49,7 +49,7 @@ impl Pose {
             translation: edge.translation,
             rotation: edge.rotation,
         };
-        pose.from_matrix()
+        pose.through_matrix()
     }
 
     /// Returns the pose in the outer frame of a pose in this one.
@@ -86,7 +86,7 @@ impl Pose {
 
     /// Returns the same pose with the unit quaternion that follows from the matrix. Two opposite
     /// quaternions are one rotation: tf2 converts each edge and each result to a matrix and back.
-    fn from_matrix(&self) -> Self {
+    fn through_matrix(&self) -> Self {
         let [[a, b, c], [d, e, f], [g, h, i]] = self.matrix();
         // The divisor is computed from the root that is far from zero. That part becomes positive.
         let rotation = if a + e + i > 0.0 {
@@ -344,7 +344,7 @@ impl Between {
     /// Returns the text of `tf2_echo`.
     #[must_use]
     pub fn text(&self) -> String {
-        let pose = self.pose.from_matrix();
+        let pose = self.pose.through_matrix();
         let [x, y, z] = pose.translation;
         let [a, b, c, d] = pose.rotation;
         let angles = pose.roll_pitch_yaw();
