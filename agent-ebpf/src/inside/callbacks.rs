@@ -10,7 +10,7 @@ use crate::{
     accounting,
     instructions::add,
     late,
-    maps::{ANNOUNCEMENTS, Current, Thread, calendar, count, now, observe, read, steady},
+    maps::{ANNOUNCEMENTS, Current, Thread, calendar, count, now, observe, raw, read},
     messages, names,
 };
 
@@ -211,16 +211,21 @@ fn is_schedule(period: u64, last: u64, next: u64, now: u64) -> bool {
     is_period && clock_of(last, now).wrapping_sub(last) < SECOND
 }
 
-/// Returns the current time of the clock from which `last` was read: the steady clock or the
-/// system's. A result slightly before `last` becomes `last`, because the clock differences that
-/// user space sets are imprecise.
+/// Returns the current time of the clock from which `last` was read: the system's, or rcl's steady
+/// clock, CLOCK_MONOTONIC_RAW in Humble and CLOCK_MONOTONIC in Jazzy. Of these two, it is the one that
+/// passed `last` later. A result slightly before `last` becomes `last`, because the clock differences
+/// that user space sets are imprecise.
 #[inline(always)]
 fn clock_of(last: u64, now: u64) -> u64 {
-    let steady = steady(now);
-    let clock = if last < steady.wrapping_add(LONGEST) {
-        steady
-    } else {
+    let raw = raw(now);
+    // A clock before `last` has the greatest age.
+    let age = |clock: u64| clock.wrapping_add(IMPRECISION).wrapping_sub(last);
+    let clock = if last >= now.wrapping_add(LONGEST) {
         calendar(now)
+    } else if age(raw) < age(now) {
+        raw
+    } else {
+        now
     };
     if clock < last && last - clock < IMPRECISION {
         last

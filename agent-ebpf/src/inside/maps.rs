@@ -328,9 +328,9 @@ pub fn calendar(monotonic: u64) -> u64 {
     }
 }
 
-/// Converts CLOCK_MONOTONIC to CLOCK_MONOTONIC_RAW, the steady clock of rcl.
+/// Converts CLOCK_MONOTONIC to CLOCK_MONOTONIC_RAW.
 #[inline(always)]
-pub fn steady(monotonic: u64) -> u64 {
+pub fn raw(monotonic: u64) -> u64 {
     difference(clock::MONOTONIC_RAW).wrapping_add(monotonic)
 }
 

@@ -138,11 +138,7 @@ impl Metadata {
             self.starting_time
         ));
         line(&format!("message_count: {}", self.message_count));
-        if self.topics.is_empty() {
-            line("topics_with_message_count:\n    []");
-        } else {
-            line("topics_with_message_count:");
-        }
+        sequence("topics_with_message_count", &self.topics, &mut line);
         for topic in &self.topics {
             self.topic(topic, &mut line);
         }
@@ -154,11 +150,11 @@ impl Metadata {
             "compression_mode: {}",
             scalar(&self.compression_mode)
         ));
-        line("relative_file_paths:");
+        sequence("relative_file_paths", &self.relative_file_paths, &mut line);
         for path in &self.relative_file_paths {
             line(&format!("  - {}", scalar(path)));
         }
-        line("files:");
+        sequence("files", &self.files, &mut line);
         for file in &self.files {
             line(&format!("  - path: {}", scalar(&file.path)));
             line("    starting_time:");
@@ -247,6 +243,14 @@ fn check(text: &str) -> Result<(), MetadataError> {
         }
     }
     Ok(())
+}
+
+/// Writes the name of a sequence, and `[]` for an empty one, because the player of Jazzy rejects null.
+fn sequence<T>(name: &str, items: &[T], line: &mut impl FnMut(&str)) {
+    line(&format!("{name}:"));
+    if items.is_empty() {
+        line("  []");
+    }
 }
 
 /// Formats a YAML scalar: plain if it is unambiguous, else in double quotes.
@@ -477,6 +481,39 @@ mod tests {
         let read = Metadata::read(text).unwrap();
         assert_eq!(read.topics[0].name, "/chatter");
         assert_eq!((read.version, read.files), (9, metadata(9).files));
+    }
+
+    #[test]
+    fn the_record_of_an_empty_bag_has_the_layout_of_the_serializer_of_jazzy() {
+        let empty = Metadata {
+            relative_file_paths: Vec::new(),
+            starting_time: NO_START,
+            duration: 0,
+            message_count: 0,
+            topics: Vec::new(),
+            files: Vec::new(),
+            ..metadata(9)
+        };
+        assert_eq!(
+            empty.record_text(),
+            "version: 9
+storage_identifier: mcap
+duration:
+  nanoseconds: 0
+starting_time:
+  nanoseconds_since_epoch: 9223372036854775807
+message_count: 0
+topics_with_message_count:
+  []
+compression_format: \"\"
+compression_mode: \"\"
+relative_file_paths:
+  []
+files:
+  []
+custom_data: ~
+ros_distro: jazzy"
+        );
     }
 
     #[test]

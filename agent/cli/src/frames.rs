@@ -45,10 +45,11 @@ const IDENTITY: Pose = Pose {
 
 impl Pose {
     fn of(edge: &TransformEdge<'_>) -> Self {
-        Self {
+        let pose = Self {
             translation: edge.translation,
             rotation: edge.rotation,
-        }
+        };
+        pose.through_matrix()
     }
 
     /// Returns the pose in the outer frame of a pose in this one.
@@ -62,21 +63,73 @@ impl Pose {
     }
 
     fn inverse(self) -> Self {
-        let [x, y, z, w] = self.rotation;
-        let rotation = [-x, -y, -z, w];
-        let translation = rotate(rotation, self.translation).map(|number| -number);
+        let rotation = conjugate(self.rotation);
+        let translation = rotate(rotation, self.translation.map(|number| -number));
         Self {
             translation,
             rotation,
         }
     }
 
-    /// Returns the rows of the rotation matrix.
+    /// Returns the rows of the rotation matrix, for a quaternion of any length.
     fn matrix(&self) -> [[f64; 3]; 3] {
-        let columns = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
-        let [x, y, z] = columns.map(|axis| rotate(self.rotation, axis));
-        let [[a, b, c], [d, e, f], [g, h, i]] = [x, y, z];
-        [[a, d, g], [b, e, h], [c, f, i]]
+        let [x, y, z, w] = self.rotation;
+        let square = x * x + y * y + z * z + w * w;
+        let scale = if square > 0.0 { 2.0 / square } else { 0.0 };
+        let [p, q, r] = [x, y, z].map(|number| number * scale);
+        [
+            [1.0 - (y * q + z * r), x * q - w * r, x * r + w * q],
+            [x * q + w * r, 1.0 - (x * p + z * r), y * r - w * p],
+            [x * r - w * q, y * r + w * p, 1.0 - (x * p + y * q)],
+        ]
+    }
+
+    /// Returns the same pose with the unit quaternion that follows from the matrix. Two opposite
+    /// quaternions are one rotation: tf2 converts each edge and each result to a matrix and back.
+    fn through_matrix(&self) -> Self {
+        let [[a, b, c], [d, e, f], [g, h, i]] = self.matrix();
+        // The divisor is computed from the root that is far from zero. That part becomes positive.
+        let rotation = if a + e + i > 0.0 {
+            let root = (a + e + i + 1.0).sqrt();
+            let scale = 0.5 / root;
+            [
+                (h - f) * scale,
+                (c - g) * scale,
+                (d - b) * scale,
+                0.5 * root,
+            ]
+        } else if a >= e && a >= i {
+            let root = (a - e - i + 1.0).sqrt();
+            let scale = 0.5 / root;
+            [
+                0.5 * root,
+                (d + b) * scale,
+                (g + c) * scale,
+                (h - f) * scale,
+            ]
+        } else if e >= i {
+            let root = (e - i - a + 1.0).sqrt();
+            let scale = 0.5 / root;
+            [
+                (b + d) * scale,
+                0.5 * root,
+                (h + f) * scale,
+                (c - g) * scale,
+            ]
+        } else {
+            let root = (i - a - e + 1.0).sqrt();
+            let scale = 0.5 / root;
+            [
+                (c + g) * scale,
+                (f + h) * scale,
+                0.5 * root,
+                (d - b) * scale,
+            ]
+        };
+        Self {
+            translation: self.translation,
+            rotation,
+        }
     }
 
     /// Returns roll, pitch and yaw in radians.
@@ -98,17 +151,18 @@ impl Pose {
 }
 
 /// Returns the vector, rotated by a quaternion of any length.
-fn rotate([x, y, z, w]: [f64; 4], [a, b, c]: [f64; 3]) -> [f64; 3] {
-    let square = x * x + y * y + z * z + w * w;
-    let scale = if square > 0.0 { 2.0 / square } else { 0.0 };
-    let (dot, own) = (x * a + y * b + z * c, x * x + y * y + z * z);
-    let cross = [y * c - z * b, z * a - x * c, x * b - y * a];
-    let [p, q, r] = cross;
-    [
-        a + scale * (x * dot - a * own + w * p),
-        b + scale * (y * dot - b * own + w * q),
-        c + scale * (z * dot - c * own + w * r),
-    ]
+fn rotate(rotation: [f64; 4], [a, b, c]: [f64; 3]) -> [f64; 3] {
+    let square: f64 = rotation.iter().map(|number| number * number).sum();
+    if square == 0.0 {
+        return [a, b, c];
+    }
+    let turned = multiply(rotation, [a, b, c, 0.0]);
+    let [x, y, z, _] = multiply(turned, conjugate(rotation));
+    [x, y, z].map(|number| number / square)
+}
+
+fn conjugate([x, y, z, w]: [f64; 4]) -> [f64; 4] {
+    [-x, -y, -z, w]
 }
 
 fn multiply([a, b, c, d]: [f64; 4], [x, y, z, w]: [f64; 4]) -> [f64; 4] {
@@ -290,9 +344,10 @@ impl Between {
     /// Returns the text of `tf2_echo`.
     #[must_use]
     pub fn text(&self) -> String {
-        let [x, y, z] = self.pose.translation;
-        let [a, b, c, d] = self.pose.rotation;
-        let angles = self.pose.roll_pitch_yaw();
+        let pose = self.pose.through_matrix();
+        let [x, y, z] = pose.translation;
+        let [a, b, c, d] = pose.rotation;
+        let angles = pose.roll_pitch_yaw();
         let [roll, pitch, yaw] = angles;
         let [r, p, w] = angles.map(f64::to_degrees);
         // tf2_echo pads the nanoseconds with nothing.
@@ -305,7 +360,7 @@ impl Between {
              - Matrix:\n",
             self.stamp.0, self.stamp.1
         );
-        for (row, offset) in self.pose.matrix().into_iter().zip(self.pose.translation) {
+        for (row, offset) in pose.matrix().into_iter().zip(pose.translation) {
             for number in row.into_iter().chain([offset]) {
                 let _ = write!(text, " {number:6.3}");
             }
@@ -439,6 +494,31 @@ mod tests {
             dot.contains("  \"map\" -> \"odom\" [label=\"50.0 Hz, 0.50 s ago  \"];\n"),
             "{dot}"
         );
+    }
+
+    #[test]
+    fn opposite_quaternions_are_printed_as_tf2_echo_prints_them() {
+        // The rotation of an optical frame, and half turns about each axis.
+        for (rotation, printed) in [
+            ([-0.5, 0.5, -0.5, 0.5], "[0.500, -0.500, 0.500, -0.500]"),
+            ([0.5, -0.5, 0.5, -0.5], "[0.500, -0.500, 0.500, -0.500]"),
+            ([0.0, 0.0, -0.6, -0.8], "[0.000, 0.000, 0.600, 0.800]"),
+            ([-1.0, 0.0, 0.0, 0.0], "[1.000, 0.000, 0.000, 0.000]"),
+            ([0.0, -1.0, 0.0, 0.0], "[0.000, 1.000, 0.000, 0.000]"),
+            ([0.0, 0.0, -2.0, 0.0], "[0.000, 0.000, 1.000, 0.000]"),
+        ] {
+            let edge = TransformEdge {
+                rotation,
+                ..edge("map", "camera", 0.0, false)
+            };
+            let tree = TransformTree {
+                edges: vec![edge],
+                ..TransformTree::default()
+            };
+            let text = Frames::new(&tree).between("map", "camera").unwrap().text();
+            let line = format!("- Rotation: in Quaternion {printed}\n");
+            assert!(text.contains(&line), "{rotation:?}: {text}");
+        }
     }
 
     #[test]

@@ -1,5 +1,6 @@
 /* A program that calls libtracetools.so in the order of rclcpp (Iron), by commands on standard
- * input. It prints a line after each command. -DPLACE=240 or 248: offset of rmw_handle. */
+ * input. It prints a line after each command. -DPLACE=240 or 248: offset of rmw_handle.
+ * -DSTEADY=CLOCK_MONOTONIC: rcl's steady clock of Jazzy, else that of Humble. */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
 #include <fcntl.h>
@@ -17,6 +18,10 @@
 #include <sys/wait.h>
 #include <time.h>
 #include <unistd.h>
+
+#ifndef STEADY
+#define STEADY CLOCK_MONOTONIC_RAW
+#endif
 
 void ros_trace_rcl_node_init(const void *, const void *, const char *, const char *);
 void ros_trace_rcl_publisher_init(const void *, const void *, const void *, const char *, size_t);
@@ -439,10 +444,10 @@ int main(int argc, char **argv) {
             /* A timer of 1 ms, called `us` microseconds late by rcl's steady clock;
                the last call skips two periods. */
             timer_impl.period = 1000000;
-            int64_t next = clock_now(CLOCK_MONOTONIC_RAW) + 1000000;
+            int64_t next = clock_now(STEADY) + 1000000;
             for (long i = 0; i < n; i++) {
-                while (clock_now(CLOCK_MONOTONIC_RAW) < next + us * 1000) {}
-                timer_impl.last = clock_now(CLOCK_MONOTONIC_RAW);
+                while (clock_now(STEADY) < next + us * 1000) {}
+                timer_impl.last = clock_now(STEADY);
                 next += 1000000;
                 while (next <= timer_impl.last) next += 1000000;
                 if (i == n - 1) next += 2000000;

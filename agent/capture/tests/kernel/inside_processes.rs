@@ -338,6 +338,27 @@ fn callbacks_have_triggers_durations_waits_and_effects() {
 /// `rmw_fastrtps_cpp` of Lyrical takes messages of buffer topics without `rmw_take`. The process is
 /// older than the probes in one round, and younger in the other.
 #[test]
+fn the_period_and_the_wait_of_a_timer_are_read_by_either_steady_clock() {
+    for clock in ["CLOCK_MONOTONIC_RAW", "CLOCK_MONOTONIC"] {
+        let mut robot = Robot::new(248, &[&format!("-DSTEADY={clock}")], true);
+        robot.attach();
+        let mut process = robot.start();
+        process.run("timer 20 400");
+        let report = robot.report(&process);
+        let [timer] = &report.callbacks[..] else {
+            panic!("{clock}: {report:?}");
+        };
+        let period = Trigger::Timer(Some(Duration::from_millis(1)));
+        assert_eq!((timer.calls, &timer.trigger), (20, &period), "{clock}");
+        let wait = timer.waits.quantile(0.5).unwrap();
+        assert!(
+            (0.4..5.0).contains(&milliseconds(wait)),
+            "{clock}: {wait:?}"
+        );
+    }
+}
+
+#[test]
 fn messages_taken_without_rmw_take_count_for_their_subscription_and_not_as_timers() {
     for is_older in [true, false] {
         let mut robot = Robot::new(248, &[], true);

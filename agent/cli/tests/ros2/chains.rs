@@ -185,8 +185,9 @@ fn compare(host: &Host<'_>, list: &ChainList<'_>, what: &str) -> Result<()> {
         println!(
             "{what}, {name}: agent {agent:.6} s, nodes {logged:.6} s ({least:.6} to {most:.6} s)"
         );
-        // On a busy machine, the calls that publish take long.
-        let close = CLOSE.max((most - least) / 4.0);
+        // A message leaves at any time within the call that publishes, which is long on a busy
+        // machine.
+        let close = CLOSE.max((most - least) / 2.0);
         ensure!(
             (least..most).contains(&agent) && (agent - logged).abs() < close,
             "{what}, {name}: {agent}, not {logged} ({least} to {most})"

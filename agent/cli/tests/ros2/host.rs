@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of};
+use ros2probe_testing::harness::agent::Agent;
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::shared_memory::SharedMemory;
@@ -94,13 +94,15 @@ impl<'n> Host<'n> {
 
     /// Returns the configuration of [`Self::agent`].
     pub fn settings(&self, lines: &str) -> String {
-        let capture = match self.middleware {
-            Middleware::FastExact(choice) => format!(
-                "capture: {{source: host, cgroup: {}, shm: {{exact: {choice}}}}}\n",
-                self.network.cgroup().display()
-            ),
-            _ => at_the_sockets_of(self.network),
+        let exact = match self.middleware {
+            Middleware::FastSampled => "off",
+            Middleware::FastExact(choice) => choice,
+            _ => "auto",
         };
+        let capture = format!(
+            "capture: {{source: host, cgroup: {}, shm: {{exact: {exact}}}}}\n",
+            self.network.cgroup().display()
+        );
         let directory = self.directory.path().display();
         format!(
             "{capture}api: {{socket: {directory}/api.sock}}\nstate_directory: {directory}\n{lines}"

@@ -27,7 +27,7 @@ const MESSAGES: u64 = 3000;
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
 fn messages_over_fast_dds_equal_the_counts_of_the_nodes() -> Result<()> {
-    agrees_with_the_nodes(Middleware::FastSampled)
+    agrees_with_the_nodes(Middleware::FastExact("auto"))
 }
 
 #[test]
@@ -89,7 +89,7 @@ fn agrees_with_the_nodes(middleware: Middleware) -> Result<()> {
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, intra_process_demo: make test-ros2"]
 fn receptions_within_a_process_equal_the_number_that_the_demo_prints() -> Result<()> {
     let network = Namespace::alone()?;
-    let host = Host::new(&network, Middleware::FastSampled)?;
+    let host = Host::new(&network, Middleware::FastExact("auto"))?;
     let agent = agent(&host)?;
     let line = "exec timeout -s INT 12 ros2 run intra_process_demo two_node_pipeline > $1 2>&1";
     let log = host.path("demo.log");

@@ -22,7 +22,7 @@ const LEARNS: Duration = Duration::from_secs(40);
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, demo_nodes_cpp: make test-ros2"]
 fn fast_dds_with_shared_memory_meets_the_expectations_learnt_from_it() -> Result<()> {
-    meets_what_was_learnt(Middleware::FastSampled)
+    meets_what_was_learnt(Middleware::FastExact("auto"))
 }
 
 #[test]

@@ -11,6 +11,7 @@ mod chains;
 mod cost;
 mod discover;
 mod echo;
+mod frames;
 mod host;
 mod incident;
 mod inside;

@@ -10,6 +10,7 @@ middleware serializes it, and the standard output of `echo` for each list of opt
 import argparse
 import array
 import contextlib
+import inspect
 import io
 import json
 import math
@@ -176,8 +177,8 @@ def message_of(rng, message_class, depth=0, is_long=False):
 
 
 def fields(message):
-    for slot in message.__slots__:
-        name = slot.lstrip("_")
+    # Since Jazzy, the last slot is no field.
+    for name in message.get_fields_and_field_types():
         yield name
         value = getattr(message, name)
         if hasattr(value, "__slots__"):
@@ -193,8 +194,10 @@ class Verb(echo.EchoVerb):
 
     def subscribe_and_spin(self, node, topic, message_class, qos, no_lost, raw):
         payload = self.payload
-        self._subscriber_callback(
-            payload if raw else deserialize_message(payload, message_class))
+        message = payload if raw else deserialize_message(payload, message_class)
+        # Since Jazzy, the callback has the information about the message, too.
+        has_info = len(inspect.signature(self._subscriber_callback).parameters) > 1
+        self._subscriber_callback(message, *([{}] if has_info else []))
 
 
 def printed(type_name, payload, options):

@@ -75,7 +75,7 @@ const FREE_OF_ZENOH: &[&str] = &[
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, demo_nodes_cpp, lifecycle: make test-ros2"]
 fn with_fast_dds_ros2_prints_the_same_and_sends_nothing() -> Result<()> {
-    answers_as_the_real_daemon(Middleware::FastSampled)
+    answers_as_the_real_daemon(Middleware::FastExact("auto"))
 }
 
 #[test]
