@@ -66,7 +66,9 @@ pub struct Robot {
     pub differences: Vec<Difference>,
 }
 
-/// Samples of all robots, by robot.
+/// Values of series.
+type Samples = Vec<(Labels, f64)>;
+/// By robot.
 type ByRobot<T> = BTreeMap<String, T>;
 
 impl State {
@@ -83,6 +85,24 @@ impl State {
     }
 }
 
+/// Answers of the engine about the whole fleet, by robot.
+struct Answers {
+    /// Age of the last sample in seconds.
+    ages: ByRobot<Samples>,
+    ready: ByRobot<Samples>,
+    versions: ByRobot<Samples>,
+    nodes: ByRobot<Samples>,
+    topics: ByRobot<Samples>,
+    publishers: ByRobot<Samples>,
+    subscriptions: ByRobot<Samples>,
+    /// Messages a second of each topic.
+    rates: ByRobot<Samples>,
+    /// Fraction of messages.
+    losses: ByRobot<Samples>,
+    violated: ByRobot<Samples>,
+    findings: ByRobot<Samples>,
+}
+
 impl Fleet {
     /// Queries an engine.
     ///
@@ -90,125 +110,132 @@ impl Fleet {
     ///
     /// Fails if the engine cannot be reached, or refuses a query.
     pub fn read(engine: &Engine, question: &Question) -> Result<Self, EngineError> {
+        let answers = Answers::ask(engine, question)?;
+        let reach = f64::from(question.reach);
+        let in_reach = answers.ages.iter().filter(|(_, age)| {
+            let age = value(age);
+            age.is_some_and(|age| age < reach)
+        });
+        let traits = in_reach.map(|(name, _)| (name.clone(), answers.traits(name)));
+        let mut differences = differences::find(&traits.collect());
+        let robots = answers.ages.keys().map(|name| {
+            let differences = differences.remove(name).unwrap_or_default();
+            answers.robot(name, reach, differences)
+        });
+        let mut robots: Vec<_> = robots.collect();
+        robots.sort_by(|one, two| (one.state, &one.name).cmp(&(two.state, &two.name)));
+        Ok(Self { robots })
+    }
+}
+
+impl Answers {
+    fn ask(engine: &Engine, question: &Question) -> Result<Self, EngineError> {
         let job = format!("job={}", quoted(&question.job));
         let ask = |expression: &str| {
             let expression = expression.replace("$JOB", &job);
             Ok::<_, EngineError>(by_robot(engine.ask(&expression)?))
         };
-        let (hours, reach) = (question.hours, f64::from(question.reach));
-        let ages = ask(&format!(
-            "time() - max by (instance) (max_over_time(timestamp(ros2probe_ready{{$JOB}})[10m:5s]) \
-             or max_over_time(timestamp(ros2probe_ready{{$JOB}})[{hours}h:1m]))"
-        ))?;
-        let ready = ask("min by (instance) (ros2probe_ready{$JOB})")?;
-        let versions = ask("ros2probe_build_info{$JOB}")?;
-        let nodes = ask("group by (instance, ros_node) (ros2_node_info{$JOB})")?;
-        let topics = ask(
-            "group by (instance, topic, message_type, reliability, durability) \
-             (ros2_topic_info{$JOB,kind=\"topic\"})",
-        )?;
-        let publishers = ask("sum by (instance, topic) (ros2_topic_publishers{$JOB})")?;
-        let subscriptions = ask("sum by (instance, topic) (ros2_topic_subscriptions{$JOB})")?;
-        let rates = ask("sum by (instance, topic) (rate(ros2_topic_messages_total{$JOB}[2m]))")?;
-        let losses = ask(
-            "sum by (instance) (increase(ros2_topic_subscriber_lost_messages_total{$JOB}[5m])) / \
-             sum by (instance) (increase(ros2_topic_subscriber_expected_messages_total{$JOB}[5m]))",
-        )?;
-        let violated = ask("ros2_watch_expectation_violated{$JOB} == 1")?;
-        let findings = ask("sum by (instance, kind) (ros2_diagnoses{$JOB}) > 0")?;
+        let hours = question.hours;
+        Ok(Self {
+            ages: ask(&format!(
+                "time() - max by (instance) (max_over_time(timestamp(ros2probe_ready{{$JOB}})[10m:5s]) \
+                 or max_over_time(timestamp(ros2probe_ready{{$JOB}})[{hours}h:1m]))"
+            ))?,
+            ready: ask("min by (instance) (ros2probe_ready{$JOB})")?,
+            versions: ask("ros2probe_build_info{$JOB}")?,
+            nodes: ask("group by (instance, ros_node) (ros2_node_info{$JOB})")?,
+            topics: ask(
+                "group by (instance, topic, message_type, reliability, durability) \
+                 (ros2_topic_info{$JOB,kind=\"topic\"})",
+            )?,
+            publishers: ask("sum by (instance, topic) (ros2_topic_publishers{$JOB})")?,
+            subscriptions: ask("sum by (instance, topic) (ros2_topic_subscriptions{$JOB})")?,
+            rates: ask("sum by (instance, topic) (rate(ros2_topic_messages_total{$JOB}[2m]))")?,
+            losses: ask(
+                "sum by (instance) (increase(ros2_topic_subscriber_lost_messages_total{$JOB}[5m])) / \
+                 sum by (instance) (increase(ros2_topic_subscriber_expected_messages_total{$JOB}[5m]))",
+            )?,
+            violated: ask("ros2_watch_expectation_violated{$JOB} == 1")?,
+            findings: ask("sum by (instance, kind) (ros2_diagnoses{$JOB}) > 0")?,
+        })
+    }
 
-        let mut traits: ByRobot<BTreeMap<String, Trait>> = BTreeMap::new();
-        for (name, age) in &ages {
-            let is_in_reach = value(age).is_some_and(|age| age < reach);
-            if is_in_reach {
-                let mut of_robot = BTreeMap::new();
-                // A topic without publishers has no type and no quality of service.
-                let mut text = |key: String, text: String| {
-                    if !text.is_empty() {
-                        of_robot.insert(key, Trait::Text(text));
-                    }
-                };
-                for (labels, _) in of(&versions, name) {
-                    text("version of the agent".to_owned(), label(labels, "version"));
-                }
-                for (labels, _) in of(&nodes, name) {
-                    text(
-                        format!("node {}", common(labels, "ros_node", name)),
-                        "present".to_owned(),
-                    );
-                }
-                for (labels, _) in of(&topics, name) {
-                    let topic = common(labels, "topic", name);
-                    for quality in ["message_type", "reliability", "durability"] {
-                        let key = format!("{} of {topic}", quality.replace('_', " "));
-                        text(key, label(labels, quality));
-                    }
-                }
-                for (what, counts) in [
-                    ("publishers", &publishers),
-                    ("subscriptions", &subscriptions),
-                ] {
-                    for (labels, count) in of(counts, name) {
-                        let topic = common(labels, "topic", name);
-                        text(format!("{what} of {topic}"), format!("{count}"));
-                    }
-                }
-                for (labels, count) in of(&findings, name) {
-                    let kind = label(labels, "kind");
-                    if is_usual(&kind) {
-                        text(format!("endpoints with {kind}"), format!("{count}"));
-                    }
-                }
-                for (labels, rate) in of(&rates, name) {
-                    let key = format!("rate of {}", common(labels, "topic", name));
-                    of_robot.insert(key, Trait::Hertz(*rate));
-                }
-                traits.insert(name.clone(), of_robot);
+    /// Returns the properties of a robot that are compared.
+    fn traits(&self, name: &str) -> BTreeMap<String, Trait> {
+        let mut traits = BTreeMap::new();
+        // A topic without publishers has no type and no quality of service.
+        let mut text = |key: String, text: String| {
+            if !text.is_empty() {
+                traits.insert(key, Trait::Text(text));
+            }
+        };
+        for (labels, _) in of(&self.versions, name) {
+            text("version of the agent".to_owned(), label(labels, "version"));
+        }
+        for (labels, _) in of(&self.nodes, name) {
+            let node = common(labels, "ros_node", name);
+            text(format!("node {node}"), "present".to_owned());
+        }
+        for (labels, _) in of(&self.topics, name) {
+            let topic = common(labels, "topic", name);
+            for quality in ["message_type", "reliability", "durability"] {
+                let key = format!("{} of {topic}", quality.replace('_', " "));
+                text(key, label(labels, quality));
             }
         }
-        let mut differences = differences::find(&traits);
+        for (what, counts) in [
+            ("publishers", &self.publishers),
+            ("subscriptions", &self.subscriptions),
+        ] {
+            for (labels, count) in of(counts, name) {
+                let topic = common(labels, "topic", name);
+                text(format!("{what} of {topic}"), format!("{count}"));
+            }
+        }
+        for (labels, count) in of(&self.findings, name) {
+            let kind = label(labels, "kind");
+            if is_usual(&kind) {
+                text(format!("endpoints with {kind}"), format!("{count}"));
+            }
+        }
+        for (labels, rate) in of(&self.rates, name) {
+            let key = format!("rate of {}", common(labels, "topic", name));
+            traits.insert(key, Trait::Hertz(*rate));
+        }
+        traits
+    }
 
-        let mut robots: Vec<_> = ages
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "the number of findings is small and positive"
+    )]
+    fn robot(&self, name: &str, reach: f64, differences: Vec<Difference>) -> Robot {
+        let violated = of(&self.violated, name).iter();
+        let violated =
+            violated.map(|(labels, _)| (label(labels, "topic"), label(labels, "expectation")));
+        let findings = of(&self.findings, name)
             .iter()
-            .map(|(name, age)| {
-                let violated = of(&violated, name).iter();
-                let violated = violated
-                    .map(|(labels, _)| (label(labels, "topic"), label(labels, "expectation")));
-                let findings = of(&findings, name).iter();
-                #[expect(
-                    clippy::cast_possible_truncation,
-                    clippy::cast_sign_loss,
-                    reason = "a small positive number"
-                )]
-                let findings = findings
-                    .map(|(labels, count)| (label(labels, "kind"), *count as u64))
-                    .filter(|(kind, _)| !is_usual(kind));
-                let version = of(&versions, name).first();
-                let mut robot = Robot {
-                    name: name.clone(),
-                    state: State::Ok,
-                    age_s: value(age).unwrap_or(0.0).max(0.0),
-                    version: version.map(|(labels, _)| label(labels, "version")),
-                    nodes: of(&nodes, name).len(),
-                    topics: of(&topics, name).len(),
-                    loss: losses
-                        .get(name)
-                        .and_then(|loss| value(loss))
-                        .filter(|loss| loss.is_finite()),
-                    violated: violated.collect(),
-                    findings: findings.collect(),
-                    differences: differences.remove(name).unwrap_or_default(),
-                };
-                let is_ready = ready.get(name).and_then(|ready| value(ready));
-                robot.state = match robot.age_s < reach {
-                    true => state(&robot, is_ready.is_some_and(|ready| ready > 0.5)),
-                    false => State::OutOfReach,
-                };
-                robot
-            })
-            .collect();
-        robots.sort_by(|one, two| (one.state, &one.name).cmp(&(two.state, &two.name)));
-        Ok(Self { robots })
+            .map(|(labels, count)| (label(labels, "kind"), *count as u64))
+            .filter(|(kind, _)| !is_usual(kind));
+        let version = of(&self.versions, name).first();
+        let mut robot = Robot {
+            name: name.to_owned(),
+            state: State::OutOfReach,
+            age_s: value(of(&self.ages, name)).unwrap_or(0.0).max(0.0),
+            version: version.map(|(labels, _)| label(labels, "version")),
+            nodes: of(&self.nodes, name).len(),
+            topics: of(&self.topics, name).len(),
+            loss: value(of(&self.losses, name)).filter(|loss| loss.is_finite()),
+            violated: violated.collect(),
+            findings: findings.collect(),
+            differences,
+        };
+        if robot.age_s < reach {
+            let ready = value(of(&self.ready, name));
+            robot.state = state(&robot, ready.is_some_and(|ready| ready > 0.5));
+        }
+        robot
     }
 }
 
@@ -230,8 +257,8 @@ fn is_usual(kind: &str) -> bool {
     kind.starts_with("unmatched_")
 }
 
-fn by_robot(samples: Vec<(Labels, f64)>) -> ByRobot<Vec<(Labels, f64)>> {
-    let mut robots: ByRobot<Vec<_>> = BTreeMap::new();
+fn by_robot(samples: Samples) -> ByRobot<Samples> {
+    let mut robots: ByRobot<Samples> = BTreeMap::new();
     for (labels, value) in samples {
         if let Some(robot) = labels.get("instance") {
             robots
@@ -243,7 +270,7 @@ fn by_robot(samples: Vec<(Labels, f64)>) -> ByRobot<Vec<(Labels, f64)>> {
     robots
 }
 
-fn of<'a>(samples: &'a ByRobot<Vec<(Labels, f64)>>, robot: &str) -> &'a [(Labels, f64)] {
+fn of<'a>(samples: &'a ByRobot<Samples>, robot: &str) -> &'a [(Labels, f64)] {
     samples.get(robot).map_or(&[], Vec::as_slice)
 }
 
