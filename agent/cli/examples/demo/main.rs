@@ -13,14 +13,12 @@ use std::time::Duration;
 use anyhow::{Context as _, Result, bail};
 use clap::Parser;
 
-use crate::relay::{Relay, Relays};
 use crate::summary::Summary;
 use ros2probe_testing::harness::agent::Agent;
-use ros2probe_testing::harness::network::{Link, Namespace};
-use ros2probe_testing::harness::peer;
-use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::network::Link;
+use ros2probe_testing::harness::relay::{self, Relay};
+use ros2probe_testing::harness::{ended, peer};
 
-mod relay;
 mod summary;
 
 const REFRESH: Duration = Duration::from_secs(2);
@@ -47,6 +45,26 @@ struct Options {
     port: u16,
 }
 
+/// The relayed listeners of the agent.
+pub(crate) struct Relays {
+    pub(crate) metrics: Relay,
+    /// The control API and the page.
+    pub(crate) api: Relay,
+    /// The listener for viewers.
+    pub(crate) viewers: Relay,
+}
+
+impl Relays {
+    /// Returns the options with which commands reach the agent; empty if the default ports are
+    /// relayed.
+    pub(crate) fn options(&self, port: u16) -> String {
+        match self.api.address() {
+            address if address.port() == port => String::new(),
+            address => format!(" --host {address}"),
+        }
+    }
+}
+
 fn main() -> ExitCode {
     match demo(&Options::parse()) {
         Ok(()) => ExitCode::SUCCESS,
@@ -63,7 +81,7 @@ async fn demo(options: &Options) -> Result<()> {
     if let Some(socket) = &options.relay {
         return relay::serve(socket, options.port);
     }
-    let agent = options.agent.clone().map_or_else(beside_this_program, Ok)?;
+    let agent = options.agent.clone().map_or_else(peer::rp, Ok)?;
     let command = as_typed(&agent);
     for needed in [&agent, &options.config] {
         if !needed.exists() {
@@ -94,9 +112,9 @@ async fn demo(options: &Options) -> Result<()> {
         viewers: Relay::start(&link.robot, directory.path(), VIEWERS)?,
     };
     let robots = [
-        robot(&link.robot, "lidar")?,
-        robot(&link.robot, "base")?,
-        robot(&link.monitor, "monitor")?,
+        peer::start_robot(&link.robot, "lidar")?,
+        peer::start_robot(&link.robot, "base")?,
+        peer::start_robot(&link.monitor, "monitor")?,
     ];
 
     let mut summary = Summary::new(std::io::stdout().is_terminal(), command);
@@ -148,43 +166,11 @@ fn for_one_host(config: &Path, cgroup: &Path) -> Result<String> {
     Ok(text)
 }
 
-fn beside_this_program() -> Result<PathBuf> {
-    let program = std::env::current_exe().context("cannot tell where this program is")?;
-    let directory = program
-        .ancestors()
-        .nth(2)
-        .context("this program is in no directory")?;
-    Ok(directory.join("rp"))
-}
-
 /// Returns a program as a user of this directory types it.
 fn as_typed(program: &Path) -> String {
     let here = std::env::current_dir().ok();
     let below = here.and_then(|here| program.strip_prefix(here).ok());
     below.unwrap_or(program).display().to_string()
-}
-
-fn robot(host: &Namespace, role: &str) -> Result<Process> {
-    let mut robot = Process::start(&host.inside(), peer::robot()?, ["--role", role])?;
-    robot.wait_for("ready", Duration::from_secs(20))?;
-    Ok(robot)
-}
-
-async fn ended(after: Option<f64>) -> Result<()> {
-    use tokio::signal::unix::{SignalKind, signal};
-    let mut terminate = signal(SignalKind::terminate())?;
-    let limit = async {
-        match after {
-            Some(seconds) => tokio::time::sleep(Duration::from_secs_f64(seconds.max(0.0))).await,
-            None => std::future::pending().await,
-        }
-    };
-    tokio::select! {
-        interrupted = tokio::signal::ctrl_c() => interrupted?,
-        _ = terminate.recv() => {}
-        () = limit => {}
-    }
-    Ok(())
 }
 
 fn read_lossy(path: &Path) -> String {

@@ -2,8 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::API;
-use crate::relay::Relays;
+use crate::{API, Relays};
 use ros2probe_testing::harness::agent::Scrape;
 use ros2probe_testing::harness::network::Link;
 

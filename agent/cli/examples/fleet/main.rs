@@ -5,10 +5,6 @@
 //! The engines and the page of each robot are relayed to ports of this machine. The summary is the
 //! output of `rp fleet`.
 
-#[path = "../demo/relay.rs"]
-#[expect(dead_code, reason = "the demo relays more")]
-mod relay;
-
 use std::fmt::Write as _;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -20,12 +16,11 @@ use clap::Parser;
 use ros2probe_testing::harness::agent::{Agent, get};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{Link, Namespace, Uplink};
-use ros2probe_testing::harness::peer;
 use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::relay::{self, Relay};
+use ros2probe_testing::harness::{ended, peer};
 use ros2probe_testing::repository;
 use tokio::time::{Instant, sleep};
-
-use crate::relay::Relay;
 
 const REFRESH: Duration = Duration::from_secs(5);
 /// Time in reach and out of reach of the third robot.
@@ -74,7 +69,12 @@ async fn fleet(options: &Options) -> Result<()> {
     if let Some(socket) = &options.relay {
         return relay::serve(socket, options.port);
     }
-    let program = rp()?;
+    let program = peer::rp()?;
+    let name = program.display();
+    ensure!(
+        program.exists(),
+        "{name} is missing: run `make fleet`, which builds it"
+    );
     let directory = tempfile::tempdir().context("cannot create a directory")?;
     let centre = Namespace::alone()?;
     println!("starting the centre: Prometheus, Alertmanager, VictoriaMetrics");
@@ -110,7 +110,7 @@ async fn fleet(options: &Options) -> Result<()> {
         writeln!(addresses, "  {page:<16} http://{}", relay.address())?;
         relays.push(relay);
         for (host, role) in [(sensors, "lidar"), (main, "base"), (main, "monitor")] {
-            running.push(node(host, role)?);
+            running.push(peer::start_robot(host, role)?);
         }
     }
     let lossy = robots.get(1).context("no second robot")?;
@@ -162,7 +162,7 @@ fn engines(centre: &Namespace, directory: &Path) -> Result<Vec<Process>> {
     std::fs::write(file("prometheus.yaml"), text)?;
     std::fs::write(
         file("alertmanager.yaml"),
-        "route: {receiver: nobody, group_by: [alertname, instance]}\nreceivers: [{name: nobody}]\n",
+        "route: {receiver: none, group_by: [alertname, instance]}\nreceivers: [{name: none}]\n",
     )?;
     let option = |name: &str, path: &str| format!("{name}={}", file(path).display());
     let programs = [
@@ -251,12 +251,6 @@ fn agent<'a>(robot: &'a Robot, program: &Path, own: &Path) -> Result<Agent<'a>> 
     })
 }
 
-fn node(host: &Namespace, role: &str) -> Result<Process> {
-    let mut node = Process::start(&host.inside(), peer::robot()?, ["--role", role])?;
-    node.wait_for("ready", Duration::from_secs(20))?;
-    Ok(node)
-}
-
 /// Prints what `rp fleet` prints in the centre, and the alerts that fire.
 fn show(centre: &Namespace, program: &Path, addresses: &str, is_in_reach: bool) -> Result<()> {
     let [enter, network] = centre.outside();
@@ -293,38 +287,5 @@ fn show(centre: &Namespace, program: &Path, addresses: &str, is_in_reach: bool) 
         );
     }
     println!();
-    Ok(())
-}
-
-/// Returns `rp` of the same build.
-fn rp() -> Result<PathBuf> {
-    let program = std::env::current_exe().context("the path of this program")?;
-    let directory = program
-        .ancestors()
-        .nth(2)
-        .context("it is in no directory")?;
-    let program = directory.join("rp");
-    let name = program.display();
-    ensure!(
-        program.exists(),
-        "{name} is missing: run `make fleet`, which builds it"
-    );
-    Ok(program)
-}
-
-async fn ended(after: Option<f64>) -> Result<()> {
-    use tokio::signal::unix::{SignalKind, signal};
-    let mut terminate = signal(SignalKind::terminate())?;
-    let limit = async {
-        match after {
-            Some(seconds) => sleep(Duration::from_secs_f64(seconds.max(0.0))).await,
-            None => std::future::pending().await,
-        }
-    };
-    tokio::select! {
-        interrupted = tokio::signal::ctrl_c() => interrupted?,
-        _ = terminate.recv() => {}
-        () = limit => {}
-    }
     Ok(())
 }

@@ -18,6 +18,7 @@ pub mod network;
 pub mod peer;
 pub mod process;
 pub mod prometheus;
+pub mod relay;
 pub mod shape;
 pub mod shared_memory;
 pub mod snmp;
@@ -79,6 +80,25 @@ pub fn wait_within(
     while !holds()? {
         ensure!(Instant::now() < deadline, "{what}: not within {limit:?}");
         std::thread::sleep(Duration::from_millis(100));
+    }
+    Ok(())
+}
+
+/// Completes after this many seconds, if any, or when a person or a service manager ends the
+/// program.
+pub async fn ended(after: Option<f64>) -> Result<()> {
+    use tokio::signal::unix::{SignalKind, signal};
+    let mut terminate = signal(SignalKind::terminate())?;
+    let limit = async {
+        match after {
+            Some(seconds) => tokio::time::sleep(Duration::from_secs_f64(seconds.max(0.0))).await,
+            None => std::future::pending().await,
+        }
+    };
+    tokio::select! {
+        interrupted = tokio::signal::ctrl_c() => interrupted?,
+        _ = terminate.recv() => {}
+        () = limit => {}
     }
     Ok(())
 }

@@ -316,6 +316,19 @@ pub fn robot() -> Result<PathBuf> {
     Ok(profile_directory()?.join("examples/robot"))
 }
 
+/// Starts the robot's program on a host in a role of the demo, and returns once it has announced
+/// its endpoints.
+pub fn start_robot(host: &Namespace, role: &str) -> Result<Process> {
+    let mut robot = Process::start(&host.inside(), robot()?, ["--role", role])?;
+    robot.wait_for("ready", Duration::from_secs(20))?;
+    Ok(robot)
+}
+
+/// Returns `rp` of the same build.
+pub fn rp() -> Result<PathBuf> {
+    Ok(profile_directory()?.join("rp"))
+}
+
 /// Returns `target/debug` or its equivalent: tests run in its `deps`, examples in its `examples`.
 fn profile_directory() -> Result<PathBuf> {
     let program = std::env::current_exe().context("cannot tell where this program is")?;

@@ -9,38 +9,19 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result};
 
-use ros2probe_testing::harness::network::Namespace;
-use ros2probe_testing::harness::process::Process;
+use super::network::Namespace;
+use super::process::Process;
 
 /// The relay's end on this machine; its other end runs on the host and ends with it.
-pub(crate) struct Relay {
+pub struct Relay {
     address: SocketAddr,
     _remote: Process,
 }
 
-/// The relayed listeners of the agent.
-pub(crate) struct Relays {
-    pub(crate) metrics: Relay,
-    /// The control API and the page.
-    pub(crate) api: Relay,
-    /// The listener for viewers.
-    pub(crate) viewers: Relay,
-}
-
-impl Relays {
-    /// Returns the options with which commands reach the agent; empty if the default ports are
-    /// relayed.
-    pub(crate) fn options(&self, port: u16) -> String {
-        match self.api.address() {
-            address if address.port() == port => String::new(),
-            address => format!(" --host {address}"),
-        }
-    }
-}
-
 impl Relay {
-    /// Listens on `port` of this machine, or on any free port if `port` is in use.
-    pub(crate) fn start(host: &Namespace, directory: &Path, port: u16) -> Result<Relay> {
+    /// Listens on `port` of this machine, or on any free port if `port` is in use. The other end is
+    /// this program, started again with `--relay` and `--port` ([`serve`]).
+    pub fn start(host: &Namespace, directory: &Path, port: u16) -> Result<Relay> {
         let socket = directory.join(format!("relay-{port}"));
         let program = std::env::current_exe().context("cannot tell where this program is")?;
         let number = port.to_string();
@@ -69,13 +50,13 @@ impl Relay {
         })
     }
 
-    pub(crate) fn address(&self) -> SocketAddr {
+    pub fn address(&self) -> SocketAddr {
         self.address
     }
 }
 
-/// Runs the relay's end on the host.
-pub(crate) fn serve(socket: &Path, port: u16) -> Result<()> {
+/// Runs the relay's end on the host: what a program does that is given `--relay` and `--port`.
+pub fn serve(socket: &Path, port: u16) -> Result<()> {
     let listener = UnixListener::bind(socket)
         .with_context(|| format!("cannot listen on {}", socket.display()))?;
     println!("ready");
