@@ -6,11 +6,12 @@ use std::path::Path;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of};
+use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::loss::Loss;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::prometheus::{Kind, Prometheus};
+use ros2probe_testing::harness::wait_within;
 
 /// Maximum gap between samples of each second, in seconds, on a busy machine.
 const GAP: f64 = 6.0;
@@ -81,15 +82,12 @@ fn rp_fleet_finds_the_odd_ones_of_ten_robots() -> Result<()> {
         let text = String::from_utf8(output.stdout)? + &String::from_utf8(output.stderr)?;
         Ok((output.status.code(), text))
     };
-    let deadline = Instant::now() + Duration::from_secs(40);
-    let text = loop {
-        let (code, text) = fleet(&[])?;
-        if code == Some(3) && text.contains("out of reach") {
-            break text;
-        }
-        ensure!(Instant::now() < deadline, "{code:?}: {text}");
-        std::thread::sleep(Duration::from_secs(1));
-    };
+    let mut text = String::new();
+    wait_within(Duration::from_secs(40), "robot-3 is out of reach", || {
+        let code;
+        (code, text) = fleet(&[])?;
+        Ok(code == Some(3) && text.contains("out of reach"))
+    })?;
     let lines: Vec<&str> = text.lines().collect();
     ensure!(lines[1].starts_with("robot-3   out of reach  "), "{text}");
     let details = text
@@ -169,7 +167,7 @@ fn samples_survive(engine: Kind, text: &str) -> Result<()> {
     let mut agent = start()?;
     let began = Instant::now();
     let behind = |age: f64| {
-        move |page: &ros2probe_testing::harness::agent::Scrape| {
+        move |page: &Scrape| {
             let behind = page.value("ros2probe_remote_write_behind_seconds", &[]);
             behind.is_some_and(|behind| behind > age)
         }
@@ -194,11 +192,11 @@ fn samples_survive(engine: Kind, text: &str) -> Result<()> {
     drop(outage);
 
     let back = now()?;
-    let deadline = Instant::now() + Duration::from_secs(90);
-    while engine.query(&format!("timestamp({UP})"))? < back {
-        ensure!(Instant::now() < deadline, "nothing comes any more");
-        std::thread::sleep(Duration::from_millis(300));
-    }
+    wait_within(
+        Duration::from_secs(90),
+        "a sample of the link that is back",
+        || Ok(engine.query(&format!("timestamp({UP})"))? >= back),
+    )?;
     let window = began.elapsed().as_secs() + 5;
     let times = engine.times(&format!("{UP}[{window}s]"))?;
     let first = times.first().copied().unwrap_or_default();
