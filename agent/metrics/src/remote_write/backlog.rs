@@ -201,7 +201,7 @@ impl Disk {
     /// Appends a scrape. Calls `lose` with the number of samples of each scrape that is lost for it.
     /// Returns whether it is on disk.
     fn append(&mut self, scrape: &Scrape, lose: &mut dyn FnMut(usize)) -> bool {
-        if self.queue.begins_file() || !self.works {
+        if self.queue.begins_file() || self.writer.is_full() || !self.works {
             self.queue.begin_file();
             self.writer = Writer::default();
         }
@@ -384,7 +384,7 @@ mod tests {
         backlog.open(&place.path().join("missing"), LIMIT);
         (1..=3).for_each(|at| assert_eq!(backlog.add(scrape(at), false), 0));
         assert!(backlog.disk_bytes() > 0);
-        // The storage fails: the directory is no directory any more.
+        // A file replaces the directory, so that writes fail.
         std::fs::remove_dir_all(place.path().join("missing")).unwrap();
         std::fs::rename(&directory, place.path().join("missing")).unwrap();
         (4..=9).for_each(|at| assert_eq!(backlog.add(scrape(at), false), 0));
@@ -393,6 +393,24 @@ mod tests {
         assert_eq!(backlog.add(scrape(10), false), 0);
         assert_eq!(backlog.oldest_in_memory(), None);
         assert_eq!(drained(&mut backlog), (4..=10).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn series_that_come_and_go_begin_a_new_file() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut backlog = opened(directory.path());
+        for at in 0..4_u32 {
+            let series = at * 60_000..(at + 1) * 60_000;
+            let samples = series.map(|series| (Key::from(series.to_le_bytes()), 0.0));
+            let scrape = Scrape {
+                at: at.into(),
+                samples: samples.collect(),
+            };
+            assert_eq!(backlog.add(scrape, false), 0);
+        }
+        let files = std::fs::read_dir(directory.path()).unwrap();
+        assert_eq!(files.count(), 2);
+        assert_eq!(drained(&mut backlog), [0, 1, 2, 3]);
     }
 
     #[test]

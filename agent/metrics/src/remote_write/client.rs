@@ -82,7 +82,7 @@ impl Client {
     }
 
     /// Sends a body once.
-    pub(super) async fn send(&self, body: Vec<u8>, version: Version) -> Answer {
+    pub(super) async fn send(&self, body: Bytes, version: Version) -> Answer {
         let request = match self.request(body, version) {
             Ok(request) => request,
             Err(error) => return Answer::Again(in_words(&error), None),
@@ -104,10 +104,10 @@ impl Client {
 
     fn request(
         &self,
-        body: Vec<u8>,
+        body: Bytes,
         version: Version,
     ) -> Result<Request<Full<Bytes>>, SettingsError> {
-        let mut request = Request::new(Full::new(Bytes::from(body)));
+        let mut request = Request::new(Full::new(body));
         *request.method_mut() = hyper::Method::POST;
         *request.uri_mut() = self.settings.url.clone();
         let headers = request.headers_mut();

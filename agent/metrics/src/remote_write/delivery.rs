@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use prost::bytes::Bytes;
 use tokio::runtime::Builder;
 use tokio::sync::Notify;
 use tokio::time::{MissedTickBehavior, interval_at, sleep};
@@ -270,19 +271,24 @@ impl Sender<'_> {
     /// number of samples that the receiver wrote.
     async fn offer(&mut self, part: &[Arc<Scrape>]) -> Result<(), (String, Option<u64>)> {
         let mut pause = FIRST_PAUSE;
+        let mut body = self.body(part);
         loop {
             if let Err(error) = self.client.renew() {
                 self.failed(&error.to_string());
             }
-            let body = body(part, &self.job.settings.labels, self.version);
             let length = body.len();
-            let answer = self.client.send(body, self.version).await;
+            let answer = self.client.send(body.clone(), self.version).await;
             let figures = &self.job.figures;
             match answer {
-                Answer::UnknownVersion if !self.is_known => {
+                Answer::UnknownVersion => {
                     figures.count_request(Request::Retried, length);
                     self.version = Version::One;
-                    self.is_known = true;
+                    body = self.body(part);
+                    if std::mem::replace(&mut self.is_known, true) {
+                        // Another receiver took its place.
+                        sleep(pause).await;
+                        pause = (pause * 2).min(LONGEST_PAUSE);
+                    }
                 }
                 Answer::Accepted => {
                     figures.count_request(Request::Delivered, length);
@@ -302,15 +308,13 @@ impl Sender<'_> {
                     sleep(demanded.unwrap_or(pause)).await;
                     pause = (pause * 2).min(LONGEST_PAUSE);
                 }
-                Answer::UnknownVersion => {
-                    figures.count_request(Request::Retried, length);
-                    // Another receiver took its place.
-                    self.version = Version::One;
-                    sleep(pause).await;
-                    pause = (pause * 2).min(LONGEST_PAUSE);
-                }
             }
         }
+    }
+
+    /// Returns the body of a request with these samples.
+    fn body(&self, part: &[Arc<Scrape>]) -> Bytes {
+        body(part, &self.job.settings.labels, self.version).into()
     }
 
     /// Waits until the rate of bytes permits the next request.

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use prost::bytes::Buf;
 use prost::encoding::{decode_varint, encode_varint};
 
-use super::samples::{Key, Scrape};
+use super::samples::{Key, MAX_SERIES, Scrape};
 
 /// Numbers of a series. A greater number is the change of a whole value, with its sign in the
 /// lowest bit.
@@ -38,6 +38,11 @@ pub(super) struct Reader {
 }
 
 impl Writer {
+    /// Returns whether the file has as many series as one may have. Series that end stay in it.
+    pub(super) fn is_full(&self) -> bool {
+        self.values.len() >= MAX_SERIES
+    }
+
     /// Returns the record of a scrape.
     pub(super) fn record(&mut self, scrape: &Scrape) -> Vec<u8> {
         let mut record = Vec::with_capacity(self.values.len() + 64);

@@ -99,7 +99,7 @@ fn version_two(series: &[(&[u8], Points)], common: &Labels) -> Vec<u8> {
         // Metadata has the type alone.
         part.clear();
         encode_key(1, WireType::Varint, &mut part);
-        encode_varint(kind(key), &mut part);
+        encode_varint(parts(key).0.into(), &mut part);
         bytes(5, &part, &mut one);
         bytes(5, &one, &mut all);
     }
@@ -141,17 +141,6 @@ fn samples(points: &Points, series: &mut Vec<u8>) {
         encode_key(2, WireType::Varint, &mut sample);
         encode_varint(at.cast_unsigned(), &mut sample);
         bytes(2, &sample, series);
-    }
-}
-
-/// Returns the type of a metric (`Metadata.MetricType`).
-fn kind(key: &[u8]) -> u64 {
-    match parts(key).0 {
-        b'c' => 1,
-        b'g' => 2,
-        b'h' => 3,
-        b'i' => 6,
-        _ => 0,
     }
 }
 

@@ -9,14 +9,15 @@ use ros2probe_model::facts::histogram::Histogram;
 use crate::catalogue::{Kind, Metric};
 use crate::metric_sink::{Label, Number};
 
-/// Maximum number of series. The tables of the model allow fewer.
-const MAX_SERIES: usize = 100_000;
+/// Maximum number of series of a collection, and of a file of the queue before the next collection.
+/// The tables of the model allow fewer.
+pub(super) const MAX_SERIES: usize = 100_000;
 /// Ends each text of a key. No text contains it, because UTF-8 does not.
 pub(super) const END: u8 = 0xff;
 /// Value of a series that ended (`StaleNaN` of Prometheus).
 pub(super) const STALE: f64 = f64::from_bits(0x7ff0_0000_0000_0002);
 
-/// A series: the kind of its metric as one byte, its name, and names and values of its labels.
+/// A series: the type of its metric as one byte, its name, and names and values of its labels.
 /// [`END`] ends each text.
 pub(super) type Key = Arc<[u8]>;
 
@@ -48,7 +49,8 @@ impl Samples {
     pub(super) fn begin(&mut self) {
         self.collection += 1;
         self.collected = Vec::with_capacity(self.known.len());
-        self.key = vec![kind(Kind::Gauge)];
+        self.key.clear();
+        self.key.push(kind(Kind::Gauge));
         self.extend("up");
         self.add(1.0);
     }
@@ -162,17 +164,17 @@ impl Samples {
     }
 }
 
-/// Returns the first byte of keys.
+/// Returns the first byte of keys: the number of the type in version 2.0 (`Metadata.MetricType`).
 const fn kind(kind: Kind) -> u8 {
     match kind {
-        Kind::Counter => b'c',
-        Kind::Gauge => b'g',
-        Kind::Histogram => b'h',
-        Kind::Info => b'i',
+        Kind::Counter => 1,
+        Kind::Gauge => 2,
+        Kind::Histogram => 3,
+        Kind::Info => 6,
     }
 }
 
-/// Returns the kind of a key, and its texts: name, and names and values of labels.
+/// Returns the type of a key, and its texts: name, and names and values of labels.
 pub(super) fn parts(key: &[u8]) -> (u8, impl Iterator<Item = &str>) {
     let (kind, texts) = key
         .split_first()
