@@ -32,6 +32,15 @@ pub use uprobe::{Form, Probes};
 /// aligned because the ELF file is read in place.
 static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("filter.bpf.o"));
 
+/// Capture budget of all unknown writers, in bytes per second. It suffices for a dozen nodes that
+/// start simultaneously, and bounds a storm of forged writers.
+pub(crate) const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
+/// Record budget of all unknown writers per tenth of a second. Because refills are small, a storm
+/// during a delay of this process leaves most of the record ring to known writers.
+pub(crate) const UNKNOWN_RECORDS_PER_TENTH: u32 = 410;
+/// Maximum number of tenths per refill: a fifth of a ring of the default size.
+pub(crate) const UNKNOWN_PORTIONS: u32 = 4;
+
 /// Bytes with the alignment of an ELF header.
 #[repr(align(8))]
 pub(crate) struct Aligned<T: ?Sized>(pub(crate) T);
@@ -185,10 +194,15 @@ impl Filter {
         host: Option<host_hook::HostHook>,
     ) -> Result<Self, FilterError> {
         let mut budget: Array<_, i64> = take(ebpf, "BUDGET")?;
-        for index in [Budget::CaptureBytes, Budget::Records] {
+        // The programs run as soon as they are attached, which may be long before the first refill.
+        let records = UNKNOWN_RECORDS_PER_TENTH * UNKNOWN_PORTIONS;
+        for (index, amount) in [
+            (Budget::CaptureBytes, UNKNOWN_BYTES_PER_SECOND),
+            (Budget::Records, records),
+        ] {
             budget
-                .set(index as u32, 0, 0)
-                .map_err(failed("BUDGET", "clear"))?;
+                .set(index as u32, i64::from(amount), 0)
+                .map_err(failed("BUDGET", "fill"))?;
         }
         let program = program.try_clone_to_owned();
         Ok(Self {

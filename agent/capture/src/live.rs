@@ -20,7 +20,10 @@ use rustix::thread::CapabilitySet;
 
 use super::clock_step::ClockStep;
 use super::error_chain::in_words;
-use super::filter::{Filter, FilterError, holds};
+use super::filter::{
+    Filter, FilterError, UNKNOWN_BYTES_PER_SECOND, UNKNOWN_PORTIONS, UNKNOWN_RECORDS_PER_TENTH,
+    holds,
+};
 use super::filter_reader::{self, FilterReader};
 use super::host_tap::{HostTap, HostTapError};
 use super::interfaces::Selection;
@@ -42,14 +45,6 @@ use open::{open_exact, open_host, open_inside, open_wires, scope};
 use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{Observer, Wanted};
 
-/// Capture budget of all unknown writers, in bytes per second. It suffices for a dozen nodes that
-/// start simultaneously, and bounds a storm of forged writers.
-const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
-/// Record budget of all unknown writers per tenth of a second. Because refills are small, a storm
-/// during a delay of this process leaves most of the record ring to known writers.
-const UNKNOWN_RECORDS_PER_TENTH: u32 = 410;
-/// Maximum number of tenths per refill: a fifth of a ring of the default size.
-const UNKNOWN_PORTIONS: u64 = 4;
 /// Time for which captures of the host hook accumulate: a starting node announces its endpoints one
 /// by one, and each round costs CPU time.
 const GATHER: Duration = Duration::from_millis(10);
@@ -760,7 +755,8 @@ impl LiveSource {
         let tenths = monotonic.wrapping_sub(self.records_refilled) / TENTH;
         if tenths > 0 {
             self.records_refilled = monotonic;
-            let portions = u32::try_from(tenths.min(UNKNOWN_PORTIONS)).unwrap_or(1);
+            let tenths = u32::try_from(tenths).unwrap_or(UNKNOWN_PORTIONS);
+            let portions = tenths.min(UNKNOWN_PORTIONS);
             let (budget, amount) = (Budget::Records, UNKNOWN_RECORDS_PER_TENTH * portions);
             self.each_filter(|filter| filter.set_unknown_budget(budget, amount));
         }
