@@ -30,6 +30,9 @@ pub mod chunk {
     pub const RTPS: u16 = 1 << 6;
     /// The bytes are not of the connection: they are a [`super::Link`] of it.
     pub const LINK: u16 = 1 << 7;
+    /// With [`SKIPPED`]: the bytes have samples of publishers that are not known yet, and the budget
+    /// for those was spent. The samples may be needed.
+    pub const OVER_BUDGET: u16 = 1 << 8;
 }
 
 /// The sender's state of a TCP connection (`struct bpf_tcp_sock` in `linux/bpf.h`).

@@ -299,6 +299,7 @@ extern "C" fn batch(skb: *mut __sk_buff, slot: u32) -> u32 {
         this.end = total;
     }
     this.is_judged = 0;
+    this.is_over_budget = 0;
     if total == PREFIX {
         // Zenoh sends an empty batch in place of the rest of a message that was dropped.
         this.wanted = 0;
@@ -331,6 +332,7 @@ fn frame(skb: *mut __sk_buff, slot: u32, offset: u32, read: u32) -> u32 {
     if this.end > total {
         this.end = total;
     }
+    this.is_over_budget = 0;
     if rtps::read(slot) == 0 {
         return 0;
     }
@@ -427,6 +429,9 @@ fn pass(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
         }
         this.state.body = body::SKIPPED;
         this.state.pending |= u32::from(part::SKIPPED);
+        if this.is_over_budget != 0 {
+            this.state.pending |= u32::from(part::OVER_BUDGET);
+        }
     } else {
         let copied = if this.wanted > now { now } else { this.wanted };
         this.state.body = body::HEAD;

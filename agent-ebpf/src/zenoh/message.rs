@@ -91,6 +91,7 @@ fn batch(slot: u32) -> Option<()> {
             0 => CONTINUATION,
             _ => 0,
         };
+        this.is_over_budget = u32::from(this.state.chain & chain::OVER_BUDGET != 0);
     }
     this.state.chain = match header & 0x40 {
         0 => 0,

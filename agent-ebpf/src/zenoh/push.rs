@@ -68,9 +68,10 @@ pub fn read(slot: u32, in_frame: bool) -> Option<()> {
             if !spend(Budget::CaptureBytes, head) {
                 count(slot, Counter::UnknownOverBudget, 1);
                 if !in_frame {
-                    this.state.chain = chain::SKIPPED;
+                    this.state.chain = chain::SKIPPED | chain::OVER_BUDGET;
                 }
                 this.wanted = 0;
+                this.is_over_budget = 1;
             }
         }
     }

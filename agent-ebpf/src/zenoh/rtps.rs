@@ -164,6 +164,7 @@ fn pay(slot: u32, bytes: u32) -> u32 {
         count(slot, Counter::UnknownOverBudget, 1);
         if let Some(mut this) = segment(slot) {
             this.wanted = 0;
+            this.is_over_budget = 1;
         }
     }
     1

@@ -82,6 +82,8 @@ pub mod chain {
     pub const WHOLE: u32 = 2;
     /// No fragment of the message is passed on.
     pub const SKIPPED: u32 = 4;
+    /// With `SKIPPED`: because the budget of unknown publishers was spent.
+    pub const OVER_BUDGET: u32 = 8;
 }
 
 /// Identifies a direction of a connection at a socket.
@@ -199,6 +201,8 @@ pub struct Segment {
     pub wakes: u32,
     /// Number of bytes of the batch to pass on; `u32::MAX` = all.
     pub wanted: u32,
+    /// Whether no byte is wanted because the budget of unknown publishers was spent.
+    pub is_over_budget: u32,
     /// Key of the batch's lane; 0 = the batch has no lane.
     pub lane: u32,
     /// Sequence number in the lane.

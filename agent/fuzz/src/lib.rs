@@ -103,6 +103,7 @@ pub fn stream(bytes: &[u8]) {
             before: match flags >> 4 & 3 {
                 1 => Before::Skipped,
                 2 => Before::Lost,
+                3 => Before::OverBudget,
                 _ => Before::Unknown,
             },
             bytes: content,

@@ -57,10 +57,11 @@ impl<'a> Chunk<'a> {
             true => Protocol::Rtps,
             false => Protocol::Zenoh,
         };
-        let before = match (is(chunk::LOST), is(chunk::SKIPPED)) {
-            (true, _) => Before::Lost,
-            (false, true) => Before::Skipped,
-            (false, false) => Before::Unknown,
+        let before = match (is(chunk::LOST), is(chunk::OVER_BUDGET), is(chunk::SKIPPED)) {
+            (true, ..) => Before::Lost,
+            (_, true, _) => Before::OverBudget,
+            (.., true) => Before::Skipped,
+            _ => Before::Unknown,
         };
         Self {
             time,

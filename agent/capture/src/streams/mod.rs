@@ -137,6 +137,9 @@ pub enum Before {
     Unknown,
     /// The bytes were left out because they are not needed.
     Skipped,
+    /// The bytes were left out because the budget of unknown publishers was spent. They are whole
+    /// batches, whose samples may be needed.
+    OverBudget,
     /// The bytes will not arrive.
     Lost,
 }

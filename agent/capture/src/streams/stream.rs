@@ -202,8 +202,8 @@ impl Stream {
         match chunk.before {
             _ if is_old => {}
             Before::Lost => self.lost(start, counters, report),
-            Before::Skipped if self.ahead.is_empty() => self.skip_to(start),
-            Before::Skipped | Before::Unknown => {}
+            before if self.ahead.is_empty() => self.skip(before, start, counters, report),
+            _ => {}
         }
         let distance = start.wrapping_sub(self.next);
         if distance != 0 && distance < WINDOW {
@@ -214,7 +214,7 @@ impl Stream {
             let is_full = self.ahead.is_full() || self.ahead_bytes.is_exceeded();
             if is_full || self.has_waited(chunk.time) {
                 self.give_up(counters, report);
-            } else if chunk.before == Before::Skipped {
+            } else if chunk.before != Before::Unknown {
                 self.catch_up(counters, report);
             }
             return Took::Chunk;
@@ -270,9 +270,19 @@ impl Stream {
         }
     }
 
-    /// Continues at a later byte, because whole batches before it are not needed.
-    fn skip_to(&mut self, start: u32) {
-        if start.wrapping_sub(self.next) < WINDOW {
+    /// Continues at a later byte, if whole batches before it were left out on purpose.
+    fn skip(
+        &mut self,
+        before: Before,
+        start: u32,
+        counters: &mut Counters,
+        report: &mut impl FnMut(Event<'_>),
+    ) {
+        if before == Before::OverBudget {
+            self.gap(counters, report);
+        }
+        let is_left_out = matches!(before, Before::Skipped | Before::OverBudget);
+        if is_left_out && start.wrapping_sub(self.next) < WINDOW {
             self.next = start;
         }
     }
@@ -298,9 +308,7 @@ impl Stream {
     fn catch_up(&mut self, counters: &mut Counters, report: &mut impl FnMut(Event<'_>)) {
         while let Some(first) = self.ahead.front() {
             let (start, before) = (first.sequence_number, first.before);
-            if before == Before::Skipped {
-                self.skip_to(start);
-            }
+            self.skip(before, start, counters, report);
             let distance = start.wrapping_sub(self.next);
             if distance != 0 && distance < WINDOW {
                 break;

@@ -236,7 +236,12 @@ proptest! {
                 syn: *syn && *end,
                 end: *end && !*syn,
                 boundary: is_boundary.then_some(Protocol::Zenoh),
-                before: [Before::Unknown, Before::Skipped, Before::Lost][bytes.len() % 3],
+                before: [
+                    Before::Unknown,
+                    Before::Skipped,
+                    Before::OverBudget,
+                    Before::Lost,
+                ][bytes.len() % 4],
                 bytes,
                 length: u32::try_from(bytes.len()).unwrap() + more,
             };
@@ -437,6 +442,47 @@ fn skipped_bytes_are_not_a_gap_but_lost_bytes_are() {
     assert_eq!(
         (streams.counters().gaps, streams.counters().batches),
         (1, 5)
+    );
+}
+
+#[test]
+fn batches_over_the_budget_are_a_gap_between_batches() {
+    let frame = |number| [4, 0, 0x25, number, 0x1d, 3];
+    let mut streams = Streams::default();
+    let mut reported = Reported::default();
+    let chunks = [
+        (1, Before::Unknown, frame(1)),
+        (1001, Before::OverBudget, frame(2)),
+        // The chunk before this one is late, and so is what is known about the bytes before it.
+        (1019, Before::Unknown, frame(5)),
+        (1007, Before::Unknown, frame(3)),
+        (2013, Before::Unknown, frame(7)),
+        (2007, Before::OverBudget, frame(6)),
+        (1013, Before::Unknown, frame(4)),
+        (2019, Before::Skipped, frame(8)),
+    ];
+    let mut progress = Vec::new();
+    for (number, before, bytes) in chunks {
+        let chunk = Chunk {
+            boundary: Some(Protocol::Zenoh),
+            before,
+            ..chunk(1, number, &bytes)
+        };
+        streams.chunk(&chunk, |report| reported.note(report));
+        progress.push((reported.batches.len(), reported.gaps));
+    }
+    assert_eq!(
+        progress,
+        [
+            (1, 0),
+            (2, 1),
+            (2, 1),
+            (3, 1),
+            (3, 1),
+            (3, 1),
+            (7, 2),
+            (8, 2)
+        ]
     );
 }
 

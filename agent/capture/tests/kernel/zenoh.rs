@@ -72,6 +72,11 @@ impl Observed {
     }
 
     fn with(settings: &FilterSettings) -> Result<Self> {
+        Self::with_budget(settings, Some(1 << 30))
+    }
+
+    /// Attaches the programs. Without `budget`, they have the budget with which they are loaded.
+    fn with_budget(settings: &FilterSettings, budget: Option<u32>) -> Result<Self> {
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
         let cgroup = Cgroup::create(&format!("{PREFIX}-{}-zenoh{number}", std::process::id()))?;
         let mut filter = Filter::load_host(settings)?;
@@ -79,7 +84,9 @@ impl Observed {
             .zenoh_programs()
             .context("no host hook")?
             .map_err(|error| anyhow::anyhow!("{error:#?}"))?;
-        filter.set_unknown_budget(Budget::CaptureBytes, 1 << 30)?;
+        if let Some(bytes) = budget {
+            filter.set_unknown_budget(Budget::CaptureBytes, bytes)?;
+        }
         filter.attach(&File::open(cgroup.path())?)?;
         let host = Namespace::alone()?;
         Ok(Self {

@@ -89,6 +89,65 @@ fn verdicts_on_publishers_decide_which_messages_are_passed_on() -> Result<()> {
 }
 
 #[test]
+fn messages_over_the_budget_of_unknown_publishers_are_a_gap() -> Result<()> {
+    use ros2probe_wire::record::Verdict;
+    let mut observed = Observed::new()?;
+    let (known, unknown) = ([1; 16], [4; 16]);
+    observed
+        .filter
+        .set_interest(endpoint(known), Some(Verdict::Meter))?;
+    let mut connection = observed.connect("127.0.0.1:0")?;
+    pass(&mut connection, true, &with_prefix(INIT))?;
+    let mut gaps_after = |observed: &mut Observed, batches: &[Vec<u8>]| -> Result<_> {
+        for batch in batches {
+            pass(&mut connection, true, &with_prefix(batch))?;
+        }
+        let seen = observed.seen();
+        let [out, ..] = directions(&seen, &connection)?;
+        let out = out.context("unseen")?;
+        Ok((out.batches.len(), out.gaps))
+    };
+    let of_both = [push(1, unknown, &[1; 300]), push(2, known, &[2; 300])];
+    assert_eq!(gaps_after(&mut observed, &of_both)?, (1 + 2, 0));
+    observed
+        .filter
+        .set_unknown_budget(Budget::CaptureBytes, 0)?;
+    assert_eq!(gaps_after(&mut observed, &of_both)?, (1, 1));
+    // The fragments after the first one of such a message are left out, too.
+    let message = push(0, unknown, &random(6, 50_000))[2..].to_vec();
+    let fragments = message.chunks(20_000).enumerate().map(|(index, part)| {
+        let more = if index < 2 { 0x40 } else { 0 };
+        [&[0x26 | more, 3 + index as u8][..], part].concat()
+    });
+    let mut batches: Vec<_> = fragments.collect();
+    batches.push(push(6, known, &[2; 300]));
+    assert_eq!(gaps_after(&mut observed, &batches)?, (1, 1));
+    // Messages that are not needed are no gap.
+    observed
+        .filter
+        .set_interest(endpoint(unknown), Some(Verdict::Ignore))?;
+    assert_eq!(gaps_after(&mut observed, &of_both)?, (1, 0));
+    assert_eq!(observed.counter(Counter::UnknownOverBudget)?, 2);
+    Ok(())
+}
+
+#[test]
+fn the_programs_have_a_budget_as_soon_as_they_are_attached() -> Result<()> {
+    let mut observed = Observed::with_budget(&FilterSettings::default(), None)?;
+    let mut connection = observed.connect("127.0.0.1:0")?;
+    pass(&mut connection, true, &with_prefix(INIT))?;
+    for number in 0..100 {
+        let batch = push(number, [7; 16], &[1; 300]);
+        pass(&mut connection, true, &with_prefix(&batch))?;
+    }
+    let seen = observed.seen();
+    let [out, ..] = directions(&seen, &connection)?;
+    assert_eq!(out.context("unseen")?.batches.len(), 1 + 100);
+    assert_eq!(observed.counter(Counter::UnknownOverBudget)?, 0);
+    Ok(())
+}
+
+#[test]
 fn an_ignored_publisher_is_passed_on_about_once_a_second() -> Result<()> {
     use ros2probe_wire::record::Verdict;
     let mut observed = Observed::new()?;
