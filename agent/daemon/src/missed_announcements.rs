@@ -16,7 +16,8 @@ const DISCOVER_BOTH: &str = "sudo rp discover --all && rp discover --router";
 
 /// Command that makes participants repeat by TCP what they announce: it starts another participant
 /// with the same transports.
-const ANNOUNCE_BY_TCP: &str = "FASTDDS_BUILTIN_TRANSPORTS=LARGE_DATA ros2 node list --no-daemon";
+const ANNOUNCE_BY_TCP: &str =
+    "FASTDDS_BUILTIN_TRANSPORTS=LARGE_DATA ros2 node list --no-daemon --spin-time 5";
 
 /// How a participant announces its endpoints.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]

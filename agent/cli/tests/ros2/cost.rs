@@ -10,8 +10,8 @@ use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::soak::median;
 use ros2probe_testing::harness::usage::Usage;
 
+use crate::counting::{log, publish, publisher, subscription};
 use crate::host::{Host, Middleware};
-use crate::zenoh::{log, publish, publisher, subscription};
 
 const SECONDS: u64 = 10;
 

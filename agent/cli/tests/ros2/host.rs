@@ -34,6 +34,8 @@ pub enum Middleware {
     /// Shared memory, with this value of `capture.shm.exact`.
     FastExact(&'static str),
     FastUdp,
+    /// RTPS over TCP to other hosts, shared memory within a host. Humble has no such mode.
+    FastLargeData,
     Cyclone,
     Zenoh,
 }
@@ -126,6 +128,9 @@ impl<'n> Host<'n> {
         if self.middleware == Middleware::FastUdp {
             let profile = self.path("udp.xml");
             enter.push(format!("FASTRTPS_DEFAULT_PROFILES_FILE={profile}"));
+        }
+        if self.middleware == Middleware::FastLargeData {
+            enter.push("FASTDDS_BUILTIN_TRANSPORTS=LARGE_DATA".to_owned());
         }
         enter
     }

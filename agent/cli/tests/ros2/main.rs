@@ -9,6 +9,7 @@
 
 mod chains;
 mod cost;
+mod counting;
 mod discover;
 mod echo;
 mod frames;
@@ -16,6 +17,7 @@ mod host;
 mod incident;
 mod inside;
 mod installed;
+mod large_data;
 mod learn;
 mod packages;
 mod quiet;

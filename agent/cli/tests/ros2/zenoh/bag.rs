@@ -10,7 +10,7 @@ use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_until;
 
-use super::{PATIENCE, publisher, subscription};
+use crate::counting::{PATIENCE, publisher, subscription};
 use crate::host::{Host, Middleware, RP};
 use crate::installed;
 
@@ -76,7 +76,7 @@ fn plays(host: &Host<'_>, bag: &str) -> Result<()> {
         let log = host.path(&format!("played-{name}.log"));
         let name = format!("listener_{name}");
         let arguments = [&["log", &name, topic][..], &RELIABLE, &[&log]].concat();
-        let mut listener = host.python("zenoh.py", &arguments)?;
+        let mut listener = host.python("counting.py", &arguments)?;
         listener.wait_for("ready", PATIENCE)?;
         listeners.push(listener);
     }
@@ -136,7 +136,7 @@ fn record(host: &Host<'_>, bag: &str) -> Result<Process> {
 fn hashes(host: &Host<'_>, bag: &str) -> Result<String> {
     let directory = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/ros2");
     let python = installed::python();
-    let line = format!("exec {python} {directory}/zenoh.py bag \"$1\" >\"$2\"");
+    let line = format!("exec {python} {directory}/counting.py bag \"$1\" >\"$2\"");
     let output = host.path("bag.txt");
     let mut reader = host.run(&line, &[bag, &output], Stdio::inherit())?;
     ensure!(reader.wait(PATIENCE)?.success(), "rosbag2 reads the bag");

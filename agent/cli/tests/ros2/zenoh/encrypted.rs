@@ -7,7 +7,7 @@ use anyhow::{Result, ensure};
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
 
-use super::{PATIENCE, WATCH, publish, settled_log};
+use crate::counting::{PATIENCE, WATCH, publish, settled_log};
 use crate::host::{Host, Middleware};
 use crate::installed;
 
@@ -43,7 +43,7 @@ impl Robot {
         let directory = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/ros2");
         let python = installed::python();
         let line = format!(
-            "export ZENOH_CONFIG_OVERRIDE='{settings}'; exec {python} {directory}/zenoh.py \"$@\""
+            "export ZENOH_CONFIG_OVERRIDE='{settings}'; exec {python} {directory}/counting.py \"$@\""
         );
         let publish = "publish sensor /imu 1000 300 2000 RELIABLE";
         let subscribe = "subscribe one /imu 2000 RELIABLE";

@@ -4,8 +4,9 @@ use anyhow::{Result, ensure};
 use ros2probe_testing::harness::agent::Agent;
 use ros2probe_testing::harness::network::Link;
 
-use super::{
-    PATIENCE, WATCH, agrees, discover, messages, publish, publisher, settled_log, subscription,
+use super::discover;
+use crate::counting::{
+    PATIENCE, WATCH, agrees, messages, publish, publisher, settled_log, subscription,
 };
 use crate::host::{Host, Middleware};
 

@@ -7,9 +7,10 @@ use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_until;
 
-use super::{
-    PATIENCE, WATCH, agrees, delivered, discover, messages, publish, publisher, runs_in,
-    settled_log, subscription,
+use super::discover;
+use crate::counting::{
+    PATIENCE, WATCH, agrees, delivered, messages, publish, publisher, runs_in, settled_log,
+    subscription,
 };
 use crate::host::{Host, Middleware};
 

@@ -8,7 +8,9 @@ use ros2probe_api::topics::TopicDetails;
 use ros2probe_testing::harness::agent::get;
 use ros2probe_testing::harness::network::Namespace;
 
-use super::{PATIENCE, WATCH, agrees, messages, publish, publisher, settled_log, subscription};
+use crate::counting::{
+    PATIENCE, WATCH, agrees, messages, publish, publisher, settled_log, subscription,
+};
 use crate::host::{Host, Middleware};
 
 const TOPIC: &str = "/imu";

@@ -3,7 +3,7 @@
 use anyhow::{Result, ensure};
 use ros2probe_testing::harness::network::Namespace;
 
-use super::{
+use crate::counting::{
     PATIENCE, WATCH, agrees, delivered, messages, publish, publisher, settled_log, subscription,
 };
 use crate::host::{Host, Middleware};

@@ -10,7 +10,7 @@ use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::viewer::{News, SUBPROTOCOLS, open};
 use sha2::{Digest as _, Sha256};
 
-use super::{PATIENCE, publisher, subscription};
+use crate::counting::{PATIENCE, publisher, subscription};
 use crate::host::{Host, Middleware};
 
 const TOPIC: &str = "/points";

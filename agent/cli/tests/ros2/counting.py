@@ -1,9 +1,9 @@
 """Publishers and subscriptions that count, in separate processes.
 
-    zenoh.py publish NAME TOPIC RATE BYTES DEPTH RELIABILITY [LOG]
-    zenoh.py subscribe NAME TOPIC DEPTH RELIABILITY [PAUSE]
-    zenoh.py log NAME TOPIC DEPTH RELIABILITY LOG
-    zenoh.py bag PATH
+    counting.py publish NAME TOPIC RATE BYTES DEPTH RELIABILITY [LOG]
+    counting.py subscribe NAME TOPIC DEPTH RELIABILITY [PAUSE]
+    counting.py log NAME TOPIC DEPTH RELIABILITY LOG
+    counting.py bag PATH
 
 Publisher and subscription print `ready` first. Each line of standard input is a number of messages.
 The publisher sends them and prints `published N` with the total number of sent messages. For each
