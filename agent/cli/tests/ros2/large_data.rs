@@ -61,6 +61,7 @@ fn nothing_was_dropped(agent: &Agent<'_>) -> Result<()> {
     Ok(())
 }
 
+// Coverage: TCP, with `LARGE_DATA` | rmw_fastrtps | installed | exact
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp, type_description_interfaces: make test-ros2"]
 fn counts_on_both_hosts_equal_the_log_of_the_subscription() -> Result<()> {
