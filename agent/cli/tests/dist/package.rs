@@ -18,6 +18,7 @@ use ros2probe_testing::harness::wait_until;
 
 const CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
 const RUNS: &str = "systemctl is-active ros2probe.service";
+const EXIT: &str = "systemctl show --property ExecMainStatus --value ros2probe";
 const STARTS_AT_BOOT: &str = "systemctl is-enabled ros2probe.service";
 
 #[test]
@@ -59,6 +60,7 @@ fn a_host_with_systemd_runs_the_agent_until_the_package_is_purged() -> Result<()
     the_service_runs_as_its_user(&host)?;
     an_older_systemd_gives_the_privileges_of_both_sources(&host)?;
     only_the_drop_in_for_interfaces_permits_the_wire_source(&host, &old)?;
+    a_service_without_any_source_ends_with_the_missing_lines(&host)?;
     the_socket_admits_the_group_only(&host)?;
     an_upgrade_keeps_the_operators_configuration(&host, &upgrade)?;
     a_stopped_or_disabled_service_stays_so(&host, &old, &upgrade)?;
@@ -126,7 +128,6 @@ fn only_the_drop_in_for_interfaces_permits_the_wire_source(
     host: &Debian,
     package: &str,
 ) -> Result<()> {
-    const EXIT: &str = "systemctl show --property ExecMainStatus --value ros2probe";
     const DROP_IN: &str = "/usr/lib/systemd/system/ros2probe.service.d/interfaces.conf";
     let install = format!("dpkg --install {package}");
     host.run(&format!(
@@ -150,6 +151,25 @@ fn only_the_drop_in_for_interfaces_permits_the_wire_source(
     ensure!(page.contains(source), "{page}");
     host.run(&format!(
         "cp --preserve /srv/before.yaml {CONFIG}; rm /srv/before.yaml; {install} && ! test -e {DROP_IN}"
+    ))?;
+    prints(host, RUNS, "active")
+}
+
+/// Checks a service that reaches neither sockets nor interfaces.
+fn a_service_without_any_source_ends_with_the_missing_lines(host: &Debian) -> Result<()> {
+    host.run(&format!(
+        "cp --preserve {CONFIG} /srv/before.yaml; \
+         sed -i 's/^  # source: auto .*/  cgroup: \\/sys\\/fs\\/cgroup\\/absent/' {CONFIG}"
+    ))?;
+    host.text("systemctl restart ros2probe")?;
+    prints(host, EXIT, "77")?;
+    let log = host.run("journalctl --unit ros2probe --no-pager --output cat")?;
+    let lines =
+        "; to observe interfaces instead, the unit needs `CapabilityBoundingSet=CAP_NET_RAW`";
+    ensure!(log.contains(lines), "{log}");
+    host.run(&format!(
+        "cp --preserve /srv/before.yaml {CONFIG}; rm /srv/before.yaml; \
+         systemctl restart ros2probe"
     ))?;
     prints(host, RUNS, "active")
 }
