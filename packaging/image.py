@@ -34,14 +34,14 @@ OCI = "application/vnd.oci.image."
 
 
 def capabilities():
-    """Returns security.capability (struct vfs_cap_data, version 2), with the unit's capabilities.
+    """Returns security.capability (struct vfs_cap_data, version 2), with the capabilities of both sources.
 
-    They are permitted and not effective: otherwise the kernel refuses to start the program where a
+    They are the unit's, for the host's sockets, and CAP_NET_RAW for interfaces. They are permitted and not effective: otherwise the kernel refuses to start the program where a
     container grants fewer. The program makes them effective itself.
     """
     unit = (ROOT / "systemd/ros2probe.service").read_text()
     names = re.search(r"^CapabilityBoundingSet=(.*)$", unit, re.M).group(1).split()
-    permitted = sum(1 << CAPABILITIES[name] for name in names)
+    permitted = sum(1 << CAPABILITIES[name] for name in {*names, "CAP_NET_RAW"})
     return struct.pack("<5I", VERSION_2, permitted & 0xFFFFFFFF, 0, permitted >> 32, 0)
 
 

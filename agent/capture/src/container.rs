@@ -1,7 +1,8 @@
 //! Containers: whether this process is in one, and what withholds the host from it.
 //!
 //! Errors of the capture name the option of `docker run` and `podman run` that grants what is
-//! missing. Nothing here is a security decision: a container may hide that it is one.
+//! missing, or the lines of a unit of systemd. Nothing here is a security decision: a container may
+//! hide that it is one.
 
 use std::fs;
 use std::path::Path;
@@ -14,6 +15,8 @@ const VARIABLE: &str = "container";
 const ENGINES: [&str; 3] = ["docker", "oci", "podman"];
 /// Options that show the host's control groups.
 pub const CGROUP_OPTIONS: &str = "--cgroupns host --volume /sys/fs/cgroup:/sys/fs/cgroup:ro";
+/// Address families of sockets at interfaces, as a line of a unit.
+pub const FAMILIES_LINE: &str = "RestrictAddressFamilies=AF_PACKET AF_NETLINK";
 /// Option for a profile that permits the BPF calls.
 pub const SECCOMP_OPTION: &str = "--security-opt seccomp=FILE (docs/containers.md)";
 
@@ -40,6 +43,13 @@ pub fn is_container() -> bool {
 fn has_own_root() -> bool {
     let read = |path| fs::read_to_string(path).unwrap_or_default();
     mount_of("/", &read(MOUNTS)) != mount_of("/", &read(FIRST_MOUNTS))
+}
+
+/// Returns whether this process is a service of systemd that reports its state: no shell has this
+/// variable.
+#[must_use]
+pub fn is_service() -> bool {
+    std::env::var_os("NOTIFY_SOCKET").is_some()
 }
 
 /// Returns the device and the directory that are mounted on a path, of the last such mount, which

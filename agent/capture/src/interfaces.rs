@@ -9,6 +9,7 @@ use std::io::{self, Read, Write};
 use std::mem::size_of_val;
 use std::os::fd::{AsFd, BorrowedFd, FromRawFd, OwnedFd};
 
+use crate::container::{FAMILIES_LINE, is_service};
 use crate::tables::KnownInterfaces;
 use globset::{Glob, GlobSet, GlobSetBuilder};
 use ros2probe_model::facts::bounded::Bounded;
@@ -45,6 +46,11 @@ pub enum Change {
 /// Why the interfaces cannot be listed.
 #[derive(Debug, thiserror::Error)]
 pub enum InterfacesError {
+    /// The service manager forbids the socket.
+    #[error(
+        "cannot list the network interfaces: the unit needs `{FAMILIES_LINE}` (`systemctl edit`)"
+    )]
+    Family(#[source] io::Error),
     /// A system call failed.
     #[error("cannot list the network interfaces: {call} failed")]
     System {
@@ -379,15 +385,16 @@ fn link(kind: u16, mut cursor: Cursor<'_>) -> Result<Body, WireError> {
 }
 
 fn listen() -> Result<OwnedFd, InterfacesError> {
-    let failed = |call| InterfacesError::System {
-        call,
-        source: io::Error::last_os_error(),
-    };
+    let failed = |call, source| InterfacesError::System { call, source };
     let kind = libc::SOCK_RAW | libc::SOCK_CLOEXEC | libc::SOCK_NONBLOCK;
     // SAFETY: the call takes no pointers.
     let fd = unsafe { libc::socket(libc::AF_NETLINK, kind, libc::NETLINK_ROUTE) };
     if fd < 0 {
-        return Err(failed("socket(NETLINK_ROUTE)"));
+        let source = io::Error::last_os_error();
+        return Err(match source.raw_os_error() {
+            Some(libc::EAFNOSUPPORT) if is_service() => InterfacesError::Family(source),
+            _ => failed("socket(NETLINK_ROUTE)", source),
+        });
     }
     // SAFETY: the descriptor is new and has no other owner.
     let socket = unsafe { OwnedFd::from_raw_fd(fd) };
@@ -398,7 +405,7 @@ fn listen() -> Result<OwnedFd, InterfacesError> {
     let length = size_of_val(&address) as libc::socklen_t;
     // SAFETY: `address` is a whole sockaddr_nl and `length` its size.
     if unsafe { libc::bind(fd, (&raw const address).cast(), length) } < 0 {
-        return Err(failed("bind(NETLINK_ROUTE)"));
+        return Err(failed("bind(NETLINK_ROUTE)", io::Error::last_os_error()));
     }
     Ok(socket)
 }

@@ -19,6 +19,7 @@ use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 use rustix::thread::CapabilitySet;
 
 use super::clock_step::ClockStep;
+use super::container::{FAMILIES_LINE, is_container, is_service};
 use super::error_chain::in_words;
 use super::filter::{
     Filter, FilterError, UNKNOWN_BYTES_PER_SECOND, UNKNOWN_PORTIONS, UNKNOWN_RECORDS_PER_TENTH,
@@ -26,7 +27,7 @@ use super::filter::{
 };
 use super::filter_reader::{self, FilterReader};
 use super::host_tap::{HostTap, HostTapError};
-use super::interfaces::Selection;
+use super::interfaces::{InterfacesError, Selection};
 use super::netns::NetnsError;
 use super::shm::directories::{Scope, ShmDirectories};
 use super::shm::poll_interval::Budget as Shares;
@@ -69,7 +70,7 @@ pub enum CaptureError {
     #[error(transparent)]
     Namespace(#[from] NetnsError),
     /// The host hook is unavailable for this reason, and packet sockets are not permitted either.
-    #[error("{without_host}")]
+    #[error("{without_host}{}", instead())]
     Neither {
         /// Why the host hook is unavailable.
         without_host: String,
@@ -83,6 +84,18 @@ pub enum CaptureError {
     /// Waiting for packets failed.
     #[error("failed to wait for packets")]
     Wait(#[source] std::io::Error),
+}
+
+impl CaptureError {
+    /// Returns whether interfaces cannot be observed because a right is missing. A restart does not
+    /// help then.
+    #[must_use]
+    pub const fn is_for_lack_of_rights(&self) -> bool {
+        matches!(
+            self,
+            Self::Neither { .. } | Self::Tap(WireTapError::Interfaces(InterfacesError::Family(_)))
+        )
+    }
 }
 
 /// All taps of this host.
@@ -187,6 +200,17 @@ pub struct DropCount {
     pub namespace: Option<PathBuf>,
     /// Frames lost because the packet ring was full.
     pub dropped: u64,
+}
+
+/// Returns what a unit of systemd needs to observe interfaces instead; an empty text elsewhere.
+fn instead() -> String {
+    match is_service() && !is_container() {
+        true => format!(
+            "; to observe interfaces instead, the unit needs `CapabilityBoundingSet=CAP_NET_RAW`, \
+             `AmbientCapabilities=CAP_NET_RAW` and `{FAMILIES_LINE}` (`systemctl edit`)"
+        ),
+        false => String::new(),
+    }
 }
 
 /// Adds why the host hook is unavailable, if packet sockets are not permitted either.
@@ -719,7 +743,9 @@ impl LiveSource {
         let Shm::Later(scope, budget) = &self.shared_memory else {
             return;
         };
-        let started = SharedMemory::start(ShmDirectories::new(scope.clone()), *budget, spawn);
+        let directories = ShmDirectories::new(scope.clone());
+        let has_breakpoints = self.exact.is_some();
+        let started = SharedMemory::start(directories, *budget, has_breakpoints, spawn);
         self.shared_memory = match started {
             Ok(running) => Shm::Running(running),
             Err(error) => {

@@ -13,6 +13,7 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::Parser as _;
 use ros2probe_attach::client::declare_command;
+use ros2probe_capture::live::CaptureError;
 use ros2probe_daemon::agent;
 use ros2probe_daemon::config::{Config, ConfigError};
 use ros2probe_daemon::escape::visible_lines;
@@ -80,6 +81,9 @@ fn exit_code(error: &anyhow::Error) -> ExitCode {
     } else if error.is::<Missing>()
         || error.is::<CapabilitiesRemain>()
         || error.is::<ConfineError>()
+        || error
+            .downcast_ref()
+            .is_some_and(CaptureError::is_for_lack_of_rights)
     {
         ExitCode::from(NO_PERMISSION)
     } else if error.is::<ConfigError>() || error.is::<SettingsError>() {

@@ -39,6 +39,7 @@ use self::inbox::{Inbox, Item};
 use self::poll_interval::{Budget, Need, PollInterval};
 use self::tap::{Counters, Tap};
 use super::border::observe;
+use super::container::{is_container, is_service};
 use super::reorder_buffer::ReorderBuffer;
 use super::system::{Clocks, DirectoryWatch, calendar, monotonic, run_first, thread_cpu, wait};
 use crate::threads::{Progress, Spawn, Task};
@@ -91,11 +92,16 @@ struct Shared {
 
 impl SharedMemory {
     /// Starts polling, within shares of a CPU. The thread keeps those capabilities of the caller
-    /// that it needs.
+    /// that it needs. It reports a missing priority, unless breakpoints read the names.
     ///
     /// # Errors
     /// Fails if the thread cannot be started.
-    pub fn start(directories: ShmDirectories, budget: Budget, spawn: Spawn) -> io::Result<Self> {
+    pub fn start(
+        directories: ShmDirectories,
+        budget: Budget,
+        has_breakpoints: bool,
+        spawn: Spawn,
+    ) -> io::Result<Self> {
         let (ended, end) = io::pipe()?;
         let shared = Arc::new(Shared {
             inbox: Inbox::with_bell(),
@@ -103,10 +109,11 @@ impl SharedMemory {
         });
         let thread = std::thread::Builder::new().name("shm".to_owned());
         let looks = Arc::clone(&shared);
+        let remedy = (!has_breakpoints).then(priority_remedy);
         let thread = spawn(
             Task::SharedMemory,
             thread.stack_size(256 << 10),
-            Box::new(move || poll(&looks, directories, budget, &ended)),
+            Box::new(move || poll(&looks, directories, budget, remedy, &ended)),
         )?;
         Ok(Self {
             shared,
@@ -243,8 +250,26 @@ impl Shared {
     }
 }
 
-/// The thread's main function.
-fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget, ended: &PipeReader) {
+/// Returns what grants real-time priority to this process.
+fn priority_remedy() -> &'static str {
+    match (is_container(), is_service()) {
+        (true, _) => "add --ulimit rtprio=1",
+        (false, true) => {
+            "the unit needs `LimitRTPRIO=1`, `RestrictRealtime=no` and \
+             `SystemCallFilter=sched_setscheduler` (`systemctl edit`)"
+        }
+        (false, false) => "the agent needs CAP_SYS_NICE",
+    }
+}
+
+/// The thread's main function. `remedy` is reported if the thread gets no priority.
+fn poll(
+    shared: &Shared,
+    directories: ShmDirectories,
+    budget: Budget,
+    remedy: Option<&str>,
+    ended: &PipeReader,
+) {
     let mut tap = Tap::new(directories, calendar);
     let cpus = std::thread::available_parallelism().map_or(1, usize::from);
     let mut interval = PollInterval::new(budget).on(cpus);
@@ -302,8 +327,10 @@ fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget, ended: &Pi
             is_first = !is_first;
             if let Err(error) = run_first(is_first) {
                 (may_be_first, is_first) = (false, false);
-                tracing::info!(%error, "names announced in shared memory may be missed on a busy \
-                    host");
+                if let Some(remedy) = remedy {
+                    tracing::info!(%error, remedy, "names announced in shared memory may be \
+                        missed on a busy host");
+                }
             }
         }
         // While listing has used up its CPU share, events about new files wait as well.

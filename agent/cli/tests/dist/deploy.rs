@@ -389,7 +389,7 @@ fn the_image_has_the_binary_of_make_dist_the_capabilities_of_the_unit_and_no_roo
     ensure!(
         instructions(&text, "CMD") == [r#"["run", "--config", "/etc/ros2probe/ros2probe.yaml"]"#]
     );
-    capabilities_are_those_of_the_unit(&text)
+    capabilities_are_those_of_both_sources(&text)
 }
 
 /// Returns the arguments of each instruction of this name in a Dockerfile.
@@ -448,9 +448,9 @@ fn image_copies_the_binary_and_the_configuration(text: &str) -> Result<()> {
     Ok(())
 }
 
-/// Checks that the file's capabilities are the unit's, and that each of the documented containers has
-/// those of its source.
-fn capabilities_are_those_of_the_unit(text: &str) -> Result<()> {
+/// Checks that the file's capabilities are the unit's and that for packet sockets, and that each of
+/// the documented containers has those of its source.
+fn capabilities_are_those_of_both_sources(text: &str) -> Result<()> {
     let set = text
         .split("setcap ")
         .nth(1)
@@ -460,8 +460,12 @@ fn capabilities_are_those_of_the_unit(text: &str) -> Result<()> {
         .split(',')
         .map(str::to_uppercase)
         .collect();
-    let unit = bounding_set()?;
-    ensure!(set == unit, "file {set:?}, unit {unit:?}");
+    let mut both = bounding_set()?;
+    both.insert("CAP_NET_RAW".to_owned());
+    ensure!(
+        set == both,
+        "file {set:?}, unit and packet sockets {both:?}"
+    );
     for (with, other) in [
         ("--network host", "CAP_NET_RAW"),
         ("--network container:robot", "CAP_NET_ADMIN"),
@@ -470,7 +474,7 @@ fn capabilities_are_those_of_the_unit(text: &str) -> Result<()> {
         let added = words.windows(2).filter(|pair| pair[0] == "--cap-add");
         let added = added.map(|pair| format!("CAP_{}", pair[1]));
         let added: BTreeSet<String> = added.chain([other.to_owned()]).collect();
-        ensure!(added == unit, "{with} {added:?}, unit {unit:?}");
+        ensure!(added == both, "{with} {added:?}, both sources {both:?}");
     }
     Ok(())
 }

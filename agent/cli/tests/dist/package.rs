@@ -18,6 +18,7 @@ use ros2probe_testing::harness::wait_until;
 
 const CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
 const RUNS: &str = "systemctl is-active ros2probe.service";
+const EXIT: &str = "systemctl show --property ExecMainStatus --value ros2probe";
 const STARTS_AT_BOOT: &str = "systemctl is-enabled ros2probe.service";
 
 #[test]
@@ -57,7 +58,9 @@ fn a_host_with_systemd_runs_the_agent_until_the_package_is_purged() -> Result<()
 
     host.run(&format!("dpkg --install {old}"))?;
     the_service_runs_as_its_user(&host)?;
-    an_older_systemd_gives_the_same_privileges(&host)?;
+    an_older_systemd_gives_the_privileges_of_both_sources(&host)?;
+    only_the_drop_in_for_interfaces_permits_the_wire_source(&host, &old)?;
+    a_service_without_any_source_ends_with_the_missing_lines(&host)?;
     the_socket_admits_the_group_only(&host)?;
     an_upgrade_keeps_the_operators_configuration(&host, &upgrade)?;
     a_stopped_or_disabled_service_stays_so(&host, &old, &upgrade)?;
@@ -103,7 +106,7 @@ fn the_service_runs_as_its_user(host: &Debian) -> Result<()> {
 }
 
 /// Checks the drop-in for systemd before 247.
-fn an_older_systemd_gives_the_same_privileges(host: &Debian) -> Result<()> {
+fn an_older_systemd_gives_the_privileges_of_both_sources(host: &Debian) -> Result<()> {
     host.run(
         "mkdir /run/systemd/system/ros2probe.service.d && \
          cp /usr/share/ros2probe/systemd-before-247.conf /run/systemd/system/ros2probe.service.d/ && \
@@ -117,6 +120,58 @@ fn an_older_systemd_gives_the_same_privileges(host: &Debian) -> Result<()> {
     ensure!(bounds.trim().ends_with("\t000000c000003000"), "{bounds}");
     host.run("rm -r /run/systemd/system/ros2probe.service.d && systemctl daemon-reload")
         .map(drop)
+}
+
+/// Checks that the error has the missing lines. An installation links the drop-in on a host without
+/// control groups of version 2, and removes it elsewhere.
+fn only_the_drop_in_for_interfaces_permits_the_wire_source(
+    host: &Debian,
+    package: &str,
+) -> Result<()> {
+    const DROP_IN: &str = "/usr/lib/systemd/system/ros2probe.service.d/interfaces.conf";
+    let install = format!("dpkg --install {package}");
+    host.run(&format!(
+        "cp --preserve {CONFIG} /srv/before.yaml; sed -i 's/^  # source: auto .*/  source: wire/' {CONFIG}"
+    ))?;
+    host.text("systemctl restart ros2probe")?;
+    prints(host, EXIT, "77")?;
+    let log = host.run("journalctl --unit ros2probe --no-pager --output cat")?;
+    for line in [
+        "CapabilityBoundingSet=CAP_NET_RAW",
+        "RestrictAddressFamilies=AF_PACKET AF_NETLINK",
+    ] {
+        ensure!(log.contains(line), "no {line} in {log}");
+    }
+    host.run(&format!(
+        "unshare --mount sh -c 'umount --all --types cgroup2 && {install}' && test -L {DROP_IN}"
+    ))?;
+    prints(host, RUNS, "active")?;
+    let page = host.get(17400, "/metrics")?;
+    let source = "ros2probe_capture_source_info{source=\"wire\",reason=\"\"} 1";
+    ensure!(page.contains(source), "{page}");
+    host.run(&format!(
+        "cp --preserve /srv/before.yaml {CONFIG}; rm /srv/before.yaml; {install} && ! test -e {DROP_IN}"
+    ))?;
+    prints(host, RUNS, "active")
+}
+
+/// Checks a service that reaches neither sockets nor interfaces.
+fn a_service_without_any_source_ends_with_the_missing_lines(host: &Debian) -> Result<()> {
+    host.run(&format!(
+        "cp --preserve {CONFIG} /srv/before.yaml; \
+         sed -i 's/^  # source: auto .*/  cgroup: \\/sys\\/fs\\/cgroup\\/absent/' {CONFIG}"
+    ))?;
+    host.text("systemctl restart ros2probe")?;
+    prints(host, EXIT, "77")?;
+    let log = host.run("journalctl --unit ros2probe --no-pager --output cat")?;
+    let lines =
+        "; to observe interfaces instead, the unit needs `CapabilityBoundingSet=CAP_NET_RAW`";
+    ensure!(log.contains(lines), "{log}");
+    host.run(&format!(
+        "cp --preserve /srv/before.yaml {CONFIG}; rm /srv/before.yaml; \
+         systemctl restart ros2probe"
+    ))?;
+    prints(host, RUNS, "active")
 }
 
 /// Checks access to the socket while `api.listen` is off.
@@ -388,7 +443,7 @@ fn book() -> Result<Vec<String>> {
     Ok(pages)
 }
 
-const FILES: [(&str, u32); 20] = [
+const FILES: [(&str, u32); 21] = [
     ("etc/ros2probe/ros2probe.yaml", 0o644),
     ("usr/bin/rp", 0o755),
     ("usr/lib/systemd/system/ros2probe-attach.service", 0o644),
@@ -404,6 +459,7 @@ const FILES: [(&str, u32); 20] = [
     ("usr/share/lintian/overrides/ros2probe", 0o644),
     ("usr/share/ros2probe/dashboards/fleet.json", 0o644),
     ("usr/share/ros2probe/dashboards/robot.json", 0o644),
+    ("usr/share/ros2probe/interfaces.conf", 0o644),
     ("usr/share/ros2probe/ros2probe.schema.json", 0o644),
     ("usr/share/ros2probe/rules/ros2probe.alerts.yaml", 0o644),
     ("usr/share/ros2probe/rules/ros2probe.rules.yaml", 0o644),

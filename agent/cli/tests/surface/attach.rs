@@ -402,7 +402,12 @@ fn ten_thousand_requests_and_clients_that_never_read_leave_the_memory_unchanged(
             }
         });
         for number in 0..requests {
-            let answer = receive(&socket).unwrap();
+            let mut answer = receive(&socket).unwrap();
+            // On a busy machine, a request that is aborted after its answer has two.
+            if answer["number"] == json!(number - 1) {
+                assert!(answer["content"]["refused"].is_string(), "{answer}");
+                answer = receive(&socket).unwrap();
+            }
             assert_eq!(answer["number"], number);
         }
         sending.join().unwrap();

@@ -10,7 +10,7 @@ use rustix::thread::{
 };
 
 use crate::config::{CaptureSettings, SourceChoice};
-use ros2probe_capture::container::is_container;
+use ros2probe_capture::container::{FAMILIES_LINE, is_container, is_service};
 
 /// Capabilities for attaching programs to a cgroup (`CAP_NET_ADMIN`), for loading them (`CAP_BPF`),
 /// and for tracepoints and iterators (`CAP_PERFMON`). `CAP_PERFMON` also skips Spectre barriers in
@@ -281,9 +281,14 @@ impl Missing {
             .flat_map(capability_names)
             .collect();
         let names = names.join(" ");
+        let bounds = format!("`CapabilityBoundingSet={names}`");
+        let more = match self.grant.contains(&CapabilitySet::NET_RAW) {
+            true => format!(", {bounds} and `{FAMILIES_LINE}`"),
+            false => format!(" and {bounds}"),
+        };
         format!(
-            "live capture needs {}: the unit needs `AmbientCapabilities={names}` and \
-             `CapabilityBoundingSet={names}` (`systemctl edit`)",
+            "live capture needs {}: the unit needs `AmbientCapabilities={names}`{more} \
+             (`systemctl edit`)",
             self.needs()
         )
     }
@@ -294,8 +299,7 @@ impl fmt::Display for Missing {
         if is_container() {
             return f.write_str(&self.in_container());
         }
-        // A service with its own notifications: no shell has this variable.
-        if std::env::var_os("NOTIFY_SOCKET").is_some() {
+        if is_service() {
             return f.write_str(&self.in_unit());
         }
         f.write_str(&self.in_shell())
@@ -348,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn the_daemon_set_grants_exactly_the_capabilities_of_both_sources() {
+    fn the_daemon_set_grants_exactly_the_capabilities_of_the_host_source() {
         let manifest = include_str!("../../../../deploy/kubernetes/ros2probe.yaml");
         let mut lines = manifest.lines().map(str::trim);
         let added = lines.find_map(|line| line.strip_prefix("add: [")?.strip_suffix(']'));
@@ -356,7 +360,7 @@ mod tests {
         let added: CapabilitySet = added
             .map(|name| CapabilitySet::from_name(name).unwrap())
             .collect();
-        assert_eq!(added, set(&[HOST, WIRE].concat()));
+        assert_eq!(added, set(&HOST));
     }
 
     #[test]
@@ -414,6 +418,16 @@ mod tests {
              `AmbientCapabilities=CAP_NET_ADMIN CAP_BPF CAP_PERFMON` and \
              `CapabilityBoundingSet=CAP_NET_ADMIN CAP_BPF CAP_PERFMON` (`systemctl edit`)"
         );
+        let missing = super::missing(set(&WIRE[1..]), &settings(SourceChoice::Wire)).unwrap();
+        assert_eq!(
+            missing.in_unit(),
+            "live capture needs CAP_NET_RAW for the source `wire`: the unit needs \
+             `AmbientCapabilities=CAP_NET_RAW CAP_BPF CAP_PERFMON`, \
+             `CapabilityBoundingSet=CAP_NET_RAW CAP_BPF CAP_PERFMON` and \
+             `RestrictAddressFamilies=AF_PACKET AF_NETLINK` (`systemctl edit`)"
+        );
+        let unit = include_str!("../../../../systemd/ros2probe.service");
+        assert!(unit.contains(&format!("#     {FAMILIES_LINE}\n")));
     }
 
     #[test]

@@ -19,7 +19,8 @@ const MAX_BYTES: u64 = 30 * 1024 * 1024;
 const PROGRAM: &str = "usr/bin/rp";
 const USER: u32 = 65532;
 
-/// Returns the capabilities that the unit grants, without their prefix.
+/// Returns the capabilities of both sources, without their prefix: those of the unit, and that for
+/// packet sockets.
 fn capabilities() -> Result<Vec<String>> {
     let unit = fs::read_to_string(sources("systemd/ros2probe.service"))?;
     let set = unit
@@ -28,6 +29,7 @@ fn capabilities() -> Result<Vec<String>> {
         .context("the unit bounds nothing")?;
     Ok(set
         .split(' ')
+        .chain(["CAP_NET_RAW"])
         .map(|name| name.trim_start_matches("CAP_").to_owned())
         .collect())
 }
