@@ -3,8 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::fmt::Write as _;
 
+use history::stamp_of;
 use ros2probe_api::transforms::{TransformEdge, TransformTree};
 use ros2probe_daemon::escape::visible;
+
+pub use history::History;
+
+mod history;
 
 /// Position and orientation of a frame in another one.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -45,11 +50,10 @@ const IDENTITY: Pose = Pose {
 
 impl Pose {
     fn of(edge: &TransformEdge<'_>) -> Self {
-        let pose = Self {
+        Self {
             translation: edge.translation,
             rotation: edge.rotation,
-        };
-        pose.through_matrix()
+        }
     }
 
     /// Returns the pose in the outer frame of a pose in this one.
@@ -150,6 +154,10 @@ impl Pose {
     }
 }
 
+fn dot(one: [f64; 4], other: [f64; 4]) -> f64 {
+    one.iter().zip(other).map(|(one, other)| one * other).sum()
+}
+
 /// Returns the vector, rotated by a quaternion of any length.
 fn rotate(rotation: [f64; 4], [a, b, c]: [f64; 3]) -> [f64; 3] {
     let square: f64 = rotation.iter().map(|number| number * number).sum();
@@ -190,11 +198,57 @@ impl<'a> Frames<'a> {
         }
     }
 
-    /// Returns the transform between two frames, as `tf2_echo SOURCE TARGET` prints it.
+    /// Returns the transform between two frames, as `tf2_echo SOURCE TARGET` prints it: at the
+    /// latest time for which each edge has a transform. An edge of which `history` has no pose at
+    /// that time counts with its last one.
     ///
     /// # Errors
     /// Fails if a frame is unknown, or if both are in separate trees.
-    pub fn between(&self, source: &str, target: &str) -> Result<Between, NoTransform> {
+    pub fn between(
+        &self,
+        source: &str,
+        target: &str,
+        history: &History,
+    ) -> Result<Between, NoTransform> {
+        let [up, down] = self.ways(source, target)?;
+        let stamp = common_stamp(&[&up, &down]);
+        let pose_of = |way: &[&TransformEdge<'_>]| {
+            way.iter().fold(IDENTITY, |pose, edge| {
+                let at_stamp = || history.pose_at(&edge.child, stamp_of(stamp));
+                let moving = (!edge.is_static).then(at_stamp).flatten();
+                let of_edge = moving.unwrap_or_else(|| Pose::of(edge));
+                of_edge.through_matrix().then(pose)
+            })
+        };
+        Ok(Between {
+            stamp,
+            pose: pose_of(&up).inverse().then(pose_of(&down)),
+        })
+    }
+
+    /// Returns whether `history` has the pose of each moving edge between two frames at the latest
+    /// time for which all of them have a transform.
+    ///
+    /// # Errors
+    /// Fails if a frame is unknown, or if both are in separate trees.
+    pub fn has_poses(
+        &self,
+        source: &str,
+        target: &str,
+        history: &History,
+    ) -> Result<bool, NoTransform> {
+        let ways = self.ways(source, target)?;
+        let stamp = stamp_of(common_stamp(&[&ways[0], &ways[1]]));
+        let mut moving = ways.iter().flatten().filter(|edge| !edge.is_static);
+        Ok(moving.all(|edge| history.pose_at(&edge.child, stamp).is_some()))
+    }
+
+    /// Returns the edges from each of two frames up to their nearest common ancestor.
+    fn ways(
+        &self,
+        source: &str,
+        target: &str,
+    ) -> Result<[Vec<&'a TransformEdge<'a>>; 2], NoTransform> {
         let [source, target] = [source, target].map(|frame| frame.trim_start_matches('/'));
         let (from, to) = (self.ancestors(source)?, self.ancestors(target)?);
         let common = from
@@ -203,23 +257,19 @@ impl<'a> Frames<'a> {
         let Some((common, _)) = common else {
             return Err(NoTransform::Apart(source.to_owned(), target.to_owned()));
         };
-        let up = self.pose_in(&from, common);
-        let down = self.pose_in(&to, common);
-        let mut stamps: Vec<_> = [&up.1[..], &down.1[..]].concat();
-        stamps.sort_unstable();
-        Ok(Between {
-            stamp: stamps.first().copied().unwrap_or_default(),
-            pose: up.0.inverse().then(down.0),
-        })
+        Ok([&from, &to].map(|way| {
+            let below = way.iter().take_while(|(frame, _)| frame != common);
+            below.filter_map(|(_, edge)| *edge).collect()
+        }))
     }
 
     /// Returns the frame and its ancestors, each with the edge to its parent.
-    fn ancestors(
+    fn ancestors<'b>(
         &self,
-        frame: &'a str,
-    ) -> Result<Vec<(&'a str, Option<&'a TransformEdge<'a>>)>, NoTransform>
+        frame: &'b str,
+    ) -> Result<Vec<(&'b str, Option<&'a TransformEdge<'a>>)>, NoTransform>
     where
-        Self: 'a,
+        'a: 'b,
     {
         let is_parent = || self.edges.values().any(|edge| edge.parent == frame);
         if !self.edges.contains_key(frame) && !is_parent() {
@@ -238,23 +288,6 @@ impl<'a> Frames<'a> {
                 None => return Ok(found),
             }
         }
-    }
-
-    /// Returns the pose of the first frame in the last one, and the stamps of moving transforms.
-    fn pose_in(
-        &self,
-        way: &[(&str, Option<&TransformEdge<'_>>)],
-        end: &str,
-    ) -> (Pose, Vec<(i32, u32)>) {
-        let (mut pose, mut stamps) = (IDENTITY, Vec::new());
-        let edges = way.iter().take_while(|(frame, _)| *frame != end);
-        for edge in edges.filter_map(|(_, edge)| *edge) {
-            pose = Pose::of(edge).then(pose);
-            if !edge.is_static {
-                stamps.push((edge.stamp_sec, edge.stamp_nanosec));
-            }
-        }
-        (pose, stamps)
     }
 
     /// Returns the tree as indented text. `now` is the Unix time of the view.
@@ -321,6 +354,17 @@ impl<'a> Frames<'a> {
         }
         text + "}\n"
     }
+}
+
+/// Returns the oldest of the last stamps of moving edges; zero without any.
+fn common_stamp(ways: &[&[&TransformEdge<'_>]]) -> (i32, u32) {
+    let moving = ways
+        .iter()
+        .copied()
+        .flatten()
+        .filter(|edge| !edge.is_static);
+    let stamps = moving.map(|edge| (edge.stamp_sec, edge.stamp_nanosec));
+    stamps.min().unwrap_or_default()
 }
 
 /// Returns rate, age and broadcasters of an edge.
@@ -416,7 +460,9 @@ mod tests {
     #[test]
     fn the_text_is_that_of_tf2_echo() {
         let tree = tree();
-        let between = Frames::new(&tree).between("map", "/lidar").unwrap();
+        let between = Frames::new(&tree)
+            .between("map", "/lidar", &History::default())
+            .unwrap();
         assert_eq!(
             between.text(),
             "At time 99.5\n\
@@ -433,21 +479,61 @@ mod tests {
     }
 
     #[test]
+    fn edges_with_newer_stamps_count_at_the_oldest_one() {
+        let tree = tree();
+        let frames = Frames::new(&tree);
+        let mut history = History::default();
+        history.add_last(&tree);
+        assert_eq!(frames.has_poses("map", "base_link", &history), Ok(false));
+        let earlier = TransformTree {
+            edges: vec![TransformEdge {
+                stamp_sec: 98,
+                stamp_nanosec: 600_000_010,
+                translation: [4.0, 0.0, 0.0],
+                ..edge("odom", "base_link", 0.0, true)
+            }],
+            ..TransformTree::default()
+        };
+        history.add_last(&earlier);
+        assert_eq!(frames.has_poses("map", "base_link", &history), Ok(true));
+        let between = frames.between("map", "base_link", &history).unwrap();
+        assert_eq!(between.stamp, (99, 5));
+        // Half of the time has passed between 98.6 and 99.4.
+        let [x, ..] = between.pose.translation;
+        assert!((x - 13.0).abs() < 1e-6, "{x}");
+        assert_eq!(frames.has_poses("camera", "lidar", &history), Ok(false));
+        history.add_last(&tree);
+        assert_eq!(frames.has_poses("camera", "base_link", &history), Ok(true));
+    }
+
+    #[test]
     fn a_way_down_and_up_again_is_the_inverse() {
         let tree = tree();
         let frames = Frames::new(&tree);
-        let there = frames.between("camera", "map").unwrap().pose;
-        let back = frames.between("map", "camera").unwrap().pose;
+        let there = frames
+            .between("camera", "map", &History::default())
+            .unwrap()
+            .pose;
+        let back = frames
+            .between("map", "camera", &History::default())
+            .unwrap()
+            .pose;
         let same = there.then(back);
         assert!(
             same.translation.iter().all(|number| number.abs() < 1e-9),
             "{same:?}"
         );
         assert!((same.rotation[3].abs() - 1.0).abs() < 1e-9, "{same:?}");
-        let siblings = frames.between("camera", "lidar").unwrap().pose;
+        let siblings = frames
+            .between("camera", "lidar", &History::default())
+            .unwrap()
+            .pose;
         assert!((siblings.translation[0] - 0.5).abs() < 1e-9, "{siblings:?}");
         assert_eq!(
-            frames.between("lidar", "base_link").unwrap().stamp,
+            frames
+                .between("lidar", "base_link", &History::default())
+                .unwrap()
+                .stamp,
             (0, 0),
             "static"
         );
@@ -457,7 +543,11 @@ mod tests {
     fn frames_without_a_transform_have_a_reason() {
         let tree = tree();
         let frames = Frames::new(&tree);
-        let reason = |source, target| frames.between(source, target).unwrap_err();
+        let reason = |source, target| {
+            frames
+                .between(source, target, &History::default())
+                .unwrap_err()
+        };
         assert_eq!(
             reason("map", "nose"),
             NoTransform::Unknown("nose".to_owned())
@@ -470,7 +560,7 @@ mod tests {
         };
         let frames = Frames::new(&circle);
         assert_eq!(
-            frames.between("a", "b").unwrap_err(),
+            frames.between("a", "b", &History::default()).unwrap_err(),
             NoTransform::Circle("a".to_owned())
         );
         assert_eq!(frames.tree(0.0), "");
@@ -515,7 +605,10 @@ mod tests {
                 edges: vec![edge],
                 ..TransformTree::default()
             };
-            let text = Frames::new(&tree).between("map", "camera").unwrap().text();
+            let text = Frames::new(&tree)
+                .between("map", "camera", &History::default())
+                .unwrap()
+                .text();
             let line = format!("- Rotation: in Quaternion {printed}\n");
             assert!(text.contains(&line), "{rotation:?}: {text}");
         }

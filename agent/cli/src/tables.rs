@@ -8,6 +8,10 @@ ros2probe_model::tables! {
     StreamTopics { name: "samples.topics", entries: 65_536, effect: "described again by each message" }
     /// Their writers
     StreamWriters { name: "samples.writers", entries: DescribedWriters::CAP, effect: "described again by each message" }
+    /// Edges whose transforms `rp tf` keeps
+    FrameEdges { name: "tf.edges", entries: 4096, effect: "its last transform is used" }
+    /// Transforms of an edge in the last ten seconds
+    FramePoses { name: "tf.poses", entries: 16_384, effect: "the oldest one is dropped" }
     /// Announcements of one kind that `rp discover` receives from a participant
     ReceivedAnnouncements { name: "discover.received", entries: 4096 }
     /// Endpoints of this participant

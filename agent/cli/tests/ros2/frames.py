@@ -1,7 +1,9 @@
 """A broadcaster of static and moving transforms.
 
-It repeats the moving ones with an unchanged stamp. Each line of standard input turns and moves them,
-with a new stamp, and prints the stamp as `tf2_echo` does. Without a line, none is sent.
+It repeats the moving ones with unchanged stamps. Each line of standard input turns and moves them,
+with new stamps, and prints the stamp of the first one as `tf2_echo` does. After the line `next` all
+have that stamp. After `apart` the others have one before and one after it. Without a line, none is
+sent.
 """
 
 import math
@@ -40,16 +42,22 @@ def transform(parent, child, translation, quaternion, seconds=0, nanoseconds=0):
     return message
 
 
-def moving(step):
-    """Returns the transforms of a step, with one stamp."""
+def base(step, stamp):
+    way = (math.sin(step), math.sin(2 * step), math.sin(3 * step), math.cos(step))
+    return transform("odom", "base_link", (-1.5, step / 3, 1e-5), way, *stamp)
+
+
+def moving(step, apart):
+    """Returns the transforms of a step."""
     # The nanoseconds are few, and have no leading zeros in the output.
-    stamp = (int(time.time()), 1 + step)
-    odom = (0.0, 0.0, math.sin(step / 7), math.cos(step / 7))
-    base = (math.sin(step), math.sin(2 * step), math.sin(3 * step), math.cos(step))
-    return TFMessage(transforms=[
-        transform("map", "odom", (10.0 * step, -0.0005, 0.0), odom, *stamp),
-        transform("odom", "base_link", (-1.5, step / 3, 1e-5), base, *stamp),
-    ])
+    seconds, nanoseconds = int(time.time()), 1 + step
+    stamp = (seconds, nanoseconds)
+    way = (0.0, 0.0, math.sin(step / 7), math.cos(step / 7))
+    odom = transform("map", "odom", (10.0 * step, -0.0005, 0.0), way, *stamp)
+    if not apart:
+        return TFMessage(transforms=[odom, base(step, stamp)])
+    before, after = (seconds - 1, 970_000_000), (seconds, 50_000_000)
+    return TFMessage(transforms=[odom, base(step, before), base(step + 0.4, after)])
 
 
 rclpy.init()
@@ -71,7 +79,7 @@ def repeat():
 
 threading.Thread(target=repeat, daemon=True).start()
 print("ready", flush=True)
-for step, _ in enumerate(sys.stdin):
-    present.append(moving(step))
+for step, line in enumerate(sys.stdin):
+    present.append(moving(step, line.strip() == "apart"))
     stamp = present[-1].transforms[0].header.stamp
     print(f"At time {stamp.sec}.{stamp.nanosec}", flush=True)

@@ -36,7 +36,13 @@ const MOVING: [(&str, &str); 4] = [
     ("base_link", "map"),
     ("marker", "camera"),
 ];
-/// Number of poses of each pair of [`MOVING`].
+/// Pairs of frames with moving transforms that have different stamps.
+const APART: [(&str, &str); 3] = [
+    ("map", "base_link"),
+    ("base_link", "map"),
+    ("marker", "camera"),
+];
+/// Number of poses of each pair of [`MOVING`] and [`APART`].
 const STEPS: usize = 4;
 /// The last row of a pose.
 const END: &str = "  0.000  0.000  0.000  1.000\n";
@@ -63,10 +69,12 @@ fn prints_as_tf2_echo(middleware: Middleware) -> Result<()> {
         let _tf2_echo = tf2_echo(&host, source, target)?;
         both_print(&host, source, target, "At time 0.0")?;
     }
-    for (source, target) in MOVING {
+    let moving = MOVING.map(|pair| (pair, "next"));
+    let apart = APART.map(|pair| (pair, "apart"));
+    for ((source, target), stamps) in moving.into_iter().chain(apart) {
         let _tf2_echo = tf2_echo(&host, source, target)?;
         for _ in 0..STEPS {
-            broadcaster.write_line("next")?;
+            broadcaster.write_line(stamps)?;
             let stamp = broadcaster.line_with_end("", PATIENCE)?;
             both_print(&host, source, target, &stamp)?;
         }

@@ -105,6 +105,8 @@ pub struct Writer {
     sampled: Option<Box<Sampled>>,
     /// Time of the last observation from a uprobe in the writer's own process.
     exact: Option<ModelTime>,
+    /// Whether the uprobe's view has ended, and no other view has shown a sample since.
+    has_lost_view: bool,
 }
 
 /// Counters that settling changes.
@@ -139,6 +141,7 @@ impl Writer {
             clock_ahead: 0,
             sampled: None,
             exact: None,
+            has_lost_view: false,
         }
     }
 
@@ -252,10 +255,11 @@ impl Writer {
         sampled.map_or(Duration::ZERO, |sampled| sampled.seeming_silence(slowest))
     }
 
-    /// Returns whether no view has shown any of its samples.
+    /// Returns whether no view has shown any of its samples, or none since the uprobe's view ended.
     #[must_use]
     pub const fn is_unseen(&self) -> bool {
-        self.last_message.is_none() && self.sampled.is_none() && self.exact.is_none()
+        let is_new = self.last_message.is_none() && self.sampled.is_none();
+        self.exact.is_none() && (is_new || self.has_lost_view)
     }
 
     /// Records that bytes between fragments were not captured.
@@ -271,8 +275,8 @@ impl Writer {
     }
 
     /// Ends the exact view of the writer by uprobes.
-    pub const fn end_exact_view(&mut self) {
-        self.exact = None;
+    pub fn end_exact_view(&mut self) {
+        self.has_lost_view |= self.exact.take().is_some();
     }
 
     /// Processes an observation of this writer and returns the message that it completed. `opened`
@@ -299,6 +303,7 @@ impl Writer {
             // The uprobe has reported the sample already, or will report it.
             return None;
         }
+        self.has_lost_view &= !matches!(observation, Observation::Sample(_));
         let takes = self
             .sampled
             .as_mut()

@@ -562,6 +562,26 @@ fn when_uprobes_end_messages_in_shared_memory_count_immediately() {
     assert_eq!((sampled.seen, sampled.span), (2, 3));
 }
 
+#[test]
+fn when_uprobes_end_a_writer_is_unseen_until_another_view_shows_a_sample() {
+    let mut bench = Bench::new(Traits::default());
+    assert!(bench.writer.is_unseen());
+    bench.writer.end_exact_view();
+    bench.put(in_its_process(data(1))).wait(1000);
+    assert!(!bench.writer.is_unseen());
+    for (number, in_view) in [
+        (3, in_shared_memory as fn(Record) -> Record),
+        (5, in_its_process),
+        (7, |record| record),
+    ] {
+        bench.put(in_its_process(data(number - 1))).wait(1000);
+        bench.writer.end_exact_view();
+        assert!(bench.writer.is_unseen(), "{number}");
+        bench.put(in_view(data(number))).wait(1000);
+        assert!(!bench.writer.is_unseen(), "{number}");
+    }
+}
+
 /// Returns a record of a sample in three fragments.
 fn third(number: u64, start: u32) -> Record {
     Record {
