@@ -40,7 +40,9 @@ use crate::surface::ros2_daemon::Ros2Daemon;
 use crate::surface::{Exposition, Format, MetricSources};
 use crate::watches::Watches;
 use crate::{control, file, memory};
-use ros2probe_metrics::otlp::{self, Host, Inputs, NodeLogQueue, NodeLogSink, SpanQueue, SpanSink};
+use ros2probe_metrics::otlp::{
+    self, Endpoint, Host, Inputs, NodeLogQueue, NodeLogSink, SpanQueue, SpanSink,
+};
 use ros2probe_metrics::remote_write;
 
 /// Subdirectory of samples that wait for remote write.
@@ -369,6 +371,13 @@ fn overridden(configured: &Config, options: &Options) -> Config {
     let mut config = configured.clone();
     if let Some(private) = &options.private {
         private.apply(&mut config);
+    }
+    if options.replay.is_some() && options.config.is_none() {
+        // The receivers in the configuration of the installed agent are for the robot's present.
+        config.remote_write.url = None;
+        if let Endpoint::At(_) = config.otlp.endpoint {
+            config.otlp.endpoint = Endpoint::Environment;
+        }
     }
     if let Some(listen) = options.metrics {
         config.metrics.listen = listen.0;
