@@ -4,7 +4,6 @@
 use std::fmt;
 use std::fs;
 use std::os::unix::fs::MetadataExt as _;
-use std::path::PathBuf;
 
 use crate::config::{Config, ShmMode, SourceChoice, StateChoice};
 use crate::memory;
@@ -111,11 +110,7 @@ pub(crate) fn state(choice: &StateChoice) -> Option<Restriction> {
 
 /// Returns the restriction of the state directory, in a container or elsewhere.
 fn unwritable(choice: &StateChoice) -> Option<Restriction> {
-    let path = match choice {
-        StateChoice::Off => return None,
-        StateChoice::At(path) => path.clone(),
-        StateChoice::Auto => PathBuf::from(memory::DEFAULT),
-    };
+    let path = memory::path(choice)?;
     let directory = fs::metadata(&path).ok()?;
     let refusal = access(&path, Access::WRITE_OK).err()?;
     let option = match refusal {
@@ -144,6 +139,8 @@ fn writer(user_id: u32, directory: &fs::Metadata) -> String {
 #[cfg(test)]
 mod tests {
     use std::os::unix::fs::PermissionsExt as _;
+
+    use std::path::PathBuf;
 
     use super::*;
 

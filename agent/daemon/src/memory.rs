@@ -12,7 +12,7 @@ use anyhow::anyhow;
 use ros2probe_model::graph::discovery::Memory;
 
 /// Default directory of the package and of the service manager.
-pub(crate) const DEFAULT: &str = "/var/lib/ros2probe";
+const DEFAULT: &str = "/var/lib/ros2probe";
 /// Variable of the service manager.
 const VARIABLE: &str = "STATE_DIRECTORY";
 /// Subdirectory of recordings.
@@ -23,14 +23,11 @@ pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
     if container::state(choice).is_some() {
         return None;
     }
-    let named = std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
-    let opened = match (choice, named) {
-        (StateChoice::Off, _) => return None,
-        (StateChoice::At(path), _) => StateDirectory::open(path),
-        (StateChoice::Auto, Some(path)) => StateDirectory::open(Path::new(&path)),
-        (StateChoice::Auto, None) if !Path::new(DEFAULT).exists() => return None,
-        (StateChoice::Auto, None) => StateDirectory::open(Path::new(DEFAULT)),
-    };
+    let path = path(choice)?;
+    if *choice == StateChoice::Auto && path == Path::new(DEFAULT) && !path.exists() {
+        return None;
+    }
+    let opened = StateDirectory::open(&path);
     match opened {
         Ok(directory) => Some(Arc::new(directory)),
         Err(error) => {
@@ -40,6 +37,18 @@ pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
                 "state is not saved: a restart loses names and added watches"
             );
             None
+        }
+    }
+}
+
+/// Returns the path of the state directory; `None` if no state is saved.
+pub(crate) fn path(choice: &StateChoice) -> Option<PathBuf> {
+    match choice {
+        StateChoice::Off => None,
+        StateChoice::At(path) => Some(path.clone()),
+        StateChoice::Auto => {
+            let named = std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
+            Some(named.map_or_else(|| PathBuf::from(DEFAULT), PathBuf::from))
         }
     }
 }
