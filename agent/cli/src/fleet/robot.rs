@@ -1,6 +1,6 @@
 //! The state of each robot, from queries about the whole fleet.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
@@ -86,6 +86,7 @@ impl State {
 }
 
 /// Answers of the engine about the whole fleet, by robot.
+#[derive(Default)]
 struct Answers {
     /// Age of the last sample in seconds.
     ages: ByRobot<Samples>,
@@ -162,11 +163,13 @@ impl Answers {
 
     /// Returns the properties of a robot that are compared.
     fn traits(&self, name: &str) -> BTreeMap<String, Trait> {
-        let mut traits = BTreeMap::new();
+        // Several domains, or topics that differ by a number, may have one key. The order in which an
+        // engine returns them is not defined.
+        let mut texts = BTreeMap::<String, BTreeSet<String>>::new();
         // A topic without publishers has no type and no quality of service.
         let mut text = |key: String, text: String| {
             if !text.is_empty() {
-                traits.insert(key, Trait::Text(text));
+                texts.entry(key).or_default().insert(text);
             }
         };
         for (labels, _) in of(&self.versions, name) {
@@ -187,8 +190,11 @@ impl Answers {
             ("publishers", &self.publishers),
             ("subscriptions", &self.subscriptions),
         ] {
+            let mut sums = BTreeMap::<String, f64>::new();
             for (labels, count) in of(counts, name) {
-                let topic = common(labels, "topic", name);
+                *sums.entry(common(labels, "topic", name)).or_default() += count;
+            }
+            for (topic, count) in sums {
                 text(format!("{what} of {topic}"), format!("{count}"));
             }
         }
@@ -198,9 +204,17 @@ impl Answers {
                 text(format!("endpoints with {kind}"), format!("{count}"));
             }
         }
+        let joined = |texts: BTreeSet<String>| texts.into_iter().collect::<Vec<_>>().join(", ");
+        let texts = texts
+            .into_iter()
+            .map(|(key, texts)| (key, Trait::Text(joined(texts))));
+        let mut traits: BTreeMap<_, _> = texts.collect();
         for (labels, rate) in of(&self.rates, name) {
             let key = format!("rate of {}", common(labels, "topic", name));
-            traits.insert(key, Trait::Hertz(*rate));
+            let sum = traits.entry(key).or_insert(Trait::Hertz(0.0));
+            if let Trait::Hertz(sum) = sum {
+                *sum += rate;
+            }
         }
         traits
     }
@@ -324,5 +338,37 @@ mod tests {
         assert_eq!(common("/launch_ros_4711"), "/launch_ros_<number>");
         assert_eq!(common("/camera_2/image"), "/camera_2/image");
         assert_eq!(quoted("a\"b\\"), "\"a\\\"b\\\\\"");
+    }
+
+    #[test]
+    fn traits_of_topics_with_one_key_do_not_depend_on_the_order_of_the_answer() {
+        let labels = |topic: &str, reliability: &str| {
+            let labels = [("topic", topic), ("reliability", reliability)];
+            Labels::from(labels.map(|(name, value)| (name.to_owned(), value.to_owned())))
+        };
+        let mut series = vec![
+            (labels("/camera_001/image", "reliable"), 30.0),
+            (labels("/camera_002/image", "best_effort"), 15.0),
+        ];
+        let mut traits = Vec::new();
+        for _ in 0..2 {
+            series.reverse();
+            let of_robot = BTreeMap::from([("robot".to_owned(), series.clone())]);
+            let answers = Answers {
+                topics: of_robot.clone(),
+                publishers: of_robot.clone(),
+                rates: of_robot,
+                ..Answers::default()
+            };
+            traits.push(answers.traits("robot"));
+        }
+        assert_eq!(traits[0], traits[1]);
+        let of = |key: &str| traits[0][&format!("{key} of /camera_<number>/image")].clone();
+        assert_eq!(
+            of("reliability"),
+            Trait::Text("best_effort, reliable".to_owned())
+        );
+        assert_eq!(of("publishers"), Trait::Text("45".to_owned()));
+        assert_eq!(of("rate"), Trait::Hertz(45.0));
     }
 }
