@@ -19,10 +19,12 @@ const TRIP_EXPIRY: Duration = Duration::from_secs(600);
 const STAMPING: i64 = 500_000;
 /// Messages among which one is expected to be as fast as a round trip.
 const ENOUGH: u32 = 20;
-/// Several messages of a second, all later than the fastest one by `STEP` nanoseconds, show a step
-/// back of the clock or another path.
+/// Several messages of each second, all later than the fastest one by `STEP` nanoseconds, show a
+/// step back of the clock or another path.
 const SEVERAL: u32 = 5;
 const STEP: i64 = 100_000_000;
+/// Number of such seconds. Old messages for a late joiner arrive within one.
+const LATE_SECONDS: u32 = 2;
 
 /// Evidence for the upper bound.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -72,6 +74,8 @@ pub(super) struct Evidence {
     last: ModelTime,
     /// Greatest lower bound of this second, and the number of messages.
     second: Option<(i64, u32)>,
+    /// Consecutive seconds with several messages, all of them late.
+    late_seconds: u32,
     steps: u64,
 }
 
@@ -168,7 +172,7 @@ impl Evidence {
         let (best, messages) = self.second.unwrap_or((ahead, 0));
         self.second = Some((best.max(ahead), messages.saturating_add(1)));
         let window = &mut self.current;
-        let known = window.least.map(|least| least.least(at));
+        let known = window.least(at);
         if known.is_none_or(|known| ahead >= known) {
             window.least = Some(Aged { value: ahead, at });
         }
@@ -195,11 +199,16 @@ impl Evidence {
     /// Ends a second. Returns false once all evidence has expired.
     pub(super) fn end_second(&mut self, now: ModelTime) -> bool {
         let (least, most, _) = self.relative(now);
-        let is_back = self.second.take().is_some_and(|(best, messages)| {
-            let known = least.is_some_and(|least| best < least.saturating_sub(STEP));
-            messages >= SEVERAL && known
-        });
-        if is_back || least.zip(most).is_some_and(|(least, most)| least > most) {
+        if let Some((best, messages)) = self.second.take() {
+            let is_late = least.is_some_and(|least| best < least.saturating_sub(STEP));
+            self.late_seconds = match is_late {
+                true => self.late_seconds + u32::from(messages >= SEVERAL),
+                false => 0,
+            };
+        }
+        if self.late_seconds >= LATE_SECONDS
+            || least.zip(most).is_some_and(|(least, most)| least > most)
+        {
             self.steps += 1;
             *self = Self {
                 began: now,
