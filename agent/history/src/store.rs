@@ -6,6 +6,7 @@ use std::io;
 use std::ops::Range;
 use std::os::unix::fs::DirBuilderExt as _;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::block::{Block, Kind};
@@ -45,6 +46,9 @@ pub struct Store {
     /// Maximum size of all files, in bytes.
     limit: u64,
     tiers: Mutex<[Vec<Blocks>; 2]>,
+    /// Unix time of the last [`Self::condense`]. Blocks that end later are those of a clock that was
+    /// set back.
+    now: AtomicU32,
 }
 
 /// Times from which a tier has blocks.
@@ -124,6 +128,7 @@ impl Store {
             directory: directory.to_path_buf(),
             limit,
             tiers: Mutex::new(tiers),
+            now: AtomicU32::new(u32::MAX),
         })
     }
 
@@ -133,14 +138,18 @@ impl Store {
     ///
     /// Fails if the blocks cannot be written, or if little space is free. The store is as before.
     pub fn append(&self, tier: Tier, blocks: &[Block]) -> io::Result<()> {
-        let Some(begin) = blocks.iter().map(|block| block.begin).min() else {
+        let begin = blocks.iter().map(|block| block.begin).min();
+        let Some((begin, first)) = begin.zip(blocks.first()) else {
             return Ok(());
         };
         prepare(&self.directory)?;
         let budget = tier.budget(self.limit);
         let mut file = match self.files(tier).pop() {
+            // After a step back of the clock, a new file keeps the two times apart.
             Some(last)
-                if last.length < budget / FILES && begin.abs_diff(last.begin) < tier.span() =>
+                if last.length < budget / FILES
+                    && begin.abs_diff(last.begin) < tier.span()
+                    && (tier == Tier::Seconds || first.begin >= last.end) =>
             {
                 last
             }
@@ -177,12 +186,13 @@ impl Store {
     }
 
     /// Merges rows of [`Tier::Seconds`] into [`Tier::Tens`], for each ten minutes that have passed
-    /// at the time `now`.
+    /// at the time `now`: at most [`MAX_WINDOWS`] of them in one call.
     ///
     /// # Errors
     ///
     /// Fails if the blocks cannot be written.
     pub fn condense(&self, now: u32) -> io::Result<()> {
+        self.now.store(now, Ordering::Relaxed);
         for _ in 0..MAX_WINDOWS {
             let Some(times) = self.next_window(now) else {
                 return Ok(());
@@ -320,7 +330,7 @@ impl Store {
     /// Returns which tier has which part of the times.
     fn parts(&self, times: Range<u32>, step: u32) -> [(Tier, Range<u32>); 2] {
         let border = if step >= TEN {
-            self.condensed(times.end)
+            self.condensed(self.now.load(Ordering::Relaxed))
         } else {
             let files = self.files(Tier::Seconds);
             files.iter().map(|file| file.begin).min().unwrap_or(0)
@@ -334,7 +344,7 @@ impl Store {
     /// those of a clock that was set back.
     fn condensed(&self, now: u32) -> u32 {
         let files = self.files(Tier::Tens);
-        let past = files.iter().filter(|file| file.begin <= now);
+        let past = files.iter().filter(|file| file.end <= now);
         past.map(|file| file.end).max().unwrap_or(0)
     }
 

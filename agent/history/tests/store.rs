@@ -199,6 +199,17 @@ fn a_clock_that_was_in_the_future_does_not_end_the_history() {
 }
 
 #[test]
+fn a_clock_that_was_some_minutes_ahead_hides_no_rows_of_the_right_time() {
+    let directory = tempfile::tempdir().unwrap();
+    drop(filled(directory.path(), LIMIT, 1000..1010));
+    drop(filled(directory.path(), LIMIT, 1060..1090));
+    let store = filled(directory.path(), LIMIT, 1040..1058);
+    assert_eq!(rows(&store, 62_400..63_480, 1).len(), 1080);
+    // Ten minutes are merged, and eight are not yet.
+    assert_eq!(rows(&store, 62_400..63_480, 10).len(), 60 + 480);
+}
+
+#[test]
 fn the_first_write_creates_the_directory_for_its_owner_alone() {
     use std::os::unix::fs::PermissionsExt as _;
     let parent = tempfile::tempdir().unwrap();
