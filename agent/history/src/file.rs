@@ -64,6 +64,19 @@ impl Blocks {
 
     /// Appends blocks as a whole. After a failure the file is as before.
     pub(crate) fn append(&mut self, blocks: &[Block]) -> io::Result<()> {
+        self.write(blocks, |_| Ok(()))
+    }
+
+    /// Appends blocks as [`Self::append`] does, and waits until they are on disk.
+    pub(crate) fn append_durably(&mut self, blocks: &[Block]) -> io::Result<()> {
+        self.write(blocks, File::sync_data)
+    }
+
+    fn write(
+        &mut self,
+        blocks: &[Block],
+        finish: impl Fn(&File) -> io::Result<()>,
+    ) -> io::Result<()> {
         let mut bytes = Vec::new();
         for block in blocks {
             bytes.append(&mut block.stored()?);
@@ -72,7 +85,7 @@ impl Blocks {
         // This also removes what a write that failed has left.
         file.set_len(self.length)?;
         file.seek(SeekFrom::Start(self.length))?;
-        if let Err(error) = file.write_all(&bytes) {
+        if let Err(error) = file.write_all(&bytes).and_then(|()| finish(&file)) {
             let _ = file.set_len(self.length);
             return Err(error);
         }

@@ -68,7 +68,8 @@ impl Queue {
     ///
     /// Fails if the directory cannot be read.
     pub fn open(directory: &Path, limit: u64) -> io::Result<Self> {
-        let waiting = kept_place(directory).unwrap_or(Place(0, 0));
+        let kept = kept_place(directory);
+        let waiting = kept.unwrap_or(Place(0, 0));
         let mut found = Vec::new();
         match fs::read_dir(directory) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {}
@@ -97,7 +98,8 @@ impl Queue {
             directory: directory.to_path_buf(),
             limit,
             files: files.collect(),
-            next: next.max(waiting.0),
+            // Records of a new file all wait, also if the kept place is after the end of its file.
+            next: kept.map_or(next, |kept| next.max(kept.0.saturating_add(1))),
             continues: false,
             waiting,
             reading: Place(0, FIRST_PLACE),
@@ -154,7 +156,10 @@ impl Queue {
             let number = self.next;
             let path = self.directory.join(format!("{number:010}.{EXTENSION}"));
             let mut blocks = Blocks::create(path, at)?;
-            if let Err(error) = blocks.append(&[block]) {
+            let appended = blocks.append_durably(&[block]);
+            // The power may fail at any time: the file's name must be on disk, too.
+            let appended = appended.and_then(|()| fs::File::open(&self.directory)?.sync_all());
+            if let Err(error) = appended {
                 let _ = fs::remove_file(&blocks.path);
                 return Err(error);
             }
@@ -162,7 +167,7 @@ impl Queue {
             self.files.push_back(Numbered { number, blocks });
             self.continues = true;
         } else if let Some(last) = self.files.back_mut() {
-            last.blocks.append(&[block])?;
+            last.blocks.append_durably(&[block])?;
         }
         while self.files.len() > 1 && (self.bytes() > self.limit || self.files.len() > MAX_FILES) {
             self.lose_oldest(lost);
@@ -172,35 +177,47 @@ impl Queue {
 
     /// Returns the next record; `None` after the last one. After [`Self::open`] this begins with
     /// the first record of the oldest file, which may no longer wait.
-    pub fn read(&mut self) -> Option<Record> {
+    ///
+    /// # Errors
+    ///
+    /// Fails if a file cannot be opened. The next call tries again.
+    pub fn read(&mut self) -> io::Result<Option<Record>> {
         loop {
-            let front = self.files.front()?.number;
-            self.reading = self.reading.max(Place(front, FIRST_PLACE));
-            let of_reading = self
-                .files
-                .iter()
-                .find(|file| file.number >= self.reading.0)?;
+            let Some(front) = self.files.front() else {
+                return Ok(None);
+            };
+            self.reading = self.reading.max(Place(front.number, FIRST_PLACE));
+            let mut files = self.files.iter();
+            let Some(of_reading) = files.find(|file| file.number >= self.reading.0) else {
+                return Ok(None);
+            };
             if of_reading.number > self.reading.0 {
                 self.reading = Place(of_reading.number, FIRST_PLACE);
             }
             let is_last = Some(of_reading.number) == self.files.back().map(|file| file.number);
             let blocks = &of_reading.blocks;
-            if let Ok(mut reader) = Reader::open(&blocks.path, blocks.length) {
+            let reader = match Reader::open(&blocks.path, blocks.length) {
+                Ok(reader) => Some(reader),
+                // Somebody has deleted the file.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => None,
+                Err(error) => return Err(error),
+            };
+            if let Some(mut reader) = reader {
                 reader.place = self.reading.1;
                 while let Some((header, place)) = reader.next() {
                     self.reading.1 = reader.place;
                     if let Some(block) = reader.block(&header, place) {
-                        return Some(Record {
+                        return Ok(Some(Record {
                             at: block.end,
                             content: block.content,
                             is_first: place == FIRST_PLACE,
                             is_waiting: Place(self.reading.0, place) >= self.waiting,
-                        });
+                        }));
                     }
                 }
             }
             if is_last {
-                return None;
+                return Ok(None);
             }
             self.reading = Place(self.reading.0.saturating_add(1), FIRST_PLACE);
         }
@@ -243,7 +260,7 @@ impl Queue {
         while self.reading.0 == number {
             let place = self.reading;
             match self.read() {
-                Some(mut record) if self.reading.0 == number => {
+                Ok(Some(mut record)) if self.reading.0 == number => {
                     record.is_waiting &= place >= reached;
                     lost(record);
                 }

@@ -6,6 +6,7 @@
 //! sudden end loses none that are on disk.
 
 use std::collections::VecDeque;
+use std::io;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -128,9 +129,16 @@ impl Backlog {
             samples >= REQUEST_SAMPLES
         };
         if let Some(disk) = &mut self.disk {
-            while batch.len() < REQUEST_SCRAPES
-                && let Some(scrape) = disk.read()
-            {
+            let mut is_read = Ok(());
+            while batch.len() < REQUEST_SCRAPES {
+                let scrape = match disk.read() {
+                    Ok(Some(scrape)) => scrape,
+                    Ok(None) => break,
+                    Err(error) => {
+                        is_read = Err(error);
+                        break;
+                    }
+                };
                 let is_last = is_full(&scrape);
                 batch.push(Arc::new(scrape));
                 if is_last {
@@ -139,6 +147,11 @@ impl Backlog {
             }
             if !batch.is_empty() {
                 self.taken = Taken::Disk;
+                return batch;
+            }
+            if let Err(error) = is_read {
+                // The samples in memory are newer, and wait as well.
+                tracing::warn!(%error, "cannot read samples for remote write from disk");
                 return batch;
             }
             // No record that is left can be read.
@@ -163,8 +176,10 @@ impl Backlog {
             Taken::Memory(count) => drop(self.memory.drain(..count.min(self.memory.len()))),
             Taken::Written(count) => {
                 if let Some(disk) = &mut self.disk {
-                    for _ in 0..count {
-                        disk.read();
+                    // What cannot be read now is delivered again.
+                    let mut left = count;
+                    while left > 0 && matches!(disk.read(), Ok(Some(_))) {
+                        left -= 1;
                     }
                     disk.queue.remove();
                 }
@@ -213,9 +228,13 @@ impl Disk {
             record,
             &mut |Record {
                       content,
+                      is_first,
                       is_waiting,
                       ..
                   }| {
+                if is_first {
+                    of_file = Reader::default();
+                }
                 let scrape = of_file.scrape(&content).filter(|_| is_waiting);
                 scrape
                     .into_iter()
@@ -233,10 +252,12 @@ impl Disk {
         self.works
     }
 
-    /// Returns the next waiting scrape.
-    fn read(&mut self) -> Option<Scrape> {
+    /// Returns the next waiting scrape; `None` after the last one.
+    fn read(&mut self) -> io::Result<Option<Scrape>> {
         loop {
-            let record = self.queue.read()?;
+            let Some(record) = self.queue.read()? else {
+                return Ok(None);
+            };
             if record.is_first {
                 self.reader = Reader::default();
             }
@@ -244,7 +265,7 @@ impl Disk {
             if let Some(scrape) = self.reader.scrape(&record.content)
                 && record.is_waiting
             {
-                return Some(scrape);
+                return Ok(Some(scrape));
             }
         }
     }
@@ -342,27 +363,29 @@ mod tests {
         assert_eq!(drained(&mut backlog), (1..=72).collect::<Vec<_>>());
     }
 
+    /// Returns a scrape of 2,000 samples whose values do not compress.
+    fn incompressible(at: i64) -> Scrape {
+        let mut scrape = scrape(at);
+        let mut random = at.cast_unsigned() + 1;
+        let samples = (0..2_000_u32).map(|series| {
+            random = random.wrapping_mul(0x5851_f42d_4c95_7f2d).wrapping_add(1);
+            let key: Key = series.to_le_bytes().into();
+            (key, f64::from_bits(random >> 2))
+        });
+        scrape.samples = samples.collect();
+        scrape
+    }
+
     #[test]
     fn a_full_queue_counts_what_it_loses_once() {
         let directory = tempfile::tempdir().unwrap();
         let mut backlog = Backlog::default();
         backlog.open(directory.path(), 1 << 20);
-        // The values do not compress, and each scrape has 2,000 of them.
-        let wide = |at: i64| {
-            let mut scrape = scrape(at);
-            let mut random = at.cast_unsigned() + 1;
-            scrape.samples = (0..2_000_u32)
-                .map(|series| {
-                    random = random.wrapping_mul(0x5851_f42d_4c95_7f2d).wrapping_add(1);
-                    let key: Key = series.to_le_bytes().into();
-                    (key, f64::from_bits(random >> 2))
-                })
-                .collect();
-            scrape
-        };
-        backlog.add(wide(0), true);
+        backlog.add(incompressible(0), true);
         let taken = backlog.take();
-        let lost: u64 = (1..200).map(|at| backlog.add(wide(at), false)).sum();
+        let lost: u64 = (1..200)
+            .map(|at| backlog.add(incompressible(at), false))
+            .sum();
         assert!(backlog.disk_bytes() <= 1 << 20);
         // The receiver answers at last: the request has what was first.
         assert_eq!(times(&taken), [0]);
@@ -373,6 +396,23 @@ mod tests {
         assert!(missing > 50);
         let expected = 199 - i64::try_from(left.len()).unwrap()..199;
         assert_eq!(left, expected.map(|at| at + 1).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_smaller_limit_after_a_restart_counts_each_sample_that_is_lost() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut backlog = Backlog::default();
+        backlog.open(directory.path(), 1 << 20);
+        let numbers = 0..100;
+        let lost: u64 = numbers
+            .map(|at| backlog.add(incompressible(at), false))
+            .sum();
+        let mut backlog = Backlog::default();
+        backlog.open(directory.path(), 1 << 17);
+        let lost = lost + backlog.add(incompressible(100), false);
+        let left = drained(&mut backlog).len() as u64;
+        assert!(left > 0 && lost > 0, "{left} {lost}");
+        assert_eq!(lost, (101 - left) * 2_000);
     }
 
     #[test]

@@ -53,6 +53,9 @@ pub(super) enum Answer {
     Refused(String, Option<u64>),
     /// The receiver does not know this version.
     UnknownVersion,
+    /// A success that does not state what was written: of a receiver that does not know version 2.0,
+    /// or of something between it and the robot.
+    Unconfirmed,
 }
 
 impl Client {
@@ -75,8 +78,8 @@ impl Client {
     pub(super) fn renew(&mut self) -> Result<(), SettingsError> {
         let files = self.settings.changed();
         if files != self.files {
-            self.files = files;
             self.connections = connections(&self.settings)?;
+            self.files = files;
         }
         Ok(())
     }
@@ -194,8 +197,13 @@ fn answer(response: &Response<Bytes>, version: Version) -> Answer {
         status,
         StatusCode::UNSUPPORTED_MEDIA_TYPE | StatusCode::BAD_REQUEST
     );
-    if version == Version::Two && written.is_none() && (status.is_success() || is_old) {
-        return Answer::UnknownVersion;
+    if version == Version::Two && written.is_none() {
+        if is_old {
+            return Answer::UnknownVersion;
+        }
+        if status.is_success() {
+            return Answer::Unconfirmed;
+        }
     }
     if status.is_success() {
         return Answer::Accepted;
@@ -261,7 +269,8 @@ mod tests {
         let again = |text: &str, pause| Answer::Again(text.to_owned(), pause);
         assert_eq!(one(&reply(204, &[], "")), Answer::Accepted);
         assert_eq!(two(&reply(204, &[(WRITTEN, "3")], "")), Answer::Accepted);
-        for status in [204, 400, 415] {
+        assert_eq!(two(&reply(204, &[], "")), Answer::Unconfirmed);
+        for status in [400, 415] {
             assert_eq!(two(&reply(status, &[], "")), Answer::UnknownVersion);
         }
         let old = one(&reply(400, &[], "out of order\n"));

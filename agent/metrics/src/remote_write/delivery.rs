@@ -277,10 +277,18 @@ impl Sender<'_> {
                 self.failed(&error.to_string());
             }
             let length = body.len();
-            let answer = self.client.send(body.clone(), self.version).await;
+            let answer = match self.client.send(body.clone(), self.version).await {
+                // A receiver of version 2.0 states it, but the portal of a network does not.
+                Answer::Unconfirmed if self.is_known => {
+                    let reason = "a success without the number of written samples";
+                    Answer::Again(reason.to_owned(), None)
+                }
+                Answer::Unconfirmed => Answer::UnknownVersion,
+                answer => answer,
+            };
             let figures = &self.job.figures;
             match answer {
-                Answer::UnknownVersion => {
+                Answer::UnknownVersion | Answer::Unconfirmed => {
                     figures.count_request(Request::Retried, length);
                     self.version = Version::One;
                     body = self.body(part);
@@ -336,7 +344,8 @@ impl Sender<'_> {
         }
     }
 
-    /// Logs the first failure until a request succeeds again.
+    /// Handles a failed request: logs the first failure until a request succeeds again, and writes
+    /// the samples in memory to disk.
     fn failed(&mut self, reason: &str) {
         let is_first = self.works != Some(false);
         self.works = Some(false);
