@@ -78,11 +78,11 @@ impl History {
             return;
         };
         let (stamp, kept) = (stamp_of(stamp), KEPT.as_nanos() as Stamp);
-        let newest = poses.back().map_or(stamp, |last| last.stamp);
-        if stamp < newest - kept {
+        if poses.back().is_some_and(|last| stamp < last.stamp - kept) {
             // The broadcasters' clock went back, as at the start of another simulation.
             poses.clear();
         }
+        let newest = poses.back().map_or(stamp, |last| last.stamp);
         let place = poses.partition_point(|other| other.stamp < stamp);
         // The first transform of a stamp counts.
         if poses.get(place).is_some_and(|other| other.stamp == stamp) {

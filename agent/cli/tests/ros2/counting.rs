@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Context as _, Result};
 use ros2probe_api::measurement::Delivered;
 use ros2probe_api::topics::TopicDetails;
 use ros2probe_testing::harness::agent::{Agent, get};

@@ -119,7 +119,6 @@ fn an_agent_that_starts_last_learns_the_topics_from_a_command() -> Result<()> {
 
     // The saved state has the topics.
     std::thread::sleep(std::time::Duration::from_secs(8));
-    let mut agent = agent;
     agent.process.signal("KILL")?;
     drop(agent);
     publish(&mut sensor, 100, 1400)?;
