@@ -31,8 +31,9 @@ const NETWORK: &str = "ip link set lo multicast on up && \
     ip link add robot type veth peer name unplugged && ip link set unplugged up && \
     ip addr add 10.99.0.1/24 dev robot && ip link set robot up && \
     ip route add 239.0.0.0/8 dev robot";
-/// Prints each path with its type, mode, owner and target, and each checksum below `/etc`, but for
-/// what is in memory, logs, caches of apt, backups, and what systemd writes while it runs.
+/// Prints each path with its type, mode, owner and target, and the checksum of each file in `/etc`.
+/// Left out are file systems in memory, logs, caches of apt, backups, and files that systemd writes
+/// while it runs.
 const TRACE: &str = r"find / -xdev \( -path /proc -o -path /sys -o -path /dev -o -path /run -o -path /tmp \
     -o -path /packages -o -path /var/log -o -path /var/cache/apt -o -path /var/lib/apt \
     -o -path '/var/lib/dpkg/*-old' -o -path /var/lib/systemd/timers -o -path /var/lib/systemd/random-seed \

@@ -104,8 +104,8 @@ impl Debian {
         self.first
     }
 
-    /// Returns the command prefix that runs a program of this machine on the host's network, and in a
-    /// control group below the host's root, which systemd-nspawn calls `payload`.
+    /// Returns the command prefix that runs a program of this machine on the host's network and in a
+    /// control group of the host. systemd-nspawn names the root of these groups `payload`.
     pub(crate) fn beside(&self) -> Vec<String> {
         let enter = "mkdir -p \"$0\" && echo 0 >\"$0/cgroup.procs\" && exec \"$@\"";
         let group = self
