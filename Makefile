@@ -133,6 +133,7 @@ release: ## what a maintainer publishes, in target/publish: make dist, wheels, i
 	@$(MAKE) --no-print-directory dist
 	packaging/release.sh $(if $(TRIAL),--trial)
 	@$(MAKE) --no-print-directory -C agent/cli/tests/peers OUT=$(TARGET)/peers $(TARGET)/peers/fastdds
+	cargo build --package ros2probe --example robot
 	ROS2PROBE_DIST=$(TARGET)/publish ROS2PROBE_PACKAGES=$(TARGET)/publish cargo test --package ros2probe --test dist -- --include-ignored publish::
 
 vm: ## boot whole systems, install the package in each and check it; VM="arm64-6.1 ..." chooses (needs root)

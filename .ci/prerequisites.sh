@@ -240,12 +240,13 @@ musl() {
     done
 }
 
-# A fresh Debian for installing the package: its containers do not modify it. Ansible needs python3-apt.
+# A fresh Debian for installing the package: its containers do not modify it. Ansible needs python3-apt,
+# and wheels python3-venv.
 debian() {
-    local place=$tools/debian more=dbus,python3-apt,systemd,systemd-sysv
+    local place=$tools/debian more=dbus,python3-apt,python3-venv,systemd,systemd-sysv
     [ "$(cat "$place/complete" 2>/dev/null)" = "$more" ] && return
     packages debootstrap debian-archive-keyring systemd-container man-db
-    say "making a Debian 12 system in target/tools/debian (as root, 320 MB)"
+    say "making a Debian 12 system in target/tools/debian (as root, 340 MB)"
     as_root rm -rf "$place"
     mkdir -p "$place"
     as_root debootstrap --variant=minbase --include=$more bookworm "$place" >"$tools/debian.log" ||
@@ -520,7 +521,7 @@ for need; do
         podman
         qemu
         debian
-        python_packages wheels "twine==7.0.0" "check-wheel-contents==0.6.3"
+        python_packages wheels "twine==7.0.0" "check-wheel-contents==0.6.3" "uv==0.13.9" "pipx==1.18.4"
         ;;
     vm)
         other=aarch64

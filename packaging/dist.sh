@@ -54,7 +54,9 @@ flags() {
     printf '%s\n' "-Clinker=rust-lld" \
         "--remap-path-prefix=$root=/ros2probe" "--remap-path-prefix=$target=/ros2probe/target" \
         "--remap-path-prefix=$sysroot/lib/rustlib/src/rust=/rustc/$commit"
-    for registry in "${CARGO_HOME:-$HOME/.cargo}"/registry/src/*/; do
+    # A name that begins with a dash is of a registry that `cargo package` makes for itself. Another
+    # set of flags would compile all crates again.
+    for registry in "${CARGO_HOME:-$HOME/.cargo}"/registry/src/[!-]*/; do
         printf '%s\n' "--remap-path-prefix=${registry%/}=/crates"
     done
 }

@@ -22,7 +22,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from deb import CONFIGURATION, COPYRIGHT, LIBRARIES, PROGRAM, Package
-from sources import REPOSITORY, ROOT
+from sources import LICENCE, REPOSITORY, ROOT
 
 TIME = int(os.environ["SOURCE_DATE_EPOCH"])
 CREATED = datetime.fromtimestamp(TIME, timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -134,7 +134,7 @@ def main(path, commit, *packages):
         "org.opencontainers.image." + name: value
         for name, value in {
             "created": CREATED, "description": packages[0].fields["Description"].splitlines()[0],
-            "documentation": REPOSITORY + "/blob/main/docs/containers.md", "licenses": "Apache-2.0 OR MIT",
+            "documentation": REPOSITORY + "/blob/main/docs/containers.md", "licenses": LICENCE,
             "revision": commit, "source": REPOSITORY, "title": "ros2probe", "version": version,
         }.items()}
     layout = Layout()

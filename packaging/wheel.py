@@ -17,8 +17,8 @@ import zipfile
 from datetime import datetime, timezone
 from pathlib import Path
 
-from deb import LIBRARIES, PROGRAM, Package
-from sources import REPOSITORY, ROOT
+from deb import COPYRIGHT, LIBRARIES, PROGRAM, Package
+from sources import LICENCE, REPOSITORY, ROOT
 
 MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 
@@ -28,9 +28,10 @@ Name: ros2probe
 Version: {version}
 Summary: {summary}
 Author-email: {maintainer}
-License-Expression: Apache-2.0 OR MIT
+License-Expression: {licence}
 License-File: LICENSE-APACHE
 License-File: LICENSE-MIT
+License-File: copyright
 License-File: libraries.txt
 Keywords: ros2,dds,rtps,zenoh,observability,ebpf,prometheus
 Classifier: Environment :: Console
@@ -68,7 +69,7 @@ def main(package, directory):
     name = f"ros2probe-{package.version}"
     tags = "".join(f"Tag: py3-none-{platform}\n" for platform in platforms)
     metadata = METADATA.format(
-        version=package.version, repository=REPOSITORY, maintainer=package.fields["Maintainer"],
+        version=package.version, licence=LICENCE, repository=REPOSITORY, maintainer=package.fields["Maintainer"],
         summary=package.fields["Description"].splitlines()[0], description=description())
     files = [
         (f"{name}.data/scripts/rp", package.read(PROGRAM), 0o755),
@@ -76,6 +77,7 @@ def main(package, directory):
         (f"{name}.dist-info/WHEEL", (WHEEL + tags).encode(), 0o644),
         (f"{name}.dist-info/licenses/LICENSE-APACHE", (ROOT / "LICENSE-APACHE").read_bytes(), 0o644),
         (f"{name}.dist-info/licenses/LICENSE-MIT", (ROOT / "LICENSE-MIT").read_bytes(), 0o644),
+        (f"{name}.dist-info/licenses/copyright", package.read(COPYRIGHT), 0o644),
         (f"{name}.dist-info/licenses/libraries.txt", gzip.decompress(package.read(LIBRARIES)), 0o644),
     ]
     # The record lists itself without a checksum, as the specification of wheels requires.

@@ -46,6 +46,8 @@ pub enum Group {
 pub enum Verdict {
     /// It held.
     Passed,
+    /// It may not have held, which does not fail.
+    Warned,
     /// It did not hold.
     Failed,
     /// It could not be judged.
@@ -96,6 +98,7 @@ impl Verdict {
     pub const fn name(self) -> &'static str {
         match self {
             Self::Passed => "passed",
+            Self::Warned => "warning",
             Self::Failed => "failed",
             Self::Skipped => "not judged",
         }
@@ -190,20 +193,24 @@ impl Judgement<'_> {
     }
 
     /// Returns whether the run could be judged at all. A run that nothing observed never passes.
-    fn observation(&self) -> [Condition; 3] {
+    fn observation(&self) -> [Condition; 4] {
         let agent = match &self.run.agent_ended {
             Some((time, reason)) => {
                 let detail = format!("the agent ended after {time:.1} s: {reason}");
                 self.condition(Group::Observation, "agent", Verdict::Failed, detail)
             }
             None => {
-                let detail = match self.seen.dropped {
-                    0 => "it observed the whole run".to_owned(),
-                    many => format!("it dropped {many} packets, so counts are lower bounds"),
-                };
+                let detail = "it observed the whole run";
                 self.condition(Group::Observation, "agent", Verdict::Passed, detail)
             }
         };
+        let missed = self.seen.missed(self.until);
+        let (verdict, detail) = match (missed.is_empty(), self.rules.is_strict) {
+            (true, _) => (Verdict::Passed, "the agent missed nothing".to_owned()),
+            (false, false) => (Verdict::Warned, missed.join("; ")),
+            (false, true) => (Verdict::Failed, missed.join("; ")),
+        };
+        let completeness = self.condition(Group::Observation, "completeness", verdict, detail);
         let (count, domain_id) = (self.seen.participants, self.run.domain_id);
         let participants = match count {
             0 => {
@@ -230,7 +237,7 @@ impl Judgement<'_> {
             );
             self.condition(Group::Observation, "judged time", Verdict::Failed, detail)
         };
-        [agent, participants, time]
+        [agent, completeness, participants, time]
     }
 
     fn expectations(&self, pattern: &str, name: &str, expected: &Expected) -> Vec<Condition> {
@@ -353,6 +360,7 @@ fn sentence(found: &Finding, why: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_api::health::{Health, Limit};
     use ros2probe_api::live::{self, Line};
 
     use super::super::observation::tests::{RULES, graph, row, values};
@@ -417,6 +425,86 @@ mod tests {
         };
         let conditions = judge(&ended, &observed(RULES, 0));
         assert_eq!(failed(&conditions), [("observation", "agent")]);
+    }
+
+    #[test]
+    fn what_the_agent_missed_is_a_warning_and_fails_a_strict_run() {
+        let limit = |key: &'static str, reached| Limit {
+            limit: key.into(),
+            reached,
+            ..Limit::default()
+        };
+        let health = Health {
+            dropped_packets: 7,
+            contended_datagrams: 2,
+            // Clients of the agent hide nothing of the robot.
+            limits: vec![
+                limit("topics", 3),
+                limit("api_clients", 5),
+                limit("flows", 0),
+            ],
+            ..Health::default()
+        };
+        for (is_strict, expected) in [(false, Verdict::Warned), (true, Verdict::Failed)] {
+            let mut seen = observed(Rules { is_strict, ..RULES }, 0);
+            let of = |seen: &Observation| {
+                let all = judge(&run(20.0), seen).into_iter();
+                let mut found = all.filter(|it| it.name == "completeness");
+                found.next().unwrap()
+            };
+            assert_eq!(of(&seen).verdict, Verdict::Passed);
+            seen.health(&Health::default());
+            assert_eq!(of(&seen).verdict, Verdict::Passed);
+            seen.health(&health);
+            let Condition {
+                verdict, detail, ..
+            } = of(&seen);
+            assert_eq!(verdict, expected);
+            assert!(
+                detail.starts_with("the agent dropped 9 packets"),
+                "{detail}"
+            );
+            assert!(
+                detail.contains("; limits.topics was reached, and 3 entries"),
+                "{detail}"
+            );
+            assert!(
+                !detail.contains("api_clients") && !detail.contains("flows"),
+                "{detail}"
+            );
+        }
+    }
+
+    #[test]
+    fn writers_that_stay_unknown_are_a_warning() {
+        let unknown = live::Finding {
+            id: "unknown_writers|".to_owned(),
+            kind: "unknown_writers".into(),
+            severity: live::Severity::Warning,
+            domain_id: None,
+            topic: None,
+            node: None,
+            since: None,
+            text: "Writers are active whose announcement was missed".to_owned(),
+            remedy: None,
+            writer: None,
+            reader: None,
+            policies: Vec::new(),
+        };
+        // At the start they are usual, because announcements follow.
+        for (last, expected) in [(4_u8, Verdict::Passed), (8, Verdict::Warned)] {
+            let mut seen = Observation::new(RULES, 0);
+            seen.line(graph(1, &["/a"]), 0.0);
+            for second in 1..=20_u8 {
+                let present = (second <= last).then(|| unknown.clone());
+                seen.line(Line::Findings(present.into_iter().collect()), second.into());
+                seen.line(values(vec![row(0, u64::from(second), 0)]), second.into());
+            }
+            let conditions = judge(&run(20.0), &seen);
+            let mut found = conditions.iter().filter(|it| it.name == "completeness");
+            assert_eq!(found.next().unwrap().verdict, expected);
+            assert_eq!(failed(&conditions), []);
+        }
     }
 
     #[test]

@@ -104,6 +104,9 @@ fn case(writer: &mut Writer<Vec<u8>>, condition: &Condition) -> io::Result<()> {
                     .create_element("skipped")
                     .with_attribute(("message", first))
                     .write_empty()?,
+                Verdict::Warned => writer
+                    .create_element("system-out")
+                    .write_text_content(BytesText::new(&format!("warning: {detail}")))?,
                 Verdict::Passed => writer
                     .create_element("system-out")
                     .write_text_content(BytesText::new(&detail))?,
@@ -140,6 +143,7 @@ mod tests {
         let hostile = "/a\"><script>alert('1')</script>\u{0}&amp;";
         let conditions = [
             condition(Group::Command, "sh -c 'a < b'", Verdict::Passed),
+            condition(Group::Observation, "completeness", Verdict::Warned),
             condition(Group::Expectations, hostile, Verdict::Skipped),
             condition(Group::Loss, hostile, Verdict::Failed),
         ];
@@ -171,8 +175,10 @@ mod tests {
             }
         }
         let shown = hostile.replace('\u{0}', "\\u{0}");
-        assert_eq!(names, ["sh -c 'a < b'", &shown, &shown]);
-        assert_eq!(counts, ["3", "1", "1"]);
+        assert_eq!(names, ["sh -c 'a < b'", "completeness", &shown, &shown]);
+        assert_eq!(counts, ["4", "1", "1"]);
+        // Readers of JUnit have no warnings: it is the output of a case that passed.
+        assert!(text.contains("<system-out>warning: &lt;/failure"), "{text}");
         assert!(
             !text.contains("<script>") && !text.contains('\u{1b}'),
             "{text}"

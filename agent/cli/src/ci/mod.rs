@@ -26,6 +26,8 @@ pub struct Rules {
     pub fail_on: FailOn,
     /// Messages that the worst subscriber of a topic may lose; `None` is unlimited.
     pub max_lost: Option<u64>,
+    /// A part of the run that the agent missed fails, and is no mere warning.
+    pub is_strict: bool,
 }
 
 /// Findings that fail.

@@ -4,8 +4,10 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
 use ros2probe_api::Open;
+use ros2probe_api::health::Health;
 use ros2probe_api::live::{self, Graph, Line, Row, Severity};
 use ros2probe_api::watches::{Expectations, Origin, TopicState, WatchList, WatchedTopic};
+use ros2probe_daemon::config::Limit;
 use ros2probe_daemon::escape::visible;
 
 use super::Rules;
@@ -20,6 +22,9 @@ const MAX_FINDINGS: usize = 1024;
 const MAX_EDGES: usize = 8192;
 /// Maximum number of pairs of a watch and a topic over a run.
 const MAX_EXPECTED: usize = 2048;
+
+/// Kinds of findings about messages that the agent does not see.
+const UNSEEN: [&str; 3] = ["observation_suspended", "unknown_writers", "zenoh_unseen"];
 
 /// Kinds of findings that other conditions judge.
 const JUDGED_ELSEWHERE: [&str; 3] = ["loss", "watch_violated", "watch_silent"];
@@ -41,8 +46,10 @@ pub struct Observation {
     pub nodes: BTreeSet<String>,
     /// Greatest number of participants at once.
     pub participants: usize,
-    /// Packets, records and datagrams that the agent dropped.
+    /// Packets, records and datagrams that the agent dropped or skipped since its start.
     pub dropped: u64,
+    /// Times that the agent refused or evicted an entry since its start, by the key of the limit.
+    pub reached: BTreeMap<&'static str, u64>,
     /// Topics, findings, pairs of a node and a topic, or of a watch and a topic, beyond the caps.
     pub left_out: u64,
     /// The latest state of the stream.
@@ -132,6 +139,7 @@ impl Observation {
             nodes: BTreeSet::new(),
             participants: 0,
             dropped: 0,
+            reached: BTreeMap::new(),
             left_out: 0,
             present: Present::default(),
             departures: Vec::new(),
@@ -148,7 +156,6 @@ impl Observation {
     pub fn line(&mut self, line: Line<'_>, now: f64) -> bool {
         match line {
             Line::Graph(graph) => self.graph(&graph, now),
-            Line::Agent(agent) => self.dropped = agent.dropped,
             Line::Findings(findings) => self.found(findings),
             Line::Values(values) => {
                 for row in values.topics {
@@ -157,9 +164,49 @@ impl Observation {
                 self.second(now);
                 return true;
             }
-            Line::Open(_) | Line::History(_) | Line::Events(_) | Line::End(_) => {}
+            Line::Open(_) | Line::Agent(_) | Line::History(_) | Line::Events(_) | Line::End(_) => {}
         }
         false
+    }
+
+    /// Takes the counters of what the agent missed.
+    pub fn health(&mut self, health: &Health) {
+        self.dropped = health.dropped();
+        for limit in &health.limits {
+            let known = Limit::find(&limit.limit).filter(|known| known.blinds());
+            if let Some(known) = known.filter(|_| limit.reached > 0) {
+                self.reached.insert(known.key(), limit.reached);
+            }
+        }
+    }
+
+    /// Returns a sentence for each part of the run that the agent missed. Findings count from the
+    /// time to settle until `until`.
+    pub fn missed(&self, until: f64) -> Vec<String> {
+        let mut missed = Vec::new();
+        if self.dropped > 0 {
+            let dropped = self.dropped;
+            missed.push(format!(
+                "the agent dropped {dropped} packets, so counts are lower bounds: raise \
+                 capture.ring_bytes and capture.record_ring_bytes of --expect"
+            ));
+        }
+        for (key, count) in &self.reached {
+            missed.push(format!(
+                "limits.{key} was reached, and {count} entries were refused or evicted: raise it \
+                 in --expect"
+            ));
+        }
+        if self.left_out > 0 {
+            let left_out = self.left_out;
+            missed.push(format!("{left_out} names are left out: the report is full"));
+        }
+        let unseen = self
+            .findings
+            .values()
+            .filter(|found| UNSEEN.contains(&&*found.kind) && found.seconds.judged(until) > 0);
+        missed.extend(unseen.map(|found| found.text.clone()));
+        missed
     }
 
     /// Takes the states of the watches.
@@ -427,6 +474,7 @@ pub(super) mod tests {
         shutdown: 10.0,
         fail_on: FailOn::Error,
         max_lost: Some(0),
+        is_strict: false,
     };
 
     /// Returns a graph of participants and of topics, each with a publisher.

@@ -60,13 +60,18 @@ const fn class(is_bad: bool) -> &'static str {
 }
 
 fn summary(page: &mut String, run: &Run, conditions: &[Condition], seen: &Observation, bag: &str) {
-    let [failed, passed, skipped] =
-        [Verdict::Failed, Verdict::Passed, Verdict::Skipped].map(|it| count(conditions, it));
+    let [failed, warned, passed, skipped] = [
+        Verdict::Failed,
+        Verdict::Warned,
+        Verdict::Passed,
+        Verdict::Skipped,
+    ]
+    .map(|it| count(conditions, it));
     let until = run.judged_until(seen);
     let rows = [
         (
             "Conditions",
-            format!("{failed} failed, {passed} passed, {skipped} not judged"),
+            format!("{failed} failed, {warned} warnings, {passed} passed, {skipped} not judged"),
         ),
         ("Began", time(run.began)),
         ("Duration", format!("{:.1} s", run.seconds)),
@@ -106,11 +111,16 @@ fn of_conditions(page: &mut String, conditions: &[Condition]) {
         "<h2>Conditions</h2>\n<div class=\"wide\"><table><tr><th></th><th>Subject</th>\
          <th>Condition</th><th>What was seen</th></tr>\n",
     );
-    let order = [Verdict::Failed, Verdict::Skipped, Verdict::Passed];
+    let order = [
+        Verdict::Failed,
+        Verdict::Warned,
+        Verdict::Skipped,
+        Verdict::Passed,
+    ];
     for verdict in order {
         for each in conditions.iter().filter(|it| it.verdict == verdict) {
             let class = match verdict {
-                Verdict::Failed => "bad",
+                Verdict::Failed | Verdict::Warned => "bad",
                 Verdict::Passed => "good",
                 Verdict::Skipped => "",
             };

@@ -73,6 +73,7 @@ mod tests {
         shutdown: 10.0,
         fail_on: FailOn::Error,
         max_lost: Some(0),
+        is_strict: false,
     };
 
     #[test]

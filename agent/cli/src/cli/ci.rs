@@ -20,6 +20,7 @@ use clap::{Args, ValueEnum};
 use ros2probe::ci::{self, Condition, FailOn, Observation, Rules, Run, Verdict, judge};
 use ros2probe::client::{Agent, Lines, Next, Target};
 use ros2probe_api::MAX_DOMAIN_ID;
+use ros2probe_api::health::Health;
 use ros2probe_api::live::Line;
 use ros2probe_api::watches::WatchList;
 use ros2probe_daemon::config::Config;
@@ -48,7 +49,9 @@ const PROGRESS: Duration = Duration::from_secs(30);
 #[command(after_help = "\
 The first seconds (--settle) and the shutdown are not judged. The shutdown begins when a participant
 leaves within the last seconds of the run (--shutdown), or with SIGINT or SIGTERM to rp ci, which
-the command receives, too. A run fails that saw no participant, or that was too short to judge.
+the command receives, too. A run fails that saw no participant, or that was too short to judge. If
+the agent missed a part of the run, because a buffer or a limit was full, that is a warning, or a
+failure with --strict.
 
 Files in the output directory: junit.xml, report.html, bag/ and agent.log.
 
@@ -71,6 +74,9 @@ pub(crate) struct Ci {
     /// watchlist replaces it for its topics
     #[arg(long, value_name = "N|any", default_value = "0")]
     max_lost: MaxLost,
+    /// Fail if the agent missed a part of the run, instead of a warning
+    #[arg(long)]
+    strict: bool,
     /// Seconds after the start of the command that are not judged
     #[arg(long, value_name = "SECONDS", default_value_t = 5, value_parser = clap::value_parser!(u32).range(..=3600))]
     settle: u32,
@@ -165,6 +171,7 @@ impl Ci {
                 Severity::None => FailOn::None,
             },
             max_lost: self.max_lost.0,
+            is_strict: self.strict,
         };
         let mut session = Session::start(rules, domain_id, &self.command)?;
         session.observe(&agent, &mut process, &signals)?;
@@ -198,10 +205,15 @@ fn report(run: &Run, conditions: &[Condition], output: &Path) -> ExitCode {
         print(&format!("{verdict:<10} {group:<12} {}: {first}", each.name));
     }
     let failed = conditions.iter().filter(|it| it.verdict == Verdict::Failed);
+    let warned = conditions.iter().filter(|it| it.verdict == Verdict::Warned);
     let (failed, all) = (failed.count(), conditions.len());
+    let warnings = match warned.count() {
+        0 => "",
+        _ => ", with a warning: the agent missed a part of the run",
+    };
     let place = output.join("report.html");
     print(&format!(
-        "{failed} of {all} conditions failed; the report is {}",
+        "{failed} of {all} conditions failed{warnings}; the report is {}",
         place.display()
     ));
     match (run.code, failed) {
@@ -326,6 +338,9 @@ impl Session {
             }
             if let Ok(list) = agent.get::<WatchList>("/watch") {
                 self.seen.watches(&list, now);
+            }
+            if let Ok(health) = agent.get::<Health>("/health") {
+                self.seen.health(&health);
             }
             self.report_progress(now);
             if deadline.is_some() {

@@ -1,6 +1,7 @@
 //! How this program was installed, and the commands that install another version the same way.
 
 use std::env::consts::ARCH;
+use std::ffi::OsStr;
 use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,6 +12,8 @@ use super::{Feed, Location, Version};
 
 /// Places of Python packages below a prefix, and of distributions of Debian.
 const PYTHON_PACKAGES: [&str; 2] = ["site-packages", "dist-packages"];
+/// Start of the names of directories in which uv caches the environments of `uvx`.
+const UVX_CACHE: &str = "archive-v";
 
 /// How this program was installed.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -25,6 +28,8 @@ pub enum Installation {
     Wheel {
         /// Directory of the environment.
         prefix: PathBuf,
+        /// Program that manages the environment.
+        installer: Installer,
     },
     /// In the image, which has no shell.
     Image,
@@ -35,6 +40,22 @@ pub enum Installation {
         /// Path of the file.
         path: PathBuf,
     },
+}
+
+/// Program that manages the Python environment of a wheel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Installer {
+    /// `pip install`.
+    Pip,
+    /// `uv pip install` in an environment of `uv venv`, which has no pip.
+    Uv,
+    /// `uv tool install`.
+    UvTool,
+    /// `uvx`, which keeps the environment in its cache.
+    Uvx,
+    /// `pipx install`.
+    Pipx,
 }
 
 impl Installation {
@@ -53,8 +74,10 @@ impl Installation {
         let prefix = program.parent().and_then(Path::parent);
         let prefix = prefix.unwrap_or(Path::new("/"));
         if has_wheel(prefix) {
-            let prefix = prefix.to_owned();
-            return Self::Wheel { prefix };
+            return Self::Wheel {
+                prefix: prefix.to_owned(),
+                installer: Installer::of(prefix),
+            };
         }
         let crates = fs::read_to_string(prefix.join(".crates.toml"));
         if crates.is_ok_and(|crates| crates.contains("\"ros2probe ")) {
@@ -113,14 +136,13 @@ impl Installation {
                     .chain([format!("sudo apt install {file}")])
                     .collect()
             }
-            Self::Wheel { prefix } => {
+            Self::Wheel { prefix, installer } => {
                 let file = match file {
                     Some(Location::Path(path)) => quoted(path),
                     Some(Location::Address(address)) => address.to_string(),
                     None => format!("ros2probe=={version}"),
                 };
-                let python = quoted(&prefix.join("bin/python3"));
-                vec![format!("{python} -m pip install {file}")]
+                vec![installer.command(prefix, &file)]
             }
             Self::Image => {
                 let (download, file) = local("ros2probe-image.tar");
@@ -149,7 +171,10 @@ impl fmt::Display for Installation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Package { .. } => f.write_str("by the Debian package"),
-            Self::Wheel { prefix } => write!(f, "by a Python wheel in {}", prefix.display()),
+            Self::Wheel { prefix, installer } => {
+                let (installer, prefix) = (installer.name(), prefix.display());
+                write!(f, "by a Python wheel in {prefix} ({installer})")
+            }
             Self::Image => f.write_str("in the image of a container"),
             Self::Crate => f.write_str("by cargo"),
             Self::Binary { path } => write!(f, "as the file {}", path.display()),
@@ -157,7 +182,53 @@ impl fmt::Display for Installation {
     }
 }
 
-/// Returns whether pip has installed ros2probe below this prefix.
+impl Installer {
+    /// Finds the program that manages the environment in this directory by the files that it keeps
+    /// there.
+    fn of(prefix: &Path) -> Self {
+        if prefix.join("uv-receipt.toml").exists() {
+            return Self::UvTool;
+        }
+        if prefix.join("pipx_metadata.json").exists() {
+            return Self::Pipx;
+        }
+        let settings = fs::read_to_string(prefix.join("pyvenv.cfg")).unwrap_or_default();
+        if !settings.lines().any(|line| line.starts_with("uv = ")) {
+            return Self::Pip;
+        }
+        let above = prefix.parent().and_then(Path::file_name);
+        match above.and_then(OsStr::to_str) {
+            Some(name) if name.starts_with(UVX_CACHE) => Self::Uvx,
+            _ => Self::Uv,
+        }
+    }
+
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Pip => "pip",
+            Self::Uv => "uv",
+            Self::UvTool => "uv tool",
+            Self::Uvx => "uvx",
+            Self::Pipx => "pipx",
+        }
+    }
+
+    /// Returns the command that installs a wheel or a requirement, which is one word of a shell.
+    fn command(self, prefix: &Path, file: &str) -> String {
+        let python = prefix.join("bin/python3");
+        match self {
+            // `pip install --user` and Debian's pip use a Python of another prefix.
+            Self::Pip if !python.exists() => format!("python3 -m pip install {file}"),
+            Self::Pip => format!("{} -m pip install {file}", quoted(&python)),
+            Self::Uv => format!("uv pip install --python {} {file}", quoted(&python)),
+            Self::UvTool => format!("uv tool install {file}"),
+            Self::Uvx => format!("uvx --from {file} rp --version"),
+            Self::Pipx => format!("pipx install --force {file}"),
+        }
+    }
+}
+
+/// Returns whether a wheel has installed ros2probe below this prefix.
 fn has_wheel(prefix: &Path) -> bool {
     let Ok(versions) = fs::read_dir(prefix.join("lib")) else {
         return false;
@@ -231,7 +302,77 @@ mod tests {
         let info = "venv/lib/python3.12/site-packages/ros2probe-0.1.0.dist-info/RECORD";
         write(root, info, "");
         let program = prefix.join("bin/rp");
-        assert_eq!(find(&program), Installation::Wheel { prefix });
+        let installer = Installer::Pip;
+        assert_eq!(find(&program), Installation::Wheel { prefix, installer });
+    }
+
+    #[test]
+    fn the_command_for_a_wheel_is_of_the_program_that_manages_its_environment() {
+        let root = tempfile::tempdir().unwrap();
+        let root = root.path();
+        let own = "home = /usr/bin\nuv = 0.13.9\n";
+        for (place, file, text, installer, command) in [
+            (
+                "venv",
+                "bin/python3",
+                "",
+                "pip",
+                "PREFIX/bin/python3 -m pip install ./new.whl",
+            ),
+            (
+                ".local",
+                "bin/rp",
+                "",
+                "pip",
+                "python3 -m pip install ./new.whl",
+            ),
+            (
+                "uv/venv",
+                "pyvenv.cfg",
+                own,
+                "uv",
+                "uv pip install --python PREFIX/bin/python3 ./new.whl",
+            ),
+            (
+                "share/uv/tools/ros2probe",
+                "uv-receipt.toml",
+                "[tool]\nrequirements = [{ name = \"ros2probe\" }]\n",
+                "uv tool",
+                "uv tool install ./new.whl",
+            ),
+            (
+                "cache/uv/archive-v0/hY2NIJPeE_XUuAYg",
+                "pyvenv.cfg",
+                own,
+                "uvx",
+                "uvx --from ./new.whl rp --version",
+            ),
+            (
+                "share/pipx/venvs/ros2probe",
+                "pipx_metadata.json",
+                "{\"environment\": \"ros2probe\"}",
+                "pipx",
+                "pipx install --force ./new.whl",
+            ),
+        ] {
+            let prefix = root.join(place);
+            let record = "lib/python3.11/site-packages/ros2probe-0.1.0.dist-info/RECORD";
+            write(&prefix, record, "");
+            write(&prefix, file, text);
+            let found = Installation::find(&prefix.join("bin/rp"), root);
+            let shown = format!("by a Python wheel in {} ({installer})", prefix.display());
+            assert_eq!(found.to_string(), shown);
+            let Installation::Wheel { prefix, installer } = found else {
+                panic!("not a wheel: {place}");
+            };
+            let prefix_shown = prefix.display().to_string();
+            let expected = command.replace("PREFIX", &prefix_shown);
+            assert_eq!(installer.command(&prefix, "./new.whl"), expected);
+        }
+        // Both managers may have made the environment with uv.
+        write(root, "share/pipx/venvs/ros2probe/pyvenv.cfg", own);
+        let prefix = root.join("share/pipx/venvs/ros2probe");
+        assert_eq!(Installer::of(&prefix), Installer::Pipx);
     }
 
     #[test]

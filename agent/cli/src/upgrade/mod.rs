@@ -15,7 +15,7 @@ use serde::Serialize;
 
 pub use feed::{ContentError, Feed, FeedError, InvalidLocation, InvalidVersion, Location, Version};
 pub use fetch::FetchError;
-pub use installation::Installation;
+pub use installation::{Installation, Installer};
 
 /// A comparison of this program with a feed.
 #[derive(Debug, Serialize)]

@@ -12,6 +12,7 @@ mod binaries;
 mod chart;
 mod crates;
 mod deploy;
+mod licences;
 mod package;
 mod publish;
 mod ros;

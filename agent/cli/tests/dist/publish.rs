@@ -9,12 +9,15 @@ pub mod podman;
 mod provenance;
 mod repository;
 mod ros;
+mod ways;
 mod wheel;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::harness::wait_until;
+use ros2probe_testing::local_agent::LocalAgent;
 use ros2probe_testing::repository as sources;
 
 use super::binaries::program;
@@ -67,6 +70,25 @@ fn refuse(command: &mut Command) -> Result<String> {
     let output = command.output().with_context(|| format!("{command:?}"))?;
     ensure!(!output.status.success(), "{command:?}: {}", all(&output));
     Ok(all(&output))
+}
+
+/// Replays a capture with a binary of a release for aarch64, and waits for the first metric. It runs
+/// under qemu elsewhere.
+fn measures_on_arm(binary: &Path) -> Result<()> {
+    let capture = sources("wire/tests/data/cyclonedds-samehost-any.pcap.gz");
+    let mut command = program::command("aarch64", binary);
+    let agent = LocalAgent::replay(
+        &mut command,
+        &capture,
+        &["--speed", "max", "--watch", "/**"],
+    );
+    let series = "ros2_topic_messages_total{domain_id=\"0\",topic=\"/chatter\"";
+    wait_until("the first metric", || {
+        let page = agent.get("/metrics").body;
+        Ok(page
+            .lines()
+            .any(|line| line.starts_with(series) && !line.ends_with(" 0")))
+    })
 }
 
 /// Runs a binary of a release for aarch64, under qemu elsewhere.

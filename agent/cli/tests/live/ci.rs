@@ -467,18 +467,89 @@ fn the_action_runs_rp_ci_with_its_inputs_and_keeps_the_status() -> Result<()> {
     Ok(())
 }
 
+/// Returns the process id of the agent of `rp ci` on a host.
+fn agent_of(host: &Namespace) -> Result<String> {
+    let group = fs::read_to_string(host.cgroup().join("cgroup.procs"))?;
+    let agent = group.lines().find(|id| {
+        let line = fs::read(format!("/proc/{id}/cmdline")).unwrap_or_default();
+        line.windows(9).any(|part| part == b"--private")
+    });
+    Ok(agent.context("no agent")?.to_owned())
+}
+
+#[test]
+fn packets_that_the_agent_dropped_are_a_warning_and_fail_a_strict_run() -> Result<()> {
+    let host = Namespace::alone()?;
+    // This ring holds some 500 records, and the robot causes one for each message.
+    let place = Place::new("capture: {source: wire, record_ring_bytes: 65536}\n")?;
+    let robot = healthy(12)?.replace("--rate 50", "--rate 500");
+    let script = format!("echo began; {robot}");
+    for (option, code, failed) in [
+        ("--no-bag", 0, &[][..]),
+        ("--strict", CONDITION_FAILED, &["observation completeness"]),
+    ] {
+        let options = ["--settle", "2", "--max-lost", "any", option];
+        let mut process = place.start(&host, &options, &script)?;
+        process.wait_for("began", PATIENCE)?;
+        std::thread::sleep(Duration::from_secs(4));
+        // A stopped agent reads no record.
+        let agent = agent_of(&host)?;
+        harness::run(&format!("kill -STOP {agent}"))?;
+        std::thread::sleep(Duration::from_secs(3));
+        harness::run(&format!("kill -CONT {agent}"))?;
+        let cases = place.end(&mut process, code)?;
+        assert_eq!(cases.failed(), failed);
+        let said = fs::read_to_string(place.path("said"))?;
+        let verdict = match code {
+            0 => "rp ci: warning    observation  completeness: the agent dropped ",
+            _ => "rp ci: failed     observation  completeness: the agent dropped ",
+        };
+        ensure!(said.contains(verdict), "{said}");
+        ensure!(
+            said.contains(", with a warning: the agent missed") == (code == 0),
+            "{said}"
+        );
+        let junit = fs::read_to_string(place.path("out/junit.xml"))?;
+        let output = "<system-out>warning: the agent dropped ";
+        ensure!(junit.contains(output) == (code == 0), "{junit}");
+        let page = report(&place)?;
+        ensure!(page.contains("the agent dropped "), "{page}");
+    }
+    Ok(())
+}
+
+#[test]
+fn topics_beyond_a_limit_fail_a_strict_run() -> Result<()> {
+    let host = Namespace::alone()?;
+    let place = Place::new(&format!(
+        "{}limits: {{topics: 1}}\n",
+        at_the_sockets_of(&host)
+    ))?;
+    let other = healthy(9)?
+        .replace("/imu", "/odom")
+        .replace("/ekf", "/planner")
+        .replace("/driver", "/wheels");
+    let script = format!("({}) & ({other}) & wait", healthy(9)?);
+    for (option, code, failed) in [
+        ("--no-bag", 0, &[][..]),
+        ("--strict", CONDITION_FAILED, &["observation completeness"]),
+    ] {
+        let options = ["--settle", "2", "--max-lost", "any", option];
+        let mut process = place.start(&host, &options, &script)?;
+        assert_eq!(place.end(&mut process, code)?.failed(), failed);
+        let said = fs::read_to_string(place.path("said"))?;
+        ensure!(said.contains("limits.topics was reached, and "), "{said}");
+    }
+    Ok(())
+}
+
 #[test]
 fn an_agent_that_is_killed_fails_the_run_but_not_the_command() -> Result<()> {
     let host = Namespace::alone()?;
     let place = Place::new(&at_the_sockets_of(&host))?;
     let mut process = place.start(&host, &["--settle", "0"], "echo began; sleep 5; exit 0")?;
     process.wait_for("began", PATIENCE)?;
-    let group = fs::read_to_string(host.cgroup().join("cgroup.procs"))?;
-    let agent = group.lines().find(|id| {
-        let line = fs::read(format!("/proc/{id}/cmdline")).unwrap_or_default();
-        line.windows(9).any(|part| part == b"--private")
-    });
-    harness::run(&format!("kill -KILL {}", agent.context("no agent")?))?;
+    harness::run(&format!("kill -KILL {}", agent_of(&host)?))?;
     let failed = place.end(&mut process, CONDITION_FAILED)?.failed();
     ensure!(
         failed.contains(&"observation agent".to_owned()),

@@ -75,7 +75,7 @@ pub(crate) fn changed(package: &Path, directory: &Path) -> Result<PathBuf> {
     let text = std::fs::read_to_string(&control)?;
     let version = format!("Version: {}\n", env!("CARGO_PKG_VERSION"));
     ensure!(text.contains(&version), "{text}");
-    std::fs::write(&control, text.replace(&version, "Version: 99.0\n"))?;
+    std::fs::write(&control, text.replace(&version, "Version: 99.0.0\n"))?;
     let configuration = parts.join("etc/ros2probe/ros2probe.yaml");
     let text = std::fs::read_to_string(&configuration)?;
     std::fs::write(&configuration, format!("# changed\n{text}"))?;

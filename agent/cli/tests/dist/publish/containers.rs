@@ -99,7 +99,7 @@ fn counted(publisher: &mut Peer, topic: &str, agents: &[&Agent<'_>]) -> Result<(
 
 /// Makes the profile of the page in a directory, and returns the option for it. The default profile of
 /// podman 4.3 refuses `bpf`.
-fn seccomp(directory: &Path) -> Result<String> {
+pub(super) fn seccomp(directory: &Path) -> Result<String> {
     let text = std::fs::read_to_string(page())?;
     let command = text.lines().find(|line| line.starts_with("jq "));
     let mut shell = Command::new("sh");
@@ -110,7 +110,11 @@ fn seccomp(directory: &Path) -> Result<String> {
 }
 
 /// Starts `rp run` in a container, and waits until it is ready.
-fn contained<'h>(podman: &Podman, options: &Options, host: &'h Namespace) -> Result<Agent<'h>> {
+pub(super) fn contained<'h>(
+    podman: &Podman,
+    options: &Options,
+    host: &'h Namespace,
+) -> Result<Agent<'h>> {
     let process = podman.start(options, &[])?;
     let mut agent = Agent { process, host };
     agent.wait_ready(READY)?;

@@ -2,11 +2,15 @@
 
 use std::fs;
 use std::process::Command;
+use std::time::Instant;
 
 use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::harness::agent::Agent;
+use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::repository as sources;
 use serde_json::json;
 
+use super::ways::{everything_at, measures};
 use super::{VERSION, published, succeed};
 use crate::crates;
 
@@ -39,6 +43,8 @@ fn cargo_installs_rp_from_the_published_crates_and_leaves_nothing() -> Result<()
         cargo.env("CARGO_TARGET_DIR", directory.path().join("target"));
         cargo
     };
+    let host = Namespace::alone()?;
+    let began = Instant::now();
     let mut install = cargo("install");
     // Only the speed of the program depends on the profile.
     install.args(["--locked", "--offline", "--debug"]);
@@ -48,6 +54,11 @@ fn cargo_installs_rp_from_the_published_crates_and_leaves_nothing() -> Result<()
     succeed(install.arg(format!("ros2probe@{VERSION}")))?;
 
     let program = root.join("bin/rp");
+    let configuration = directory.path().join("robot.yaml");
+    fs::write(&configuration, everything_at(&host))?;
+    let agent = Agent::start(&host, &program, &configuration)?;
+    measures(&agent, "crates, unoptimized", "/by_crates", began)?;
+    drop(agent);
     let version = succeed(Command::new(&program).arg("--version"))?;
     ensure!(version == format!("rp {VERSION}\n"), "{version}");
     let capture = sources("wire/tests/data/cyclonedds-samehost-any.pcap.gz");
@@ -63,6 +74,10 @@ fn cargo_installs_rp_from_the_published_crates_and_leaves_nothing() -> Result<()
     }
 
     succeed(cargo("uninstall").arg("ros2probe"))?;
-    ensure!(!program.exists(), "cargo left the program behind");
+    let mut find = Command::new("find");
+    let left = succeed(find.arg(&root).args(["-type", "f", "-printf", "%f\\n"]))?;
+    // cargo keeps its own lists, which are empty now.
+    let is_list = |name: &str| [".crates.toml", ".crates2.json"].contains(&name);
+    ensure!(left.lines().all(is_list), "{left}");
     Ok(())
 }

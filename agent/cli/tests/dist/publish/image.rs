@@ -12,7 +12,7 @@ use ros2probe_testing::repository as sources;
 use serde_json::Value;
 
 use super::podman::{Options, Podman};
-use super::{VERSION, image, on_arm, package, packaging, succeed};
+use super::{VERSION, image, measures_on_arm, on_arm, package, packaging, succeed};
 
 /// Maximum size of the image of one architecture, as registries transfer it.
 const MAX_BYTES: u64 = 30 * 1024 * 1024;
@@ -174,6 +174,7 @@ fn contains_the_package(root: &Path, architecture: &str) -> Result<()> {
             version.stdout == format!("rp {VERSION}\n").as_bytes(),
             "{version:?}"
         );
+        measures_on_arm(&root.join(PROGRAM))?;
     }
     Ok(())
 }

@@ -14,10 +14,10 @@ use crate::ansible::Managed;
 use crate::package::installation::debian::{Debian, Start};
 use ros2probe_testing::harness::wait_until;
 
-const ADDRESS: &str = "http://127.0.0.1:8000";
+pub(super) const ADDRESS: &str = "http://127.0.0.1:8000";
 
 /// Copies the repository to where the host's web server reads it.
-fn serve(directory: &Path) -> Result<()> {
+pub(super) fn serve(directory: &Path) -> Result<()> {
     // A tempdir is private, but apt downloads as the user _apt.
     fs::set_permissions(directory, fs::Permissions::from_mode(0o755))?;
     let mut copy = Command::new("cp");
@@ -26,7 +26,7 @@ fn serve(directory: &Path) -> Result<()> {
 }
 
 /// Starts the web server in a host, which has no other source of packages.
-fn listen(host: &Debian) -> Result<()> {
+pub(super) fn listen(host: &Debian) -> Result<()> {
     host.run(
         "rm -f /etc/apt/sources.list; \
          python3 -m http.server 8000 --directory /packages/apt >/srv/log 2>&1 &",

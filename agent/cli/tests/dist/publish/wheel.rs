@@ -2,17 +2,18 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Output};
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::repository as sources;
+use serde_json::Value;
 
 use super::feed::upgrade;
-use super::{VERSION, on_arm, package, packaging, published, succeed, tool};
-use crate::package::installation::installable;
+use super::{VERSION, measures_on_arm, on_arm, package, packaging, published, succeed, tool};
+use crate::package::installation::{all, changed, installable};
 
 /// Returns the name of the wheel for a machine.
-fn name(machine: &str) -> String {
+pub(super) fn name(machine: &str) -> String {
     let platforms = ["manylinux_2_17", "manylinux2014", "musllinux_1_2"];
     let platforms = platforms.map(|platform| format!("{platform}_{machine}"));
     format!("ros2probe-{VERSION}-py3-none-{}.whl", platforms.join("."))
@@ -135,6 +136,124 @@ fn pip_of_an_arm_host_chooses_the_other_wheel() -> Result<()> {
             version.stdout == format!("rp {VERSION}\n").as_bytes(),
             "{version:?}"
         );
+        measures_on_arm(&binary)?;
+    }
+    Ok(())
+}
+
+/// A program that manages the environments of tools, and commands of a shell.
+struct Manager {
+    name: &'static str,
+    /// Installs the wheel `$WHEEL`.
+    install: &'static str,
+    rp: &'static str,
+    /// Prints the version of ros2probe.
+    list: &'static str,
+    /// Version that it prints after the upgrade.
+    upgraded: &'static str,
+    uninstall: &'static str,
+}
+
+const MANAGERS: [Manager; 4] = [
+    Manager {
+        name: "uv tool",
+        install: "uv tool install $WHEEL",
+        rp: "$HOME/.local/bin/rp",
+        list: "uv tool list",
+        upgraded: "ros2probe v99.0.0",
+        uninstall: "uv tool uninstall ros2probe",
+    },
+    Manager {
+        name: "pipx",
+        install: "pipx install $WHEEL",
+        rp: "$HOME/.local/bin/rp",
+        list: "pipx list --short",
+        upgraded: "ros2probe 99.0.0",
+        uninstall: "pipx uninstall ros2probe",
+    },
+    Manager {
+        name: "uv",
+        install: "uv venv $HOME/own && uv pip install --python $HOME/own/bin/python3 $WHEEL",
+        rp: "$HOME/own/bin/rp",
+        list: "uv pip list --python $HOME/own/bin/python3 --format freeze",
+        upgraded: "ros2probe==99.0.0",
+        uninstall: "rm -r $HOME/own",
+    },
+    Manager {
+        name: "uvx",
+        install: "uvx --from $WHEEL rp --version",
+        rp: "uvx --from $WHEEL rp",
+        list: "true",
+        upgraded: "",
+        uninstall: "true",
+    },
+];
+
+#[test]
+#[ignore = "looks at a release: make release"]
+fn the_printed_command_upgrades_what_uv_and_pipx_have_installed() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let debian = match std::env::consts::ARCH {
+        "aarch64" => "arm64",
+        _ => "amd64",
+    };
+    let newer = changed(&package(debian)?, directory.path())?;
+    let files = directory.path().join("files");
+    fs::create_dir(&files)?;
+    made(&newer, &files)?;
+    let mut script = packaging("feed.py")?;
+    let feed = succeed(script.args(["99.0.0", "0123456789abcdef"]).arg(&files))?;
+    fs::write(files.join("release.json"), feed)?;
+    for manager in MANAGERS {
+        let home = directory.path().join(manager.name.replace(' ', "-"));
+        fs::create_dir(&home)?;
+        let run = |line: &str| -> Result<Output> {
+            let path = std::env::var("PATH")?;
+            let tools = tool("wheels/bin").display().to_string();
+            let wheel = published()?.join(name(std::env::consts::ARCH));
+            let mut shell = Command::new("sh");
+            shell.args(["-c", line]).env("HOME", &home);
+            shell.env("PATH", format!("{tools}:{path}"));
+            shell.env("WHEEL", wheel).env("UV_OFFLINE", "1");
+            for variable in [
+                "XDG_DATA_HOME",
+                "XDG_CACHE_HOME",
+                "XDG_BIN_HOME",
+                "PIPX_HOME",
+            ] {
+                shell.env_remove(variable);
+            }
+            shell.output().with_context(|| line.to_owned())
+        };
+        let passes = |line: &str| -> Result<String> {
+            let output = run(line)?;
+            ensure!(output.status.success(), "{line}: {}", all(&output));
+            Ok(String::from_utf8(output.stdout)?)
+        };
+        passes(manager.install)?;
+        let check = format!(
+            "{} upgrade --check --json --feed {}/release.json",
+            manager.rp,
+            files.display()
+        );
+        let output = run(&check)?;
+        ensure!(output.status.code() == Some(100), "{}", all(&output));
+        let found: Value = serde_json::from_slice(&output.stdout)?;
+        let installer = &found["installation"]["installer"];
+        ensure!(*installer == manager.name.replace(' ', "_"), "{found}");
+        passes(found["commands"][0].as_str().context("no command")?)?;
+        let listed = passes(manager.list)?;
+        ensure!(
+            listed.contains(manager.upgraded),
+            "{}: {listed}",
+            manager.name
+        );
+        passes(manager.uninstall)?;
+        // Caches and empty files of locks are of the managers.
+        let left = passes(
+            "find $HOME -name .cache -prune -o -size +0 -name '*ros2probe*' -print -o -name rp -print",
+        )?;
+        ensure!(left.is_empty(), "{left}");
     }
     Ok(())
 }

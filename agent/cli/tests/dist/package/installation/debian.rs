@@ -104,6 +104,22 @@ impl Debian {
         self.first
     }
 
+    /// Returns the command prefix that runs a program of this machine on the host's network and in a
+    /// control group of the host. systemd-nspawn names the root of these groups `payload`.
+    pub(crate) fn beside(&self) -> Vec<String> {
+        let enter = "mkdir -p \"$0\" && echo 0 >\"$0/cgroup.procs\" && exec \"$@\"";
+        let group = self
+            .cgroup
+            .path()
+            .join("payload/beside")
+            .display()
+            .to_string();
+        let network = format!("--net=/proc/{}/ns/net", self.first);
+        ["sh", "-c", enter, &group, "nsenter", &network]
+            .map(str::to_owned)
+            .to_vec()
+    }
+
     /// Runs a script that must succeed, and returns its output.
     pub(crate) fn run(&self, script: &str) -> Result<String> {
         let output = self.attempt(script)?;
