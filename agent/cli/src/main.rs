@@ -19,7 +19,7 @@ use ros2probe_daemon::escape::visible_lines;
 use ros2probe_daemon::privilege::{CapabilitiesRemain, ConfineError, Missing};
 use ros2probe_metrics::otlp::SettingsError;
 
-use cli::{Arguments, CannotStart, Command, UserError};
+use cli::{Arguments, CannotStart, Command, NoDestination, UserError};
 
 /// `EX_NOPERM` and `EX_CONFIG` of sysexits.h.
 const NO_PERMISSION: u8 = 77;
@@ -38,6 +38,7 @@ fn main() -> ExitCode {
         Some(Command::Attach(options)) => done(options.run()),
         Some(Command::Discover(options)) => done(ask::discover(&options)),
         Some(Command::Fleet(fleet)) => fleet.print(),
+        Some(Command::Ship(ship)) => ship.run(),
         Some(Command::Upgrade(upgrade)) => upgrade.print(),
         Some(Command::Completions(completions)) => completions.print(),
         Some(Command::Man(manual)) => manual.print(),
@@ -82,7 +83,10 @@ fn exit_code(error: &anyhow::Error) -> ExitCode {
         || error.is::<ConfineError>()
     {
         ExitCode::from(NO_PERMISSION)
-    } else if error.is::<ConfigError>() || error.is::<SettingsError>() {
+    } else if error.is::<ConfigError>()
+        || error.is::<SettingsError>()
+        || error.is::<NoDestination>()
+    {
         ExitCode::from(BAD_CONFIG)
     } else {
         ExitCode::FAILURE

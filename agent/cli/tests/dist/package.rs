@@ -388,11 +388,12 @@ fn book() -> Result<Vec<String>> {
     Ok(pages)
 }
 
-const FILES: [(&str, u32); 20] = [
+const FILES: [(&str, u32); 21] = [
     ("etc/ros2probe/ros2probe.yaml", 0o644),
     ("usr/bin/rp", 0o755),
     ("usr/lib/systemd/system/ros2probe-attach.service", 0o644),
     ("usr/lib/systemd/system/ros2probe-attach.socket", 0o644),
+    ("usr/lib/systemd/system/ros2probe-ship.service", 0o644),
     ("usr/lib/systemd/system/ros2probe.service", 0o644),
     ("usr/share/bash-completion/completions/rp", 0o644),
     ("usr/share/doc/ros2probe/CHANGELOG.md.gz", 0o644),

@@ -4,7 +4,12 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 fn unit() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../systemd/ros2probe.service")
+    named("ros2probe.service")
+}
+
+fn named(unit: &str) -> PathBuf {
+    let units = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../systemd");
+    units.join(unit)
 }
 
 fn systemd_analyze(arguments: &[&str], unit: &Path) -> Output {
@@ -18,7 +23,14 @@ fn systemd_analyze(arguments: &[&str], unit: &Path) -> Output {
 /// `make test` omits this test with an older systemd (`.ci/prerequisites.sh --left-out`).
 #[test]
 fn the_exposure_level_is_at_most_2() {
-    let output = systemd_analyze(&["security", "--offline=true", "--no-pager"], &unit());
+    for unit in ["ros2probe.service", "ros2probe-ship.service"] {
+        assert_exposure(unit);
+    }
+}
+
+fn assert_exposure(unit: &str) {
+    let arguments = ["security", "--offline=true", "--no-pager"];
+    let output = systemd_analyze(&arguments, &named(unit));
     let refused = String::from_utf8_lossy(&output.stderr);
     assert!(
         !refused.contains("unrecognized option"),
@@ -26,7 +38,7 @@ fn the_exposure_level_is_at_most_2() {
     );
     let said = String::from_utf8_lossy(&output.stdout).into_owned();
     let level = said.lines().find_map(|line| {
-        let (_, level) = line.split_once("Overall exposure level for ros2probe.service: ")?;
+        let (_, level) = line.split_once(&format!("Overall exposure level for {unit}: "))?;
         level.split_whitespace().next()?.parse::<f64>().ok()
     });
     assert!(
@@ -36,19 +48,21 @@ fn the_exposure_level_is_at_most_2() {
 }
 
 #[test]
-fn systemd_accepts_every_line_of_the_unit() {
+fn systemd_accepts_every_line_of_the_units() {
     let directory = tempfile::tempdir().unwrap();
-    let copy = directory.path().join("ros2probe.service");
-    let text = std::fs::read_to_string(unit()).unwrap();
-    std::fs::write(&copy, text.replace("/usr/bin/rp", env!("CARGO_BIN_EXE_rp"))).unwrap();
-    let output = systemd_analyze(&["verify", "--man=no"], &copy);
-    let said = String::from_utf8_lossy(&output.stderr);
-    // Messages about other units on the machine are ignored.
-    let ours: Vec<&str> = said
-        .lines()
-        .filter(|line| line.contains("ros2probe"))
-        .collect();
-    assert!(ours.is_empty(), "{said}");
+    for unit in ["ros2probe.service", "ros2probe-ship.service"] {
+        let copy = directory.path().join(unit);
+        let text = std::fs::read_to_string(named(unit)).unwrap();
+        std::fs::write(&copy, text.replace("/usr/bin/rp", env!("CARGO_BIN_EXE_rp"))).unwrap();
+        let output = systemd_analyze(&["verify", "--man=no"], &copy);
+        let said = String::from_utf8_lossy(&output.stderr);
+        // Messages about other units on the machine are ignored.
+        let ours: Vec<&str> = said
+            .lines()
+            .filter(|line| line.contains("ros2probe"))
+            .collect();
+        assert!(ours.is_empty(), "{said}");
+    }
 }
 
 #[test]
