@@ -7,6 +7,7 @@
 //! - [`info::Bag`] opens a bag and describes its content; [`read`] visits the records of a file.
 //! - [`messages::read`] visits the messages of a bag, also in the sqlite3 storage.
 //! - [`reindex::reindex`] completes the files of a bag whose writer was killed.
+//! - [`lock::is_held`] returns whether a bag still has a writer.
 //!
 //! This crate starts no thread, reads no clock, and neither subscribes, decodes nor selects topics:
 //! callers pass times, payloads and the text of schemas. sqlite3 bags are never written.
@@ -53,6 +54,7 @@ pub mod compression;
 mod file;
 mod file_compression;
 pub mod info;
+pub mod lock;
 pub mod mcap;
 pub mod messages;
 pub mod metadata;

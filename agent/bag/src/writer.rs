@@ -20,7 +20,7 @@ use super::file::{FileWriter, METADATA_NAME};
 use super::mcap::{Message, Metadata as MetadataRecord};
 use super::metadata::{self, Metadata};
 use super::metadata_file::{Durability, write_metadata};
-use super::{Compressed, Compression, Error, FileCompression, Form, Options, qos};
+use super::{Compressed, Compression, Error, FileCompression, Form, Options, lock, qos};
 use contents::{DoneFile, Topic, times};
 
 /// Description of a topic in a bag.
@@ -68,6 +68,8 @@ pub struct Writer {
     uncompressed: Vec<FileCompression>,
     /// Accepted messages that were never written: number and bytes per channel.
     unwritten: BTreeMap<u16, (u64, u64)>,
+    /// Holds the lock until the writer ends.
+    _lock: Option<File>,
 }
 
 /// Result of writing a bag.
@@ -128,6 +130,7 @@ impl Writer {
             current: None,
             uncompressed: Vec::new(),
             unwritten: BTreeMap::new(),
+            _lock: lock::hold(directory),
         };
         let begun = writer.open_file();
         if let Err(error) = begun.and_then(|()| writer.write_metadata_file()) {

@@ -20,7 +20,7 @@ use ros2probe_daemon::escape::visible_lines;
 use ros2probe_daemon::privilege::{CapabilitiesRemain, ConfineError, Missing};
 use ros2probe_metrics::otlp::SettingsError;
 
-use cli::{Arguments, CannotStart, Command, UserError};
+use cli::{Arguments, CannotStart, Command, NoDestination, UserError};
 
 /// `EX_NOPERM` and `EX_CONFIG` of sysexits.h.
 const NO_PERMISSION: u8 = 77;
@@ -39,6 +39,7 @@ fn main() -> ExitCode {
         Some(Command::Attach(options)) => done(options.run()),
         Some(Command::Discover(options)) => done(ask::discover(&options)),
         Some(Command::Fleet(fleet)) => fleet.print(),
+        Some(Command::Ship(ship)) => ship.run(),
         Some(Command::Upgrade(upgrade)) => upgrade.print(),
         Some(Command::Completions(completions)) => completions.print(),
         Some(Command::Man(manual)) => manual.print(),
@@ -86,7 +87,10 @@ fn exit_code(error: &anyhow::Error) -> ExitCode {
             .is_some_and(CaptureError::is_for_lack_of_rights)
     {
         ExitCode::from(NO_PERMISSION)
-    } else if error.is::<ConfigError>() || error.is::<SettingsError>() {
+    } else if error.is::<ConfigError>()
+        || error.is::<SettingsError>()
+        || error.is::<NoDestination>()
+    {
         ExitCode::from(BAD_CONFIG)
     } else {
         ExitCode::FAILURE

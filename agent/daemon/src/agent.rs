@@ -104,6 +104,9 @@ pub struct Components<'a> {
     pub keeper: Option<StateWriter>,
     /// Directory of recordings. `None` means that recordings are refused.
     pub recordings: Option<PathBuf>,
+    /// State directory with the receipts of delivered bags. `None` means that bags are not
+    /// delivered.
+    pub receipts: Option<PathBuf>,
     /// Definitions of messages.
     pub library: Arc<Library>,
     /// Time span of the figures kept for topics; zero means none.
@@ -155,6 +158,7 @@ impl Components<'_> {
             figures: Arc::clone(&sources.recordings),
             subscriptions: Arc::clone(&subscriptions),
             library: Arc::clone(&library),
+            receipts: self.receipts,
         }));
         let snapshots = match Snapshots::start(&config.recordings.snapshots, &recordings) {
             // A missing disk must not prevent observation.
@@ -264,6 +268,7 @@ pub fn run(options: Options) -> Result<()> {
     let viewers = foxglove::Server::open(&config.foxglove, &config.api, &sources.viewers)?;
     let mut state = KeptState::open(&source, &config, &watches);
     let recordings = memory::recordings(&config.recordings.directory, state.directory());
+    let receipts = state.directory().map(|state| state.path().to_owned());
     let kept = history(&config, &control);
     if let Some(state) = state.directory()
         && !kept.is_zero()
@@ -319,6 +324,7 @@ pub fn run(options: Options) -> Result<()> {
             .keep(&watches)
             .context("cannot start the threads that keep state")?,
         recordings,
+        receipts: receipts.filter(|_| config.ship.url.is_some()),
         library,
         history: kept,
         addresses: page_addresses(&config, &control),

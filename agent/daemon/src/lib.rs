@@ -40,6 +40,7 @@ pub mod recording;
 pub mod replay_pace;
 pub mod run;
 pub mod settings_cell;
+pub mod ship;
 pub mod snapshot_cell;
 pub mod state;
 pub mod subscriptions;

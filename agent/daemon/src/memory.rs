@@ -14,9 +14,9 @@ use ros2probe_model::graph::discovery::Memory;
 /// Default directory of the package and of the service manager.
 const DEFAULT: &str = "/var/lib/ros2probe";
 /// Variable of the service manager.
-const VARIABLE: &str = "STATE_DIRECTORY";
+pub(crate) const VARIABLE: &str = "STATE_DIRECTORY";
 /// Subdirectory of recordings.
-const RECORDINGS: &str = "recordings";
+pub(crate) const RECORDINGS: &str = "recordings";
 
 /// Opens the state directory; returns `None` if no state is saved.
 pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {

@@ -41,6 +41,7 @@ impl PrivateAgent {
         config.ros2_daemon.is_on = false;
         config.otlp.endpoint = Endpoint::Off;
         config.remote_write.url = None;
+        config.ship.url = None;
         config.state_directory = StateChoice::Off;
         config.history_bytes = 0;
         config.recordings.directory = StateChoice::At(self.directory.join(RECORDINGS));

@@ -34,6 +34,7 @@ pub mod robot_pictures;
 pub mod robot_states;
 pub mod robot_transforms;
 pub mod rotel;
+pub mod s3;
 pub mod sample_robot;
 pub mod truth;
 pub mod type_description;

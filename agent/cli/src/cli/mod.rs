@@ -30,6 +30,7 @@ mod reference;
 mod run;
 mod service;
 mod shared;
+mod ship;
 mod tf;
 mod top;
 mod topic;
@@ -49,6 +50,7 @@ pub(crate) use ci::{CannotStart, Ci};
 pub(crate) use discover::Discover;
 pub(crate) use output::{Output, UserError, is_broken_pipe};
 pub(crate) use run::Run;
+pub(crate) use ship::NoDestination;
 pub(crate) use welcome::print as welcome;
 
 /// Watches a ROS 2 robot from copies of its DDS traffic, without joining it.
@@ -80,6 +82,8 @@ pub(crate) enum Command {
     Attach(Attach),
     /// Show the robots of a fleet from their engine: which is in trouble, and what differs
     Fleet(fleet::Fleet),
+    /// Deliver finished bags to an object store or a folder
+    Ship(ship::Ship),
     /// Check a feed of releases for a newer version
     Upgrade(upgrade::Upgrade),
     /// Print completions for a shell

@@ -255,6 +255,7 @@ fn assemble(
         keeper: None,
         // `rp bag record` records a capture, not the agent that replays it.
         recordings: None,
+        receipts: None,
         library: Arc::new(Library::new(Sources::default())),
         history: Duration::ZERO,
         addresses: Vec::new(),

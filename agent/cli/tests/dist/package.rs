@@ -448,6 +448,7 @@ const FILES: [(&str, u32); 21] = [
     ("usr/bin/rp", 0o755),
     ("usr/lib/systemd/system/ros2probe-attach.service", 0o644),
     ("usr/lib/systemd/system/ros2probe-attach.socket", 0o644),
+    ("usr/lib/systemd/system/ros2probe-ship.service", 0o644),
     ("usr/lib/systemd/system/ros2probe.service", 0o644),
     ("usr/share/bash-completion/completions/rp", 0o644),
     ("usr/share/doc/ros2probe/CHANGELOG.md.gz", 0o644),

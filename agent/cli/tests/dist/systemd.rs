@@ -3,8 +3,16 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+/// The units of the agent and of deliveries.
+const UNITS: [&str; 2] = ["ros2probe.service", "ros2probe-ship.service"];
+
 fn unit() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../systemd/ros2probe.service")
+    named("ros2probe.service")
+}
+
+fn named(unit: &str) -> PathBuf {
+    let units = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../systemd");
+    units.join(unit)
 }
 
 fn systemd_analyze(arguments: &[&str], unit: &Path) -> Output {
@@ -18,14 +26,16 @@ fn systemd_analyze(arguments: &[&str], unit: &Path) -> Output {
 /// `make test` omits this test with an older systemd (`.ci/prerequisites.sh --left-out`).
 #[test]
 fn the_exposure_level_is_at_most_1_5() {
-    let level = exposure(&unit());
-    assert!(level <= 1.5, "{level}");
+    for name in UNITS {
+        let level = exposure(&named(name));
+        assert!(level <= 1.5, "{name}: {level}");
+    }
 }
 
 /// `make test` omits this test likewise.
 #[test]
 fn the_exposure_level_of_the_broker_is_the_documented_one() {
-    let level = exposure(&unit().with_file_name("ros2probe-attach.service"));
+    let level = exposure(&named("ros2probe-attach.service"));
     let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/shared-memory.md");
     let page = std::fs::read_to_string(page).unwrap();
     let stated = format!("an exposure level of {level:.1}.");
@@ -48,12 +58,14 @@ fn exposure(unit: &Path) -> f64 {
 }
 
 #[test]
-fn systemd_accepts_every_line_of_the_unit() {
+fn systemd_accepts_every_line_of_the_units() {
     let directory = tempfile::tempdir().unwrap();
-    let copy = directory.path().join("ros2probe.service");
-    let text = std::fs::read_to_string(unit()).unwrap();
-    std::fs::write(&copy, text.replace("/usr/bin/rp", env!("CARGO_BIN_EXE_rp"))).unwrap();
-    accepts(&copy);
+    for name in UNITS {
+        let copy = directory.path().join(name);
+        let text = std::fs::read_to_string(named(name)).unwrap();
+        std::fs::write(&copy, text.replace("/usr/bin/rp", env!("CARGO_BIN_EXE_rp"))).unwrap();
+        accepts(&copy);
+    }
 }
 
 #[test]

@@ -47,6 +47,7 @@ mod ros2;
 mod ros2_daemon;
 mod rules;
 mod samples;
+mod ship;
 mod top;
 mod upgrade;
 mod web_config;

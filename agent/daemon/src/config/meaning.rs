@@ -17,8 +17,8 @@ use super::document::Node;
 use super::mistake::{Mistakes, Position};
 use super::shape::{
     ApiShape, CaptureShape, ConfigShape, FoxgloveShape, LogLevelShape, MetricsShape, OtlpShape,
-    RecordingsShape, RemoteWriteShape, RobotShape, Ros2DaemonShape, SnapshotShape, Switch,
-    WatchEntryShape, WatchShape,
+    RecordingsShape, RemoteWriteShape, RobotShape, Ros2DaemonShape, ShipShape, SnapshotShape,
+    Switch, WatchEntryShape, WatchShape,
 };
 use super::watch::{
     ExpectationValues, Expectations, PatternError, Retain, Watch, check_globs, check_pattern,
@@ -26,8 +26,8 @@ use super::watch::{
 use super::{
     ApiSettings, CaptureSettings, Config, Endpoint, Extraction, FoxgloveSettings, Level, Limits,
     MAX_PARAMETERS, MetricsSettings, OtlpSettings, RecordingLimits, RecordingSettings,
-    RemoteWriteSettings, Ros2DaemonSettings, ShmSettings, SnapshotSettings, SocketChoice,
-    SourceChoice, StateChoice,
+    RemoteWriteSettings, Ros2DaemonSettings, ShipSettings, ShmSettings, SnapshotSettings,
+    SocketChoice, SourceChoice, StateChoice, Windows,
 };
 use crate::events::Trigger;
 use ros2probe_message::filter::{Filter, FilterError};
@@ -35,6 +35,7 @@ use ros2probe_metrics::otlp::otlp_endpoint;
 use ros2probe_metrics::remote_write;
 use ros2probe_model::derive::robot::parameters::ExpectedParameter;
 use ros2probe_model::derive::robot::{Part, Parts};
+use ros2probe_ship::Window;
 
 /// Maximum number of configured snapshots; each needs memory and a thread.
 const MAX_SNAPSHOTS: usize = 8;
@@ -164,6 +165,7 @@ impl Reader {
             otlp: otlp(shape.otlp.unwrap_or_default()),
             remote_write: self.remote_write(shape.remote_write.unwrap_or_default()),
             recordings: self.recordings(shape.recordings.unwrap_or_default()),
+            ship: ship(shape.ship.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             service_timeout: Duration::from_secs_f64(shape.service_timeout_s),
             retain: shape.retain,
@@ -628,6 +630,25 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
         {
             Err(InvalidText::RelativePath("`/etc/ros2probe/robot.pem`"))
         }
+        "ship.url" if !ros2probe_ship::is_destination(text) => Err(InvalidText::Unfit(
+            "a destination, as in `s3://bucket/prefix`, `gs://bucket`, `az://container` or \
+             `file:///mnt/bags`",
+        )),
+        "ship.endpoint" if remote_write::receiver(text).is_none() => Err(InvalidText::Unfit(
+            "the URL of a store, as in `https://minio.example:9000`",
+        )),
+        "ship.instance" if text.is_empty() || text.len() > 128 => Err(InvalidText::Unfit(
+            "the name of a robot, in at most 128 bytes",
+        )),
+        "ship.credentials_file" | "ship.ca_file" if !text.starts_with('/') => {
+            Err(InvalidText::RelativePath("`/etc/ros2probe/ship.env`"))
+        }
+        "ship.windows[]" => match text.parse::<Window>() {
+            Ok(_) => Ok(()),
+            Err(_) => Err(InvalidText::Unfit(
+                "two times of the day, as in `22:00-06:00`",
+            )),
+        },
         _ => Ok(()),
     }
 }
@@ -683,6 +704,23 @@ fn without_indices(key: &str) -> String {
         shown
     };
     key.chars().filter(|c| shown(*c)).collect()
+}
+
+/// Returns the settings of a delivery; texts that are no windows are reported by the check of texts.
+fn ship(shape: ShipShape) -> ShipSettings {
+    let windows = shape.windows.unwrap_or_default();
+    let windows = windows.iter().filter_map(|text| text.parse().ok());
+    ShipSettings {
+        url: shape.url,
+        endpoint: shape.endpoint,
+        region: shape.region,
+        instance: shape.instance,
+        credentials_file: shape.credentials_file.map(PathBuf::from),
+        ca_file: shape.ca_file.map(PathBuf::from),
+        max_bytes_per_second: shape.max_bytes_per_second,
+        windows: Windows(windows.collect()),
+        triggered_always: shape.triggered_always,
+    }
 }
 
 fn state(text: &str) -> StateChoice {

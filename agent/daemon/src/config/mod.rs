@@ -39,6 +39,7 @@ pub use ros2probe_model::facts::watch::{
     check_pattern,
 };
 pub use ros2probe_model::measure::rehearsal;
+pub use ros2probe_ship::Windows;
 use tracing_subscriber::filter::LevelFilter;
 
 /// Maximum number of parameters that should have a value.
@@ -86,6 +87,8 @@ pub struct Config {
     pub remote_write: RemoteWriteSettings,
     /// Recordings of the agent.
     pub recordings: RecordingSettings,
+    /// Delivery of bags by `rp ship`.
+    pub ship: ShipSettings,
     /// Time for which a topic without endpoints is still reported.
     pub topic_grace: Duration,
     /// Time without a reply after which a call of a service is reported as hanging.
@@ -278,6 +281,29 @@ impl RecordingSettings {
     }
 }
 
+/// Delivery of bags by `rp ship`.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ShipSettings {
+    /// Destination; `None` = bags stay on the robot.
+    pub url: Option<String>,
+    /// Address of a store other than that of the provider.
+    pub endpoint: Option<String>,
+    /// Region of the bucket.
+    pub region: Option<String>,
+    /// Name of this robot.
+    pub instance: Option<String>,
+    /// File with credentials.
+    pub credentials_file: Option<PathBuf>,
+    /// File with certificate authorities.
+    pub ca_file: Option<PathBuf>,
+    /// Maximum number of bytes of requests per second.
+    pub max_bytes_per_second: Option<u64>,
+    /// Times of the day in which bags are delivered.
+    pub windows: Windows,
+    /// Whether bags of snapshots are delivered outside the windows too.
+    pub triggered_always: bool,
+}
+
 /// A snapshot: the last seconds of some topics.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SnapshotSettings {
@@ -409,6 +435,7 @@ impl Config {
             ("otlp", self.otlp != new.otlp),
             ("remote_write", self.remote_write != new.remote_write),
             ("recordings", self.recordings != new.recordings),
+            ("ship", self.ship != new.ship),
             ("topic_grace_s", self.topic_grace != new.topic_grace),
             ("retain", self.retain != new.retain),
             ("robot", self.robot != new.robot),
@@ -489,6 +516,7 @@ impl Default for Config {
             otlp: OtlpSettings::default(),
             remote_write: RemoteWriteSettings::default(),
             recordings: RecordingSettings::default(),
+            ship: ShipSettings::default(),
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
             service_timeout: Duration::from_secs_f64(defaults::service_timeout_s()),
             retain: RetainChoice::default(),

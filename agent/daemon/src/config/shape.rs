@@ -53,6 +53,8 @@ pub(super) struct ConfigShape {
     /// Bags written by the agent: on request (`POST /recordings`), and of the last seconds before
     /// an incident.
     pub(super) recordings: Option<RecordingsShape>,
+    /// Where `rp ship` delivers finished bags.
+    pub(super) ship: Option<ShipShape>,
     /// What the robot itself says, in topics of standard types. The agent reads it as it passes, on
     /// watched and other topics.
     pub(super) robot: Option<RobotShape>,
@@ -716,6 +718,38 @@ pub(super) struct RemoteWriteShape {
     /// Maximum number of bytes of requests per second; by default they have no limit.
     #[schemars(range(min = 1_000, max = 1_000_000_000))]
     pub(super) max_bytes_per_second: Option<u64>,
+}
+
+/// Delivery of finished bags by `rp ship`, a program of its own.
+#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct ShipShape {
+    /// Destination: `s3://BUCKET/PREFIX`, `gs://BUCKET/PREFIX`, `az://CONTAINER/PREFIX` or
+    /// `file:///DIRECTORY`. Without it, nothing is delivered. With it, the agent deletes no bag
+    /// that was not delivered.
+    pub(super) url: Option<String>,
+    /// Address of a store other than that of the provider, e.g. `https://minio.example:9000`.
+    pub(super) endpoint: Option<String>,
+    /// Region of the bucket.
+    pub(super) region: Option<String>,
+    /// Name of this robot, a directory at the destination; default: `remote_write.instance`, then
+    /// `otlp.robot`, then the name of the host.
+    pub(super) instance: Option<String>,
+    /// Absolute path of a file with credentials: lines NAME=value, with the names of the
+    /// provider's environment variables. A replaced file applies to the next request.
+    pub(super) credentials_file: Option<String>,
+    /// Absolute path of a PEM file with the certificate authorities that may sign the store's
+    /// certificate; default: those of the system.
+    pub(super) ca_file: Option<String>,
+    /// Maximum number of bytes of requests per second; by default they have no limit.
+    #[schemars(range(min = 1_000, max = 1_000_000_000))]
+    pub(super) max_bytes_per_second: Option<u64>,
+    /// Times of the day in which bags are delivered, in local time, e.g. `22:00-06:00`; default:
+    /// at any time.
+    pub(super) windows: Option<Vec<String>>,
+    /// Whether bags of snapshots are delivered outside the windows too.
+    pub(super) triggered_always: bool,
 }
 
 impl Default for CaptureShape {

@@ -54,6 +54,8 @@ pub struct Recordings {
     pub(super) figures: Arc<RecordingFigures>,
     subscriptions: Arc<Subscriptions>,
     library: Arc<Library>,
+    /// State directory with the receipts of delivered bags; `None` if bags are not delivered.
+    receipts: Option<PathBuf>,
     list: Mutex<Vec<Arc<Recording>>>,
     slots: Arc<Slots>,
 }
@@ -79,6 +81,8 @@ pub struct Components {
     pub subscriptions: Arc<Subscriptions>,
     /// Definitions of messages.
     pub library: Arc<Library>,
+    /// State directory with the receipts of delivered bags; `None` if bags are not delivered.
+    pub receipts: Option<PathBuf>,
 }
 
 /// Recording requested by a client.
@@ -191,6 +195,7 @@ impl Recordings {
             figures,
             subscriptions,
             library,
+            receipts,
         } = components;
         Self {
             directory,
@@ -203,6 +208,7 @@ impl Recordings {
             figures,
             subscriptions,
             library,
+            receipts,
             list: Mutex::new(Vec::new()),
         }
     }
@@ -400,6 +406,13 @@ impl Recordings {
             }),
             schema: Box::new(move |name, hash| schema(&library, name, hash)),
         }
+    }
+
+    /// Returns whether a bag may be removed for another one: if bags are delivered, only a delivered
+    /// one.
+    pub(super) fn may_remove(&self, bag: &Path) -> bool {
+        let receipts = self.receipts.as_deref();
+        receipts.is_none_or(|state| ros2probe_ship::is_delivered(state, bag))
     }
 
     /// Returns the validated name and the path of a new bag.

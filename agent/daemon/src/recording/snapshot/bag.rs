@@ -198,7 +198,9 @@ impl SnapshotBag {
         };
         let needed = needed + CLOSING_BYTES;
         let others = settings.max_count - usize::from(cause.event_id().is_some());
-        let Space { bytes, removed } = make_space(&directory, settings, others, needed);
+        let Space { bytes, removed } = make_space(&directory, settings, others, needed, |bag| {
+            recordings.may_remove(bag)
+        });
         if bytes < needed {
             return Err(failed(cause, no_space(settings).to_string(), removed));
         }
@@ -224,7 +226,7 @@ impl SnapshotBag {
     ///
     /// Fails if the storage fails or a limit of the snapshot is reached. [`Self::finish`] completes
     /// the bag nevertheless.
-    pub(super) fn take(&mut self, item: &Item) -> Result<(), Error> {
+    pub(super) fn take(&mut self, item: &Item, recordings: &Recordings) -> Result<(), Error> {
         if let Item::Sample(sample) = item {
             let payload = sample
                 .payload
@@ -232,7 +234,7 @@ impl SnapshotBag {
                 .map_or(0, |payload| payload.len() as u64);
             let size = self.recorder.writer().expected_bytes() + payload + CLOSING_BYTES;
             if size > self.bytes {
-                self.grow(size)?;
+                self.grow(size, recordings)?;
             }
             let mut topics = self.topics.lock().unwrap_or_else(PoisonError::into_inner);
             if !topics.contains(&*sample.topic.name) {
@@ -243,9 +245,11 @@ impl SnapshotBag {
     }
 
     /// Removes further old bags, so that this bag may have `size` bytes.
-    fn grow(&mut self, size: u64) -> Result<(), Error> {
+    fn grow(&mut self, size: u64, recordings: &Recordings) -> Result<(), Error> {
         let others = self.settings.max_count;
-        let space = make_space(&self.directory, &self.settings, others, size);
+        let space = make_space(&self.directory, &self.settings, others, size, |bag| {
+            recordings.may_remove(bag)
+        });
         self.bytes = space.bytes;
         self.removed += space.removed;
         if space.bytes < size {

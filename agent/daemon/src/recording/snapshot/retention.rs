@@ -24,15 +24,18 @@ struct KeptBag {
 }
 
 /// Removes the oldest triggered bags of the snapshot until the bag at `new` may have `needed`
-/// bytes. At most `others` triggered bags remain beside it.
+/// bytes. At most `others` triggered bags remain beside it. Bags that may not be removed stay, and
+/// count only by their bytes.
 pub(super) fn make_space(
     new: &Path,
     settings: &SnapshotSettings,
     others: usize,
     needed: u64,
+    may_remove: impl Fn(&Path) -> bool,
 ) -> Space {
     let limit = settings.max_total_bytes;
     let (mut triggered, mut used) = kept(new, settings);
+    triggered.retain(|bag| may_remove(&bag.path));
     triggered.sort_by_key(|bag| bag.modified);
     let mut count = triggered.len();
     let mut removed = 0;

@@ -116,7 +116,7 @@ impl SnapshotTask {
             let taken = if is_early || is_late {
                 Ok(())
             } else {
-                open.bag.take(&item)
+                open.bag.take(&item, &self.recordings)
             };
             if is_late || is_end || taken.is_err() || Instant::now() > open.deadline {
                 self.complete(taken.err());
@@ -200,7 +200,7 @@ impl SnapshotTask {
         let mut bag = SnapshotBag::create(&self.recordings, &self.settings, cause, needed)
             .map_err(|failed| self.fail(failed))?;
         for sample in samples {
-            if let Err(error) = bag.take(&Item::Sample(sample)) {
+            if let Err(error) = bag.take(&Item::Sample(sample), &self.recordings) {
                 return Err(self.fail(bag.discard(&error)));
             }
         }

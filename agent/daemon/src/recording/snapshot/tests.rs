@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use ros2probe_bag::metadata::{self, Metadata};
 use ros2probe_message::{Library, Sources};
@@ -65,6 +65,10 @@ fn settings(triggers: &[&str], before: u64, after: u64) -> SnapshotSettings {
 
 impl Robot {
     fn new(settings: SnapshotSettings) -> Self {
+        Self::with_receipts(settings, None)
+    }
+
+    fn with_receipts(settings: SnapshotSettings, receipts: Option<&Path>) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let latest = Arc::new(SnapshotCell::new(SourceKind::Wire));
         let caps = Caps {
@@ -89,6 +93,7 @@ impl Robot {
             figures: Arc::clone(&figures),
             subscriptions,
             library: Arc::new(Library::new(Sources::default())),
+            receipts: receipts.map(Path::to_owned),
         });
         let topic = Topic {
             domain_id: DomainId(0),
@@ -478,6 +483,54 @@ fn a_requested_bag_is_never_removed_for_others() {
     assert!(refused.contains("max_total_bytes"), "{refused}");
     assert!(robot.bags().contains_key(&requested));
     assert!(robot.shown().failed >= 1);
+}
+
+/// Writes the receipt of `rp ship` for a bag.
+fn deliver(state: &Path, bag: &Path) {
+    let mut files: Vec<_> = std::fs::read_dir(bag)
+        .unwrap()
+        .map(|entry| {
+            let entry = entry.unwrap();
+            let about = entry.metadata().unwrap();
+            let changed = about.modified().unwrap();
+            let changed = changed.duration_since(SystemTime::UNIX_EPOCH).unwrap();
+            let name = entry.file_name().into_string().unwrap();
+            (name, about.len(), changed.as_nanos())
+        })
+        .collect();
+    files.sort();
+    let lines = files
+        .iter()
+        .map(|(name, bytes, changed)| format!("{bytes} {changed} {name}\n"));
+    let directory = state.join("ship/bags");
+    std::fs::create_dir_all(&directory).unwrap();
+    let name = bag.file_name().unwrap().to_str().unwrap();
+    let receipt = directory.join(format!("{name}.receipt"));
+    std::fs::write(receipt, lines.collect::<String>()).unwrap();
+}
+
+#[test]
+fn a_bag_that_was_not_delivered_is_never_removed_for_others() {
+    let state = tempfile::tempdir().unwrap();
+    let few = SnapshotSettings {
+        max_count: 1,
+        ..settings(&["message_lost"], 1, 0)
+    };
+    let mut robot = Robot::with_receipts(few, Some(state.path()));
+    robot.run(20);
+    for _ in 0..3 {
+        robot.lose_messages();
+        robot.run(1);
+    }
+    let before: Vec<_> = robot.bags().into_keys().collect();
+    assert_eq!(before.len(), 3);
+    deliver(state.path(), &robot.directory.path().join(&before[1]));
+    robot.lose_messages();
+    robot.run(1);
+    let after: Vec<_> = robot.bags().into_keys().collect();
+    assert!(!after.contains(&before[1]), "{after:?}");
+    assert!(after.contains(&before[0]) && after.contains(&before[2]));
+    assert_eq!(after.len(), 3);
 }
 
 #[test]

@@ -1,0 +1,742 @@
+//! `rp ship` delivers bags to a folder and to a store of S3, through refusals, cut connections and
+//! its own death: each bag once, whole, with its manifest.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File, FileTimes};
+use std::io::Read as _;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Output, Stdio};
+use std::time::{Duration, Instant, SystemTime};
+
+use crate::rp;
+use ros2probe_bag::{Options, TopicDescription, Writer};
+use ros2probe_testing::s3::{BUCKET, Call, Fate, Operation, Store, hex};
+use ros2probe_wire::Timestamp;
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+const SECRET: &str = "the-secret-of-the-robot";
+const MIB: usize = 1 << 20;
+/// Size of the parts of a large file.
+const PART: usize = 8 * MIB;
+/// Maximum wait for a state.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A robot with bags, and the configuration of its delivery.
+struct Robot {
+    directory: TempDir,
+    url: String,
+    more: String,
+}
+
+impl Robot {
+    /// Creates a robot that delivers to a store.
+    fn of(store: &Store) -> Self {
+        let more = format!("endpoint: http://{}", store.address);
+        Self::to(&format!("s3://{BUCKET}/fleet/north"), &more)
+    }
+
+    fn to(url: &str, more: &str) -> Self {
+        let robot = Self {
+            directory: tempfile::tempdir().unwrap(),
+            url: url.to_owned(),
+            more: more.to_owned(),
+        };
+        robot.set_key("AK-1");
+        robot.configure("", "");
+        robot
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.directory.path().join(name)
+    }
+
+    fn bag(&self, name: &str) -> PathBuf {
+        self.path("state/recordings").join(name)
+    }
+
+    /// Replaces the file with credentials, as a program that rotates them does.
+    fn set_key(&self, key: &str) {
+        let text = format!("AWS_ACCESS_KEY_ID={key}\nAWS_SECRET_ACCESS_KEY={SECRET}\n");
+        fs::write(self.path("ship.new"), text).unwrap();
+        fs::rename(self.path("ship.new"), self.path("ship.env")).unwrap();
+    }
+
+    /// Writes the configuration with further keys of `ship` and of `recordings`.
+    fn configure(&self, ship: &str, recordings: &str) {
+        let state = self.path("state");
+        let text = format!(
+            "state_directory: {}\nrecordings: {{reserve_percent: 0, reserve_bytes: 0{recordings}}}\n\
+             ship:\n  url: {}\n  instance: robot-17\n  credentials_file: {}\n  {}\n{ship}",
+            state.display(),
+            self.url,
+            self.path("ship.env").display(),
+            self.more,
+        );
+        fs::create_dir_all(state.join("recordings")).unwrap();
+        fs::write(self.path("ros2probe.yaml"), text).unwrap();
+    }
+
+    /// Records a bag of about this size that ended in order some seconds ago. Each has other bytes.
+    fn record(&self, name: &str, bytes: usize, seconds: u64) {
+        let writer = self.write(name, bytes, seconds, None);
+        writer.close(BTreeMap::new()).unwrap();
+        age(&self.bag(name), seconds);
+    }
+
+    /// Records a bag of a snapshot.
+    fn snapshot(&self, name: &str, bytes: usize, seconds: u64) {
+        let trigger = json!({
+            "snapshot": "incident",
+            "trigger": "participant_lost",
+            "event": "ros2.participant.lost",
+            "time": "2026-11-20T02:34:07Z",
+        });
+        let writer = self.write(name, bytes, seconds, Some(&trigger));
+        writer.close(BTreeMap::new()).unwrap();
+        age(&self.bag(name), seconds);
+    }
+
+    fn write(&self, name: &str, bytes: usize, seconds: u64, trigger: Option<&Value>) -> Writer {
+        let mut options = Options::default();
+        if let Some(trigger) = trigger {
+            let key = "ros2probe_trigger".to_owned();
+            options.custom_data.insert(key, trigger.to_string());
+        }
+        let mut writer = Writer::create(&self.bag(name), options).unwrap();
+        let topic = writer
+            .topic(TopicDescription {
+                name: "/points".into(),
+                type_name: "sensor_msgs/msg/PointCloud2".into(),
+                type_hash: None,
+                publishers: Vec::new(),
+                schema: None,
+            })
+            .unwrap();
+        let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+        let begin = now.unwrap().as_nanos() as u64 - seconds * 1_000_000_000;
+        let mut state = name
+            .bytes()
+            .fold(88_172_645_463_325_252_u64, |state, byte| {
+                state.wrapping_mul(31).wrapping_add(byte.into())
+            });
+        let mut left = bytes;
+        let mut number = 0;
+        while left > 0 {
+            let mut message = vec![0_u8; left.min(MIB / 4)];
+            for chunk in message.chunks_mut(8) {
+                state ^= state << 13;
+                state ^= state >> 7;
+                state ^= state << 17;
+                chunk.copy_from_slice(&state.to_le_bytes()[..chunk.len()]);
+            }
+            let time = Timestamp(begin + number);
+            writer.write(topic, time, time, number, &message).unwrap();
+            left -= message.len();
+            number += 1;
+        }
+        writer
+    }
+
+    fn command(&self, arguments: &[&str]) -> std::process::Command {
+        let mut rp = rp();
+        rp.args(["ship", "--config"])
+            .arg(self.path("ros2probe.yaml"))
+            .args(arguments)
+            .env_remove("STATE_DIRECTORY");
+        for (name, _) in std::env::vars() {
+            if name.starts_with("AWS_") {
+                rp.env_remove(name);
+            }
+        }
+        rp
+    }
+
+    /// Runs `rp ship --once`. No output has the secret.
+    fn once(&self) -> Output {
+        let output = self.command(&["--once"]).output().unwrap();
+        let all = format!("{output:?}");
+        assert!(!all.contains(SECRET), "{all}");
+        output
+    }
+
+    fn delivers(&self) {
+        let output = self.once();
+        assert!(output.status.success(), "{output:?}");
+    }
+
+    /// Starts `rp ship` as the service does.
+    fn start(&self) -> Running {
+        let child = self.command(&[]).stderr(Stdio::piped()).spawn().unwrap();
+        Running(Some(child))
+    }
+
+    fn status(&self) -> Value {
+        let output = self.command(&["--status", "--json"]).output().unwrap();
+        assert!(output.status.success(), "{output:?}");
+        serde_json::from_slice(&output.stdout).unwrap()
+    }
+
+    fn wait_for(&self, what: &str, wanted: impl Fn(&Value) -> bool) {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let status = fs::read(self.path("state/ship/status.json")).ok();
+            let status = status.and_then(|text| serde_json::from_slice::<Value>(&text).ok());
+            if status.as_ref().is_some_and(&wanted) {
+                return;
+            }
+            assert!(Instant::now() < deadline, "no {what}: {status:#?}");
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+}
+
+/// A running `rp ship`; dropping the value kills it.
+struct Running(Option<Child>);
+
+impl Running {
+    /// Kills it as `kill -9` does.
+    fn kill(mut self) {
+        let mut child = self.0.take().unwrap();
+        child.kill().unwrap();
+        child.wait().unwrap();
+    }
+
+    /// Ends it as a service manager does, and returns its log, which has no secret.
+    fn end(mut self) -> String {
+        let mut child = self.0.take().unwrap();
+        let process = rustix::process::Pid::from_child(&child);
+        rustix::process::kill_process(process, rustix::process::Signal::TERM).unwrap();
+        assert_eq!(child.wait().unwrap().code(), Some(0));
+        let mut log = String::new();
+        child.stderr.unwrap().read_to_string(&mut log).unwrap();
+        assert!(!log.contains(SECRET), "{log}");
+        log
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        if let Some(child) = &mut self.0 {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+    }
+}
+
+/// Sets the times of all files of a bag back.
+fn age(bag: &Path, seconds: u64) {
+    let then = SystemTime::now() - Duration::from_secs(seconds);
+    for entry in fs::read_dir(bag).unwrap() {
+        let file = File::open(entry.unwrap().path()).unwrap();
+        file.set_times(FileTimes::new().set_modified(then)).unwrap();
+    }
+}
+
+/// Returns the files of a bag by name.
+fn files(bag: &Path) -> BTreeMap<String, Vec<u8>> {
+    let entries = fs::read_dir(bag).unwrap().map(Result::unwrap);
+    entries
+        .map(|entry| {
+            let name = entry.file_name().into_string().unwrap();
+            (name, fs::read(entry.path()).unwrap())
+        })
+        .collect()
+}
+
+/// Asserts that delivered files are those of a bag, and that the manifest has their checksums.
+/// Returns the manifest.
+fn assert_whole(
+    bag: &BTreeMap<String, Vec<u8>>,
+    mut delivered: BTreeMap<String, Vec<u8>>,
+) -> Value {
+    let manifest = delivered.remove("manifest.json").expect("a manifest");
+    let manifest: Value = serde_json::from_slice(&manifest).unwrap();
+    let names = |files: &BTreeMap<String, Vec<u8>>| files.keys().cloned().collect::<Vec<_>>();
+    assert_eq!(names(&delivered), names(bag));
+    assert!(delivered == *bag, "other bytes");
+    let listed = manifest["files"].as_array().unwrap();
+    assert_eq!(listed.len(), bag.len());
+    for file in listed {
+        let content = &bag[file["name"].as_str().unwrap()];
+        assert_eq!(file["bytes"], content.len());
+        assert_eq!(file["sha256"], hex(content));
+    }
+    manifest
+}
+
+/// Returns the files of a bag in a store.
+fn stored(store: &Store, bag: &str) -> BTreeMap<String, Vec<u8>> {
+    let begin = format!("fleet/north/robot-17/{bag}/");
+    let objects = store.objects().into_iter();
+    objects
+        .filter_map(|(name, content)| {
+            let name = name.strip_prefix(&begin)?.to_owned();
+            Some((name, content.to_vec()))
+        })
+        .collect()
+}
+
+fn assert_stored(store: &Store, robot: &Robot, bag: &str) -> Value {
+    assert_whole(&files(&robot.bag(bag)), stored(store, bag))
+}
+
+/// Returns the objects for which the store served an operation, in their order.
+fn served(store: &Store, operation: impl Fn(Operation) -> bool) -> Vec<String> {
+    let served = store.served().into_iter();
+    let served = served.filter(|call| operation(call.operation));
+    served.map(|call| call.object).collect()
+}
+
+fn manifests(store: &Store) -> Vec<String> {
+    let puts = served(store, |operation| operation == Operation::Put).into_iter();
+    let bags = puts.filter_map(|object| {
+        let bag = object.strip_suffix("/manifest.json")?;
+        Some(bag.rsplit('/').next().unwrap().to_owned())
+    });
+    bags.collect()
+}
+
+#[test]
+fn a_bag_arrives_in_a_folder_with_its_manifest() {
+    let folder = tempfile::tempdir().unwrap();
+    let robot = Robot::to(&format!("file://{}", folder.path().display()), "");
+    robot.record("drive", 9 * MIB, 100);
+    robot.snapshot("incident_1", 1000, 50);
+    let recording = robot.write("running", 1000, 10, None);
+    robot.delivers();
+    for bag in ["drive", "incident_1"] {
+        let delivered = files(&folder.path().join("robot-17").join(bag));
+        let manifest = assert_whole(&files(&robot.bag(bag)), delivered);
+        assert_eq!(manifest["robot"], "robot-17");
+        assert_eq!(manifest["bag"], bag);
+        assert_eq!(manifest["is_complete"], true);
+        assert_eq!(manifest["findings"], Value::Null, "no agent runs");
+        assert_eq!(manifest["topics"][0]["name"], "/points");
+        let trigger = &manifest["trigger"]["trigger"];
+        assert_eq!(
+            *trigger,
+            if bag == "drive" {
+                Value::Null
+            } else {
+                json!("participant_lost")
+            }
+        );
+        assert!(manifest["start"].as_str() <= manifest["end"].as_str());
+        assert!(manifest["start"].is_string());
+    }
+    assert!(!folder.path().join("robot-17/running").exists());
+    let status = robot.status();
+    assert_eq!(status["delivered_bags"], 2);
+    assert_eq!(status["waiting_bags"], 0);
+    assert_eq!(status["unfinished_bags"], 1);
+    assert_eq!(status["last_delivered"]["path"], "robot-17/drive");
+    drop(recording);
+    // Space is not needed.
+    assert!(robot.bag("drive").exists());
+}
+
+#[test]
+fn a_folder_that_is_not_there_is_not_created() {
+    let folder = tempfile::tempdir().unwrap();
+    let missing = folder.path().join("not-mounted");
+    let robot = Robot::to(&format!("file://{}", missing.display()), "");
+    robot.record("drive", 1000, 100);
+    let output = robot.once();
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert!(error.contains("not-mounted does not exist"), "{error}");
+    assert!(!missing.exists());
+    fs::create_dir(&missing).unwrap();
+    robot.delivers();
+    assert!(missing.join("robot-17/drive/manifest.json").exists());
+}
+
+#[test]
+fn the_manifest_is_the_last_object_and_a_large_file_has_parts() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.record("drive", 20 * MIB, 100);
+    robot.delivers();
+    assert_stored(&store, &robot, "drive");
+    let written = served(&store, |operation| {
+        matches!(operation, Operation::Put | Operation::Complete)
+    });
+    let names: Vec<_> = written
+        .iter()
+        .map(|object| object.rsplit('/').next().unwrap())
+        .collect();
+    assert_eq!(names, ["drive_0.mcap", "metadata.yaml", "manifest.json"]);
+    let parts = served(&store, |operation| matches!(operation, Operation::Part(_)));
+    assert_eq!(parts.len(), 3);
+    // A second pass sends nothing.
+    let before = store.served().len();
+    robot.delivers();
+    assert_eq!(store.served().len(), before);
+}
+
+#[test]
+fn a_store_that_refuses_and_cuts_has_each_bag_once_in_the_end() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    let mut number = 0;
+    // Each second request fails.
+    store.decide(move |call| {
+        number += 1;
+        match number % 12 {
+            2 => Fate::Refuse(500, None),
+            4 => Fate::Refuse(429, Some(1)),
+            6 => Fate::Refuse(403, None),
+            8 => Fate::CutAfter(call.length / 2),
+            10 => Fate::CutAnswer,
+            _ => Fate::Serve,
+        }
+    });
+    robot.record("drive", 17 * MIB, 100);
+    robot.snapshot("incident_1", 3 * MIB, 50);
+    robot.record("short", 1000, 20);
+    let running = robot.start();
+    robot.wait_for("delivery", |status| status["delivered_bags"] == 3);
+    let log = running.end();
+    for bag in ["drive", "incident_1", "short"] {
+        assert_stored(&store, &robot, bag);
+    }
+    assert_eq!(store.objects().len(), 3 * 3, "{:?}", store.objects().keys());
+    assert!(
+        log.contains("500 Internal Server Error (RefusedByTheTest)"),
+        "{log}"
+    );
+    assert!(log.contains("403 Forbidden"), "{log}");
+}
+
+#[test]
+fn a_store_out_of_reach_is_reported_and_nothing_is_lost() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.record("drive", 1000, 100);
+    store.decide(|_| Fate::CutAfter(0));
+    let output = robot.once();
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert!(error.contains("the store is out of reach"), "{error}");
+    assert_eq!(robot.status()["waiting_bags"], 1);
+    assert!(robot.bag("drive").exists());
+    store.decide(|_| Fate::Serve);
+    robot.delivers();
+    assert_stored(&store, &robot, "drive");
+}
+
+#[test]
+fn a_killed_process_continues_with_the_part_in_which_it_died() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.configure("  max_bytes_per_second: 8000000\n", "");
+    robot.record("drive", 30 * MIB, 100);
+    let running = robot.start();
+    // The second part is on its way.
+    store.wait_for("second part", |store| store.received() > PART + PART / 2);
+    running.kill();
+    let sent = served(&store, |operation| matches!(operation, Operation::Part(_)));
+    assert_eq!(sent.len(), 1);
+    robot.configure("", "");
+    robot.delivers();
+    assert_stored(&store, &robot, "drive");
+    let parts: Vec<_> = store.served().iter().map(|call| call.operation).collect();
+    let count = |wanted| parts.iter().filter(|part| **part == wanted).count();
+    assert_eq!(count(Operation::Begin), 1);
+    for number in 1..=4 {
+        assert_eq!(count(Operation::Part(number)), 1, "part {number}");
+    }
+}
+
+#[test]
+fn a_process_that_is_killed_again_and_again_delivers_each_bag_once() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.configure("  max_bytes_per_second: 20000000\n", "");
+    robot.record("drive", 18 * MIB, 100);
+    robot.record("lap", 2 * MIB, 50);
+    for step in 1_usize..=12 {
+        let running = robot.start();
+        std::thread::sleep(Duration::from_millis(90 * step as u64 % 700 + 60));
+        running.kill();
+    }
+    robot.configure("", "");
+    robot.delivers();
+    for bag in ["drive", "lap"] {
+        assert_stored(&store, &robot, bag);
+    }
+    assert_eq!(store.objects().len(), 6);
+}
+
+#[test]
+fn an_upload_whose_completion_was_not_confirmed_is_not_repeated() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    let mut is_cut = false;
+    store.decide(move |call| {
+        let cuts = call.operation == Operation::Complete && !is_cut;
+        is_cut |= cuts;
+        if cuts { Fate::CutAnswer } else { Fate::Serve }
+    });
+    robot.record("drive", 12 * MIB, 100);
+    robot.delivers();
+    assert_stored(&store, &robot, "drive");
+    let begun = served(&store, |operation| operation == Operation::Begin);
+    assert_eq!(begun.len(), 1);
+}
+
+#[test]
+fn an_upload_that_the_store_dropped_begins_again() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    store.decide(|call| match call.operation {
+        Operation::Part(2) => Fate::Refuse(503, None),
+        _ => Fate::Serve,
+    });
+    robot.record("drive", 12 * MIB, 100);
+    assert_eq!(robot.once().status.code(), Some(1));
+    store.expire_uploads();
+    store.decide(|_| Fate::Serve);
+    robot.delivers();
+    assert_stored(&store, &robot, "drive");
+}
+
+#[test]
+fn replaced_credentials_apply_without_a_restart() {
+    let store = Store::start();
+    store.accept_key("AK-2");
+    let robot = Robot::of(&store);
+    robot.record("drive", 1000, 100);
+    let running = robot.start();
+    robot.wait_for("refusal", |status| {
+        let reason = status["last_failure"]["reason"].as_str();
+        reason.is_some_and(|reason| reason.contains("403 Forbidden"))
+    });
+    robot.set_key("AK-2");
+    robot.wait_for("delivery", |status| status["delivered_bags"] == 1);
+    assert_stored(&store, &robot, "drive");
+    // The next key applies to the next bag.
+    store.accept_key("AK-3");
+    robot.set_key("AK-3");
+    robot.record("lap", 1000, 10);
+    robot.wait_for("second delivery", |status| status["delivered_bags"] == 2);
+    running.end();
+    assert_stored(&store, &robot, "lap");
+    let keys: Vec<_> = store
+        .served()
+        .into_iter()
+        .map(|call: Call| call.key)
+        .collect();
+    assert!(
+        keys.iter().all(|key| key == "AK-2" || key == "AK-3"),
+        "{keys:?}"
+    );
+}
+
+#[test]
+fn outside_the_windows_only_triggered_bags_are_delivered_if_configured() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    let now = jiff::Zoned::now();
+    let at = |hours: i64| {
+        let time = now.time().wrapping_add(jiff::Span::new().hours(hours));
+        time.strftime("%H:%M").to_string()
+    };
+    let closed = format!(
+        "  windows: ['{}-{}']\n  triggered_always: true\n",
+        at(2),
+        at(3)
+    );
+    robot.configure(&closed, "");
+    robot.record("drive", 1000, 100);
+    robot.snapshot("incident_1", 1000, 50);
+    let running = robot.start();
+    robot.wait_for("delivery", |status| status["delivered_bags"] == 1);
+    std::thread::sleep(Duration::from_secs(3));
+    let status = robot.status();
+    assert_eq!(status["waiting"], json!(["drive"]));
+    let opens = status["opens_in_seconds"].as_u64().unwrap();
+    assert!((6_900..=7_200).contains(&opens), "{opens}");
+    running.end();
+    assert_eq!(manifests(&store), ["incident_1"]);
+    let open = format!("  windows: ['{}-{}']\n", at(-1), at(1));
+    robot.configure(&open, "");
+    let running = robot.start();
+    robot.wait_for("delivery", |status| status["delivered_bags"] == 2);
+    running.end();
+    assert_stored(&store, &robot, "drive");
+}
+
+#[test]
+fn a_triggered_bag_overtakes_one_that_is_being_delivered() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.configure("  max_bytes_per_second: 8000000\n", "");
+    robot.record("drive", 40 * MIB, 100);
+    let running = robot.start();
+    store.wait_for("first bytes", |store| store.received() > MIB);
+    robot.snapshot("incident_1", 1000, 5);
+    store.wait_for("the triggered bag", |store| !manifests(store).is_empty());
+    running.kill();
+    assert_eq!(manifests(&store), ["incident_1"]);
+    assert_stored(&store, &robot, "incident_1");
+    robot.configure("", "");
+    robot.delivers();
+    assert_stored(&store, &robot, "drive");
+    let begun = served(&store, |operation| operation == Operation::Begin);
+    assert_eq!(begun.len(), 1, "the parts before are not sent again");
+}
+
+#[test]
+fn delivered_bags_are_deleted_only_if_space_is_needed_and_the_store_has_them() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.record("drive", 30_000, 100);
+    robot.record("lap", 60_000, 50);
+    robot.delivers();
+    assert!(robot.bag("drive").exists() && robot.bag("lap").exists());
+    robot.configure("", ", max_total_bytes: 65536");
+    store.remove("fleet/north/robot-17/drive/drive_0.mcap");
+    robot.delivers();
+    assert!(robot.bag("drive").exists(), "it was delivered again first");
+    assert_stored(&store, &robot, "drive");
+    robot.delivers();
+    // The oldest bag is not enough.
+    assert!(!robot.bag("drive").exists() && !robot.bag("lap").exists());
+    assert_eq!(robot.status()["deleted_bags"], 2);
+    assert_eq!(store.objects().len(), 6);
+    // A bag that the store does not have stays.
+    store.decide(|_| Fate::Refuse(503, None));
+    robot.record("new", 90_000, 10);
+    assert_eq!(robot.once().status.code(), Some(1));
+    assert!(robot.bag("new").exists());
+}
+
+/// The test needs root, for a disk of its own.
+#[test]
+fn bags_on_a_full_disk_are_delivered_and_deleted() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.configure("", ", max_total_bytes: 1000000");
+    robot.record("drive", 12 * MIB, 100);
+    robot.record("lap", 2 * MIB, 50);
+    let before = ["drive", "lap"].map(|bag| files(&robot.bag(bag)));
+    fs::rename(robot.path("state"), robot.path("before")).unwrap();
+    fs::create_dir(robot.path("state")).unwrap();
+    let script = r#"mount -t tmpfs -o size=16m none "$0/state" || exit 99
+        cp -a "$0/before/recordings" "$0/state/" || exit 98
+        dd if=/dev/zero of="$0/state/others" bs=4k 2>/dev/null
+        echo x >> "$0/state/others" && exit 97
+        exec "$@""#;
+    let rp = robot.command(&[]);
+    let child = std::process::Command::new("unshare")
+        .args(["--mount", "sh", "-c", script])
+        .arg(robot.directory.path())
+        .arg(rp.get_program())
+        .args(rp.get_args())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let state = format!("/proc/{}/root{}", child.id(), robot.path("state").display());
+    let running = Running(Some(child));
+    store.wait_for("both bags", |store| manifests(store).len() == 2);
+    let recordings = Path::new(&state).join("recordings");
+    let deadline = Instant::now() + PATIENCE;
+    while fs::read_dir(&recordings).unwrap().count() > 0 {
+        assert!(Instant::now() < deadline, "bags are still there");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    let log = running.end();
+    assert!(log.contains("failed to record a delivery"), "{log}");
+    for (bag, before) in ["drive", "lap"].into_iter().zip(&before) {
+        assert_whole(before, stored(&store, bag));
+    }
+    assert_eq!(store.objects().len(), 6);
+}
+
+#[test]
+fn after_a_loss_of_the_records_no_bag_is_delivered_twice() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.record("drive", 10 * MIB, 100);
+    robot.delivers();
+    fs::remove_dir_all(robot.path("state/ship")).unwrap();
+    let before = store.received();
+    robot.delivers();
+    assert_eq!(store.received(), before);
+    assert_eq!(store.objects().len(), 3);
+    assert_eq!(robot.status()["delivered_bags"], 1);
+}
+
+#[test]
+fn another_bag_of_the_same_name_has_a_number() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.record("drive", 1000, 100);
+    robot.delivers();
+    let first = stored(&store, "drive");
+    fs::remove_dir_all(robot.bag("drive")).unwrap();
+    robot.record("drive", 2000, 50);
+    robot.delivers();
+    assert!(stored(&store, "drive") == first);
+    let manifest = assert_whole(&files(&robot.bag("drive")), stored(&store, "drive-2"));
+    assert_eq!(manifest["bag"], "drive");
+}
+
+#[test]
+fn an_answer_beyond_the_cap_is_refused() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    robot.record("drive", 1000, 100);
+    let manifest = "fleet/north/robot-17/drive/manifest.json";
+    store.insert(manifest, vec![b' '; 16 * MIB + 1]);
+    let output = robot.once();
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert!(error.contains("length limit exceeded"), "{error}");
+    store.remove(manifest);
+    robot.delivers();
+    assert_stored(&store, &robot, "drive");
+}
+
+#[test]
+fn the_bag_of_a_killed_recorder_is_named_incomplete() {
+    let store = Store::start();
+    let robot = Robot::of(&store);
+    let mut recording = robot.write("drive", 3000, 200, None);
+    recording.flush().unwrap();
+    age(&robot.bag("drive"), 200);
+    robot.delivers();
+    assert!(store.objects().is_empty(), "its recorder lives");
+    drop(recording);
+    robot.delivers();
+    let manifest = assert_stored(&store, &robot, "drive");
+    assert_eq!(manifest["is_complete"], false);
+}
+
+#[test]
+fn mistakes_of_the_configuration_are_reported_at_the_start() {
+    let robot = Robot::to("s3://bags", "");
+    let fails = |code: i32, text: &str| {
+        let output = robot.once();
+        let error = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(code), "{error}");
+        assert!(error.contains(text), "{error}");
+    };
+    robot.configure("  windows: ['22-6']\n", "");
+    fails(78, "ship.windows[0]");
+    fs::write(robot.path("ros2probe.yaml"), "ship: {url: 'ftp://a'}\n").unwrap();
+    fails(78, "ship.url");
+    fs::write(robot.path("ros2probe.yaml"), "watch: []\n").unwrap();
+    fails(78, "no destination is configured");
+    robot.configure("", "");
+    robot.record("drive", 1000, 100);
+    fs::write(robot.path("ship.env"), format!("AWS_SECRET={SECRET}\n")).unwrap();
+    fails(1, "line 1 of");
+    let first = robot.start();
+    let process = first.0.as_ref().unwrap().id();
+    robot.wait_for("start", |status| status["process_id"] == process);
+    fails(1, "another rp ship works with");
+    first.kill();
+}

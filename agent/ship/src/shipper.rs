@@ -1,0 +1,457 @@
+//! The loop that delivers bags: which is next, pauses after failures, windows, and space.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use jiff::Zoned;
+use object_store::path::Path;
+use serde_json::Value;
+use tokio::time::sleep;
+
+use crate::bags::{Bag, Found, Scanner};
+use crate::delivery::{DeliveryError, Step};
+use crate::settings::{Settings, SettingsError, destination};
+use crate::space;
+use crate::state::{Delivery, Records, RecordsError};
+use crate::status::{Delivered, Failure, MAX_LISTED, Status, Uploading, now};
+use crate::store::Store;
+
+/// Time between two scans of the directory.
+const POLL: Duration = Duration::from_secs(2);
+/// Pauses after a failure.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
+const LONGEST_PAUSE: Duration = Duration::from_mins(1);
+/// Number of failures in a row after which a single pass ends.
+const MAX_FAILURES: u32 = 3;
+/// Beginning of the name of a bag that is being deleted.
+const DELETED: &str = ".delivered-";
+
+/// Returns warnings and errors of the agent between two times in nanoseconds since 1970; `None` if
+/// the agent cannot be queried.
+pub type Findings = Arc<dyn Fn(u64, u64) -> Option<Vec<Value>> + Send + Sync>;
+
+/// Receives the progress of a delivery.
+pub type Observer = Box<dyn FnMut(&Uploading)>;
+
+/// Delivers bags.
+pub struct Shipper {
+    pub(crate) settings: Settings,
+    /// Path below the bucket or folder.
+    pub(crate) prefix: Path,
+    pub(crate) records: Records,
+    pub(crate) findings: Option<Findings>,
+    observer: Option<Observer>,
+    store: Option<Store>,
+    scanner: Scanner,
+    status: Status,
+    /// Failures that concern one bag, until its delivery. A bag with more of them waits behind
+    /// others.
+    failures: BTreeMap<String, u32>,
+    /// Failures in a row, of all bags.
+    failures_in_row: u32,
+    /// Reason of the last failure that was logged; `None` after a success.
+    logged: Option<String>,
+    /// Whether windows are ignored.
+    is_single: bool,
+    last_scan: Option<Instant>,
+    found: Found,
+}
+
+/// Why a shipper ends.
+#[derive(Debug, thiserror::Error)]
+pub enum ShipError {
+    /// The settings name no destination.
+    #[error(transparent)]
+    Settings(#[from] SettingsError),
+    /// The directory of records cannot be used, or another process uses it.
+    #[error("cannot record deliveries")]
+    Records(#[source] Box<dyn std::error::Error + Send + Sync>),
+    /// A single pass could not deliver all bags.
+    #[error("{bag}: {reason} (waiting bags: {waiting})")]
+    Undelivered {
+        /// Number of bags that wait.
+        waiting: usize,
+        /// Bag whose delivery failed last.
+        bag: String,
+        /// Reason of the failure.
+        reason: String,
+    },
+    /// The directory of the bags cannot be read.
+    #[error("cannot read {}", .0.display())]
+    Directory(PathBuf, #[source] io::Error),
+}
+
+impl From<RecordsError> for ShipError {
+    fn from(error: RecordsError) -> Self {
+        Self::Records(Box::new(error))
+    }
+}
+
+impl Shipper {
+    /// Opens the records of deliveries, without a request.
+    ///
+    /// # Errors
+    /// Fails if the settings name no destination, or the records cannot be used.
+    pub fn new(
+        settings: Settings,
+        findings: Option<Findings>,
+        observer: Option<Observer>,
+    ) -> Result<Self, ShipError> {
+        let wrong = || SettingsError::Url(settings.url.clone());
+        let (_, url) = destination(&settings.url).ok_or_else(wrong)?;
+        let prefix = match url.scheme() {
+            "file" => Path::ROOT,
+            _ => Path::from_url_path(url.path()).map_err(|_| wrong())?,
+        };
+        let records = Records::open(&settings.state)?;
+        let mut status = Status::read(&settings.state).unwrap_or_default();
+        status.uploading = None;
+        Ok(Self {
+            records,
+            status,
+            prefix,
+            findings,
+            observer,
+            store: None,
+            scanner: Scanner::default(),
+            failures: BTreeMap::new(),
+            failures_in_row: 0,
+            logged: None,
+            is_single: false,
+            last_scan: None,
+            found: Found::default(),
+            settings,
+        })
+    }
+
+    /// Delivers bags until the future is dropped, which is safe at any time.
+    ///
+    /// # Errors
+    /// Never fails: failures are logged, and the delivery is repeated.
+    pub async fn run(&mut self) -> Result<(), ShipError> {
+        loop {
+            let wait = match self.turn().await {
+                Ok(wait) => wait,
+                Err(error) => {
+                    self.log_failure("", &describe(&error));
+                    Some(POLL)
+                }
+            };
+            if let Some(wait) = wait {
+                sleep(wait).await;
+            }
+        }
+    }
+
+    /// Delivers the finished bags once, without regard to windows.
+    ///
+    /// # Errors
+    /// Fails if a bag waits after some attempts, or if the directory cannot be read.
+    pub async fn run_once(&mut self) -> Result<Status, ShipError> {
+        self.is_single = true;
+        self.scan()?;
+        loop {
+            let wait = self.turn().await?;
+            let waiting = self.waiting().len();
+            if waiting == 0 {
+                return Ok(self.status.clone());
+            }
+            if self.failures_in_row >= MAX_FAILURES {
+                let failure = self.status.last_failure.clone().unwrap_or_default();
+                return Err(ShipError::Undelivered {
+                    waiting,
+                    bag: failure.bag,
+                    reason: failure.reason,
+                });
+            }
+            if let Some(wait) = wait {
+                sleep(wait).await;
+            }
+        }
+    }
+
+    /// Delivers one bag as far as possible. Returns a time to wait, if there is a reason.
+    async fn turn(&mut self) -> Result<Option<Duration>, ShipError> {
+        self.scan()?;
+        self.drop_vanished().await;
+        self.make_space().await;
+        let Some(bag) = self.next() else {
+            self.show_status();
+            return Ok(Some(POLL));
+        };
+        let delivered = self.deliver(&bag).await;
+        self.status.uploading = None;
+        let wait = match delivered {
+            Ok(Step::Delivered) => {
+                self.delivered(&bag);
+                None
+            }
+            Ok(Step::Interrupted) => None,
+            Err(error) => Some(self.failed(&bag, &error).await),
+        };
+        self.show_status();
+        Ok(wait)
+    }
+
+    /// Returns the opened destination.
+    pub(crate) fn store(&mut self) -> Result<&mut Store, SettingsError> {
+        match &mut self.store {
+            Some(store) => Ok(store),
+            none => Ok(none.insert(Store::open(&self.settings)?)),
+        }
+    }
+
+    fn scan(&mut self) -> Result<(), ShipError> {
+        let directory = &self.settings.recordings;
+        match self.scanner.scan(directory) {
+            Ok(found) => self.found = found,
+            // The agent creates the directory with the first bag.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => self.found = Found::default(),
+            Err(error) => return Err(ShipError::Directory(directory.clone(), error)),
+        }
+        self.last_scan = Some(Instant::now());
+        Ok(())
+    }
+
+    /// Returns the bags that the destination does not have, in the order of their delivery.
+    fn waiting(&self) -> Vec<&Bag> {
+        let is_waiting = |bag: &&Bag| {
+            let record = self.records.get(&bag.name);
+            record
+                .is_none_or(|record| !record.is_delivered || record.fingerprint != bag.fingerprint)
+        };
+        let mut bags: Vec<_> = self.found.bags.iter().filter(is_waiting).collect();
+        // The sort keeps the order of the bags that failed equally often.
+        bags.sort_by_key(|bag| self.failures.get(&bag.name).copied().unwrap_or(0));
+        bags
+    }
+
+    /// Returns the bag to deliver now.
+    fn next(&self) -> Option<Bag> {
+        let mut waiting = self.waiting().into_iter();
+        waiting.find(|bag| self.is_permitted(bag)).cloned()
+    }
+
+    /// Returns whether the bag may be delivered at this time.
+    fn is_permitted(&self, bag: &Bag) -> bool {
+        let is_urgent = bag.is_triggered() && self.settings.triggered_always;
+        self.is_single || is_urgent || self.opens_in().is_zero()
+    }
+
+    fn opens_in(&self) -> Duration {
+        self.settings.windows.opens_in(Zoned::now().time())
+    }
+
+    /// Returns whether the delivery of a bag ends for now: the window closed, or a triggered bag
+    /// waits behind one that is not.
+    pub(crate) fn is_interrupted(&mut self, bag: &Bag) -> bool {
+        if !self.is_permitted(bag) {
+            return true;
+        }
+        let is_due = self.last_scan.is_none_or(|scan| scan.elapsed() >= POLL);
+        if bag.is_triggered() || !is_due || self.scan().is_err() {
+            return false;
+        }
+        let next = self.next();
+        next.is_some_and(|next| next.is_triggered() && next.name != bag.name)
+    }
+
+    /// Forgets bags that were deleted by others.
+    async fn drop_vanished(&mut self) {
+        if !self.settings.recordings.is_dir() {
+            return;
+        }
+        let vanished = |name: &&str| {
+            let path = self.settings.recordings.join(name);
+            fs::symlink_metadata(path).is_err_and(|error| error.kind() == io::ErrorKind::NotFound)
+        };
+        let vanished: Vec<_> = self
+            .records
+            .names()
+            .filter(vanished)
+            .map(str::to_owned)
+            .collect();
+        for name in vanished {
+            self.failures.remove(&name);
+            // Its unfinished uploads stay at the destination if that is out of reach.
+            let _ = self.drop_record(&name).await;
+        }
+    }
+
+    /// Deletes delivered bags while space is needed, the oldest first. Each is confirmed first.
+    async fn make_space(&mut self) {
+        self.remove_deleted();
+        while space::is_needed(&self.settings.recordings, self.settings.space) {
+            let is_delivered = |bag: &&Bag| {
+                let record = self.records.get(&bag.name);
+                record.is_some_and(|record| {
+                    record.is_delivered && record.fingerprint == bag.fingerprint
+                })
+            };
+            let bags = self.found.bags.iter().filter(is_delivered);
+            let Some(bag) = bags.min_by_key(|bag| bag.began()).cloned() else {
+                return;
+            };
+            let Some(mut delivery) = self.records.get(&bag.name).cloned() else {
+                return;
+            };
+            match self.is_confirmed(&delivery).await {
+                Ok(true) => {}
+                Ok(false) => {
+                    let name = &bag.name;
+                    tracing::warn!(bag = %name, "the destination no longer has a delivered bag: it is delivered again");
+                    again(&mut delivery);
+                    self.records.keep(&bag.name, delivery);
+                    return;
+                }
+                Err(error) => {
+                    self.failed(&bag, &error).await;
+                    return;
+                }
+            }
+            let aside = self
+                .settings
+                .recordings
+                .join(format!("{DELETED}{}", bag.name));
+            // After a loss of power, a bag is there as a whole or not at all.
+            let removed = fs::rename(&bag.path, &aside).and_then(|()| fs::remove_dir_all(&aside));
+            if let Err(error) = removed {
+                tracing::warn!(bag = %bag.name, %error, "failed to delete a delivered bag");
+                return;
+            }
+            tracing::info!(bag = %bag.name, "deleted a delivered bag for space");
+            self.status.deleted_bags += 1;
+            self.records.forget(&bag.name);
+            self.found.bags.retain(|other| other.name != bag.name);
+        }
+    }
+
+    /// Removes the rest of bags whose deletion was interrupted.
+    fn remove_deleted(&self) {
+        let entries = fs::read_dir(&self.settings.recordings)
+            .into_iter()
+            .flatten();
+        for entry in entries.flatten() {
+            if entry.file_name().to_string_lossy().starts_with(DELETED) {
+                let _ = fs::remove_dir_all(entry.path());
+            }
+        }
+    }
+
+    fn delivered(&mut self, bag: &Bag) {
+        let remote = self.records.get(&bag.name);
+        let remote = remote
+            .and_then(|record| record.remote.clone())
+            .unwrap_or_default();
+        let path = format!("{}/{remote}", self.settings.instance);
+        tracing::info!(bag = %bag.name, path, bytes = bag.bytes(), "delivered");
+        self.status.delivered_bags += 1;
+        self.status.delivered_bytes += bag.bytes();
+        self.status.last_delivered = Some(Delivered {
+            bag: bag.name.clone(),
+            path,
+            at: now(),
+        });
+        self.failures.remove(&bag.name);
+        self.failures_in_row = 0;
+        self.logged = None;
+    }
+
+    /// Records a failure, and returns the pause after it.
+    async fn failed(&mut self, bag: &Bag, error: &DeliveryError) -> Duration {
+        // While the link is down, triggered bags stay first.
+        if error.is_of_bag() {
+            let failures = self.failures.entry(bag.name.clone()).or_default();
+            *failures = failures.saturating_add(1);
+        }
+        self.failures_in_row = self.failures_in_row.saturating_add(1);
+        self.log_failure(&bag.name, &describe(error));
+        if matches!(error, DeliveryError::Changed) {
+            let _ = self.drop_record(&bag.name).await;
+        }
+        // Files that the file with credentials names may have been replaced.
+        if let Some(store) = &mut self.store {
+            let _ = store.reopen_all();
+        }
+        let demanded = match error {
+            DeliveryError::Store(error) => error.pause(),
+            _ => None,
+        };
+        let doublings = self.failures_in_row.saturating_sub(1).min(10);
+        let pause = FIRST_PAUSE
+            .saturating_mul(1 << doublings)
+            .min(LONGEST_PAUSE);
+        pause.max(demanded.unwrap_or_default())
+    }
+
+    /// Keeps a failure, and logs it unless it is the same as before.
+    fn log_failure(&mut self, bag: &str, reason: &str) {
+        if self.logged.as_deref() != Some(reason) {
+            tracing::warn!(bag, reason, "failed to deliver; it is repeated");
+            self.logged = Some(reason.to_owned());
+        }
+        self.status.last_failure = Some(Failure {
+            bag: bag.to_owned(),
+            reason: reason.to_owned(),
+            at: now(),
+        });
+    }
+
+    /// Shows a delivery after a successful step of it.
+    pub(crate) fn progressed(&mut self, bag: &Bag, delivery: &Delivery) {
+        let (bytes, done_bytes) = delivery.progress();
+        let uploading = Uploading {
+            bag: bag.name.clone(),
+            bytes,
+            done_bytes,
+        };
+        self.failures_in_row = 0;
+        if let Some(observer) = &mut self.observer {
+            observer(&uploading);
+        }
+        self.status.uploading = Some(uploading);
+        self.show_status();
+    }
+
+    fn show_status(&mut self) {
+        let waiting = self.waiting();
+        let names = waiting.iter().take(MAX_LISTED);
+        let names: Vec<_> = names.map(|bag| bag.name.clone()).collect();
+        let (bags, bytes) = (
+            waiting.len() as u64,
+            waiting.iter().map(|bag| bag.bytes()).sum(),
+        );
+        self.status.waiting = names;
+        self.status.waiting_bags = bags;
+        self.status.waiting_bytes = bytes;
+        self.status.unfinished_bags = self.found.unfinished.len() as u64;
+        self.status.opens_in_seconds = self.opens_in().as_secs();
+        self.status.write(&self.settings.state);
+    }
+}
+
+/// Makes a delivery begin again.
+fn again(delivery: &mut Delivery) {
+    delivery.is_delivered = false;
+    for file in &mut delivery.files {
+        file.is_sent = false;
+        file.is_delivered = false;
+        file.upload = None;
+    }
+}
+
+/// Returns an error with its causes.
+fn describe(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(deeper) = cause {
+        text.push_str(": ");
+        text.push_str(&deeper.to_string());
+        cause = deeper.source();
+    }
+    text
+}

@@ -1,0 +1,102 @@
+//! What `rp ship --status` prints, and the file in which a running shipper leaves it.
+
+use std::path::{Path, PathBuf};
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+
+use crate::state::{read_json, write_json};
+
+/// State of a delivery.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Status {
+    /// Time of this state, RFC 3339.
+    pub at: String,
+    /// Process id of the shipper.
+    pub process_id: u32,
+    /// Bags that wait, the next one first: at most 100 of them.
+    pub waiting: Vec<String>,
+    /// Number of all bags that wait.
+    pub waiting_bags: u64,
+    /// Bytes of all bags that wait.
+    pub waiting_bytes: u64,
+    /// Number of bags that are recorded at this time.
+    pub unfinished_bags: u64,
+    /// Bag that is delivered at this time.
+    pub uploading: Option<Uploading>,
+    /// Number of bags that were delivered since the first start.
+    pub delivered_bags: u64,
+    /// Bytes of these bags.
+    pub delivered_bytes: u64,
+    /// Number of delivered bags that were deleted on the robot.
+    pub deleted_bags: u64,
+    /// The latest delivered bag.
+    pub last_delivered: Option<Delivered>,
+    /// The latest failure.
+    pub last_failure: Option<Failure>,
+    /// Seconds until a window opens; zero if one is open.
+    pub opens_in_seconds: u64,
+}
+
+/// A bag that is delivered at this time.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Uploading {
+    /// Name of the bag.
+    pub bag: String,
+    /// Its size in bytes.
+    pub bytes: u64,
+    /// Bytes of it that the destination has.
+    pub done_bytes: u64,
+}
+
+/// A delivered bag.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Delivered {
+    /// Name of the bag.
+    pub bag: String,
+    /// Name of its directory at the destination, with that of the robot.
+    pub path: String,
+    /// Time of the delivery, RFC 3339.
+    pub at: String,
+}
+
+/// A failure.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Failure {
+    /// Name of the bag.
+    pub bag: String,
+    /// What failed.
+    pub reason: String,
+    /// Time of the failure, RFC 3339.
+    pub at: String,
+}
+
+/// Maximum number of bags that are listed.
+pub(crate) const MAX_LISTED: usize = 100;
+
+impl Status {
+    /// Reads the state that a shipper left in its directory; `None` without one.
+    #[must_use]
+    pub fn read(directory: &Path) -> Option<Self> {
+        read_json(&path(directory))
+    }
+
+    /// Writes the state. A failure is ignored: nothing depends on it.
+    pub(crate) fn write(&mut self, directory: &Path) {
+        self.at = now();
+        self.process_id = std::process::id();
+        let _ = write_json(&path(directory), self);
+    }
+}
+
+/// Returns the time in RFC 3339, to the second.
+pub(crate) fn now() -> String {
+    let now = Timestamp::now();
+    Timestamp::from_second(now.as_second())
+        .unwrap_or(now)
+        .to_string()
+}
+
+fn path(directory: &Path) -> PathBuf {
+    directory.join("status.json")
+}
