@@ -14,7 +14,7 @@ use ros2probe_model::graph::discovery::Memory;
 /// Default directory of the package and of the service manager.
 const DEFAULT: &str = "/var/lib/ros2probe";
 /// Variable of the service manager.
-pub(crate) const VARIABLE: &str = "STATE_DIRECTORY";
+const VARIABLE: &str = "STATE_DIRECTORY";
 /// Subdirectory of recordings.
 pub(crate) const RECORDINGS: &str = "recordings";
 
@@ -23,11 +23,7 @@ pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
     if container::state(choice).is_some() {
         return None;
     }
-    let path = path(choice)?;
-    if *choice == StateChoice::Auto && path == Path::new(DEFAULT) && !path.exists() {
-        return None;
-    }
-    let opened = StateDirectory::open(&path);
+    let opened = StateDirectory::open(&path(choice)?);
     match opened {
         Ok(directory) => Some(Arc::new(directory)),
         Err(error) => {
@@ -48,7 +44,8 @@ pub(crate) fn path(choice: &StateChoice) -> Option<PathBuf> {
         StateChoice::At(path) => Some(path.clone()),
         StateChoice::Auto => {
             let named = std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
-            Some(named.map_or_else(|| PathBuf::from(DEFAULT), PathBuf::from))
+            let default = || Path::new(DEFAULT).exists().then(|| DEFAULT.into());
+            named.map(PathBuf::from).or_else(default)
         }
     }
 }

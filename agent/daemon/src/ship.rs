@@ -1,12 +1,10 @@
 //! Settings of `rp ship`, from the configuration that it shares with the agent.
 
-use std::path::{Path, PathBuf};
-
 use ros2probe_metrics::otlp::Host;
 use ros2probe_ship::{DIRECTORY, Settings, SpaceLimits};
 
 use crate::config::{Config, StateChoice};
-use crate::memory::{DEFAULT, RECORDINGS, VARIABLE};
+use crate::memory::{self, RECORDINGS};
 
 /// Why bags cannot be delivered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -32,7 +30,7 @@ pub enum NoShip {
 pub fn settings(config: &Config) -> Result<Settings, NoShip> {
     let ship = &config.ship;
     let url = ship.url.clone().ok_or(NoShip::Destination)?;
-    let state = state_directory(&config.state_directory).ok_or(NoShip::State)?;
+    let state = memory::path(&config.state_directory).ok_or(NoShip::State)?;
     let recordings = match &config.recordings.directory {
         StateChoice::Off => return Err(NoShip::Recordings),
         StateChoice::At(path) => path.clone(),
@@ -61,17 +59,6 @@ pub fn settings(config: &Config) -> Result<Settings, NoShip> {
             max_total_bytes: limits.max_total_bytes,
         },
     })
-}
-
-/// Returns the state directory of the agent; `None` without one.
-fn state_directory(choice: &StateChoice) -> Option<PathBuf> {
-    let named = std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
-    match (choice, named) {
-        (StateChoice::Off, _) => None,
-        (StateChoice::At(path), _) => Some(path.clone()),
-        (StateChoice::Auto, Some(path)) => Some(PathBuf::from(path)),
-        (StateChoice::Auto, None) => Path::new(DEFAULT).exists().then(|| DEFAULT.into()),
-    }
 }
 
 #[cfg(test)]

@@ -443,7 +443,7 @@ fn book() -> Result<Vec<String>> {
     Ok(pages)
 }
 
-const FILES: [(&str, u32); 21] = [
+const FILES: [(&str, u32); 22] = [
     ("etc/ros2probe/ros2probe.yaml", 0o644),
     ("usr/bin/rp", 0o755),
     ("usr/lib/systemd/system/ros2probe-attach.service", 0o644),
