@@ -63,6 +63,8 @@ pub fn settings(config: &Config) -> Result<Settings, NoShip> {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
 
     fn config(text: &str) -> Config {
