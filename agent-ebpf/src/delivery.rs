@@ -103,7 +103,7 @@ const NEW_QUEUE: Queue = Queue {
     stall_throttled: 0,
 };
 
-/// Minimum of a wait for a CPU that explains the waits of several datagrams, in nanoseconds.
+/// Minimum wait for a CPU, in nanoseconds, to which the waits of several datagrams are attributed.
 const STALL: u64 = 500_000;
 
 /// Returns whether deliveries are followed.

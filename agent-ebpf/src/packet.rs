@@ -14,8 +14,8 @@ use crate::{
 /// Maximum offset at which [`in_place`] reads, because the verifier requires a bound.
 const IN_PLACE_BYTES: usize = 0x7fff;
 
-/// The hook at which a program sees a packet. The values are `u32` because they cross a function
-/// boundary.
+/// The hook at which a program sees a packet. The values are `u32`, because functions of BPF take and
+/// return integers.
 pub mod hook {
     /// A frame on an interface.
     pub const WIRE: u32 = 0;

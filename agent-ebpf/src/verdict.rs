@@ -30,7 +30,7 @@ pub const NO_WAKEUP: u64 = 1;
 pub const FORCE_WAKEUP: u64 = 2;
 pub const AVAILABLE_DATA: u64 = 0;
 
-/// Results of [`advance`]. The values are `u32` because they cross a function boundary.
+/// Results of [`advance`]. The values are `u32`, because functions of BPF take and return integers.
 pub mod progress {
     /// More submessages may follow in this frame.
     pub const ON: u32 = 0;
@@ -349,8 +349,8 @@ pub fn charge(len: u32) -> bool {
     spend(Budget::CaptureBytes, len)
 }
 
-/// Charges a budget if any of it is left; returns whether any was left. Racing CPUs may overdraw
-/// the budget by a datagram.
+/// Charges a budget if any of it is left; returns whether any was left. The last charge may overdraw
+/// the budget, and racing CPUs may lose a charge.
 #[inline(always)]
 pub fn spend(budget: Budget, amount: u32) -> bool {
     let Some(budget) = BUDGET.get(budget as u32) else {

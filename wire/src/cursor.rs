@@ -22,7 +22,7 @@ pub enum Reason {
     BadLength,
     /// A fixed marker (magic, version, encapsulation) with an unexpected value.
     BadMarker,
-    /// Text that is not UTF-8 or lacks its terminator.
+    /// Text that is not UTF-8, lacks its terminator, or has characters that a name cannot have.
     BadText,
     /// A value outside the field's range.
     BadValue,

@@ -90,7 +90,8 @@ impl<'a> Log<'a> {
     /// Parses a sample's payload, encapsulation header included.
     ///
     /// # Errors
-    /// Returns [`Reason::BadMarker`](crate::cursor::Reason::BadMarker) if the payload is not plain CDR.
+    /// Fails if the payload is not plain CDR ([`Reason::BadMarker`](crate::cursor::Reason::BadMarker)),
+    /// or if a field cannot be read.
     pub fn parse(payload: &'a [u8]) -> Result<Self, WireError> {
         let mut cursor = text::plain_cdr(payload)?;
         let stamp = (cursor.u32("stamp.sec")?, cursor.u32("stamp.nanosec")?);

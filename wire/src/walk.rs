@@ -87,7 +87,7 @@ pub enum Step {
     /// The next submessage begins among the available bytes, but not all bytes that the walk needs
     /// are available.
     Split = 2,
-    /// A submessage contradicts the datagram's length; the rest is unreadable.
+    /// A submessage is invalid, or contradicts the datagram's length; the rest is unreadable.
     Malformed = 3,
     /// A submessage that yields no record.
     Passed = 4,
@@ -188,7 +188,7 @@ macro_rules! read {
 
 /// Reads the submessage at `walk.offset`, given that the first `present` bytes of the payload are
 /// available. Advances the offset unless it returns [`Step::Later`], [`Step::Split`] or
-/// [`Step::End`].
+/// [`Step::End`]. After [`Step::Malformed`] the walk cannot continue.
 #[inline(always)]
 pub fn step<B: Bytes>(walk: &mut Walk, bytes: &B, present: u32) -> Step {
     let start = walk.offset;
@@ -575,9 +575,9 @@ pub enum Fate {
     Reader = 3,
 }
 
-/// Returns the part of the verdict that needs no state. Discovery is SPDP, SEDP and the readable
-/// parts of their secure variants; other builtin traffic (liveliness, type lookup, authentication)
-/// is ignored.
+/// Returns the part of the verdict that needs no state. Discovery is SPDP, SEDP, the readable parts
+/// of their secure variants, and replies of TypeLookup. Other builtin traffic (liveliness,
+/// authentication) is ignored.
 #[inline(always)]
 #[must_use]
 pub const fn fate(record: &Record) -> Fate {

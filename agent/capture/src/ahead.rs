@@ -13,7 +13,7 @@ use ros2probe_wire::record::{Body, Record, flag};
 use super::reassembly::Reassembled;
 use crate::tables::{AheadBytes, AheadDatagrams, AheadRecords};
 
-/// Linux gives up a fragmented datagram after 30 seconds (`ipfrag_time`).
+/// By default, Linux gives up a fragmented datagram after 30 seconds (`ipfrag_time`).
 const LIFETIME_NANOSECONDS: i64 = 30_000_000_000;
 
 /// A complete item for the model.

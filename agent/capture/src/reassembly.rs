@@ -2,8 +2,8 @@
 //!
 //! Memory is allocated for bytes that have arrived, never for a length in a header. Flows and bytes
 //! are capped, and the oldest flow is evicted first. A finished datagram is remembered for a while,
-//! so that a duplicate fragment does not open it again. Fragments never wait longer than in the
-//! receiving kernel.
+//! so that a duplicate fragment does not open it again. Fragments wait as long as in the receiving
+//! kernel by default (`ipfrag_time`).
 //!
 //! The kernel filter walks fragmented datagrams itself. If it cannot continue, it hands the
 //! datagram over: it reports the next submessage and captures only the remaining fragments. Such a

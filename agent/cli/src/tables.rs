@@ -5,9 +5,9 @@ use ros2probe_daemon::tables::DescribedWriters;
 
 ros2probe_model::tables! {
     /// Topics that one stream of messages has described, in `rp`
-    StreamTopics { name: "samples.topics", entries: 65_536, effect: "described again by each message" }
+    StreamTopics { name: "samples.topics", entries: 65_536, effect: "each message repeats its description" }
     /// Their writers
-    StreamWriters { name: "samples.writers", entries: DescribedWriters::CAP, effect: "described again by each message" }
+    StreamWriters { name: "samples.writers", entries: DescribedWriters::CAP, effect: "each message repeats its description" }
     /// Edges whose transforms `rp tf` keeps
     FrameEdges { name: "tf.edges", entries: 4096, effect: "its last transform is used" }
     /// Transforms of an edge in the last ten seconds

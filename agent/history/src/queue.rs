@@ -198,7 +198,7 @@ impl Queue {
             let blocks = &of_reading.blocks;
             let reader = match Reader::open(&blocks.path, blocks.length) {
                 Ok(reader) => Some(reader),
-                // Somebody has deleted the file.
+                // The file was deleted.
                 Err(error) if error.kind() == io::ErrorKind::NotFound => None,
                 Err(error) => return Err(error),
             };

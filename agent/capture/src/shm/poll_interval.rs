@@ -26,8 +26,8 @@ const ACCOUNT: f64 = 0.1;
 const MEETING: f64 = 10e-6;
 /// Maximum sleep during discovery, at the end of the credit.
 const SELDOM: f64 = 500e-6;
-/// Time of busy polling after each announcement, and after each message that is needed: messages
-/// arrive in bursts.
+/// Time of busy polling after each announcement, and of the shortest sleeps after each message that
+/// is needed: messages arrive in bursts.
 const BURSTS: f64 = 200e-6;
 /// Duration of close polling after a participant creates its files, and after each announcement.
 const PARTICIPANT_WATCH: f64 = 0.3;
@@ -36,7 +36,7 @@ const ANNOUNCEMENT_WATCH: f64 = 0.1;
 /// while topics are measured, a minute in which a robot starts costs less than 2.5 % of a CPU.
 const CREDIT: f64 = 0.4;
 const CREDIT_PER_SECOND: f64 = 0.002;
-/// Maximum sleep while every message is needed. In a burst, a sender reuses its buffers after some
+/// Maximum sleep while every message is needed and CPU time is saved for it. In a burst, a sender reuses its buffers after some
 /// 100 us, and its readers are faster than that.
 const EVERY: f64 = 50e-6;
 const EARLY_WAKE: f64 = 20e-6;
@@ -44,7 +44,7 @@ const EARLY_WAKE: f64 = 20e-6;
 /// recording is complete, and maximum overdraft.
 const SAVINGS: f64 = 5.0;
 const OVERDRAFT: f64 = 0.25;
-/// Maximum sleep, whatever a poll costs.
+/// Maximum sleep while anything is needed, whatever a poll costs.
 const LONGEST: f64 = 50e-3;
 
 /// Purpose of the tap at a given time.

@@ -185,7 +185,7 @@ impl Tap {
         self.allowance.is_left(now)
     }
 
-    /// Charges CPU time spent on noticing files, in nanoseconds.
+    /// Charges CPU time spent on listing directories and opening ports, in nanoseconds.
     pub const fn spend(&mut self, nanoseconds: u64) {
         self.allowance.spend(nanoseconds);
     }
@@ -256,8 +256,8 @@ impl Tap {
         }
     }
 
-    /// Polls everything once, at `now` nanoseconds of the monotonic clock; appends items of
-    /// interest. Returns the number of announced messages.
+    /// Polls the ports that are due, up to a limit of messages, at `now` nanoseconds of the monotonic
+    /// clock; appends items of interest. Returns the number of announced messages.
     pub fn poll(&mut self, now: u64, found: &mut Vec<Item>) -> usize {
         self.now = now;
         self.classifier.refill(now);

@@ -102,7 +102,7 @@ fn report(answer: &Answer, out: &mut impl Write) -> Result<()> {
     if session.unreadable() > 0 {
         writeln!(
             out,
-            "  {} tokens have an unknown form",
+            "  {} tokens have an unknown format",
             session.unreadable()
         )?;
     }

@@ -192,7 +192,8 @@ impl Judgement<'_> {
         self.condition(Group::Command, command, verdict, detail)
     }
 
-    /// Returns whether the run could be judged at all. A run that nothing observed never passes.
+    /// Returns the conditions under which the run can be judged at all. A run that nothing observed
+    /// never passes.
     fn observation(&self) -> [Condition; 4] {
         let agent = match &self.run.agent_ended {
             Some((time, reason)) => {

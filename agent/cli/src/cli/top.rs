@@ -76,7 +76,7 @@ impl Top {
             hidden: self.hidden,
         };
         if self.target.from.is_some() {
-            let text = "rp: rp top shows a capture from its beginning on: leave out --from";
+            let text = "rp: rp top cannot start in the middle of a capture: leave out --from";
             return Err(UserError(text.to_owned()).into());
         }
         let speed = self.speed.unwrap_or(Speed::Times(1.0));

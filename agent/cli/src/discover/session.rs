@@ -220,7 +220,7 @@ impl Session {
         self.over
     }
 
-    /// Returns whether the participant sent any answer.
+    /// Returns whether the participant sent a HEARTBEAT of a writer of SEDP.
     #[must_use]
     pub const fn was_answered(&self) -> bool {
         self.heard.is_some()

@@ -26,7 +26,7 @@ const REASSEMBLY: [(Sysctl, Sysctl); 2] = [
     ),
 ];
 const MEBIBYTE: u64 = 1 << 20;
-/// Size in bytes above which a message travels in several datagrams or IP fragments.
+/// Size in bytes above which a message needs several UDP datagrams.
 const LARGE: u64 = 64 << 10;
 /// Assumed message size without measurements: a typical camera image or lidar scan.
 const USUAL: u64 = 4 * MEBIBYTE;

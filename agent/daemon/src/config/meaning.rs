@@ -569,7 +569,7 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), InvalidText> {
         }
         "robot.extract[].metric" if !is_metric(text) => Err(InvalidText::Unfit(
             "1 to 128 lower-case letters, digits and `_`, as in `robot_battery_ratio`; the \
-             beginnings `ros2` and `process_`, and the ends of other types, as `_total`, are taken",
+             prefixes `ros2` and `process_`, and suffixes of other types, such as `_total`, are reserved",
         )),
         "recordings.snapshots[].name" if !is_plain(text) => Err(InvalidText::Unfit(
             "1 to 64 letters, digits, `_` or `-`: it names directories",

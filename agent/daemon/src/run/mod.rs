@@ -321,8 +321,8 @@ impl Run {
         }
     }
 
-    /// Passes new items to the outputs. Slow readers do not block this thread. Returns whether an
-    /// event other than of a participant or endpoint is among them.
+    /// Passes new items to the outputs. Slow readers block this thread only during a replay. Returns
+    /// whether an event other than of a participant or endpoint is among them.
     fn hand_over(&mut self) -> bool {
         let now = self.source.clock();
         let output = self.observer.drain();

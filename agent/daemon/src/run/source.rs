@@ -27,8 +27,8 @@ use ros2probe_model::facts::bounded::Declared as _;
 use ros2probe_model::observe::observer::Observer;
 use ros2probe_model::report::snapshot::TableFacts;
 
-/// Reason why calls are not observed on demand.
-const INSIDE_RESTS: &str = "capture.inside is auto, and no client needs calls";
+/// Reason why calls are not observed at present.
+const INSIDE_IDLE: &str = "capture.inside is auto, and no client needs calls";
 
 /// Source of packets.
 pub enum Source {
@@ -332,7 +332,7 @@ fn inside(live: &LiveSource) -> Option<InsideSourceFacts> {
         processes: library.processes as u64,
         refused: library.refused,
     });
-    let resting = || facts.is_resting.then(|| INSIDE_RESTS.to_owned());
+    let resting = || facts.is_resting.then(|| INSIDE_IDLE.to_owned());
     let reason_off = facts.detached.or_else(|| stalled(live, Part::Inside));
     Some(InsideSourceFacts {
         mode: match (facts.is_on_demand, facts.has_callbacks) {

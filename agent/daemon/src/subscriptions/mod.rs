@@ -278,8 +278,8 @@ impl Subscriptions {
         }
     }
 
-    /// For the capture thread: marks these requests as in force, with every message captured from
-    /// now on.
+    /// Marks these requests as in force. The capture thread calls this once it captures every message
+    /// for them.
     pub fn confirm(&self, sample_requests: &[SampleRequest]) {
         for channel in self.channels.load().iter() {
             if sample_requests

@@ -176,7 +176,7 @@ impl Backlog {
             Taken::Memory(count) => drop(self.memory.drain(..count.min(self.memory.len()))),
             Taken::Written(count) => {
                 if let Some(disk) = &mut self.disk {
-                    // What cannot be read now is delivered again.
+                    // Records that cannot be read now are delivered again.
                     let mut left = count;
                     while left > 0 && matches!(disk.read(), Ok(Some(_))) {
                         left -= 1;

@@ -59,7 +59,7 @@ const ALL_BROADCASTERS: Allowance = Allowance::new(8 << 20, 2 << 20);
 /// A paused writer is captured again once it is allowed this many bytes.
 const RESUME_BYTES: u64 = 256 << 10;
 
-/// What the agent may read of what the robot says; each can be switched off.
+/// Standard topics and services that the agent reads; each can be switched off.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Part {
     /// Logs of nodes.
@@ -322,7 +322,7 @@ impl Robot {
         }
     }
 
-    /// Returns what is read of messages of this type on this topic.
+    /// Returns how messages of this type on this topic are read; `None` if they are not.
     #[must_use]
     pub fn standard(&self, topic: &TopicName, message_type: &TypeName) -> Option<Standard> {
         let is_wanted = || self.fields.cover(topic, message_type);

@@ -149,8 +149,8 @@ impl Judgement {
             .collect()
     }
 
-    /// Evaluates the topic. Returns the new state if it differs from the previous one. At the first
-    /// evaluation, any state but `Ok` counts as a change.
+    /// Evaluates the topic. Returns the previous state if the state changed; it is `None` at the first
+    /// evaluation, at which any state but `Ok` counts as a change.
     pub fn judge(
         &mut self,
         expectations: &Expectations,

@@ -5,8 +5,8 @@
 //! retransmission, a GAP or HEARTBEAT of the writer, ACKNACKs of the readers, or the decision about
 //! a loss closes it. The time of the sample is then the time at which the gap closed. The waiting
 //! samples are bounded in number, bytes and time. Beyond these bounds they are dispatched, and a
-//! late retransmission follows out of order. Samples never wait without a gap, without a reliable
-//! reader, or if all readers are on other hosts, whose ACKNACKs are not seen.
+//! late retransmission follows out of order. Otherwise samples wait only after a gap, for a reliable
+//! reader on this host: ACKNACKs of readers on other hosts are not seen.
 //!
 //! Samples of every writer also wait while uprobes take over from polling: the last message that
 //! both views may have seen can arrive after later ones. The readers do not wait for it, so these

@@ -14,7 +14,7 @@ use crate::facts::loss::LossCause;
 use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{KnownLosses, OpenLosses};
 
-/// The kernel waits 30 s for IP fragments (`net.ipv4.ipfrag_time`).
+/// By default, the kernel waits 30 s for IP fragments (`net.ipv4.ipfrag_time`).
 pub const REASSEMBLY: Duration = Duration::from_secs(35);
 
 /// Known causes and pending losses.
@@ -58,7 +58,8 @@ impl LossCauses {
         self.known.remove(&number)
     }
 
-    /// Splits `first..=last` into runs with the same cause; `None` for an unknown cause.
+    /// Removes the known causes of `first..=last`. Visits each number with a known cause alone, and the
+    /// others as runs without a cause.
     pub fn explain(
         &mut self,
         first: SequenceNumber,

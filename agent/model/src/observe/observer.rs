@@ -476,7 +476,7 @@ impl Observer {
     }
 
     /// Processes a submessage that a source saw: renews the lease of its sender, and measures user
-    /// data. Only the sequence numbers move here. [`Self::tick`] turns gaps into losses.
+    /// data. Losses are not decided here: [`Self::tick`] turns gaps into losses.
     fn observe(&mut self, observation: &Observation) {
         self.counts.records += 1;
         let writer = observation.head().writer;

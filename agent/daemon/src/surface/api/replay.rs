@@ -58,7 +58,7 @@ async fn show(State(context): State<Context>) -> Result<Json<ReplayState>, Probl
         (status = 200, description = "Position and new pace.", body = ReplayState),
         (status = 404, description = "The agent replays no capture.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 422, description = "The speed is impossible, or the time has passed.",
+        (status = 422, description = "The speed is out of range, or the time is before the position of the replay.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]

@@ -33,7 +33,7 @@ pub enum ViewerListener {
     Off,
     /// Listening, with the rights of clients without a token; `None` if every client needs one.
     At(SocketAddr, Option<Access>),
-    /// The agent could not listen, for this reason.
+    /// Listening failed, for the reason in the text.
     Failed(SocketAddr, String),
 }
 

@@ -3,10 +3,10 @@
 //! Silent entries are evicted first. An entry is silent after 5 s if it existed for less than 2 s,
 //! otherwise after 90 s. An entry with a socket on this host is never silent. Other entries are
 //! evicted only for a new entry with a higher priority: first the lowest priority, and among equals
-//! the longest silence.
+//! those that are not established, then the longest silence.
 //!
 //! Names and user data can be forged, too. New entries without a socket on this host displace
-//! established entries only until such new entries fill half of the table.
+//! established entries only until entries with a priority fill half of the table.
 //!
 //! A search visits the whole table, and a flood would trigger one per packet. Therefore one search
 //! serves many new entries, and the rate of searches is limited.

@@ -350,7 +350,7 @@ fn consecutive_missed_messages_explain_a_longer_silence() {
     assert!((15..30).contains(&possibly_missed(at_random)));
     // Half of the messages are missed, all in a row.
     assert!(possibly_missed((1..=50).chain(100..=101)) > 400);
-    // A busy machine may not poll for seconds.
+    // On a busy machine, polling can pause for seconds.
     let mut view = View::new();
     view.see(1);
     let short = view.sampled.seeming_silence(Duration::from_millis(1));
