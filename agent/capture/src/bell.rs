@@ -1,7 +1,10 @@
 //! Wakes a thread that waits for packets: a descriptor that is readable after [`Bell::ring`] until
 //! [`Bell::silence`]. It signals that an event occurred, not which one.
+//!
+//! It uses `read` and `write`, which the system call filter of each thread allows. The standard
+//! library reads sockets by `recvfrom`, which most filters refuse.
 
-use std::io::{self, Read as _, Write as _};
+use std::io;
 use std::os::fd::{AsFd as _, BorrowedFd};
 use std::os::unix::net::UnixStream;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -42,7 +45,7 @@ impl Bell {
 
     /// Rings the bell. If its buffer is full, it rings already.
     pub fn ring(&self) {
-        let _ = (&self.ringer).write(&[1]);
+        let _ = rustix::io::write(&self.ringer, &[1]);
         self.rung.store(true, Ordering::Release);
     }
 
@@ -51,10 +54,8 @@ impl Bell {
         if !self.rung.swap(false, Ordering::AcqRel) {
             return;
         }
-        if (&self.listener)
-            .read(&mut [0; RINGS])
-            .is_ok_and(|rings| rings == RINGS)
-        {
+        let read = rustix::io::read(&self.listener, &mut [0; RINGS]);
+        if read.is_ok_and(|rings| rings == RINGS) {
             self.rung.store(true, Ordering::Release);
         }
     }

@@ -2,9 +2,10 @@
 
 use std::io::{Read as _, Write as _};
 use std::net::ToSocketAddrs as _;
-use std::os::fd::AsRawFd as _;
+use std::os::fd::{AsRawFd as _, BorrowedFd};
 use std::os::unix::net::UnixStream;
 
+use ros2probe_capture::bell::Bell;
 use seccompiler::TargetArch;
 
 use super::super::{Unprivileged, confine};
@@ -95,6 +96,33 @@ const LOOK_UP_MAP: c_long = 1;
 
 fn socket(family: i32, kind: c_long) -> Option<i32> {
     call(libc::SYS_socket, [family.into(), kind, 0, 0, 0, 0])
+}
+
+#[test]
+fn each_thread_can_silence_a_bell_that_woke_it() {
+    for role in ROLES {
+        let bell = Bell::new().unwrap();
+        let rings = confined(role, move || {
+            [(); 2].map(|()| {
+                bell.ring();
+                let rang = is_readable(bell.descriptor());
+                bell.silence();
+                (rang, is_readable(bell.descriptor()))
+            })
+        });
+        assert_eq!(rings, [(true, false); 2], "{role:?}");
+    }
+}
+
+/// Returns whether a descriptor is readable now.
+fn is_readable(descriptor: BorrowedFd<'_>) -> bool {
+    let mut poll = libc::pollfd {
+        fd: descriptor.as_raw_fd(),
+        events: libc::POLLIN,
+        revents: 0,
+    };
+    // SAFETY: `poll` is one entry, and outlives the call.
+    unsafe { libc::poll(&raw mut poll, 1, 0) == 1 }
 }
 
 #[test]
