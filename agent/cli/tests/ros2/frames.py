@@ -17,6 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from tf2_msgs.msg import TFMessage
 
 PERIOD = 0.1
+START = int(time.time())
 HALF = math.sqrt(0.5)
 # Child: parent, translation, and quaternion. Those of `up` and `down` are at the poles.
 STATIC = {
@@ -49,8 +50,9 @@ def base(step, stamp):
 
 def moving(step, apart):
     """Returns the transforms of a step."""
-    # The nanoseconds are few, and have no leading zeros in the output.
-    seconds, nanoseconds = int(time.time()), 1 + step
+    # Poses of several steps must not be neighbours in time: a listener that starts later has fewer of
+    # them. The nanoseconds are few, and have no leading zeros in the output.
+    seconds, nanoseconds = START + 2 * step, 1 + step
     stamp = (seconds, nanoseconds)
     way = (0.0, 0.0, math.sin(step / 7), math.cos(step / 7))
     odom = transform("map", "odom", (10.0 * step, -0.0005, 0.0), way, *stamp)
