@@ -78,7 +78,7 @@ impl Pose {
     /// Returns the rows of the rotation matrix, for a quaternion of any length.
     fn matrix(&self) -> [[f64; 3]; 3] {
         let [x, y, z, w] = self.rotation;
-        let square = x * x + y * y + z * z + w * w;
+        let square = dot(self.rotation, self.rotation);
         let scale = if square > 0.0 { 2.0 / square } else { 0.0 };
         let [p, q, r] = [x, y, z].map(|number| number * scale);
         [
@@ -160,7 +160,7 @@ fn dot(one: [f64; 4], other: [f64; 4]) -> f64 {
 
 /// Returns the vector, rotated by a quaternion of any length.
 fn rotate(rotation: [f64; 4], [a, b, c]: [f64; 3]) -> [f64; 3] {
-    let square: f64 = rotation.iter().map(|number| number * number).sum();
+    let square = dot(rotation, rotation);
     if square == 0.0 {
         return [a, b, c];
     }

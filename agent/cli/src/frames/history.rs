@@ -56,12 +56,8 @@ impl History {
     /// Adds the last transform of each moving edge.
     pub fn add_last(&mut self, tree: &TransformTree<'_>) {
         for edge in tree.edges.iter().filter(|edge| !edge.is_static) {
-            let pose = Pose {
-                translation: edge.translation,
-                rotation: edge.rotation,
-            };
             let stamp = (edge.stamp_sec, edge.stamp_nanosec);
-            self.add([&edge.parent, &edge.child], stamp, pose);
+            self.add([&edge.parent, &edge.child], stamp, Pose::of(edge));
         }
     }
 
