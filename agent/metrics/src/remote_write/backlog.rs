@@ -52,6 +52,8 @@ struct Disk {
     reader: Reader,
     /// Whether the last record was written.
     works: bool,
+    /// Whether the last record was read.
+    can_read: bool,
 }
 
 impl Backlog {
@@ -129,15 +131,13 @@ impl Backlog {
             samples >= REQUEST_SAMPLES
         };
         if let Some(disk) = &mut self.disk {
-            let mut is_read = Ok(());
             while batch.len() < REQUEST_SCRAPES {
                 let scrape = match disk.read() {
                     Ok(Some(scrape)) => scrape,
                     Ok(None) => break,
-                    Err(error) => {
-                        is_read = Err(error);
-                        break;
-                    }
+                    // The samples in memory are newer, and wait as well.
+                    Err(_) if batch.is_empty() => return batch,
+                    Err(_) => break,
                 };
                 let is_last = is_full(&scrape);
                 batch.push(Arc::new(scrape));
@@ -147,11 +147,6 @@ impl Backlog {
             }
             if !batch.is_empty() {
                 self.taken = Taken::Disk;
-                return batch;
-            }
-            if let Err(error) = is_read {
-                // The samples in memory are newer, and wait as well.
-                tracing::warn!(%error, "cannot read samples for remote write from disk");
                 return batch;
             }
             // No record that is left can be read.
@@ -210,6 +205,7 @@ impl Disk {
             writer: Writer::default(),
             reader: Reader::default(),
             works: true,
+            can_read: true,
         }
     }
 
@@ -252,10 +248,16 @@ impl Disk {
         self.works
     }
 
-    /// Returns the next waiting scrape; `None` after the last one.
+    /// Returns the next waiting scrape; `None` after the last one. Logs the first failure until a
+    /// record is read again.
     fn read(&mut self) -> io::Result<Option<Scrape>> {
         loop {
-            let Some(record) = self.queue.read()? else {
+            let record = self.queue.read();
+            let could_read = std::mem::replace(&mut self.can_read, record.is_ok());
+            if let (Err(error), true) = (&record, could_read) {
+                tracing::warn!(%error, "cannot read samples for remote write from disk");
+            }
+            let Some(record) = record? else {
                 return Ok(None);
             };
             if record.is_first {
