@@ -288,3 +288,53 @@ fn lower(bound: &mut Option<Aged>, value: i64, at: ModelTime) {
         *bound = Some(Aged { value, at });
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Passes seconds with some messages each, whose stamps are ahead by this many nanoseconds.
+    fn seconds(evidence: &mut Evidence, range: std::ops::Range<u64>, messages: u32, ahead: i64) {
+        for second in range {
+            let at = ModelTime::from_nanoseconds(second * 1_000_000_000);
+            for _ in 0..messages {
+                evidence.arrived(ahead, at);
+            }
+            evidence.end_second(at);
+        }
+    }
+
+    fn least(evidence: &Evidence, second: u64) -> Option<i64> {
+        let now = ModelTime::from_nanoseconds(second * 1_000_000_000);
+        evidence.relative(now).0
+    }
+
+    #[test]
+    fn the_bound_of_a_slow_peer_returns_after_a_step_back_of_its_clock() {
+        let mut evidence = Evidence::default();
+        seconds(&mut evidence, 1..100, 1, 0);
+        assert!(least(&evidence, 100).is_some_and(|bound| bound > -STEP));
+        seconds(&mut evidence, 100..400, 1, -1_000_000_000);
+        let bound = least(&evidence, 400).unwrap();
+        assert!(
+            (-1_100_000_000..=-1_000_000_000).contains(&bound),
+            "{bound}"
+        );
+    }
+
+    #[test]
+    fn a_second_with_old_messages_for_a_late_joiner_is_no_step() {
+        let mut evidence = Evidence::default();
+        seconds(&mut evidence, 1..100, 1, 0);
+        seconds(&mut evidence, 100..101, 2 * SEVERAL, -3_600_000_000_000);
+        seconds(&mut evidence, 101..110, 1, 0);
+        assert_eq!(evidence.steps(), 0);
+        seconds(
+            &mut evidence,
+            110..110 + u64::from(LATE_SECONDS),
+            SEVERAL,
+            -1_000_000_000,
+        );
+        assert_eq!(evidence.steps(), 1, "a clock that was set back");
+    }
+}
