@@ -379,9 +379,9 @@ unsafe fn remember(runs: *mut Runs, id: u64, now: u64) {
     }
 }
 
-/// Adds the runs of this CPU since `since` to those that ran instead. Threads
-/// whose ids end with the same bits share a place: a thread takes it from another one if its run is
-/// longer than the time of that one so far.
+/// Adds the runs of this CPU since `since` to those that ran instead. Threads whose ids end with the
+/// same bits share a place: a thread takes it from another one if its run is longer than the time of
+/// that one so far.
 ///
 /// The body has no branch but the end of the loop, because the verifier would follow each
 /// combination of branches.
