@@ -48,6 +48,8 @@ impl PrivateAgent {
         config.recordings.snapshots.clear();
         let limits = &mut config.recordings.limits;
         limits.max_bytes.get_or_insert(BAG_BYTES);
+        // A part of a shared disk says nothing about a bag of this size: CI runs on full disks.
+        limits.reserve_percent = 0;
         for watch in &mut config.watches {
             watch.domain_id.get_or_insert(self.domain_id);
         }
@@ -156,7 +158,12 @@ mod tests {
             watches,
             [("/imu", Some(7)), ("/a", Some(3)), ("/**", Some(7))]
         );
-        assert_eq!(config.recordings.limits.max_bytes, Some(BAG_BYTES));
+        let limits = config.recordings.limits;
+        assert_eq!(limits.max_bytes, Some(BAG_BYTES));
+        assert_eq!(
+            (limits.reserve_percent, limits.reserve_bytes),
+            (0, 512 << 20)
+        );
         assert_eq!(applied("watch: [/**]\n").watches.len(), 1);
     }
 

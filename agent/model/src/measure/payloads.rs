@@ -239,7 +239,10 @@ impl Payloads {
             begin.before == Some(counted.number) || is_known && begin.begins_after(counted.number)
         });
         for begin in &mut interested.begins {
-            begin.arrived(&to, counted.number);
+            begin.concerns(&to, counted.number);
+            if missed.is_some() {
+                begin.concerns(&interested.payloads, counted.number);
+            }
         }
         let queued = QueuedSample {
             to,
@@ -424,7 +427,7 @@ impl Payloads {
             last,
             reason,
         } = *missing;
-        let Some(interested) = self.writers.get(&writer) else {
+        let Some(interested) = self.writers.get_mut(&writer) else {
             return;
         };
         if reason == MissedReason::Incomplete {
@@ -477,7 +480,7 @@ impl Payloads {
 
     /// Reports samples that will not be retransmitted.
     fn unannounced(&mut self, writer: Guid, numbers: &[SequenceNumber], now: ModelTime) {
-        let Some(interested) = self.writers.get(&writer) else {
+        let Some(interested) = self.writers.get_mut(&writer) else {
             return;
         };
         let (reason, delay) = ((MissedReason::Unannounced, now), self.payload_delay);
@@ -504,19 +507,23 @@ impl Payloads {
         }
     }
 
+    /// Queues an outcome, `bytes` of which are a payload. A sample beyond the bounds is reported as
+    /// missing; the other half of the queue is for such reports.
     fn give(&mut self, dispatches: QueuedDispatch, bytes: usize) {
         let (used, limit, _) = self.size();
-        if self.dispatches.len() < WaitingDispatches::CAP / 2
-            && (bytes == 0 || used + bytes <= limit)
-        {
+        let has_room = self.dispatches.len() < WaitingDispatches::CAP / 2
+            && (bytes == 0 || used + bytes <= limit);
+        let SampleOutcome::Sample(sample) = &dispatches.outcome else {
+            self.dispatches.push(dispatches);
+            return;
+        };
+        if has_room {
             self.dispatch_bytes += bytes;
             self.dispatches.push(dispatches);
             return;
         }
         self.refused += 1;
-        if let SampleOutcome::Sample(sample) = &dispatches.outcome
-            && let Some(interested) = self.writers.get(&sample.writer)
-        {
+        if let Some(interested) = self.writers.get(&sample.writer) {
             let (writer, number) = (sample.writer, sample.sequence_number);
             let mut missed = interested.not_captured(writer, number);
             missed.to = dispatches.to;
@@ -528,22 +535,25 @@ impl Payloads {
 impl WantedWriter {
     /// Reports missing samples to each subscription, limited to the numbers that concern it.
     fn missed(
-        &self,
+        &mut self,
         writer: Guid,
         (first, last): (SequenceNumber, SequenceNumber),
         (reason, now): (MissedReason, ModelTime),
         payload_delay: Duration,
     ) -> Vec<QueuedDispatch> {
         let mut missed: Vec<(SequenceNumber, Vec<u64>)> = Vec::new();
-        for begin in &self.begins {
+        for begin in &mut self.begins {
             let Some(from) = begin.misses_from(reason, now, payload_delay) else {
                 continue;
             };
             let first = first.max(from);
+            if first > last {
+                continue;
+            }
+            begin.concerns(&[begin.id], first);
             match missed.iter_mut().find(|(known, _)| *known == first) {
                 Some((_, to)) => to.push(begin.id),
-                None if first <= last => missed.push((first, vec![begin.id])),
-                None => {}
+                None => missed.push((first, vec![begin.id])),
             }
         }
         let dispatches = |(first, to): (SequenceNumber, Vec<u64>)| Dispatch {

@@ -554,3 +554,53 @@ fn a_sample_polled_after_the_first_one_of_a_subscription_is_not_dispatched_to_it
     handover.host.wait(1_000);
     assert_eq!(missed(&mut handover.host), []);
 }
+
+/// Returns the dispatched numbers, and first and last number of missing samples.
+fn outcomes(host: &mut Host) -> (Vec<u64>, Vec<(u64, u64)>) {
+    let (mut numbers, mut runs) = (Vec::new(), Vec::new());
+    for dispatch in host.observer.drain().samples {
+        match dispatch.outcome {
+            SampleOutcome::Sample(sample) => numbers.push(sample.sequence_number.0),
+            SampleOutcome::Missed(missed) => runs.push((missed.first.0, missed.last.0)),
+        }
+    }
+    (numbers, runs)
+}
+
+#[test]
+fn a_missed_sample_between_a_reported_one_and_the_first_one_is_reported() {
+    let mut handover = Handover::new(Depth::Arrivals, 1);
+    let alice = handover.alice;
+    handover.host.wait(1_000);
+    handover.host.heartbeat(alice, 1, 3);
+    handover.host.wait(500);
+    assert_eq!(outcomes(&mut handover.host), (vec![], vec![(2, 3)]));
+    handover.host.heartbeat(alice, 1, 4);
+    handover.polled(5);
+    handover.host.wait(500);
+    assert_eq!(outcomes(&mut handover.host), (vec![5], vec![(4, 4)]));
+}
+
+#[test]
+fn a_missed_sample_after_one_without_its_payload_is_reported() {
+    let mut handover = Handover::new(Depth::Payloads, 1);
+    let alice = handover.alice;
+    let polled = |host: &mut Host, message: Message| {
+        let envelope = forge::multicast(host.now, 0);
+        host.observer.input(Input::SharedMemory {
+            envelope: &envelope,
+            payload: &message.bytes(),
+        });
+    };
+    let payload = [[0, 1, 0, 0].as_slice(), &[7; 2_000]].concat();
+    handover.host.wait(500);
+    // Polling saw only the last fragment.
+    let last = Message::from(ALICE).fragment(WRITER, 2, 2, 1_500, &payload);
+    polled(&mut handover.host, last);
+    assert_eq!(outcomes(&mut handover.host), (vec![], vec![(2, 2)]));
+    handover.host.heartbeat(alice, 1, 3);
+    let whole = Message::from(ALICE).data(WRITER, 4, &payload);
+    polled(&mut handover.host, whole);
+    handover.host.wait(500);
+    assert_eq!(outcomes(&mut handover.host), (vec![4], vec![(3, 3)]));
+}

@@ -18,7 +18,7 @@ pub(super) struct RequestBegin {
     /// The next number of the writer when the request began.
     number: SequenceNumber,
     since: ModelTime,
-    /// The lowest number that arrived for it.
+    /// The lowest number that arrived for it or was reported as missing.
     first: Option<SequenceNumber>,
     /// Number of the sample from before the request that its reader received first.
     pub(super) before: Option<SequenceNumber>,
@@ -36,7 +36,7 @@ impl RequestBegin {
         }
     }
 
-    /// Returns whether this sample arrived for it.
+    /// Returns whether this sample arrived for it or was reported as missing.
     pub(super) fn has(&self, number: SequenceNumber) -> bool {
         self.first.is_some_and(|first| first <= number)
     }
@@ -51,8 +51,9 @@ impl RequestBegin {
         self.first.is_some_and(|first| first > number)
     }
 
-    /// Records a sample that arrived for the requests `to`.
-    pub(super) fn arrived(&mut self, to: &[u64], number: SequenceNumber) {
+    /// Records a sample that arrived for the requests `to`, or was reported to them as missing. All
+    /// later samples then concern these requests, too.
+    pub(super) fn concerns(&mut self, to: &[u64], number: SequenceNumber) {
         if self.first.is_none_or(|first| number < first) && to.contains(&self.id) {
             self.first = Some(number);
         }
@@ -62,8 +63,8 @@ impl RequestBegin {
     /// sample yet.
     ///
     /// Polling shared memory notices numbers late, perhaps those of samples that were sent before
-    /// the request. Numbers that polling missed therefore count from the first sample that arrives.
-    /// If none arrives in time, they count from the start of the request.
+    /// the request. Numbers that polling missed therefore count from the first sample that arrives or
+    /// is reported. If there is none in time, they count from the start of the request.
     pub(super) fn misses_from(
         &self,
         reason: MissedReason,
