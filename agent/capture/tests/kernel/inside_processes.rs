@@ -2,6 +2,7 @@
 
 mod deliveries;
 mod handoffs;
+mod kernel_trace;
 mod late;
 mod thread_states;
 

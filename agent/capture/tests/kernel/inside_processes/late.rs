@@ -19,7 +19,7 @@ use super::{Process, Robot};
 const BOUND: Duration = Duration::from_millis(5);
 
 /// A process whose late calls are observed, by the scheduler's events.
-fn started() -> (Robot, Process) {
+pub(super) fn started() -> (Robot, Process) {
     let mut robot = Robot::new(248, &[], true);
     robot.attach();
     let mut process = robot.start();
@@ -416,7 +416,7 @@ fn measure_the_causes_of_a_hundred_calls_each() {
 }
 
 /// Binds the process to the first CPU.
-fn pin(process: &Process) {
+pub(super) fn pin(process: &Process) {
     let id = process.child.id().to_string();
     let pinned = Command::new("taskset").args(["-pc", "0", &id]).output();
     assert!(pinned.unwrap().status.success());
