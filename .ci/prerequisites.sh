@@ -527,7 +527,7 @@ for need; do
         other=aarch64
         [ "$(dpkg --print-architecture)" = amd64 ] || other=x86-64
         packages clang mmdebstrap arch-test qemu-system-arm qemu-system-x86 qemu-user-static e2fsprogs make \
-            g++ "g++-$other-linux-gnu" libfastrtps-dev cyclonedds-dev cyclonedds-tools
+            g++ "g++-$other-linux-gnu" libfastrtps-dev cyclonedds-dev cyclonedds-tools gnupg apt-utils
         rust
         musl x86_64 aarch64
         ;;

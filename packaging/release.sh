@@ -37,18 +37,12 @@ keys() {
         step "keys for a trial"
         minisign -G -f -W -s "$private/minisign.key" -p "$private/minisign.pub" >/dev/null
         export MINISIGN_SECRET_KEY=$private/minisign.key
-        mkdir -m 700 "$private/gnupg"
-        GNUPGHOME=$private/gnupg gpg --batch --quiet --passphrase '' \
-            --quick-generate-key "Trial of a release <trial@invalid>" ed25519 sign 1d
-        GNUPGHOME=$private/gnupg gpg --batch --quiet --armor --export-secret-keys >"$private/apt.key"
-        GNUPGHOME=$private/gnupg gpgconf --kill all
-        export APT_SIGNING_KEY=$private/apt.key
-        unset MINISIGN_PASSWORD APT_SIGNING_PASSPHRASE
+        unset MINISIGN_PASSWORD
     fi
     [ -f "${MINISIGN_SECRET_KEY-}" ] ||
         die "MINISIGN_SECRET_KEY must name the file of minisign's secret key, which signs SHA256SUMS" \
             "(a trial without keys of your own: make release TRIAL=1)"
-    [ -f "${APT_SIGNING_KEY-}" ] ||
+    [ -n "$trial" ] || [ -f "${APT_SIGNING_KEY-}" ] ||
         die "APT_SIGNING_KEY must name the file of gpg's exported secret key, which signs the repository for apt" \
             "(a trial without keys of your own: make release TRIAL=1)"
 }
@@ -131,7 +125,7 @@ release() {
 
     step "repository for apt, signed by gpg"
     if [ -n "${APT_POOL-}" ]; then packages+=("$APT_POOL"/ros2probe_*.deb); fi
-    packaging/repository.sh "$out/apt" "${packages[@]}"
+    packaging/repository.sh ${trial:+--trial} "$out/apt" "${packages[@]}"
 
     find "$out" -maxdepth 1 -type f -printf '%10s %f\n' | sort -k2 >&2
     if [ -n "$trial" ]; then

@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
 # Makes a signed repository for apt, which any web server can serve as it is.
 #
-#   packaging/repository.sh DIRECTORY PACKAGE...
+#   packaging/repository.sh [--trial] DIRECTORY PACKAGE...
 #
 # DIRECTORY gets the suite "stable" with the component "main". APT_SIGNING_KEY names the exported
 # secret key (`gpg --export-secret-keys`), and APT_SIGNING_PASSPHRASE is its passphrase, if it has
-# one. The public key becomes DIRECTORY/ros2probe.asc. The index depends only on the packages and
+# one. --trial signs with a key that is deleted afterwards. The public key becomes
+# DIRECTORY/ros2probe.asc. The index depends only on the packages and
 # SOURCE_DATE_EPOCH; its signature contains the current time.
 set -euo pipefail
 
@@ -14,8 +15,10 @@ die() {
     exit 1
 }
 
-[ $# -ge 2 ] || die "usage: repository.sh DIRECTORY PACKAGE..."
-[ -f "${APT_SIGNING_KEY-}" ] || die "APT_SIGNING_KEY must name the file of gpg's exported secret key"
+trial=
+[ "${1-}" != --trial ] || { trial=yes && shift; }
+[ $# -ge 2 ] || die "usage: repository.sh [--trial] DIRECTORY PACKAGE..."
+[ -n "$trial" ] || [ -f "${APT_SIGNING_KEY-}" ] || die "APT_SIGNING_KEY must name the file of gpg's exported secret key"
 out=$1
 shift
 export LC_ALL=C TZ=UTC
@@ -34,7 +37,12 @@ trap 'gpgconf --kill all; rm -rf "$GNUPGHOME"' EXIT
 gpg_() {
     gpg --batch --quiet --no-tty --pinentry-mode loopback --passphrase-fd 3 "$@" 3<<<"${APT_SIGNING_PASSPHRASE-}"
 }
-gpg_ --import "$APT_SIGNING_KEY" || die "gpg cannot read the secret key in $APT_SIGNING_KEY"
+if [ -n "$trial" ]; then
+    unset APT_SIGNING_PASSPHRASE
+    gpg_ --quick-generate-key "Trial of a release <trial@invalid>" ed25519 sign 1d
+else
+    gpg_ --import "$APT_SIGNING_KEY" || die "gpg cannot read the secret key in $APT_SIGNING_KEY"
+fi
 
 cd "$out"
 suite=dists/stable

@@ -200,6 +200,14 @@ robot() {
     echo "$target/$triple/release/examples/robot"
 }
 
+# The repository for apt of a release, with the packages of `make dist`. Its key is deleted.
+repository() {
+    step "repository for apt, signed for a trial"
+    # The package's time is that of its sources.
+    SOURCE_DATE_EPOCH=$(stat -c %Y "$target/dist/SHA256SUMS") \
+        packaging/repository.sh --trial "$out/apt" "$target/dist"/ros2probe_*.deb
+}
+
 # payload NAME ARCHITECTURE SCRIPT [SETTING=VALUE...]: what a guest reads from its second disk.
 payload() {
     local place=$out/$1 architecture=$2 script=$3 tree program
@@ -207,6 +215,7 @@ payload() {
     tree=$(mktemp -d -p "$out")
     cleanup+=("rm -rf '$tree'")
     cp packaging/vm/*.sh "$target/dist"/ros2probe_*_"$architecture.deb" "$tree"
+    cp -r "$out/apt" "$tree"
     cp "$program" "$tree/robot"
     cp "$(peers "$architecture")"/{fastdds,cyclonedds,traced,libtracetools.so} "$tree"
     mv "$tree/$script" "$tree/main.sh"
@@ -275,10 +284,10 @@ main() {
     for name in $chosen; do
         case " $all " in *" $name "*) ;; *) die "no system $name; the systems are: $all" ;; esac
     done
+    [ -n "$disks" ] || ls "$target/dist"/ros2probe_*.deb >/dev/null 2>&1 || die "no package in $target/dist: run make dist"
+    [ -n "$disks" ] || repository
     while read -r name architecture suite package source options; do
         case " ${chosen/pair/pair arm64-6.1 amd64-6.1} " in *" $name "*) ;; *) continue ;; esac
-        [ -n "$disks" ] || ls "$target/dist"/ros2probe_*_"$architecture.deb" >/dev/null 2>&1 ||
-            die "no package for $architecture in $target/dist: run make dist"
         [ -n "$disks" ] || step "$(cd "$target/dist" && date -r ros2probe_*_"$architecture.deb" '+the package of %F %T'), from make dist"
         emulate "$architecture"
         base "$architecture"

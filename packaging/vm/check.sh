@@ -9,6 +9,33 @@ active() {
     figure=$(systemctl is-active ros2probe)
     [ "$figure" = active ]
 }
+# refuses FILE: apt accepts no package of a copy of the repository in which that file has another byte.
+refuses() {
+    rm -rf changed lists
+    mkdir -p lists/partial
+    cp -r apt changed
+    for each in changed/$1; do
+        if [ -f "$each" ]; then
+            printf '~' | dd of="$each" bs=1 seek=$(($(stat -c %s "$each") / 2)) conv=notrunc status=none
+        fi
+        case $each in */Packages) gzip -9nkf "$each" ;; esac
+    done
+    ! { apt_from changed -o Dir::State::lists="$here/lists" update &&
+        (cd lists && apt_from changed -o Dir::State::lists="$here/lists" download ros2probe); } >>refused.log 2>&1
+}
+tampering_refused() {
+    if refuses nothing; then
+        figure="an equal copy is refused: $(tail -1 refused.log)"
+        return 1
+    fi
+    for file in pool/main/r/ros2probe/*.deb dists/stable/main/binary-*/Packages dists/stable/InRelease; do
+        if ! refuses "$file"; then
+            figure="accepted a changed $file"
+            return 1
+        fi
+    done
+    figure="package, index and InRelease"
+}
 # Threads hold no capability but those that SECURITY.md names, and each has a filter of system calls.
 confined() {
     pid=$(systemctl show -P MainPID ros2probe)
@@ -386,6 +413,7 @@ there=
 [ -z "${HIDE_BTF-}" ] || mount -t tmpfs none /sys/kernel/btf
 within lo
 describe
+check "a changed repository is refused" tampering_refused
 check install installed
 if ! is_ready; then
     journalctl -u ros2probe --no-pager -o cat | tail -30 | sed 's/^/LOG\t/'

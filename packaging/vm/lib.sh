@@ -3,6 +3,7 @@
 # shellcheck shell=sh
 config=/etc/ros2probe/ros2probe.yaml
 package=$(ls ./ros2probe_*.deb)
+here=$PWD
 figure=
 
 # check NAME COMMAND...: the command leaves its figure in $figure.
@@ -35,8 +36,17 @@ wait_until() {
 
 is_ready() { [ "$(curl -s -o /dev/null -w '%{http_code}' --max-time 5 http://127.0.0.1:17400/readyz)" = 200 ]; }
 restart() { systemctl restart ros2probe && wait_until 60 is_ready; }
+# apt_from DIRECTORY COMMAND...: apt-get with that repository as its only source.
+apt_from() {
+    echo "deb [signed-by=$here/apt/ros2probe.asc] file:$here/$1 stable main" >"$here/repository.list"
+    shift
+    apt-get -o Dir::Etc::sourcelist="$here/repository.list" -o Dir::Etc::sourceparts=/nonexistent \
+        -o APT::Update::Error-Mode=any "$@"
+}
+# Installs as docs/install.md does, from the repository of the release.
 installed() {
-    apt-get install -y "$package" >install.log 2>&1 && wait_until 60 is_ready
+    apt_from apt update >install.log 2>&1 && apt_from apt install -y ros2probe >>install.log 2>&1 &&
+        wait_until 60 is_ready
     status=$?
     [ $status = 0 ] || tail -5 install.log
     figure="$(systemctl show -P ActiveEnterTimestampMonotonic ros2probe | awk '{printf "started %.0f s after boot", $1 / 1e6}')"
