@@ -84,14 +84,14 @@ impl History {
         if poses.get(place).is_some_and(|other| other.stamp == stamp) {
             return;
         }
-        if poses.is_full() {
-            poses.pop_front();
+        let mut place = place;
+        if poses.is_full() && poses.pop_front().is_some() {
+            place = place.saturating_sub(1);
         }
         let parent = match poses.back() {
             Some(last) if &*last.parent == parent => Arc::clone(&last.parent),
             _ => parent.into(),
         };
-        let place = place.min(poses.len());
         poses.insert(
             place,
             Stamped {

@@ -25,7 +25,8 @@ pub struct SnapshotFigures {
     pub messages: u64,
     /// Memory used by the messages, in bytes.
     pub bytes: u64,
-    /// Messages evicted before the end of the time span, for lack of memory.
+    /// Messages, and reports of missing ones, evicted before the end of the time span, for lack of
+    /// memory.
     pub crowded_out: u64,
     /// Bags written.
     pub written: u64,

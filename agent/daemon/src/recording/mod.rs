@@ -9,7 +9,7 @@ mod figures;
 mod filter;
 mod graph;
 mod recorder;
-mod report;
+pub(super) mod report;
 mod sample_ring;
 mod service;
 mod session;

@@ -10,7 +10,7 @@ use crate::subscriptions::{Missed, MissedReason};
 /// Maximum number of listed runs of missing samples; further runs are only counted.
 const RUNS: usize = 256;
 /// Key of the report in the bag's custom data.
-pub(super) const CUSTOM_DATA: &str = "ros2probe";
+pub(in crate::recording) const CUSTOM_DATA: &str = "ros2probe";
 
 /// Counts a recorded message.
 pub(super) fn add_written(report: &mut Report, topic: &str, bytes: usize) {

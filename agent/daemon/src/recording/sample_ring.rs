@@ -64,17 +64,20 @@ impl SampleRing {
         let now = sample.time;
         self.bytes += cost(&sample);
         self.samples.push_back(sample);
-        self.advance(now);
+        self.evict(|sample, span| now - sample.time > span);
         while self.bytes > self.limit && self.pop().is_some() {
             self.crowded_out += 1;
         }
     }
 
-    /// Evicts samples that are too old at `now`.
+    /// Evicts samples that are too old at `now`, and those of a clock that was ahead and set back.
     pub fn advance(&mut self, now: Timestamp) {
+        self.evict(|sample, span| now.distance(sample.time) > span);
+    }
+
+    fn evict(&mut self, is_old: impl Fn(&Sample, Duration) -> bool) {
         let Some(span) = self.span else { return };
-        let is_old = |sample: &Arc<Sample>| now - sample.time > span;
-        while self.samples.front().is_some_and(is_old) {
+        while (self.samples.front()).is_some_and(|sample| is_old(sample, span)) {
             self.pop();
         }
     }

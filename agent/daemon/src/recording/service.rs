@@ -380,6 +380,7 @@ impl Recordings {
             depth: Depth::Payloads,
             queue_bytes: self.queue_bytes,
             overflow: Overflow::DropOldest,
+            is_clock_complete: true,
             label: format!("recording {name}"),
         })?)
     }

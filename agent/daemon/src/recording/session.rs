@@ -20,8 +20,9 @@ use ros2probe_bag::{Compressed, Error, FileCompression, Progress};
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Interval of status reports.
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
-/// Maximum time to wait for messages that were sent before the end.
-const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
+/// Maximum time to wait for messages that were sent before the end. Samples wait for a repeated one
+/// for up to 4 s.
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Command to a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -89,6 +89,8 @@ pub struct Run {
     unconfirmed: Option<(Arc<Vec<SampleRequest>>, Instant)>,
     /// Last clock item sent to subscriptions.
     published_until: Timestamp,
+    /// Last clock item sent to subscriptions whose clock waits for the order of samples.
+    complete_until: Timestamp,
     /// Time of the latest snapshot, and the revision of the graph in it.
     taken: Option<(Instant, u64)>,
     stop: CancellationToken,
@@ -136,6 +138,7 @@ impl Run {
             sample_requests: None,
             unconfirmed: None,
             published_until: Timestamp::default(),
+            complete_until: Timestamp::default(),
             taken: None,
             stop,
             keeper: None,
@@ -242,6 +245,7 @@ impl Run {
         }
         if let Source::Live(live) = &mut self.source {
             live.drain(&mut self.observer);
+            self.observer.input(Input::Stopping);
         }
         self.hand_over();
         self.publish();
@@ -358,6 +362,11 @@ impl Run {
         let new_clock = (clock > self.published_until).then_some(clock);
         self.published_until = self.published_until.max(clock);
         self.subscriptions.deliver(output.samples, new_clock);
+        let complete = self.observer.complete_until(now);
+        if complete > self.complete_until || complete + SET_BACK < self.complete_until {
+            self.complete_until = complete;
+            self.subscriptions.complete(complete);
+        }
         has_event
     }
 

@@ -53,6 +53,7 @@ struct ChannelOptions {
     depth: Depth,
     queue_bytes: usize,
     overflow: Overflow,
+    is_clock_complete: bool,
     label: String,
 }
 
@@ -106,6 +107,7 @@ impl Channel {
                 depth: request.depth,
                 queue_bytes: request.queue_bytes,
                 overflow: request.overflow,
+                is_clock_complete: request.is_clock_complete,
                 label: request.label,
             },
             queue: Mutex::default(),
@@ -144,6 +146,10 @@ impl Channel {
         }
         wanted.fresh = Some(Arc::new(Selection::of_topics(fresh)));
         wanted.selection = Arc::new(Selection::of_topics(topics));
+    }
+
+    pub(super) const fn is_clock_complete(&self) -> bool {
+        self.request.is_clock_complete
     }
 
     pub(super) fn request(&self) -> SampleRequest {

@@ -67,6 +67,9 @@ pub struct Request {
     pub queue_bytes: usize,
     /// Treatment of samples that do not fit.
     pub overflow: Overflow,
+    /// Whether [`Item::Clock`] comes only after samples that wait for lower numbers: by some seconds
+    /// later while a reliable writer repeats a sample.
+    pub is_clock_complete: bool,
     /// Name of the client, for logs.
     pub label: String,
 }
@@ -309,10 +312,20 @@ impl Subscriptions {
             }
         }
         for channel in channels.iter() {
-            if let Some(clock) = clock {
+            if let Some(clock) = clock.filter(|_| !channel.is_clock_complete()) {
                 channel.clock(clock, &self.stop);
             }
             channel.wake();
+        }
+    }
+
+    /// For the capture thread: queues the clock for subscriptions that need a complete one.
+    pub fn complete(&self, clock: Timestamp) {
+        for channel in self.channels.load().iter() {
+            if channel.is_clock_complete() {
+                channel.clock(clock, &self.stop);
+                channel.wake();
+            }
         }
     }
 

@@ -28,6 +28,7 @@ fn request(depth: Depth, queue_bytes: usize, overflow: Overflow) -> Request {
         depth,
         queue_bytes,
         overflow,
+        is_clock_complete: false,
         label: "test".to_owned(),
     }
 }

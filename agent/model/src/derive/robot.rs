@@ -15,6 +15,7 @@ mod text;
 pub mod transforms;
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use foldhash::HashMap;
 use ros2probe_wire::diagnostics::{self as wire, DiagnosticStatuses};
@@ -22,7 +23,7 @@ use ros2probe_wire::lifecycle::{self as wire_lifecycle, LifecycleState, Transiti
 use ros2probe_wire::ros_parameters::{self, ParameterEvent, RepliedValues, RequestedNames};
 use ros2probe_wire::rtps::{RequestHeader, VendorId};
 use ros2probe_wire::transforms as wire_transforms;
-use ros2probe_wire::{DomainId, Guid, SequenceNumber, WireError, log};
+use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp, WireError, log};
 
 use crate::derive::services::Half;
 use crate::derive::services::service::CallId;
@@ -58,6 +59,9 @@ const BROADCASTER: Allowance = Allowance::new(2 << 20, 512 << 10);
 const ALL_BROADCASTERS: Allowance = Allowance::new(8 << 20, 2 << 20);
 /// A paused writer is captured again once it is allowed this many bytes.
 const RESUME_BYTES: u64 = 256 << 10;
+/// Minimum time by which a message with a lower number is written later, after a restart of its
+/// writer.
+const RESTART: Duration = Duration::from_millis(100);
 
 /// Standard topics and services that the agent reads; each can be switched off.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -181,6 +185,8 @@ pub struct Origin<'a> {
     pub writer: Guid,
     /// Its sequence number.
     pub number: SequenceNumber,
+    /// Whether a message of a higher number was read before: this one was retransmitted.
+    pub is_late: bool,
     /// The node that has the writer.
     pub node: Option<&'a NodeName>,
 }
@@ -189,6 +195,8 @@ pub struct Origin<'a> {
 #[derive(Clone, Copy, Debug, Default)]
 struct ReadNumbers {
     newest: SequenceNumber,
+    /// Source time of the newest.
+    source: Option<Timestamp>,
     /// Bit `n` stands for the number `newest - n`.
     bits: u64,
 }
@@ -420,7 +428,8 @@ impl Robot {
             return Heard::Paused;
         }
         let number = sample.sequence_number;
-        if known.read.has(number) {
+        let source = sample.source_timestamp.timestamp();
+        if known.read.has(number, source) {
             return Heard::Nothing;
         }
         let standard = known.standard;
@@ -439,13 +448,14 @@ impl Robot {
                 &assembled
             }
         };
-        known.read.add(number);
+        let is_late = known.read.add(number, source);
         let origin = Origin {
             at: now,
             domain_id: known.domain_id,
             topic: &known.topic,
             writer,
             number,
+            is_late,
             node,
         };
         let decoded = match standard {
@@ -456,6 +466,10 @@ impl Robot {
                 .and_then(|event| self.parameters.add(&origin, event, events)),
             Standard::Transforms => wire_transforms::Transforms::parse(payload)
                 .and_then(|transforms| self.transforms.add(&origin, transforms, events)),
+            // These have one state for each writer.
+            Standard::TransitionEvent | Standard::LifecycleState | Standard::Fields if is_late => {
+                Ok(())
+            }
             Standard::TransitionEvent => match Transition::parse(payload) {
                 Ok(transition) => match self.lifecycle.transit(&origin, transition) {
                     Some(node) => return Heard::Transition(transition.from, node),
@@ -598,25 +612,45 @@ impl Robot {
     }
 }
 
+impl Origin<'_> {
+    /// Returns whether a value is of a later message of the same writer than this one.
+    #[must_use]
+    pub fn precedes(&self, writer: Guid, number: SequenceNumber) -> bool {
+        // After a restart of the writer, its lower numbers are later.
+        self.is_late && self.writer == writer && self.number < number
+    }
+}
+
 impl ReadNumbers {
     /// Returns whether the number was added. Numbers far below the newest count as added, as copies
     /// that a later subscriber requests.
-    fn has(&self, number: SequenceNumber) -> bool {
+    fn has(&self, number: SequenceNumber, source: Option<Timestamp>) -> bool {
         match self.newest.steps_since(number) {
-            _ if number > self.newest => false,
+            _ if number > self.newest || self.is_restart(number, source) => false,
             steps => steps >= 64 || self.bits >> steps & 1 != 0,
         }
     }
 
-    fn add(&mut self, number: SequenceNumber) {
+    /// Adds a number. Returns whether a higher one was added before.
+    fn add(&mut self, number: SequenceNumber, source: Option<Timestamp>) -> bool {
+        if self.is_restart(number, source) {
+            *self = Self::default();
+        }
         match number.steps_since(self.newest) {
             0 => self.bits |= 1_u64.checked_shl(steps(self.newest, number)).unwrap_or(0),
             _ => {
                 let moved = steps(number, self.newest);
                 self.bits = self.bits.checked_shl(moved).unwrap_or(0) | 1;
-                self.newest = number;
+                (self.newest, self.source) = (number, source);
             }
         }
+        number < self.newest
+    }
+
+    /// Returns whether the writer has restarted its numbers: a lower one was written later.
+    fn is_restart(&self, number: SequenceNumber, source: Option<Timestamp>) -> bool {
+        let times = source.zip(self.source);
+        number < self.newest && times.is_some_and(|(new, newest)| new > newest + RESTART)
     }
 }
 
@@ -637,14 +671,17 @@ fn steps(number: SequenceNumber, lower: SequenceNumber) -> u32 {
 mod tests {
     use super::*;
 
+    const LATER: Timestamp = Timestamp(RESTART.as_nanos() as u64 + 2);
+
     #[test]
     fn a_number_is_read_once_and_old_ones_are_copies() {
         let mut read = ReadNumbers::default();
         let mut is_new = |number| {
             let number = SequenceNumber(number);
-            let is_new = !read.has(number);
+            let is_new = !read.has(number, None);
             if is_new {
-                read.add(number);
+                let is_late = number < read.newest;
+                assert_eq!(read.add(number, None), is_late);
             }
             is_new
         };
@@ -653,5 +690,17 @@ mod tests {
         assert!(is_new(40) && !is_new(40), "within the window");
         assert!(!is_new(38), "before it");
         assert!(is_new(1 << 40) && !is_new(102) && is_new((1 << 40) - 63));
+    }
+
+    #[test]
+    fn a_lower_number_with_a_later_source_time_is_that_of_a_restarted_writer() {
+        let mut read = ReadNumbers::default();
+        let [first, later] = [Some(Timestamp(1)), Some(LATER)];
+        assert!(!read.add(SequenceNumber(1 << 40), first));
+        assert!(read.has(SequenceNumber(7), first), "a copy");
+        assert!(!read.has(SequenceNumber(7), later));
+        assert!(!read.add(SequenceNumber(7), later), "not late");
+        assert!(read.has(SequenceNumber(7), later));
+        assert!(!read.has(SequenceNumber(8), later));
     }
 }

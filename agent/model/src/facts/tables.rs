@@ -195,7 +195,7 @@ crate::tables! {
     /// Latest losses of receivers
     LatestDeliveryLosses { name: "journal.delivery_losses", entries: 4096, rule: Oldest }
     /// Samples that subscriptions will not receive, until they are reported
-    MissingSamples { name: "journal.missing", entries: 1024 }
+    MissingSamples { name: "journal.missing", entries: 16_384 }
     /// Events that wait to be taken; they are taken when 1024 wait
     WaitingEvents { name: "events.waiting", entries: 4096, reported: "`ros2probe.events.suppressed`" }
     /// Writers whose losses in a second are combined in an event

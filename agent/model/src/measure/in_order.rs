@@ -100,6 +100,13 @@ impl InOrder {
         self.waiting.is_empty() && self.earlier.is_empty()
     }
 
+    /// Returns the earliest time of a sample that waits for lower numbers; `None` if none waits.
+    #[must_use]
+    pub fn waiting_since(&self) -> Option<ModelTime> {
+        let waiting = self.waiting.values();
+        waiting.map(|queued| queued.sample.time).min()
+    }
+
     /// Returns the bytes of the waiting samples.
     #[must_use]
     pub const fn bytes(&self) -> usize {
@@ -118,7 +125,7 @@ impl InOrder {
     }
 
     /// Begins a new incarnation after all samples of the previous one are dispatched. Returns whether
-    /// there was a previous one.
+    /// there was a previous one. Call it before [`Self::put`] and [`Self::turn`].
     pub fn begin(
         &mut self,
         incarnation: u32,
@@ -173,7 +180,6 @@ impl InOrder {
         room: usize,
         give: &mut impl FnMut(QueuedSample),
     ) -> Option<SequenceNumber> {
-        self.begin(progress.incarnation, now, give);
         let first = self
             .earlier
             .first()

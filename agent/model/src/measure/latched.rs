@@ -13,7 +13,7 @@ use ros2probe_wire::record::Verdict;
 use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use crate::facts::bounded::{Bounded, Counted, Sum, TableFacts};
-use crate::facts::dispatch::{Sample, Topic};
+use crate::facts::dispatch::{Missed, MissedReason, Sample, Topic};
 use crate::facts::model_time::ModelTime;
 use crate::facts::observation::{self, Content};
 use crate::facts::tables::{RetainedBytes, RetainedWriters};
@@ -228,6 +228,21 @@ impl Latched {
             self.replace(sample.writer, last);
         } else {
             self.keep(Arc::clone(sample), at);
+        }
+    }
+
+    /// Drops the kept message of a writer if a later one was sent whose bytes are missing.
+    pub fn missed(&mut self, missed: &Missed) {
+        let known = self.writers.get_mut(&missed.writer);
+        let Some(known) = known.filter(|_| missed.reason == MissedReason::NotCaptured) else {
+            return;
+        };
+        if matches!(known.last, Last::Kept(..))
+            && let Some((newest, source)) = known.newest
+            && newest < missed.last
+        {
+            known.newest = Some((missed.last, source));
+            self.replace(missed.writer, Last::Unseen);
         }
     }
 

@@ -129,13 +129,14 @@ impl Payloads {
     }
 
     /// Begins to dispatch the samples of this writer at `now`; the next sample has the number
-    /// `next`.
+    /// `next`, or is the first one. `is_new`: the requests are older than the writer.
     pub fn want(
         &mut self,
         writer: Guid,
         topic: Topic,
         requested: &RequestIds,
         (next, now): (SequenceNumber, ModelTime),
+        is_new: bool,
     ) {
         let before = self.writers.remove(&writer);
         let known = before.as_ref().filter(|known| *known.topic == topic);
@@ -147,7 +148,11 @@ impl Payloads {
             let mut earlier = earlier.iter().flat_map(|earlier| &earlier.begins);
             let earlier = earlier.find(|(known, _)| known == id);
             let number = earlier.map_or(next, |(_, number)| *number);
-            known.unwrap_or_else(|| RequestBegin::new(*id, number, now))
+            let mut begin = known.unwrap_or_else(|| RequestBegin::new(*id, number, now));
+            if is_new && next == SequenceNumber::ZERO {
+                begin.precedes_writer(now);
+            }
+            begin
         };
         let begins = requested.ids.iter().map(begins).collect();
         let was_deep = before.as_ref().filter(|before| !before.payloads.is_empty());
@@ -206,13 +211,7 @@ impl Payloads {
     ) -> Option<SequenceNumber> {
         let interested = self.writers.get_mut(&writer)?;
         let mut before = Vec::new();
-        let order = &mut interested.order;
-        let restarts = order.begin(progress.incarnation, counted.at, &mut |queued| {
-            before.push(queued);
-        });
-        if restarts {
-            (interested.begins.iter_mut()).for_each(RequestBegin::restart);
-        }
+        interested.begin(progress, counted.at, &mut |queued| before.push(queued));
         let payload = match interested.payloads.is_empty() {
             true => None,
             false => self.assembly.take(writer, counted.number),
@@ -221,7 +220,8 @@ impl Payloads {
         let is_expected = counted.began >= interested.since + self.payload_delay
             || interested
                 .first_whole
-                .is_some_and(|first| first < counted.number);
+                .is_some_and(|first| first < counted.number)
+            || interested.begins.iter().all(|begin| begin.is_older);
         if payload.is_some() {
             let first = interested.first_whole.get_or_insert(counted.number);
             *first = counted.number.min(*first);
@@ -236,7 +236,8 @@ impl Payloads {
         let is_complete = interested.order.is_idle() && counted.number < progress.complete;
         let is_known = is_complete && !counted.unconfirmed;
         let to = interested.without(to, |begin| {
-            begin.before == Some(counted.number) || is_known && begin.begins_after(counted.number)
+            begin.before == Some(counted.number) && !counted.unconfirmed
+                || is_known && begin.begins_after(counted.number)
         });
         for begin in &mut interested.begins {
             begin.concerns(&to, counted.number);
@@ -371,6 +372,15 @@ impl Payloads {
         writers
     }
 
+    /// Returns the earliest time of a sample that waits for lower numbers; `None` if none waits.
+    #[must_use]
+    pub fn waiting_since(&self) -> Option<ModelTime> {
+        let writers = self.writers.values();
+        writers
+            .filter_map(|interested| interested.order.waiting_since())
+            .min()
+    }
+
     /// Returns whether this writer has waiting or possibly retransmitted samples.
     #[must_use]
     pub fn is_unsettled(&self, writer: Guid) -> bool {
@@ -389,10 +399,11 @@ impl Payloads {
         let (_, limit, _) = self.assembly.size();
         let room = (limit / 2).saturating_sub(self.waiting_bytes);
         let interested = self.writers.get_mut(&writer)?;
-        let order = &mut interested.order;
-        let room = room + order.bytes();
-        let forgone = order.forgone(progress, now);
         let mut queued = Vec::new();
+        let room = room + interested.order.bytes();
+        interested.begin(progress, now, &mut |each| queued.push(each));
+        let order = &mut interested.order;
+        let forgone = order.forgone(progress, now);
         let skip = order.turn(progress, now, room, &mut |each| queued.push(each));
         self.unannounced(writer, &forgone, now);
         queued
@@ -533,6 +544,13 @@ impl Payloads {
 }
 
 impl WantedWriter {
+    /// Begins a new incarnation of the writer, if it has restarted.
+    fn begin(&mut self, progress: &Progress, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
+        if self.order.begin(progress.incarnation, now, give) {
+            self.begins.iter_mut().for_each(RequestBegin::restart);
+        }
+    }
+
     /// Reports missing samples to each subscription, limited to the numbers that concern it.
     fn missed(
         &mut self,

@@ -448,6 +448,18 @@ impl Profiler {
         unknown_writers
     }
 
+    /// Stops waiting for samples in shared memory.
+    pub fn settle_sampled(&mut self, now: ModelTime, journal: &mut Journal, graph: &Graph) {
+        for (guid, measured) in &mut self.writers {
+            let writer_ref = measured.writer_ref(*guid);
+            let context =
+                &mut self
+                    .shared
+                    .measurement_context(writer_ref, now, journal, graph.wall_clock);
+            measured.writer.settle_sampled(context);
+        }
+    }
+
     /// Settles all samples at the end of the input.
     pub fn settle(&mut self, now: ModelTime, journal: &mut Journal, graph: &Graph) {
         let mut guids: Vec<_> = self.writers.keys().copied().collect();

@@ -63,6 +63,8 @@ pub struct Sampled {
     settled: SequenceNumber,
     /// Time of the last [`Self::tick`] that settled, and the next number at that time.
     last_settled: (ModelTime, SequenceNumber),
+    /// Time of the tick before that.
+    settled_before: ModelTime,
     /// Runs of numbers that were settled without being seen.
     unseen: Vec<(SequenceNumber, SequenceNumber)>,
     /// The latest number that arrived, presumably whole, and its time.
@@ -119,6 +121,7 @@ impl Sampled {
             next: SequenceNumber::ZERO,
             settled: SequenceNumber::ZERO,
             last_settled: (now, SequenceNumber::ZERO),
+            settled_before: now,
             unseen: Vec::new(),
             arrived: None,
             head: None,
@@ -187,6 +190,7 @@ impl Sampled {
         if now - then >= ARRIVAL_TIMEOUT {
             self.settle(next.min(self.next));
             self.last_settled = (now, self.next);
+            self.settled_before = then;
         }
     }
 
@@ -195,10 +199,14 @@ impl Sampled {
         self.settle(self.next);
     }
 
-    /// Returns the time when the wait for a sample began; `None` if no sample is awaited.
+    /// Returns a time before which no wait for a sample began; `None` if no sample is awaited.
     #[must_use]
     pub fn unseen_since(&self) -> Option<ModelTime> {
-        self.unseen().map(|_| self.last_settled.0)
+        let (at, next) = self.last_settled;
+        Some(match self.unseen()? < next {
+            true => self.settled_before,
+            false => at,
+        })
     }
 
     /// Returns the lowest awaited number; `None` if no sample is awaited.
@@ -520,6 +528,7 @@ impl Sampled {
     const fn begin(&mut self, next: SequenceNumber, now: ModelTime) {
         (self.sighted, self.finished) = (u128::MAX, u128::MAX);
         (self.next, self.settled, self.last_settled) = (next, next, (now, next));
+        self.settled_before = now;
     }
 
     /// Stops waiting for numbers below `end`; unseen ones are skipped.

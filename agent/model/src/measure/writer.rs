@@ -413,12 +413,17 @@ impl Writer {
         });
     }
 
-    /// Settles all samples at the end of the input.
-    pub fn settle(&mut self, context: &mut MeasurementContext<'_>) {
+    /// Stops waiting for samples in shared memory.
+    pub fn settle_sampled(&mut self, context: &mut MeasurementContext<'_>) {
         if let Some(sampled) = &mut self.sampled {
             sampled.settle_all();
             self.leave_unseen(context.journal);
         }
+    }
+
+    /// Settles all samples at the end of the input.
+    pub fn settle(&mut self, context: &mut MeasurementContext<'_>) {
+        self.settle_sampled(context);
         let (reception, mut settling) =
             self.parts(context.journal, (context.now, context.has_receivers));
         reception.settle(context.budget, &mut |decision| settling.take(decision));

@@ -149,6 +149,9 @@ pub enum Input<'a> {
     },
     /// The input has ended: open decisions are made without elapsed time.
     End,
+    /// The agent ends: samples that wait for others are dispatched, and those in shared memory that
+    /// are still awaited are reported as missing. Open losses stay undecided.
+    Stopping,
 }
 
 /// A captured datagram, without its submessages.

@@ -289,6 +289,7 @@ impl Observer {
             Input::Restored { memory, now } => {
                 self.restore(memory, self.graph.wall_clock.model_time(now));
             }
+            Input::Stopping => self.release_waiting(),
             Input::End => self.settle(),
         }
     }
@@ -712,7 +713,7 @@ impl Observer {
             self.graph.topics.shrink(self.settings.endpoints);
             self.apply_lists(id, now);
         }
-        self.apply(id, guid, now);
+        self.apply(id, guid, now, true);
         self.find_references(id);
         let opened = self
             .graph

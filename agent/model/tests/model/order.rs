@@ -11,10 +11,10 @@ use ros2probe_model::observe::observer::Settings;
 use ros2probe_testing::model::forge;
 use ros2probe_testing::model::forge::Message;
 use ros2probe_testing::model::host::{
-    ALICE, BOB, CapturePoint, Host, MILLISECOND, READER, START, WRITER,
+    ALICE, BOB, CapturePoint, Host, MILLISECOND, READER, START, STRING, WRITER,
 };
 use ros2probe_wire::record::{flag, kind};
-use ros2probe_wire::{Guid, GuidPrefix, Record};
+use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
 
 fn request(host: &mut Host, depth: Depth) {
     sample_requests(host, &[1], depth);
@@ -603,4 +603,108 @@ fn a_missed_sample_after_one_without_its_payload_is_reported() {
     polled(&mut handover.host, whole);
     handover.host.wait(500);
     assert_eq!(outcomes(&mut handover.host), (vec![4], vec![(3, 3)]));
+}
+
+#[test]
+fn a_recording_names_the_first_missed_samples_of_a_writer_that_appears_during_it() {
+    let mut host = Host::new();
+    request(&mut host, Depth::Arrivals);
+    host.wait(5_000);
+    let bob = GuidPrefix(*b"\x01\x10bobby-host");
+    host.participant(bob, "10.0.0.1:7415".parse().unwrap());
+    let payload = forge::endpoint(Guid::new(bob, WRITER), "rt/chatter", STRING, false);
+    host.announce(Message::from(bob).data(forge::SEDP_WRITERS, 1, &payload));
+    let polled = |host: &mut Host, number: u64| {
+        let message = Message::from(bob).data(WRITER, number, &[0, 1, 0, 0, 7, 7, 7, 7]);
+        let envelope = forge::multicast(host.now, 0);
+        host.observer.input(Input::SharedMemory {
+            envelope: &envelope,
+            payload: &message.bytes(),
+        });
+    };
+    host.wait(100);
+    polled(&mut host, 1);
+    host.wait(10);
+    polled(&mut host, 4);
+    host.wait(1_000);
+    assert_eq!(outcomes(&mut host), (vec![1, 4], vec![(2, 3)]));
+}
+
+#[test]
+fn a_clock_is_not_ahead_of_samples_that_are_not_decided() {
+    let mut handover = Handover::new(Depth::Arrivals, 1);
+    let alice = handover.alice;
+    let host = &mut handover.host;
+    host.wait(1_950);
+    let noticed = host.now;
+    host.heartbeat(alice, 1, 2);
+    let mut reported = Vec::new();
+    while reported.is_empty() {
+        let now = Timestamp(host.now);
+        assert!(host.observer.dispatched_until(now).0 <= noticed);
+        host.wait(50);
+        reported = missed(host);
+    }
+    assert_eq!(reported, [(MissedReason::NotCaptured, 2, 2)]);
+    let now = Timestamp(host.now);
+    assert_eq!(host.observer.dispatched_until(now), now);
+}
+
+#[test]
+fn a_restart_that_a_heartbeat_confirms_dispatches_the_new_samples() {
+    let (mut host, bob) = listening();
+    host.acknack(bob, 500);
+    for number in [500, 502] {
+        host.data(bob, number);
+        host.wait(10);
+    }
+    assert_eq!(numbers(&mut host), [500]);
+    host.wait(500);
+    host.data(bob, 1);
+    host.wait(10);
+    host.heartbeat(bob, 1, 1);
+    host.wait(10);
+    for number in 2..=4 {
+        host.data(bob, number);
+        host.wait(10);
+    }
+    let mut numbers = numbers(&mut host);
+    numbers.retain(|number| *number != 502);
+    assert_eq!(numbers, [1, 2, 3, 4]);
+}
+
+#[test]
+fn a_complete_clock_waits_for_samples_that_wait_for_a_repetition() {
+    let (mut host, bob) = listening();
+    for number in [1, 2, 4] {
+        host.wait(10);
+        host.data(bob, number);
+    }
+    let waiting = host.now;
+    host.wait(1_000);
+    let now = Timestamp(host.now);
+    assert_eq!(host.observer.dispatched_until(now), now);
+    assert_eq!(host.observer.complete_until(now), Timestamp(waiting));
+    host.data(bob, 3);
+    assert_eq!(host.observer.complete_until(now), now);
+    assert_eq!(numbers(&mut host), [1, 2, 3, 4]);
+}
+
+#[test]
+fn waiting_samples_are_dispatched_and_unseen_ones_reported_when_the_agent_stops() {
+    let (mut host, bob) = listening();
+    for number in [1, 3] {
+        host.wait(10);
+        host.data(bob, number);
+    }
+    host.observer.input(Input::Stopping);
+    assert_eq!(outcomes(&mut host), (vec![1, 3], vec![]));
+    assert_eq!(host.measurement().lost, 0);
+
+    let mut handover = Handover::new(Depth::Arrivals, 1);
+    let alice = handover.alice;
+    handover.host.wait(1_000);
+    handover.host.heartbeat(alice, 1, 3);
+    handover.host.observer.input(Input::Stopping);
+    assert_eq!(outcomes(&mut handover.host), (vec![], vec![(2, 3)]));
 }

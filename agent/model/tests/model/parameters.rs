@@ -395,3 +395,25 @@ fn nodes_with_and_without_simulated_time_are_a_finding_after_some_seconds() {
     declare(&mut scene, "/lidar", true);
     assert_eq!(mixed(&mut scene, 1000), []);
 }
+
+#[test]
+fn a_retransmitted_event_changes_only_parameters_without_a_later_event() {
+    let mut scene = Scene::new();
+    scene.event(&[("speed", 1), ("retries", 1)], &[], &[]);
+    let late = |scene: &mut Scene, number, changed: Integers<'_>| {
+        let payload = event("/planner", &[], changed, &[]);
+        let message = Message::from(PLANNER).data(EVENTS.entity, number, &payload);
+        scene.domain.put(message);
+    };
+    scene.number += 1;
+    // The second event was lost, and arrives after the third one.
+    scene.event(&[], &[("speed", 3)], &[]);
+    late(&mut scene, 2, &[("speed", 2), ("retries", 2)]);
+    let known = [("retries", "2"), ("speed", "3")];
+    assert_eq!(
+        scene.known(),
+        known.map(|(name, value)| (name.into(), value.into()))
+    );
+    let changed: Vec<_> = scene.changes().into_iter().map(|[name, ..]| name).collect();
+    assert_eq!(changed, owned([Some("speed"), Some("retries")]));
+}

@@ -390,3 +390,67 @@ fn more_static_broadcasters_than_the_table_holds_count_as_read() {
     }
     assert_eq!(domain.snapshot().transforms.trees[0].unread_static, 1024);
 }
+
+#[test]
+fn a_retransmitted_transform_is_counted_and_neither_the_last_one_nor_a_step_back() {
+    let mut robot = Robot::new();
+    robot.go_on(FIRST, 1);
+    let lost = Transform {
+        parent: "odom",
+        child: "base_link",
+        stamp: robot.now + 1000,
+        x: 1.0,
+        yaw: 0.0,
+    };
+    robot.numbers[0] += 1;
+    robot.wait(100);
+    robot.broadcast(FIRST, "odom", "base_link", 1.5);
+    let last = robot.edge("base_link").stamp;
+    let message = transforms(&[lost]);
+    let message = Message::from(FIRST.prefix).data(FIRST.entity, 11, &message);
+    robot.domain.put(message);
+    let edge = robot.edge("base_link");
+    assert_eq!((edge.count, edge.stamp), (12, last));
+    assert_eq!(edge.pose.translation[0], 1.5);
+    assert!(robot.jumps().is_empty());
+    robot.wait(1_000);
+    assert!(robot.faults().is_empty());
+}
+
+#[test]
+fn transforms_of_a_broadcaster_that_restarted_its_numbers_are_read() {
+    let mut robot = Robot::new();
+    robot.go_on(FIRST, 10);
+    robot.numbers[0] = 0;
+    robot.wait(1_000);
+    let transform = Transform {
+        parent: "odom",
+        child: "base_link",
+        stamp: robot.now + 1000,
+        x: 2.0,
+        yaw: 0.0,
+    };
+    let source = robot.domain.now;
+    let message = Message::from(FIRST.prefix).info_ts(source);
+    let message = message.data(FIRST.entity, 1, &transforms(&[transform]));
+    robot.domain.put(message);
+    assert_eq!(
+        robot.edge("base_link").pose.translation[0],
+        1.0,
+        "no source time before"
+    );
+    for number in [200, 1] {
+        robot.wait(1_000);
+        let transform = Transform {
+            parent: "odom",
+            child: "base_link",
+            stamp: robot.now + 1000,
+            x: number as f64,
+            yaw: 0.0,
+        };
+        let message = Message::from(FIRST.prefix).info_ts(robot.domain.now);
+        let message = message.data(FIRST.entity, number, &transforms(&[transform]));
+        robot.domain.put(message);
+        assert_eq!(robot.edge("base_link").pose.translation[0], number as f64);
+    }
+}

@@ -26,7 +26,7 @@ pub const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10bobby-host");
 pub const CAROL: GuidPrefix = GuidPrefix(*b"\x01\x10carol-host");
 /// Destination of multicast samples.
 pub const GROUP: &str = "239.255.0.1:7401";
-const STRING: &str = "std_msgs::msg::dds_::String_";
+pub const STRING: &str = "std_msgs::msg::dds_::String_";
 
 /// A point at which records are captured.
 #[derive(Clone, Copy)]

@@ -1,5 +1,6 @@
 //! Thread of one snapshot: keeps the last samples, and begins and completes its bags.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::Receiver;
@@ -15,7 +16,7 @@ use crate::events::{AgentEvent, Record};
 use crate::recording::SnapshotFigures;
 use crate::recording::sample_ring::SampleRing;
 use crate::recording::service::{Recordings, causes};
-use crate::subscriptions::{Item, Subscription};
+use crate::subscriptions::{Item, Missed, Subscription};
 
 /// Maximum delay of commands and events.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
@@ -25,11 +26,21 @@ const EVENT_DELAY: Duration = Duration::from_secs(2);
 /// stops.
 const SOURCE_DELAY: Duration = Duration::from_secs(5);
 
+/// Minimum step back of the source's clock which means that it was set. Items up to the time of the
+/// clock may follow it by some seconds.
+const SET_BACK: Duration = Duration::from_secs(10);
+/// Maximum number of reports of missing messages before an incident.
+const MAX_MISSED_BEFORE: usize = 1024;
+
 /// State of a snapshot's thread.
 pub(super) struct SnapshotTask {
     settings: SnapshotSettings,
     recordings: Arc<Recordings>,
     ring: SampleRing,
+    /// Reports of missing messages in the time of the ring, with the clock of each.
+    missed: VecDeque<(Timestamp, Missed)>,
+    /// Missing messages whose report was evicted for lack of a place.
+    unnamed: u64,
     figures: SnapshotFigures,
     /// Time of the source.
     clock: Timestamp,
@@ -55,6 +66,8 @@ impl SnapshotTask {
         let span = settings.before + EVENT_DELAY;
         Self {
             ring: SampleRing::new(settings.max_bytes, Some(span)),
+            missed: VecDeque::new(),
+            unnamed: 0,
             figures: SnapshotFigures::default(),
             clock: Timestamp(0),
             event: recordings.events.last(),
@@ -108,7 +121,10 @@ impl SnapshotTask {
             Item::Clock(now) => Some(*now),
             Item::Missed(_) | Item::End(_) => None,
         };
-        self.clock = self.clock.max(now.unwrap_or_default());
+        self.clock = match item {
+            Item::Clock(now) if now + SET_BACK < self.clock => now,
+            _ => self.clock.max(now.unwrap_or_default()),
+        };
         let is_end = matches!(item, Item::End(_));
         if let Some(open) = &mut self.open {
             let is_late = now.is_some_and(|now| now > open.end);
@@ -124,10 +140,24 @@ impl SnapshotTask {
         }
         match item {
             Item::Sample(sample) => self.ring.push(sample),
-            Item::Clock(now) => self.ring.advance(now),
-            Item::Missed(_) => {}
+            Item::Clock(now) => {
+                self.ring.advance(now);
+                let span = self.settings.before + EVENT_DELAY;
+                self.missed.retain(|(at, _)| now.distance(*at) <= span);
+            }
+            Item::Missed(missed) => self.note_missed(missed),
             Item::End(_) => std::thread::sleep(POLL_INTERVAL),
         }
+    }
+
+    /// Keeps a report of missing messages for the bag of an incident that follows.
+    fn note_missed(&mut self, missed: Missed) {
+        if self.missed.len() >= MAX_MISSED_BEFORE
+            && let Some((_, evicted)) = self.missed.pop_front()
+        {
+            self.unnamed += evicted.samples;
+        }
+        self.missed.push_back((self.clock, missed));
     }
 
     /// Compares new events with the triggers.
@@ -197,10 +227,13 @@ impl SnapshotTask {
         let samples: Vec<_> = samples.map(Arc::clone).collect();
         let payloads = samples.iter().filter_map(|sample| sample.payload.as_ref());
         let needed = payloads.map(|payload| payload.len() as u64).sum();
+        let missed = self.missed.iter().filter(|(at, _)| *at >= since);
+        let missed: Vec<_> = missed.map(|(_, missed)| missed.clone()).collect();
         let mut bag = SnapshotBag::create(&self.recordings, &self.settings, cause, needed)
             .map_err(|failed| self.fail(failed))?;
-        for sample in samples {
-            if let Err(error) = bag.take(&Item::Sample(sample), &self.recordings) {
+        let samples = samples.into_iter().map(Item::Sample);
+        for item in samples.chain(missed.into_iter().map(Item::Missed)) {
+            if let Err(error) = bag.take(&item, &self.recordings) {
                 return Err(self.fail(bag.discard(&error)));
             }
         }
@@ -262,7 +295,7 @@ impl SnapshotTask {
     pub(super) fn show(&mut self) {
         self.figures.messages = self.ring.len() as u64;
         self.figures.bytes = self.ring.bytes() as u64;
-        self.figures.crowded_out = self.ring.crowded_out();
+        self.figures.crowded_out = self.ring.crowded_out() + self.unnamed;
         let figures = &self.recordings.figures;
         figures.snapshot(&self.settings.name, self.figures);
     }

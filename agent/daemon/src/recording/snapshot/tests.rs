@@ -30,7 +30,7 @@ use crate::limit_facts::LimitFigures;
 use crate::recording::service::{Components, Recordings};
 use crate::recording::{RecordingFigures, SnapshotFigures};
 use crate::snapshot_cell::SnapshotCell;
-use crate::subscriptions::{Caps, Item, Subscriptions, Topic};
+use crate::subscriptions::{Caps, Item, Missed, MissedReason, Subscriptions, Topic};
 
 const TENTH: u64 = SECOND / 10;
 
@@ -199,6 +199,36 @@ impl Robot {
             .sum()
     }
 
+    /// Reports messages as lost at the current time.
+    fn miss(&mut self, first: u64, last: u64) {
+        self.task.take(Item::Missed(Missed {
+            topic: Arc::clone(&self.topic),
+            writer: Guid::default(),
+            first: SequenceNumber(first),
+            last: SequenceNumber(last),
+            samples: last - first + 1,
+            reason: MissedReason::Lost,
+        }));
+    }
+
+    /// Returns first and last number of the runs that the report of the only bag names as missing.
+    fn missing(&self) -> Vec<(u64, u64)> {
+        let bag = std::fs::read_dir(self.directory.path()).unwrap().next();
+        let file = bag.unwrap().unwrap().path().join(metadata::FILE_NAME);
+        let metadata = Metadata::read(&std::fs::read_to_string(file).unwrap()).unwrap();
+        let report = &metadata.custom_data[crate::recording::report::CUSTOM_DATA];
+        let report: serde_json::Value = serde_json::from_str(report).unwrap();
+        let runs = report["missing_runs"].as_array().unwrap().iter();
+        let number = |run: &serde_json::Value, end: &str| run[end].as_u64().unwrap();
+        runs.map(|run| {
+            (
+                number(run, "first_sequence_number"),
+                number(run, "last_sequence_number"),
+            )
+        })
+        .collect()
+    }
+
     fn shown(&mut self) -> SnapshotFigures {
         self.task.show();
         self.figures.snapshots()[0].1
@@ -259,6 +289,47 @@ fn a_bag_has_the_seconds_around_its_event_and_names_the_event() {
     assert_eq!(attribute("trigger"), "message_lost");
     assert_eq!(attribute("trigger_event_id"), trigger["event_id"]);
     assert_eq!(attribute("messages"), 51);
+}
+
+#[test]
+fn a_bag_names_the_messages_that_were_missing_before_its_event() {
+    let mut robot = Robot::new(settings(&["message_lost"], 3, 2));
+    robot.run(50);
+    robot.miss(10, 12);
+    robot.run(50);
+    robot.miss(70, 71);
+    robot.run(10);
+    robot.miss(80, 82);
+    robot.lose_messages();
+    robot.run(10);
+    robot.miss(90, 90);
+    robot.run(20);
+    assert_eq!(robot.missing(), [(70, 71), (80, 82), (90, 90)]);
+}
+
+#[test]
+fn reports_of_missing_messages_beyond_their_cap_are_counted() {
+    let mut robot = Robot::new(settings(&["message_lost"], 3, 2));
+    robot.run(30);
+    for number in 0..1034 {
+        robot.miss(2 * number + 1, 2 * number + 1);
+    }
+    assert_eq!(robot.shown().crowded_out, 10);
+}
+
+#[test]
+fn a_clock_that_is_set_back_does_not_end_the_collection_of_messages() {
+    let mut robot = Robot::new(settings(&[], 3, 0));
+    robot.run(100);
+    robot.now -= 900;
+    robot.run(50);
+    let (last, expected) = (robot.now, (robot.now - 30..=robot.now).collect::<Vec<_>>());
+    robot.task.write_memory(Cause::Request).unwrap();
+    assert_eq!(robot.only_bag(), expected);
+    assert!(
+        robot.shown().messages <= 60,
+        "{last}: those of before are evicted"
+    );
 }
 
 /// An event arrives up to two seconds after the incident; the bag reaches back from the incident.

@@ -159,6 +159,7 @@ async fn samples(
         } else {
             Overflow::DropOldest
         },
+        is_clock_complete: depth == Depth::Payloads,
         label: "GET /samples".to_owned(),
     };
     let opened = context.subscriptions.open(request);

@@ -374,6 +374,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 queue_bytes: QUEUE_BYTES,
                 // A viewer must not delay a replay.
                 overflow: Overflow::DropOldest,
+                is_clock_complete: false,
                 label: "foxglove".to_owned(),
             });
         match opened {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_wire::diagnostics::{self as wire, DiagnosticLevel, DiagnosticStatuses};
-use ros2probe_wire::{DomainId, Guid, WireError};
+use ros2probe_wire::{DomainId, Guid, SequenceNumber, WireError};
 
 use super::Origin;
 use super::text::bounded;
@@ -49,6 +49,8 @@ struct Part {
     /// The longest of the latest intervals between its messages; `None` after the first.
     interval: Option<Duration>,
     fault: Option<Fault>,
+    /// Sequence number of its last message.
+    number: SequenceNumber,
 }
 
 /// The time in which a part is in error or stale.
@@ -97,6 +99,10 @@ impl Diagnostics {
         if let Some((_, silent)) = self.parts.make_room(&key, |part| part.status.at) {
             self.removed(&silent);
         }
+        let known = self.parts.get(&key);
+        if known.is_some_and(|part| origin.precedes(part.status.writer, part.number)) {
+            return;
+        }
         let known = self.parts.remove(&key);
         if let Some(part) = &known {
             self.value_bytes.sub(part.status.value_bytes());
@@ -127,6 +133,7 @@ impl Diagnostics {
         let mut part = Part {
             interval: known.as_ref().map(|part| part.interval_until(origin.at)),
             fault: known.and_then(|part| part.fault),
+            number: origin.number,
             status,
         };
         self.revision += u64::from(part.judge(origin.at));

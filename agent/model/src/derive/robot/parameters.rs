@@ -8,7 +8,7 @@ use std::time::Duration;
 use ros2probe_wire::ros_parameters::{
     self as wire, ChangeKind, ParameterEvent, ParameterValue, RepliedValues, RequestedNames,
 };
-use ros2probe_wire::{DomainId, Guid, WireError};
+use ros2probe_wire::{DomainId, Guid, SequenceNumber, WireError};
 
 use super::Origin;
 use super::text::bounded;
@@ -78,8 +78,9 @@ pub struct ExpectedParameter {
 struct Known {
     value: Arc<str>,
     at: ModelTime,
-    /// Writer of the event.
+    /// Writer and number of the event.
     writer: Guid,
+    number: SequenceNumber,
 }
 
 /// A request to set a parameter.
@@ -239,8 +240,12 @@ impl Parameters {
         events: &mut Events,
     ) {
         let (at, kind) = (origin.at, change.kind);
+        let known = self.known.get(&key);
+        if known.is_some_and(|known| origin.precedes(known.writer, known.number)) {
+            return;
+        }
+        let before = known.map(|known| Arc::clone(&known.value));
         self.has_changed = true;
-        let before = self.known.get(&key).map(|known| Arc::clone(&known.value));
         let value = (kind != ChangeKind::Deleted).then(|| text(&change.parameter.value));
         match &value {
             Some(value) => self.know(origin, key.clone(), Arc::clone(value)),
@@ -276,6 +281,7 @@ impl Parameters {
             value,
             at: origin.at,
             writer: origin.writer,
+            number: origin.number,
         };
         self.has_changed = true;
         self.known.make_room(&key, |known| known.at);

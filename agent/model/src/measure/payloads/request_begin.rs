@@ -22,6 +22,8 @@ pub(super) struct RequestBegin {
     first: Option<SequenceNumber>,
     /// Number of the sample from before the request that its reader received first.
     pub(super) before: Option<SequenceNumber>,
+    /// Whether the request is older than the writer, so that it concerns all of its samples.
+    pub(super) is_older: bool,
 }
 
 impl RequestBegin {
@@ -33,6 +35,7 @@ impl RequestBegin {
             since,
             first: None,
             before: None,
+            is_older: false,
         }
     }
 
@@ -41,9 +44,14 @@ impl RequestBegin {
         self.first.is_some_and(|first| first <= number)
     }
 
+    /// Records that the request is older than its writer, which was announced at `now`.
+    pub(super) fn precedes_writer(&mut self, now: ModelTime) {
+        self.is_older |= self.since == now;
+    }
+
     /// Begins again with the numbers of a writer that was started anew.
     pub(super) fn restart(&mut self) {
-        (self.number, self.first) = (SequenceNumber::ZERO, None);
+        (self.number, self.first, self.before) = (SequenceNumber::ZERO, None, None);
     }
 
     /// Returns whether its first sample so far has a higher number.
@@ -71,7 +79,7 @@ impl RequestBegin {
         now: ModelTime,
         payload_delay: Duration,
     ) -> Option<SequenceNumber> {
-        if reason != MissedReason::NotCaptured {
+        if reason != MissedReason::NotCaptured || self.is_older {
             return Some(self.number);
         }
         match self.first {

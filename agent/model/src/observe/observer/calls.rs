@@ -100,7 +100,7 @@ impl Observer {
                     .find(endpoint.domain_id, &endpoint.naming()?)
             });
             if let Some(id) = id {
-                self.apply(id, guid, now);
+                self.apply(id, guid, now, false);
             }
         }
     }

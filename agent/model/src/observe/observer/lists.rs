@@ -134,7 +134,7 @@ impl Observer {
         let lists = [&topic.writers, &topic.readers, &topic.buffer_endpoints];
         let guids: Vec<_> = lists.into_iter().flatten().copied().collect();
         for guid in guids {
-            self.apply(id, guid, now);
+            self.apply(id, guid, now, false);
         }
     }
 
@@ -172,8 +172,8 @@ impl Observer {
         }
     }
 
-    /// Applies the decision about a topic to one endpoint.
-    pub(super) fn apply(&mut self, id: TopicId, guid: Guid, now: ModelTime) {
+    /// Applies the decision about a topic to one endpoint. `is_new`: it was announced just now.
+    pub(super) fn apply(&mut self, id: TopicId, guid: Guid, now: ModelTime, is_new: bool) {
         let Some(topic) = self.graph.topics.get(id) else {
             return;
         };
@@ -228,7 +228,7 @@ impl Observer {
                         let next = known.map_or(SequenceNumber::ZERO, |known| known.writer.next());
                         self.measure
                             .payloads
-                            .want(guid, topic, requested, (next, now));
+                            .want(guid, topic, requested, (next, now), is_new);
                     }
                     _ => self.measure.payloads.release(guid, now),
                 }
@@ -253,7 +253,7 @@ impl Observer {
             self.graph.topics.find(endpoint.domain_id, &naming)
         });
         if let Some(id) = id {
-            self.apply(id, writer, now);
+            self.apply(id, writer, now, false);
         }
     }
 

@@ -43,6 +43,28 @@ impl Observer {
         })
     }
 
+    /// Returns the latest time before which no sample waits for lower numbers either. A reliable
+    /// writer may take seconds to repeat one.
+    #[must_use]
+    pub fn complete_until(&self, now: Timestamp) -> Timestamp {
+        let until = self.dispatched_until(now);
+        let waiting = self.measure.payloads.waiting_since();
+        waiting.map_or(until, |since| {
+            until.min(self.graph.wall_clock.wall_time(since))
+        })
+    }
+
+    /// Dispatches waiting samples and reports unseen ones at the end of the agent. What is lost stays
+    /// undecided.
+    pub(super) fn release_waiting(&mut self) {
+        let (profiler, graph) = (&mut self.measure.profiler, &self.graph);
+        profiler.settle_sampled(self.clock, &mut self.journal, graph);
+        self.report_missing();
+        for writer in self.measure.payloads.unsettled() {
+            self.measure.payloads.give_all(writer, self.clock);
+        }
+    }
+
     /// Dispatches a sample in the order of numbers, or stores its number if the writer is unknown.
     pub(super) fn counted(&mut self, writer: Guid, counted: &Counted) {
         if self.requested.sample_requests.is_empty() {
@@ -172,12 +194,16 @@ impl Observer {
         }
     }
 
-    /// Keeps dispatched samples of transient-local writers.
+    /// Keeps dispatched samples of transient-local writers, and drops those that are no longer the
+    /// last.
     pub(super) fn keep_dispatched(&mut self, samples: &[Dispatch]) {
         for each in samples {
-            if let SampleOutcome::Sample(sample) = &each.outcome {
-                let at = self.graph.wall_clock.model_time(sample.time);
-                self.measure.latched.dispatched(sample, at);
+            match &each.outcome {
+                SampleOutcome::Sample(sample) => {
+                    let at = self.graph.wall_clock.model_time(sample.time);
+                    self.measure.latched.dispatched(sample, at);
+                }
+                SampleOutcome::Missed(missed) => self.measure.latched.missed(missed),
             }
         }
     }

@@ -220,6 +220,7 @@ fn request(domain_id: DomainId, dds_name: &DdsName) -> Request {
         queue_bytes: QUEUE_BYTES,
         // A slow client must not delay the agent, nor a replay.
         overflow: Overflow::DropOldest,
+        is_clock_complete: false,
         label: "GET /topics/{topic}/messages".to_owned(),
     }
 }

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_wire::Guid;
 use ros2probe_wire::transforms::{Pose, Transform};
+use ros2probe_wire::{Guid, SequenceNumber};
 
 use super::{NAME, Origin, without_slash};
 use crate::derive::robot::text::bounded;
@@ -76,6 +76,8 @@ struct Source {
     stamp: (i32, u32),
     since: ModelTime,
     at: ModelTime,
+    /// Sequence number of its last message.
+    number: SequenceNumber,
 }
 
 /// The longest of the latest steps between two transforms.
@@ -156,11 +158,16 @@ impl Edge {
             Some(last) if last.parent.as_bytes() == transform.parent => Arc::clone(&last.parent),
             _ => without_slash(&bounded(transform.parent, NAME)).into(),
         };
-        let went_back = self.heard(origin, transform.stamp);
         self.count += 1;
         if let Some(current) = self.seconds.last_mut() {
             *current = current.saturating_add(1);
         }
+        let mut sources = self.broadcasters.iter();
+        if sources.any(|each| origin.precedes(each.writer, each.number)) {
+            // A reader of a reliable topic has received it before the later ones.
+            return None;
+        }
+        let went_back = self.heard(origin, transform.stamp);
         let mut jump = None;
         if let Some(last) = self
             .last
@@ -207,6 +214,7 @@ impl Edge {
             let went_back = stamp < source.stamp;
             source.stamp = stamp;
             source.at = origin.at;
+            source.number = origin.number;
             if source.node.is_none() {
                 source.node = origin.node.cloned();
             }
@@ -218,6 +226,7 @@ impl Edge {
             stamp,
             since: origin.at,
             at: origin.at,
+            number: origin.number,
         };
         if self.broadcasters.is_full() {
             let oldest = self.broadcasters.iter_mut().min_by_key(|each| each.at);
