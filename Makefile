@@ -152,6 +152,13 @@ bench: ## benchmarks, and the cost of the agent and of a subscriber (needs root)
 	cargo build --release --package ros2probe --example robot --example workloads
 	@$(SUDO) $(TARGET)/release/examples/workloads $(BENCH_OPTIONS)
 
+cost: ## what observing adds to a workload, with intervals, and the time of each kernel program; COST_OPTIONS="--pairs 100 --load 4" (needs root)
+	@.ci/prerequisites.sh test dist
+	@$(MAKE) --no-print-directory peers
+	cargo build --release --package ros2probe --bin rp --target $(SHIPPED)
+	cargo build --release --package ros2probe --example workloads
+	@$(SUDO) $(TARGET)/release/examples/workloads --pairs 30 --seconds 2 $(COST_OPTIONS)
+
 soak: ## an hour of a changing graph and faults with the released binary; SOAK_SECONDS=N; results in target/soak (needs root)
 	@.ci/prerequisites.sh test dist
 	cargo build --release --package ros2probe --bin rp --target $(SHIPPED)
@@ -191,4 +198,4 @@ deny: ## licences, sources and known vulnerabilities of dependencies; DENY=bans 
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo fleet fleet-bench test test-fast test-corpus test-ros2 bench-ros2 ebpf run page page-bench screenshots peers arm dist release vm distcheck bench soak fuzz miri book deny prerequisites
+.PHONY: help demo fleet fleet-bench test test-fast test-corpus test-ros2 bench-ros2 ebpf run page page-bench screenshots peers arm dist release vm distcheck bench cost soak fuzz miri book deny prerequisites

@@ -1,4 +1,4 @@
-//! `make bench`: the cost of observing. Each workload runs between two hosts, alternately without
+//! `make bench` and `make cost`: the cost of observing. Each workload runs between two hosts, alternately without
 //! an observer, with the agent (host hook, packet sockets) and with a Cyclone DDS subscriber. The
 //! table shows CPU time and memory of the observer, and the total of all processes.
 //!
@@ -11,19 +11,22 @@
 
 mod caps;
 mod footprint;
+mod paired;
+mod programs;
 mod report;
 mod spread;
 mod tabs;
 mod window;
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
+use std::process::{Child, Command, ExitCode};
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, bail};
 use clap::{Parser, ValueEnum};
 
 use crate::footprint::Footprint;
+use crate::paired::Running;
 use crate::report::{Row, Targets};
 use crate::spread::{Spread, Subject};
 use crate::window::{Observer, Window};
@@ -35,6 +38,12 @@ struct Options {
     /// Program of the agent [default: the shipped static binary]
     #[arg(long)]
     agent: Option<PathBuf>,
+    /// Compares this many pairs of windows with and without each observer, while the workload runs on
+    #[arg(long, value_parser = clap::value_parser!(u16).range(2..), conflicts_with_all = ["spread", "rounds"])]
+    pairs: Option<u16>,
+    /// Busy processes beside the workload
+    #[arg(long, default_value_t = 0)]
+    load: u16,
     /// Length of each measurement
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..))]
     seconds: u64,
@@ -51,12 +60,12 @@ struct Options {
     /// Prints minimum, median and maximum of each kind instead of the table
     #[arg(long)]
     spread: bool,
-    /// With `--spread`: another binary of the agent, whose windows alternate with those of the
-    /// first
-    #[arg(long, requires = "spread")]
+    /// With `--spread` or `--pairs`: another binary of the agent, whose windows alternate with those
+    /// of the first
+    #[arg(long)]
     before: Option<PathBuf>,
-    /// With `--spread`: only these kinds
-    #[arg(long, value_enum, value_delimiter = ',', requires = "spread")]
+    /// With `--spread` or `--pairs`: only these kinds
+    #[arg(long, value_enum, value_delimiter = ',')]
     observer: Vec<Observer>,
 }
 
@@ -92,6 +101,26 @@ const ROBOT: [(usize, f64); 10] = [
     (120, 100.0),
 ];
 
+/// Workloads of `make cost`: name, bytes, rate, and whether both peers share memory on one host.
+const PAIRED: [(&str, usize, f64, Stack, bool); 4] = [
+    ("320 B @ 200 Hz", 320, 200.0, Stack::Cyclone, false),
+    ("2.72 MB @ 20 Hz", 2_720_000, 20.0, Stack::Cyclone, false),
+    (
+        "320 B @ 200 Hz, shared memory",
+        320,
+        200.0,
+        Stack::Fast,
+        true,
+    ),
+    (
+        "2.72 MB @ 20 Hz, shared memory",
+        2_720_000,
+        20.0,
+        Stack::Fast,
+        true,
+    ),
+];
+
 const WORKLOADS: [Workload; 7] = [
     Workload::of_all("320 B @ 200 Hz", &[(320, 200.0)], 0.145),
     Workload::of_all("644 KB @ 20 Hz", &[(644_000, 20.0)], 0.24),
@@ -110,6 +139,13 @@ fn main() -> Result<ExitCode> {
     };
     if !program.exists() {
         bail!("{} is missing: run `make bench`", program.display());
+    }
+    let _load: Vec<Busy> = (0..options.load)
+        .map(|_| Busy::start())
+        .collect::<Result<_>>()?;
+    if let Some(pairs) = options.pairs {
+        compare(&program, pairs, &options)?;
+        return Ok(ExitCode::SUCCESS);
     }
     let mut missed = Vec::new();
     if "footprint".contains(&options.only) {
@@ -208,6 +244,81 @@ fn spread(workload: &Workload, stack: Stack, program: &Path, options: &Options) 
         format!("{}, {stack:?}", workload.name),
         subjects,
     ))
+}
+
+/// Prints what each observer adds to the workloads of `make cost`.
+fn compare(program: &Path, pairs: u16, options: &Options) -> Result<()> {
+    let seconds = Duration::from_secs(options.seconds);
+    let mut programs = String::new();
+    println!(
+        "{pairs} pairs of windows of {} s; CPU seconds are per 20 s; ± is the interval of 95 %\n\n{}",
+        options.seconds,
+        paired::HEAD
+    );
+    for (name, size, rate, stack, shares_memory) in PAIRED {
+        if !name.contains(&options.only) {
+            continue;
+        }
+        let context = || format!("{name} with {stack:?}");
+        let stream = Stream {
+            topic: "/sensor".to_owned(),
+            rate,
+            // Fast DDS sends best-effort messages by UDP, too.
+            reliable: shares_memory,
+            ..Stream::point_cloud(size, 0)
+        };
+        let running = Running::start(stack, vec![stream], shares_memory, program);
+        let running = running.with_context(context)?;
+        let subjects = subjects(program, shares_memory, options);
+        let rows = running.measure(name, &subjects, (pairs, seconds));
+        for row in rows.with_context(context)? {
+            println!("{row}");
+            programs += &row.programs();
+        }
+    }
+    println!("\n{programs}");
+    Ok(())
+}
+
+/// Returns the observers of `make cost`. A subscriber to shared memory would have to be on the host.
+fn subjects(program: &Path, shares_memory: bool, options: &Options) -> Vec<paired::Subject> {
+    let kinds: &[Observer] = match shares_memory {
+        true => &[Observer::Host],
+        false => &[Observer::Host, Observer::Wire, Observer::Subscriber],
+    };
+    let chosen =
+        |observer: &&Observer| options.observer.is_empty() || options.observer.contains(observer);
+    let subject = |observer, program: &Path, note| paired::Subject {
+        observer,
+        program: program.to_path_buf(),
+        note,
+    };
+    let mut subjects = Vec::new();
+    for &observer in kinds.iter().filter(chosen) {
+        let before = options.before.as_deref().filter(|_| observer.is_agent());
+        subjects.extend(before.map(|before| subject(observer, before, ", before")));
+        subjects.push(subject(observer, program, ""));
+    }
+    subjects
+}
+
+/// A process that takes a CPU, until this value is dropped.
+struct Busy(Child);
+
+impl Busy {
+    fn start() -> Result<Busy> {
+        let child = Command::new("sh")
+            .args(["-c", "while :; do :; done"])
+            .spawn();
+        Ok(Busy(child.context("cannot start a busy process")?))
+    }
+}
+
+impl Drop for Busy {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
 }
 
 /// Returns the binary in the target directory for this machine's architecture.

@@ -12,7 +12,7 @@ use ros2probe_testing::harness::run;
 use ros2probe_testing::harness::usage::{Memory, Usage, machine_idle, softirq_cpu};
 
 /// Time for discovery to settle and caches to fill before the window opens.
-const WARM_UP: Duration = Duration::from_secs(3);
+pub(crate) const WARM_UP: Duration = Duration::from_secs(3);
 /// Interval of reading the observer's memory.
 const SAMPLING: Duration = Duration::from_secs(1);
 /// Length of time to which CPU times are scaled.
@@ -68,17 +68,17 @@ impl Observer {
     pub(crate) const fn is_agent(self) -> bool {
         matches!(self, Observer::Host | Observer::Wire)
     }
+}
 
-    /// Returns the configuration if the observer is the agent. With the host hook, the agent
-    /// observes both hosts as if all nodes ran on one, but nothing else on the machine.
-    fn configuration(self, link: &Link) -> Option<String> {
-        let capture = match self {
-            Observer::Host => format!("source: host, cgroup: {}", link.cgroup().display()),
-            Observer::Wire => "source: wire".to_owned(),
-            Observer::None | Observer::Subscriber => return None,
-        };
-        Some(format!("watch: [/**]\ncapture: {{{capture}}}\nlog: warn\n"))
-    }
+/// Returns the configuration if the observer is the agent. With the host hook, the agent observes
+/// both hosts as if all nodes ran on one, but nothing else on the machine.
+pub(crate) fn configuration(observer: Observer, link: &Link) -> Option<String> {
+    let capture = match observer {
+        Observer::Host => format!("source: host, cgroup: {}", link.cgroup().display()),
+        Observer::Wire => "source: wire".to_owned(),
+        Observer::None | Observer::Subscriber => return None,
+    };
+    Some(format!("watch: [/**]\ncapture: {{{capture}}}\nlog: warn\n"))
 }
 
 impl Window {
@@ -91,11 +91,11 @@ impl Window {
     ) -> Result<Window> {
         let link = Link::new()?;
         let directory = tempfile::tempdir().context("cannot create a directory")?;
-        let configuration = directory.path().join("ros2probe.yaml");
-        let agent = match observer.configuration(&link) {
+        let file = directory.path().join("ros2probe.yaml");
+        let agent = match configuration(observer, &link) {
             Some(text) => {
-                std::fs::write(&configuration, text).context("cannot write a configuration")?;
-                Some(Agent::start(&link.robot, program, &configuration)?)
+                std::fs::write(&file, text).context("cannot write a configuration")?;
+                Some(Agent::start(&link.robot, program, &file)?)
             }
             None => None,
         };
@@ -176,15 +176,16 @@ impl AgentTotals {
     }
 }
 
-struct Spent {
+/// What a window took. CPU seconds are per 20 s.
+pub(crate) struct Spent {
     machine: f64,
-    workload: f64,
-    cpu: f64,
+    pub(crate) workload: f64,
+    pub(crate) cpu: f64,
     memory: Memory,
 }
 
 impl Spent {
-    fn during(length: Duration, watching: &[u32], parts: &[u32]) -> Result<Spent> {
+    pub(crate) fn during(length: Duration, watching: &[u32], parts: &[u32]) -> Result<Spent> {
         let look = || {
             let nothing = (Duration::ZERO, Memory::default());
             watching.iter().try_fold(nothing, |sum, pid| {
