@@ -13,7 +13,7 @@ use crate::request::Means;
 
 /// File with the kernel's type of perf events for uprobes. Older interfaces leave probes behind
 /// when a process is killed.
-const KIND: &str = "/sys/bus/event_source/devices/uprobe/type";
+const UPROBE_TYPE_PATH: &str = "/sys/bus/event_source/devices/uprobe/type";
 
 /// Why programs are not attached.
 #[derive(Debug, thiserror::Error)]
@@ -95,7 +95,7 @@ pub fn attach(
                 .map_err(AttachError::Kernel)?
         }
         Means::PerfEvents => {
-            let kind = fs::read_to_string(KIND).map_err(AttachError::NoUprobes)?;
+            let kind = fs::read_to_string(UPROBE_TYPE_PATH).map_err(AttachError::NoUprobes)?;
             let kind = kind.trim().parse().map_err(io::Error::other);
             let kind = kind.map_err(AttachError::NoUprobes)?;
             let events = found.iter().filter_map(|(index, place)| {

@@ -16,7 +16,7 @@ use rustix::net::{
 use crate::functions::{Calls, Library};
 use crate::mapped::Use;
 use crate::message::{receive, send};
-use crate::request::{Activity, Answer, MAX_PROCESSES, Means, Numbered, PATIENCE, Place, Request};
+use crate::request::{Activity, Answer, MAX_PROCESSES, Means, Numbered, REQUEST_TIMEOUT, Place, Request};
 use crate::server::Peer;
 use crate::server::answer::answer;
 
@@ -25,7 +25,7 @@ pub const COMMAND: &str = "attach";
 /// Whether this program has [`COMMAND`].
 static HAS_COMMAND: AtomicBool = AtomicBool::new(false);
 /// Maximum time to wait for an answer. The broker itself gives up earlier.
-const ANSWERS_WITHIN: Duration = PATIENCE.saturating_add(Duration::from_secs(1));
+const RESPONSE_TIMEOUT: Duration = REQUEST_TIMEOUT.saturating_add(Duration::from_secs(1));
 /// Pause before another attempt to connect.
 const RETRY: Duration = Duration::from_secs(5);
 
@@ -437,7 +437,7 @@ fn open(path: &Path) -> io::Result<OwnedFd> {
 
 fn bounded(socket: &OwnedFd) -> io::Result<()> {
     for timeout in [Timeout::Recv, Timeout::Send] {
-        set_socket_timeout(socket, timeout, Some(ANSWERS_WITHIN))?;
+        set_socket_timeout(socket, timeout, Some(RESPONSE_TIMEOUT))?;
     }
     Ok(())
 }

@@ -16,7 +16,7 @@ const PREFIX: &str = "ros_trace_";
 /// callbacks show messages within a process.
 pub const ENQUEUE: &str = "rclcpp_ring_buffer_enqueue";
 /// Program at `callback_start` if only messages are observed and the library lacks [`ENQUEUE`].
-const RECEIVED: (&str, &str) = ("callback_received", "callback_start");
+const RECEPTION_PROGRAM: (&str, &str) = ("callback_received", "callback_start");
 
 /// Functions of messages, with programs of the same name.
 const MESSAGES: [&str; 14] = [
@@ -68,11 +68,11 @@ const RUNTIME: [&str; 10] = [
 /// `SharedMemTransport::copy_to_shared_buffer`, called once per message that goes into shared
 /// memory. Its caller `send` is called for all other messages, too. The parameters follow in the
 /// mangled name.
-pub const COPY: &str = "_ZN8eprosima7fastdds4rtps18SharedMemTransport21copy_to_shared_bufferE";
+pub const FAST_DDS_COPY: &str = "_ZN8eprosima7fastdds4rtps18SharedMemTransport21copy_to_shared_bufferE";
 /// `(unsigned char const*, unsigned int, ..)`: Fast DDS 2.x.
-pub(crate) const WHOLE: &str = "PKhj";
+pub(crate) const CONTIGUOUS_PARAMETERS: &str = "PKhj";
 /// `(std::vector<NetworkBuffer> const&, unsigned int, ..)`: Fast DDS 3.x.
-pub(crate) const LIST: &str = "RKSt6vectorINS1_13NetworkBuffer";
+pub(crate) const BUFFER_LIST_PARAMETERS: &str = "RKSt6vectorINS1_13NetworkBuffer";
 
 /// A library whose users the broker can list.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug, Serialize, Deserialize)]
@@ -132,8 +132,8 @@ impl Calls {
     pub fn programs(self) -> Vec<(&'static str, &'static str)> {
         let same = |name: &&'static str| (*name, *name);
         match self {
-            Self::SharedMemory => vec![("shm_handed", WHOLE), ("shm_handed_list", LIST)],
-            Self::Messages => MESSAGES.iter().map(same).chain([RECEIVED]).collect(),
+            Self::SharedMemory => vec![("shm_handed", CONTIGUOUS_PARAMETERS), ("shm_handed_list", BUFFER_LIST_PARAMETERS)],
+            Self::Messages => MESSAGES.iter().map(same).chain([RECEPTION_PROGRAM]).collect(),
             Self::Callbacks | Self::Initialization | Self::Runtime => {
                 MESSAGES.iter().chain(&CALLBACKS).map(same).collect()
             }
@@ -162,7 +162,7 @@ impl Calls {
     /// Returns whether a program is left out, because a program at another function of the library
     /// reports the same.
     pub(crate) fn leaves_out(program: &str, has: impl Fn(&str) -> bool) -> bool {
-        program == RECEIVED.0 && has(ENQUEUE)
+        program == RECEPTION_PROGRAM.0 && has(ENQUEUE)
     }
 }
 
@@ -202,7 +202,7 @@ mod tests {
     fn the_programs_of_callbacks_include_those_of_messages() {
         let callbacks = Calls::Callbacks.programs();
         let mut messages = Calls::Messages.programs();
-        messages.retain(|(program, _)| *program != RECEIVED.0);
+        messages.retain(|(program, _)| *program != RECEPTION_PROGRAM.0);
         assert!(messages.iter().all(|each| callbacks.contains(each)));
         assert_eq!(Calls::Callbacks.expected(Means::PerfEvents), 25);
         assert_eq!(Calls::Callbacks.expected(Means::Links), 1);

@@ -22,9 +22,9 @@ pub const MAX_PROCESSES: usize = 1024;
 /// Maximum number of descriptors in one packet, `SCM_MAX_FD` of the kernel.
 pub const MAX_DESCRIPTORS: usize = 253;
 /// Time in which a request is answered. A fork that needs longer is killed.
-pub const PATIENCE: Duration = Duration::from_secs(4);
+pub const REQUEST_TIMEOUT: Duration = Duration::from_secs(4);
 /// Time in which a request for an environment is answered. An environment is short.
-const PATIENCE_OF_ENVIRONMENT: Duration = Duration::from_millis(500);
+const ENVIRONMENT_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A request with its number, which its answers repeat.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -79,8 +79,8 @@ impl Request {
     #[must_use]
     pub const fn patience(&self) -> Duration {
         match self {
-            Self::Domain { .. } => PATIENCE_OF_ENVIRONMENT,
-            _ => PATIENCE,
+            Self::Domain { .. } => ENVIRONMENT_TIMEOUT,
+            _ => REQUEST_TIMEOUT,
         }
     }
 }

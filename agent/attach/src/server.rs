@@ -39,9 +39,9 @@ pub const ATTACHMENT_BURST: f64 = 250.0;
 /// requests are refused.
 pub const MAX_STUCK: usize = 4;
 /// Pause after the kernel refused a connection or a process.
-const PAUSE: Duration = Duration::from_millis(200);
+const RETRY_DELAY: Duration = Duration::from_millis(200);
 /// Maximum wait of the broker, which then counts its children.
-const ROUND: Duration = Duration::from_secs(1);
+const MAX_WAIT: Duration = Duration::from_secs(1);
 
 /// The peer of a connection (SO_PEERCRED, unix(7)).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -72,7 +72,7 @@ pub fn serve(listener: OwnedFd, users: &[u32], idle: Duration) -> io::Result<()>
         }
         let has_room = connections.len() < MAX_CONNECTIONS;
         let source = has_room.then(|| listening.as_fd());
-        if ready(source, rest.min(ROUND))?
+        if ready(source, rest.min(MAX_WAIT))?
             && let Some(socket) = accept(listening)
         {
             connections.extend(begin(socket, users, &mut listener));
@@ -98,7 +98,7 @@ fn accept(listener: &OwnedFd) -> Option<OwnedFd> {
         Ok(socket) => Some(socket),
         Err(error) => {
             tracing::warn!(%error, "accept failed");
-            std::thread::sleep(PAUSE);
+            std::thread::sleep(RETRY_DELAY);
             None
         }
     }
@@ -134,7 +134,7 @@ fn begin(socket: OwnedFd, users: &[u32], listener: &mut Option<OwnedFd>) -> Opti
         Ok(child) => child,
         Err(error) => {
             tracing::error!(%error, "fork failed");
-            std::thread::sleep(PAUSE);
+            std::thread::sleep(RETRY_DELAY);
             None
         }
     }

@@ -22,7 +22,7 @@ use super::options::Storage;
 use super::read::Scan;
 
 /// Name of the writer in a file's header.
-pub(super) const LIBRARY: &str = concat!("ros2probe ", env!("CARGO_PKG_VERSION"));
+pub(super) const LIBRARY_NAME: &str = concat!("ros2probe ", env!("CARGO_PKG_VERSION"));
 /// Name of the metadata records.
 pub(super) const METADATA_NAME: &str = "rosbag2";
 /// Size of the pieces in which records without chunks are written, in bytes.
@@ -85,7 +85,7 @@ impl FileWriter {
             is_torn: false,
         };
         let mut begin = mcap::MAGIC.to_vec();
-        mcap::header(&mut begin, "ros2", LIBRARY);
+        mcap::header(&mut begin, "ros2", LIBRARY_NAME);
         writer.reserve(0)?;
         writer.append(&[&begin])?;
         writer.write_metadata(metadata)?;

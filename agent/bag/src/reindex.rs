@@ -166,10 +166,10 @@ fn number(name: &str) -> Option<u64> {
 
 /// Returns whether a name ends with a time, `YYYY_MM_DD-HH_MM_SS`.
 fn ends_with_time(name: &str) -> bool {
-    const SHAPE: &[u8; 19] = b"0000_00_00-00_00_00";
+    const TIME_SHAPE: &[u8; 19] = b"0000_00_00-00_00_00";
     let time = name.as_bytes().last_chunk::<19>();
     time.is_some_and(|time| {
-        let mut pairs = SHAPE.iter().zip(time);
+        let mut pairs = TIME_SHAPE.iter().zip(time);
         pairs.all(|(shape, byte)| match shape {
             b'0' => byte.is_ascii_digit(),
             _ => byte == shape,

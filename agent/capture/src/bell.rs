@@ -10,7 +10,7 @@ use std::os::unix::net::UnixStream;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Maximum number of rings that one call of [`Bell::silence`] takes.
-const RINGS: usize = 64;
+const MAX_RINGS: usize = 64;
 
 /// A bell that any thread may ring or wait for.
 #[derive(Debug)]
@@ -54,8 +54,8 @@ impl Bell {
         if !self.rung.swap(false, Ordering::AcqRel) {
             return;
         }
-        let read = rustix::io::read(&self.listener, &mut [0; RINGS]);
-        if read.is_ok_and(|rings| rings == RINGS) {
+        let read = rustix::io::read(&self.listener, &mut [0; MAX_RINGS]);
+        if read.is_ok_and(|rings| rings == MAX_RINGS) {
             self.rung.store(true, Ordering::Release);
         }
     }
@@ -73,7 +73,7 @@ mod tests {
         let rings = || wait(&[bell.descriptor()], Duration::ZERO).unwrap() == Some(0);
         bell.silence();
         assert!(!rings());
-        for _ in 0..3 * RINGS {
+        for _ in 0..3 * MAX_RINGS {
             bell.ring();
         }
         for _ in 0..3 {

@@ -48,14 +48,14 @@ use ros2probe_model::observe::observer::{Observer, Wanted};
 
 /// Time for which captures of the host hook accumulate: a starting node announces its endpoints one
 /// by one, and each round costs CPU time.
-const GATHER: Duration = Duration::from_millis(10);
+const READ_INTERVAL: Duration = Duration::from_millis(10);
 /// Shorter time while whole samples are captured: a point cloud fills the ring in a few
 /// milliseconds.
-const GATHER_PAYLOADS: Duration = Duration::from_millis(2);
-const TENTH: u64 = SECOND / 10;
+const PAYLOAD_READ_INTERVAL: Duration = Duration::from_millis(2);
+const REFILL_INTERVAL: u64 = SECOND / 10;
 /// Time between two rounds that indicates a delay of this process; longer than any wait for
 /// packets.
-const HELD_UP: u64 = 2 * SECOND;
+const MAX_ROUND_GAP: u64 = 2 * SECOND;
 
 /// Why capturing cannot start or continue.
 #[derive(Debug, thiserror::Error)]
@@ -376,7 +376,7 @@ impl LiveSource {
         let descriptors: Vec<_> = bell.into_iter().chain(taps).collect();
         let began = Instant::now();
         let timeout = match self.wanted_waits {
-            true => timeout.min(Duration::from_nanos(TENTH)),
+            true => timeout.min(Duration::from_nanos(REFILL_INTERVAL)),
             false => timeout,
         };
         let ready = wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
@@ -385,9 +385,9 @@ impl LiveSource {
             // Packets arrive in bursts. After a timeout, packets have already had time to
             // accumulate.
             std::thread::sleep(if observer.wants_payloads() {
-                GATHER_PAYLOADS
+                PAYLOAD_READ_INTERVAL
             } else {
-                GATHER
+                READ_INTERVAL
             });
         }
         let mut clocks = Clocks::read();
@@ -400,7 +400,7 @@ impl LiveSource {
             );
             observer.input(Input::ClockSet(step));
         }
-        let held_up = clocks.monotonic.saturating_sub(self.clocks.monotonic) >= HELD_UP;
+        let held_up = clocks.monotonic.saturating_sub(self.clocks.monotonic) >= MAX_ROUND_GAP;
         self.clocks = clocks;
         self.refill(clocks.monotonic);
         let mut settle = 0;
@@ -435,7 +435,7 @@ impl LiveSource {
         // announcements may not have fit.
         let clock = self.clock;
         let ends = observer.next_expiry().is_some_and(|end| end <= clock);
-        let is_due = clocks.monotonic.wrapping_sub(self.heard) >= TENTH;
+        let is_due = clocks.monotonic.wrapping_sub(self.heard) >= REFILL_INTERVAL;
         if held_up || ends && is_due {
             self.heard = clocks.monotonic;
             for (prefix, at) in self.last_seen() {
@@ -462,7 +462,7 @@ impl LiveSource {
 
     /// Passes the model's requests for shared memory to its readers, ten times a second.
     fn apply_wanted(&mut self, now: u64, observer: &Observer) {
-        self.wanted_waits = now.wrapping_sub(self.wanted_asked) < TENTH;
+        self.wanted_waits = now.wrapping_sub(self.wanted_asked) < REFILL_INTERVAL;
         if self.wanted_waits {
             return;
         }
@@ -773,12 +773,12 @@ impl LiveSource {
     }
 
     fn refill(&mut self, monotonic: u64) {
-        if monotonic.wrapping_sub(self.bytes_refilled) >= SECOND - TENTH {
+        if monotonic.wrapping_sub(self.bytes_refilled) >= SECOND - REFILL_INTERVAL {
             self.bytes_refilled = monotonic;
             let (budget, amount) = (Budget::CaptureBytes, UNKNOWN_BYTES_PER_SECOND);
             self.each_filter(|filter| filter.set_unknown_budget(budget, amount));
         }
-        let tenths = monotonic.wrapping_sub(self.records_refilled) / TENTH;
+        let tenths = monotonic.wrapping_sub(self.records_refilled) / REFILL_INTERVAL;
         if tenths > 0 {
             self.records_refilled = monotonic;
             let tenths = u32::try_from(tenths).unwrap_or(UNKNOWN_PORTIONS);

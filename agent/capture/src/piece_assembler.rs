@@ -16,7 +16,7 @@ use crate::tables::{FreshDatagrams, OpenPieces};
 /// loses its CPU.
 const LIFETIME_NANOSECONDS: u64 = 1_000_000_000;
 /// Time without a datagram in several pieces after which buffers are freed.
-const KEPT_NANOSECONDS: u64 = 10_000_000_000;
+const PIECE_LIFETIME_NANOSECONDS: u64 = 10_000_000_000;
 
 /// Incomplete datagrams, the oldest first: datagrams that several CPUs write at the same time, and
 /// datagrams with lost pieces.
@@ -96,7 +96,7 @@ impl PieceAssembler {
 
     /// Discards datagrams that have waited too long, in the kernel's clock.
     pub fn advance(&mut self, now: u64) {
-        if now.saturating_sub(self.used) > KEPT_NANOSECONDS {
+        if now.saturating_sub(self.used) > PIECE_LIFETIME_NANOSECONDS {
             self.spare = Vec::new();
         }
         let before = self.open.len();

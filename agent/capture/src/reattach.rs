@@ -22,10 +22,10 @@ use super::system::{DirectoryWatch, wait};
 use crate::threads::{Progress, Spawn, Task};
 
 /// Interval of checks while the directory above the group is not watched.
-const EVERY: Duration = Duration::from_secs(1);
+const POLL_INTERVAL: Duration = Duration::from_secs(1);
 /// Interval of checks while it is watched: inotify reports a group that appears there or is
 /// removed. Only the removal or the mount of a directory further up waits for a check.
-const EVERY_WATCHED: Duration = Duration::from_secs(10);
+const WATCHED_POLL_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Device and inode of a directory, unique per control group.
 pub type Identity = (u64, u64);
@@ -139,8 +139,8 @@ impl Follow {
             self.check();
             let ended = ended.as_fd();
             let every = match watches_above && self.attached.is_some() {
-                true => EVERY_WATCHED,
-                false => EVERY,
+                true => WATCHED_POLL_INTERVAL,
+                false => POLL_INTERVAL,
             };
             self.shared.progress.rest();
             let is_over = match &watch {

@@ -34,7 +34,7 @@ use crate::tables::{
 };
 
 /// Maximum capacity that an empty queue keeps. A larger queue is freed after a burst.
-const KEPT: usize = 512;
+const MAX_KEPT_CAPACITY: usize = 512;
 /// Maximum number of records read per round: several rings of the default size.
 const RECORDS_PER_ROUND: usize = 32_768;
 /// Maximum delay of a captured datagram after the report of its drop.
@@ -298,17 +298,17 @@ impl ReorderBuffer {
 
     fn give_back(&mut self) {
         for records in [&mut self.kernel, &mut self.socket_full] {
-            if records.is_empty() && records.capacity() > KEPT {
+            if records.is_empty() && records.capacity() > MAX_KEPT_CAPACITY {
                 *records = VecDeque::new();
             }
         }
-        if self.walked.is_empty() && self.walked.capacity() > KEPT {
+        if self.walked.is_empty() && self.walked.capacity() > MAX_KEPT_CAPACITY {
             self.walked.take();
         }
-        if self.polled.is_empty() && self.polled.capacity() > KEPT {
+        if self.polled.is_empty() && self.polled.capacity() > MAX_KEPT_CAPACITY {
             self.polled.take();
         }
-        if self.segments.is_empty() && self.segments.capacity() > KEPT {
+        if self.segments.is_empty() && self.segments.capacity() > MAX_KEPT_CAPACITY {
             self.segments = VecDeque::new();
         }
     }
@@ -521,8 +521,8 @@ mod tests {
         }
         assert!(order.kernel.capacity() >= 20_000);
         while order.next(&clocks(900), 900 * MILLISECOND).is_some() {}
-        assert!(order.kernel.capacity() <= KEPT);
-        assert!(order.walked.capacity() <= KEPT);
+        assert!(order.kernel.capacity() <= MAX_KEPT_CAPACITY);
+        assert!(order.walked.capacity() <= MAX_KEPT_CAPACITY);
     }
 
     fn segment(number: u32, milliseconds: u64, bytes: &[u8]) -> (u64, Chunk<'_>) {

@@ -32,9 +32,9 @@ const NOMINAL_FRAME: usize = 2048;
 /// Size of a block, in bytes. The largest frame, a 64 KiB datagram on loopback, fits with its
 /// header and the block's. The kernel releases a block when it is full or [`Settings::retire`] old,
 /// so the number of blocks limits the delay of the reader. Many small blocks are therefore better.
-const BLOCK: usize = 128 << 10;
+const BLOCK_BYTES: usize = 128 << 10;
 /// Default size of a ring, in bytes.
-const MEMORY: usize = 4 << 20;
+const DEFAULT_RING_BYTES: usize = 4 << 20;
 /// Pause between polls of a socket that repeatedly reports an error.
 const ERROR_PAUSE: Duration = Duration::from_millis(10);
 
@@ -51,7 +51,7 @@ pub struct Settings {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self::with_memory(MEMORY)
+        Self::with_memory(DEFAULT_RING_BYTES)
     }
 }
 
@@ -61,8 +61,8 @@ impl Settings {
     #[must_use]
     pub fn with_memory(bytes: usize) -> Self {
         Self {
-            block_size: BLOCK,
-            blocks: (bytes / BLOCK).max(2),
+            block_size: BLOCK_BYTES,
+            blocks: (bytes / BLOCK_BYTES).max(2),
             retire: Duration::from_millis(100),
         }
     }

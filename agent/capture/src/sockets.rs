@@ -19,13 +19,13 @@ use ros2probe_model::observe::observer::Observer;
 use ros2probe_model::report::snapshot::SocketFacts;
 
 /// Interval of searches for new sockets: every second round of an idle agent.
-const PERIOD: u64 = 19 * SECOND / 10;
+const SEARCH_INTERVAL: u64 = 19 * SECOND / 10;
 /// Minimum interval while a connection of Zenoh begins, which may last for less than a second.
-const SOON: u64 = SECOND / 10;
+const SHORT_SEARCH_INTERVAL: u64 = SECOND / 10;
 /// Interval of reading all owners again, because sockets are closed and their drops increase.
-const ALL_PERIOD: u64 = 15 * SECOND;
+const FULL_SEARCH_INTERVAL: u64 = 15 * SECOND;
 /// Maximum number of queries for an owner that was not found.
-const MOST_QUESTIONS: u8 = 3;
+const MAX_REQUESTS: u8 = 3;
 
 /// State of all sockets.
 #[derive(Debug)]
@@ -64,7 +64,7 @@ impl Sockets {
     /// Queries the kernel if a query is due, and passes changes to the model.
     pub fn follow(&mut self, filter: &Filter, now: u64, observer: &mut Observer) {
         let is_awaited = observer.awaits_holders();
-        let interval = if is_awaited { SOON } else { PERIOD };
+        let interval = if is_awaited { SHORT_SEARCH_INTERVAL } else { SEARCH_INTERVAL };
         if now.saturating_sub(self.looked) < interval {
             return;
         }
@@ -120,9 +120,9 @@ impl Sockets {
         let owners = inside?.owners()?;
         let unknown = |cookie: &u64| {
             let known = self.known.get(cookie);
-            known.is_none_or(|known| known.owner.is_none() && known.questions < MOST_QUESTIONS)
+            known.is_none_or(|known| known.owner.is_none() && known.questions < MAX_REQUESTS)
         };
-        let due = now.saturating_sub(self.asked) >= ALL_PERIOD;
+        let due = now.saturating_sub(self.asked) >= FULL_SEARCH_INTERVAL;
         if met.is_empty() || !(due || met.keys().any(unknown)) {
             return None;
         }
@@ -150,7 +150,7 @@ impl Sockets {
             if owner.is_none() && known.owner.is_some() {
                 // The last process that held the socket has closed it.
                 *known = Known {
-                    questions: MOST_QUESTIONS,
+                    questions: MAX_REQUESTS,
                     ..Known::default()
                 };
                 observer.input(Input::SocketClosed(*cookie));
@@ -167,7 +167,7 @@ impl Sockets {
 impl Known {
     /// Returns whether a process may hold the socket open.
     const fn may_be_open(&self) -> bool {
-        self.owner.is_some() || self.questions < MOST_QUESTIONS
+        self.owner.is_some() || self.questions < MAX_REQUESTS
     }
 
     /// Returns the drops of the socket beyond the attributed ones; `None` if the kernel does not
@@ -265,7 +265,7 @@ mod tests {
         all.poll(owners, &met, &mut observer);
         all.poll(BTreeMap::from([(2, owner(0))]), &met, &mut observer);
         let questions = |all: &Sockets, cookie| all.known.get(&cookie).unwrap().questions;
-        assert_eq!(questions(&all, 1), MOST_QUESTIONS);
+        assert_eq!(questions(&all, 1), MAX_REQUESTS);
         assert!(all.known.get(&1).unwrap().owner.is_none());
         assert_eq!(questions(&all, 2), 2);
         all.forget(&sockets(&[2], 0), &mut observer);

@@ -13,9 +13,9 @@ use ros2probe_wire::Timestamp;
 use rustix::process::{DumpableBehavior, set_dumpable_behavior};
 
 /// Maximum number of attempts to read the clocks.
-const READINGS: usize = 8;
+const MAX_READINGS: usize = 8;
 /// Maximum time between two clock readings that count as simultaneous, in nanoseconds.
-const CLOSE: u64 = 5_000;
+const MAX_READING_NANOSECONDS: u64 = 5_000;
 
 /// Waits until one of `descriptors` is readable or in error, a signal arrives, or the timeout
 /// expires. Returns the index of the first such descriptor.
@@ -201,8 +201,8 @@ impl Clocks {
     #[must_use]
     pub fn read() -> Self {
         let mut best = Self::read_once();
-        for _ in 1..READINGS {
-            if best.1 <= CLOSE {
+        for _ in 1..MAX_READINGS {
+            if best.1 <= MAX_READING_NANOSECONDS {
                 break;
             }
             let again = Self::read_once();
@@ -275,7 +275,7 @@ pub fn raw_difference() -> u64 {
         let within = nanoseconds(libc::CLOCK_MONOTONIC).saturating_sub(before);
         (within, raw.wrapping_sub(before + within / 2))
     };
-    let readings = std::iter::repeat_with(read).take(READINGS);
+    let readings = std::iter::repeat_with(read).take(MAX_READINGS);
     readings.min().unwrap_or_default().1
 }
 

@@ -9,7 +9,7 @@ use std::time::Duration;
 use anyhow::{Context as _, Result, bail};
 use ros2probe::discover::announcements::Announcements;
 use ros2probe::discover::participants::{HeardParticipant, Listening, listen};
-use ros2probe::discover::session::{MOST_PACKETS, Session, Target};
+use ros2probe::discover::session::{MAX_PACKETS, Session, Target};
 use ros2probe::discover::{converse, local_participant};
 use ros2probe_daemon::agent::configuration;
 
@@ -91,7 +91,7 @@ fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write
     let will = if options.dry_run { "would" } else { "will" };
     writeln!(
         out,
-        "\n{}: {will} send at most {MOST_PACKETS} packets, from {}, normally these:",
+        "\n{}: {will} send at most {MAX_PACKETS} packets, from {}, normally these:",
         target.prefix, local_participant.address
     )?;
     for packet in session.plan() {

@@ -7,7 +7,7 @@ use ros2probe_api::inside::{Durations, Inside, Owner, ThreadStates};
 use crate::top::text::{safe, seconds};
 
 /// Width between two columns.
-const GAP: usize = 2;
+const COLUMN_GAP: usize = 2;
 
 /// Returns whether nothing is known.
 #[must_use]
@@ -177,7 +177,7 @@ fn table<const N: usize>(
     for cells in all() {
         let padded = cells.iter().zip(widths);
         let line: String = padded
-            .map(|(cell, width)| format!("{cell:<0$}", width + GAP))
+            .map(|(cell, width)| format!("{cell:<0$}", width + COLUMN_GAP))
             .collect();
         out.push_str(line.trim_end());
         out.push('\n');

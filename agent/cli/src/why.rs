@@ -9,7 +9,7 @@ use ros2probe_api::why::{LateCall, LateCallback, OtherThread, Part, Why};
 use crate::top::text::{counted, safe, seconds};
 
 /// Width of a drawn bar, in characters.
-const BAR: usize = 48;
+const BAR_WIDTH: usize = 48;
 /// Stages in the order of time, in words.
 const STAGES: [(&str, &str); 6] = [
     ("publish", "until sent"),
@@ -20,7 +20,7 @@ const STAGES: [(&str, &str); 6] = [
     ("callback", "in the call"),
 ];
 /// Share of a call below which a part has no words.
-const SMALL: f64 = 0.005;
+const MIN_NAMED_SHARE: f64 = 0.005;
 
 /// Returns whether no late call is known.
 #[must_use]
@@ -98,7 +98,7 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
     let _ = writeln!(out, "  [{}]", bar(&call.parts, total));
     let mut others: Vec<_> = call.others.iter().collect();
     others.sort_by(|one, other| other.seconds.total_cmp(&one.seconds));
-    let others = others.iter().filter(|other| other.seconds >= total * SMALL);
+    let others = others.iter().filter(|other| other.seconds >= total * MIN_NAMED_SHARE);
     let others: Vec<_> = others
         .take(4)
         .map(|other| match other.thread_id {
@@ -116,7 +116,7 @@ fn worst_call(call: &LateCall<'_>, zone: &TimeZone, out: &mut String) {
     if let Some(blocked) = call
         .blocked
         .as_ref()
-        .filter(|it| it.seconds >= total * SMALL)
+        .filter(|it| it.seconds >= total * MIN_NAMED_SHARE)
     {
         let system_call = match &blocked.system_call {
             Some(name) => format!("{}({})", safe(name), safe(&blocked.argument)),
@@ -169,7 +169,7 @@ fn named(other: &OtherThread<'_>, id: String) -> String {
 
 /// Returns the parts that are not small, with their lengths.
 fn listed(parts: &[&Part<'_>], total: f64) -> String {
-    let shown = parts.iter().filter(|part| part.seconds >= total * SMALL);
+    let shown = parts.iter().filter(|part| part.seconds >= total * MIN_NAMED_SHARE);
     let words: Vec<_> = shown
         .map(|part| format!("{} {}", safe(&part.cause), seconds(part.seconds)))
         .collect();
@@ -179,17 +179,17 @@ fn listed(parts: &[&Part<'_>], total: f64) -> String {
 /// Draws the parts in the order of their time: the first letter of a cause for each share of the
 /// call.
 fn bar(parts: &[Part<'_>], total: f64) -> String {
-    let mut bar = String::with_capacity(BAR);
+    let mut bar = String::with_capacity(BAR_WIDTH);
     let mut until = 0.0;
     for part in parts {
         until += part.seconds;
         let letter = part.cause.chars().next().unwrap_or('?');
         #[expect(clippy::cast_precision_loss, reason = "a bar has few characters")]
-        while bar.len() < BAR && (bar.len() as f64 + 0.5) / BAR as f64 <= until / total {
+        while bar.len() < BAR_WIDTH && (bar.len() as f64 + 0.5) / BAR_WIDTH as f64 <= until / total {
             bar.push(letter);
         }
     }
-    while bar.len() < BAR {
+    while bar.len() < BAR_WIDTH {
         bar.push(' ');
     }
     bar

@@ -46,7 +46,7 @@ use ros2probe_metrics::otlp::{
 use ros2probe_metrics::remote_write;
 
 /// Subdirectory of samples that wait for remote write.
-const QUEUE: &str = "remote_write";
+const REMOTE_WRITE_DIRECTORY: &str = "remote_write";
 
 /// Default configuration file.
 pub const DEFAULT_CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
@@ -299,7 +299,7 @@ pub fn run(options: Options) -> Result<()> {
         let inputs = remote_write::Inputs {
             metrics: Arc::new(sources.clone()),
             figures: Arc::clone(&sources.remote_write),
-            directory: state.directory().map(|state| state.path().join(QUEUE)),
+            directory: state.directory().map(|state| state.path().join(REMOTE_WRITE_DIRECTORY)),
         };
         let started = remote_write::start(settings, inputs, privilege::spawn_export);
         exporters.push(started.context("remote write cannot start")?);

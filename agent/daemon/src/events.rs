@@ -4,7 +4,7 @@
 //! references. Each reader keeps its own position; overwritten events are counted and reported to
 //! it.
 //!
-//! Bursts are limited: at most `MOST` events of one name are kept per second, and further ones are
+//! Bursts are limited: at most `MAX_EVENTS_PER_SECOND` events of one name are kept per second, and further ones are
 //! only counted. The seconds of robot events are those of the source's clock, so a capture yields
 //! the same events at any speed.
 //!
@@ -39,7 +39,7 @@ pub use table::EVENTS;
 pub use trigger::Trigger;
 
 /// Maximum number of events of one name per second.
-const MOST: u32 = 200;
+const MAX_EVENTS_PER_SECOND: u32 = 200;
 
 /// Log of the latest events.
 #[derive(Debug)]
@@ -362,7 +362,7 @@ impl Storm {
     /// Returns whether another event of this name is allowed; otherwise counts it as suppressed.
     fn admits(&mut self, name: &'static str) -> bool {
         let recorded = self.recorded.entry(name).or_default();
-        if *recorded >= MOST {
+        if *recorded >= MAX_EVENTS_PER_SECOND {
             *self.held_back.entry(name).or_default() += 1;
             return false;
         }

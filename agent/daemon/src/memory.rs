@@ -12,11 +12,11 @@ use anyhow::anyhow;
 use ros2probe_model::graph::discovery::Memory;
 
 /// Default directory of the package and of the service manager.
-const DEFAULT: &str = "/var/lib/ros2probe";
+const DEFAULT_DIRECTORY: &str = "/var/lib/ros2probe";
 /// Variable of the service manager.
-const VARIABLE: &str = "STATE_DIRECTORY";
+const STATE_DIRECTORY_VARIABLE: &str = "STATE_DIRECTORY";
 /// Subdirectory of recordings.
-pub(crate) const RECORDINGS: &str = "recordings";
+pub(crate) const RECORDINGS_DIRECTORY: &str = "recordings";
 
 /// Opens the state directory; returns `None` if no state is saved.
 pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
@@ -43,8 +43,8 @@ pub(crate) fn path(choice: &StateChoice) -> Option<PathBuf> {
         StateChoice::Off => None,
         StateChoice::At(path) => Some(path.clone()),
         StateChoice::Auto => {
-            let named = std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
-            let default = || Path::new(DEFAULT).exists().then(|| DEFAULT.into());
+            let named = std::env::var_os(STATE_DIRECTORY_VARIABLE).filter(|path| !path.is_empty());
+            let default = || Path::new(DEFAULT_DIRECTORY).exists().then(|| DEFAULT_DIRECTORY.into());
             named.map(PathBuf::from).or_else(default)
         }
     }
@@ -55,7 +55,7 @@ pub(crate) fn recordings(choice: &StateChoice, state: Option<&StateDirectory>) -
     match choice {
         StateChoice::Off => None,
         StateChoice::At(path) => Some(path.clone()),
-        StateChoice::Auto => Some(state?.path().join(RECORDINGS)),
+        StateChoice::Auto => Some(state?.path().join(RECORDINGS_DIRECTORY)),
     }
 }
 

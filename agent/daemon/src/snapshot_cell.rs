@@ -20,12 +20,12 @@ use ros2probe_model::measure::history::Past;
 use ros2probe_model::report::snapshot::Snapshot;
 
 /// Maximum age of a state that still describes the robot.
-const FRESH: Duration = Duration::from_secs(5);
+const MAX_FRESH_AGE: Duration = Duration::from_secs(5);
 /// Number of further seconds that are published after a client has read the last seconds.
 const PAST_SECONDS: u8 = 5;
 
 /// Time for which calls inside processes are observed after the last request for them.
-const CALLS_HELD: Duration = Duration::from_secs(10);
+const REQUEST_LIFETIME: Duration = Duration::from_secs(10);
 /// Maximum number of topics and nodes about whose late calls clients ask at once.
 const MAX_LATE_QUESTIONS: usize = 16;
 
@@ -149,7 +149,7 @@ impl SnapshotCell {
     /// Notes that a client needs calls inside processes.
     pub fn want_calls(&self) {
         let before = self.calls_wanted.swap(Some(Arc::new(Instant::now())));
-        if before.is_none_or(|before| before.elapsed() > CALLS_HELD) {
+        if before.is_none_or(|before| before.elapsed() > REQUEST_LIFETIME) {
             self.bell.ring();
         }
     }
@@ -161,7 +161,7 @@ impl SnapshotCell {
         let age = wanted
             .as_deref()
             .map(|at| now.saturating_duration_since(*at));
-        age.is_some_and(|age| age <= CALLS_HELD)
+        age.is_some_and(|age| age <= REQUEST_LIFETIME)
     }
 
     /// Notes that a client requests the causes of late calls. With `above`, calls of callbacks of
@@ -169,7 +169,7 @@ impl SnapshotCell {
     pub fn want_late(&self, name: Option<&str>, above: Option<Duration>) {
         self.want_calls();
         let mut questions = self.late_questions();
-        questions.retain(|question| question.at.elapsed() <= CALLS_HELD);
+        questions.retain(|question| question.at.elapsed() <= REQUEST_LIFETIME);
         let is_same = |question: &LateQuestion| question.name.as_deref() == name;
         let question = LateQuestion {
             at: Instant::now(),
@@ -186,7 +186,7 @@ impl SnapshotCell {
     #[must_use]
     pub fn late_demand(&self, now: Instant) -> LateDemand {
         let mut questions = self.late_questions();
-        questions.retain(|question| now.saturating_duration_since(question.at) <= CALLS_HELD);
+        questions.retain(|question| now.saturating_duration_since(question.at) <= REQUEST_LIFETIME);
         let bounds = questions.iter().filter_map(|question| {
             Some(RequestedBound {
                 name: question.name.clone(),
@@ -336,11 +336,11 @@ impl State {
             return Ok(());
         }
         let stuck = now.saturating_duration_since(self.agent.capture_progress);
-        if stuck > FRESH {
+        if stuck > MAX_FRESH_AGE {
             return Err(Unready::NoProgress(stuck.as_secs()));
         }
         let age = now.saturating_duration_since(self.agent.at);
-        if age > FRESH {
+        if age > MAX_FRESH_AGE {
             return Err(Unready::Outdated(age.as_secs()));
         }
         Ok(())

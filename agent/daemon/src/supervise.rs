@@ -34,10 +34,10 @@ use tokio_util::sync::CancellationToken;
 use crate::logging::Log;
 
 /// Polling intervals of readiness until the agent is ready, and of the watchdog afterwards.
-const STARTING_TICK: Duration = Duration::from_millis(100);
-const TICK: Duration = Duration::from_secs(2);
+const STARTUP_TICK_INTERVAL: Duration = Duration::from_millis(100);
+const TICK_INTERVAL: Duration = Duration::from_secs(2);
 /// Maximum time for answers in progress and for the working thread's last round.
-const DRAIN: Duration = Duration::from_secs(3);
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// Supervisor of an agent.
 pub(crate) struct Supervisor {
@@ -114,7 +114,7 @@ impl Supervisor {
         let mut serving = responder.begin(surfaces);
         let (mut ros2_daemon, reloaded) = self.begin_ros2_daemon();
         let mut watchdog = Watchdog::new();
-        let mut tick = ticks(STARTING_TICK);
+        let mut tick = ticks(STARTUP_TICK_INTERVAL);
         let (mut working, mut answering) = (true, true);
 
         let outcome = loop {
@@ -160,7 +160,7 @@ impl Supervisor {
                 }
                 _ = tick.tick() => {
                     if watchdog.check(&self.sources.latest, &self.sources.events) {
-                        tick = ticks(watchdog.period.map_or(TICK, |period| period.min(TICK)));
+                        tick = ticks(watchdog.period.map_or(TICK_INTERVAL, |period| period.min(TICK_INTERVAL)));
                     }
                 }
             }
@@ -169,7 +169,7 @@ impl Supervisor {
         let _ = sd_notify::notify(&[NotifyState::Stopping]);
         self.stop.cancel();
         self.sources.latest.bell().ring();
-        let drained = timeout(DRAIN, async {
+        let drained = timeout(DRAIN_TIMEOUT, async {
             if working {
                 let _ = (&mut worker.ended).await;
             }

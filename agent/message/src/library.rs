@@ -29,14 +29,14 @@ use crate::library::search::Search;
 use crate::type_object::NotUsable;
 
 /// Directory of ROS installations, one subdirectory per distribution.
-const INSTALLED: &str = "/opt/ros";
+const ROS_PREFIX: &str = "/opt/ros";
 /// Maximum number of sources searched: a workspace installed package by package has hundreds.
 pub(super) const MAX_SOURCES: usize = 1024;
 /// Maximum number of cached types, and maximum size of their text in bytes.
 const MAX_KEPT: usize = 1024;
 const MAX_KEPT_TEXT: usize = 32 << 20;
 /// Prefix of type hashes of the only known version.
-const HASH: &str = "RIHS01_";
+const HASH_PREFIX: &str = "RIHS01_";
 
 /// Sources to search, in this order.
 #[derive(Debug, Clone, Default)]
@@ -64,7 +64,7 @@ impl Sources {
                     .collect()
             })
             .unwrap_or_default();
-        for prefix in installed(Path::new(INSTALLED), dialect) {
+        for prefix in installed(Path::new(ROS_PREFIX), dialect) {
             if !prefixes.contains(&prefix) {
                 prefixes.push(prefix);
             }
@@ -238,7 +238,7 @@ impl Library {
             .parse()
             .map_err(|_| NotFound::NotATypeName(name.to_owned()))?;
         let announced = announced_hash
-            .filter(|hash| hash.starts_with(HASH))
+            .filter(|hash| hash.starts_with(HASH_PREFIX))
             .map(str::to_owned);
         let equivalence = announced_hash.filter(|hash| EquivalenceHash::parse(hash).is_some());
         let key = (root, announced);

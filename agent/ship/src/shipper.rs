@@ -21,14 +21,14 @@ use crate::status::{Delivered, Failure, MAX_LISTED, Status, Uploading, now};
 use crate::store::Store;
 
 /// Time between two scans of the directory.
-const POLL: Duration = Duration::from_secs(2);
+const SCAN_INTERVAL: Duration = Duration::from_secs(2);
 /// Pauses after a failure.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_mins(1);
 /// Number of failures in a row after which a single pass ends.
 const MAX_FAILURES: u32 = 3;
 /// Beginning of the name of a bag that is being deleted.
-const DELETED: &str = ".delivered-";
+const DELETED_PREFIX: &str = ".delivered-";
 
 /// Returns warnings and errors of the agent between two times in nanoseconds since 1970; `None` if
 /// the agent cannot be queried.
@@ -138,7 +138,7 @@ impl Shipper {
                 Ok(wait) => wait,
                 Err(error) => {
                     self.log_failure("", &describe(&error));
-                    Some(POLL)
+                    Some(SCAN_INTERVAL)
                 }
             };
             if let Some(wait) = wait {
@@ -181,7 +181,7 @@ impl Shipper {
         self.make_space().await;
         let Some(bag) = self.next() else {
             self.show_status();
-            return Ok(Some(POLL));
+            return Ok(Some(SCAN_INTERVAL));
         };
         let delivered = self.deliver(&bag).await;
         self.status.uploading = None;
@@ -252,7 +252,7 @@ impl Shipper {
         if !self.is_permitted(bag) {
             return true;
         }
-        let is_due = self.last_scan.is_none_or(|scan| scan.elapsed() >= POLL);
+        let is_due = self.last_scan.is_none_or(|scan| scan.elapsed() >= SCAN_INTERVAL);
         if bag.is_triggered() || !is_due || self.scan().is_err() {
             return false;
         }
@@ -316,7 +316,7 @@ impl Shipper {
             let aside = self
                 .settings
                 .recordings
-                .join(format!("{DELETED}{}", bag.name));
+                .join(format!("{DELETED_PREFIX}{}", bag.name));
             // After a loss of power, a bag is there as a whole or not at all.
             let removed = fs::rename(&bag.path, &aside).and_then(|()| fs::remove_dir_all(&aside));
             if let Err(error) = removed {
@@ -336,7 +336,7 @@ impl Shipper {
             .into_iter()
             .flatten();
         for entry in entries.flatten() {
-            if entry.file_name().to_string_lossy().starts_with(DELETED) {
+            if entry.file_name().to_string_lossy().starts_with(DELETED_PREFIX) {
                 let _ = fs::remove_dir_all(entry.path());
             }
         }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use jiff::civil::Time;
 
-const MINUTES: u32 = 24 * 60;
+const MINUTES_PER_DAY: u32 = 24 * 60;
 
 /// One time of the day, as in `22:00-06:00`. It may pass midnight.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -63,7 +63,7 @@ impl Windows {
         let waits = self
             .0
             .iter()
-            .map(|window| (window.begin + MINUTES - minute) % MINUTES);
+            .map(|window| (window.begin + MINUTES_PER_DAY - minute) % MINUTES_PER_DAY);
         let wait = u64::from(waits.min().unwrap_or(0)) * 60;
         Duration::from_secs(wait.saturating_sub(second))
     }
@@ -78,7 +78,7 @@ fn minutes(text: &str) -> Option<u32> {
     };
     let (hour, minute) = (number(hour)?, number(minute)?);
     let is_time = hour < 24 && minute < 60 || (hour, minute) == (24, 0);
-    is_time.then_some((hour * 60 + minute) % MINUTES)
+    is_time.then_some((hour * 60 + minute) % MINUTES_PER_DAY)
 }
 
 #[cfg(test)]
@@ -139,20 +139,20 @@ mod tests {
     proptest! {
         #[test]
         fn a_window_is_open_at_the_time_at_which_it_opens(
-            begin in 0_u32..MINUTES,
-            length in 1_u32..MINUTES,
+            begin in 0_u32..MINUTES_PER_DAY,
+            length in 1_u32..MINUTES_PER_DAY,
             hour in 0_i8..24,
             minute in 0_i8..60,
             second in 0_i8..60,
         ) {
-            let end = (begin + length) % MINUTES;
+            let end = (begin + length) % MINUTES_PER_DAY;
             let windows = Windows(vec![Window { begin, end }]);
             let now = time(hour, minute, second, 0);
             let wait = windows.opens_in(now);
             let then = now.wrapping_add(jiff::SignedDuration::try_from(wait).unwrap());
             prop_assert_eq!(windows.opens_in(then), Duration::ZERO);
             let minute = hour as u32 * 60 + minute as u32;
-            let is_inside = (minute + MINUTES - begin) % MINUTES < length;
+            let is_inside = (minute + MINUTES_PER_DAY - begin) % MINUTES_PER_DAY < length;
             prop_assert_eq!(wait == Duration::ZERO, is_inside);
         }
     }

@@ -18,7 +18,7 @@ use super::super::error_chain::Reason;
 use super::{FilterError, failed, take};
 
 /// Programs and their attach types of linux/bpf.h.
-const RECEIVERS: [(&str, u32); 2] = [("received_ipv4", 19), ("received_ipv6", 20)];
+const RECEIVER_PROGRAMS: [(&str, u32); 2] = [("received_ipv4", 19), ("received_ipv6", 20)];
 
 type KeyWords = [u64; size_of::<DeliveryKey>() / 8];
 type DeliveryWords = [u64; size_of::<Delivery>() / 8];
@@ -58,7 +58,7 @@ impl Deliveries {
             let descriptor = program.fd()?.try_clone();
             Ok(descriptor.map_err(ProgramError::IOError)?)
         };
-        let [(ipv4, _), (ipv6, _)] = RECEIVERS;
+        let [(ipv4, _), (ipv6, _)] = RECEIVER_PROGRAMS;
         let receivers = load(ipv4).and_then(|ipv4| Ok([ipv4, load(ipv6)?]));
         Ok(Self {
             receivers: receivers.map_err(|error| Reason::of(&error)),
@@ -79,7 +79,7 @@ impl Deliveries {
             return Ok(());
         }
         let receivers = self.receivers.as_ref().map_err(Clone::clone)?;
-        let links = receivers.iter().zip(RECEIVERS).map(|(program, (_, at))| {
+        let links = receivers.iter().zip(RECEIVER_PROGRAMS).map(|(program, (_, at))| {
             let [program, cgroup] =
                 [program.as_fd().as_raw_fd(), cgroup.as_raw_fd()].map(i32::cast_unsigned);
             bpf::create_link(program, cgroup, at)

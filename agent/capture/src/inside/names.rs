@@ -12,7 +12,7 @@ use ros2probe_wire::inside::{Announcement, Figures, Handle, announced, kind};
 use crate::tables::InsideNames;
 
 /// Maximum length of a chain of relations.
-const DEPTH: usize = 8;
+const MAX_DEPTH: usize = 8;
 
 /// Names that a process has announced.
 #[derive(Debug, Default)]
@@ -146,7 +146,7 @@ impl Names {
     /// Follows relations to an object that is not itself a relation.
     fn resolve(&self, of: Of, address: u64) -> Option<(Of, u64, &Named)> {
         let mut at = (of, address);
-        for _ in 0..DEPTH {
+        for _ in 0..MAX_DEPTH {
             match self.known.get(&at)? {
                 Named::Is(of, address) => at = (*of, *address),
                 named => return Some((at.0, at.1, named)),

@@ -15,26 +15,26 @@ use super::table::ProcessTable;
 use super::{Facts, MAX_HITS, Shared, Work};
 use crate::bell::Bell;
 use crate::error_chain::{Reason, in_words};
-use crate::mappings::{MappingEvents, NewMappings, UNCONCERNED};
+use crate::mappings::{MappingEvents, NewMappings, UNRELATED_DELAY};
 use crate::system::{Clocks, wait};
 use crate::threads::Progress;
-use crate::uprobe::attachments::{Attachments, LibraryFacts, RETRY};
+use crate::uprobe::attachments::{Attachments, LibraryFacts, RETRY_DELAY};
 use crate::uprobe::processes::Processes;
 
 /// Interval of reports.
-const EVERY: Duration = Duration::from_secs(1);
+const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 /// Time for which announcements accumulate before they are read.
-const GATHER: Duration = Duration::from_millis(250);
+const ANNOUNCEMENT_DELAY: Duration = Duration::from_millis(250);
 /// Time for which the programs stay detached after all calls exceeded their budget.
-const PAUSE: Duration = Duration::from_secs(60);
+const SUSPENSION_TIME: Duration = Duration::from_secs(60);
 /// Intervals between checks for ended processes while no calls are observed. Each check needs the
 /// broker, which otherwise ends.
-const REVIEW: Duration = Duration::from_secs(600);
-const REVIEW_OF_MANY: Duration = Duration::from_secs(60);
+const REVIEW_INTERVAL: Duration = Duration::from_secs(600);
+const SHORT_REVIEW_INTERVAL: Duration = Duration::from_secs(60);
 /// Number of known processes for the shorter interval: half of those that the programs can have.
-const MANY: usize = PROCESS_CAPACITY as usize / 2;
+const MANY_PROCESSES: usize = PROCESS_CAPACITY as usize / 2;
 /// Number of rounds after which rates are known: two reports that each cover a second of calls.
-const ROUNDS_OF_RATES: u32 = 3;
+const RATE_ROUNDS: u32 = 3;
 
 /// The breakpoints in all libraries.
 pub(super) struct Probes {
@@ -180,7 +180,7 @@ impl Observation {
             self.last_round = now;
             tracing::info!("observing calls: a client needs them");
         }
-        if self.suspended_at.is_some_and(|at| now - at >= PAUSE) {
+        if self.suspended_at.is_some_and(|at| now - at >= SUSPENSION_TIME) {
             self.suspended_at = None;
             tracing::info!("attached again inside processes");
         }
@@ -204,7 +204,7 @@ impl Observation {
         let over = || format!("all processes made more than {MAX_HITS} calls per second");
         let detached = failed.or_else(|| self.suspended_at.map(|_| over()));
         self.report(shared, detached);
-        self.wait(shared, now + EVERY);
+        self.wait(shared, now + REPORT_INTERVAL);
     }
 
     /// Finds processes and attaches to their libraries. Returns the error if the broker did not
@@ -273,9 +273,9 @@ impl Observation {
     fn rest(&mut self, shared: &Shared) {
         let now = Instant::now();
         let interval = match self.lacks_broker {
-            true => RETRY,
-            false if self.table.len() >= MANY => REVIEW_OF_MANY,
-            false => REVIEW,
+            true => RETRY_DELAY,
+            false if self.table.len() >= MANY_PROCESSES => SHORT_REVIEW_INTERVAL,
+            false => REVIEW_INTERVAL,
         };
         if now - self.last_review >= interval {
             self.last_review = now;
@@ -284,7 +284,7 @@ impl Observation {
             (self.table).forget_ended(&mut self.tables, &clocks, &mut self.broker);
             self.report(shared, failed);
         }
-        self.wait(shared, now + EVERY);
+        self.wait(shared, now + REPORT_INTERVAL);
         self.set_clocks();
         (self.table).drain(&mut self.tables, &Clocks::read(), &mut self.broker);
         self.broker.rest();
@@ -299,7 +299,7 @@ impl Observation {
             match event {
                 Event::Announced => {
                     (self.table).drain(&mut self.tables, &Clocks::read(), &mut self.broker);
-                    gathers_until = Instant::now() + GATHER;
+                    gathers_until = Instant::now() + ANNOUNCEMENT_DELAY;
                 }
                 Event::Mapped => self.meet_mapped(),
                 Event::Demanded => {
@@ -314,7 +314,7 @@ impl Observation {
     fn meet_mapped(&mut self) {
         let new = self.take_mapped();
         if !new.is_incomplete && new.processes.is_empty() {
-            std::thread::sleep(UNCONCERNED);
+            std::thread::sleep(UNRELATED_DELAY);
             return;
         }
         // A broker that does not answer is reported in the next round.
@@ -397,7 +397,7 @@ impl Observation {
             libraries: self.probes.facts(self.is_resting),
             detached,
             is_resting: self.is_resting,
-            shows_rates: self.rounds >= ROUNDS_OF_RATES,
+            shows_rates: self.rounds >= RATE_ROUNDS,
             late: self.late.observed(),
             without_events: self.late.without_events().map(str::to_owned),
             without_deliveries: self.late.without_deliveries().map(str::to_owned),

@@ -38,9 +38,9 @@ use crate::tables::{
 /// Maximum calls per second of one process. Above it, its calls are no longer counted.
 pub const MAX_PROCESS_HITS: u64 = 50_000;
 /// Minimum time over which calls per second are evaluated: a shorter time may contain only a burst.
-const JUDGED_OVER: Duration = Duration::from_millis(500);
+const MIN_EVALUATION_TIME: Duration = Duration::from_millis(500);
 /// Number of rounds after which a process outside of the control group is inspected again.
-const RECHECK: u32 = 5;
+const RECHECK_ROUNDS: u32 = 5;
 
 /// The observed processes.
 pub struct ProcessTable {
@@ -271,7 +271,7 @@ impl ProcessTable {
     ) -> Round {
         self.rounds = self.rounds.wrapping_add(1);
         self.unjudged += elapsed;
-        let is_due = self.unjudged >= JUDGED_OVER;
+        let is_due = self.unjudged >= MIN_EVALUATION_TIME;
         let judged = is_due.then(|| std::mem::take(&mut self.unjudged));
         self.drain(tables, clocks, broker);
         let (mut reports, mut hits) = (HashMap::new(), 0);
@@ -293,7 +293,7 @@ impl ProcessTable {
         });
         for (id, process) in &processes {
             if process.state == state::OUTSIDE {
-                if self.rounds.is_multiple_of(RECHECK) {
+                if self.rounds.is_multiple_of(RECHECK_ROUNDS) {
                     let _ = tables.remove_process(*id);
                 }
                 continue;

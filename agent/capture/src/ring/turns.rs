@@ -6,7 +6,7 @@
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use super::block::{Frames, STATUS};
+use super::block::{Frames, STATUS_OFFSET};
 
 /// The blocks, and the index of the next one.
 #[derive(Debug)]
@@ -78,7 +78,7 @@ impl Turns {
     /// Returns the status word of the next block.
     fn status(&self) -> &AtomicU32 {
         // SAFETY: a block is longer than its header, which has the word (STATUS, a multiple of 4).
-        let word = unsafe { self.start().byte_add(STATUS) };
+        let word = unsafe { self.start().byte_add(STATUS_OFFSET) };
         // SAFETY: the caller of `new` guarantees that the word is aligned and mapped while `self`
         // lives. Kernel and user space access it as one 32-bit word. The kernel does not write it
         // while user space owns the block.
@@ -147,13 +147,13 @@ mod tests {
             // SAFETY: the block is within the memory.
             let block = unsafe { self.0.byte_add(index * BLOCK) };
             // SAFETY: the word is within the block, after its start.
-            let word = unsafe { block.byte_add(STATUS) };
+            let word = unsafe { block.byte_add(STATUS_OFFSET) };
             // SAFETY: the word is aligned, and both sides access it as an atomic.
             let status = unsafe { AtomicU32::from_ptr(word.cast().as_ptr()) };
             while status.load(Ordering::Acquire) & libc::TP_STATUS_USER != 0 {
                 thread::yield_now();
             }
-            let (head, tail) = (&bytes[..STATUS], &bytes[STATUS + 4..]);
+            let (head, tail) = (&bytes[..STATUS_OFFSET], &bytes[STATUS_OFFSET + 4..]);
             // SAFETY: the kernel's side owns the block, since the reader has released it.
             unsafe { block.copy_from_nonoverlapping(NonNull::from(head).cast(), head.len()) };
             // SAFETY: the address is within the block, after the status.

@@ -10,29 +10,29 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use super::cell::SegmentId;
-use super::owner::{LOCKED, Locks};
+use super::owner::{LOCK_SUFFIXES, Locks};
 use crate::tables::{Directories, DirectoryFiles, ScopeProcesses};
 use ros2probe_model::facts::bounded::Bounded;
 
 /// Directory of shared memory.
 const SHARED_MEMORY: &str = "/dev/shm";
 /// Prefixes of file names: Fast DDS 2.x, 3.x.
-const PREFIXES: [&str; 2] = ["fastrtps_", "fastdds_"];
+const FILE_PREFIXES: [&str; 2] = ["fastrtps_", "fastdds_"];
 /// Maximum number of entries read per directory.
 const MAX_LISTED: usize = 65_536;
 /// Granularity of directory timestamps: a directory that changed more recently may change again
 /// without a new timestamp.
-const COARSE: Duration = Duration::from_secs(1);
+const TIMESTAMP_GRANULARITY: Duration = Duration::from_secs(1);
 /// Number of rounds in which a new process may still be mounting directories. Afterwards it is
-/// inspected only once in [`ROUNDS`] rounds.
+/// inspected only once in [`MAX_QUIET_ROUNDS`] rounds.
 const MOUNTING_ROUNDS: u32 = 5;
-const ROUNDS: u32 = 32;
+const MAX_QUIET_ROUNDS: u32 = 32;
 /// Maximum number of levels of cgroups that are read.
-const DEPTH: usize = 8;
+const MAX_DEPTH: usize = 8;
 /// Number of rounds in which a new process may still move to a cgroup in scope.
 const MOVING_ROUNDS: u32 = 3;
 /// Maximum number of rounds without a new process that use the same list of processes.
-const SAME_ROUNDS: u32 = 5;
+const MAX_REUSED_ROUNDS: u32 = 5;
 
 /// Device and inode of a directory of shared memory.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
@@ -105,7 +105,7 @@ impl Scope {
             Self::AllProcesses | Self::Networks(_) => all_processes(),
             Self::Cgroup(cgroup) => {
                 let mut processes = Bounded::default();
-                processes_of(cgroup, DEPTH, &mut processes);
+                processes_of(cgroup, MAX_DEPTH, &mut processes);
                 processes
             }
             Self::Directories(_) => Bounded::default(),
@@ -118,7 +118,7 @@ impl Name {
     #[must_use]
     pub fn parse(name: &str) -> Option<Self> {
         let (generation, rest) = (0_u8..)
-            .zip(PREFIXES)
+            .zip(FILE_PREFIXES)
             .find_map(|(index, prefix)| Some((Generation(index), name.strip_prefix(prefix)?)))?;
         if let Some(number) = rest.strip_prefix("port") {
             let is_number = !number.is_empty() && number.bytes().all(|b| b.is_ascii_digit());
@@ -140,14 +140,14 @@ impl Name {
     /// Returns the file that this lock file protects; `None` if it is not a lock file.
     fn of_lock(name: &str) -> Option<Self> {
         let suffix = |suffix: &&str| name.strip_suffix(*suffix).and_then(Self::parse);
-        LOCKED.iter().find_map(suffix)
+        LOCK_SUFFIXES.iter().find_map(suffix)
     }
 
     /// Returns the file's name.
     #[must_use]
     pub fn file_name(&self) -> String {
         let prefix = |generation: &Generation| {
-            let prefix = PREFIXES.get(usize::from(generation.0));
+            let prefix = FILE_PREFIXES.get(usize::from(generation.0));
             prefix.copied().unwrap_or_default()
         };
         match self {
@@ -249,7 +249,7 @@ impl ShmDirectories {
         for &pid in processes {
             let (known, met) = before.get(&pid).copied().unwrap_or((None, 0));
             self.is_mounting |= met <= MOUNTING_ROUNDS;
-            let is_settled = met > MOUNTING_ROUNDS && met % ROUNDS != pid % ROUNDS;
+            let is_settled = met > MOUNTING_ROUNDS && met % MAX_QUIET_ROUNDS != pid % MAX_QUIET_ROUNDS;
             let directory = match known.and_then(|id| self.directories.get_mut(&id)) {
                 // The path of the directory may lead through another process, which may have ended.
                 Some(directory) if is_settled && (directory.seen || directory.path.exists()) => {
@@ -308,7 +308,7 @@ impl ShmDirectory {
     fn list(&mut self, left_out: &mut u64) -> bool {
         let changed = fs::metadata(&self.path).and_then(|metadata| metadata.modified());
         let changed = changed.ok();
-        let settled = changed.is_some_and(|at| at.elapsed().is_ok_and(|age| age > COARSE));
+        let settled = changed.is_some_and(|at| at.elapsed().is_ok_and(|age| age > TIMESTAMP_GRANULARITY));
         if settled && changed == self.changed {
             return false;
         }
@@ -430,7 +430,7 @@ impl NewestProcess {
             self.rounds.saturating_add(1)
         };
         self.same += 1;
-        self.lists = self.rounds <= MOVING_ROUNDS || self.same >= SAME_ROUNDS;
+        self.lists = self.rounds <= MOVING_ROUNDS || self.same >= MAX_REUSED_ROUNDS;
         if self.lists {
             self.same = 0;
         }
@@ -488,7 +488,7 @@ mod tests {
             rounds.count()
         };
         assert_eq!(lists(Some(7), MOVING_ROUNDS + 1), 4);
-        assert_eq!(lists(Some(7), 4 * SAME_ROUNDS), 4);
+        assert_eq!(lists(Some(7), 4 * MAX_REUSED_ROUNDS), 4);
         assert_eq!(lists(Some(8), 1), 1);
         assert_eq!(lists(Some(8), MOVING_ROUNDS), 3);
         // If the id is unknown, the processes are always listed.

@@ -12,7 +12,7 @@ use ros2probe_model::facts::shared_memory::MemoryUse;
 use ros2probe_wire::DomainId;
 
 /// Size of the blocks that a file's metadata counts, in bytes.
-const BLOCK: u64 = 512;
+const FILE_BLOCK_BYTES: u64 = 512;
 
 /// Inode of a network namespace, and a domain. Participants of Fast DDS that have both in common use
 /// shared memory with each other.
@@ -55,7 +55,7 @@ impl ShmDirectory {
             match (locks.owner(&path), name) {
                 (Owner::Dead, _) => {
                     let metadata = fs::symlink_metadata(&path);
-                    stale += metadata.map_or(0, |metadata| metadata.blocks() * BLOCK);
+                    stale += metadata.map_or(0, |metadata| metadata.blocks() * FILE_BLOCK_BYTES);
                 }
                 (Owner::Alive(process), Name::Port(_, number)) => {
                     let network = fs::metadata(Path::new(&format!("/proc/{process}/ns/net")));

@@ -47,12 +47,12 @@ use ros2probe_model::observe::input::Input;
 use ros2probe_model::observe::observer::{Observer, Wanted};
 
 /// Interval at which the counters are published.
-const REPORT: u64 = 200_000_000;
+const REPORT_INTERVAL: u64 = 200_000_000;
 /// Length of one sleep while polling is paused.
-const PAUSE: Duration = Duration::from_millis(50);
+const PAUSE_SLEEP: Duration = Duration::from_millis(50);
 
 /// Number of polls in close succession between two readings of their CPU time.
-const ACCOUNT_EVERY: u64 = 16;
+const ACCOUNT_INTERVAL: u64 = 16;
 
 /// Handle of the thread that polls shared memory.
 pub struct SharedMemory {
@@ -293,7 +293,7 @@ fn poll(
             reported = 0;
             shared.report(&tap, looks, interval.stretch());
             shared.progress.rest();
-            std::thread::sleep(PAUSE);
+            std::thread::sleep(PAUSE_SLEEP);
             continue;
         }
         let now = monotonic();
@@ -301,10 +301,10 @@ fn poll(
         let announced = tap.poll(now, &mut found);
         shared.inbox.put(&mut found);
         looks += 1;
-        if looks % ACCOUNT_EVERY == 0 || !(tap.is_hurried || tap.misses_nothing) {
+        if looks % ACCOUNT_INTERVAL == 0 || !(tap.is_hurried || tap.misses_nothing) {
             cpu = seconds(thread_cpu());
         }
-        if now.saturating_sub(reported) >= REPORT {
+        if now.saturating_sub(reported) >= REPORT_INTERVAL {
             reported = now;
             shared.report(&tap, looks, interval.stretch());
         }

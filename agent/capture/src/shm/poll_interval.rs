@@ -7,45 +7,45 @@
 use std::time::Duration;
 
 /// Sleep during bursts of messages, and maximum sleep while a topic is measured, in seconds.
-const BURST: f64 = 100e-6;
-const WATCHING: f64 = 1e-3;
+const BURST_SLEEP: f64 = 100e-6;
+const WATCHING_SLEEP: f64 = 1e-3;
 /// Maximum sleep if only discovery is needed, and after a quiet period.
-const NAMES: f64 = 5e-3;
-const QUIET: f64 = 10e-3;
+const DISCOVERY_SLEEP: f64 = 5e-3;
+const QUIET_SLEEP: f64 = 10e-3;
 /// Sleep if nothing is needed: an occasional poll, since the latest messages stay readable.
-const NOTHING: f64 = 100e-3;
+const UNNEEDED_SLEEP: f64 = 100e-3;
 /// Length of a quiet period.
 const QUIET_AFTER: f64 = 3.0;
 /// Factor by which the sleep grows after an empty poll.
-const SLOWER: f64 = 1.5;
+const SLEEP_GROWTH: f64 = 1.5;
 /// Interval at which the CPU share is computed.
-const ACCOUNT: f64 = 0.1;
+const ACCOUNT_INTERVAL: f64 = 0.1;
 /// Sleep during discovery while the credit is full: each participant announces its names once, and
 /// reuses the buffer some 50 us later. Short sleeps see more than busy polling: the scheduler
 /// prefers threads that wake up.
-const MEETING: f64 = 10e-6;
+const MEETING_SLEEP: f64 = 10e-6;
 /// Maximum sleep during discovery, at the end of the credit.
-const SELDOM: f64 = 500e-6;
+const DISCOVERY_LIMIT_SLEEP: f64 = 500e-6;
 /// Time of busy polling after each announcement, and of the shortest sleeps after each message that
 /// is needed: messages arrive in bursts.
-const BURSTS: f64 = 200e-6;
+const BUSY_POLL_TIME: f64 = 200e-6;
 /// Duration of close polling after a participant creates its files, and after each announcement.
 const PARTICIPANT_WATCH: f64 = 0.3;
 const ANNOUNCEMENT_WATCH: f64 = 0.1;
 /// CPU credit for close polling: its maximum, and its growth per second. With the share of a CPU
 /// while topics are measured, a minute in which a robot starts costs less than 2.5 % of a CPU.
-const CREDIT: f64 = 0.4;
+const MAX_CREDIT: f64 = 0.4;
 const CREDIT_PER_SECOND: f64 = 0.002;
 /// Maximum sleep while every message is needed and CPU time is saved for it. In a burst, a sender reuses its buffers after some
 /// 100 us, and its readers are faster than that.
-const EVERY: f64 = 50e-6;
+const EVERY_MESSAGE_SLEEP: f64 = 50e-6;
 const EARLY_WAKE: f64 = 20e-6;
 /// Maximum CPU time that is saved for polls while every message is needed, so that a short
 /// recording is complete, and maximum overdraft.
-const SAVINGS: f64 = 5.0;
-const OVERDRAFT: f64 = 0.25;
+const MAX_SAVINGS: f64 = 5.0;
+const MAX_OVERDRAFT: f64 = 0.25;
 /// Maximum sleep while anything is needed, whatever a poll costs.
-const LONGEST: f64 = 50e-3;
+const MAX_SLEEP: f64 = 50e-3;
 
 /// Purpose of the tap at a given time.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -104,7 +104,7 @@ impl PollInterval {
         Self {
             budget,
             need: Need::Nothing,
-            sleep: WATCHING,
+            sleep: WATCHING_SLEEP,
             stretch: 1.0,
             quiet_since: 0.0,
             accounted: (0.0, 0.0),
@@ -112,8 +112,8 @@ impl PollInterval {
             awake_until: 0.0,
             has_company: false,
             was_close: false,
-            credit: CREDIT,
-            savings: SAVINGS,
+            credit: MAX_CREDIT,
+            savings: MAX_SAVINGS,
             spent: (0.0, 0.0),
         }
     }
@@ -135,8 +135,8 @@ impl PollInterval {
     /// Extends close polling, because an announcement was read and more may follow.
     pub fn announcement(&mut self, now: f64) {
         self.watch_closely(now + ANNOUNCEMENT_WATCH);
-        if self.has_company && self.credit > CREDIT / 2.0 {
-            self.awake_until = now + BURSTS;
+        if self.has_company && self.credit > MAX_CREDIT / 2.0 {
+            self.awake_until = now + BUSY_POLL_TIME;
         }
     }
 
@@ -163,8 +163,8 @@ impl PollInterval {
             }
             // The start of a whole robot uses up the credit slowly. A robot repeats its names: each
             // participant sends them to every later one.
-            let rest = self.credit / CREDIT;
-            self.sleep = (MEETING / rest.powi(4)).min(SELDOM);
+            let rest = self.credit / MAX_CREDIT;
+            self.sleep = (MEETING_SLEEP / rest.powi(4)).min(DISCOVERY_LIMIT_SLEEP);
             return Duration::from_secs_f64(self.sleep);
         }
         self.meeting_until = now;
@@ -172,7 +172,7 @@ impl PollInterval {
             // The budget changes, so the measured cost is forgotten.
             (self.stretch, self.accounted) = (1.0, (now, cpu));
             let saved = (now - self.spent.0) * self.budget.every;
-            self.savings = (self.savings + saved).min(SAVINGS);
+            self.savings = (self.savings + saved).min(MAX_SAVINGS);
             self.spent = (now, cpu);
         }
         self.need = need;
@@ -181,17 +181,17 @@ impl PollInterval {
             return self.sleep_little(now, cpu, found);
         }
         let longest = match need {
-            Need::Nothing => NOTHING,
-            _ if now - self.quiet_since > QUIET_AFTER => QUIET,
-            Need::Names => NAMES,
-            Need::Watching | Need::Every => WATCHING,
+            Need::Nothing => UNNEEDED_SLEEP,
+            _ if now - self.quiet_since > QUIET_AFTER => QUIET_SLEEP,
+            Need::Names => DISCOVERY_SLEEP,
+            Need::Watching | Need::Every => WATCHING_SLEEP,
         };
         self.sleep = match found {
-            0 => (self.sleep * SLOWER).min(longest),
-            1 => (longest / 2.0).max(BURST),
-            _ => BURST,
+            0 => (self.sleep * SLEEP_GROWTH).min(longest),
+            1 => (longest / 2.0).max(BURST_SLEEP),
+            _ => BURST_SLEEP,
         };
-        let stretched = (self.sleep * self.stretch).min(LONGEST.max(longest));
+        let stretched = (self.sleep * self.stretch).min(MAX_SLEEP.max(longest));
         Duration::from_secs_f64(stretched)
     }
 
@@ -207,19 +207,19 @@ impl PollInterval {
     fn sleep_little(&mut self, now: f64, cpu: f64, found: usize) -> Duration {
         let (then, used) = std::mem::replace(&mut self.spent, (now, cpu));
         let saved = (now - then) * self.budget.every - (cpu - used);
-        self.savings = (self.savings + saved).clamp(-OVERDRAFT, SAVINGS);
-        self.sleep = EVERY;
+        self.savings = (self.savings + saved).clamp(-MAX_OVERDRAFT, MAX_SAVINGS);
+        self.sleep = EVERY_MESSAGE_SLEEP;
         if found > 0 {
-            self.awake_until = now + BURSTS;
+            self.awake_until = now + BUSY_POLL_TIME;
         }
         if self.savings <= 0.0 {
-            let slower = EVERY * self.stretch.max(SLOWER);
-            return Duration::from_secs_f64(slower.min(LONGEST));
+            let slower = EVERY_MESSAGE_SLEEP * self.stretch.max(SLEEP_GROWTH);
+            return Duration::from_secs_f64(slower.min(MAX_SLEEP));
         }
         Duration::from_secs_f64(if now < self.awake_until {
             EARLY_WAKE
         } else {
-            EVERY
+            EVERY_MESSAGE_SLEEP
         })
     }
 
@@ -232,11 +232,11 @@ impl PollInterval {
     fn account(&mut self, now: f64, cpu: f64) {
         let (then, used) = self.accounted;
         let elapsed = now - then;
-        if elapsed < ACCOUNT {
+        if elapsed < ACCOUNT_INTERVAL {
             return;
         }
         self.accounted = (now, cpu);
-        self.credit = (self.credit + elapsed * CREDIT_PER_SECOND).min(CREDIT);
+        self.credit = (self.credit + elapsed * CREDIT_PER_SECOND).min(MAX_CREDIT);
         let share = (cpu - used) / elapsed;
         let budget = match self.need {
             Need::Every => self.budget.every,
@@ -245,7 +245,7 @@ impl PollInterval {
         // The tap wakes up less often by the factor of the excess, but gradually.
         let wanted = share / budget;
         let correction = wanted.clamp(0.8, 1.5);
-        self.stretch = (self.stretch * correction).clamp(1.0, LONGEST / BURST);
+        self.stretch = (self.stretch * correction).clamp(1.0, MAX_SLEEP / BURST_SLEEP);
     }
 }
 

@@ -34,20 +34,20 @@ const MAX_PER_URGENT_POLL: usize = 64;
 const PORTS_PER_URGENT_POLL: usize = 8;
 /// Number of bytes at the start of a message in which an announcement of its participant's nodes
 /// begins.
-const BEGIN: usize = 4096;
+const HEAD_BYTES: usize = 4096;
 /// Silence after which a port is polled less often, and the interval of those polls.
 const SILENT_AFTER: u64 = 2_000_000_000;
-const SILENT_EVERY: u64 = 10_000_000;
+const SILENT_POLL_INTERVAL: u64 = 10_000_000;
 /// Pause before another attempt to open a segment.
-const RETRY: u64 = 50_000_000;
+const RETRY_NANOSECONDS: u64 = 50_000_000;
 /// Interval of listing directories.
-const LIST_EVERY: u64 = 100_000_000;
+const LIST_INTERVAL: u64 = 100_000_000;
 /// Interval of polling a port that is not initialized yet.
-const TRY_EVERY: u64 = 1_000_000;
-const FIND_EVERY: u64 = 1_000_000_000;
-const URGENT_FIND_EVERY: u64 = 10_000_000_000;
+const OPEN_RETRY_INTERVAL: u64 = 1_000_000;
+const FIND_INTERVAL: u64 = 1_000_000_000;
+const URGENT_FIND_INTERVAL: u64 = 10_000_000_000;
 /// Interval between two measurements of the directories' use.
-const JUDGE_EVERY: u64 = 5_000_000_000;
+const MEMORY_USE_INTERVAL: u64 = 5_000_000_000;
 
 /// The open files and the read positions.
 pub struct Tap {
@@ -240,7 +240,7 @@ impl Tap {
     #[must_use]
     pub fn idle(&self, now: u64) -> Option<u64> {
         let is_idle = self.ports.is_empty() && self.unborn.is_empty() && !self.is_hurried;
-        is_idle.then(|| (self.found + FIND_EVERY).saturating_sub(now))
+        is_idle.then(|| (self.found + FIND_INTERVAL).saturating_sub(now))
     }
 
     /// Returns the counters.
@@ -261,8 +261,8 @@ impl Tap {
     pub fn poll(&mut self, now: u64, found: &mut Vec<Item>) -> usize {
         self.now = now;
         self.classifier.refill(now);
-        let lists = now.saturating_sub(self.listed) >= LIST_EVERY || self.listed == 0;
-        let tries = !self.unborn.is_empty() && now.saturating_sub(self.tried) >= TRY_EVERY;
+        let lists = now.saturating_sub(self.listed) >= LIST_INTERVAL || self.listed == 0;
+        let tries = !self.unborn.is_empty() && now.saturating_sub(self.tried) >= OPEN_RETRY_INTERVAL;
         if (lists || tries) && self.may_list(now) {
             let before = thread_cpu();
             if lists {
@@ -320,7 +320,7 @@ impl Tap {
                 }
                 let is_silent = now.saturating_sub(open.busy) > SILENT_AFTER;
                 let is_resting = is_silent && !self.misses_nothing;
-                open.due = now + if is_resting { SILENT_EVERY } else { 0 };
+                open.due = now + if is_resting { SILENT_POLL_INTERVAL } else { 0 };
                 self.counters.announced += look.pushed;
                 self.counters.missed += look.overwritten;
                 self.counters.unfilled += look.unfilled;
@@ -440,7 +440,7 @@ impl Tap {
     fn open_segment(&mut self, key: SegmentKey, now: u64) {
         match self.segments.get(&key) {
             Some(Segment::Open(..)) => return,
-            Some(Segment::Missing(since)) if now.saturating_sub(*since) < RETRY => return,
+            Some(Segment::Missing(since)) if now.saturating_sub(*since) < RETRY_NANOSECONDS => return,
             _ => {}
         }
         if self.segments.is_full() && !self.segments.contains_key(&key) {
@@ -463,9 +463,9 @@ impl Tap {
     /// Opens new files and closes files that are gone or were replaced.
     fn scan(&mut self, now: u64, found: &mut Vec<Item>) {
         let every = if self.is_hurried {
-            URGENT_FIND_EVERY
+            URGENT_FIND_INTERVAL
         } else {
-            FIND_EVERY
+            FIND_INTERVAL
         };
         let is_lost = self.found == 0 || !self.directories.are_reachable();
         let finds = is_lost || now.saturating_sub(self.found) >= every;
@@ -477,7 +477,7 @@ impl Tap {
                 self.directories.find();
             }
             self.abandoned.clear();
-            if now.saturating_sub(self.judged) >= JUDGE_EVERY || self.judged == 0 {
+            if now.saturating_sub(self.judged) >= MEMORY_USE_INTERVAL || self.judged == 0 {
                 self.judged = now;
                 self.counters.memory_use = self.directories.memory_use();
             }
@@ -620,7 +620,7 @@ fn may_announce_nodes(message: &[u8]) -> bool {
         return false;
     };
     let participant = Guid::new(GuidPrefix(prefix), EntityId::PARTICIPANT).to_bytes();
-    let begin = message.get(20..message.len().min(BEGIN));
+    let begin = message.get(20..message.len().min(HEAD_BYTES));
     let mut guids = begin.unwrap_or_default().windows(participant.len());
     guids.any(|bytes| *bytes == participant)
 }

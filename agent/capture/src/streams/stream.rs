@@ -13,17 +13,17 @@ use super::{Before, Chunk, Counters, Protocol};
 use crate::tables::{SegmentsAhead, SegmentsAheadBytes};
 
 /// Maximum distance of a segment from the next expected byte: the largest TCP window.
-const WINDOW: u32 = 1 << 30;
+const MAX_SEGMENT_DISTANCE: u32 = 1 << 30;
 /// Time after which missing bytes are given up. TCP sends them again earlier, but late if the
 /// receiver does not read.
-const WAIT: Duration = Duration::from_secs(10);
+const MISSING_BYTES_TIMEOUT: Duration = Duration::from_secs(10);
 /// Size of the length field before each batch of Zenoh, in bytes.
-const PREFIX: usize = 2;
+const LENGTH_PREFIX: usize = 2;
 /// Maximum number of bytes kept of a frame of RTPS. Payloads of a longer one are not read.
 pub const MAX_FRAME: usize = 4 << 20;
 /// Number of held bytes from which a frame may be shortened, and number of bytes that then remain.
-const MANY: usize = 256 << 10;
-const KEPT: usize = 4 << 10;
+const MIN_SHORTENED_BYTES: usize = 256 << 10;
+const KEPT_FRAME_BYTES: usize = 4 << 10;
 /// Maximum number of consecutive batches without a message. Zenoh sends one when it drops the rest
 /// of a message. More of them are zeros of other data.
 const MAX_EMPTY: usize = 64;
@@ -163,8 +163,8 @@ impl Stream {
     /// its payload is not read. Returns whether many bytes were dropped.
     pub fn shorten(&mut self) -> bool {
         match &mut self.position {
-            Position::Batch(partial) if partial.captured.capacity() > MANY => {
-                partial.captured.truncate(KEPT);
+            Position::Batch(partial) if partial.captured.capacity() > MIN_SHORTENED_BYTES => {
+                partial.captured.truncate(KEPT_FRAME_BYTES);
                 partial.captured.shrink_to_fit();
                 true
             }
@@ -179,7 +179,7 @@ impl Stream {
 
     /// Returns whether segments have waited too long.
     pub fn has_waited(&self, now: Timestamp) -> bool {
-        !self.ahead.is_empty() && now > self.waiting_since + WAIT
+        !self.ahead.is_empty() && now > self.waiting_since + MISSING_BYTES_TIMEOUT
     }
 
     /// Reads a chunk, or keeps it until the bytes before it have arrived.
@@ -198,7 +198,7 @@ impl Stream {
             return Took::Other;
         }
         // Flags are about the bytes before a later byte.
-        let is_old = start.wrapping_sub(self.next) >= WINDOW;
+        let is_old = start.wrapping_sub(self.next) >= MAX_SEGMENT_DISTANCE;
         match chunk.before {
             _ if is_old => {}
             Before::Lost => self.lost(start, counters, report),
@@ -206,7 +206,7 @@ impl Stream {
             _ => {}
         }
         let distance = start.wrapping_sub(self.next);
-        if distance != 0 && distance < WINDOW {
+        if distance != 0 && distance < MAX_SEGMENT_DISTANCE {
             if self.ahead.is_empty() {
                 self.waiting_since = chunk.time;
             }
@@ -282,7 +282,7 @@ impl Stream {
             self.gap(counters, report);
         }
         let is_left_out = matches!(before, Before::Skipped | Before::OverBudget);
-        if is_left_out && start.wrapping_sub(self.next) < WINDOW {
+        if is_left_out && start.wrapping_sub(self.next) < MAX_SEGMENT_DISTANCE {
             self.next = start;
         }
     }
@@ -310,7 +310,7 @@ impl Stream {
             let (start, before) = (first.sequence_number, first.before);
             self.skip(before, start, counters, report);
             let distance = start.wrapping_sub(self.next);
-            if distance != 0 && distance < WINDOW {
+            if distance != 0 && distance < MAX_SEGMENT_DISTANCE {
                 break;
             }
             let Some(first) = self.ahead.pop_front() else {
@@ -535,7 +535,7 @@ impl Partial {
 
     const fn prefix_len(&self) -> usize {
         match self.protocol {
-            Protocol::Zenoh => PREFIX,
+            Protocol::Zenoh => LENGTH_PREFIX,
             Protocol::Rtps => rtps_tcp::HEADER_LEN,
         }
     }
@@ -544,7 +544,7 @@ impl Partial {
         let length = match self.protocol {
             Protocol::Zenoh => {
                 let prefix = self.captured.first_chunk();
-                prefix.map(|prefix| Some(PREFIX + usize::from(u16::from_le_bytes(*prefix))))
+                prefix.map(|prefix| Some(LENGTH_PREFIX + usize::from(u16::from_le_bytes(*prefix))))
             }
             Protocol::Rtps => {
                 let header = self.captured.first_chunk();

@@ -32,7 +32,7 @@ use rustix::thread::{CapabilitySet, capabilities};
 
 /// Factor of the rings' sizes. A process can write a hundred thousand messages per second, ten
 /// times the rate of a socket. It writes a whole image at the speed of memory.
-const RINGS: usize = 4;
+const RING_FACTOR: usize = 4;
 /// Maximum size to which the ring of captured messages is enlarged, in bytes.
 const LARGE_RING: usize = 16 << 20;
 
@@ -139,9 +139,9 @@ impl Uprobe {
         let within = cgroup.map(inode).transpose()?;
         let size = |bytes| u32::try_from(bytes).unwrap_or(u32::MAX >> 1);
         let settings = FilterSettings {
-            record_ring_bytes: size(record_ring_bytes.saturating_mul(RINGS)),
+            record_ring_bytes: size(record_ring_bytes.saturating_mul(RING_FACTOR)),
             piece_ring_bytes: size(
-                (ring_bytes.saturating_mul(RINGS)).min(ring_bytes.max(LARGE_RING)),
+                (ring_bytes.saturating_mul(RING_FACTOR)).min(ring_bytes.max(LARGE_RING)),
             ),
             ..FilterSettings::default()
         };

@@ -16,11 +16,11 @@ use crate::tables::MappedLibraries;
 use ros2probe_model::facts::bounded::Bounded;
 
 /// File that lists the holders of locks.
-const LOCKS: &str = "/proc/locks";
+const LOCKS_PATH: &str = "/proc/locks";
 /// Number of rounds in which a new process may still be loading libraries. Afterwards it is
-/// inspected only once in [`ROUNDS`] rounds.
+/// inspected only once in [`MAX_QUIET_ROUNDS`] rounds.
 const LOADING_ROUNDS: u32 = 10;
-const ROUNDS: u32 = 32;
+const MAX_QUIET_ROUNDS: u32 = 32;
 
 /// Files of the library, and of Fast DDS's shared memory, that a process maps.
 #[derive(Clone, Default, PartialEq, Eq, Debug)]
@@ -103,7 +103,7 @@ impl Processes {
         let is_asked = |pid: &u32| {
             self.known.get(pid).is_none_or(|known| {
                 known.met <= LOADING_ROUNDS
-                    || known.met % ROUNDS == pid % ROUNDS
+                    || known.met % MAX_QUIET_ROUNDS == pid % MAX_QUIET_ROUNDS
                     || all && !known.use_of_it.is_any()
             })
         };
@@ -204,7 +204,7 @@ impl Processes {
     pub fn closed(&self) -> Option<u32> {
         let mut closed = self.known.iter().filter(|(_, process)| process.is_closed);
         let first = closed.clone().next().map(|(pid, _)| *pid)?;
-        let Ok(locks) = fs::read_to_string(LOCKS) else {
+        let Ok(locks) = fs::read_to_string(LOCKS_PATH) else {
             return Some(first);
         };
         let holders: HashSet<u32> = locks.lines().filter_map(holder).collect();
@@ -214,7 +214,7 @@ impl Processes {
     }
 }
 
-/// Returns the holder of the lock in a line of [`LOCKS`], if Fast DDS takes this kind for its ports
+/// Returns the holder of the lock in a line of [`LOCKS_PATH`], if Fast DDS takes this kind for its ports
 /// and segments.
 fn holder(line: &str) -> Option<u32> {
     let mut fields = line.split_ascii_whitespace().skip(1);

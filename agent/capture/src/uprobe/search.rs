@@ -22,21 +22,21 @@ use crate::bell::Bell;
 use crate::breakpoints::Attached;
 use crate::error_chain::{Reason, in_words};
 use crate::filter::Probes;
-use crate::mappings::{MappingEvents, NewMappings, UNCONCERNED};
+use crate::mappings::{MappingEvents, NewMappings, UNRELATED_DELAY};
 use crate::shm::directories::{Name, Scope, ShmDirectories};
 use crate::system::{DirectoryWatch, wait};
 use crate::threads::{Progress, Spawn, Task};
 
 /// Interval of inspecting processes without an event.
-const EVERY: Duration = Duration::from_secs(1);
+const INSPECTION_INTERVAL: Duration = Duration::from_secs(1);
 /// Time for which events accumulate: a starting participant creates several files together.
-const GATHER: Duration = Duration::from_millis(20);
+const EVENT_DELAY: Duration = Duration::from_millis(20);
 /// Time after the start of a process in which its names are announced, each once.
-const STARTING: Duration = Duration::from_secs(10);
+const STARTUP_TIME: Duration = Duration::from_secs(10);
 /// Time between resuming the polls of shared memory and detaching the probes.
-const OVERLAP: Duration = Duration::from_millis(400);
+const DETACH_OVERLAP: Duration = Duration::from_millis(400);
 /// Why nothing is attached on demand.
-const RESTING: &str =
+const IDLE_REASON: &str =
     "capture.shm.exact is auto, and no client reads samples of a topic in shared memory";
 /// Handle of the thread.
 pub struct LibrarySearch {
@@ -83,7 +83,7 @@ impl Facts {
     fn resting() -> Self {
         Self {
             libraries: Vec::new(),
-            uncovered: Some(RESTING.to_owned()),
+            uncovered: Some(IDLE_REASON.to_owned()),
             has_inspected: true,
             is_resting: true,
         }
@@ -216,7 +216,7 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
         failed: None,
         mappings: None,
         without_mappings: None,
-        starting_until: Instant::now() + STARTING,
+        starting_until: Instant::now() + STARTUP_TIME,
     };
     let mut shared_memory = ShmDirectories::new(scope);
     // Without inotify, a starting participant is noticed within a second.
@@ -230,7 +230,7 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
             if shared.attached.load(Ordering::Acquire) {
                 // Polling of shared memory resumes before the probes are detached.
                 shared.report(Facts::resting());
-                std::thread::sleep(OVERLAP);
+                std::thread::sleep(DETACH_OVERLAP);
                 followed.rest();
                 shared.attached.store(false, Ordering::Release);
                 tracing::info!("no longer attached: no samples are read");
@@ -242,7 +242,7 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
         }
         shared.attached.store(true, Ordering::Release);
         let now = Instant::now();
-        let all = somebody_came && asked_all.is_none_or(|at| now - at >= EVERY);
+        let all = somebody_came && asked_all.is_none_or(|at| now - at >= INSPECTION_INTERVAL);
         if all {
             asked_all = Some(now);
         }
@@ -254,7 +254,7 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
         shared.report(followed.facts());
         shared.visited.store(true, Ordering::Release);
         let Some(watch) = &mut watch else {
-            followed.wait_attaching(None, EVERY, shared);
+            followed.wait_attaching(None, INSPECTION_INTERVAL, shared);
             continue;
         };
         shared_memory.find();
@@ -267,8 +267,8 @@ fn follow(shared: &Shared, attachments: Attachments<Attached>, scope: Scope, bro
             watch.add(new);
         }
         watched = directories;
-        followed.wait_attaching(None, GATHER, shared);
-        let is_created = followed.wait_attaching(Some(watch), EVERY, shared);
+        followed.wait_attaching(None, EVENT_DELAY, shared);
+        let is_created = followed.wait_attaching(Some(watch), INSPECTION_INTERVAL, shared);
         somebody_came = is_created && watch.created(|name| Name::parse(name).is_some());
     }
     shared.progress.rest();
@@ -332,14 +332,14 @@ impl Followed {
         let mapped = self.mappings.iter().flat_map(MappingEvents::descriptors);
         let descriptors: Vec<_> = bell.chain(mapped).collect();
         shared.progress.rest();
-        let ready = wait(&descriptors, EVERY);
+        let ready = wait(&descriptors, INSPECTION_INTERVAL);
         shared.progress.step();
         shared.bell.iter().for_each(Bell::silence);
         let new = self.take_mapped();
         if new.is_incomplete || self.processes.are_in_scope(&new.processes) {
-            self.starting_until = Instant::now() + STARTING;
+            self.starting_until = Instant::now() + STARTUP_TIME;
         } else if matches!(ready, Ok(Some(_))) {
-            std::thread::sleep(UNCONCERNED);
+            std::thread::sleep(UNRELATED_DELAY);
         }
     }
 
@@ -383,12 +383,12 @@ impl Followed {
     fn attach_mapped(&mut self, shared: &Shared) {
         let new = self.take_mapped();
         if self.processes.are_in_scope(&new.processes) {
-            self.starting_until = Instant::now() + STARTING;
+            self.starting_until = Instant::now() + STARTUP_TIME;
         }
         if let Err(error) = self.processes.meet(&new, &mut self.broker) {
             self.failed = Some(in_words(&error));
         } else if !new.is_incomplete && new.processes.is_empty() {
-            std::thread::sleep(UNCONCERNED);
+            std::thread::sleep(UNRELATED_DELAY);
             return;
         }
         let now = Instant::now();
@@ -409,7 +409,7 @@ impl Shared {
         let mut known = self.facts.lock().unwrap_or_else(PoisonError::into_inner);
         if known.uncovered != facts.uncovered {
             match &facts.uncovered {
-                Some(reason) if reason == RESTING => {}
+                Some(reason) if reason == IDLE_REASON => {}
                 Some(reason) => tracing::warn!(reason, "shared memory is sampled"),
                 None => tracing::info!("every message into shared memory is seen"),
             }
@@ -468,7 +468,7 @@ mod tests {
     use std::fs;
     use std::os::fd::AsRawFd as _;
 
-    use super::super::attachments::{LINGER, RETRY};
+    use super::super::attachments::{DETACH_DELAY, RETRY_DELAY};
     use super::super::processes::Use;
     use super::*;
     use crate::breakpoints::Means;
@@ -513,7 +513,7 @@ mod tests {
         let mut attachments = attachments(probes, Arc::default());
         let (start, broker) = (Instant::now(), &mut Broker::here());
         attachments.follow(&all, start, broker);
-        attachments.follow(&all, start + RETRY, broker);
+        attachments.follow(&all, start + RETRY_DELAY, broker);
         let facts = super::facts(&attachments, &all, None);
         assert_driven::<Libraries>();
         let refused = facts.libraries.iter().find_map(|each| each.refused.clone());
@@ -527,9 +527,9 @@ mod tests {
         // The last library has no probe. It gets one after the first library is detached.
         used.libraries.remove(0);
         let fewer = Processes::of(process, used);
-        let later = start + RETRY + LINGER + EVERY;
+        let later = start + RETRY_DELAY + DETACH_DELAY + INSPECTION_INTERVAL;
         attachments.follow(&fewer, later, broker);
-        attachments.follow(&fewer, later + EVERY, broker);
+        attachments.follow(&fewer, later + INSPECTION_INTERVAL, broker);
         let facts = super::facts(&attachments, &fewer, None);
         assert_eq!(facts.libraries.len(), Libraries::CAP);
         assert_eq!(facts.uncovered, None);

@@ -17,7 +17,7 @@ use crate::cli::Discover;
 /// Mount point of the control groups of version 2.
 const CGROUP_ROOT: &str = "/sys/fs/cgroup";
 /// Kinds of endpoints in the order of the report: one, several.
-const KINDS: [(EndpointKind, &str, &str); 4] = [
+const ENDPOINT_KINDS: [(EndpointKind, &str, &str); 4] = [
     (EndpointKind::Publisher, "publisher", "publishers"),
     (EndpointKind::Subscription, "subscription", "subscriptions"),
     (EndpointKind::Server, "service", "services"),
@@ -90,7 +90,7 @@ fn report(answer: &Answer, out: &mut impl Write) -> Result<()> {
         for node in &graph.nodes {
             writeln!(out, "    node   {node}")?;
         }
-        for (kind, one, _) in KINDS {
+        for (kind, one, _) in ENDPOINT_KINDS {
             for (name, ros_type) in graph.endpoints.get(&kind).into_iter().flatten() {
                 writeln!(out, "    {one} {name} {ros_type}")?;
             }
@@ -125,7 +125,7 @@ fn report(answer: &Answer, out: &mut impl Write) -> Result<()> {
 
 fn counts(graph: &DomainGraph) -> String {
     let nodes = number(graph.nodes.len(), "node", "nodes");
-    let endpoints = KINDS.map(|(kind, one, several)| number(graph.count(kind), one, several));
+    let endpoints = ENDPOINT_KINDS.map(|(kind, one, several)| number(graph.count(kind), one, several));
     let (others, last) = endpoints.split_at(endpoints.len() - 1);
     format!("{nodes}, {} and {}", others.join(", "), last.concat())
 }

@@ -16,9 +16,9 @@ use ros2probe_model::facts::names::TopicName;
 use ros2probe_wire::{Expansion, Timestamp};
 
 /// Interval of progress reports, in messages.
-const PROGRESS: u64 = 65_536;
+const PROGRESS_INTERVAL: u64 = 65_536;
 /// Type of messages that describe the images of another topic and have the same stamps.
-const COMPANION: &str = "sensor_msgs/msg/CameraInfo";
+const COMPANION_TYPE: &str = "sensor_msgs/msg/CameraInfo";
 
 /// Chains in a bag.
 #[derive(Debug)]
@@ -59,7 +59,7 @@ impl BagChains {
         let mut seen = 0_u64;
         let read = messages::read(path, expansion, &mut |message, total| {
             seen += 1;
-            if seen.is_multiple_of(PROGRESS) {
+            if seen.is_multiple_of(PROGRESS_INTERVAL) {
                 progress(seen, total);
             }
             let logged = Timestamp(message.log_time);
@@ -155,7 +155,7 @@ impl BagChains {
 
 /// Returns whether messages of this topic begin with a header and may belong to a chain.
 fn is_stamped(message: &Message<'_>) -> bool {
-    if message.type_name == COMPANION {
+    if message.type_name == COMPANION_TYPE {
         return false;
     }
     // The text of the type itself comes first. The types of its fields follow a line of `=`.

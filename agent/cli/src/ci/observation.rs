@@ -12,7 +12,7 @@ use ros2probe_daemon::escape::visible;
 
 use super::Rules;
 use super::series::{Point, Series};
-use super::tally::{LATE, Tally};
+use super::tally::{MAX_STATE_DELAY, Tally};
 
 /// Maximum number of topics over a run.
 const MAX_TOPICS: usize = 2048;
@@ -24,10 +24,10 @@ const MAX_EDGES: usize = 8192;
 const MAX_EXPECTED: usize = 2048;
 
 /// Kinds of findings about messages that the agent does not see.
-const UNSEEN: [&str; 3] = ["observation_suspended", "unknown_writers", "zenoh_unseen"];
+const UNSEEN_FINDINGS: [&str; 3] = ["observation_suspended", "unknown_writers", "zenoh_unseen"];
 
 /// Kinds of findings that other conditions judge.
-const JUDGED_ELSEWHERE: [&str; 3] = ["loss", "watch_violated", "watch_silent"];
+const EXPECTATION_FINDINGS: [&str; 3] = ["loss", "watch_violated", "watch_silent"];
 
 /// What an agent observed while a command ran. Times are seconds from the start of the command.
 #[derive(Debug)]
@@ -204,7 +204,7 @@ impl Observation {
         let unseen = self
             .findings
             .values()
-            .filter(|found| UNSEEN.contains(&&*found.kind) && found.seconds.judged(until) > 0);
+            .filter(|found| UNSEEN_FINDINGS.contains(&&*found.kind) && found.seconds.judged(until) > 0);
         missed.extend(unseen.map(|found| found.text.clone()));
         missed
     }
@@ -251,13 +251,13 @@ impl Observation {
         let earliest = end - self.rules.shutdown;
         let mut departures = self.departures.iter();
         let first = departures.find(|time| **time >= earliest);
-        first.map_or(end, |first| first - LATE)
+        first.map_or(end, |first| first - MAX_STATE_DELAY)
     }
 
     /// Returns the findings that other conditions do not judge.
     pub fn own_findings(&self) -> impl Iterator<Item = &Finding> {
         let all = self.findings.values();
-        all.filter(|found| !JUDGED_ELSEWHERE.contains(&&*found.kind))
+        all.filter(|found| !EXPECTATION_FINDINGS.contains(&&*found.kind))
     }
 
     fn expect(
@@ -285,7 +285,7 @@ impl Observation {
         let remain = |id: &u32| participants.contains(id);
         if !self.present.participants.iter().all(remain) {
             self.departures.push(now);
-            let certain = now - self.rules.shutdown - 2.0 * LATE;
+            let certain = now - self.rules.shutdown - 2.0 * MAX_STATE_DELAY;
             self.departures.retain(|time| *time >= certain);
         }
         self.participants = self.participants.max(participants.len());

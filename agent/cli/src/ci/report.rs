@@ -14,7 +14,7 @@ use super::observation::{Finding, Observation};
 use super::series::Means;
 use super::{Condition, Group, Run, Verdict};
 
-const HEAD: &str = "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
+const HTML_HEAD: &str = "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
 <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">\
 <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
 <meta name=\"color-scheme\" content=\"light dark\">";
@@ -28,7 +28,7 @@ pub fn html(run: &Run, conditions: &[Condition], seen: &Observation, bag: &str) 
     let verdict = if failed == 0 { "passed" } else { "failed" };
     let command = escape(&*run.command);
     let mut page = format!(
-        "{HEAD}<title>rp ci: {verdict}: {command}</title><style>{STYLE}</style></head><body>\n\
+        "{HTML_HEAD}<title>rp ci: {verdict}: {command}</title><style>{STYLE}</style></head><body>\n\
          <h1><span class=\"{0}\">{verdict}</span> {command}</h1>\n",
         class(failed > 0)
     );

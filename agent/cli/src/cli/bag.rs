@@ -14,7 +14,7 @@ use ros2probe_bag::reindex::{self, Found};
 use ros2probe_daemon::escape::visible;
 
 use super::convert::Convert;
-use super::interrupt::INTERRUPTED;
+use super::interrupt::EXIT_INTERRUPTED;
 use super::record::Record;
 use super::{Arguments, Output, UserError};
 
@@ -87,7 +87,7 @@ impl Bag {
     pub(crate) const fn interrupted(&self) -> Option<u8> {
         match self.verb {
             Some(Verb::Record(_) | Verb::Convert(_)) => None,
-            _ => Some(INTERRUPTED),
+            _ => Some(EXIT_INTERRUPTED),
         }
     }
 

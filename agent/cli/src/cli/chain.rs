@@ -21,7 +21,7 @@ use serde_json::{Value, json};
 use super::{Output, UserError};
 
 /// Interval of progress reports on a terminal.
-const PROGRESS: Duration = Duration::from_secs(1);
+const PROGRESS_INTERVAL: Duration = Duration::from_secs(1);
 
 /// `rp chain [FROM] [TO]`.
 #[derive(Args, Debug)]
@@ -92,7 +92,7 @@ impl Chain {
             times,
             &ends,
             &mut |messages, total| {
-                if is_shown && last.elapsed() >= PROGRESS {
+                if is_shown && last.elapsed() >= PROGRESS_INTERVAL {
                     last = Instant::now();
                     let all = total.map(|total| format!(" of {total}"));
                     let all = all.unwrap_or_default();

@@ -17,7 +17,7 @@ use super::shared::names_of;
 use super::{Output, UserError};
 
 /// Interval between two views.
-const INTERVAL: Duration = Duration::from_secs(1);
+const VIEW_INTERVAL: Duration = Duration::from_secs(1);
 
 /// `rp diag`.
 #[derive(Args, Debug)]
@@ -87,7 +87,7 @@ impl Diag {
                 return Ok(ExitCode::SUCCESS);
             }
             is_first = false;
-            std::thread::sleep(INTERVAL);
+            std::thread::sleep(VIEW_INTERVAL);
         }
     }
 

@@ -24,7 +24,7 @@ use super::shared::{Matching, Spinning, names_of};
 use super::{Output, UserError};
 
 /// Moves the cursor home and clears the terminal.
-const CLEAR: &str = "\x1b[H\x1b[2J\n";
+const CLEAR_SCREEN: &str = "\x1b[H\x1b[2J\n";
 
 /// `rp topic echo`.
 #[derive(Args, Debug)]
@@ -275,7 +275,7 @@ impl Printer<'_> {
             return Ok(false);
         };
         if self.command.clear {
-            self.output.write(CLEAR)?;
+            self.output.write(CLEAR_SCREEN)?;
         }
         self.output.write(&for_stdout(message))?;
         Ok(true)

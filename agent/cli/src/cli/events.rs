@@ -52,7 +52,7 @@ pub(crate) struct ActionEcho {
 }
 
 /// Parts of an action, and their topics below its name.
-const PARTS: [(&str, &str); 5] = [
+const ACTION_PARTS: [(&str, &str); 5] = [
     ("GOAL_SERVICE", "/_action/send_goal/_service_event"),
     ("CANCEL_SERVICE", "/_action/cancel_goal/_service_event"),
     ("RESULT_SERVICE", "/_action/get_result/_service_event"),
@@ -127,7 +127,7 @@ impl ActionEcho {
 /// Returns the parts that `--interfaces` selects. An unknown part fails with ros2cli's message.
 fn chosen(interfaces: Option<&str>) -> Result<Vec<(&'static str, &'static str)>, Refused> {
     let Some(interfaces) = interfaces else {
-        return Ok(PARTS.to_vec());
+        return Ok(ACTION_PARTS.to_vec());
     };
     if interfaces.is_empty() {
         let text = "Input action interface name is empty.";
@@ -135,7 +135,7 @@ fn chosen(interfaces: Option<&str>) -> Result<Vec<(&'static str, &'static str)>,
     }
     let mut chosen = Vec::new();
     for name in interfaces.split('|').map(str::trim) {
-        let known = PARTS
+        let known = ACTION_PARTS
             .iter()
             .find(|(part, _)| part.eq_ignore_ascii_case(name));
         let part =

@@ -29,7 +29,7 @@ pub(crate) const AGENT_ENDED: &str = "the agent has ended: `systemctl status ros
 /// Note at the end of a replay.
 pub(crate) const END_OF_CAPTURE: &str = "end of capture";
 /// Minimum interval of requests for a definition that the agent does not have.
-const RETRY: Duration = Duration::from_secs(1);
+const DEFINITION_RETRY_INTERVAL: Duration = Duration::from_secs(1);
 /// Maximum number of writers with a remembered type.
 const MAX_WRITERS: usize = 1024;
 
@@ -261,7 +261,7 @@ impl<'a> Types<'a> {
         match self.writers.get(&sample.writer) {
             Some(Ok(known)) => return Some(Arc::clone(known)),
             // A node may describe the type to the agent at any time.
-            Some(Err(at)) if self.agent.is_none() || at.elapsed() < RETRY => return None,
+            Some(Err(at)) if self.agent.is_none() || at.elapsed() < DEFINITION_RETRY_INTERVAL => return None,
             _ => {}
         }
         let offered = sample.offered.as_ref();

@@ -10,7 +10,7 @@ use rustix::process::Signal;
 use tokio::signal::unix::{SignalKind, signal};
 
 /// ros2cli's default exit code after Ctrl-C.
-pub(crate) const INTERRUPTED: u8 = 2;
+pub(crate) const EXIT_INTERRUPTED: u8 = 2;
 
 /// Makes Ctrl-C end the process with `code`.
 ///
@@ -44,7 +44,7 @@ pub(crate) fn flag() -> io::Result<Arc<AtomicBool>> {
     let is_set = Arc::clone(&flag);
     on_each(move |_| {
         if is_set.swap(true, Ordering::Relaxed) {
-            std::process::exit(INTERRUPTED.into());
+            std::process::exit(EXIT_INTERRUPTED.into());
         }
         true
     })?;

@@ -28,9 +28,9 @@ use super::{Output, UserError};
 use file::Destination;
 
 /// Interval between two views of the topics.
-const INTERVAL: Duration = Duration::from_secs(1);
+const VIEW_INTERVAL: Duration = Duration::from_secs(1);
 /// Maximum wait for a line before the flag of Ctrl-C is checked.
-const POLL: Duration = Duration::from_millis(100);
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Size of the stream's queue, in bytes. The stream's lines are discarded.
 const QUEUE_BYTES: usize = 64 << 10;
 const MAX_MINUTES: u16 = (MAX_SECONDS / 60) as u16;
@@ -139,19 +139,19 @@ impl Session {
         self.view_while(&mut lines, agent)?;
         let begin = Instant::now();
         let end = begin + Duration::from_secs(self.seconds.into());
-        let mut due = begin + INTERVAL;
+        let mut due = begin + VIEW_INTERVAL;
         let mut is_explained = false;
         while !self.is_over(Instant::now() >= end) {
             let left = due.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 self.view_while(&mut lines, agent)?;
-                due += INTERVAL;
+                due += VIEW_INTERVAL;
                 if !std::mem::replace(&mut is_explained, true) {
                     self.explain_unseen();
                 }
                 continue;
             }
-            match lines.line_within(left.min(POLL))? {
+            match lines.line_within(left.min(POLL_INTERVAL))? {
                 Next::Line(line) if !is_end(&line) => {}
                 Next::Nothing => {}
                 Next::Line(_) | Next::End => return Err(agent_ended().into()),

@@ -17,7 +17,7 @@ use super::follow::{StreamItem, StreamStatus, follow};
 use super::notes::{NOT_ALL_PRINTED, Notes};
 use super::{Output, UserError};
 
-const ROSOUT: &str = "/rosout";
+const ROSOUT_TOPIC: &str = "/rosout";
 
 /// `rp log`.
 #[derive(Args, Debug)]
@@ -114,7 +114,7 @@ impl Log {
             printer.earlier(&agent, domain_id)?;
             return Ok(ExitCode::SUCCESS);
         }
-        let names = [ROSOUT.to_owned()];
+        let names = [ROSOUT_TOPIC.to_owned()];
         let mut notes = Notes::begin(&agent, domain_id, is_replay, &names, NOT_ALL_PRINTED);
         let mut has_begun = is_replay;
         let status = follow(&agent, domain_id, &names, &mut notes, |item, _| {

@@ -177,7 +177,7 @@ impl Question {
             | Self::Inside(_)
             | Self::Why(_)
             | Self::Page(_)
-            | Self::Foxglove(_) => Some(interrupt::INTERRUPTED),
+            | Self::Foxglove(_) => Some(interrupt::EXIT_INTERRUPTED),
             // `top` restores the terminal first, and `learn` writes what it has learnt.
             Self::Top(_) | Self::Learn(_) => None,
         }

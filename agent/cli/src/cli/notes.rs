@@ -20,15 +20,15 @@ use ros2probe_daemon::recording::{GraphSnapshot, PublishedTopic};
 use super::shared::names_of;
 
 /// Silence after which the reason is requested.
-pub(crate) const SILENT: Duration = Duration::from_secs(5);
+pub(crate) const SILENCE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Minimum time between two reports of a topic's missing messages.
-const PAUSE: Duration = Duration::from_secs(5);
+const MIN_REPORT_INTERVAL: Duration = Duration::from_secs(5);
 /// Consequence of sampling for verbs that print messages.
 pub(crate) const NOT_ALL_PRINTED: &str = "not every message is printed";
 /// Maximum number of topics named in one line.
-const NAMES: usize = 8;
+const MAX_NAMED_TOPICS: usize = 8;
 /// Remedy for sampled topics.
-const SWITCH: &str = "`capture.shm.exact: auto` captures each message";
+const SAMPLING_REMEDY: &str = "`capture.shm.exact: auto` captures each message";
 
 /// Notes on the topics of one verb.
 pub(crate) struct Notes<'a> {
@@ -50,7 +50,7 @@ pub(crate) struct Notes<'a> {
 
 /// Missing messages that are not reported yet. The variable is global, because Ctrl-C may end the
 /// process. A process runs only one verb.
-static MISSING: Mutex<Missing> = Mutex::new(Missing(BTreeMap::new()));
+static MISSING_MESSAGES: Mutex<Missing> = Mutex::new(Missing(BTreeMap::new()));
 
 /// Missing messages by topic and reason: the unreported count, and the time of the last report.
 struct Missing(BTreeMap<(String, &'static str), (u64, Option<Instant>)>);
@@ -58,7 +58,7 @@ struct Missing(BTreeMap<(String, &'static str), (u64, Option<Instant>)>);
 /// Reports missing messages before the process ends.
 pub(crate) fn end() {
     // If another thread holds the lock, it is blocked on stderr.
-    if let Ok(mut missing) = MISSING.try_lock() {
+    if let Ok(mut missing) = MISSING_MESSAGES.try_lock() {
         missing.report(true);
     }
 }
@@ -136,10 +136,10 @@ impl<'a> Notes<'a> {
         missing.report(false);
     }
 
-    /// Reports once why no message arrived, after [`SILENT`].
+    /// Reports once why no message arrived, after [`SILENCE_TIMEOUT`].
     pub(crate) fn now(&mut self) -> Result<()> {
         Missing::all().report(false);
-        if self.is_replay || self.is_explained || self.begun.elapsed() < SILENT {
+        if self.is_replay || self.is_explained || self.begun.elapsed() < SILENCE_TIMEOUT {
             return Ok(());
         }
         self.explain()
@@ -262,7 +262,7 @@ impl<'a> Notes<'a> {
 
 impl Missing {
     fn all() -> MutexGuard<'static, Self> {
-        MISSING.lock().unwrap_or_else(PoisonError::into_inner)
+        MISSING_MESSAGES.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn add(&mut self, key: (String, &'static str), samples: u64) {
@@ -278,7 +278,7 @@ impl Missing {
     fn due(&mut self, at_end: bool) -> Vec<String> {
         let mut lines = Vec::new();
         for ((topic, why), (count, reported)) in &mut self.0 {
-            let is_due = reported.is_none_or(|reported| reported.elapsed() >= PAUSE);
+            let is_due = reported.is_none_or(|reported| reported.elapsed() >= MIN_REPORT_INTERVAL);
             if *count == 0 || !is_due && !at_end {
                 continue;
             }
@@ -322,7 +322,7 @@ impl Sampling {
             // remedy.
             exact => {
                 let reason = exact.and_then(|exact| exact.reason.clone());
-                Self::Sampled(reason.unwrap_or_else(|| SWITCH.to_owned()))
+                Self::Sampled(reason.unwrap_or_else(|| SAMPLING_REMEDY.to_owned()))
             }
         }
     }
@@ -331,7 +331,7 @@ impl Sampling {
     /// `begun`, they do not.
     pub(crate) fn is_known(&mut self, agent: &Agent, begun: Instant) -> bool {
         if matches!(self, Self::OnDemand) {
-            if begun.elapsed() < SILENT {
+            if begun.elapsed() < SILENCE_TIMEOUT {
                 return false;
             }
             *self = match Self::at(agent) {
@@ -375,9 +375,9 @@ fn counted_inside(topic: &Topic<'_>) -> Option<String> {
 }
 
 fn few(names: &[String]) -> String {
-    let shown: Vec<&str> = names.iter().take(NAMES).map(String::as_str).collect();
+    let shown: Vec<&str> = names.iter().take(MAX_NAMED_TOPICS).map(String::as_str).collect();
     let shown = shown.join(", ");
-    match names.len().saturating_sub(NAMES) {
+    match names.len().saturating_sub(MAX_NAMED_TOPICS) {
         0 => shown,
         more => format!("{shown} and {more} more"),
     }
@@ -427,7 +427,7 @@ mod tests {
     #[test]
     fn a_long_list_of_sampled_topics_is_one_line() {
         let names: Vec<String> = (0..10).map(|number| format!("/t{number}")).collect();
-        let sampling = Sampling::Sampled(SWITCH.to_owned());
+        let sampling = Sampling::Sampled(SAMPLING_REMEDY.to_owned());
         let text = sampling.text(&names, NOT_ALL_PRINTED).unwrap();
         assert!(text.starts_with("/t0, /t1, "), "{text}");
         assert!(
@@ -449,7 +449,7 @@ mod tests {
             Sampling::of(&health).text(&["/imu".to_owned()], NOT_ALL_PRINTED)
         };
         let off = text(r#""able":false"#).unwrap();
-        assert!(off.ends_with(SWITCH), "{off}");
+        assert!(off.ends_with(SAMPLING_REMEDY), "{off}");
         let resting = r#""able":false,"on_demand":true,"reason":"no client reads samples""#;
         assert_eq!(text(resting), None);
         assert_eq!(text(r#""able":true"#), None);

@@ -35,7 +35,7 @@ use read_ahead::ReadAhead;
 use signals::{Phase, listen};
 
 /// Default size of messages that wait for the storage, in bytes, as in `ros2 bag record`.
-const CACHE: u64 = 100 << 20;
+const DEFAULT_CACHE_BYTES: u64 = 100 << 20;
 
 /// `rp bag record`.
 #[derive(Args, Debug)]
@@ -113,7 +113,7 @@ pub(crate) struct Record {
     max_bag_duration: u64,
     /// Bytes of messages that may wait for the storage in this process. Further messages wait in
     /// the agent, and those that do not fit there are dropped, counted and reported
-    #[arg(long, value_name = "BYTES", default_value_t = CACHE)]
+    #[arg(long, value_name = "BYTES", default_value_t = DEFAULT_CACHE_BYTES)]
     max_cache_size: u64,
     /// Compress files after they are complete: file
     #[arg(long, value_name = "none|file", default_value = "none")]

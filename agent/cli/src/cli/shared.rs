@@ -14,7 +14,7 @@ use ros2probe_api::path::encoded;
 use ros2probe_api::problem::Code;
 use ros2probe_api::services::ServiceList;
 use ros2probe_api::topics::Topic;
-use ros2probe_daemon::missed_announcements::{DISCOVER, explanation, sentence};
+use ros2probe_daemon::missed_announcements::{DISCOVER_COMMAND, explanation, sentence};
 use serde::de::DeserializeOwned;
 
 use super::{Output, UserError};
@@ -137,7 +137,7 @@ impl Graph {
 }
 
 /// Whether the note about missing names has been printed.
-static EXPLAINED: Once = Once::new();
+static EXPLANATION_PRINTED: Once = Once::new();
 
 /// Returns all names in a domain, including hidden ones. The reason for missing names is printed
 /// once on stderr.
@@ -167,7 +167,7 @@ fn explain(names: &Names<'_>, agent: &Agent, domain_id: u32) {
 /// Prints that announcements were missed, if any were.
 fn explain_late(names: &Names<'_>, agent: &Agent) {
     if let Some(text) = late(names, agent.is_replay()) {
-        EXPLAINED.call_once(|| eprintln!("rp: {text}"));
+        EXPLANATION_PRINTED.call_once(|| eprintln!("rp: {text}"));
     }
 }
 
@@ -181,7 +181,7 @@ fn late(names: &Names<'_>, is_replay: bool) -> Option<String> {
         remedy,
         ..
     } = names;
-    let remedy = remedy.as_deref().unwrap_or(DISCOVER);
+    let remedy = remedy.as_deref().unwrap_or(DISCOVER_COMMAND);
     let what = match (names.topics.is_empty(), unknown_writers) {
         (true, _) if *participants == 1 => {
             let what =

@@ -46,11 +46,11 @@ pub(crate) struct Tf {
 }
 
 /// Time within which each edge should have a transform, before the last ones are used instead.
-const PATIENCE: Duration = Duration::from_secs(3);
+const POSE_TIMEOUT: Duration = Duration::from_secs(3);
 /// Consequence of sampling.
 const NOT_ALL_READ: &str = "not every transform is read";
 /// Interval at which poses are looked for within that time.
-const RETRY: Duration = Duration::from_millis(100);
+const POSE_RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
 /// The moving transforms since the start of the command.
 struct Recent<'a> {
@@ -77,7 +77,7 @@ impl<'a> Recent<'a> {
 
     /// Returns whether missing transforms may still arrive.
     fn is_expected(&self) -> bool {
-        self.samples.is_some() && self.start.elapsed() < PATIENCE
+        self.samples.is_some() && self.start.elapsed() < POSE_TIMEOUT
     }
 
     /// Reads transforms for this time.
@@ -166,7 +166,7 @@ impl Tf {
                 }
                 recent.follow(Duration::from_secs_f64(1.0 / self.rate))?;
             } else {
-                recent.follow(RETRY)?;
+                recent.follow(POSE_RETRY_INTERVAL)?;
             }
             answer = agent.get(&path)?;
         }

@@ -10,7 +10,7 @@ use ros2probe::ros2::topic;
 use ros2probe_api::names::{Names, TopicName};
 
 use super::echo::Echo;
-use super::interrupt::INTERRUPTED;
+use super::interrupt::EXIT_INTERRUPTED;
 use super::rates::{Bandwidth, Delay, Hz};
 use super::shared::{Graph, Spinning, answer, print_found, print_or_fail, print_text};
 
@@ -109,7 +109,7 @@ impl Topic {
         match &self.verb {
             Some(Verb::Hz(hz)) => hz.interrupted(),
             Some(Verb::Bw(bandwidth)) => bandwidth.interrupted(),
-            _ => INTERRUPTED,
+            _ => EXIT_INTERRUPTED,
         }
     }
 

@@ -16,7 +16,7 @@ use super::UserError;
 use super::shared::print_text;
 
 /// Interval of questions while no late call is known.
-const EVERY: Duration = Duration::from_secs(1);
+const POLL_INTERVAL: Duration = Duration::from_secs(1);
 
 /// `rp why`.
 #[derive(Args, Debug)]
@@ -82,7 +82,7 @@ impl Why {
                 let seconds = end.saturating_duration_since(now).as_secs();
                 eprintln!("no late call so far: waiting for at most {seconds} s (Ctrl-C ends)");
             }
-            std::thread::sleep(EVERY);
+            std::thread::sleep(POLL_INTERVAL);
         };
         if self.json {
             return print_text(&(serde_json::to_string_pretty(&answer)? + "\n"));

@@ -48,9 +48,9 @@ use transport::Transport;
 const TIMEOUT: Duration = Duration::from_secs(30);
 /// Maximum silence of an agent: before its answer, within it, and in a stream of messages, which
 /// contains the clock.
-const SILENCE: Duration = Duration::from_secs(5);
+const STREAM_SILENCE: Duration = Duration::from_secs(5);
 /// Maximum silence in a stream of events, which has a heartbeat every 15 s.
-const BEATS: Duration = Duration::from_secs(40);
+const HEARTBEAT_TIMEOUT: Duration = Duration::from_secs(40);
 /// Maximum size of an answer, in bytes. Streams have no such limit.
 const MAX_ANSWER: usize = 256 << 20;
 
@@ -217,9 +217,9 @@ impl Agent {
             if answer.status().is_success() {
                 self.transport.resume();
                 let silence = if path.starts_with("/events") {
-                    BEATS
+                    HEARTBEAT_TIMEOUT
                 } else {
-                    SILENCE
+                    STREAM_SILENCE
                 };
                 // A replay within this process runs at the pace of its capture.
                 let silence = (!self.transport.is_replayed()).then_some(silence);
@@ -304,7 +304,7 @@ impl Agent {
         if self.transport.is_replayed() {
             return self.transport.send(request).await;
         }
-        let answer = timeout(SILENCE, self.transport.send(request)).await;
+        let answer = timeout(STREAM_SILENCE, self.transport.send(request)).await;
         answer.unwrap_or_else(|_| Err(self.transport.slow()))
     }
 
@@ -314,7 +314,7 @@ impl Agent {
         let mut body = Limited::new(answer.into_body(), MAX_ANSWER);
         let mut whole = BytesMut::new();
         loop {
-            let frame = timeout(SILENCE, body.frame()).await;
+            let frame = timeout(STREAM_SILENCE, body.frame()).await;
             let Some(frame) = frame.map_err(|_| self.transport.slow())? else {
                 break;
             };

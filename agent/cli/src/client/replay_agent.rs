@@ -28,9 +28,9 @@ use tokio_util::sync::CancellationToken;
 /// Capacity of a pipe in bytes; most answers are smaller.
 const PIPE_BYTES: usize = 1 << 20;
 /// Cap on topics. A capture is read offline, so the limit of a live agent does not apply.
-const TOPICS: usize = 16_384;
+const MAX_TOPICS: usize = 16_384;
 /// Maximum wait for the end of a replay whose streams have ended.
-const TIMEOUT: Duration = Duration::from_millis(500);
+const END_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Range and pace of a replay.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -105,7 +105,7 @@ impl ReplayAgent {
         report: fn(&str),
     ) -> Result<Self, ReplayError> {
         let mut config = Config::default();
-        config.limits.topics = TOPICS;
+        config.limits.topics = MAX_TOPICS;
         let (replay, mut control) = open(capture, options, &config)?;
         let stop = CancellationToken::new();
         let agent = assemble(replay, options.measured, &config, stop.clone());
@@ -143,9 +143,9 @@ impl ReplayAgent {
     /// Returns the result of the replay; `None` until its end.
     #[must_use]
     pub(super) fn outcome(&self) -> Option<Outcome> {
-        let deadline = Instant::now() + TIMEOUT;
+        let deadline = Instant::now() + END_TIMEOUT;
         while self.outcome.get().is_none() && Instant::now() < deadline {
-            std::thread::sleep(TIMEOUT / 50);
+            std::thread::sleep(END_TIMEOUT / 50);
         }
         self.outcome.get().cloned()
     }

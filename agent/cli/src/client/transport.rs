@@ -25,11 +25,11 @@ use ros2probe_daemon::run::CaptureTime;
 /// The agent's socket, as created by the package and the service manager.
 const SOCKET: &str = "/run/ros2probe/api.sock";
 /// Default address of the agent's API.
-const LOOPBACK: &str = "127.0.0.1:17401";
+const LOOPBACK_ADDRESS: &str = "127.0.0.1:17401";
 /// Default port of an agent on another host.
 const PORT: &str = "17401";
 /// Maximum wait for a connection.
-const TIMEOUT: Duration = Duration::from_secs(5);
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A transport to an agent.
 #[derive(Debug)]
@@ -79,8 +79,8 @@ impl Transport {
             Ok(_) => return Ok(Self::Socket(path.to_path_buf())),
             Err(error) => error,
         };
-        match within(TcpStream::connect(LOOPBACK)).await {
-            Ok(_) => Ok(Self::Address(LOOPBACK.to_owned())),
+        match within(TcpStream::connect(LOOPBACK_ADDRESS)).await {
+            Ok(_) => Ok(Self::Address(LOOPBACK_ADDRESS.to_owned())),
             Err(_) if socket.kind() == io::ErrorKind::PermissionDenied => {
                 let path = path.to_path_buf();
                 Err(ClientError::Denied { path })
@@ -237,7 +237,7 @@ impl fmt::Display for Transport {
 }
 
 async fn within<S>(connect: impl Future<Output = io::Result<S>>) -> io::Result<S> {
-    let connected = timeout(TIMEOUT, connect).await;
+    let connected = timeout(CONNECT_TIMEOUT, connect).await;
     connected.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()))
 }
 

@@ -26,11 +26,11 @@ use self::session::{Outgoing, Session, Target};
 use ros2probe_model::report::snapshot::ParticipantFacts;
 
 /// Interval at which the session advances without input.
-const SLICE: Duration = Duration::from_millis(5);
+const ADVANCE_INTERVAL: Duration = Duration::from_millis(5);
 /// Wait after the goodbye for packets in flight, which a closed port would make the kernel answer.
-const LINGER: Duration = Duration::from_millis(50);
+const LINGER_TIME: Duration = Duration::from_millis(50);
 /// Maximum size of a UDP payload, in bytes.
-const DATAGRAM: usize = 65_507;
+const MAX_DATAGRAM: usize = 65_507;
 
 /// Reason why a participant receives no request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -129,7 +129,7 @@ pub fn local_participant(
         // Fast DDS answers a participant of its own host at 127.0.0.1, whatever address is
         // announced.
         let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
-        socket.set_read_timeout(Some(SLICE))?;
+        socket.set_read_timeout(Some(ADVANCE_INTERVAL))?;
         let port = socket.local_addr()?.port();
         Ok((SocketAddrV4::new(address, port), socket))
     };
@@ -164,7 +164,7 @@ pub fn converse(session: &mut Session, socket: &UdpSocket) -> Result<Duration, D
         let elapsed = u64::try_from(began.elapsed().as_nanos()).unwrap_or(u64::MAX);
         Timestamp(elapsed.saturating_add(1))
     };
-    let mut buffer = vec![0; DATAGRAM];
+    let mut buffer = vec![0; MAX_DATAGRAM];
     while !session.is_over() {
         let outgoing = session.advance(now());
         let round =
@@ -175,7 +175,7 @@ pub fn converse(session: &mut Session, socket: &UdpSocket) -> Result<Duration, D
         }
     }
     let took = began.elapsed();
-    let end = Instant::now() + LINGER;
+    let end = Instant::now() + LINGER_TIME;
     while Instant::now() < end {
         listen(session, socket, &mut buffer, now)?;
     }

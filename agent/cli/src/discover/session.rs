@@ -1,7 +1,7 @@
 //! One conversation with one participant: announcement, requests, goodbye.
 //!
 //! A state machine without socket and clock: time and datagrams in, datagrams out. It sends at most
-//! [`MOST_PACKETS`] packets whatever the participant does, and the last one is the goodbye.
+//! [`MAX_PACKETS`] packets whatever the participant does, and the last one is the goodbye.
 //! HEARTBEATs are not answered individually: Fast DDS sends several while it repeats its
 //! announcements, and restarts after each answer.
 
@@ -18,7 +18,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::announcer::Announcer;
 use super::message::{
-    LocalParticipant, MOST_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER,
+    LocalParticipant, MAX_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER,
     SUBSCRIPTIONS_READER,
 };
 use crate::tables::{DiscoveredEndpoints, PartialAnnouncements, UserWriters};
@@ -28,19 +28,19 @@ use ros2probe_model::facts::wall_clock::WallClock;
 use ros2probe_model::graph::discovery_fragments::DiscoveryFragments;
 
 /// Maximum number of packets sent to one participant, including the goodbye.
-pub const MOST_PACKETS: u32 = 6;
+pub const MAX_PACKETS: u32 = 6;
 
 /// Silence after which the announcement is repeated once. Both vendors announce
 /// themselves within 2 ms.
-const SILENCE: Duration = Duration::from_millis(500);
+const END_SILENCE: Duration = Duration::from_millis(500);
 /// Time from the first HEARTBEAT to the request, so that the second one can arrive.
-const GATHER: Duration = Duration::from_millis(20);
+const REQUEST_DELAY: Duration = Duration::from_millis(20);
 /// Maximum wait for requested samples before another request.
-const TIMEOUT: Duration = Duration::from_millis(300);
+const REQUEST_TIMEOUT: Duration = Duration::from_millis(300);
 /// Maximum wait for the node list after everything else.
 const NODES_TIMEOUT: Duration = Duration::from_millis(500);
 /// Maximum duration of a conversation.
-const LIMIT: Duration = Duration::from_secs(3);
+const MAX_DURATION: Duration = Duration::from_secs(3);
 const NODES_TOPIC: &str = "ros_discovery_info";
 
 /// Participant that receives requests, and its addresses.
@@ -143,7 +143,7 @@ impl Session {
     #[must_use]
     pub fn plan(&self) -> Vec<Outgoing> {
         let first = SequenceNumber::FIRST;
-        let full = || (first, first.until(first + MOST_NUMBERS));
+        let full = || (first, first.until(first + MAX_NUMBERS));
         let mut plan = vec![
             self.to_discovery("introduction", self.message().announce(self.local)),
             self.to_discovery("request", self.request([full(), full()])),
@@ -183,10 +183,10 @@ impl Session {
             self.began = now;
             self.introduce(now, &mut outgoing);
         }
-        let is_deaf = self.heard.is_none() && now - self.announced >= SILENCE;
+        let is_deaf = self.heard.is_none() && now - self.announced >= END_SILENCE;
         if is_deaf && self.sent.packets == 1 {
             self.introduce(now, &mut outgoing);
-        } else if is_deaf || now - self.began >= LIMIT {
+        } else if is_deaf || now - self.began >= MAX_DURATION {
             self.end(&mut outgoing);
             return outgoing;
         }
@@ -387,15 +387,15 @@ impl Session {
         let Some(heard) = self.heard else { return };
         let both = self.publications.available.is_some() && self.subscriptions.available.is_some();
         let due = match self.asked {
-            None => both || now - heard >= GATHER,
+            None => both || now - heard >= REQUEST_DELAY,
             Some(asked) => {
                 let came = self.publications.is_answered() && self.subscriptions.is_answered();
-                came || now - asked >= TIMEOUT
+                came || now - asked >= REQUEST_TIMEOUT
             }
         };
         // One of the remaining packets is for the node request and one for the goodbye.
         let reserved = 1 + u32::from(self.wants_nodes && matches!(self.nodes, Nodes::Open { .. }));
-        if !due || self.missing() == 0 || self.sent.packets + reserved >= MOST_PACKETS {
+        if !due || self.missing() == 0 || self.sent.packets + reserved >= MAX_PACKETS {
             return;
         }
         let wanted = [&mut self.publications, &mut self.subscriptions].map(Announcer::next_request);
@@ -419,7 +419,7 @@ impl Session {
         let Some(last) = self.user_writers.get(&writer).map(|range| *range.end()) else {
             return;
         };
-        if last == SequenceNumber::ZERO || self.sent.packets + 1 >= MOST_PACKETS {
+        if last == SequenceNumber::ZERO || self.sent.packets + 1 >= MAX_PACKETS {
             self.nodes = Nodes::Missing;
             return;
         }
@@ -432,9 +432,9 @@ impl Session {
 
     /// Requests missing fragments of incomplete samples.
     fn request_fragments(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
-        let due = |(_, at): &(&(EntityId, SequenceNumber), &Timestamp)| now - **at >= GATHER;
+        let due = |(_, at): &(&(EntityId, SequenceNumber), &Timestamp)| now - **at >= REQUEST_DELAY;
         let stuck: Vec<_> = self.partial.iter().filter(due).map(|(it, _)| *it).collect();
-        if stuck.is_empty() || self.partial.values().any(|at| now - *at < GATHER) {
+        if stuck.is_empty() || self.partial.values().any(|at| now - *at < REQUEST_DELAY) {
             return;
         }
         for is_builtin in [true, false] {
@@ -455,7 +455,7 @@ impl Session {
                 message = message.nack_frag(reader, *writer, *number, missing, self.requests);
                 asked = true;
             }
-            if !asked || self.sent.packets + 1 >= MOST_PACKETS {
+            if !asked || self.sent.packets + 1 >= MAX_PACKETS {
                 continue;
             }
             let what = "request for fragments";
@@ -467,7 +467,7 @@ impl Session {
             self.send(datagram, outgoing);
         }
         // Fragments have the same timeout as other requests.
-        let later = now + TIMEOUT - GATHER;
+        let later = now + REQUEST_TIMEOUT - REQUEST_DELAY;
         for at in self.partial.values_mut() {
             *at = later;
         }
@@ -479,9 +479,9 @@ impl Session {
             return false;
         };
         let settled = match self.asked {
-            Some(asked) => self.missing() == 0 || now - asked >= TIMEOUT,
+            Some(asked) => self.missing() == 0 || now - asked >= REQUEST_TIMEOUT,
             // A participant without endpoints sends HEARTBEATs with firstSN 1 and lastSN 0.
-            None => now - heard >= GATHER && self.missing() == 0,
+            None => now - heard >= REQUEST_DELAY && self.missing() == 0,
         };
         if !settled {
             return false;

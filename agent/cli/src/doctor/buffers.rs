@@ -15,7 +15,7 @@ use ros2probe_api::topics::Topic;
 const AREA: Area = Area::Buffers;
 const RECEIVE_MAX: Sysctl = Sysctl("net.core.rmem_max");
 const RECEIVE_DEFAULT: Sysctl = Sysctl("net.core.rmem_default");
-const REASSEMBLY: [(Sysctl, Sysctl); 2] = [
+const REASSEMBLY_SYSCTLS: [(Sysctl, Sysctl); 2] = [
     (
         Sysctl("net.ipv4.ipfrag_high_thresh"),
         Sysctl("net.ipv4.ipfrag_time"),
@@ -27,15 +27,15 @@ const REASSEMBLY: [(Sysctl, Sysctl); 2] = [
 ];
 const MEBIBYTE: u64 = 1 << 20;
 /// Size in bytes above which a message needs several UDP datagrams.
-const LARGE: u64 = 64 << 10;
+const LARGE_MESSAGE: u64 = 64 << 10;
 /// Assumed message size without measurements: a typical camera image or lidar scan.
-const USUAL: u64 = 4 * MEBIBYTE;
+const DEFAULT_MESSAGE: u64 = 4 * MEBIBYTE;
 const MESSAGES_IN_BUFFER: u64 = 2;
 const MESSAGES_IN_REASSEMBLY: u64 = 16;
 /// Ratio of lost messages above which the finding is a problem.
-const MANY: f64 = 0.01;
+const PROBLEM_LOSS_RATIO: f64 = 0.01;
 /// Maximum number of topics in one sentence.
-const NAMED: usize = 3;
+const MAX_NAMED_TOPICS: usize = 3;
 
 /// Name of a kernel parameter.
 #[derive(Clone, Copy, Debug)]
@@ -76,7 +76,7 @@ pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
     ));
     let is_large = largest
         .as_ref()
-        .is_some_and(|largest| largest.bytes > LARGE);
+        .is_some_and(|largest| largest.bytes > LARGE_MESSAGE);
     findings.extend(reassembly(
         &host.files,
         largest.as_ref().filter(|_| is_large),
@@ -91,7 +91,7 @@ pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
                 .map_or(0, |received| received.lost_in_reassembly_messages)
         },
         |finding| {
-            let [(memory, time), _] = REASSEMBLY;
+            let [(memory, time), _] = REASSEMBLY_SYSCTLS;
             finding
                 .remedy(memory.set(128 * MEBIBYTE))
                 .remedy(time.set(3))
@@ -123,7 +123,7 @@ fn largest(topics: &[Topic<'_>]) -> Option<Largest> {
 
 /// Returns the size of `messages` of the largest messages, rounded up to whole mebibytes.
 fn wanted(largest: Option<&Largest>, messages: u64) -> u64 {
-    let bytes = largest.map_or(USUAL, |largest| largest.bytes);
+    let bytes = largest.map_or(DEFAULT_MESSAGE, |largest| largest.bytes);
     bytes
         .saturating_mul(messages)
         .max(1)
@@ -185,7 +185,7 @@ fn receive(files: &Files, largest: Option<&Largest>) -> Finding {
 
 fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
     let mut findings = Vec::new();
-    for (number, (memory, time)) in (0..).zip(REASSEMBLY) {
+    for (number, (memory, time)) in (0..).zip(REASSEMBLY_SYSCTLS) {
         let (bytes, seconds) = (memory.read(files), time.read(files));
         let check = if number == 0 {
             "reassembly"
@@ -256,14 +256,14 @@ fn lost(
         ratio(count(topic), received)
     };
     let worst = lossy.iter().map(|topic| ratio(topic)).fold(0.0, f64::max);
-    let severity = if worst >= MANY {
+    let severity = if worst >= PROBLEM_LOSS_RATIO {
         Severity::Problem
     } else {
         Severity::Warning
     };
     let named: Vec<_> = lossy
         .iter()
-        .take(NAMED)
+        .take(MAX_NAMED_TOPICS)
         .map(|topic| {
             format!(
                 "{} {} ({:.1} %)",

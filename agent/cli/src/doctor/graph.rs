@@ -11,14 +11,14 @@ use ros2probe_api::doctor::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
 use ros2probe_api::participants::Participant;
 use ros2probe_api::topics::Topic;
-use ros2probe_daemon::missed_announcements::{self, Announces, DISCOVER};
+use ros2probe_daemon::missed_announcements::{self, Announces, DISCOVER_COMMAND};
 
 const AREA: Area = Area::Graph;
 /// Adds remedies to a finding.
 type Helps = fn(Finding) -> Finding;
 
 /// Maximum number of topics in one sentence.
-const NAMED: usize = 3;
+const MAX_NAMED_TOPICS: usize = 3;
 
 /// Returns the findings of all graph checks. `processes` is the number of ROS processes on the
 /// agent's host, if it is known.
@@ -158,7 +158,7 @@ fn names(participants: &[Participant<'_>]) -> Option<Finding> {
 
 /// Returns the command that requests the announcements of these participants.
 fn remedy_of<'a>(participants: impl Iterator<Item = &'a Participant<'a>>) -> &'static str {
-    missed_announcements::command(participants.map(Announces::of)).unwrap_or(DISCOVER)
+    missed_announcements::command(participants.map(Announces::of)).unwrap_or(DISCOVER_COMMAND)
 }
 
 /// Returns a remedy with a comment. By TCP, another participant is needed.
@@ -440,11 +440,11 @@ fn near_misses(topics: &[Topic<'_>]) -> Option<Finding> {
 fn listed(topics: &[&Topic<'_>]) -> String {
     let names: Vec<_> = topics
         .iter()
-        .take(NAMED)
+        .take(MAX_NAMED_TOPICS)
         .map(|topic| topic.name.as_ref())
         .collect();
     let names = names.join(", ");
-    match topics.len().saturating_sub(NAMED) {
+    match topics.len().saturating_sub(MAX_NAMED_TOPICS) {
         0 => names,
         more => format!("{names} and {more} more"),
     }

@@ -21,11 +21,11 @@ const MAX_LINE: u64 = 64 << 10;
 /// Maximum number of characters shown of a command.
 const MAX_COMMAND: usize = 40;
 /// Maximum number of processes named in one sentence, per group.
-const NAMED: usize = 4;
+const MAX_NAMED_PROCESSES: usize = 4;
 /// Name of the daemon of the `ros2` command line.
 const ROS2_DAEMON: &str = "ros2 daemon";
 /// Implementations whose messages pass only through shared memory that the agent does not read.
-const UNREAD: [&str; 2] = ["iceoryx", "iceoryx2"];
+const UNREAD_IMPLEMENTATIONS: [&str; 2] = ["iceoryx", "iceoryx2"];
 /// Maximum number of ROS processes inspected.
 const MAX_PROCESSES: usize = 2000;
 
@@ -209,7 +209,7 @@ impl Processes {
     fn unread_implementations(&self) -> Option<Finding> {
         let unread = |process: &&Process| {
             let own = process.implementation;
-            own.is_some_and(|implementation| UNREAD.contains(&implementation))
+            own.is_some_and(|implementation| UNREAD_IMPLEMENTATIONS.contains(&implementation))
         };
         let unread: Vec<_> = self.found.iter().filter(unread).collect();
         let implementation = unread.first()?.implementation?;
@@ -285,7 +285,7 @@ impl Processes {
         groups.sort_by_key(|(_, group)| group.len());
         let named: Vec<_> = groups
             .iter()
-            .take(NAMED)
+            .take(MAX_NAMED_PROCESSES)
             .map(|(key, group)| format!("{key}: {}", names(group)))
             .collect();
         let sentence = format!("{consequence}; {}", named.join("; "));
@@ -371,7 +371,7 @@ fn names_of_files(map: &str) -> impl Iterator<Item = &str> {
 
 /// Returns the RMW implementation of the mapped libraries; `None` if no library belongs to one.
 fn implementation(map: &str) -> Option<&'static str> {
-    const LIBRARIES: [(&str, &str); 9] = [
+    const RMW_LIBRARIES: [(&str, &str); 9] = [
         ("librmw_zenoh_cpp.so", "Zenoh"),
         ("libddsc.so", "Cyclone DDS"),
         ("librmw_cyclonedds_cpp.so", "Cyclone DDS"),
@@ -384,7 +384,7 @@ fn implementation(map: &str) -> Option<&'static str> {
     ];
     let mut found: Vec<_> = names_of_files(map)
         .filter_map(|name| {
-            let by_name = LIBRARIES.iter().find(|(library, _)| {
+            let by_name = RMW_LIBRARIES.iter().find(|(library, _)| {
                 let rest = name.strip_prefix(library);
                 rest.is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', ' ']))
             });
@@ -433,11 +433,11 @@ fn command(host: &HostState, id: u32) -> String {
 fn names(processes: &[&Process]) -> String {
     let names: Vec<_> = processes
         .iter()
-        .take(NAMED)
+        .take(MAX_NAMED_PROCESSES)
         .map(|each| each.name())
         .collect();
     let names = names.join(", ");
-    match processes.len().saturating_sub(NAMED) {
+    match processes.len().saturating_sub(MAX_NAMED_PROCESSES) {
         0 => names,
         more => format!("{names} and {more} more"),
     }

@@ -7,9 +7,9 @@ use ros2probe_daemon::agent_facts::{Ability, AgentFacts};
 
 const AREA: Area = Area::Sight;
 /// Source of facts about a running agent.
-pub(super) const ASKED: &str = "GET /health";
+pub(super) const HEALTH_SOURCE: &str = "GET /health";
 /// Source of facts from a trial.
-pub(super) const TRIED: &str = "test load of the BPF programs";
+pub(super) const TRIAL_SOURCE: &str = "test load of the BPF programs";
 
 /// Abilities of a capture source.
 #[derive(Clone, Debug, Default)]
@@ -41,7 +41,7 @@ impl Visibility {
             source_reason: health.source_reason.clone(),
             able: able.filter_map(|each| known(&each.ability)).collect(),
             reasons: reasons.collect(),
-            from: ASKED,
+            from: HEALTH_SOURCE,
         }
     }
 
@@ -53,7 +53,7 @@ impl Visibility {
             source_reason: facts.source_reason,
             able: facts.abilities,
             reasons: facts.blind,
-            from: TRIED,
+            from: TRIAL_SOURCE,
         }
     }
 }
@@ -77,7 +77,7 @@ pub fn failed(error: &str) -> Vec<Finding> {
     let finding = Finding::new(AREA, "source", Severity::Problem, sentence);
     vec![
         finding
-            .seen(error, TRIED)
+            .seen(error, TRIAL_SOURCE)
             .remedy("sudo rp run    # prints the full cause"),
     ]
 }

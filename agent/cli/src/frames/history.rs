@@ -12,7 +12,7 @@ use super::{Pose, dot};
 use crate::tables::{FrameEdges, FramePoses};
 
 /// Time for which a transform is kept after its stamp, as `tf2_ros::Buffer` keeps it by default.
-const KEPT: Duration = Duration::from_secs(10);
+const TRANSFORM_LIFETIME: Duration = Duration::from_secs(10);
 
 /// A time of the broadcasters' clock in nanoseconds.
 pub(super) type Stamp = i64;
@@ -73,7 +73,7 @@ impl History {
         let Some(poses) = self.edges.get_mut(child) else {
             return;
         };
-        let (stamp, kept) = (stamp_of(stamp), KEPT.as_nanos() as Stamp);
+        let (stamp, kept) = (stamp_of(stamp), TRANSFORM_LIFETIME.as_nanos() as Stamp);
         if poses.back().is_some_and(|last| stamp < last.stamp - kept) {
             // The broadcasters' clock went back, as at the start of another simulation.
             poses.clear();

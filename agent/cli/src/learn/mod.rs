@@ -27,7 +27,7 @@ const MIN_STEP: f64 = 0.5;
 const MAX_STEP: f64 = 60.0;
 
 /// Kinds of topics that a watch covers by their ROS name.
-const KINDS: [&str; 4] = ["topic", "action_feedback", "action_status", "service_event"];
+const WATCHABLE_KINDS: [&str; 4] = ["topic", "action_feedback", "action_status", "service_event"];
 
 /// Names and globs of the topics to learn. If empty, all topics that `ros2 topic list` shows.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -90,7 +90,7 @@ impl Selection {
     }
 
     fn covers(&self, topic: &Topic<'_>) -> bool {
-        if !KINDS.contains(&topic.kind.as_ref()) {
+        if !WATCHABLE_KINDS.contains(&topic.kind.as_ref()) {
             return false;
         }
         if self.0.iter().any(|pattern| *pattern == topic.name) {
@@ -178,8 +178,8 @@ impl Learner {
                 .map(|(name, observation)| thresholds::lesson(name, observation))
                 .collect(),
             period,
-            unnamed: count(UNNAMED),
-            beyond_limit: count(BEYOND),
+            unnamed: count(UNWATCHABLE_REASON),
+            beyond_limit: count(LIMIT_REASON),
         })
     }
 
@@ -189,8 +189,8 @@ impl Learner {
         let limit = Limit::Watches.row().default;
         if !self.topics.contains_key(name) {
             let why = match (check_pattern(name).is_err(), self.topics.len() >= limit) {
-                (true, _) => Some(UNNAMED),
-                (_, true) => Some(BEYOND),
+                (true, _) => Some(UNWATCHABLE_REASON),
+                (_, true) => Some(LIMIT_REASON),
                 _ => None,
             };
             if let Some(why) = why {
@@ -206,8 +206,8 @@ impl Learner {
     }
 }
 
-const UNNAMED: &str = "no watch can name it";
-const BEYOND: &str = "limits.watches";
+const UNWATCHABLE_REASON: &str = "no watch can name it";
+const LIMIT_REASON: &str = "limits.watches";
 
 /// Rounds a time of 0 to 60 s to whole seconds.
 #[expect(

@@ -6,7 +6,7 @@
 
 use std::ops::RangeInclusive;
 
-use ros2probe_daemon::config::rehearsal::{self, GRACE, Second};
+use ros2probe_daemon::config::rehearsal::{self, STARTUP_GRACE_SECONDS, Second};
 use ros2probe_daemon::config::watch::ExpectationValues;
 use ros2probe_daemon::config::{Expectations, LossShare};
 
@@ -21,13 +21,13 @@ pub const RATE_DEVIATIONS: f64 = 4.0;
 const RATE_LIMITS: (f64, f64) = (0.6, 1.6);
 /// Minimum distance of the minimum rate from half the median, in messages of a window. Half the
 /// rate then violates the minimum, in spite of the agent's tolerance of one message.
-const TOLERANCE: f64 = 1.0;
+const MESSAGE_TOLERANCE: f64 = 1.0;
 /// Windows in seconds for rates that vary too much in the agent's default window.
-const WINDOWS: [u64; 4] = [2, 3, 5, rehearsal::SECONDS];
+const WINDOW_SECONDS: [u64; 4] = [2, 3, 5, rehearsal::SECONDS];
 /// Minimum rate with a band: three messages are due in the agent's longest window of 10 s.
-const SLOWEST: f64 = 0.3;
+const MIN_RATE_HZ: f64 = 0.3;
 /// Minimum number of seconds and of messages to learn from.
-const LEAST: usize = 10;
+const MIN_OBSERVATIONS: usize = 10;
 /// Margin of a silence, as a factor of the longest observed one.
 pub const SILENCE_MARGIN: f64 = 3.0;
 /// Minimum learnt silence in seconds, since the agent evaluates once a second.
@@ -68,7 +68,7 @@ pub enum Remark {
 #[must_use]
 pub fn lesson(topic: &str, observation: &Observation) -> Lesson {
     let mut draft = Draft::new(observation);
-    if draft.messages < LEAST as u64 {
+    if draft.messages < MIN_OBSERVATIONS as u64 {
         draft.too_few();
     } else {
         draft.rate();
@@ -155,18 +155,18 @@ impl<'a> Draft<'a> {
     fn rate(&mut self) {
         const KEYS: &str = "min_rate_hz and max_rate_hz";
         let seconds = self.complete.len();
-        if seconds < LEAST {
+        if seconds < MIN_OBSERVATIONS {
             return self.leave_out(KEYS, format!("{seconds} s are too short"));
         }
         let messages: u64 = self.complete.iter().map(|it| u64::from(it.messages)).sum();
         let mean = number(messages) / number(seconds as u64);
         let lowest = mean * (1.0 - RATE_MARGIN);
-        if lowest < SLOWEST {
+        if lowest < MIN_RATE_HZ {
             let why = format!("{messages} messages in {seconds} s are too seldom for a rate");
             return self.leave_out(KEYS, why);
         }
         let default = rehearsal::window(lowest);
-        let wider = WINDOWS.into_iter().filter(|seconds| *seconds > default);
+        let wider = WINDOW_SECONDS.into_iter().filter(|seconds| *seconds > default);
         let lengths = std::iter::once(default).chain(wider);
         let windows: Vec<Windows> = lengths
             .filter_map(|seconds| self.windows(seconds, default))
@@ -302,7 +302,7 @@ impl<'a> Draft<'a> {
             .map(|second| f64::from(second.delay) / f64::from(second.delayed))
             .collect();
         let count = means.len();
-        let Some(means) = Summary::of(means).filter(|_| count >= LEAST) else {
+        let Some(means) = Summary::of(means).filter(|_| count >= MIN_OBSERVATIONS) else {
             return self.leave_out(
                 KEY,
                 format!("{count} s with writer's timestamps are too few"),
@@ -392,7 +392,7 @@ impl<'a> Draft<'a> {
             } else {
                 0
             };
-            if published > GRACE {
+            if published > STARTUP_GRACE_SECONDS {
                 settled.push(*second);
             }
         }
@@ -407,7 +407,7 @@ impl<'a> Draft<'a> {
         count: fn(&Second) -> u16,
         expecting: fn(Option<u32>) -> ExpectationValues,
     ) -> Option<u32> {
-        if settled.len() < LEAST {
+        if settled.len() < MIN_OBSERVATIONS {
             let published = self.seconds.iter().filter(|it| it.publishers > 0).count();
             self.leave_out(key, format!("{published} s with a publisher are too few"));
             return None;
@@ -495,20 +495,20 @@ impl Windows {
     /// Returns the smallest minimum rate that half the rate violates.
     fn least(&self) -> f64 {
         let median = self.rates.median;
-        let half = 0.5 * median + TOLERANCE / number(self.seconds);
+        let half = 0.5 * median + MESSAGE_TOLERANCE / number(self.seconds);
         half.max(RATE_LIMITS.0 * median)
     }
 
     /// Returns whether no window violates this minimum rate.
     fn is_above(&self, rate: f64) -> bool {
         let seconds = number(self.seconds);
-        rate * seconds < self.rates.minimum * seconds + TOLERANCE
+        rate * seconds < self.rates.minimum * seconds + MESSAGE_TOLERANCE
     }
 
     /// Returns whether no window violates this maximum rate.
     fn is_below(&self, rate: f64) -> bool {
         let seconds = number(self.seconds);
-        rate * seconds + TOLERANCE > self.rates.maximum * seconds
+        rate * seconds + MESSAGE_TOLERANCE > self.rates.maximum * seconds
     }
 
     /// Returns the expectation of these rates in windows of this length.

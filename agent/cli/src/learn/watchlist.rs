@@ -8,11 +8,11 @@ use super::thresholds::{
 };
 use ros2probe_api::parameters::Parameters;
 use ros2probe_daemon::config::MAX_PARAMETERS;
-use ros2probe_daemon::config::rehearsal::GRACE;
+use ros2probe_daemon::config::rehearsal::STARTUP_GRACE_SECONDS;
 use ros2probe_daemon::escape::visible;
 
 /// Column at which reasons begin.
-const COLUMN: usize = 28;
+const REASON_COLUMN: usize = 28;
 /// Maximum size of a configuration file that an agent reads, in bytes.
 const MAX_BYTES: usize = 1 << 20;
 
@@ -132,7 +132,7 @@ fn head(source: &Source<'_>) -> String {
 # max_latency_ms: median of one-second means with {LATENCY_DEVIATIONS} deviations or 5 ms, at least twice
 #   the 95th percentile
 # max_silence_s: {SILENCE_MARGIN} times the longest silence, at least 2 s and five messages
-# publishers, subscribers: median of the numbers, from {GRACE} s after the first publisher on
+# publishers, subscribers: median of the numbers, from {STARTUP_GRACE_SECONDS} s after the first publisher on
 # A value that the robot itself would have violated is widened to the extreme that was seen. One
 # that is then too wide to find a fault is left out.
 "
@@ -156,7 +156,7 @@ fn entry(text: &mut String, lesson: &Lesson, source: &Source<'_>, is_explained: 
             }
             Remark::Set(key, value, why) => {
                 let setting = format!("    {key}: {value}");
-                line(text, &format!("{setting:COLUMN$}  # {}", visible(why)));
+                line(text, &format!("{setting:REASON_COLUMN$}  # {}", visible(why)));
             }
             Remark::LeftOut(..) if !is_explained => {}
             Remark::LeftOut(keys, why) => {

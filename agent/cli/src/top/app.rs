@@ -15,9 +15,9 @@ use ros2probe_api::health::Health;
 use ros2probe_api::topics::{TopicDetails, TopicList};
 
 /// Time for which a drop counts as recent.
-const RECENT: Duration = Duration::from_secs(30);
+const RECENT_DROP_TIME: Duration = Duration::from_secs(30);
 /// Time for which the answer to a key stays on the screen.
-const SAID: Duration = Duration::from_secs(8);
+const STATUS_LINE_TIME: Duration = Duration::from_secs(8);
 
 /// Facts received from the agent.
 #[derive(Debug)]
@@ -220,14 +220,14 @@ impl App {
     #[must_use]
     pub fn status(&self, now: Instant) -> Option<&str> {
         let (at, text) = self.status.as_ref()?;
-        (now.saturating_duration_since(*at) < SAID).then_some(text.as_str())
+        (now.saturating_duration_since(*at) < STATUS_LINE_TIME).then_some(text.as_str())
     }
 
     /// Returns whether the agent dropped data recently.
     #[must_use]
     pub fn is_dropping(&self, now: Instant) -> bool {
         let dropped_at = self.dropped_at;
-        dropped_at.is_some_and(|at| now.saturating_duration_since(at) < RECENT)
+        dropped_at.is_some_and(|at| now.saturating_duration_since(at) < RECENT_DROP_TIME)
     }
 
     /// Returns the age of the topic list; `None` before the first list.

@@ -19,7 +19,7 @@ use super::theme::{Kind, Theme};
 /// Maximum number of receivers and destinations without a known reader.
 const MAX_OTHERS: usize = 16;
 /// Width of a node's name, in columns.
-const NODE: usize = 24;
+const NODE_WIDTH: usize = 24;
 
 /// A line and its style.
 pub type Styled = (String, Kind);
@@ -410,7 +410,7 @@ fn publishers(topic: &Topic<'_>, theme: Theme, lines: &mut Vec<Styled>) {
     }
     let title = counted(topic.publishers.len() as u64, "publisher");
     let heading = format!(
-        "{title:<NODE$} {:>6} {:>6} {:>6} {:>5} {:>5}  QOS",
+        "{title:<NODE_WIDTH$} {:>6} {:>6} {:>6} {:>5} {:>5}  QOS",
         "HZ", "B/S", "LOST", "MED", "P99"
     );
     lines.push((heading, Kind::Heading));
@@ -419,7 +419,7 @@ fn publishers(topic: &Topic<'_>, theme: Theme, lines: &mut Vec<Styled>) {
         let known = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
         let latency = measured.and_then(|it| it.latency);
         let line = format!(
-            "{:<NODE$} {:>6} {:>6} {:>6} {:>5} {:>5}  {}",
+            "{:<NODE_WIDTH$} {:>6} {:>6} {:>6} {:>5} {:>5}  {}",
             node(writer, theme),
             known(measured.and_then(|it| it.rate_hertz).map(rate)),
             known(
@@ -451,7 +451,7 @@ fn subscribers(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>
     }
     let title = counted(topic.subscriptions.len() as u64, "subscriber");
     let heading = format!(
-        "{title:<NODE$} {:>7} {:>6} {:>6}  QOS",
+        "{title:<NODE_WIDTH$} {:>7} {:>6} {:>6}  QOS",
         "CAME", "LOST", "BEHIND"
     );
     lines.push((heading, Kind::Heading));
@@ -472,7 +472,7 @@ fn subscribers(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>
         });
         let known = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
         let line = format!(
-            "{:<NODE$} {:>7} {:>6} {:>6}  {}",
+            "{:<NODE_WIDTH$} {:>7} {:>6} {:>6}  {}",
             node(reader, theme),
             known(sum.map(|it| it.messages.to_string())),
             known(sum.map(|it| it.lost_messages.to_string())),
@@ -510,11 +510,11 @@ fn others(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>) {
     if others.is_empty() {
         return;
     }
-    let heading = format!("{:<NODE$} {:>7} {:>6}", "other ways", "CAME", "LOST");
+    let heading = format!("{:<NODE_WIDTH$} {:>7} {:>6}", "other ways", "CAME", "LOST");
     lines.push((heading, Kind::Heading));
     for (to, it) in others.iter().take(MAX_OTHERS) {
-        let to = beginning(to, NODE, theme.cut());
-        let line = format!("{to:<NODE$} {:>7} {:>6}", it.messages, it.lost_messages);
+        let to = beginning(to, NODE_WIDTH, theme.cut());
+        let line = format!("{to:<NODE_WIDTH$} {:>7} {:>6}", it.messages, it.lost_messages);
         lines.push((line, Kind::Plain));
     }
     if let Some(more) = others
@@ -538,7 +538,7 @@ fn add(sum: &mut Delivered, one: &Delivered) {
 
 fn node(endpoint: &Endpoint<'_>, theme: Theme) -> String {
     let name = safe(endpoint.node.as_deref().unwrap_or(&endpoint.guid));
-    end(&name, NODE, theme.cut())
+    end(&name, NODE_WIDTH, theme.cut())
 }
 
 fn qos(endpoint: &Endpoint<'_>, topic: &Topic<'_>) -> String {

@@ -8,7 +8,7 @@ use ros2probe_api::attributes::Value;
 use ros2probe_api::events::{Event, Lagged};
 
 /// Maximum number of events kept for scrolling.
-const KEPT: usize = 1_000;
+const MAX_EVENTS: usize = 1_000;
 
 /// Line of one event.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -94,7 +94,7 @@ impl EventPane {
 
     fn push(&mut self, line: Line) {
         self.lines.push_back(line);
-        if self.lines.len() > KEPT {
+        if self.lines.len() > MAX_EVENTS {
             self.lines.pop_front();
         }
     }
@@ -155,7 +155,7 @@ mod tests {
     #[test]
     fn the_pane_keeps_the_latest_events_and_the_number_of_missed_ones() {
         let mut events = EventPane::default();
-        for number in 0..KEPT + 5 {
+        for number in 0..MAX_EVENTS + 5 {
             events.add(
                 &event(json!({"severity": "INFO", "attributes": {"count": number}})),
                 None,
@@ -165,7 +165,7 @@ mod tests {
             missed: Some(7),
             reason: "overwritten".into(),
         });
-        assert_eq!(events.shown().count(), KEPT);
+        assert_eq!(events.shown().count(), MAX_EVENTS);
         events.only_warnings = true;
         let lines: Vec<_> = events.shown().collect();
         assert_eq!(lines.len(), 1);

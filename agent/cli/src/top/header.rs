@@ -2,7 +2,7 @@
 //! must never look healthy.
 
 use ros2probe_api::health::Health;
-use ros2probe_daemon::missed_announcements::{DISCOVER, explanation, sentence};
+use ros2probe_daemon::missed_announcements::{DISCOVER_COMMAND, explanation, sentence};
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
@@ -13,7 +13,7 @@ use super::text::{counted, safe};
 use super::theme::{Kind, Theme};
 
 /// Age above which the table is stale, as in the agent itself.
-const FRESH: Duration = Duration::from_secs(5);
+const STALE_AGE: Duration = Duration::from_secs(5);
 
 /// Returns at most `most` lines. With a `width` of 0, lines are as wide as their text.
 #[must_use]
@@ -152,7 +152,7 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
         let since = now.saturating_duration_since(*since).as_secs();
         warn(format!("agent unreachable for {since} s, retrying: {why}"));
     }
-    if let Some(age) = app.age(now).filter(|age| *age > FRESH)
+    if let Some(age) = app.age(now).filter(|age| *age > STALE_AGE)
         && !app
             .health
             .as_ref()
@@ -191,7 +191,7 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
     }
     if health.unknown_writers > 0 {
         let remedy = health.unknown_writers_remedy.as_deref();
-        let (what, remedy) = (sentence(health.unknown_writers), remedy.unwrap_or(DISCOVER));
+        let (what, remedy) = (sentence(health.unknown_writers), remedy.unwrap_or(DISCOVER_COMMAND));
         warn(format!("{what}: {}", explanation(&safe(remedy))));
     }
     if health.topics_rejected > 0 {

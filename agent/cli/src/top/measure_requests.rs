@@ -19,7 +19,7 @@ use ros2probe_api::watches::{Watch, WatchRequest};
 /// Interval at which a connection checks whether it is still needed.
 const POLL_INTERVAL: Duration = Duration::from_millis(200);
 /// Number of checks between two attempts to reopen a connection.
-const PAUSE: u32 = 10;
+const REOPEN_CHECKS: u32 = 10;
 
 /// All topics measured on behalf of this program.
 #[derive(Debug)]
@@ -159,7 +159,7 @@ impl Stream {
                 }
                 Err(_) => {}
             }
-            for _ in 0..PAUSE {
+            for _ in 0..REOPEN_CHECKS {
                 if self.is_over() {
                     return;
                 }

@@ -33,9 +33,9 @@ use terminal::Screen;
 use theme::Theme;
 
 /// Maximum time between two drawings, which update the shown age.
-const TICK: Duration = Duration::from_millis(500);
+const MAX_REDRAW_INTERVAL: Duration = Duration::from_millis(500);
 /// Minimum time between two drawings caused by facts. Keys redraw immediately.
-const CALM: Duration = Duration::from_millis(100);
+const MIN_REDRAW_INTERVAL: Duration = Duration::from_millis(100);
 /// Maximum number of keys and facts that wait for a slow terminal. Senders block beyond it.
 const MAX_WAITING: usize = 64;
 /// Maximum number of header lines in text without scrolling.
@@ -115,7 +115,7 @@ fn handle_input(app: &mut App, poller: &Poller, input: &Receiver<Input>) -> Opti
     let begun = Instant::now();
     let mut is_changed = false;
     loop {
-        let timeout = if is_changed { CALM } else { TICK };
+        let timeout = if is_changed { MIN_REDRAW_INTERVAL } else { MAX_REDRAW_INTERVAL };
         let next = match input.recv_timeout(timeout.saturating_sub(begun.elapsed())) {
             Ok(next) => next,
             Err(RecvTimeoutError::Timeout) => return None,

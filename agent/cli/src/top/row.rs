@@ -10,9 +10,9 @@ use ros2probe_api::Open;
 use ros2probe_api::topics::{ReasonCode, Topic};
 
 /// Time span of losses in the table, so that an old loss does not hide a new one.
-const WINDOW: Duration = Duration::from_secs(30);
+const LOSS_WINDOW: Duration = Duration::from_secs(30);
 /// Minimum time between two samples of the counters.
-const STEP: Duration = Duration::from_millis(900);
+const SAMPLE_INTERVAL: Duration = Duration::from_millis(900);
 
 /// Identity of a topic within all domains.
 #[derive(Clone, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -106,24 +106,24 @@ struct Counters {
     lost: u64,
 }
 
-/// Counters of the last [`WINDOW`].
+/// Counters of the last [`LOSS_WINDOW`].
 #[derive(Clone, Debug, Default)]
 pub struct Past {
     notes: VecDeque<(Instant, Counters)>,
 }
 
 impl Past {
-    /// Returns the loss ratio of the last [`WINDOW`], or the total one if nothing was sent in it.
+    /// Returns the loss ratio of the last [`LOSS_WINDOW`], or the total one if nothing was sent in it.
     /// The flag is whether messages were lost in the window.
     fn loss(&mut self, topic: &Topic<'_>, now: Instant) -> (Option<f64>, bool) {
         let latest = Counters::of(topic);
         let first = self.notes.front().map(|(_, counters)| *counters);
         let lately = first.and_then(|first| latest.since(first));
         let is_lost = lately.is_some_and(|(_, lost)| lost);
-        let is_due = self.notes.back().is_none_or(|(at, _)| now - *at >= STEP);
+        let is_due = self.notes.back().is_none_or(|(at, _)| now - *at >= SAMPLE_INTERVAL);
         if is_due {
             self.notes.push_back((now, latest));
-            while self.notes.front().is_some_and(|(at, _)| now - *at > WINDOW) {
+            while self.notes.front().is_some_and(|(at, _)| now - *at > LOSS_WINDOW) {
                 self.notes.pop_front();
             }
         }

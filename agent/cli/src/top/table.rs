@@ -6,7 +6,7 @@ use super::row::{Column, Row};
 use super::text;
 
 /// Minimum width of the name column.
-const NAME: usize = 20;
+const MIN_NAME_WIDTH: usize = 20;
 /// Maximum width of the state column.
 const MAX_STATE: usize = 28;
 
@@ -70,7 +70,7 @@ impl Field {
     /// Returns the minimum width of the column.
     const fn width(self) -> usize {
         match self {
-            Self::Name => NAME,
+            Self::Name => MIN_NAME_WIDTH,
             Self::Type => 12,
             Self::Wanted => 7,
             Self::Rate | Self::Bandwidth => 6,
@@ -137,7 +137,7 @@ impl Table {
             lengths.max().unwrap_or(0)
         };
         let mut columns = vec![Field::Name, Field::Rate, Field::State];
-        let mut left = width.saturating_sub(NAME + 6 + 9 + 2);
+        let mut left = width.saturating_sub(MIN_NAME_WIDTH + 6 + 9 + 2);
         let commands = [
             (Field::Domain, domains.len() > 1),
             (Field::Bandwidth, true),
@@ -172,9 +172,9 @@ impl Table {
             columns.push(Field::Type);
         }
         // On a narrow screen, the name takes the remaining width.
-        let least = NAME + 6 + 9 + 2;
+        let least = MIN_NAME_WIDTH + 6 + 9 + 2;
         let name = if width < least {
-            NAME.saturating_sub(least - width)
+            MIN_NAME_WIDTH.saturating_sub(least - width)
         } else {
             name
         };

@@ -16,15 +16,15 @@ use super::text::{beginning, safe};
 use super::theme::{Kind, Theme};
 
 /// Minimum usable size: columns and lines.
-pub const LEAST: (u16, u16) = (40, 8);
+pub const MIN_SIZE: (u16, u16) = (40, 8);
 /// Columns before each topic for two marks: selected, and measured on behalf of this program.
-const MARKS: usize = 2;
+const MARK_COLUMNS: usize = 2;
 
 /// Draws the screen, and stores the heights of the panes in the state.
 pub fn draw(app: &mut App, frame: &mut Frame<'_>, theme: Theme, now: Instant) {
     let area = frame.area();
-    if area.width < LEAST.0 || area.height < LEAST.1 {
-        let (width, height) = LEAST;
+    if area.width < MIN_SIZE.0 || area.height < MIN_SIZE.1 {
+        let (width, height) = MIN_SIZE;
         let text = format!("rp top needs {width}x{height}");
         put(frame, area, 0, &text, theme, Kind::Plain);
         return;
@@ -122,16 +122,16 @@ impl Panes {
 }
 
 fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
-    let width = usize::from(area.width) - MARKS;
+    let width = usize::from(area.width) - MARK_COLUMNS;
     let rows: Vec<_> = app.shown().collect();
     let table = Table::plan(width, &rows, theme.cut());
     let (heading, sorted) = table.heading(app.sort);
-    let heading = format!("{:MARKS$}{heading}", "");
+    let heading = format!("{:MARK_COLUMNS$}{heading}", "");
     put(frame, area, 0, &heading, theme, Kind::Heading);
     if let Some((at, width)) = sorted {
         let column = |at: usize| u16::try_from(at).unwrap_or(u16::MAX);
         let area = Rect {
-            x: area.x + column(MARKS + at),
+            x: area.x + column(MARK_COLUMNS + at),
             width: column(width),
             height: 1,
             ..area

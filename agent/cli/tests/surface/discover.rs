@@ -8,7 +8,7 @@ use std::path::Path;
 use proptest::prelude::*;
 use ros2probe::discover::Refusal;
 use ros2probe::discover::message::{LocalParticipant, Message};
-use ros2probe::discover::session::{MOST_PACKETS, Outgoing, Session, Target};
+use ros2probe::discover::session::{MAX_PACKETS, Outgoing, Session, Target};
 use ros2probe_model::facts::bounded::ledger;
 use ros2probe_model::facts::model_time::ModelTime;
 use ros2probe_model::graph::discovery::{Addresses, hexadecimal};
@@ -113,7 +113,7 @@ impl Recording {
 /// Checks the rules of every conversation.
 fn assert_is_polite(session: &Session, recording: &Recording, outgoing: &[(u64, Outgoing)]) {
     let (sent, _) = session.cost();
-    assert!(sent.packets <= MOST_PACKETS, "{} packets", sent.packets);
+    assert!(sent.packets <= MAX_PACKETS, "{} packets", sent.packets);
     assert_eq!(sent.packets as usize, outgoing.len());
     let bytes: usize = outgoing.iter().map(|(_, packet)| packet.bytes.len()).sum();
     assert_eq!(sent.bytes, bytes as u64);

@@ -75,17 +75,17 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Config, Mistakes> {
 }
 
 /// The reader of each version of the file, the oldest first.
-const READERS: &[(u32, Read)] = &[(1, read_1)];
+const VERSION_READERS: &[(u32, Read)] = &[(1, read_1)];
 type Read = fn(&str, &Node) -> Result<Config, Mistakes>;
 
 /// Returns the reader for the version of the file, which defaults to the first version. In a newer
 /// file only the version is reported, since the meaning of its other keys is unknown.
 fn reader(document: &Node, mistakes: &mut Mistakes) -> Option<Read> {
-    let newest = READERS.last().map_or(0, |(version, _)| *version);
+    let newest = VERSION_READERS.last().map_or(0, |(version, _)| *version);
     let Some((version, position)) = document.version() else {
-        return READERS.first().map(|(_, read)| *read);
+        return VERSION_READERS.first().map(|(_, read)| *read);
     };
-    let known = READERS
+    let known = VERSION_READERS
         .iter()
         .find(|(known, _)| i128::from(*known) == version);
     if known.is_none() {

@@ -8,7 +8,7 @@ use crate::agent_facts::AgentFacts;
 use crate::snapshot_cell::Unready;
 
 /// Minimum time between two reports of losses.
-const PAUSE: Duration = Duration::from_secs(1);
+const MIN_REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Detects losses of packets and records before they reach the model.
 #[derive(Debug, Default)]
@@ -31,7 +31,7 @@ pub struct SourceMonitor {
 impl DropMonitor {
     /// Returns events about losses since the last report.
     pub fn check(&mut self, facts: &AgentFacts, now: Instant) -> Vec<AgentEvent> {
-        let early = |at: Instant| now.saturating_duration_since(at) < PAUSE;
+        let early = |at: Instant| now.saturating_duration_since(at) < MIN_REPORT_INTERVAL;
         if self.at.is_some_and(early) {
             return Vec::new();
         }

@@ -103,7 +103,7 @@ fn a_lifecycle_transition_is_a_warning_only_on_an_error() {
 #[test]
 fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
     let log = EventLog::new();
-    let storm = u64::from(MOST) + 50;
+    let storm = u64::from(MAX_EVENTS_PER_SECOND) + 50;
     log.add(taken((0..storm).map(node).collect()), second(0));
     let other = Event {
         kind: EventKind::Silence {
@@ -118,7 +118,7 @@ fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
     more.overflow = vec![(Class::Endpoint, 9)];
     log.add(more, second(1));
     let batch = log.read(0, KeptEvents::CAP);
-    assert_eq!(batch.records.len() as u64, u64::from(MOST) + 1);
+    assert_eq!(batch.records.len() as u64, u64::from(MAX_EVENTS_PER_SECOND) + 1);
     assert_eq!(names(&batch).last(), Some(&"ros2.topic.silent"));
     log.add(Taken::default(), second(1));
     assert_eq!(log.last(), batch.last);
@@ -150,7 +150,7 @@ fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
     );
     assert_eq!(log.dropped()[0], ("storm", 60));
     let recorded: BTreeMap<_, _> = log.recorded().into_iter().collect();
-    assert_eq!(recorded["ros2.node.discovered"], u64::from(MOST) + 1);
+    assert_eq!(recorded["ros2.node.discovered"], u64::from(MAX_EVENTS_PER_SECOND) + 1);
     assert_eq!(
         (recorded[suppressed], recorded["ros2.message.lost"]),
         (2, 0)
@@ -161,12 +161,12 @@ fn a_burst_is_limited_each_second_and_summarized_in_one_event() {
 fn a_burst_of_agent_events_is_limited_by_the_clock_of_the_agent() {
     let log = EventLog::new();
     let at = |seconds| log.begun + Duration::from_secs(seconds);
-    for _ in 0..MOST + 3 {
+    for _ in 0..MAX_EVENTS_PER_SECOND + 3 {
         log.record_at(AgentEvent::Reloaded { watches: 1 }, at(1));
     }
-    assert_eq!(log.last(), u64::from(MOST));
+    assert_eq!(log.last(), u64::from(MAX_EVENTS_PER_SECOND));
     log.record_at(AgentEvent::Reloaded { watches: 1 }, at(2));
-    let rest = log.read(MOST.into(), 10);
+    let rest = log.read(MAX_EVENTS_PER_SECOND.into(), 10);
     assert_eq!(names(&rest)[0], "ros2probe.events.suppressed");
     assert_eq!(rest.records.len(), 2);
 }

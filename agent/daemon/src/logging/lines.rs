@@ -13,13 +13,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 /// Bytes that a ready pipe accepts without blocking (`PIPE_BUF`).
-const PIECE: usize = 4096;
+const PIPE_BUF: usize = 4096;
 /// Maximum time to wait for a reader that has kept up so far.
-const TIMEOUT: Timespec = Timespec {
+const READER_TIMEOUT: Timespec = Timespec {
     tv_sec: 0,
     tv_nsec: 100_000_000,
 };
-const NONE: Timespec = Timespec {
+const NO_WAIT: Timespec = Timespec {
     tv_sec: 0,
     tv_nsec: 0,
 };
@@ -50,7 +50,7 @@ impl<W: Write + AsFd> Lines<W> {
 
     /// Writes a line as far as possible without blocking.
     fn line(&mut self, line: &[u8]) -> io::Result<()> {
-        for piece in line.chunks(PIECE) {
+        for piece in line.chunks(PIPE_BUF) {
             self.ready()?;
             self.target.write_all(piece)?;
             self.is_cut = !piece.ends_with(b"\n");
@@ -74,7 +74,7 @@ impl<W: Write + AsFd> Lines<W> {
     }
 
     fn ready(&self) -> io::Result<()> {
-        let timeout = if self.is_stuck { NONE } else { TIMEOUT };
+        let timeout = if self.is_stuck { NO_WAIT } else { READER_TIMEOUT };
         let mut target = [PollFd::new(&self.target, PollFlags::OUT)];
         // A descriptor after a hangup is ready, too; the write then fails.
         match poll(&mut target, Some(&timeout)) {

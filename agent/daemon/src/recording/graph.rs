@@ -16,7 +16,7 @@ use crate::agent_facts::Ability;
 use crate::latched::latched;
 use crate::snapshot_cell::State;
 
-const VOLATILE: &str = "VOLATILE";
+const VOLATILE_DURABILITY: &str = "VOLATILE";
 
 /// The graph at one moment; a report compares two of them.
 #[derive(Clone, Debug, Default)]
@@ -107,7 +107,7 @@ impl From<&Topic<'_>> for PublishedTopic {
         let passages = passages.map(|each| (each.passage.as_ref(), each.pairs));
         let publishers = topic.publishers.iter();
         let durable_publishers =
-            publishers.filter(|publisher| publisher.qos.durability != VOLATILE);
+            publishers.filter(|publisher| publisher.qos.durability != VOLATILE_DURABILITY);
         Self {
             domain_id: topic.domain_id,
             name: topic.name.to_string(),
@@ -223,7 +223,7 @@ impl Publisher {
     /// repeated only to late joiners.
     #[must_use]
     pub fn is_durable(&self) -> bool {
-        self.qos.durability != VOLATILE
+        self.qos.durability != VOLATILE_DURABILITY
     }
 }
 

@@ -32,9 +32,9 @@ use ros2probe_model::report::snapshot::Transport;
 
 /// Interval of writes to the operating system, by the time of samples. A killed process loses at
 /// most one interval.
-const FLUSH: Duration = Duration::from_secs(1);
+const FLUSH_INTERVAL: Duration = Duration::from_secs(1);
 /// Interval of syncs to disk. A power failure loses at most one interval.
-const SYNC: Duration = Duration::from_secs(5);
+const SYNC_INTERVAL: Duration = Duration::from_secs(5);
 
 /// Sources of facts that samples do not contain.
 pub struct Sources<'a> {
@@ -423,15 +423,15 @@ impl<'a> Recorder<'a> {
         if self.synced.0 == 0 {
             (self.flushed, self.synced) = (now, now);
         }
-        if now.distance(self.flushed) >= FLUSH
+        if now.distance(self.flushed) >= FLUSH_INTERVAL
             && let Some(quota) = &self.quota
         {
             quota.check()?;
         }
-        if now.distance(self.synced) >= SYNC {
+        if now.distance(self.synced) >= SYNC_INTERVAL {
             (self.flushed, self.synced) = (now, now);
             self.writer.sync()
-        } else if now.distance(self.flushed) >= FLUSH {
+        } else if now.distance(self.flushed) >= FLUSH_INTERVAL {
             self.flushed = now;
             self.writer.flush()
         } else {

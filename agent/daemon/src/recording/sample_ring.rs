@@ -9,7 +9,7 @@ use ros2probe_wire::Timestamp;
 use ros2probe_model::facts::dispatch::Sample;
 
 /// Memory of a sample besides its payload, in bytes.
-const OVERHEAD: usize = 256;
+const SAMPLE_OVERHEAD: usize = 256;
 
 /// The last samples, oldest first.
 #[derive(Debug)]
@@ -104,7 +104,7 @@ impl SampleRing {
 }
 
 fn cost(sample: &Sample) -> usize {
-    OVERHEAD + sample.payload.as_ref().map_or(0, bytes::Bytes::len)
+    SAMPLE_OVERHEAD + sample.payload.as_ref().map_or(0, bytes::Bytes::len)
 }
 
 #[cfg(test)]

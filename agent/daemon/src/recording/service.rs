@@ -34,12 +34,12 @@ use ros2probe_message::Library;
 use ros2probe_wire::DomainId;
 
 /// Maximum number of ended recordings whose report is kept.
-const ENDED: usize = 16;
+const MAX_ENDED: usize = 16;
 /// Maximum sizes of a bag's chunk and of a file's index in memory, in bytes.
 const CHUNK_BYTES: u64 = 1 << 20;
 const INDEX_BYTES: u64 = 1 << 20;
 /// Maximum length of the name of a recording, in bytes.
-const NAME: usize = 128;
+const MAX_NAME: usize = 128;
 
 /// All recordings of an agent.
 #[derive(Debug)]
@@ -423,11 +423,11 @@ impl Recordings {
         let name = name.unwrap_or_else(default_name);
         let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
         let is_name = !name.is_empty()
-            && name.len() <= NAME
+            && name.len() <= MAX_NAME
             && !name.starts_with('.')
             && name.chars().all(plain);
         if !is_name {
-            return Err(Refusal::Name(name.chars().take(NAME).collect()));
+            return Err(Refusal::Name(name.chars().take(MAX_NAME).collect()));
         }
         let place = directory.join(&name);
         Ok((name, place))
@@ -597,7 +597,7 @@ pub(super) fn causes(error: &ros2probe_bag::Error) -> String {
 /// Removes all but the latest ended recordings.
 fn forget_ended(list: &mut Vec<Arc<Recording>>) {
     let mut surplus = list.iter().filter(|each| each.is_over()).count();
-    surplus = surplus.saturating_sub(ENDED);
+    surplus = surplus.saturating_sub(MAX_ENDED);
     list.retain(|each| {
         let goes = surplus > 0 && each.is_over();
         surplus -= usize::from(goes);

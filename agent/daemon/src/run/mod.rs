@@ -39,22 +39,22 @@ use ros2probe_model::report::snapshot::{DecodeErrorCount, Snapshot, TableFacts};
 pub use source::{Source, probe};
 
 /// Maximum time for which a replay runs without checking commands.
-const SLICE: Duration = Duration::from_millis(250);
+const REPLAY_SLICE: Duration = Duration::from_millis(250);
 /// Maximum time for which a live source waits without checking commands and the clock. Captured
 /// frames, a half-full record ring and commands end the wait earlier. Each round costs a wake-up,
 /// and on a quiet host nothing else wakes the thread.
-const SLICE_LIVE: Duration = Duration::from_secs(1);
+const LIVE_SLICE: Duration = Duration::from_secs(1);
 /// Minimum interval of snapshots without requests. They are due each second, and a wake-up may be
 /// early or late.
-const PUBLISH: Duration = Duration::from_millis(900);
+const PUBLISH_INTERVAL: Duration = Duration::from_millis(900);
 /// Minimum interval of snapshots with requests.
-const PUBLISH_ASKED: Duration = Duration::from_millis(50);
+const REQUESTED_PUBLISH_INTERVAL: Duration = Duration::from_millis(50);
 /// Maximum interval of snapshots without a reader, while the graph does not change.
-const SNAPSHOT_UNREAD: Duration = Duration::from_secs(5);
+const UNREAD_PUBLISH_INTERVAL: Duration = Duration::from_secs(5);
 /// Maximum interval of clock items to subscribers during silence.
-const SLICE_SUBSCRIBED: Duration = Duration::from_millis(90);
+const SUBSCRIBED_SLICE: Duration = Duration::from_millis(90);
 /// Maximum time for which readers wait for breakpoints in the processes that send to them.
-const ATTACHES_WITHIN: Duration = Duration::from_secs(5);
+const ATTACH_TIMEOUT: Duration = Duration::from_secs(5);
 const CLOCK_INTERVAL: Duration = Duration::from_millis(100);
 /// Minimum step back of the clock which means that the clock was set.
 const SET_BACK: Duration = Duration::from_secs(1);
@@ -187,9 +187,9 @@ impl Run {
             let slice = if !self.observer.has_applied_lists() {
                 Duration::ZERO
             } else if self.outputs.latest.is_asked() {
-                PUBLISH_ASKED
+                REQUESTED_PUBLISH_INTERVAL
             } else if subscribed {
-                SLICE_SUBSCRIBED
+                SUBSCRIBED_SLICE
             } else {
                 self.idle_slice()
             };
@@ -216,11 +216,11 @@ impl Run {
             self.confirm_complete();
             let has_arrived = self.end_jump(pace, has_event);
             let age = published.elapsed();
-            let is_current = age < PUBLISH_ASKED && !self.source.is_paused();
+            let is_current = age < REQUESTED_PUBLISH_INTERVAL && !self.source.is_paused();
             let is_asked = !is_current && self.outputs.latest.is_asked();
             let held = self.source.reached_pause();
             let must = finished || held || has_arrived || polled.is_err() || is_asked;
-            if must || age >= PUBLISH {
+            if must || age >= PUBLISH_INTERVAL {
                 if must || self.is_snapshot_due() {
                     self.publish();
                 } else {
@@ -286,12 +286,12 @@ impl Run {
     /// of a second.
     fn idle_slice(&self) -> Duration {
         if let Source::Replay(_) = self.source {
-            return SLICE;
+            return REPLAY_SLICE;
         }
         let decision = self.observer.next_decision();
         let second = self.history.as_ref().map(History::due);
         let next = second.map_or(decision, |second| second.min(decision));
-        (next - self.source.clock()).min(SLICE_LIVE)
+        (next - self.source.clock()).min(LIVE_SLICE)
     }
 
     /// Returns the next time at which a replay has to return: for a clock item to subscriptions, or
@@ -399,7 +399,7 @@ impl Run {
         }
     }
 
-    /// Confirms requests in force once every message is captured, or after [`ATTACHES_WITHIN`].
+    /// Confirms requests in force once every message is captured, or after [`ATTACH_TIMEOUT`].
     /// Readers then report why messages may be missing.
     fn confirm_complete(&mut self) {
         let Some((_, since)) = self.unconfirmed else {
@@ -409,7 +409,7 @@ impl Run {
             Source::Live(live) => live.is_attaching(&self.observer),
             Source::Replay(_) => false,
         };
-        if is_attaching && since.elapsed() < ATTACHES_WITHIN {
+        if is_attaching && since.elapsed() < ATTACH_TIMEOUT {
             return;
         }
         if let Some((sample_requests, _)) = self.unconfirmed.take() {
@@ -468,7 +468,7 @@ impl Run {
     fn is_snapshot_due(&self) -> bool {
         let was_read = self.outputs.latest.was_read();
         let is_current = self.taken.is_some_and(|(at, revision)| {
-            at.elapsed() < SNAPSHOT_UNREAD && revision == self.observer.memory_revision()
+            at.elapsed() < UNREAD_PUBLISH_INTERVAL && revision == self.observer.memory_revision()
         });
         was_read || !is_current || !matches!(self.source, Source::Live(_))
     }

@@ -20,9 +20,9 @@ use ros2probe_capture::streams::Streams;
 use ros2probe_model::observe::observer::Observer;
 
 /// Interval of progress reports on a terminal.
-const PROGRESS: Duration = Duration::from_secs(1);
+const PROGRESS_INTERVAL: Duration = Duration::from_secs(1);
 /// Minimum gap between packets that the replay skips in one step.
-const FAR: Duration = Duration::from_secs(3600);
+const MIN_SKIPPED_GAP: Duration = Duration::from_secs(3600);
 
 /// Polling interval of requests while a replay is paused.
 const PAUSE_POLL: Duration = Duration::from_millis(5);
@@ -255,7 +255,7 @@ impl Replay {
                 if let Some(until) = later
                     && delay.is_zero()
                 {
-                    let is_far = time - until > FAR;
+                    let is_far = time - until > MIN_SKIPPED_GAP;
                     let time = if is_far { time.0 - 1 } else { until.0 };
                     self.clock = self.clock.max(Timestamp(time));
                     break;
@@ -472,7 +472,7 @@ impl Replay {
         if self.finished {
             eprint!("\r\x1b[K");
             self.progress = None;
-        } else if last.elapsed() >= PROGRESS {
+        } else if last.elapsed() >= PROGRESS_INTERVAL {
             self.progress = Some(Instant::now());
             let seconds =
                 self.clock.nanoseconds_since(self.began.unwrap_or_default()) / 1_000_000_000;

@@ -19,9 +19,9 @@ use ros2probe_model::facts::dispatch::{Missed, MissedReason, Sample};
 use ros2probe_model::facts::selection::SampleRequest;
 
 /// Memory of a queued entry besides its payload, in bytes.
-const OVERHEAD: usize = 256;
+const ENTRY_OVERHEAD: usize = 256;
 /// Interval at which a source that waits for a reader checks for the end of the agent.
-const LOOK: Duration = Duration::from_millis(50);
+const STOP_CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
 /// One subscription, shared by both ends.
 #[derive(Debug)]
@@ -183,7 +183,7 @@ impl Channel {
         charge: Option<&Arc<QueuedBytes>>,
         stop: &CancellationToken,
     ) {
-        let bytes = OVERHEAD + sample.payload.as_ref().map_or(0, bytes::Bytes::len);
+        let bytes = ENTRY_OVERHEAD + sample.payload.as_ref().map_or(0, bytes::Bytes::len);
         let mut queue = self.wait_for_room(bytes, stop);
         let item = Item::Sample(Arc::clone(sample));
         self.push(&mut queue, item, bytes, charge.map(Arc::clone));
@@ -191,7 +191,7 @@ impl Channel {
 
     /// Reports samples that will not be delivered.
     pub(super) fn miss(&self, missed: Missed, stop: &CancellationToken) {
-        let mut queue = self.wait_for_room(OVERHEAD, stop);
+        let mut queue = self.wait_for_room(ENTRY_OVERHEAD, stop);
         if let Some(Item::Missed(last)) = queue.waiting.last_mut()
             && follows(last, &missed)
         {
@@ -199,19 +199,19 @@ impl Channel {
             last.samples += missed.samples;
             return;
         }
-        self.push(&mut queue, Item::Missed(missed), OVERHEAD, None);
+        self.push(&mut queue, Item::Missed(missed), ENTRY_OVERHEAD, None);
     }
 
     /// Reports that all items up to `now` are in the queue.
     pub(super) fn clock(&self, now: Timestamp, stop: &CancellationToken) {
-        let mut queue = self.wait_for_room(OVERHEAD, stop);
+        let mut queue = self.wait_for_room(ENTRY_OVERHEAD, stop);
         if let Some(Item::Clock(last)) = queue.waiting.last_mut()
             && self.request.overflow == Overflow::DropOldest
         {
             *last = now.max(*last);
             return;
         }
-        self.push(&mut queue, Item::Clock(now), OVERHEAD, None);
+        self.push(&mut queue, Item::Clock(now), ENTRY_OVERHEAD, None);
     }
 
     /// Reports the end of the stream.
@@ -318,7 +318,7 @@ impl Channel {
             && !stop.is_cancelled()
         {
             self.wake();
-            let waited = self.changed.wait_timeout(queue, LOOK);
+            let waited = self.changed.wait_timeout(queue, STOP_CHECK_INTERVAL);
             (queue, _) = waited.unwrap_or_else(PoisonError::into_inner);
         }
         queue

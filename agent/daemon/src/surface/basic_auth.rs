@@ -19,7 +19,7 @@ use tokio::sync::Semaphore;
 
 /// A hash without a known password. It makes the check of an unknown name as slow as that of a
 /// known name.
-const NOBODY: &str = "$2y$10$QOauhQNbBCuQDKes6eFzPeMqBSjb7Mr5DUmpZ/VcEd00UAV/LDeSi";
+const UNKNOWN_USER_HASH: &str = "$2y$10$QOauhQNbBCuQDKes6eFzPeMqBSjb7Mr5DUmpZ/VcEd00UAV/LDeSi";
 
 /// Checks the credentials of requests.
 #[derive(Debug)]
@@ -49,7 +49,7 @@ impl Gate {
         }
         let hash = self.users.get(&name);
         let is_known = hash.is_some();
-        let hash = hash.map_or(NOBODY, String::as_str).to_owned();
+        let hash = hash.map_or(UNKNOWN_USER_HASH, String::as_str).to_owned();
         let offered = password.clone();
         // The semaphore is never closed.
         let _turn = self.turn.acquire().await;
@@ -138,6 +138,6 @@ mod tests {
         }
         assert!(!gate.lets_in(&HeaderMap::new()).await);
         assert_eq!(gate.known.lock().unwrap().len(), 1);
-        assert!(bcrypt::verify("x", NOBODY).is_ok());
+        assert!(bcrypt::verify("x", UNKNOWN_USER_HASH).is_ok());
     }
 }

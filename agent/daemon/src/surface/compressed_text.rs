@@ -15,7 +15,7 @@ use lz4_flex::block::{compress_prepend_size, decompress_size_prepended};
 use super::large_responses::Reservation;
 
 /// Approximate size of a piece in bytes, as it is sent.
-const PIECE: usize = 64 << 10;
+const PIECE_BYTES: usize = 64 << 10;
 
 /// Encoding of the text for the client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -65,12 +65,12 @@ impl TextCompressor {
     /// # Errors
     /// Never fails, because it writes to memory.
     pub(super) fn write(&mut self, text: &[u8]) -> io::Result<()> {
-        for part in text.chunks(PIECE) {
+        for part in text.chunks(PIECE_BYTES) {
             match &mut self.form {
                 Form::Plain(rest) => rest.extend_from_slice(part),
                 Form::Gzip(encoder) => encoder.write_all(part)?,
             }
-            self.pack(PIECE);
+            self.pack(PIECE_BYTES);
         }
         Ok(())
     }

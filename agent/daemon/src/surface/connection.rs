@@ -18,19 +18,19 @@ use crate::limit_facts::Slot;
 
 /// A connection is closed after this time without a request, and a stream after this time without a
 /// successful write.
-const IDLE: Duration = Duration::from_secs(75);
+const IDLE_TIMEOUT: Duration = Duration::from_secs(75);
 /// Maximum time from the first to the last byte of a request.
-const REQUEST: Duration = Duration::from_secs(10);
-/// A client must read [`LEAST`] bytes of a complete answer within this time.
-const PROGRESS: Duration = Duration::from_secs(10);
-const LEAST: usize = 64 << 10;
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
+/// A client must read [`MIN_PROGRESS_BYTES`] bytes of a complete answer within this time.
+const PROGRESS_TIMEOUT: Duration = Duration::from_secs(10);
+const MIN_PROGRESS_BYTES: usize = 64 << 10;
 /// An agent that acts this late after a deadline had no CPU time.
-const LATE: Duration = Duration::from_secs(1);
-/// Maximum number of bytes of unfinished requests per listener, in addition to [`FREE`] per
+const MAX_TIMER_DELAY: Duration = Duration::from_secs(1);
+/// Maximum number of bytes of unfinished requests per listener, in addition to [`UNCHARGED_BYTES`] per
 /// connection.
-const UNFINISHED: usize = 256 << 10;
+const MAX_UNFINISHED_BYTES: usize = 256 << 10;
 /// Number of bytes of an unfinished request that every connection may use.
-const FREE: usize = 4 << 10;
+const UNCHARGED_BYTES: usize = 4 << 10;
 
 /// The connections of one listener.
 #[derive(Debug, Default)]
@@ -98,7 +98,7 @@ impl Connections {
             stream,
             state,
             connections: Arc::clone(self),
-            deadline: Box::pin(sleep_until(Instant::now() + IDLE)),
+            deadline: Box::pin(sleep_until(Instant::now() + IDLE_TIMEOUT)),
             slot: Some(slot),
         }
     }
@@ -135,7 +135,7 @@ impl Connections {
 
     /// Counts bytes of an unfinished request; returns false if they exceed the limit.
     fn hold(&self, bytes: usize) -> bool {
-        let more = |held: usize| Some(held + bytes).filter(|held| *held <= UNFINISHED);
+        let more = |held: usize| Some(held + bytes).filter(|held| *held <= MAX_UNFINISHED_BYTES);
         let unfinished = &self.unfinished;
         let held = unfinished.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more);
         held.is_ok()
@@ -231,12 +231,12 @@ impl Progress {
         if let Some((since, _)) = self.stalled
             && self.phase != Phase::Streaming
         {
-            return since + PROGRESS;
+            return since + PROGRESS_TIMEOUT;
         }
         match self.phase {
-            Phase::Waiting if self.read == 0 => self.since + IDLE,
-            Phase::Waiting | Phase::Receiving => self.since + REQUEST,
-            Phase::Working | Phase::Answering | Phase::Streaming => self.since + IDLE,
+            Phase::Waiting if self.read == 0 => self.since + IDLE_TIMEOUT,
+            Phase::Waiting | Phase::Receiving => self.since + REQUEST_TIMEOUT,
+            Phase::Working | Phase::Answering | Phase::Streaming => self.since + IDLE_TIMEOUT,
         }
     }
 }
@@ -274,7 +274,7 @@ impl<S> Connection<S> {
         }
         progress.read += bytes;
         progress.was_empty = false;
-        let beyond = progress.read.saturating_sub(FREE);
+        let beyond = progress.read.saturating_sub(UNCHARGED_BYTES);
         let fresh = beyond.saturating_sub(progress.counted);
         if !self.connections.hold(fresh) {
             return Err(io::Error::other("too many bytes of unfinished requests"));
@@ -296,9 +296,9 @@ impl<S> Connection<S> {
         }
         if let Some((since, taken)) = &mut progress.stalled {
             *taken += bytes;
-            if *taken >= LEAST {
+            if *taken >= MIN_PROGRESS_BYTES {
                 progress.stalled = None;
-            } else if *since + PROGRESS + LATE <= now {
+            } else if *since + PROGRESS_TIMEOUT + MAX_TIMER_DELAY <= now {
                 // An agent with CPU time would have closed the connection at the deadline.
                 progress.stalled = Some((now, 0));
             }
@@ -496,7 +496,7 @@ mod tests {
             assert!(stopped.is_none(), "the buffer is full");
             client.read_exact(&mut [0; 1 << 10]).await.unwrap();
             // The agent gets no CPU time.
-            tokio::time::advance(2 * PROGRESS).await;
+            tokio::time::advance(2 * PROGRESS_TIMEOUT).await;
         }
         assert_eq!(connection.write(&[7; 1 << 10]).await.unwrap(), 1 << 10);
     }
@@ -516,7 +516,7 @@ mod tests {
             refused += u32::from(connection.read_exact(&mut bytes).await.is_err());
             large.push((connection, sending));
         }
-        assert!(connections.unfinished.load(Ordering::Relaxed) <= UNFINISHED);
+        assert!(connections.unfinished.load(Ordering::Relaxed) <= MAX_UNFINISHED_BYTES);
         assert_eq!(refused, 13, "36 KiB each of 256");
         let (mut small, mut client) = join();
         client.write_all(b"GET /metrics").await.unwrap();

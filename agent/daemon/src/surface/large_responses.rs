@@ -13,13 +13,13 @@ use tokio_util::sync::CancellationToken;
 use super::compressed_text::{CompressedText, Encoding, TextCompressor};
 
 /// Maximum number of large answers of one surface that are created simultaneously.
-const AT_ONCE: usize = 2;
+const MAX_CONCURRENT: usize = 2;
 /// Budget in bytes for compressed answers of one surface that are being read.
-const KEPT: usize = 4 << 20;
+const MAX_RETAINED_BYTES: usize = 4 << 20;
 /// Minimum size of a large answer, in bytes.
-const LARGE: usize = 256 << 10;
+const MIN_LARGE_BYTES: usize = 256 << 10;
 /// Maximum time that a request waits for a permit.
-const TIMEOUT: Duration = Duration::from_secs(2);
+const PERMIT_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Large answers of one surface.
 #[derive(Debug)]
@@ -55,8 +55,8 @@ impl LargeResponses {
     /// Creates the state without any answers.
     pub(super) const fn new() -> Self {
         Self {
-            making: Semaphore::const_new(AT_ONCE),
-            longest: TIMEOUT,
+            making: Semaphore::const_new(MAX_CONCURRENT),
+            longest: PERMIT_TIMEOUT,
             kept: Mutex::new(Vec::new()),
         }
     }
@@ -77,7 +77,7 @@ impl LargeResponses {
         let mut kept = self.lock();
         let mut sum: usize = kept.iter().map(|each| each.bytes).sum();
         kept.retain(|each| {
-            let stays = sum + bytes <= KEPT;
+            let stays = sum + bytes <= MAX_RETAINED_BYTES;
             if !stays {
                 each.given_up.cancel();
                 sum -= each.bytes;
@@ -99,7 +99,7 @@ impl LargeResponses {
 impl RenderPermit {
     /// Returns the text as a response body.
     pub(super) fn keep_packed(self, text: CompressedText) -> Body {
-        if text.len() < LARGE {
+        if text.len() < MIN_LARGE_BYTES {
             return text.into_body(None);
         }
         let room = self.of.room(text.kept());
@@ -108,7 +108,7 @@ impl RenderPermit {
 
     /// Returns the bytes as a response body of the same length.
     pub(super) fn keep(self, bytes: Bytes) -> Body {
-        if bytes.len() < LARGE {
+        if bytes.len() < MIN_LARGE_BYTES {
             return bytes.into();
         }
         let mut packer = TextCompressor::new(Encoding::Identity);
@@ -156,7 +156,7 @@ mod tests {
     #[tokio::test]
     async fn slow_readers_of_large_answers_do_not_block_others() {
         static ANSWERS: LargeResponses = LargeResponses {
-            making: Semaphore::const_new(AT_ONCE),
+            making: Semaphore::const_new(MAX_CONCURRENT),
             longest: Duration::ZERO,
             kept: Mutex::new(Vec::new()),
         };
@@ -167,7 +167,7 @@ mod tests {
             bodies.push(turn.keep(bytes.clone()));
         }
         let held: usize = ANSWERS.lock().iter().map(|kept| kept.bytes).sum();
-        assert!(held <= KEPT, "{held}");
+        assert!(held <= MAX_RETAINED_BYTES, "{held}");
         // The last answers are complete, and the first answers end early.
         let mut whole = 0;
         for body in bodies {
@@ -186,14 +186,14 @@ mod tests {
     #[tokio::test]
     async fn a_third_answer_gets_no_permit_until_one_of_two_is_created() {
         static ANSWERS: LargeResponses = LargeResponses {
-            making: Semaphore::const_new(AT_ONCE),
+            making: Semaphore::const_new(MAX_CONCURRENT),
             longest: Duration::ZERO,
             kept: Mutex::new(Vec::new()),
         };
         let one = ANSWERS.turn().await.unwrap();
         let _two = ANSWERS.turn().await.unwrap();
         assert!(ANSWERS.turn().await.is_none());
-        let _small = one.keep(noise(LARGE - 1));
+        let _small = one.keep(noise(MIN_LARGE_BYTES - 1));
         assert!(ANSWERS.turn().await.is_some());
         assert!(ANSWERS.lock().is_empty(), "small answers take no room");
     }

@@ -135,7 +135,7 @@ fn every_type_of_the_embedded_packages_has_the_hash_of_its_description() {
 fn description(structure: &Structure) -> Described {
     let mut fields: Vec<_> = structure.fields.iter().map(field_description).collect();
     if fields.is_empty() {
-        fields.push(field(PLACEHOLDER, 3));
+        fields.push(field(PLACEHOLDER_MEMBER, 3));
     }
     described(&structure.name.to_string(), &fields)
 }
@@ -364,7 +364,7 @@ fn waiting_responses_and_forged_types_are_bounded_and_do_not_displace_used_ones(
 
 #[test]
 fn a_type_without_fields_is_an_octet() {
-    let empty = described("a/msg/Empty", &[field(PLACEHOLDER, 3)]);
+    let empty = described("a/msg/Empty", &[field(PLACEHOLDER_MEMBER, 3)]);
     let found = described_type(&Response::of(&[empty]).payload()).unwrap();
     let decoded = decode(&found, &[0, 1, 0, 0, 0], &Limits::default()).unwrap();
     let text = yaml::document(&decoded.message, &Default::default(), yaml::Style::Block);

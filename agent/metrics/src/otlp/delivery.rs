@@ -15,10 +15,10 @@ use super::exports::{Exports, Outcome, Reason, Signal};
 use super::reports::Report;
 
 /// Pauses before a batch is offered again.
-const FIRST_PAUSE: Duration = Duration::from_secs(1);
-const LONGEST_PAUSE: Duration = Duration::from_secs(30);
+const FIRST_RETRY_DELAY: Duration = Duration::from_secs(1);
+const MAX_RETRY_DELAY: Duration = Duration::from_secs(30);
 /// Time for the last batches, of the two seconds for stopping.
-const LAST: Duration = Duration::from_millis(1_400);
+const LAST_BATCH_TIMEOUT: Duration = Duration::from_millis(1_400);
 
 /// An exporter of the library and the form of its batches.
 pub(super) trait Export {
@@ -159,7 +159,7 @@ impl<E: Export> Delivery<E> {
 
     /// Sends the last batches once each, until one fails.
     pub(super) async fn finish(mut self, batches: Vec<E::Batch>) {
-        let deadline = Instant::now() + LAST;
+        let deadline = Instant::now() + LAST_BATCH_TIMEOUT;
         let mut left = batches.iter();
         while let Some(batch) = left.next() {
             let sent = timeout_at(deadline, self.send(batch, false)).await;
@@ -176,7 +176,7 @@ impl<E: Export> Delivery<E> {
 
     /// Offers a batch until the receiver accepts or refuses it.
     async fn offer(&mut self, batch: &E::Batch) {
-        let (mut pause, mut is_again) = (FIRST_PAUSE, false);
+        let (mut pause, mut is_again) = (FIRST_RETRY_DELAY, false);
         while let Err((error, is_refused)) = self.send(batch, is_again).await {
             self.failed(&error);
             if is_refused {
@@ -185,7 +185,7 @@ impl<E: Export> Delivery<E> {
             }
             is_again = true;
             sleep(pause).await;
-            pause = (pause * 2).min(LONGEST_PAUSE);
+            pause = (pause * 2).min(MAX_RETRY_DELAY);
         }
     }
 

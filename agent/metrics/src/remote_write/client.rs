@@ -22,13 +22,13 @@ use tokio_rustls::rustls::{ClientConfig, RootCertStore};
 use super::request::Version;
 use super::settings::{Settings, SettingsError};
 
-const VERSION: HeaderName = HeaderName::from_static("x-prometheus-remote-write-version");
+const VERSION_HEADER: HeaderName = HeaderName::from_static("x-prometheus-remote-write-version");
 /// Number of samples that a receiver of version 2.0 wrote.
-const WRITTEN: &str = "x-prometheus-remote-write-samples-written";
+const SAMPLES_WRITTEN_HEADER: &str = "x-prometheus-remote-write-samples-written";
 /// Maximum length of an answer that is read, in bytes.
 const ANSWER_BYTES: usize = 4 << 10;
 /// Maximum length of a reason in the log, in characters.
-const REASON: usize = 200;
+const MAX_REASON: usize = 200;
 /// Maximum pause that a receiver may demand.
 const LONGEST_PAUSE: Duration = Duration::from_mins(5);
 
@@ -117,7 +117,7 @@ impl Client {
         for (name, value) in [
             (CONTENT_ENCODING, "snappy"),
             (CONTENT_TYPE, version.content_type()),
-            (VERSION, version.header()),
+            (VERSION_HEADER, version.header()),
             (USER_AGENT, concat!("ros2probe/", env!("CARGO_PKG_VERSION"))),
         ] {
             headers.insert(name, HeaderValue::from_static(value));
@@ -191,7 +191,7 @@ fn certificates(text: &str) -> Option<Vec<CertificateDer<'static>>> {
 /// Interprets a response (Prometheus Remote-Write 2.0, "Responses").
 fn answer(response: &Response<Bytes>, version: Version) -> Answer {
     let (status, headers) = (response.status(), response.headers());
-    let written = headers.get(WRITTEN).and_then(number);
+    let written = headers.get(SAMPLES_WRITTEN_HEADER).and_then(number);
     // A receiver of version 1.0 ignores a body of version 2.0, or cannot parse it.
     let is_old = matches!(
         status,
@@ -209,7 +209,7 @@ fn answer(response: &Response<Bytes>, version: Version) -> Answer {
         return Answer::Accepted;
     }
     let text = String::from_utf8_lossy(response.body());
-    let text: String = text.trim().chars().take(REASON).collect();
+    let text: String = text.trim().chars().take(MAX_REASON).collect();
     let reason = format!("{status}: {text}");
     if status.is_server_error() || is_temporary(status) {
         Answer::Again(reason, pause(headers))
@@ -268,7 +268,7 @@ mod tests {
         let two = |response: &_| answer(response, Version::Two);
         let again = |text: &str, pause| Answer::Again(text.to_owned(), pause);
         assert_eq!(one(&reply(204, &[], "")), Answer::Accepted);
-        assert_eq!(two(&reply(204, &[(WRITTEN, "3")], "")), Answer::Accepted);
+        assert_eq!(two(&reply(204, &[(SAMPLES_WRITTEN_HEADER, "3")], "")), Answer::Accepted);
         assert_eq!(two(&reply(204, &[], "")), Answer::Unconfirmed);
         for status in [400, 415] {
             assert_eq!(two(&reply(status, &[], "")), Answer::UnknownVersion);
@@ -276,7 +276,7 @@ mod tests {
         let old = one(&reply(400, &[], "out of order\n"));
         let reason = "400 Bad Request: out of order".to_owned();
         assert_eq!(old, Answer::Refused(reason.clone(), None));
-        let partly = two(&reply(400, &[(WRITTEN, "2")], "out of order"));
+        let partly = two(&reply(400, &[(SAMPLES_WRITTEN_HEADER, "2")], "out of order"));
         assert_eq!(partly, Answer::Refused(reason, Some(2)));
         let pause = Some(Duration::from_secs(7));
         let busy = reply(429, &[("retry-after", "7")], "");

@@ -26,7 +26,7 @@ use crate::metric_source::MetricSource;
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
 /// Time for the last requests, of the two seconds for stopping.
-const LAST: Duration = Duration::from_millis(1_400);
+const LAST_REQUEST_TIMEOUT: Duration = Duration::from_millis(1_400);
 /// Maximum time to wait for fresh figures.
 const REFRESH_TIMEOUT: Duration = Duration::from_millis(500);
 
@@ -172,7 +172,7 @@ impl Job {
     /// Completes when the time for the last requests is over.
     async fn ended(&self) {
         self.stop.cancelled().await;
-        sleep(LAST).await;
+        sleep(LAST_REQUEST_TIMEOUT).await;
     }
 
     /// Collects at each interval until the agent stops, and then a last time.

@@ -34,15 +34,15 @@ pub use bounds::{Range, Source};
 /// Name of the agent's host in answers if no participant announces it.
 pub const THIS_HOST: &str = "localhost";
 /// Latest messages of one writer whose acknowledgement gives a round trip.
-const SENT: usize = 16;
+const MAX_SENT_PER_WRITER: usize = 16;
 /// An ACKNACK answers no HEARTBEAT that left longer before it.
-const ANSWER: Duration = Duration::from_millis(500);
+const MAX_RESPONSE_DELAY: Duration = Duration::from_millis(500);
 /// Latest messages of writers that no peer has acknowledged so far.
-const OTHERS: usize = 32;
+const MAX_UNACKNOWLEDGED_WRITERS: usize = 32;
 /// Nanoseconds between two clocks, beyond the uncertainty: from the first number on the offset is a
 /// finding, and below the second it is none any longer.
-const APART: i64 = 10_000_000;
-const TOGETHER: i64 = 5_000_000;
+const MIN_OFFSET_OF_FINDING: i64 = 10_000_000;
+const MAX_OFFSET_OF_RESOLUTION: i64 = 5_000_000;
 
 /// The clocks of all hosts whose messages arrive here.
 #[derive(Debug, Default)]
@@ -74,8 +74,8 @@ struct Peer {
 #[derive(Debug, Default)]
 struct Sent {
     newest: SequenceNumber,
-    times: [(SequenceNumber, ModelTime); SENT],
-    /// HEARTBEATs that follow each other by less than `ANSWER`.
+    times: [(SequenceNumber, ModelTime); MAX_SENT_PER_WRITER],
+    /// HEARTBEATs that follow each other by less than `MAX_RESPONSE_DELAY`.
     announced: Option<Announced>,
     /// The greatest number that a reader acknowledged.
     acknowledged: SequenceNumber,
@@ -95,7 +95,7 @@ struct Announced {
 /// The latest messages of writers that no peer has acknowledged, and the times at which they left.
 #[derive(Debug, Default)]
 struct Others {
-    messages: [(Guid, SequenceNumber, ModelTime); OTHERS],
+    messages: [(Guid, SequenceNumber, ModelTime); MAX_UNACKNOWLEDGED_WRITERS],
     /// Place of the oldest message.
     oldest: usize,
 }
@@ -236,8 +236,8 @@ impl Clocks {
             let range = peer.evidence.range(now, clock);
             let least = range.map_or(0, |range| range.least_distance());
             let is_apart = match peer.apart {
-                Some(_) => least > TOGETHER,
-                None => least > APART,
+                Some(_) => least > MAX_OFFSET_OF_RESOLUTION,
+                None => least > MIN_OFFSET_OF_FINDING,
             };
             if is_apart != peer.apart.is_some() {
                 peer.apart = range.filter(|_| is_apart);
@@ -363,7 +363,7 @@ impl Sent {
     }
 
     fn announce(&mut self, number: SequenceNumber, at: ModelTime) {
-        let before = self.announced.filter(|before| at - before.last < ANSWER);
+        let before = self.announced.filter(|before| at - before.last < MAX_RESPONSE_DELAY);
         self.announced = Some(Announced {
             first: before.map_or(at, |before| before.first),
             last: at,
@@ -396,7 +396,7 @@ impl Others {
         if let Some(oldest) = self.messages.get_mut(self.oldest) {
             *oldest = message;
         }
-        self.oldest = (self.oldest + 1) % OTHERS;
+        self.oldest = (self.oldest + 1) % MAX_UNACKNOWLEDGED_WRITERS;
     }
 
     /// Returns the first time at which a message left: an acknowledgement may be for the first
@@ -421,7 +421,7 @@ pub fn seconds(nanoseconds: i64) -> f64 {
 
 /// Returns the slot of a number.
 fn slot(number: SequenceNumber) -> usize {
-    usize::try_from(number.0 % SENT as u64).unwrap_or(0)
+    usize::try_from(number.0 % MAX_SENT_PER_WRITER as u64).unwrap_or(0)
 }
 
 /// Returns by how many nanoseconds a stamp is ahead of a time.

@@ -30,12 +30,12 @@ use near::LonelyTopics;
 /// Time for which an endpoint may have no counterpart, because nodes start one after another.
 const MATCH_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum number of findings kept of each kind.
-const PER_KIND: usize = 256;
+const MAX_FINDINGS_PER_KIND: usize = 256;
 /// Maximum number of series for incompatible pairs.
 const MAX_QOS_PAIRS: usize = 1024;
 /// Maximum number of steps per examination, and per topic. A step takes about ten nanoseconds.
-const STEPS: usize = 500_000;
-const STEPS_PER_TOPIC: usize = 50_000;
+const MAX_STEPS: usize = 500_000;
+const MAX_STEPS_PER_TOPIC: usize = 50_000;
 
 /// Examines the graph after each change.
 #[derive(Debug, Default)]
@@ -82,7 +82,7 @@ impl Examiner {
     /// Returns the number of findings, their cap, and how many were omitted so far.
     #[must_use]
     pub fn size(&self) -> (usize, usize, u64) {
-        let limit = PER_KIND * Diagnosis::KINDS.len();
+        let limit = MAX_FINDINGS_PER_KIND * Diagnosis::KINDS.len();
         (self.current.list.len(), limit, self.left_out)
     }
 
@@ -195,7 +195,7 @@ impl Findings {
             qos_pairs: Vec::new(),
             left_out: 0,
             unexamined: 0,
-            steps: STEPS,
+            steps: MAX_STEPS,
             steps_here: 0,
         }
     }
@@ -205,7 +205,7 @@ impl Findings {
         let kinds = Diagnosis::KINDS.iter().zip(&mut self.counts);
         let mut own = kinds.filter(|(kind, _)| **kind == diagnosis.kind());
         match own.next() {
-            Some((_, count)) if *count < PER_KIND => {
+            Some((_, count)) if *count < MAX_FINDINGS_PER_KIND => {
                 *count += 1;
                 self.list.push(diagnosis);
             }
@@ -220,7 +220,7 @@ impl Findings {
 
     /// Starts the step budget of the next topic.
     const fn turn(&mut self) {
-        self.steps_here = STEPS_PER_TOPIC;
+        self.steps_here = MAX_STEPS_PER_TOPIC;
     }
 
     /// Spends steps; returns false if the budget is exhausted.

@@ -50,12 +50,12 @@ const MESSAGE_BYTES: usize = 64 << 10;
 /// Maximum size of all unfinished messages, in bytes.
 const ASSEMBLY_BYTES: usize = 1 << 20;
 /// Bytes of one writer that may be captured in a burst, and per second.
-const WRITER: Allowance = Allowance::new(1 << 20, 64 << 10);
+const WRITER_ALLOWANCE: Allowance = Allowance::new(1 << 20, 64 << 10);
 /// Bytes of all writers that may be captured in a burst, and per second.
-const ALL_WRITERS: Allowance = Allowance::new(8 << 20, 512 << 10);
+const COMMON_ALLOWANCE: Allowance = Allowance::new(8 << 20, 512 << 10);
 /// The same of transforms: a message each of thirty joints, 100 times a second, is 300 KB/s.
-const BROADCASTER: Allowance = Allowance::new(2 << 20, 512 << 10);
-const ALL_BROADCASTERS: Allowance = Allowance::new(8 << 20, 2 << 20);
+const BROADCASTER_ALLOWANCE: Allowance = Allowance::new(2 << 20, 512 << 10);
+const COMMON_BROADCASTER_ALLOWANCE: Allowance = Allowance::new(8 << 20, 2 << 20);
 /// A paused writer is captured again once it is allowed this many bytes.
 const RESUME_BYTES: u64 = 256 << 10;
 
@@ -282,8 +282,8 @@ impl Default for Robot {
             writers: Bounded::default(),
             assembly: Assembly::new(ASSEMBLY_BYTES),
             allowances: Allowances {
-                transforms: CommonAllowance::new(ALL_BROADCASTERS, RESUME_BYTES),
-                others: CommonAllowance::new(ALL_WRITERS, RESUME_BYTES),
+                transforms: CommonAllowance::new(COMMON_BROADCASTER_ALLOWANCE, RESUME_BYTES),
+                others: CommonAllowance::new(COMMON_ALLOWANCE, RESUME_BYTES),
             },
             logs: Logs::default(),
             diagnostics: Diagnostics::default(),
@@ -346,8 +346,8 @@ impl Robot {
             topic: topic.clone(),
             standard,
             allowance: WriterAllowance::new(match standard {
-                Standard::Transforms => BROADCASTER,
-                _ => WRITER,
+                Standard::Transforms => BROADCASTER_ALLOWANCE,
+                _ => WRITER_ALLOWANCE,
             }),
             read: ReadNumbers::default(),
         };

@@ -41,7 +41,7 @@ use service::{CallId, Position, Service, Sighting};
 /// Maximum bytes per second of one writer. A writer that exceeds it is not captured for a while.
 const MAX_BYTES_PER_SECOND: usize = 4 << 20;
 /// Time for which a writer above the maximum is not captured.
-const SUSPENDED: Duration = Duration::from_secs(10);
+const SUSPENSION_TIME: Duration = Duration::from_secs(10);
 
 /// End of the name of a node's service for descriptions of types (REP-2016).
 const TYPE_DESCRIPTION: &str = "/get_type_description";
@@ -228,7 +228,7 @@ impl Services {
         if self.charge(guid, payload.len(), at) {
             return true;
         }
-        let identity = Identity::of(call, payload.get(ENCAPSULATION..).unwrap_or_default());
+        let identity = Identity::of(call, payload.get(ENCAPSULATION_BYTES..).unwrap_or_default());
         self.identities.put((guid, number), identity);
         false
     }
@@ -241,7 +241,7 @@ impl Services {
         if !writer.is_over_budget(bytes, at) {
             return false;
         }
-        let until = at + SUSPENDED;
+        let until = at + SUSPENSION_TIME;
         writer.suspended = Some(until);
         let key = writer.service.key.clone();
         self.suspend(&key, until, at);
@@ -550,7 +550,7 @@ fn identity(
             },
             _ => return Ok(None),
         };
-        (call, ENCAPSULATION)
+        (call, ENCAPSULATION_BYTES)
     };
     let body = if sample.is_start() {
         found.payload.get(body..).unwrap_or_default()
@@ -580,7 +580,7 @@ pub fn call(half: Half, found: &Found<'_>, sample: &Sample, vendor: VendorId) ->
 }
 
 /// Bytes of the encapsulation header (RTPS 2.5, 10.2).
-const ENCAPSULATION: usize = 4;
+const ENCAPSULATION_BYTES: usize = 4;
 
 /// Returns where the sample was seen.
 fn position(sample: &Sample) -> Position {

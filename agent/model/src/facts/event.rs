@@ -27,13 +27,13 @@ use crate::facts::wall_clock::WallClock;
 use crate::facts::watch::WatchState;
 
 /// Maximum number of events per class and second of the source's clock.
-const MOST: u16 = 512;
+const MAX_EVENTS_PER_SECOND: u16 = 512;
 /// Number of waiting events above which they should be taken before further input.
-const MANY: usize = 1024;
+const MANY_WAITING: usize = 1024;
 /// Maximum length of a text in an event, such as a topic's name, in bytes.
-pub(crate) const TEXT: usize = 256;
+pub(crate) const MAX_TEXT: usize = 256;
 /// Maximum length of a list in an event, such as the participants of a duplicate node.
-const LIST: usize = 8;
+const MAX_LIST: usize = 8;
 
 /// An event.
 #[derive(Clone, Debug, PartialEq)]
@@ -273,7 +273,7 @@ impl Events {
         if second != quota.second && second.checked_add(1) != Some(quota.second) {
             (quota.second, quota.in_second) = (second, 0);
         }
-        if quota.in_second >= MOST {
+        if quota.in_second >= MAX_EVENTS_PER_SECOND {
             quota.overflow += 1;
             return;
         }
@@ -285,7 +285,7 @@ impl Events {
     /// Returns whether so many events wait that they should be taken before further input.
     #[must_use]
     pub fn are_many(&self) -> bool {
-        self.waiting.len() >= MANY
+        self.waiting.len() >= MANY_WAITING
     }
 
     /// Adds samples that reached no receiver to the burst of their writer.
@@ -384,7 +384,7 @@ impl Events {
 /// Returns the text, truncated to the maximum length in an event.
 #[must_use]
 pub fn bounded(text: &str) -> &str {
-    text.get(..text.floor_char_boundary(TEXT))
+    text.get(..text.floor_char_boundary(MAX_TEXT))
         .unwrap_or_default()
 }
 
@@ -393,11 +393,11 @@ pub fn bounded(text: &str) -> &str {
 pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
     let mut finding = finding.clone();
     match &mut finding {
-        Diagnosis::TypeConflict { types, .. } => types.truncate(LIST),
-        Diagnosis::TypeHashConflict { hashes, .. } => hashes.truncate(LIST),
-        Diagnosis::DuplicateNode { participants, .. } => participants.truncate(LIST),
-        Diagnosis::NodeInSeveralDomains { domains, .. } => domains.truncate(LIST),
-        Diagnosis::SharedMachineId { participants, .. } => participants.truncate(LIST),
+        Diagnosis::TypeConflict { types, .. } => types.truncate(MAX_LIST),
+        Diagnosis::TypeHashConflict { hashes, .. } => hashes.truncate(MAX_LIST),
+        Diagnosis::DuplicateNode { participants, .. } => participants.truncate(MAX_LIST),
+        Diagnosis::NodeInSeveralDomains { domains, .. } => domains.truncate(MAX_LIST),
+        Diagnosis::SharedMachineId { participants, .. } => participants.truncate(MAX_LIST),
         Diagnosis::LogErrors { text, .. } => *text = bounded(text).into(),
         Diagnosis::ClocksApart { peer, .. } => *peer = bounded(peer).into(),
         Diagnosis::QosIncompatible { .. }
@@ -499,13 +499,13 @@ mod tests {
     #[test]
     fn a_storm_of_one_class_is_counted_and_does_not_displace_the_others() {
         let mut events = Events::default();
-        for number in 0..MOST + 7 {
+        for number in 0..MAX_EVENTS_PER_SECOND + 7 {
             events.push(ModelTime::from_nanoseconds(number.into()), node("/a"));
         }
         events.lose(&loss(guid(1), 10, 5, 7));
         events.end_bursts(|_| {});
         let taken = events.take(WallClock::default());
-        assert_eq!(taken.events.len(), usize::from(MOST) + 1);
+        assert_eq!(taken.events.len(), usize::from(MAX_EVENTS_PER_SECOND) + 1);
         assert_eq!(taken.overflow, [(Class::Node, 7)]);
         // Taking events does not renew the quota of a second; the next second has its own.
         events.push(ModelTime::from_nanoseconds(SECOND - 1), node("/b"));
@@ -562,12 +562,12 @@ mod tests {
     #[test]
     fn long_texts_are_truncated_between_characters() {
         let long: TopicName = "\u{e9}".repeat(5_000).into();
-        assert_eq!(bounded(&long).len(), TEXT);
-        assert_eq!(long.bounded(TEXT).len(), TEXT);
+        assert_eq!(bounded(&long).len(), MAX_TEXT);
+        assert_eq!(long.bounded(MAX_TEXT).len(), MAX_TEXT);
         let short: TopicName = "/points".into();
         assert!(std::sync::Arc::ptr_eq(
             &short.shared(),
-            &short.bounded(TEXT).shared()
+            &short.bounded(MAX_TEXT).shared()
         ));
     }
 }

@@ -13,7 +13,7 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{DiscoveryEvents, LatestDeliveryLosses, LatestLosses, MissingSamples};
 
 /// Number of the latest entries that a new loss may extend.
-const RECENT: usize = 16;
+const MAX_EXTENDED: usize = 16;
 
 /// A change of a participant, endpoint or node.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -124,7 +124,7 @@ impl Journal {
             } = *loss;
             (writer, participant, socket, destination, cause)
         };
-        let mut recent = self.delivery_losses.iter_mut().rev().take(RECENT);
+        let mut recent = self.delivery_losses.iter_mut().rev().take(MAX_EXTENDED);
         let continued =
             recent.find(|entry| whose(entry) == whose(&loss) && entry.last.precedes(loss.first));
         if let Some(entry) = continued {

@@ -250,7 +250,7 @@ impl TryFrom<ExpectationValues> for Expectations {
             publishers.map(f64::from),
             subscribers.map(f64::from),
         ];
-        for ((key, low, high), value) in RANGES.into_iter().zip(values) {
+        for ((key, low, high), value) in EXPECTATION_RANGES.into_iter().zip(values) {
             if let Some(value) = value.filter(|value| !(low..=high).contains(value)) {
                 return Err(ExpectationError::OutOfRange {
                     key,
@@ -289,7 +289,7 @@ pub const MAX_GLOBS: usize = 256;
 pub const MAX_GLOB_BYTES: usize = 16 << 10;
 
 /// Valid ranges of expectations, as in the configuration's schema.
-const RANGES: [(&str, f64, f64); 8] = [
+const EXPECTATION_RANGES: [(&str, f64, f64); 8] = [
     ("min_rate_hz", 0.0, 1_000_000.0),
     ("max_rate_hz", 0.0, 1_000_000.0),
     // The longest window is `rate::SECONDS`.

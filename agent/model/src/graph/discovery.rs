@@ -44,7 +44,7 @@ pub use memory::{Memory, hexadecimal};
 use pending::PendingTable;
 pub use priority::Priority;
 
-const PENDING_FOR: Duration = Duration::from_secs(60);
+const PENDING_TIMEOUT: Duration = Duration::from_secs(60);
 /// Maximum length of a topic or type name: `string<256>` in the builtin topics of DDS. Longer names
 /// are rejected to bound memory.
 const MAX_NAME_LEN: usize = 256;
@@ -344,7 +344,7 @@ impl Discovery {
         for (end, prefix) in expired {
             self.remove(prefix, end, Some(Event::Expired), journal);
         }
-        let fresh = |at: ModelTime| at + PENDING_FOR > now;
+        let fresh = |at: ModelTime| at + PENDING_TIMEOUT > now;
         let participants = &self.participants;
         self.pending_endpoints
             .retain(|guid, pending| fresh(pending.at) || participants.contains_key(&guid.prefix));

@@ -17,17 +17,17 @@ use foldhash::HashMap;
 use ros2probe_wire::{Guid, SequenceNumber};
 
 /// Memory per sample, and per fragment that arrived early, in addition to its bytes.
-const OVERHEAD: usize = 128;
+const ENTRY_OVERHEAD: usize = 128;
 /// An unfinished sample is dropped after this long without a fragment.
 const FRAGMENT_TIMEOUT: Duration = Duration::from_secs(30);
 /// Minimum allocation for a sample, in bytes.
-const LEAST: usize = 4096;
+const MIN_ALLOCATION: usize = 4096;
 /// Minimum size of a buffer that is reused: the kernel would have to clear each page of a new one.
-const LARGE: usize = 128 << 10;
+const MIN_REUSED_BUFFER: usize = 128 << 10;
 /// Maximum number of buffers kept for reuse, and the time without a sample after which they are
 /// freed.
-const KEPT: usize = 4;
-const KEPT_FOR: Duration = Duration::from_secs(10);
+const MAX_SPARE_BUFFERS: usize = 4;
+const SPARE_BUFFER_LIFETIME: Duration = Duration::from_secs(10);
 
 /// All unfinished samples.
 #[derive(Debug)]
@@ -98,7 +98,7 @@ impl Assembly {
                 head: self.buffer(size),
                 ..Part::new(self.begun, size, fragment_size, now)
             };
-            self.bytes += part.bytes() + OVERHEAD;
+            self.bytes += part.bytes() + ENTRY_OVERHEAD;
             self.parts.insert(key, part);
         }
         let Some(part) = self.parts.get_mut(&key) else {
@@ -147,9 +147,9 @@ impl Assembly {
             return None;
         }
         let payload = Bytes::from(part.head);
-        if (LARGE..=self.limit / 2).contains(&payload.len()) {
+        if (MIN_REUSED_BUFFER..=self.limit / 2).contains(&payload.len()) {
             let others = self.limit / 2 - payload.len();
-            while self.passed.len() >= KEPT || self.passed_bytes() > others {
+            while self.passed.len() >= MAX_SPARE_BUFFERS || self.passed_bytes() > others {
                 self.passed.pop_front();
             }
             self.passed.push_back((part.touched, payload.clone()));
@@ -167,7 +167,7 @@ impl Assembly {
         let is_free = |(_, payload): &(ModelTime, Bytes)| {
             (size..=2 * size).contains(&payload.len()) && payload.is_unique()
         };
-        let index = (size >= LARGE).then(|| self.passed.iter().position(is_free));
+        let index = (size >= MIN_REUSED_BUFFER).then(|| self.passed.iter().position(is_free));
         let free = index.flatten().and_then(|index| self.passed.remove(index));
         let mut buffer = free.map_or_else(Vec::new, |(_, payload)| Vec::from(payload));
         buffer.clear();
@@ -187,7 +187,7 @@ impl Assembly {
     /// Drops samples that have received no fragment for a long time.
     pub fn expire(&mut self, now: ModelTime) {
         self.retain(|_, part| part.touched + FRAGMENT_TIMEOUT > now);
-        self.passed.retain(|(at, _)| *at + KEPT_FOR > now);
+        self.passed.retain(|(at, _)| *at + SPARE_BUFFER_LIFETIME > now);
     }
 
     fn retain(&mut self, mut keep: impl FnMut(&(Guid, SequenceNumber), &Part) -> bool) {
@@ -196,7 +196,7 @@ impl Assembly {
             let keeps = keep(key, part);
             if !keeps {
                 ages.remove(&part.age);
-                *bytes -= part.bytes() + OVERHEAD;
+                *bytes -= part.bytes() + ENTRY_OVERHEAD;
             }
             keeps
         });
@@ -205,7 +205,7 @@ impl Assembly {
     fn remove(&mut self, key: (Guid, SequenceNumber)) -> Option<Part> {
         let part = self.parts.remove(&key)?;
         self.ages.remove(&part.age);
-        self.bytes -= part.bytes() + OVERHEAD;
+        self.bytes -= part.bytes() + ENTRY_OVERHEAD;
         Some(part)
     }
 }
@@ -234,8 +234,8 @@ impl Part {
             let known = self.ahead.get(&start).map_or(0, |known| known.len());
             if bytes.len() > known {
                 let entry = self.ahead.insert(start, bytes.into());
-                let before = entry.map_or(0, |entry| entry.len() + OVERHEAD);
-                self.ahead_bytes = self.ahead_bytes + bytes.len() + OVERHEAD - before;
+                let before = entry.map_or(0, |entry| entry.len() + ENTRY_OVERHEAD);
+                self.ahead_bytes = self.ahead_bytes + bytes.len() + ENTRY_OVERHEAD - before;
             }
             return;
         }
@@ -244,7 +244,7 @@ impl Part {
             && *entry.key() <= self.next
         {
             let (start, bytes) = entry.remove_entry();
-            self.ahead_bytes -= bytes.len() + OVERHEAD;
+            self.ahead_bytes -= bytes.len() + ENTRY_OVERHEAD;
             self.append(start, &bytes);
         }
     }
@@ -266,7 +266,7 @@ impl Part {
         let bytes = bytes.get(..len).unwrap_or_default();
         let needed = self.head.len() + len;
         if needed > self.head.capacity() {
-            let roomy = needed.max(2 * self.head.capacity()).max(LEAST);
+            let roomy = needed.max(2 * self.head.capacity()).max(MIN_ALLOCATION);
             let more = roomy.min(self.size) - self.head.len();
             self.head.reserve_exact(more);
         }
@@ -464,7 +464,7 @@ mod tests {
         put(&mut assembly, &hostile, &[0; 100], 0);
         let far = fragment(writer(1), 1, 60_000, 1, u32::MAX, 65_535);
         put(&mut assembly, &far, &[0; 100], 0);
-        assert!(assembly.bytes < LEAST + 1000, "{}", assembly.bytes);
+        assert!(assembly.bytes < MIN_ALLOCATION + 1000, "{}", assembly.bytes);
     }
 
     #[test]
@@ -507,7 +507,7 @@ mod tests {
         assert_ne!(next(4, size / 4).0, second, "it is much larger");
         assert_eq!(next(5, size).2, 0);
         assert_eq!(held, vec![1; 300_000]);
-        assembly.expire(ModelTime::ZERO + 2 * KEPT_FOR + FRAGMENT_TIMEOUT);
+        assembly.expire(ModelTime::ZERO + 2 * SPARE_BUFFER_LIFETIME + FRAGMENT_TIMEOUT);
         assert_eq!(assembly.passed_bytes(), 0);
     }
 

@@ -26,10 +26,10 @@ use crate::facts::observation::{AckNack, Content, Gap, Heartbeat, Sample};
 use crate::facts::route::Direction;
 use crate::facts::route::{Receiver, Route};
 use crate::facts::tables::WithheldLosses;
-use crate::measure::loss_causes::{LossCauses, REASSEMBLY};
+use crate::measure::loss_causes::{LossCauses, REASSEMBLY_TIMEOUT};
 use crate::measure::reception::{CompleteSample, Outcome, Reception};
 use crate::measure::samples::Budget;
-use crate::measure::sequence::REACH;
+use crate::measure::sequence::MAX_TRUSTED_JUMP;
 use crate::measure::undelivered::Undelivered;
 use crate::measure::writer::{BEST_EFFORT_WINDOW, settle_window};
 use accounting::Accounting;
@@ -37,15 +37,15 @@ pub use accounting::Totals;
 
 /// Maximum number of samples, missed while there was no reader, that are excused one by one. If
 /// there are more, the delivery restarts.
-const EXCUSED: u64 = 512;
+const MAX_IRRELEVANT_AT_START: u64 = 512;
 /// Samples that left this host less than this ago may still arrive.
-const UNDER_WAY: Duration = Duration::from_secs(1);
+const MAX_TRANSIT_TIME: Duration = Duration::from_secs(1);
 /// Samples that left for a receiver count as lost if it shows no sign of life for this time. Socket
 /// diagnostics of the kernel report a closed socket earlier.
 const SILENCE: Duration = Duration::from_secs(18);
-const FIRST_MOMENTS: Duration = Duration::from_secs(5);
+const START_GRACE: Duration = Duration::from_secs(5);
 /// A run of pending losses longer than this is settled when two deliveries merge.
-const LONG_RUN: u64 = 256;
+const MIN_LONG_RUN: u64 = 256;
 
 /// State outside the delivery that an observation changes.
 #[derive(Debug)]
@@ -88,7 +88,7 @@ pub struct Delivery {
     waiting: Option<ModelTime>,
     /// Whether samples that left after `waiting` are already counted as lost.
     presumed_lost: bool,
-    /// Number of samples that left this host for the receiver at least [`UNDER_WAY`] ago and have
+    /// Number of samples that left this host for the receiver at least [`MAX_TRANSIT_TIME`] ago and have
     /// not arrived.
     under_way: u64,
     /// Losses of the last seconds.
@@ -300,7 +300,7 @@ impl Delivery {
     pub fn not_reassembled(&mut self, number: SequenceNumber, context: &mut DeliveryContext<'_>) {
         self.uses_network = true;
         let sequence = self.reception.sequence();
-        if !sequence.started() || number > sequence.next().saturating_add(REACH) {
+        if !sequence.started() || number > sequence.next().saturating_add(MAX_TRUSTED_JUMP) {
             return;
         }
         if self.loss_causes.resolve(number) {
@@ -378,7 +378,7 @@ impl Delivery {
         // Long runs are not caused by single fragments, and no retransmission repairs them.
         let (long, short): (Vec<_>, Vec<_>) = runs
             .into_iter()
-            .partition(|(first, last)| *last - *first > LONG_RUN);
+            .partition(|(first, last)| *last - *first > MIN_LONG_RUN);
         let pending: BTreeSet<SequenceNumber> = short
             .into_iter()
             .flat_map(|(first, last)| first.until(last.next()))
@@ -473,7 +473,7 @@ impl Delivery {
         let is_sent = self.direction() == Direction::Sent;
         let source = sample.source_timestamp.timestamp();
         let is_late = self.misses(number) && number < sequence.settled();
-        if !is_sent && is_late && !sequence.is_unconfirmed(number, source, REACH) {
+        if !is_sent && is_late && !sequence.is_unconfirmed(number, source, MAX_TRUSTED_JUMP) {
             return self.late(sample, context);
         }
         let before = (sequence.next(), sequence.last_advance());
@@ -563,7 +563,7 @@ impl Delivery {
     /// Restarts the delivery after a long range of numbers that were not for this receiver.
     fn begin_anew(&mut self, number: SequenceNumber, context: &mut DeliveryContext<'_>) {
         let sequence = self.reception.sequence();
-        let is_far = number.steps_since(sequence.next()) > EXCUSED;
+        let is_far = number.steps_since(sequence.next()) > MAX_IRRELEVANT_AT_START;
         if sequence.started() && is_far && sequence.last_advance() < self.opened {
             let (reception, budget, mut accounting) = self.split(context);
             reception.settle(budget, &mut |decision| accounting.take(decision));
@@ -619,7 +619,7 @@ impl Delivery {
         let window = settle_window(self.is_reliable(context));
         let until = context
             .reassembled
-            .then(|| context.now + REASSEMBLY.saturating_sub(window));
+            .then(|| context.now + REASSEMBLY_TIMEOUT.saturating_sub(window));
         let accounting = Accounting {
             tally: &mut self.tally,
             loss_causes: &mut self.loss_causes,

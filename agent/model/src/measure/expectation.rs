@@ -1,7 +1,7 @@
 //! Evaluates the expectations of watchlist entries on their topics.
 //!
 //! Evaluation takes place once per second of the source's clock. A topic becomes violated after
-//! `BAD` bad evaluations in a row and recovers after `GOOD` good ones. Rates are evaluated over a
+//! `BAD` bad evaluations in a row and recovers after `EVALUATIONS_TO_RECOVER` good ones. Rates are evaluated over a
 //! window of at least three expected messages (1 to 10 s), or over the window of the entry. One
 //! message of tolerance at the window's edges keeps a healthy periodic topic stable. Silence has
 //! its own time and no hysteresis. A silence between two messages, which ended before it was
@@ -12,7 +12,7 @@
 //! its own start, the first publisher or subscriber, and a time in which the source saw nothing. A
 //! topic that was silent before such a time stays silent until its next message.
 //!
-//! The numbers of publishers and subscribers are evaluated once `GRACE` has passed since the first
+//! The numbers of publishers and subscribers are evaluated once `STARTUP_GRACE_SECONDS` has passed since the first
 //! publisher appeared, because a robot needs time to start. A writer without a reader mostly sends
 //! nothing. A quiet topic without a subscriber therefore violates neither `min_rate_hz` nor
 //! `max_silence_s`, but it may violate `publishers` and `subscribers`.
@@ -27,14 +27,14 @@ use crate::facts::rate::{SECONDS, Slot};
 use crate::facts::watch::{Expectations, WatchState};
 
 /// Number of bad evaluations in a row after which a topic is violated.
-const BAD: u8 = 2;
+const EVALUATIONS_TO_VIOLATE: u8 = 2;
 /// Number of good evaluations in a row after which a violated topic recovers.
-const GOOD: u8 = 3;
+const EVALUATIONS_TO_RECOVER: u8 = 3;
 /// Number of evaluations after a silence in which its end is no silence of its own.
-const SILENCE_ENDS: u8 = 2;
+const SILENCE_END_EVALUATIONS: u8 = 2;
 /// Seconds from a topic's first publisher until the numbers of its endpoints are evaluated.
-pub const GRACE: u64 = 10;
-const NAMES: [&str; 7] = [
+pub const STARTUP_GRACE_SECONDS: u64 = 10;
+const EXPECTATION_NAMES: [&str; 7] = [
     "min_rate_hz",
     "max_rate_hz",
     "max_loss_ratio",
@@ -143,9 +143,9 @@ impl Judgement {
     #[must_use]
     pub fn violations(&self) -> Vec<&'static str> {
         let broken = |bit: &usize| self.broken & 1 << bit != 0;
-        (0..NAMES.len())
+        (0..EXPECTATION_NAMES.len())
             .filter(broken)
-            .filter_map(|bit| NAMES.get(bit).copied())
+            .filter_map(|bit| EXPECTATION_NAMES.get(bit).copied())
             .collect()
     }
 
@@ -169,7 +169,7 @@ impl Judgement {
                 .max_silence
                 .is_some_and(|maximum| evidence.has_gap(maximum));
         self.ending = match silent {
-            true => SILENCE_ENDS,
+            true => SILENCE_END_EVALUATIONS,
             false => self.ending.saturating_sub(1),
         };
         if broken & !MAX_SILENCE == 0 && !has_gap {
@@ -182,9 +182,9 @@ impl Judgement {
         } else {
             broken
         };
-        if self.bad >= BAD || has_gap {
+        if self.bad >= EVALUATIONS_TO_VIOLATE || has_gap {
             self.violated = true;
-        } else if self.good >= GOOD {
+        } else if self.good >= EVALUATIONS_TO_RECOVER {
             self.violated = false;
         }
         let lacks_endpoints = self.violated && broken & (PUBLISHERS | SUBSCRIBERS) != 0;
@@ -258,7 +258,7 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool)
             broken |= MAX_SILENCE;
         }
     }
-    if evidence.now - evidence.since >= Duration::from_secs(GRACE) {
+    if evidence.now - evidence.since >= Duration::from_secs(STARTUP_GRACE_SECONDS) {
         let lacks = |expected: Option<u32>, there: usize| {
             expected.is_some_and(|expected| there < usize::try_from(expected).unwrap_or(usize::MAX))
         };
@@ -575,7 +575,7 @@ mod tests {
         });
         bench.publishers = publishers.map_or(1, |count| count as usize);
         bench.subscriptions = subscribers.map_or(1, |count| count as usize);
-        for _ in 0..GRACE {
+        for _ in 0..STARTUP_GRACE_SECONDS {
             assert_eq!(bench.second(rate(10)), WatchState::Ok);
         }
         bench
@@ -623,7 +623,7 @@ mod tests {
         });
         bench.subscriptions = 0;
         bench.publishers = 2;
-        for _ in 0..=GRACE {
+        for _ in 0..=STARTUP_GRACE_SECONDS {
             assert_eq!(bench.second(rate(0)), WatchState::NoSubscriber);
         }
         bench.publishers = 1;
@@ -640,7 +640,7 @@ mod tests {
             ..Expectations::default()
         });
         bench.subscriptions = 0;
-        for _ in 0..GRACE {
+        for _ in 0..STARTUP_GRACE_SECONDS {
             assert_eq!(bench.second(rate(0)), WatchState::NoSubscriber);
         }
         assert_eq!(bench.second(rate(0)), WatchState::Violated);

@@ -29,7 +29,7 @@ const GAP_TIMEOUT: Duration = Duration::from_secs(4);
 /// Samples from before the announcement are retransmitted within this time, or not at all.
 const RETRANSMISSION_TIMEOUT: Duration = Duration::from_secs(10);
 /// Memory per sample in addition to its payload, in bytes.
-const OVERHEAD: usize = size_of::<QueuedSample>() + 64;
+const SAMPLE_OVERHEAD: usize = size_of::<QueuedSample>() + 64;
 /// Maximum time from the announcement to the first ACKNACK.
 const FIRST_ACKNACK_TIMEOUT: Duration = Duration::from_secs(1);
 
@@ -89,7 +89,7 @@ impl QueuedSample {
 
     /// Returns the memory that it needs while it waits.
     pub fn cost(&self) -> usize {
-        OVERHEAD + self.bytes()
+        SAMPLE_OVERHEAD + self.bytes()
     }
 }
 

@@ -41,7 +41,7 @@ pub const MESSAGE_BYTES: usize = 1 << 20;
 /// Maximum size of all unfinished messages, in bytes.
 const ASSEMBLY_BYTES: usize = 4 << 20;
 /// Bytes of one writer that may be captured in a burst, and per second.
-const WRITER: Allowance = Allowance::new(8 << 20, 16 << 10);
+const WRITER_ALLOWANCE: Allowance = Allowance::new(8 << 20, 16 << 10);
 /// Bytes of all writers that may be captured in a burst, and per second.
 const ALL_WRITERS: Allowance = Allowance::new(64 << 20, 256 << 10);
 /// A paused writer is captured again once it is allowed this many bytes: a whole message.
@@ -105,7 +105,7 @@ impl Latched {
     pub fn follow(&mut self, writer: Guid, about: LatchedTopic) {
         let new = || LatchedWriter {
             about: about.clone(),
-            allowance: WriterAllowance::new(WRITER),
+            allowance: WriterAllowance::new(WRITER_ALLOWANCE),
             newest: None,
             last: Last::Unseen,
         };

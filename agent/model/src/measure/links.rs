@@ -14,20 +14,20 @@ use crate::facts::tables::{LinkConnections, TcpLinks};
 use crate::graph::zenoh::Flow;
 
 /// Number of seconds over which the share of retransmitted segments is measured.
-const WINDOW: usize = 10;
+const WINDOW_SECONDS: usize = 10;
 /// Time without a report after which a connection is forgotten: longer than the pause between two
 /// retransmissions, at most 120 s on Linux, and than that between two KEEP_ALIVEs.
-const SILENCE: Duration = Duration::from_secs(130);
+const MAX_SILENCE: Duration = Duration::from_secs(130);
 /// Time without a report after which a link is forgotten.
-const FORGOTTEN: Duration = Duration::from_secs(600);
+const LINK_TIMEOUT: Duration = Duration::from_secs(600);
 /// Segments of 1000 that are retransmitted: from the first number on the link is a finding, and below
 /// the second it is none any longer.
-const LOSSY: u64 = 20;
-const SOUND: u64 = 10;
+const LOSSY_PERMILLE: u64 = 20;
+const RECOVERED_PERMILLE: u64 = 10;
 /// Minimum number of retransmitted segments of a finding.
-const FEW: u64 = 5;
+const MIN_RETRANSMITTED: u64 = 5;
 /// Number of seconds in which a link of a finding has sent new segments.
-const PROGRESS: usize = 3;
+const PROGRESS_SECONDS: usize = 3;
 
 /// A report about one connection.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -80,7 +80,7 @@ struct Link {
     sent: u64,
     retransmitted: u64,
     /// Sent and retransmitted segments of the last seconds; the last slot is the current second.
-    recent: [(u64, u64); WINDOW],
+    recent: [(u64, u64); WINDOW_SECONDS],
     is_lossy: bool,
 }
 
@@ -94,7 +94,7 @@ impl Link {
     /// Returns whether new segments were sent in the last seconds. A peer that is gone acknowledges
     /// nothing, and then TCP only retransmits.
     fn makes_progress(&self) -> bool {
-        let last = self.recent.iter().rev().take(PROGRESS);
+        let last = self.recent.iter().rev().take(PROGRESS_SECONDS);
         last.fold(0, |new, (sent, again)| new + sent.saturating_sub(*again)) > 0
     }
 
@@ -148,13 +148,13 @@ impl Links {
 
     /// Ends a second: determines which links are lossy, and forgets what is gone.
     pub fn end_second(&mut self, now: ModelTime) {
-        self.connections.retain(|_, each| each.at + SILENCE > now);
-        self.links.retain(|_, each| each.at + FORGOTTEN > now);
+        self.connections.retain(|_, each| each.at + MAX_SILENCE > now);
+        self.links.retain(|_, each| each.at + LINK_TIMEOUT > now);
         for link in self.links.values_mut() {
             let share = link.permille();
             let is_lossy = match link.is_lossy {
-                true => share >= SOUND,
-                false => share >= LOSSY && link.again() >= FEW && link.makes_progress(),
+                true => share >= RECOVERED_PERMILLE,
+                false => share >= LOSSY_PERMILLE && link.again() >= MIN_RETRANSMITTED && link.makes_progress(),
             };
             self.revision += u64::from(is_lossy != link.is_lossy);
             link.is_lossy = is_lossy;

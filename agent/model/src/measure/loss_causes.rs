@@ -15,7 +15,7 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{KnownLosses, OpenLosses};
 
 /// By default, the kernel waits 30 s for IP fragments (`net.ipv4.ipfrag_time`).
-pub const REASSEMBLY: Duration = Duration::from_secs(35);
+pub const REASSEMBLY_TIMEOUT: Duration = Duration::from_secs(35);
 
 /// Known causes and pending losses.
 #[derive(Debug, Default)]

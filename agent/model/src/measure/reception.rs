@@ -11,11 +11,11 @@ use ros2probe_wire::{RtpsTime, SequenceNumber};
 use crate::facts::model_time::ModelTime;
 use crate::facts::observation::{Content, DataFrag, Gap, Heartbeat, Sample};
 use crate::measure::samples::{Budget, Facts, Progress, Samples};
-use crate::measure::sequence::{Arrival, REACH, RepairMode, RunMembership, Sequence, Settled};
+use crate::measure::sequence::{Arrival, MAX_TRUSTED_JUMP, RepairMode, RunMembership, Sequence, Settled};
 
 /// Minimum nanoseconds from the last fragment number to the completing fragment that indicate a
 /// retransmission.
-const REPAIR: i64 = 5_000_000;
+const MIN_REPAIR_DELAY: i64 = 5_000_000;
 /// Number of samples before the newest one for whose fragments a sampled view still waits.
 const UNDER_WAY: u64 = 8;
 
@@ -159,7 +159,7 @@ impl Reception {
         let (number, now) = (sample.sequence_number, sample.head.at);
         let source = sample.source_timestamp.timestamp();
         let Self { sequence, samples } = self;
-        match sequence.recognise(number, source, REACH, now) {
+        match sequence.recognise(number, source, MAX_TRUSTED_JUMP, now) {
             RunMembership::Live => true,
             RunMembership::Unconfirmed { .. } => false,
             RunMembership::Confirmed(run) => {
@@ -374,7 +374,7 @@ impl Reception {
         let Arrival::New { recovered, .. } = arrival else {
             return Outcome::Open;
         };
-        let repaired = reliable && facts.repaired_after >= REPAIR;
+        let repaired = reliable && facts.repaired_after >= MIN_REPAIR_DELAY;
         Outcome::Complete(CompleteSample {
             recovered: recovered || repaired,
             ..whole_fragments(sample, &facts)

@@ -13,10 +13,10 @@ use crate::facts::watch::WatchState;
 use crate::measure::expectation::{Evidence, Judgement};
 
 pub use crate::facts::rate::SECONDS;
-pub use crate::measure::expectation::{GRACE, window};
+pub use crate::measure::expectation::{STARTUP_GRACE_SECONDS, window};
 
 /// Model time at which a rehearsal begins, in seconds: late enough for a silence before it.
-const BEGIN: u64 = 1_000_000;
+const START_SECOND: u64 = 1_000_000;
 
 /// Counts of one second of a topic. The type is small, because a client keeps hours of many topics.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -119,11 +119,11 @@ fn loss(seconds: &[Second], end: usize) -> LossShare {
 }
 
 fn instant(place: usize) -> ModelTime {
-    ModelTime::from_nanoseconds((BEGIN + place as u64) * SECOND)
+    ModelTime::from_nanoseconds((START_SECOND + place as u64) * SECOND)
 }
 
 fn duration(seconds: f32) -> Duration {
-    // The maximum is shorter than the time before `BEGIN`.
+    // The maximum is shorter than the time before `START_SECOND`.
     Duration::try_from_secs_f32(seconds.clamp(0.0, 900_000.0)).unwrap_or_default()
 }
 

@@ -19,21 +19,21 @@ const SAMPLED_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time that an unseen sample may take to arrive by another transport before it is skipped.
 const ARRIVAL_TIMEOUT: Duration = Duration::from_millis(200);
 /// Accepted probability that a silence is claimed while messages are sent.
-const FALSE_SILENCE: f64 = 1e-6;
+const FALSE_SILENCE_PROBABILITY: f64 = 1e-6;
 /// Number of messages presumed before the first one is seen, and the share of them that polling
 /// missed. On a busy machine, polling misses nine of ten large messages. The same is presumed after
 /// a missed message: its cause, such as a large message sent with it, also hides the next ones.
-const PRESUMED: f64 = 2.0;
-const PRESUMED_MISSED: f64 = 0.9;
+const PRESUMED_MESSAGES: f64 = 2.0;
+const PRESUMED_MISSED_SHARE: f64 = 0.9;
 /// Maximum time in which polling sees no message of a topic on a busy machine. Measured with Fast
 /// DDS: 0.4 s on an idle machine, more than 2 s for point clouds at a load of 10.
-const POLLING_HOLE: Duration = Duration::from_secs(10);
+const MAX_POLLING_GAP: Duration = Duration::from_secs(10);
 /// Factor by which a row of missed messages may exceed the longest one so far.
-const LONGER: f64 = 3.0;
+const MISSED_RUN_FACTOR: f64 = 3.0;
 /// Weight of the newest interval in the moving average.
-const NEWEST: f64 = 0.125;
+const NEWEST_WEIGHT: f64 = 0.125;
 /// Number of sequence numbers below the next one that are tracked individually.
-const WINDOW: u64 = u128::BITS as u64;
+const WINDOW_LEN: u64 = u128::BITS as u64;
 
 /// State of one writer's sampled view.
 #[derive(Debug)]
@@ -231,7 +231,7 @@ impl Sampled {
         if samples > 0 && since != ModelTime::ZERO {
             let newest = (now - since).as_secs_f64() / samples as f64;
             let mean = self.interval.unwrap_or(newest);
-            self.interval = Some(mean + NEWEST * (newest - mean));
+            self.interval = Some(mean + NEWEST_WEIGHT * (newest - mean));
         }
     }
 
@@ -250,14 +250,14 @@ impl Sampled {
         let interval = self.interval.unwrap_or(slowest.as_secs_f64());
         let unseen = self.span.saturating_sub(self.seen);
         let share = |missed: u64, of: u64| {
-            (missed as f64 + PRESUMED * PRESUMED_MISSED) / (of as f64 + PRESUMED)
+            (missed as f64 + PRESUMED_MESSAGES * PRESUMED_MISSED_SHARE) / (of as f64 + PRESUMED_MESSAGES)
         };
         let missed = share(unseen, self.span);
         let missed_again = share(unseen.saturating_sub(self.holes), unseen);
-        let messages = 1.0 + (FALSE_SILENCE.ln() - missed.ln()) / missed_again.ln();
-        let messages = messages.max(LONGER * self.longest_hole as f64);
+        let messages = 1.0 + (FALSE_SILENCE_PROBABILITY.ln() - missed.ln()) / missed_again.ln();
+        let messages = messages.max(MISSED_RUN_FACTOR * self.longest_hole as f64);
         let silence = Duration::try_from_secs_f64(messages * interval).unwrap_or(Duration::MAX);
-        silence.max(POLLING_HOLE)
+        silence.max(MAX_POLLING_GAP)
     }
 
     /// As [`Self::seeming_silence`], for a writer that polling has not seen yet.
@@ -488,7 +488,7 @@ impl Sampled {
         if end <= next {
             return 0;
         }
-        let oldest = end.saturating_sub(WINDOW);
+        let oldest = end.saturating_sub(WINDOW_LEN);
         self.settle(oldest.min(next));
         if oldest > next {
             if sent {
@@ -524,7 +524,7 @@ impl Sampled {
 
     /// Stops waiting for numbers below `end`; unseen ones are skipped.
     fn settle(&mut self, end: SequenceNumber) {
-        let known = self.next.saturating_sub(WINDOW).max(self.settled);
+        let known = self.next.saturating_sub(WINDOW_LEN).max(self.settled);
         for number in known.until(end.min(self.next)) {
             let bit = self.bit(number, self.next);
             if bit.is_some_and(|bit| self.finished & bit == 0) {

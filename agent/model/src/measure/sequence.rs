@@ -22,7 +22,7 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{Checkpoints, SequenceGaps};
 use bitmap::Bitmap;
 pub use unconfirmed::Run;
-use unconfirmed::{CONFIRMATIONS, UnconfirmedRun};
+use unconfirmed::{REQUIRED_CONFIRMATIONS, UnconfirmedRun};
 
 /// Initial size of the window: the undecided and recently decided numbers that are remembered.
 const MIN_WINDOW: u64 = 512;
@@ -33,20 +33,20 @@ pub const MAX_WINDOW: u64 = 32_768;
 /// losses.
 const MAX_JUMP: u64 = 1 << 20;
 /// Maximum distance by which a HEARTBEAT or GAP may exceed the received numbers, even if two agree.
-pub const FAR: u64 = 4096;
+pub const MAX_ANNOUNCED_JUMP: u64 = 4096;
 /// A number further ahead than this is unconfirmed, as is a single HEARTBEAT or GAP that claims it.
-pub const REACH: u64 = 64;
+pub const MAX_TRUSTED_JUMP: u64 = 64;
 /// A gap that fills within this time without a request is attributed to reordering. Retransmissions
 /// take longer even if their ACKNACK was not seen: readers wait 5 ms (Fast DDS) to 100 ms (Cyclone
 /// DDS) before they answer a HEARTBEAT.
-const REORDERING: Duration = Duration::from_millis(5);
+const MAX_REORDERING: Duration = Duration::from_millis(5);
 /// A lower number with a source time later by this much begins a new incarnation of the writer.
-const INCARNATION: Duration = Duration::from_millis(100);
+const MIN_INCARNATION_GAP: Duration = Duration::from_millis(100);
 /// This many consecutive samples below the window also begin a new incarnation, whatever their
 /// source times.
-const STALE: u32 = 1024;
+const MAX_STALE: u32 = 1024;
 /// Number of steps per window in which settling advances.
-const STEPS: u32 = 16;
+const SETTLING_STEPS: u32 = 16;
 
 /// State of one writer's sequence numbers.
 #[derive(Debug, Default)]
@@ -228,7 +228,7 @@ impl Sequence {
         self.older += 1;
         // After many older source times, the newest one was forged or the writer's clock was set
         // back.
-        if source >= self.newest_source || self.older >= CONFIRMATIONS {
+        if source >= self.newest_source || self.older >= REQUIRED_CONFIRMATIONS {
             (self.newest_source, self.newest, self.older) = (source, number, 0);
         }
     }
@@ -317,7 +317,7 @@ impl Sequence {
         if !self.started() || !other.started() {
             return;
         }
-        if other.next > self.next && other.next - self.next <= FAR {
+        if other.next > self.next && other.next - self.next <= MAX_ANNOUNCED_JUMP {
             self.extend(other.next.previous(), other.next, now, settled);
         }
         for number in self
@@ -409,7 +409,7 @@ impl Sequence {
         let due = self
             .checkpoints
             .back()
-            .is_none_or(|(at, next)| *next < self.next && *at + window / STEPS <= now);
+            .is_none_or(|(at, next)| *next < self.next && *at + window / SETTLING_STEPS <= now);
         if due && self.settled < self.next {
             self.checkpoints.push_back((now, self.next));
         }
@@ -502,7 +502,7 @@ impl Sequence {
             .iter()
             .rev()
             .find(|gap| gap.start <= number && number < gap.end);
-        let late = |gap: &Gap| gap.requested || now - gap.noticed >= REORDERING;
+        let late = |gap: &Gap| gap.requested || now - gap.noticed >= MAX_REORDERING;
         match repair_mode {
             RepairMode::BestEffort => false,
             // A gap that is no longer remembered is an old one.

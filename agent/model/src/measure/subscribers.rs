@@ -22,7 +22,7 @@ mod submessages;
 
 use ros2probe_wire::{Guid, SequenceNumber};
 
-use crate::facts::header::PLAUSIBLE;
+use crate::facts::header::MAX_PLAUSIBLE_OFFSET;
 use crate::facts::journal::Journal;
 use crate::facts::loss_share::LossShare;
 use crate::facts::measurement::Breakdown;
@@ -40,9 +40,9 @@ use crate::measure::samples::Budget;
 use crate::measure::topic::{Topic, TopicId};
 
 /// Maximum number of samples that one call compares with other deliveries.
-const LOOK_BACK: u64 = 4096;
+const MAX_COMPARED_SAMPLES: u64 = 4096;
 /// Maximum UDP payload of one Ethernet frame over IPv4. Larger datagrams need IP reassembly.
-const ONE_FRAME: u16 = 1472;
+const FRAME_BYTES: u16 = 1472;
 
 /// All receivers and destinations of one writer.
 #[derive(Debug, Default)]
@@ -189,7 +189,7 @@ impl Subscribers {
         }
         let head = observation.head();
         let is_host = head.is_at_socket();
-        self.reassembled |= is_host && head.datagram_len > ONE_FRAME;
+        self.reassembled |= is_host && head.datagram_len > FRAME_BYTES;
         let route = head.route();
         match observation {
             Observation::Sample(_) => {}
@@ -247,7 +247,7 @@ impl Subscribers {
         // Both times are from one clock. A sample that leaves before its timestamp, or hours after
         // it, is not a measure of the send delay.
         if let Some(source) = source.filter(|_| sample.is_start())
-            && (source..=source + PLAUSIBLE).contains(&began)
+            && (source..=source + MAX_PLAUSIBLE_OFFSET).contains(&began)
             && self.departures.is_first(source)
         {
             let delay = began.nanoseconds_since(source);
@@ -480,7 +480,7 @@ impl Subscribers {
             }
             return;
         }
-        let end = delivery.next().min(next.saturating_add(LOOK_BACK));
+        let end = delivery.next().min(next.saturating_add(MAX_COMPARED_SAMPLES));
         if next == SequenceNumber::ZERO || end <= next + 1 {
             return;
         }

@@ -25,14 +25,14 @@ use crate::measure::in_order::Progress;
 use crate::measure::reception::{Decision, Outcome, Reception};
 use crate::measure::sampled::Sampled;
 use crate::measure::samples::Budget;
-use crate::measure::sequence::{FAR, REACH};
+use crate::measure::sequence::{MAX_ANNOUNCED_JUMP, MAX_TRUSTED_JUMP};
 
 /// Time in which reordering may fill a gap of a best-effort writer.
 pub const BEST_EFFORT_WINDOW: Duration = Duration::from_secs(1);
 /// Time in which a reliable writer may retransmit: three HEARTBEAT periods of Fast DDS.
 pub const RELIABLE_WINDOW: Duration = Duration::from_secs(10);
 /// A first sample older than this is history that a late joiner requested.
-const HISTORY: Duration = Duration::from_secs(10);
+const MIN_HISTORY_AGE: Duration = Duration::from_secs(10);
 
 /// A uprobe's view of a writer stays exact for this long after its last observation: samples read
 /// from shared memory in that time were seen already.
@@ -610,7 +610,7 @@ impl Settling<'_> {
 /// Returns how far ahead the numbers of an observation may be. Polling shared memory misses more
 /// numbers.
 fn reach(head: &Head) -> u64 {
-    if head.is_polled() { FAR } else { REACH }
+    if head.is_polled() { MAX_ANNOUNCED_JUMP } else { MAX_TRUSTED_JUMP }
 }
 
 #[expect(

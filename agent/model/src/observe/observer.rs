@@ -47,7 +47,7 @@ use crate::derive::services::Services;
 use crate::derive::stamps::Stamps;
 use crate::derive::trace::{Tracer, WriterDescription};
 use crate::derive::type_descriptions::TypeDescriptions;
-use crate::facts::event::TEXT;
+use crate::facts::event::MAX_TEXT;
 use crate::facts::journal::Journal;
 use crate::facts::measurement::Measurement;
 use crate::facts::model_time::ModelTime;
@@ -77,7 +77,7 @@ use zenoh::ZenohNames;
 /// Interval at which leases, windows and gaps are checked.
 const TICK: Duration = Duration::from_millis(100);
 /// A larger step of the clock means that the clock was set; it is not processed tick by tick.
-const JUMP: Duration = Duration::from_secs(3600);
+const MAX_CLOCK_STEP: Duration = Duration::from_secs(3600);
 /// Maximum number of names matched against globs per round, which takes a few milliseconds.
 const MAX_MATCHES_PER_ROUND: usize = 20_000;
 
@@ -619,8 +619,8 @@ impl Observer {
             let topic = topics.get(topics.find(endpoint.domain_id, &naming)?)?;
             let subject = WriterDescription {
                 domain_id: topic.domain_id,
-                topic: topic.naming.name.bounded(TEXT),
-                message_type: endpoint.message_type.bounded(TEXT),
+                topic: topic.naming.name.bounded(MAX_TEXT),
+                message_type: endpoint.message_type.bounded(MAX_TEXT),
                 reliable: traits(writer, endpoint).reliable,
             };
             (topic.watched == Watched::Yes).then(|| (subject, traced_share(topic, watchlist)))
@@ -737,7 +737,7 @@ impl Observer {
         self.derive.stamps.forget(guid);
         self.derive.clocks.forget(guid);
         self.references.remove(guid);
-        let (domain_id, topic) = (endpoint.domain_id, endpoint.topic.bounded(TEXT));
+        let (domain_id, topic) = (endpoint.domain_id, endpoint.topic.bounded(MAX_TEXT));
         self.journal.events.name(guid, domain_id, &topic);
         let id = endpoint
             .naming()

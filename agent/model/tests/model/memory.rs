@@ -273,7 +273,7 @@ fn all_limits_together_fit_into_the_memory_limit_of_the_unit() {
         .find_map(|line| line.strip_prefix("MemoryMax="));
     let allowed = megabytes.unwrap().strip_suffix('M').unwrap();
     let allowed = allowed.parse::<usize>().unwrap() << 20;
-    let all = Limits::default().bytes() + Limits::BESIDE + Limits::ZENOH + Limits::LATCHED;
-    let all = all + Limits::INSIDE + Limits::TYPES + Limits::ROBOT + Limits::HISTORY;
+    let all = Limits::default().bytes() + Limits::CONSTANT_BYTES + Limits::ZENOH_BYTES + Limits::LATCHED_BYTES;
+    let all = all + Limits::INSIDE_BYTES + Limits::TYPE_BYTES + Limits::ROBOT_BYTES + Limits::HISTORY_BYTES;
     assert!(all <= allowed, "{} of {} KiB", all >> 10, allowed >> 10);
 }

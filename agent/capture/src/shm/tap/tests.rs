@@ -13,7 +13,7 @@ use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::time::SECOND;
 use tempfile::TempDir;
 
-use super::super::cpu_allowance::{SAVINGS, SHARE};
+use super::super::cpu_allowance::{MAX_SAVINGS, SHARE_DIVISOR};
 use super::super::directories::Scope;
 use super::super::image::{PortImage, SegmentImage};
 use super::*;
@@ -250,7 +250,7 @@ fn files_of_a_killed_process_yield_neither_a_port_nor_messages() {
     let lives = [port.path(host.path()), living.path(host.path())];
     let lives = lives.each_ref().map(|path| lock_of(path, true));
     port.push(living.put(&sample(2)));
-    assert_eq!(host.poll_after(FIND_EVERY), [2]);
+    assert_eq!(host.poll_after(FIND_INTERVAL), [2]);
     assert!(host.tap.has_ports() && host.tap.take_discovery_seen());
     port.push(living.put(&sample(3)));
     assert_eq!(host.poll_after(MILLISECOND), [3]);
@@ -364,7 +364,7 @@ fn an_idle_port_is_polled_rarely_until_it_has_a_message() {
     let due = due.filter(|open| open.due <= host.now + MILLISECOND);
     assert_eq!(due.count(), 0);
     ports[77].push(segment.put(&sample(5)));
-    assert_eq!(host.poll_after(SILENT_EVERY), [5]);
+    assert_eq!(host.poll_after(SILENT_POLL_INTERVAL), [5]);
     // From now on that port is polled each time.
     ports[77].push(segment.put(&sample(6)));
     assert_eq!(host.poll_after(MILLISECOND), [6]);
@@ -405,7 +405,7 @@ fn constantly_expected_files_cost_no_more_than_the_share_for_listing() {
         host.poll_after(10 * MILLISECOND);
     }
     let spent = thread_cpu() - before;
-    let most = SAVINGS + (host.now - began) / SHARE;
+    let most = MAX_SAVINGS + (host.now - began) / SHARE_DIVISOR;
     assert!(spent < 2 * most, "{spent} {most}");
     // A new port is opened all the same, if the share allows it.
     let (mut port, mut segment) = (host.port(7411), host.segment(1));

@@ -23,12 +23,12 @@ use self::session::{Session, Step};
 /// Maximum wait for the connection, for each answer, and between two parts of the last answer.
 const TIMEOUT: Duration = Duration::from_secs(3);
 /// Maximum wait for all tokens.
-const LIMIT: Duration = Duration::from_secs(30);
+const MAX_DURATION: Duration = Duration::from_secs(30);
 /// Wait for the router to close the connection after the goodbye. If this side closed it first,
 /// bytes of the router in flight would reset it.
-const LINGER: Duration = Duration::from_millis(200);
+const LINGER_TIME: Duration = Duration::from_millis(200);
 /// Maximum number of bytes per read.
-const READ: usize = 64 << 10;
+const READ_BYTES: usize = 64 << 10;
 
 /// Number of batches, and their bytes including the lengths before them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -198,7 +198,7 @@ impl Conversation {
 
     /// Receives and answers until the session is over.
     fn listen(&mut self, session: &mut Session) -> Result<(), RouterError> {
-        let mut chunk = vec![0; READ];
+        let mut chunk = vec![0; READ_BYTES];
         let peer = self.peer;
         let unusable = |why| RouterError::Unusable { peer, why };
         while !session.is_over() {
@@ -214,7 +214,7 @@ impl Conversation {
                 for outgoing in session.receive(batch).map_err(unusable)? {
                     self.send(outgoing.what, &outgoing.bytes)?;
                     if session.step() == Step::Request {
-                        self.within(LIMIT);
+                        self.within(MAX_DURATION);
                     }
                 }
                 if session.is_over() {
@@ -259,7 +259,7 @@ impl Conversation {
     /// Waits for the router to end the connection.
     fn linger(&mut self) {
         let _ = self.stream.shutdown(Shutdown::Write);
-        let end = Instant::now() + LINGER;
+        let end = Instant::now() + LINGER_TIME;
         let mut chunk = [0; 1024];
         loop {
             let left = end.saturating_duration_since(Instant::now());

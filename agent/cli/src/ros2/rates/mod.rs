@@ -27,12 +27,12 @@ const SECOND: i64 = 1_000_000_000;
 /// One nanosecond in seconds.
 const NANOSECOND: f64 = 1e-9;
 /// Clears a terminal, as `--all` does before each table.
-const CLEAR: &str = "\x1b[H\x1b[2J\n";
+const CLEAR_SCREEN: &str = "\x1b[H\x1b[2J\n";
 /// Maximum step of the clock. A larger step means that the clock was set, and skipped seconds are
 /// not reported.
 const LONGEST_JUMP: i64 = 3600 * SECOND;
 /// Maximum number of messages that wait for the clock, which ticks ten times a second.
-const WAITING: usize = 65_536;
+const MAX_WAITING: usize = 65_536;
 
 /// Measured quantity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -273,7 +273,7 @@ impl Rates {
         if self.quantity == Quantity::Delay && arrival.header_stamp.is_none() && !has_header() {
             return Err(End::Refused(Refused("msg does not have header".to_owned())));
         }
-        if self.waiting.len() >= WAITING {
+        if self.waiting.len() >= MAX_WAITING {
             self.settle(arrival.time);
         }
         self.waiting.push((arrival, place));
@@ -463,7 +463,7 @@ impl Rates {
 
     fn clear(&mut self) {
         if self.all {
-            self.output.out.push_str(CLEAR);
+            self.output.out.push_str(CLEAR_SCREEN);
         }
     }
 

@@ -14,13 +14,13 @@ use super::SECOND;
 const MAX_UNSEEN: u64 = 10_000;
 /// Maximum distance of a late message's number from the newest number. A lower number belongs to a
 /// restarted writer.
-const LATE: u64 = 256;
+const MAX_LATE_DISTANCE: u64 = 256;
 /// Maximum time by which a message is late.
 const LATE_FOR: i64 = 2 * SECOND;
 /// Maximum time from a writer's timestamp to the poll that finds the message.
 const LONGEST_POLL: i64 = 10 * SECOND;
 /// Maximum number of remembered gaps, whose messages may still be seen.
-const GAPS: usize = 16;
+const MAX_GAPS: usize = 16;
 
 /// A message of the writer.
 #[derive(Clone, Copy, Debug)]
@@ -111,7 +111,7 @@ impl Numbers {
         if !may_be_unseen || !(1..=MAX_UNSEEN).contains(&unseen) {
             return Place::Counts;
         }
-        if self.unseen.len() >= GAPS {
+        if self.unseen.len() >= MAX_GAPS {
             self.unseen.pop_front();
         }
         let gap = newest.number + 1..=message.number - 1;
@@ -129,7 +129,7 @@ impl Numbers {
         if self.unseen.iter().any(is_unseen) {
             return Place::Counted;
         }
-        let is_late = newest.number - message.number < LATE
+        let is_late = newest.number - message.number < MAX_LATE_DISTANCE
             && message.captured.saturating_sub(newest.captured) < LATE_FOR;
         match (is_late, message.is_sampled) {
             // The message is a duplicate, or was sent before the measurement.

@@ -225,14 +225,14 @@ fn all_topics_include_topics_that_appear_later() {
         "Subscribing to all 2 available topics...\nSubscribed to [/a]\nSubscribed to [/b]\n";
     assert_eq!(rates.take().out, begin);
     rates.clock(at(0));
-    assert_eq!(rates.take().out, CLEAR);
+    assert_eq!(rates.take().out, CLEAR_SCREEN);
     rates.appeared("/late", &[STRING.to_owned()]).unwrap();
     let text = messages(&mut rates, "/late", [100, 200]);
     assert_eq!(text, "Subscribed to [/late]\n");
     rates.clock(at(1000));
     let table = rates.take().out;
     assert!(
-        table.starts_with(CLEAR) && table.contains("\n/late   10.000"),
+        table.starts_with(CLEAR_SCREEN) && table.contains("\n/late   10.000"),
         "{table}"
     );
 }

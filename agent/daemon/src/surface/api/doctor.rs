@@ -20,8 +20,8 @@ use super::{Context, nouns};
 use ros2probe_api::doctor::Report;
 
 /// Maximum time of an examination. It reads files of all processes.
-const WITHIN: Duration = Duration::from_secs(10);
-static TURN: Semaphore = Semaphore::const_new(1);
+const EXAMINATION_TIMEOUT: Duration = Duration::from_secs(10);
+static EXAMINATION_PERMIT: Semaphore = Semaphore::const_new(1);
 
 /// Examines this host with the agent's own answers.
 #[derive(Clone)]
@@ -81,7 +81,7 @@ async fn examine(
 ) -> Result<Json<Report>, Problem> {
     let doctor = context.doctor.clone();
     let answers = own_answers(&context, granted).await?;
-    let report = in_turn(&TURN, WITHIN, move || (doctor.0)(&answers)).await;
+    let report = in_turn(&EXAMINATION_PERMIT, EXAMINATION_TIMEOUT, move || (doctor.0)(&answers)).await;
     report.map(Json).map_err(|no_result| match no_result {
         NoResult::Late => Problem::new(Code::Ending, "the examination of this host does not end"),
         NoResult::Ending => ending(),

@@ -21,7 +21,7 @@ use ros2probe_api::health::{self, Health, Interface, Limit, Table, Thread};
 use ros2probe_metrics::otlp::Host;
 
 /// Name of the host. It is read once, because it rarely changes while the agent runs.
-pub(super) static HOST: LazyLock<Option<String>> = LazyLock::new(|| Host::read().name);
+pub(super) static HOST_NAME: LazyLock<Option<String>> = LazyLock::new(|| Host::read().name);
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(health))
@@ -56,7 +56,7 @@ async fn health(State(context): State<Context>) -> Json<Health> {
         ready: ready.is_ok(),
         reason: ready.err().map(|reason| reason.to_string()),
         degraded: context.limits.degraded(&state),
-        host: HOST.clone(),
+        host: HOST_NAME.clone(),
         version: env!("CARGO_PKG_VERSION").into(),
         source: agent.source.label().into(),
         finished: agent.finished,

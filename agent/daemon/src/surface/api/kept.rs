@@ -18,12 +18,12 @@ const MAX_KEPT: usize = 200;
 const MAX_ENTRIES: usize = 10_000;
 
 /// The latest list. The metadata of a bag is read once, until the bag changes.
-static LISTED: Mutex<Vec<KeptBag>> = Mutex::new(Vec::new());
+static LISTED_BAGS: Mutex<Vec<KeptBag>> = Mutex::new(Vec::new());
 
 /// Returns the bags in a directory without those of these names, the latest first. It reads the
 /// directory, and so it blocks.
 pub(super) fn kept(root: &Path, known: &BTreeSet<String>) -> Vec<KeptBag> {
-    let mut listed = LISTED.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut listed = LISTED_BAGS.lock().unwrap_or_else(PoisonError::into_inner);
     *listed = among(root, known, MAX_ENTRIES, &listed);
     listed.clone()
 }

@@ -93,11 +93,11 @@ pub use server::{OpenError, Server};
 
 /// Maximum time that a request waits for a fresh snapshot, which shows the effects of earlier
 /// requests.
-const TIMEOUT: Duration = Duration::from_millis(600);
+const FRESH_STATE_TIMEOUT: Duration = Duration::from_millis(600);
 /// Maximum time that a request waits until calls inside processes are observed.
-const CALLS_WITHIN: Duration = Duration::from_secs(5);
+const CALL_OBSERVATION_TIMEOUT: Duration = Duration::from_secs(5);
 /// Interval at which the request checks for the observation.
-const CALLS_POLLED: Duration = Duration::from_millis(250);
+const CALL_POLL_INTERVAL: Duration = Duration::from_millis(250);
 
 /// State that the routes share.
 #[derive(Clone)]
@@ -145,7 +145,7 @@ impl Context {
         self.latest.want_calls();
         let is_known = async {
             loop {
-                self.latest.refresh(TIMEOUT).await;
+                self.latest.refresh(FRESH_STATE_TIMEOUT).await;
                 let state = self.latest.own_state();
                 let source = state.agent.inside.as_ref();
                 // Only the mode `auto` needs a wait. In other modes, calls are always observed or
@@ -153,22 +153,22 @@ impl Context {
                 if source.is_none_or(|source| source.mode != "auto" || source.shows_rates) {
                     return;
                 }
-                tokio::time::sleep(CALLS_POLLED).await;
+                tokio::time::sleep(CALL_POLL_INTERVAL).await;
             }
         };
-        let _ = tokio::time::timeout(CALLS_WITHIN, is_known).await;
+        let _ = tokio::time::timeout(CALL_OBSERVATION_TIMEOUT, is_known).await;
     }
 
     /// Returns the current state, or a slightly older one if the capture is busy.
     async fn state(&self) -> Arc<State> {
-        self.latest.refresh(TIMEOUT).await;
+        self.latest.refresh(FRESH_STATE_TIMEOUT).await;
         self.latest.state()
     }
 }
 
 /// Returns the name of this host.
 pub(super) fn host() -> Option<String> {
-    health::HOST.clone()
+    health::HOST_NAME.clone()
 }
 
 /// Returns the routes of all nouns with their part of the document.
@@ -239,7 +239,7 @@ async fn observe_calls(
 }
 
 /// Large answers that are being created and read.
-static VIEWS: LargeResponses = LargeResponses::new();
+static VIEW_RESPONSES: LargeResponses = LargeResponses::new();
 
 /// Marks a streamed response, which is sent as it is produced and keeps no permit for a large
 /// answer.
@@ -248,7 +248,7 @@ struct Streamed;
 
 /// Limits the number of large answers, as [`super::large_responses`] describes.
 async fn take_turns(Extract(context): Extract<Context>, request: Request, next: Next) -> Response {
-    let Some(turn) = VIEWS.turn().await else {
+    let Some(turn) = VIEW_RESPONSES.turn().await else {
         context.limits.reached(Limit::ApiClients, 1);
         let detail = "memory for responses is used up by slow readers";
         return Problem::new(Code::TooManyClients, detail).into_response();

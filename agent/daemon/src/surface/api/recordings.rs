@@ -29,14 +29,14 @@ use ros2probe_api::recordings::{self as answers, FilterOptions, RecordingList, R
 use ros2probe_bag::{Form, Options, Storage};
 
 /// Maximum time that an answer waits for a bag to be completed.
-const TIMEOUT: Duration = Duration::from_secs(10);
+const COMPLETION_TIMEOUT: Duration = Duration::from_secs(10);
 /// Maximum time that a new recording waits for the capture to apply its subscription, and for
 /// breakpoints in the processes that send the messages.
-const BEGINS_WITHIN: Duration = Duration::from_secs(6);
+const START_TIMEOUT: Duration = Duration::from_secs(6);
 /// Maximum time that the list of recordings waits for the storage. The kept bags are absent then.
-const LISTED_WITHIN: Duration = Duration::from_secs(2);
+const LIST_TIMEOUT: Duration = Duration::from_secs(2);
 /// One thread at a time reads the directory.
-static LISTING: Semaphore = Semaphore::const_new(1);
+static LISTING_PERMIT: Semaphore = Semaphore::const_new(1);
 /// Maximum duration of one file: a year, in seconds.
 const MAX_DURATION: u64 = 31_536_000;
 
@@ -63,7 +63,7 @@ async fn list(State(context): State<Context>) -> Json<RecordingList> {
     let directory = context.recordings.directory();
     let known = recordings.iter().map(|each| each.name.clone()).collect();
     let root = directory.map(FilePath::to_owned);
-    let listed = in_turn(&LISTING, LISTED_WITHIN, move || {
+    let listed = in_turn(&LISTING_PERMIT, LIST_TIMEOUT, move || {
         root.map(|root| kept::kept(&root, &known))
     });
     let kept = listed.await.ok().flatten().unwrap_or_default();
@@ -123,7 +123,7 @@ async fn begin(
     // Once the subscription is in force, the kernel's programs capture each message of the
     // requested topics.
     tokio::select! {
-        _ = recording.begin().in_force(BEGINS_WITHIN) => {}
+        _ = recording.begin().in_force(START_TIMEOUT) => {}
         () = context.stop.cancelled() => {}
     }
     let location = format!("/recordings/{}", recording.name);
@@ -172,7 +172,7 @@ async fn end(
 ) -> Result<Response, Problem> {
     let recording = find(&context, &name)?;
     recording.command(Command::Stop);
-    let status = if recording.over(TIMEOUT).await {
+    let status = if recording.over(COMPLETION_TIMEOUT).await {
         StatusCode::OK
     } else {
         StatusCode::ACCEPTED

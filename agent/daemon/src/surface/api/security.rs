@@ -26,8 +26,8 @@ use crate::surface::authority;
 pub(super) const MAX_BODY: usize = 16 << 10;
 /// Sustained number of requests per second and size of a burst. Each listener has one limit for
 /// clients with a token or on the unix socket, one for other clients, and one for refused requests.
-const RATE: f64 = 500.0;
-const BURST: f64 = 1_000.0;
+const REQUEST_RATE: f64 = 500.0;
+const REQUEST_BURST: f64 = 1_000.0;
 /// Valid length of a token. Shorter tokens can be guessed, and a longer file is not a token.
 const TOKEN_BYTES: std::ops::RangeInclusive<usize> = 16..=4096;
 
@@ -141,7 +141,7 @@ impl Door {
     pub(in crate::surface) fn new(kind: Kind, granted: Granted) -> Self {
         let bucket = || {
             Mutex::new(Bucket {
-                left: BURST,
+                left: REQUEST_BURST,
                 at: Instant::now(),
             })
         };
@@ -258,7 +258,7 @@ impl Door {
         };
         let mut bucket = bucket.lock().unwrap_or_else(PoisonError::into_inner);
         if !bucket.draw(now) {
-            let detail = format!("at most {RATE} requests a second are answered");
+            let detail = format!("at most {REQUEST_RATE} requests a second are answered");
             return Err(Problem::new(Code::TooManyRequests, detail));
         }
         drop(bucket);
@@ -354,7 +354,7 @@ impl Granted {
 impl Bucket {
     fn draw(&mut self, now: Instant) -> bool {
         let passed = now.saturating_duration_since(self.at).as_secs_f64();
-        self.left = (self.left + passed * RATE).min(BURST);
+        self.left = (self.left + passed * REQUEST_RATE).min(REQUEST_BURST);
         self.at = now;
         let any = self.left >= 1.0;
         if any {

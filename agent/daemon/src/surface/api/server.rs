@@ -25,7 +25,7 @@ use crate::surface::serving::{self, Plain};
 /// Read and write permission for owner and group.
 const SOCKET_MODE: u32 = 0o660;
 /// Group that may use the socket of an agent started as root.
-const GROUP: &str = "ros2probe";
+const SOCKET_GROUP: &str = "ros2probe";
 
 /// Why the API cannot be served.
 #[derive(Debug, thiserror::Error)]
@@ -268,14 +268,14 @@ fn lock(path: &Path) -> Result<File, OpenError> {
     }
 }
 
-/// Changes the group of the socket to [`GROUP`] if the agent runs as root and the group exists.
+/// Changes the group of the socket to [`SOCKET_GROUP`] if the agent runs as root and the group exists.
 /// Under the service manager, the agent already has that group. Otherwise the socket keeps the
 /// agent's own group.
 fn give_to_group(path: &Path) {
     let groups = fs::read_to_string("/etc/group").unwrap_or_default();
     let group = groups.lines().find_map(|line| {
         let mut fields = line.split(':');
-        let is_ours = fields.next() == Some(GROUP);
+        let is_ours = fields.next() == Some(SOCKET_GROUP);
         fields.nth(1)?.parse().ok().filter(|_| is_ours)
     });
     if let Some(group) = group {

@@ -247,7 +247,7 @@ impl Registry {
                     encoding: "jsonschema",
                     text: statistics::schema(),
                 };
-                (format!("{}{name}", statistics::PREFIX), Some(schema))
+                (format!("{}{name}", statistics::TOPIC_PREFIX), Some(schema))
             }
         };
         Channel {

@@ -14,7 +14,7 @@ use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 use super::protocol::SUBPROTOCOLS;
 
 /// Version of the WebSocket protocol.
-const VERSION: &str = "13";
+const WEBSOCKET_VERSION: &str = "13";
 
 /// Query of the URL. Viewers can choose only the URL and the subprotocols.
 #[derive(Default, Deserialize)]
@@ -51,7 +51,7 @@ pub(super) fn accept(request: &Request) -> Result<Response, Unfit> {
     let is_websocket = request.method() == Method::GET
         && has(CONNECTION, "upgrade")
         && has(UPGRADE, "websocket")
-        && has(SEC_WEBSOCKET_VERSION, VERSION);
+        && has(SEC_WEBSOCKET_VERSION, WEBSOCKET_VERSION);
     let key = key.filter(|_| is_websocket).ok_or(Unfit::NoWebSocket)?;
     let mut offered = words(headers, &SEC_WEBSOCKET_PROTOCOL);
     let spoken = offered.find_map(|offered| SUBPROTOCOLS.into_iter().find(|ours| *ours == offered));
@@ -84,7 +84,7 @@ impl IntoResponse for Unfit {
                 let headers = [
                     close,
                     (UPGRADE, HeaderValue::from_static("websocket")),
-                    (SEC_WEBSOCKET_VERSION, HeaderValue::from_static(VERSION)),
+                    (SEC_WEBSOCKET_VERSION, HeaderValue::from_static(WEBSOCKET_VERSION)),
                 ];
                 let text = "This port speaks the Foxglove WebSocket protocol. Open its address, \
                             with ws:// in front, in Foxglove, Lichtblick or PlotJuggler.\n";

@@ -23,7 +23,7 @@ use foldhash::{HashMap, HashMapExt as _};
 use ros2probe_wire::Timestamp;
 
 use super::path::{ChainFacts, Paths};
-use super::stamps::{LONGEST, QUIET, Stamp};
+use super::stamps::{MAX_CHAIN_DURATION, EVALUATION_SILENCE, Stamp};
 use crate::facts::names::TopicName;
 
 /// Maximum number of topics.
@@ -235,7 +235,7 @@ impl RecordedChains {
     fn close(&mut self, elapsed: Duration) {
         while let Some(stamp) = self.order.front() {
             let is_open =
-                |open: &Open| elapsed - open.first < LONGEST && elapsed - open.last < QUIET;
+                |open: &Open| elapsed - open.first < MAX_CHAIN_DURATION && elapsed - open.last < EVALUATION_SILENCE;
             if self.open.len() < MAX_OPEN && self.open.get(stamp).is_some_and(is_open) {
                 return;
             }

@@ -12,7 +12,7 @@ use crate::facts::names::TypeName;
 use crate::graph::discovery::Discovery;
 
 /// Steps that the comparison of two names takes.
-const STEPS: usize = 100;
+const STEPS_PER_PAIR: usize = 100;
 /// Maximum number of topics of each role that are compared.
 const MAX_TOPICS: usize = 512;
 
@@ -86,7 +86,7 @@ impl OfType {
     fn examine(&self, discovery: &Discovery, findings: &mut Findings) -> bool {
         for publisher in &self.publishers {
             for subscription in &self.subscriptions {
-                if !findings.spend(STEPS) {
+                if !findings.spend(STEPS_PER_PAIR) {
                     return false;
                 }
                 if let Some(difference) = difference(publisher, subscription, discovery) {

@@ -21,11 +21,11 @@ use crate::facts::tables::{LastLateCalls, LateCallbacks, LateHistory, LongestLat
 use crate::facts::wall_clock::WallClock;
 
 /// Time after which a longer example may be replaced by a shorter one.
-const LONGEST_FOR: Duration = Duration::from_secs(3600);
+const LONGEST_CALL_LIFETIME: Duration = Duration::from_secs(3600);
 /// Time over which late calls are counted for a finding.
 const WINDOW: Duration = Duration::from_secs(60);
 /// Minimum number of late calls with one cause in that time.
-const LEAST: usize = 3;
+const MIN_LATE_CALLS: usize = 3;
 
 /// Late calls by process and callback.
 #[derive(Debug, Default)]
@@ -187,7 +187,7 @@ impl Lateness {
     fn keep_if_long(&mut self, example: Arc<LateExample>) {
         if self.longest.is_full() {
             let rank = |kept: &LateExample| {
-                let is_recent = example.at - kept.at < LONGEST_FOR;
+                let is_recent = example.at - kept.at < LONGEST_CALL_LIFETIME;
                 (is_recent, kept.call.total())
             };
             let kept = self.longest.iter().enumerate();
@@ -212,7 +212,7 @@ impl Lateness {
             *counts.entry((entry.stage, entry.cause)).or_default() += 1;
         }
         let (cause, calls) = counts.into_iter().max_by_key(|(_, calls)| *calls)?;
-        (calls >= LEAST).then_some((cause, calls as u64))
+        (calls >= MIN_LATE_CALLS).then_some((cause, calls as u64))
     }
 
     /// Returns the cause of the last late call.

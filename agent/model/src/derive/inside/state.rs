@@ -34,7 +34,7 @@ use crate::measure::receivers::Receivers;
 use crate::measure::topic::TopicId;
 
 /// Time without a report after which the source counts as stopped.
-const STALE: Duration = Duration::from_secs(10);
+const REPORT_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Processes, handles and topics that reports have shown.
 #[derive(Debug, Default)]
@@ -149,7 +149,7 @@ impl Inside {
     /// Drops topics after their grace period, and all handles if the source has stopped.
     pub fn advance(&mut self, now: ModelTime, grace: Duration) {
         self.topics.expire(now, grace);
-        if self.at.is_some_and(|at| now - at >= STALE) {
+        if self.at.is_some_and(|at| now - at >= REPORT_TIMEOUT) {
             self.detach();
         }
     }

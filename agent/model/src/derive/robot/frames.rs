@@ -8,7 +8,7 @@ use foldhash::HashMap;
 use ros2probe_wire::{DomainId, Guid, header};
 
 use super::text::bounded;
-use super::transforms::{NAME, NAMED, Transforms, without_slash};
+use super::transforms::{NAME, MAX_NAMED, Transforms, without_slash};
 use crate::facts::bounded::{Bounded, Counted, TableFacts};
 use crate::facts::diagnosis::Diagnosis;
 use crate::facts::model_time::ModelTime;
@@ -17,7 +17,7 @@ use crate::facts::robot::{TransformFault, TransformFaultKind};
 use crate::facts::tables::FrameWriters;
 
 /// Time for which no transform may have a frame.
-const UNKNOWN: Duration = Duration::from_secs(8);
+const UNKNOWN_FRAME_TIMEOUT: Duration = Duration::from_secs(8);
 
 /// Writers of messages with a header.
 #[derive(Debug, Default)]
@@ -80,7 +80,7 @@ impl Frames {
                 continue;
             };
             let since = *writer.unknown.get_or_insert(now);
-            if now - since >= UNKNOWN {
+            if now - since >= UNKNOWN_FRAME_TIMEOUT {
                 let topics = unknown.entry((writer.domain_id, frame)).or_default();
                 topics.push(&writer.topic);
             }
@@ -88,7 +88,7 @@ impl Frames {
         let faults = unknown.into_iter().map(|((domain_id, frame), mut topics)| {
             topics.sort_unstable();
             topics.dedup();
-            let names = topics.iter().take(NAMED);
+            let names = topics.iter().take(MAX_NAMED);
             Diagnosis::TransformFault {
                 domain_id,
                 namespace: Arc::default(),

@@ -24,18 +24,18 @@ use crate::facts::tables::{
 };
 
 /// Maximum length of a name, in bytes.
-const NAME: usize = 128;
+const MAX_NAME: usize = 128;
 /// Maximum length of a value, in bytes.
-const VALUE: usize = 256;
+const MAX_VALUE: usize = 256;
 /// Time after a request in which a change counts as its effect.
-const EFFECT: Duration = Duration::from_secs(5);
+const MAX_EFFECT_DELAY: Duration = Duration::from_secs(5);
 
 /// Parameter with which a node uses simulated time.
 const SIMULATED_TIME: &str = "use_sim_time";
 /// Time for which nodes may have different clocks.
-const MIXED: Duration = Duration::from_secs(5);
+const MIXED_TIME_GRACE: Duration = Duration::from_secs(5);
 /// Maximum number of nodes that a finding names.
-const NAMED: usize = 4;
+const MAX_NAMED_NODES: usize = 4;
 
 /// Domain, node and name.
 type Key = (DomainId, NodeName, Arc<str>);
@@ -152,7 +152,7 @@ impl Parameters {
             .retain(|domain_id, _| clocks.contains_key(domain_id));
         for (domain_id, [simulated, system]) in clocks {
             let since = *self.mixed.entry(domain_id).or_insert(now);
-            if now - since >= MIXED {
+            if now - since >= MIXED_TIME_GRACE {
                 findings.push(Diagnosis::MixedTime {
                     domain_id,
                     simulated,
@@ -192,7 +192,7 @@ impl Parameters {
                 } else {
                     system
                 };
-                if nodes.len() < NAMED {
+                if nodes.len() < MAX_NAMED_NODES {
                     nodes.push(node.clone());
                 }
             }
@@ -221,10 +221,10 @@ impl Parameters {
         event: ParameterEvent<'_>,
         events: &mut Events,
     ) -> Result<(), WireError> {
-        let node = NodeName::from(&*bounded(event.node, NAME));
+        let node = NodeName::from(&*bounded(event.node, MAX_NAME));
         for change in event.changes {
             let change = change?;
-            let name = bounded(change.parameter.name, NAME).into();
+            let name = bounded(change.parameter.name, MAX_NAME).into();
             let key = (origin.domain_id, node.clone(), name);
             self.change(origin, key, &change, events);
         }
@@ -295,7 +295,7 @@ impl Parameters {
             return Ok(());
         };
         for (index, name) in names.enumerate() {
-            let name = bounded(name?, NAME).into();
+            let name = bounded(name?, MAX_NAME).into();
             self.asked.push_back(Asked { call, index, name });
         }
         Ok(())
@@ -352,7 +352,7 @@ impl Parameters {
         let node = NodeName::from(node);
         for parameter in parameters {
             let parameter = parameter?;
-            let name = bounded(parameter.name, NAME).into();
+            let name = bounded(parameter.name, MAX_NAME).into();
             self.requests.push_back(Request {
                 key: (origin.domain_id, node.clone(), name),
                 value: text(&parameter.value),
@@ -369,7 +369,7 @@ impl Parameters {
     /// Returns who requested a change to this value.
     fn requester(&self, key: &Key, value: Option<&Arc<str>>, at: ModelTime) -> Option<Requester> {
         let latest = self.requests.iter().rev();
-        let mut recent = latest.filter(|request| request.at <= at && at - request.at <= EFFECT);
+        let mut recent = latest.filter(|request| request.at <= at && at - request.at <= MAX_EFFECT_DELAY);
         let removal = text(&ParameterValue::NotSet);
         let cause = recent
             .find(|request| request.key == *key && request.value == *value.unwrap_or(&removal));
@@ -433,7 +433,7 @@ struct Truncated(String);
 
 impl std::fmt::Write for Truncated {
     fn write_str(&mut self, more: &str) -> std::fmt::Result {
-        let room = VALUE - self.0.len().min(VALUE);
+        let room = MAX_VALUE - self.0.len().min(MAX_VALUE);
         let fitting = more
             .get(..more.floor_char_boundary(room))
             .unwrap_or_default();

@@ -29,7 +29,7 @@ pub(super) const NAME: usize = 128;
 /// Time for which trees stay apart before that is a fault.
 const APART: Duration = Duration::from_secs(10);
 /// Maximum number of roots that a fault names.
-pub(super) const NAMED: usize = 4;
+pub(super) const MAX_NAMED: usize = 4;
 
 /// The transforms of all robots.
 #[derive(Debug, Default)]
@@ -320,7 +320,7 @@ impl Tree {
                         parent: Arc::default(),
                         kind: TransformFaultKind::Apart,
                         edges: 0,
-                        names: self.roots.iter().take(NAMED).cloned().collect(),
+                        names: self.roots.iter().take(MAX_NAMED).cloned().collect(),
                     });
                 }
             }

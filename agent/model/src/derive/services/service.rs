@@ -15,7 +15,7 @@ use crate::facts::tables::{ReplyRuns, ServiceClients};
 /// Number of request numbers that are remembered per client, to recognise late duplicates.
 const WINDOW: u64 = 64;
 /// A number further ahead does not move a client's highest number, since it may be forged.
-const FAR: u64 = 1 << 20;
+const MAX_SEQUENCE_JUMP: u64 = 1 << 20;
 /// Time after which an unanswered call is no longer followed.
 const FORGOTTEN_AFTER: Duration = Duration::from_secs(600);
 
@@ -272,7 +272,7 @@ impl Client {
         }
         if number > self.highest {
             let ahead = number - self.highest;
-            if ahead > FAR {
+            if ahead > MAX_SEQUENCE_JUMP {
                 return true;
             }
             self.seen = if ahead >= WINDOW {

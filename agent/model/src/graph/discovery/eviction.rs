@@ -22,17 +22,17 @@ use crate::facts::journal::Journal;
 use crate::facts::model_time::ModelTime;
 
 /// A participant seen over at least this span is established.
-const ESTABLISHED: Duration = Duration::from_secs(2);
+const MIN_ESTABLISHED_SPAN: Duration = Duration::from_secs(2);
 /// A participant that is not established is silent after this time without a packet.
 const UNESTABLISHED_SILENCE: Duration = Duration::from_secs(5);
 /// Any participant is silent after this time without a packet, whatever its lease: real ones
 /// announce themselves at least every 30 seconds (RTPS 2.5, 8.5.3.3.2).
 pub(super) const MAX_SILENCE: Duration = Duration::from_secs(90);
 /// Minimum time between two searches of a full table; it grows with the number of entries.
-const SEARCH: Duration = Duration::from_millis(100);
-const SEARCH_EACH: Duration = Duration::from_micros(10);
+const SEARCH_INTERVAL: Duration = Duration::from_millis(100);
+const SEARCH_TIME_PER_ENTRY: Duration = Duration::from_micros(10);
 /// Maximum number of candidates of each kind per search.
-const FOUND: usize = 64;
+const MAX_CANDIDATES: usize = 64;
 
 /// Candidates that a search of one table found.
 #[derive(Debug, Default)]
@@ -111,14 +111,14 @@ impl Victims {
             }
         }
         for list in [&mut self.silent, &mut self.others] {
-            if list.len() > FOUND {
-                list.select_nth_unstable(FOUND);
-                list.truncate(FOUND);
+            if list.len() > MAX_CANDIDATES {
+                list.select_nth_unstable(MAX_CANDIDATES);
+                list.truncate(MAX_CANDIDATES);
             }
             list.sort_unstable_by(|one, other| other.cmp(one));
-            list.shrink_to(FOUND);
+            list.shrink_to(MAX_CANDIDATES);
         }
-        self.search_after = now + SEARCH.max(SEARCH_EACH.saturating_mul(visited));
+        self.search_after = now + SEARCH_INTERVAL.max(SEARCH_TIME_PER_ENTRY.saturating_mul(visited));
     }
 
     /// Returns the next entry to evict for the new one.
@@ -160,7 +160,7 @@ impl Victim {
         let last_seen = participant.last_seen;
         Self {
             priority,
-            is_established: last_seen - participant.first_seen >= ESTABLISHED,
+            is_established: last_seen - participant.first_seen >= MIN_ESTABLISHED_SPAN,
             last_seen,
             guid,
         }
@@ -242,7 +242,7 @@ fn silence_priority(participant: &Participant, now: ModelTime) -> Option<Priorit
     if is_silent_for(MAX_SILENCE) {
         return Some(Priority::NOTHING);
     }
-    let is_established = last - participant.first_seen >= ESTABLISHED;
+    let is_established = last - participant.first_seen >= MIN_ESTABLISHED_SPAN;
     (!is_established && is_silent_for(UNESTABLISHED_SILENCE)).then_some(priority)
 }
 

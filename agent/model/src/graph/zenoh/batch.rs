@@ -16,9 +16,9 @@ use super::stream::{StreamId, Unseen};
 use crate::facts::model_time::ModelTime;
 
 /// Free memory for messages in FRAGMENTs below which stale ones are given up: one large message.
-const ROOM: usize = 4 << 20;
+const MIN_FREE_BYTES: usize = 4 << 20;
 /// Time without a FRAGMENT after which a message is given up if memory is needed.
-const STALE: Duration = Duration::from_secs(10);
+const STALE_AFTER: Duration = Duration::from_secs(10);
 /// Minimum time between two searches for stale messages.
 const GIVE_UP_INTERVAL: Duration = Duration::from_secs(1);
 
@@ -111,7 +111,7 @@ impl Zenoh {
             return;
         }
         self.gave_up = now;
-        let before = now - STALE;
+        let before = now - STALE_AFTER;
         for direction in self.directions.values_mut() {
             let held = direction.held();
             self.counters.incomplete += direction.give_up(before) as u64;
@@ -126,7 +126,7 @@ impl Zenoh {
         wants_bytes: bool,
         show: &mut impl FnMut(Shown<'_>),
     ) {
-        if self.chain_bytes.room() < ROOM {
+        if self.chain_bytes.room() < MIN_FREE_BYTES {
             self.give_up_chains(place.time);
         }
         let is_wanted = |beginning: &[u8]| match NetworkMessage::beginning(beginning) {

@@ -12,10 +12,10 @@ use super::stream_state::StreamState;
 use crate::facts::model_time::ModelTime;
 
 /// Lease that rmw_zenoh configures.
-const LEASE: Duration = Duration::from_secs(60);
+const DEFAULT_LEASE: Duration = Duration::from_secs(60);
 /// Part of its lease after which a sender is silent. A live sender sends several times in each
 /// lease, and the other end closes the connection after the whole lease.
-const SILENT: f64 = 0.9;
+const SILENT_LEASE_RATIO: f64 = 0.9;
 
 impl Zenoh {
     /// Returns the opposite direction, seen at the same socket or interface or, on the loopback
@@ -202,8 +202,8 @@ impl Zenoh {
             return None;
         }
         let (place, other) = self.opposite_entry(stream)?;
-        let lease = other.lease.unwrap_or(LEASE);
-        let is_silent = other.last_seen + lease.mul_f64(SILENT) <= now;
+        let lease = other.lease.unwrap_or(DEFAULT_LEASE);
+        let is_silent = other.last_seen + lease.mul_f64(SILENT_LEASE_RATIO) <= now;
         (is_silent && !other.has_left).then_some(*place)
     }
 

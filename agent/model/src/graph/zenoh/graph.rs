@@ -25,10 +25,10 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::tables::{ZenohPassages, ZenohRestored, ZenohServers, ZenohTokens, ZenohWriters};
 
 /// Bytes of a session besides its tokens: its state, and the first nodes of two trees.
-const SESSION: usize = 2048;
+const SESSION_OVERHEAD: usize = 2048;
 /// Bytes that a token's parts take in its node, among the writers and among the servers, without
 /// names.
-const PARTS: usize = 640;
+const TOKEN_OVERHEAD: usize = 640;
 /// Maximum number of routers that are remembered as forwarding tokens of sessions.
 pub(super) const MAX_PASSING_ROUTERS: usize = 256;
 /// An endpoint that discovery knows from saved state.
@@ -45,7 +45,7 @@ pub struct RestoredEndpoint<'a> {
 }
 
 /// Minimum time between two announcements of a session that discovery has forgotten.
-const REPEAT: Duration = Duration::from_secs(1);
+const REPEAT_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A change of the graph, in the terms of DDS.
 #[derive(Debug)]
@@ -192,7 +192,7 @@ impl Graph {
         let Some(state) = self.sessions.get_mut(&session) else {
             return;
         };
-        if now < state.repeated + REPEAT {
+        if now < state.repeated + REPEAT_INTERVAL {
             return;
         }
         state.repeated = now;
@@ -233,9 +233,9 @@ impl Graph {
         let session = node.session;
         let text: Arc<str> = text.into();
         // The names in the text are stored again, in the node or in the key of a service.
-        let mut beside = PARTS + text.len();
+        let mut beside = TOKEN_OVERHEAD + text.len();
         if !self.sessions.contains_key(&session) {
-            beside += SESSION;
+            beside += SESSION_OVERHEAD;
         }
         self.numbered += 1;
         let state = TokenState {

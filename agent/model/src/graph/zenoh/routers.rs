@@ -20,7 +20,7 @@ use crate::facts::model_time::ModelTime;
 /// interval of KEEP_ALIVE that rmw_zenoh configures, 30 s.
 const ALL_SEEN: Duration = Duration::from_secs(35);
 /// Time in which another connection of a router may replace one that ended.
-const REPLACED: Duration = Duration::from_secs(1);
+const REPLACEMENT_TIMEOUT: Duration = Duration::from_secs(1);
 
 impl Zenoh {
     /// Determines which ends of connections are routers, from the processes that hold the sockets.
@@ -144,7 +144,7 @@ impl Zenoh {
 
     /// Ends the sessions that a router no longer reaches.
     pub fn end_unreachable(&mut self, now: ModelTime) {
-        let is_due = |at: ModelTime| at + REPLACED <= now;
+        let is_due = |at: ModelTime| at + REPLACEMENT_TIMEOUT <= now;
         if now < self.began + ALL_SEEN || !self.cut.values().any(|at| is_due(*at)) {
             return;
         }

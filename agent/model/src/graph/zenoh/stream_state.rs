@@ -23,9 +23,9 @@ pub(super) const MAX_KEY: usize = 2048;
 /// Maximum size of one message in FRAGMENTs, in bytes.
 const MAX_MESSAGE: usize = 32 << 20;
 /// Bytes kept of a message whose payload is not requested: everything before the payload.
-const HEAD: usize = 8192;
+const MAX_HEAD: usize = 8192;
 /// Number of publications of one source after which it is considered the sender.
-const PRESUMED: u32 = 3;
+const MIN_PUBLICATIONS_OF_SENDER: u32 = 3;
 
 /// Number of a direction of a transport, never reused.
 pub(super) type DirectionNumber = u64;
@@ -169,7 +169,7 @@ impl StreamState {
 
     /// Returns the session that sends, as far as is known.
     pub(super) fn session(&self) -> Option<ZenohId> {
-        let presumed = self.presumed.filter(|(_, count)| *count >= PRESUMED);
+        let presumed = self.presumed.filter(|(_, count)| *count >= MIN_PUBLICATIONS_OF_SENDER);
         let is_certain = !self.is_ambiguous && !self.may_be_router && !self.is_router;
         let presumed = presumed.filter(|_| is_certain);
         self.sender
@@ -257,7 +257,7 @@ impl StreamState {
         let captured = fragment.bytes.captured;
         let is_whole_so_far = chain.bytes.len() == chain.length;
         chain.length += fragment.bytes.length;
-        let most = if chain.is_wanted { MAX_MESSAGE } else { HEAD };
+        let most = if chain.is_wanted { MAX_MESSAGE } else { MAX_HEAD };
         if is_whole_so_far {
             let kept = most.saturating_sub(chain.bytes.len());
             chain.keep(captured.get(..kept).unwrap_or(captured), room);

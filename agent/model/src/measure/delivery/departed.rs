@@ -4,9 +4,9 @@ use ros2probe_wire::SequenceNumber;
 
 use super::Delivery;
 use super::DeliveryContext;
-use super::FIRST_MOMENTS;
+use super::START_GRACE;
 use super::SILENCE;
-use super::UNDER_WAY;
+use super::MAX_TRANSIT_TIME;
 use crate::facts::model_time::ModelTime;
 
 impl Delivery {
@@ -25,12 +25,12 @@ impl Delivery {
             return;
         }
         let since = *self.waiting.get_or_insert(context.now);
-        let mut until = alive.map_or(ModelTime::ZERO, |alive| alive.min(context.now - UNDER_WAY));
+        let mut until = alive.map_or(ModelTime::ZERO, |alive| alive.min(context.now - MAX_TRANSIT_TIME));
         if !self.presumed_lost && since + SILENCE <= context.now {
             self.presumed_lost = true;
-            until = until.max(since + FIRST_MOMENTS);
+            until = until.max(since + START_GRACE);
         }
-        let due = left_by(context.now - UNDER_WAY).filter(|_| !self.presumed_lost);
+        let due = left_by(context.now - MAX_TRANSIT_TIME).filter(|_| !self.presumed_lost);
         let lost = left_by(until).filter(|number| *number >= self.next());
         if let Some(number) = lost.filter(|_| until >= since) {
             self.connection = None;

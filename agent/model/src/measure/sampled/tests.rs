@@ -1,5 +1,5 @@
 use super::*;
-use crate::measure::sequence::{FAR, REACH, Settled};
+use crate::measure::sequence::{MAX_ANNOUNCED_JUMP, MAX_TRUSTED_JUMP, Settled};
 use ros2probe_wire::time::{SECOND, nanoseconds};
 
 struct View {
@@ -26,7 +26,7 @@ impl View {
         let now = ModelTime::from_nanoseconds(self.now);
         self.sampled.sample(
             (SequenceNumber(number), seen, Some(Timestamp(self.now))),
-            FAR,
+            MAX_ANNOUNCED_JUMP,
             now,
             &mut self.sequence,
         )
@@ -109,7 +109,7 @@ fn a_sample_with_a_known_number_still_waits_for_its_later_fragments() {
     let now = ModelTime::from_nanoseconds(view.now);
     view.sampled.skip(
         (SequenceNumber(501), SequenceNumber(503)),
-        FAR,
+        MAX_ANNOUNCED_JUMP,
         now,
         &mut view.sequence,
     );
@@ -131,18 +131,18 @@ fn a_heartbeat_reveals_unseen_samples_and_a_gap_those_never_sent() {
     let now = ModelTime::from_nanoseconds(view.now);
     assert_eq!(
         view.sampled
-            .exist(SequenceNumber(7), FAR, now, &mut view.sequence),
+            .exist(SequenceNumber(7), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
         0
     );
     view.see(5);
     assert_eq!(
         view.sampled
-            .exist(SequenceNumber(7), FAR, now, &mut view.sequence),
+            .exist(SequenceNumber(7), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
         2
     );
     assert_eq!(
         view.sampled
-            .exist(SequenceNumber(6), FAR, now, &mut view.sequence),
+            .exist(SequenceNumber(6), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
         0
     );
     assert_eq!(view.counts(), (1, 3));
@@ -150,7 +150,7 @@ fn a_heartbeat_reveals_unseen_samples_and_a_gap_those_never_sent() {
     assert_eq!(
         view.sampled.skip(
             (SequenceNumber(9), SequenceNumber(12)),
-            FAR,
+            MAX_ANNOUNCED_JUMP,
             now,
             &mut view.sequence
         ),
@@ -164,7 +164,7 @@ fn a_heartbeat_reveals_unseen_samples_and_a_gap_those_never_sent() {
     assert_eq!(view.counts(), (3, 5));
     let forged = view
         .sampled
-        .exist(SequenceNumber(1 << 40), FAR, now, &mut view.sequence);
+        .exist(SequenceNumber(1 << 40), MAX_ANNOUNCED_JUMP, now, &mut view.sequence);
     assert_eq!((forged, view.counts()), (0, (3, 5)));
     assert_eq!(view.losses(), []);
 }
@@ -187,7 +187,7 @@ fn a_late_sample_that_a_heartbeat_announced_is_not_a_restart() {
     let now = ModelTime::from_nanoseconds(view.now);
     assert_eq!(
         view.sampled
-            .exist(SequenceNumber(5), FAR, now, &mut view.sequence),
+            .exist(SequenceNumber(5), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
         4
     );
     view.now += SECOND;
@@ -223,11 +223,11 @@ fn an_unseen_message_is_reported_once_after_the_arrival_timeout() {
     view.part(6, Completeness::Partial);
     let now = ModelTime::from_nanoseconds(view.now);
     view.sampled
-        .exist(SequenceNumber(8), FAR, now, &mut view.sequence);
+        .exist(SequenceNumber(8), MAX_ANNOUNCED_JUMP, now, &mut view.sequence);
     // Numbers skipped by a GAP are not missing.
     view.sampled.skip(
         (SequenceNumber(9), SequenceNumber(200)),
-        FAR,
+        MAX_ANNOUNCED_JUMP,
         now,
         &mut view.sequence,
     );
@@ -296,10 +296,10 @@ fn a_forged_number_far_ahead_counts_as_one_message_and_affects_no_other() {
     let now = ModelTime::from_nanoseconds(view.now);
     let messages = view
         .sampled
-        .exist(SequenceNumber(3000), REACH, now, &mut view.sequence);
+        .exist(SequenceNumber(3000), MAX_TRUSTED_JUMP, now, &mut view.sequence);
     let passed = view.sampled.skip(
         (SequenceNumber(2000), SequenceNumber(3000)),
-        REACH,
+        MAX_TRUSTED_JUMP,
         now,
         &mut view.sequence,
     );
@@ -354,7 +354,7 @@ fn consecutive_missed_messages_explain_a_longer_silence() {
     let mut view = View::new();
     view.see(1);
     let short = view.sampled.seeming_silence(Duration::from_millis(1));
-    assert_eq!(short, POLLING_HOLE);
+    assert_eq!(short, MAX_POLLING_GAP);
     view.sampled.end();
     assert!(
         view.sampled

@@ -3,9 +3,9 @@
 
 use ros2probe_wire::SequenceNumber;
 
-use super::FAR;
+use super::MAX_ANNOUNCED_JUMP;
 use super::MAX_JUMP;
-use super::REACH;
+use super::MAX_TRUSTED_JUMP;
 use super::Sequence;
 use super::Settled;
 use super::unconfirmed::Run;
@@ -25,7 +25,7 @@ impl Sequence {
             return;
         }
         let next = last.next();
-        let (is_confirmed, run) = self.claim(next, REACH, now);
+        let (is_confirmed, run) = self.claim(next, MAX_TRUSTED_JUMP, now);
         if let Some(run) = run {
             self.accept(&run, now, settled);
         }
@@ -64,7 +64,7 @@ impl Sequence {
             return (true, None);
         }
         let unconfirmed = self.unconfirmed.get_or_insert_default();
-        if ahead <= FAR && unconfirmed.is_claimed(next, reach, now) {
+        if ahead <= MAX_ANNOUNCED_JUMP && unconfirmed.is_claimed(next, reach, now) {
             return (true, None);
         }
         self.jumps += 1;
@@ -74,7 +74,7 @@ impl Sequence {
     /// Returns whether an ACKNACK is refused because it acknowledges numbers far above the known
     /// ones.
     pub const fn refuses(&mut self, base: SequenceNumber) -> bool {
-        let refuses = self.started() && base.steps_since(self.next) > FAR;
+        let refuses = self.started() && base.steps_since(self.next) > MAX_ANNOUNCED_JUMP;
         self.jumps += refuses as u64;
         refuses
     }
@@ -101,7 +101,7 @@ impl Sequence {
             return;
         }
         let ahead = base.steps_since(self.next);
-        if ahead > REACH {
+        if ahead > MAX_TRUSTED_JUMP {
             self.jumps += 1;
             if ahead <= MAX_JUMP {
                 self.unconfirmed
@@ -112,7 +112,7 @@ impl Sequence {
         }
         let mut one = |sequence: &mut Self, start: SequenceNumber, end: SequenceNumber| {
             if end > sequence.next {
-                if end - sequence.next > REACH {
+                if end - sequence.next > MAX_TRUSTED_JUMP {
                     return;
                 }
                 sequence.extend(end.previous(), end, now, settled);

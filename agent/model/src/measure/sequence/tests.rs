@@ -29,7 +29,7 @@ impl Bench {
         let number = SequenceNumber(number);
         let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
         let (source, now) = (source.map(Timestamp), ModelTime::from_nanoseconds(self.now));
-        match self.sequence.recognise(number, source, REACH, now) {
+        match self.sequence.recognise(number, source, MAX_TRUSTED_JUMP, now) {
             RunMembership::Live => {}
             RunMembership::Unconfirmed { .. } => {
                 if !self.sequence.complete_unconfirmed(number) {

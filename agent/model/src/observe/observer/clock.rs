@@ -8,11 +8,11 @@ use ros2probe_wire::record::Verdict;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Timestamp};
 
-use super::JUMP;
+use super::MAX_CLOCK_STEP;
 use super::Observer;
 use super::TICK;
 use crate::facts::diagnosis;
-use crate::facts::event::{EventKind, TEXT, bounded, bounded_finding};
+use crate::facts::event::{EventKind, MAX_TEXT, bounded, bounded_finding};
 use crate::facts::loss_share::LossShare;
 use crate::facts::measurement::Measurement;
 use crate::facts::model_time::ModelTime;
@@ -26,7 +26,7 @@ use crate::report::transport::is_polled;
 impl Observer {
     /// Advances the time: expires leases, settles gaps, evaluates expectations.
     pub(super) fn advance(&mut self, now: ModelTime) {
-        if self.clock == ModelTime::ZERO || now - self.clock > JUMP {
+        if self.clock == ModelTime::ZERO || now - self.clock > MAX_CLOCK_STEP {
             self.clock = now.round_down(TICK);
             self.tick(self.clock);
         }
@@ -114,10 +114,10 @@ impl Observer {
         let discovery = &graph.discovery;
         self.journal.events.end_bursts(|burst| {
             if let Some(endpoint) = discovery.endpoints().get(&burst.writer) {
-                burst.topic = Some((endpoint.domain_id, endpoint.topic.bounded(TEXT)));
+                burst.topic = Some((endpoint.domain_id, endpoint.topic.bounded(MAX_TEXT)));
             }
             let node = discovery.node_of(graph.base_of(burst.writer));
-            burst.node = node.map(|node| node.name.bounded(TEXT));
+            burst.node = node.map(|node| node.name.bounded(MAX_TEXT));
         });
     }
 
@@ -285,7 +285,7 @@ impl Observer {
                 let (domain_id, name) = (topic.domain_id, &topic.naming.name);
                 let kind = EventKind::Expectation {
                     domain_id,
-                    topic: name.bounded(TEXT),
+                    topic: name.bounded(MAX_TEXT),
                     watch: bounded(&watch.pattern).into(),
                     from,
                     to,
@@ -295,7 +295,7 @@ impl Observer {
                 if to == WatchState::Silent {
                     let kind = EventKind::Silence {
                         domain_id,
-                        topic: name.bounded(TEXT),
+                        topic: name.bounded(MAX_TEXT),
                         watch: bounded(&watch.pattern).into(),
                         last_message: last_message.map(|at| self.graph.wall_clock.wall_time(at)),
                     };

@@ -19,7 +19,7 @@ use ros2probe_model::measure::history::Past;
 use ros2probe_model::report::snapshot::{EndpointFacts, Snapshot};
 
 /// Maximum number of findings in a list.
-const MOST: usize = 512;
+const MAX_FINDINGS: usize = 512;
 
 /// Input of the findings.
 pub(super) struct Circumstances<'a> {
@@ -40,7 +40,7 @@ pub(super) fn findings(circumstances: &Circumstances<'_>) -> Vec<Finding> {
     list.sort_by(|one, other| {
         (one.severity, &one.kind, &one.id).cmp(&(other.severity, &other.kind, &other.id))
     });
-    list.truncate(MOST);
+    list.truncate(MAX_FINDINGS);
     list
 }
 
@@ -101,7 +101,7 @@ fn of_agent(all: &Circumstances<'_>) -> Vec<Finding> {
         let text = "Writers are active whose announcement was missed; their topics are unknown";
         let unknown = finding("unknown_writers", Severity::Warning, "", text.to_owned());
         let remedy = missed_announcements::remedy(snapshot);
-        list.push(unknown.with_remedy(remedy.unwrap_or(missed_announcements::DISCOVER)));
+        list.push(unknown.with_remedy(remedy.unwrap_or(missed_announcements::DISCOVER_COMMAND)));
     }
     if snapshot.topics_rejected > 0 {
         let text = "Watched topics are not measured: limits.topics is reached".to_owned();
@@ -260,7 +260,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             reason,
         } => Finding {
             writer: Some(writer.to_string()),
-            ..unmatched(kind, topic, *writer, reason.label(), ends, PUBLISHER)
+            ..unmatched(kind, topic, *writer, reason.label(), ends, PUBLISHER_WORDS)
         },
         Diagnosis::UnmatchedSubscription {
             topic,
@@ -268,7 +268,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             reason,
         } => Finding {
             reader: Some(reader.to_string()),
-            ..unmatched(kind, topic, *reader, reason.label(), ends, SUBSCRIBER)
+            ..unmatched(kind, topic, *reader, reason.label(), ends, SUBSCRIBER_WORDS)
         },
         Diagnosis::HangingCall { topic, writer } => {
             let text = format!(
@@ -399,8 +399,8 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
 }
 
 /// Role of an endpoint, and its counterpart.
-const PUBLISHER: [&str; 2] = ["publishes", "subscription"];
-const SUBSCRIBER: [&str; 2] = ["subscribes to", "publisher"];
+const PUBLISHER_WORDS: [&str; 2] = ["publishes", "subscription"];
+const SUBSCRIBER_WORDS: [&str; 2] = ["subscribes to", "publisher"];
 
 /// Describes an endpoint without a counterpart.
 fn unmatched(
@@ -568,7 +568,7 @@ mod tests {
 
     #[test]
     fn findings_beyond_the_cap_are_dropped_and_the_most_severe_stay() {
-        let list = (0..2 * MOST).map(|number| Diagnosis::DuplicateNode {
+        let list = (0..2 * MAX_FINDINGS).map(|number| Diagnosis::DuplicateNode {
             domain_id: DomainId(0),
             node: format!("/node_{number}").into(),
             participants: Vec::new(),
@@ -587,7 +587,7 @@ mod tests {
             ids: &Ids::default(),
             unready: Some("no packet was seen"),
         });
-        assert_eq!(found.len(), MOST);
+        assert_eq!(found.len(), MAX_FINDINGS);
         let first = found.first().unwrap();
         assert_eq!(
             (&*first.kind, first.severity),

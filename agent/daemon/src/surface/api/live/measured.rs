@@ -5,7 +5,7 @@ use std::cmp::Reverse;
 
 use super::super::watch::expectations;
 use super::findings::{Circumstances, finding};
-use super::values::{LOSS, lost_lately};
+use super::values::{LOSS_FLAG_SECONDS, lost_lately};
 use ros2probe_api::live::{Finding, Severity};
 use ros2probe_model::facts::names::NodeName;
 use ros2probe_model::facts::route::Direction;
@@ -128,7 +128,7 @@ fn died(topic: &TopicFacts) -> (&'static str, &'static str) {
     }
 }
 
-/// Returns when the current loss began. Pauses of up to [`LOSS`] seconds do not end a loss. Returns
+/// Returns when the current loss began. Pauses of up to [`LOSS_FLAG_SECONDS`] seconds do not end a loss. Returns
 /// `None` without a recent loss.
 fn began(past: &Past, topic: u32) -> Option<f64> {
     let mut began = None;
@@ -139,7 +139,7 @@ fn began(past: &Past, topic: u32) -> Option<f64> {
         } else {
             pause += 1;
         }
-        if pause > LOSS {
+        if pause > LOSS_FLAG_SECONDS {
             break;
         }
     }

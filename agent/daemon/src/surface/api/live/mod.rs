@@ -28,7 +28,7 @@ use utoipa_axum::routes;
 use super::Context;
 use super::body_stream::{Pieces, lines_of, stream_of, write_line};
 use super::events::event;
-use super::health::HOST;
+use super::health::HOST_NAME;
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
 use crate::agent_facts::SourceKind;
@@ -43,11 +43,11 @@ use shared_lines::SharedLines;
 /// that other requests still get a connection.
 const MAX_TABS: usize = 16;
 /// Time between two batches; the agent publishes its state once per second.
-const INTERVAL: Duration = Duration::from_secs(1);
+const BATCH_INTERVAL: Duration = Duration::from_secs(1);
 /// The stream begins to wait for the next state this long before it is due.
-const EARLY: Duration = Duration::from_millis(100);
+const EARLY_WAIT: Duration = Duration::from_millis(100);
 /// Maximum number of events in one batch.
-const EVENTS: usize = 64;
+const MAX_EVENTS: usize = 64;
 
 /// State that all streams share. The shared lines exist only while a stream is open.
 #[derive(Debug)]
@@ -154,14 +154,14 @@ fn open(context: &Context, state: &Known, access: String) -> Open {
     });
     Open {
         run: context.events.run(),
-        host: HOST.clone(),
+        host: HOST_NAME.clone(),
         version: env!("CARGO_PKG_VERSION").into(),
         source: state.agent.source.label().into(),
         access,
         interval_seconds: 1,
         history_seconds: context.live.history.as_secs(),
         keeps_history: context.disk_history.is_kept(),
-        flags: values::FLAGS.map(Into::into).into(),
+        flags: values::FLAG_MEANINGS.map(Into::into).into(),
         passages: Transport::ALL.map(|each| each.label().into()).into(),
         replay,
     }
@@ -195,11 +195,11 @@ impl Stream {
     async fn moment(&self) -> bool {
         let latest = &self.context.latest;
         let next = async {
-            sleep_until(self.sent + INTERVAL - EARLY).await;
+            sleep_until(self.sent + BATCH_INTERVAL - EARLY_WAIT).await;
             tokio::select! {
                 () = latest.published() => {}
                 // A finished capture publishes no further state.
-                () = sleep_until(self.sent + INTERVAL + EARLY * 3) => {}
+                () = sleep_until(self.sent + BATCH_INTERVAL + EARLY_WAIT * 3) => {}
             }
         };
         tokio::select! {
@@ -227,7 +227,7 @@ impl Stream {
             write_line(lines, &Line::History(history));
         }
         let log = &context.events;
-        let batch = log.read(self.place, EVENTS);
+        let batch = log.read(self.place, MAX_EVENTS);
         self.place = batch.last;
         if batch.lagged > 0 || !batch.records.is_empty() {
             log.overtook(Reader::Stream, batch.lagged);

@@ -11,7 +11,7 @@ use subtle::ConstantTimeEq as _;
 use crate::tables::PageTokens;
 
 /// Random bytes of a token, which is written in hexadecimal.
-const BYTES: usize = 32;
+const TOKEN_BYTES: usize = 32;
 
 /// The valid tokens, oldest first.
 #[derive(Default)]
@@ -23,14 +23,14 @@ impl Tokens {
     /// # Errors
     /// Fails if the kernel returns no random bytes.
     pub(in super::super) fn mint(&self) -> io::Result<String> {
-        let mut bytes = [0; BYTES];
+        let mut bytes = [0; TOKEN_BYTES];
         let flags = rustix::rand::GetRandomFlags::empty();
         // A call returns up to 256 bytes without interruption (getrandom(2)).
         let given = rustix::rand::getrandom(&mut bytes, flags)?;
-        if given != BYTES {
+        if given != TOKEN_BYTES {
             return Err(io::ErrorKind::UnexpectedEof.into());
         }
-        let mut token = String::with_capacity(2 * BYTES);
+        let mut token = String::with_capacity(2 * TOKEN_BYTES);
         for byte in bytes {
             // Writing to a string cannot fail.
             let _ = write!(token, "{byte:02x}");

@@ -15,16 +15,16 @@ use super::writer::seconds;
 use ros2probe_history::Store;
 
 /// Number of answers that read the storage at the same time.
-const READERS: usize = 2;
-static TURNS: Semaphore = Semaphore::const_new(READERS);
+const MAX_READERS: usize = 2;
+static READER_PERMITS: Semaphore = Semaphore::const_new(MAX_READERS);
 /// Maximum number of rows in an answer; a smaller step becomes longer.
 const MAX_ROWS: u32 = 2_000;
 /// Number of rows in an answer without `step`.
-const ROWS: u32 = 600;
+const DEFAULT_ROWS: u32 = 600;
 /// Time of an answer without `from`, in seconds.
-const HOUR: u32 = 3_600;
+const DEFAULT_SPAN_SECONDS: u32 = 3_600;
 /// Maximum time of an answer.
-const READ_WITHIN: Duration = Duration::from_secs(10);
+const READ_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Times of a question.
 #[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
@@ -91,11 +91,11 @@ impl Range {
     /// Fails if the end is before the begin, or a number is impossible.
     pub(in super::super) fn checked(self, now: u32) -> Result<Times, Problem> {
         let to = self.to.map_or(Ok(now), second)?;
-        let from = self.from.map_or(Ok(to.saturating_sub(HOUR)), second)?;
+        let from = self.from.map_or(Ok(to.saturating_sub(DEFAULT_SPAN_SECONDS)), second)?;
         let span = to.checked_sub(from).filter(|span| *span > 0);
         let span = span.ok_or_else(|| invalid("`to` must be later than `from`"))?;
         let step = match self.step {
-            None => span.div_ceil(ROWS),
+            None => span.div_ceil(DEFAULT_ROWS),
             Some(0) => return Err(invalid("`step` must be at least 1")),
             Some(step) => step.max(span.div_ceil(MAX_ROWS)),
         };
@@ -133,8 +133,8 @@ pub(super) fn now(context: &Context) -> u32 {
     seconds(context.latest.state().known().time())
 }
 
-/// Reads the store on another thread. A storage that hangs holds [`READERS`] threads, whatever the
-/// number of clients, and no client longer than [`READ_WITHIN`].
+/// Reads the store on another thread. A storage that hangs holds [`MAX_READERS`] threads, whatever the
+/// number of clients, and no client longer than [`READ_TIMEOUT`].
 ///
 /// # Errors
 /// Fails if no history is kept, if the storage does not answer, or if the agent stops.
@@ -148,7 +148,7 @@ pub(in super::super) async fn read_store<T: Send + 'static>(
     if !history.is_kept() {
         return Err(missing(none));
     }
-    let answer = in_turn(&TURNS, READ_WITHIN, move || history.opened().map(read)).await;
+    let answer = in_turn(&READER_PERMITS, READ_TIMEOUT, move || history.opened().map(read)).await;
     match answer {
         Ok(answer) => answer.ok_or_else(|| missing(none)),
         Err(NoResult::Late) => Err(missing("the storage of the history does not answer")),

@@ -17,7 +17,7 @@ use ros2probe_history::{Tier, TopicName, TopicRow, merge_into};
 use ros2probe_wire::DomainId;
 
 /// Time over which a rate is taken, in seconds.
-const WINDOW: u32 = 10;
+const RATE_WINDOW_SECONDS: u32 = 10;
 
 /// Answers with the history of a topic, also of one that no longer exists.
 pub(in super::super) async fn show(
@@ -52,11 +52,11 @@ pub(in super::super) async fn show(
         };
         let seconds = store.span(Tier::Seconds);
         if seconds.is_none_or(|seconds| seconds.begin > times.from) {
-            times.step = times.step.max(WINDOW);
+            times.step = times.step.max(RATE_WINDOW_SECONDS);
         }
         let (mut steps, mut first) = (Vec::new(), None::<TopicName>);
         // The rate of the first row needs the time before it.
-        let begin = times.from.saturating_sub(WINDOW);
+        let begin = times.from.saturating_sub(RATE_WINDOW_SECONDS);
         store.topics(begin..times.to, times.step, &is_wanted, &mut |of, row| {
             // A former topic of this name may have been in several domains. The first one is
             // shown; `domain_id` selects another.
@@ -103,7 +103,7 @@ fn columns(steps: &[TopicRow], times: Times) -> History {
     for end in (first..=times.to.next_multiple_of(times.step)).step_by(times.step as usize) {
         let row = steps.next_if(|row| row.at <= end);
         window.extend(row);
-        let reach = WINDOW.max(times.step);
+        let reach = RATE_WINDOW_SECONDS.max(times.step);
         while window
             .front()
             .is_some_and(|oldest| oldest.at + reach <= end)

@@ -199,7 +199,7 @@ fn a_long_body_is_refused_before_it_is_read() {
 fn a_flood_exceeds_the_rate_limit_until_the_bucket_refills() {
     let start = Instant::now();
     let mut bucket = Bucket {
-        left: BURST,
+        left: REQUEST_BURST,
         at: start,
     };
     let drawn = (0..2000).filter(|_| bucket.draw(start)).count();
