@@ -52,7 +52,7 @@ pub struct Clocks {
     /// Writers of this host with readers on a peer that acknowledge.
     writers: Bounded<Counted<ClockWriters>, HashMap<Guid, Sent>>,
     /// The latest messages of all other writers.
-    others: Others,
+    unacknowledged: UnacknowledgedMessages,
     /// Name that participants of this host announce.
     name: Option<Arc<str>>,
     /// Whether latencies of a peer's messages are corrected.
@@ -65,7 +65,7 @@ struct Peer {
     name: Option<Arc<str>>,
     evidence: Evidence,
     /// The finding, as it began.
-    apart: Option<Range>,
+    offset_finding: Option<Range>,
     /// Nanoseconds that are added to latencies of its messages.
     correction: i64,
 }
@@ -94,7 +94,7 @@ struct Announced {
 
 /// The latest messages of writers that no peer has acknowledged, and the times at which they left.
 #[derive(Debug, Default)]
-struct Others {
+struct UnacknowledgedMessages {
     messages: [(Guid, SequenceNumber, ModelTime); MAX_UNACKNOWLEDGED_WRITERS],
     /// Place of the oldest message.
     oldest: usize,
@@ -165,18 +165,18 @@ impl Clocks {
     }
 
     /// Records that a peer stamped a reply to a request that left this host at `sent`.
-    pub fn replied(&mut self, peer: IpAddr, stamp: Timestamp, sent: ModelTime, now: ModelTime) {
+    pub fn note_reply(&mut self, peer: IpAddr, stamp: Timestamp, sent: ModelTime, now: ModelTime) {
         if let Some(peer) = self.peers.get_mut(&peer) {
             peer.evidence.replied(ahead(stamp, sent), now);
         }
     }
 
     /// Records that a message of this host left for the first time or again.
-    pub fn left(&mut self, writer: Guid, number: SequenceNumber, at: ModelTime) {
+    pub fn note_sent(&mut self, writer: Guid, number: SequenceNumber, at: ModelTime) {
         match self.writers.get_mut(&writer) {
             Some(sent) => sent.put(number, at),
             // A writer may request one acknowledgement only, of its first messages.
-            None => self.others.put((writer, number, at)),
+            None => self.unacknowledged.put((writer, number, at)),
         }
     }
 
@@ -199,7 +199,7 @@ impl Clocks {
             Some(sent) => sent.requested(number).max(sent.time(number)),
             None => {
                 self.writers.get_or_insert_with(writer, Sent::default);
-                self.others.time(writer, number)
+                self.unacknowledged.time(writer, number)
             }
         };
         if let Some(left) = left
@@ -235,12 +235,12 @@ impl Clocks {
         for peer in self.peers.values_mut() {
             let range = peer.evidence.range(now, clock);
             let least = range.map_or(0, |range| range.least_distance());
-            let is_apart = match peer.apart {
+            let is_apart = match peer.offset_finding {
                 Some(_) => least > MAX_OFFSET_OF_RESOLUTION,
                 None => least > MIN_OFFSET_OF_FINDING,
             };
-            if is_apart != peer.apart.is_some() {
-                peer.apart = range.filter(|_| is_apart);
+            if is_apart != peer.offset_finding.is_some() {
+                peer.offset_finding = range.filter(|_| is_apart);
                 changes += 1;
             }
         }
@@ -274,7 +274,7 @@ impl Clocks {
     pub fn findings(&self) -> impl Iterator<Item = Diagnosis> {
         let labels = self.labels();
         self.peers.iter().filter_map(move |(address, peer)| {
-            let range = peer.apart?;
+            let range = peer.offset_finding?;
             Some(Diagnosis::ClocksApart {
                 peer: labels.get(address).cloned()?,
                 offset: range.middle(),
@@ -391,7 +391,7 @@ impl Sent {
     }
 }
 
-impl Others {
+impl UnacknowledgedMessages {
     fn put(&mut self, message: (Guid, SequenceNumber, ModelTime)) {
         if let Some(oldest) = self.messages.get_mut(self.oldest) {
             *oldest = message;

@@ -155,7 +155,7 @@ struct RobotWriter {
 
 /// What a sample of a followed writer changed.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Heard {
+pub enum ReadOutcome {
     /// Nothing, or some of its bytes are still missing.
     Nothing,
     /// The writer is paused, or needs no further messages: its verdict has changed.
@@ -391,37 +391,37 @@ impl Robot {
 
     /// Reads a DATA or DATA_FRAG of a followed writer. `node` is the node that has the writer.
     /// `vendor` is its implementation. `call` identifies the call of a request or reply.
-    pub fn hear(
+    pub fn read_sample(
         &mut self,
         sample: &Sample,
         payload: &[u8],
         (node, vendor): (Option<&NodeName>, VendorId),
         call: impl FnOnce(Half) -> Option<CallId>,
         events: &mut Events,
-    ) -> Heard {
+    ) -> ReadOutcome {
         let (writer, now) = (sample.head.writer, sample.head.at);
         if sample.is_message() && sample.is_start() && self.frames.waits(writer) {
             self.frames.read(writer, payload);
-            return Heard::Paused;
+            return ReadOutcome::Paused;
         }
         let Some(known) = self.writers.get_mut(&writer) else {
-            return Heard::Nothing;
+            return ReadOutcome::Nothing;
         };
         // Until the kernel knows of a pause, it captures more.
         let allowance = self.allowances.of(known.standard);
         let is_allowed = allowance.spend(&mut known.allowance, payload.len(), now);
         if known.allowance.is_paused() || !sample.is_message() {
-            return Heard::Nothing;
+            return ReadOutcome::Nothing;
         }
         let bytes = usize::try_from(sample.size()).unwrap_or(usize::MAX);
         if !is_allowed || bytes > MESSAGE_BYTES {
             allowance.pause(&mut known.allowance);
             self.assembly.release(writer);
-            return Heard::Paused;
+            return ReadOutcome::Paused;
         }
         let number = sample.sequence_number;
         if known.read.has(number) {
-            return Heard::Nothing;
+            return ReadOutcome::Nothing;
         }
         let standard = known.standard;
         let assembled;
@@ -430,10 +430,10 @@ impl Robot {
             false => {
                 self.assembly.put(sample, payload, 0);
                 if !self.assembly.is_whole(writer, number) {
-                    return Heard::Nothing;
+                    return ReadOutcome::Nothing;
                 }
                 let Some(bytes) = self.assembly.take(writer, number) else {
-                    return Heard::Nothing;
+                    return ReadOutcome::Nothing;
                 };
                 assembled = bytes;
                 &assembled
@@ -458,7 +458,7 @@ impl Robot {
                 .and_then(|transforms| self.transforms.add(&origin, transforms, events)),
             Standard::TransitionEvent => match Transition::parse(payload) {
                 Ok(transition) => match self.lifecycle.transit(&origin, transition) {
-                    Some(node) => return Heard::Transition(transition.from, node),
+                    Some(node) => return ReadOutcome::Transition(transition.from, node),
                     None => Ok(()),
                 },
                 Err(error) => Err(error),
@@ -474,7 +474,7 @@ impl Robot {
                     .and_then(|parameters| self.parameters.request(&origin, parameters))
             }
             Standard::GetParameters => RequestedNames::of_request(payload, header(vendor))
-                .and_then(|names| self.parameters.ask(call(Half::Requests), names)),
+                .and_then(|names| self.parameters.add_get_request(call(Half::Requests), names)),
             Standard::ParameterValues => {
                 RepliedValues::of_reply(payload, header(vendor)).and_then(|values| {
                     self.parameters
@@ -483,8 +483,8 @@ impl Robot {
             }
         };
         match decoded {
-            Ok(()) => Heard::Decoded,
-            Err(error) => Heard::Malformed(standard, error),
+            Ok(()) => ReadOutcome::Decoded,
+            Err(error) => ReadOutcome::Malformed(standard, error),
         }
     }
 

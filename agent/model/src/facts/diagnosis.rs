@@ -20,7 +20,7 @@ use ros2probe_wire::{DomainId, Guid};
 
 use crate::facts::calls::facts::Owner;
 use crate::facts::calls::late::{Cause, Stage};
-use crate::facts::calls::other_thread::Culprit;
+use crate::facts::calls::other_thread::ThreadLabel;
 use crate::facts::calls::report::Trigger;
 use crate::facts::link::LinkKey;
 use crate::facts::names::{DdsName, NodeName, TopicName, TypeName};
@@ -173,7 +173,7 @@ pub enum Diagnosis {
         /// What made them late.
         cause: Cause,
         /// Thread that ran instead or held the lock, in the longest of the last calls.
-        by: Option<Culprit>,
+        by: Option<ThreadLabel>,
         /// Time from ready to the end of that call.
         longest: Duration,
     },

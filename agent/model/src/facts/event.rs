@@ -298,7 +298,7 @@ impl Events {
 
     /// Adds samples that one receiver lost to the burst of their writer. A burst has the count of
     /// the receiver that lost most.
-    pub fn lose_delivery(
+    pub fn add_delivery_loss(
         &mut self,
         writer: Guid,
         receiver: Receiver,
@@ -523,19 +523,19 @@ mod tests {
         let mut events = Events::default();
         let receiver = |number| Receiver::Participant(GuidPrefix([number; 12]));
         let run = |first, last| (SequenceNumber(first), SequenceNumber(last));
-        events.lose_delivery(
+        events.add_delivery_loss(
             guid(1),
             receiver(1),
             ModelTime::from_nanoseconds(10),
             run(5, 7),
         );
-        events.lose_delivery(
+        events.add_delivery_loss(
             guid(1),
             receiver(2),
             ModelTime::from_nanoseconds(10),
             run(6, 7),
         );
-        events.lose_delivery(
+        events.add_delivery_loss(
             guid(1),
             receiver(2),
             ModelTime::from_nanoseconds(11),
@@ -554,7 +554,7 @@ mod tests {
         for number in 0..100 {
             let receiver = Receiver::Participant(GuidPrefix([number; 12]));
             let run = (SequenceNumber(1), SequenceNumber(2));
-            events.lose_delivery(guid(1), receiver, ModelTime::from_nanoseconds(10), run);
+            events.add_delivery_loss(guid(1), receiver, ModelTime::from_nanoseconds(10), run);
         }
         assert!(events.bursts[&guid(1)].losers.is_full());
     }

@@ -34,10 +34,10 @@ const SPARE_BUFFER_LIFETIME: Duration = Duration::from_secs(10);
 pub struct Assembly {
     parts: Bounded<AssembledSamples, HashMap<(Guid, SequenceNumber), Part>>,
     /// The same samples in the order in which they began.
-    ages: Bounded<AssembledSamples, BTreeMap<u64, (Guid, SequenceNumber)>>,
+    by_age: Bounded<AssembledSamples, BTreeMap<u64, (Guid, SequenceNumber)>>,
     /// Payloads that were passed on, oldest first. A buffer is free once its readers have dropped
     /// it.
-    passed: VecDeque<(ModelTime, Bytes)>,
+    handed_out: VecDeque<(ModelTime, Bytes)>,
     begun: u64,
     bytes: usize,
     limit: usize,
@@ -57,7 +57,7 @@ struct Part {
     ahead: BTreeMap<u32, Box<[u8]>>,
     /// Bytes of `ahead`, including the overhead of each entry.
     ahead_bytes: usize,
-    touched: ModelTime,
+    last_changed: ModelTime,
 }
 
 impl Assembly {
@@ -66,8 +66,8 @@ impl Assembly {
     pub fn new(limit: usize) -> Self {
         Self {
             parts: Bounded::default(),
-            ages: Bounded::default(),
-            passed: VecDeque::new(),
+            by_age: Bounded::default(),
+            handed_out: VecDeque::new(),
             begun: 0,
             bytes: 0,
             limit,
@@ -93,7 +93,7 @@ impl Assembly {
                 self.evict();
             }
             self.begun += 1;
-            self.ages.insert(self.begun, key);
+            self.by_age.insert(self.begun, key);
             let part = Part {
                 head: self.buffer(size),
                 ..Part::new(self.begun, size, fragment_size, now)
@@ -109,15 +109,15 @@ impl Assembly {
             return;
         }
         let before = part.bytes();
-        part.touched = now;
+        part.last_changed = now;
         let start = match sample.content {
             Content::Data { .. } => 1,
             Content::DataFrag(fragments) => fragments.starting,
         };
         part.put(start, payload);
         self.bytes = self.bytes + part.bytes() - before;
-        while self.bytes + self.passed_bytes() + other_bytes > self.limit {
-            if self.passed.pop_front().is_none() && !self.evict() {
+        while self.bytes + self.handed_out_bytes() + other_bytes > self.limit {
+            if self.handed_out.pop_front().is_none() && !self.evict() {
                 break;
             }
         }
@@ -125,7 +125,7 @@ impl Assembly {
 
     /// Drops the oldest sample. Returns whether there was one.
     fn evict(&mut self) -> bool {
-        let oldest = self.ages.first_key_value().map(|(_, key)| *key);
+        let oldest = self.by_age.first_key_value().map(|(_, key)| *key);
         if let Some((writer, number)) = oldest {
             self.forget(writer, number);
             self.evictions += 1;
@@ -149,16 +149,16 @@ impl Assembly {
         let payload = Bytes::from(part.head);
         if (MIN_REUSED_BUFFER..=self.limit / 2).contains(&payload.len()) {
             let others = self.limit / 2 - payload.len();
-            while self.passed.len() >= MAX_SPARE_BUFFERS || self.passed_bytes() > others {
-                self.passed.pop_front();
+            while self.handed_out.len() >= MAX_SPARE_BUFFERS || self.handed_out_bytes() > others {
+                self.handed_out.pop_front();
             }
-            self.passed.push_back((part.touched, payload.clone()));
+            self.handed_out.push_back((part.last_changed, payload.clone()));
         }
         Some(payload)
     }
 
-    fn passed_bytes(&self) -> usize {
-        self.passed.iter().map(|(_, payload)| payload.len()).sum()
+    fn handed_out_bytes(&self) -> usize {
+        self.handed_out.iter().map(|(_, payload)| payload.len()).sum()
     }
 
     /// Returns an empty buffer. A large one may be that of an earlier payload that has no reader
@@ -167,8 +167,8 @@ impl Assembly {
         let is_free = |(_, payload): &(ModelTime, Bytes)| {
             (size..=2 * size).contains(&payload.len()) && payload.is_unique()
         };
-        let index = (size >= MIN_REUSED_BUFFER).then(|| self.passed.iter().position(is_free));
-        let free = index.flatten().and_then(|index| self.passed.remove(index));
+        let index = (size >= MIN_REUSED_BUFFER).then(|| self.handed_out.iter().position(is_free));
+        let free = index.flatten().and_then(|index| self.handed_out.remove(index));
         let mut buffer = free.map_or_else(Vec::new, |(_, payload)| Vec::from(payload));
         buffer.clear();
         buffer
@@ -186,12 +186,12 @@ impl Assembly {
 
     /// Drops samples that have received no fragment for a long time.
     pub fn expire(&mut self, now: ModelTime) {
-        self.retain(|_, part| part.touched + FRAGMENT_TIMEOUT > now);
-        self.passed.retain(|(at, _)| *at + SPARE_BUFFER_LIFETIME > now);
+        self.retain(|_, part| part.last_changed + FRAGMENT_TIMEOUT > now);
+        self.handed_out.retain(|(at, _)| *at + SPARE_BUFFER_LIFETIME > now);
     }
 
     fn retain(&mut self, mut keep: impl FnMut(&(Guid, SequenceNumber), &Part) -> bool) {
-        let (ages, bytes) = (&mut self.ages, &mut self.bytes);
+        let (ages, bytes) = (&mut self.by_age, &mut self.bytes);
         self.parts.retain(|key, part| {
             let keeps = keep(key, part);
             if !keeps {
@@ -204,7 +204,7 @@ impl Assembly {
 
     fn remove(&mut self, key: (Guid, SequenceNumber)) -> Option<Part> {
         let part = self.parts.remove(&key)?;
-        self.ages.remove(&part.age);
+        self.by_age.remove(&part.age);
         self.bytes -= part.bytes() + ENTRY_OVERHEAD;
         Some(part)
     }
@@ -220,7 +220,7 @@ impl Part {
             next: 1,
             ahead: BTreeMap::new(),
             ahead_bytes: 0,
-            touched: now,
+            last_changed: now,
         }
     }
 
@@ -355,7 +355,7 @@ mod tests {
                 put(&mut assembly, &record, &bytes, 0);
             }
             prop_assert_eq!(assembly.take(writer(1), SequenceNumber(5)).map(|bytes| bytes.to_vec()), Some(whole));
-            prop_assert_eq!((assembly.bytes, assembly.ages.len()), (0, 0));
+            prop_assert_eq!((assembly.bytes, assembly.by_age.len()), (0, 0));
         }
     }
 
@@ -508,7 +508,7 @@ mod tests {
         assert_eq!(next(5, size).2, 0);
         assert_eq!(held, vec![1; 300_000]);
         assembly.expire(ModelTime::ZERO + 2 * SPARE_BUFFER_LIFETIME + FRAGMENT_TIMEOUT);
-        assert_eq!(assembly.passed_bytes(), 0);
+        assert_eq!(assembly.handed_out_bytes(), 0);
     }
 
     #[test]

@@ -90,7 +90,7 @@ pub struct Delivery {
     presumed_lost: bool,
     /// Number of samples that left this host for the receiver at least [`MAX_TRANSIT_TIME`] ago and have
     /// not arrived.
-    under_way: u64,
+    overdue: u64,
     /// Losses of the last seconds.
     recent: RecentLoss,
     /// Whether all readers are best effort: they get no retransmissions and no HEARTBEATs.
@@ -122,7 +122,7 @@ impl Delivery {
             opened: ModelTime::ZERO,
             waiting: None,
             presumed_lost: false,
-            under_way: 0,
+            overdue: 0,
             recent: RecentLoss::default(),
             best_effort: false,
             uses_network: false,
@@ -149,13 +149,13 @@ impl Delivery {
     }
 
     /// Sets the route of a receiver whose socket was unknown.
-    pub const fn lead_to(&mut self, route: Route) {
+    pub const fn set_route(&mut self, route: Route) {
         self.receiver = Receiver::Route(route);
     }
 
     /// Returns the route by which new samples arrive.
     #[must_use]
-    pub const fn main(&self) -> Route {
+    pub const fn main_route(&self) -> Route {
         self.main
     }
 
@@ -190,7 +190,7 @@ impl Delivery {
 
     /// Returns whether this sample is known to exist but has not arrived.
     #[must_use]
-    pub fn misses(&self, number: SequenceNumber) -> bool {
+    pub fn is_missing(&self, number: SequenceNumber) -> bool {
         let sequence = self.reception.sequence();
         sequence.started()
             && number >= sequence.first()
@@ -236,7 +236,7 @@ impl Delivery {
     /// Records that the last reader is gone: samples after the last received one do not count as
     /// lost.
     pub fn close(&mut self, budget: &mut Budget) {
-        (self.waiting, self.presumed_lost, self.under_way) = (None, false, 0);
+        (self.waiting, self.presumed_lost, self.overdue) = (None, false, 0);
         self.reception.close(budget);
     }
 
@@ -252,7 +252,7 @@ impl Delivery {
         sample: &Sample,
         context: &mut DeliveryContext<'_>,
     ) -> (bool, Option<CompleteSample>) {
-        self.touch(context.now);
+        self.note_seen(context.now);
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
         self.connect(sample);
         if self.undelivered.is_empty() {
@@ -272,7 +272,7 @@ impl Delivery {
 
     /// Records that the socket's buffer was full for this DATA or DATA_FRAG.
     pub fn socket_full(&mut self, sample: &Sample, context: &mut DeliveryContext<'_>) {
-        self.touch(context.now);
+        self.note_seen(context.now);
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
         if self.undelivered.note(sample) {
             context.budget.evictions += 1;
@@ -313,7 +313,7 @@ impl Delivery {
     /// Records a HEARTBEAT for this receiver. A delivery without samples begins with it. While no
     /// sample arrives and none is requested, the samples may use shared memory.
     pub fn heartbeat(&mut self, heartbeat: &Heartbeat, context: &mut DeliveryContext<'_>) {
-        self.touch(context.now);
+        self.note_seen(context.now);
         let end = heartbeat.last.next();
         self.reception.sequence_mut().begin(end);
         if !self.uses_network {
@@ -325,12 +325,12 @@ impl Delivery {
         reception.heartbeat(heartbeat, budget, &mut |decision| {
             accounting.take(decision);
         });
-        self.excuse_unheard(before);
+        self.mark_unread_irrelevant(before);
     }
 
     /// Records a GAP for this receiver.
     pub fn gap(&mut self, gap: &Gap, context: &mut DeliveryContext<'_>) {
-        self.touch(context.now);
+        self.note_seen(context.now);
         let (reception, budget, mut accounting) = self.split(context);
         reception.gap(gap, budget, &mut |decision| accounting.take(decision));
     }
@@ -417,14 +417,14 @@ impl Delivery {
 
     /// Returns how many remembered samples have arrived both here and at `other`.
     #[must_use]
-    pub fn common_with(&self, other: &Self) -> u64 {
+    pub fn count_common(&self, other: &Self) -> u64 {
         let sequence = self.reception.sequence();
         sequence.common_with(other.reception.sequence())
     }
 
     /// Counts this many messages as duplicates, because another delivery of the same receiver
     /// contains them.
-    pub fn drop_common(&mut self, common: u64, context: &mut DeliveryContext<'_>) {
+    pub fn count_common_as_duplicates(&mut self, common: u64, context: &mut DeliveryContext<'_>) {
         let tally = &mut self.tally;
         let common = common.min(tally.messages);
         if common == 0 {
@@ -458,7 +458,7 @@ impl Delivery {
         context.reliable && !self.best_effort
     }
 
-    fn touch(&mut self, now: ModelTime) {
+    fn note_seen(&mut self, now: ModelTime) {
         self.last_seen = self.last_seen.max(now);
     }
 
@@ -468,11 +468,11 @@ impl Delivery {
         context: &mut DeliveryContext<'_>,
     ) -> (bool, Option<CompleteSample>) {
         let (number, reliable) = (sample.sequence_number, self.is_reliable(context));
-        self.begin_anew(number, context);
+        self.restart(number, context);
         let sequence = self.reception.sequence();
         let is_sent = self.direction() == Direction::Sent;
         let source = sample.source_timestamp.timestamp();
-        let is_late = self.misses(number) && number < sequence.settled();
+        let is_late = self.is_missing(number) && number < sequence.settled();
         if !is_sent && is_late && !sequence.is_unconfirmed(number, source, MAX_TRUSTED_JUMP) {
             return self.late(sample, context);
         }
@@ -481,7 +481,7 @@ impl Delivery {
         let outcome = reception.sample(sample, reliable, budget, &mut |decision| {
             accounting.take(decision);
         });
-        self.excuse_unheard(before);
+        self.mark_unread_irrelevant(before);
         match outcome {
             Outcome::Open => (false, None),
             Outcome::Duplicate => {
@@ -561,7 +561,7 @@ impl Delivery {
     }
 
     /// Restarts the delivery after a long range of numbers that were not for this receiver.
-    fn begin_anew(&mut self, number: SequenceNumber, context: &mut DeliveryContext<'_>) {
+    fn restart(&mut self, number: SequenceNumber, context: &mut DeliveryContext<'_>) {
         let sequence = self.reception.sequence();
         let is_far = number.steps_since(sequence.next()) > MAX_IRRELEVANT_AT_START;
         if sequence.started() && is_far && sequence.last_advance() < self.opened {

@@ -63,7 +63,7 @@ pub struct Evidence<'a> {
     pub last_message: Option<ModelTime>,
     /// Returns how long the topic may seem silent while messages are sent. The argument is their
     /// interval if it is not known.
-    pub seeming_silence: &'a dyn Fn(Duration) -> Duration,
+    pub max_unseen_time: &'a dyn Fn(Duration) -> Duration,
     /// Time at which the topic became both published and watched.
     pub since: ModelTime,
     /// Time at which messages became expected and visible; at least `since`.
@@ -77,7 +77,7 @@ pub struct Evidence<'a> {
 
 /// State of one topic under one watchlist entry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Judgement {
+pub struct TopicEvaluation {
     /// Whether no evaluation has taken place.
     fresh: bool,
     state: WatchState,
@@ -108,7 +108,7 @@ impl Evidence<'_> {
     /// expected at `rate`.
     fn unknown_seconds(&self, rate: f64) -> f64 {
         let interval = Duration::try_from_secs_f64(1.0 / rate).unwrap_or(Duration::MAX);
-        let seeming = (self.seeming_silence)(interval);
+        let seeming = (self.max_unseen_time)(interval);
         let last = self.last_message.unwrap_or_default().max(self.observed);
         if seeming.is_zero() || self.now - last > seeming {
             return 0.0;
@@ -118,7 +118,7 @@ impl Evidence<'_> {
     }
 }
 
-impl Default for Judgement {
+impl Default for TopicEvaluation {
     fn default() -> Self {
         Self {
             fresh: true,
@@ -132,7 +132,7 @@ impl Default for Judgement {
     }
 }
 
-impl Judgement {
+impl TopicEvaluation {
     /// Returns the state.
     #[must_use]
     pub const fn state(&self) -> WatchState {
@@ -158,9 +158,9 @@ impl Judgement {
     ) -> Option<Option<WatchState>> {
         let before = (!self.fresh).then_some(self.state);
         let is_silent = self.state == WatchState::Silent;
-        let broken = broken(expectations, evidence, is_silent);
+        let broken = violated_bits(expectations, evidence, is_silent);
         let quiet = broken & MAX_SILENCE != 0 || evidence.last_message.is_none();
-        let broken = without_consequences(broken, quiet, evidence);
+        let broken = without_subscriber_effects(broken, quiet, evidence);
         let silent = broken & MAX_SILENCE != 0;
         let has_gap = !silent
             && self.ending == 0
@@ -216,7 +216,7 @@ impl Judgement {
     clippy::cast_precision_loss,
     reason = "counts of ten seconds are far below 2^52"
 )]
-fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool) -> u8 {
+fn violated_bits(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool) -> u8 {
     let mut broken = 0;
     let rates = |rate: f64| {
         let window = expectations
@@ -254,7 +254,7 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool)
             true => last,
             false => last.max(evidence.observed),
         };
-        if evidence.now - begin > maximum.max((evidence.seeming_silence)(maximum)) {
+        if evidence.now - begin > maximum.max((evidence.max_unseen_time)(maximum)) {
             broken |= MAX_SILENCE;
         }
     }
@@ -273,7 +273,7 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool)
 }
 
 /// Removes the violations that follow from the absence of all subscribers.
-const fn without_consequences(broken: u8, quiet: bool, evidence: &Evidence<'_>) -> u8 {
+const fn without_subscriber_effects(broken: u8, quiet: bool, evidence: &Evidence<'_>) -> u8 {
     let is_expected = broken & SUBSCRIBERS != 0;
     if evidence.subscriptions == 0 && (quiet || is_expected) {
         broken & !(MIN_RATE | MAX_SILENCE)
@@ -296,7 +296,7 @@ mod tests {
     use super::*;
 
     struct Bench {
-        judgement: Judgement,
+        judgement: TopicEvaluation,
         expectations: Expectations,
         now: u64,
         last_message: Option<ModelTime>,
@@ -311,7 +311,7 @@ mod tests {
     impl Bench {
         fn new(expectations: Expectations) -> Self {
             Self {
-                judgement: Judgement::default(),
+                judgement: TopicEvaluation::default(),
                 expectations,
                 now: 1000 * SECOND,
                 last_message: None,
@@ -342,7 +342,7 @@ mod tests {
                     publishers: self.publishers,
                     subscriptions: self.subscriptions,
                     last_message: self.last_message,
-                    seeming_silence: &|_| self.seeming_silence,
+                    max_unseen_time: &|_| self.seeming_silence,
                     since: ModelTime::from_nanoseconds(1000 * SECOND),
                     observed: self.observed,
                     recent: &recent,

@@ -113,7 +113,7 @@ impl InOrder {
 
     /// Returns whether this sample was counted before the announcement and is not dispatched yet.
     #[must_use]
-    pub fn lacks(&self, number: SequenceNumber) -> bool {
+    pub fn is_undispatched(&self, number: SequenceNumber) -> bool {
         self.earlier.contains(&number)
     }
 
@@ -129,7 +129,7 @@ impl InOrder {
         if previous == Some(incarnation) {
             return false;
         }
-        self.give_all(now, give);
+        self.dispatch_all(now, give);
         previous.is_some()
     }
 
@@ -152,7 +152,7 @@ impl InOrder {
     }
 
     /// Removes and returns the samples from before the announcement that will not be retransmitted.
-    pub fn forgone(&mut self, progress: &Progress, now: ModelTime) -> Vec<SequenceNumber> {
+    pub fn take_expired(&mut self, progress: &Progress, now: ModelTime) -> Vec<SequenceNumber> {
         if self.earlier.is_empty() {
             return Vec::new();
         }
@@ -183,7 +183,7 @@ impl InOrder {
             && *entry.key() < complete
         {
             let queued = entry.remove();
-            self.give(queued, now, give);
+            self.dispatch(queued, now, give);
         }
         if self.waiting.is_empty() {
             return None;
@@ -195,20 +195,20 @@ impl InOrder {
         let is_late = self.hole.1 + GAP_TIMEOUT <= now;
         if is_late || self.waiting.is_full() || self.bytes > room {
             let last = self.waiting.last_key_value().map(|(number, _)| *number);
-            self.give_all(now, give);
+            self.dispatch_all(now, give);
             return last.map(|last| last.next());
         }
         None
     }
 
     /// Dispatches all waiting samples.
-    pub fn give_all(&mut self, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
+    pub fn dispatch_all(&mut self, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
         while let Some((_, queued)) = self.waiting.pop_first() {
-            self.give(queued, now, give);
+            self.dispatch(queued, now, give);
         }
     }
 
-    fn give(&mut self, queued: QueuedSample, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
+    fn dispatch(&mut self, queued: QueuedSample, now: ModelTime, give: &mut impl FnMut(QueuedSample)) {
         self.bytes -= queued.cost();
         let came = queued.sample.time;
         // The reader may have received the lower number through unobserved shared memory. This

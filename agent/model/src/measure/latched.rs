@@ -69,7 +69,7 @@ pub struct LatchedTopic {
 
 #[derive(Debug)]
 struct LatchedWriter {
-    about: LatchedTopic,
+    topic: LatchedTopic,
     allowance: WriterAllowance,
     /// Number and source timestamp of the last message.
     newest: Option<(SequenceNumber, Option<Timestamp>)>,
@@ -104,7 +104,7 @@ impl Latched {
     /// Begins to keep the last message of this writer, unless the table of writers is full.
     pub fn follow(&mut self, writer: Guid, about: LatchedTopic) {
         let new = || LatchedWriter {
-            about: about.clone(),
+            topic: about.clone(),
             allowance: WriterAllowance::new(WRITER_ALLOWANCE),
             newest: None,
             last: Last::Unseen,
@@ -112,12 +112,12 @@ impl Latched {
         let Some(known) = self.writers.get_or_insert_with(writer, new) else {
             return;
         };
-        known.about = about;
+        known.topic = about;
         // A message that was kept for a watch may be too large without the watch.
         if let Last::Kept(sample, _) = &known.last
             && size(sample) > known.most()
         {
-            let last = Last::TooLarge(sized(size(sample)));
+            let last = Last::TooLarge(saturated_size(size(sample)));
             self.replace(writer, last);
         }
     }
@@ -178,7 +178,7 @@ impl Latched {
         }
         let number = sample.sequence_number;
         let source = sample.source_timestamp.timestamp();
-        if !known.lacks((number, source)) {
+        if !known.is_newer_or_incomplete((number, source)) {
             return false;
         }
         if known.newest.is_none_or(|(newest, _)| newest != number) {
@@ -196,9 +196,9 @@ impl Latched {
             return false;
         };
         let is_whole = matches!(sample.content, Content::Data { .. });
-        let has_stamp = known.about.has_header && is_whole;
+        let has_stamp = known.topic.has_header && is_whole;
         let sample = Sample {
-            topic: Arc::clone(&known.about.topic),
+            topic: Arc::clone(&known.topic.topic),
             time: wall_clock.wall_time(now),
             writer,
             sequence_number: number,
@@ -218,13 +218,13 @@ impl Latched {
             return;
         };
         let about = (sample.sequence_number, sample.source_timestamp);
-        if sample.payload.is_none() || !known.lacks(about) {
+        if sample.payload.is_none() || !known.is_newer_or_incomplete(about) {
             return;
         }
         known.newest = Some(about);
         self.assembly.release(sample.writer);
         if size(sample) > known.most() {
-            let last = Last::TooLarge(sized(size(sample)));
+            let last = Last::TooLarge(saturated_size(size(sample)));
             self.replace(sample.writer, last);
         } else {
             self.keep(Arc::clone(sample), at);
@@ -243,7 +243,7 @@ impl Latched {
         };
         let source = sample.source_timestamp.timestamp();
         let about = (sample.sequence_number, source);
-        if !known.lacks(about) {
+        if !known.is_newer_or_incomplete(about) {
             return;
         }
         known.newest = Some(about);
@@ -282,7 +282,7 @@ impl Latched {
         let known = self.writers.get(&writer)?;
         Some(match &known.last {
             Last::Unseen => LatchedFacts::Unseen,
-            Last::Kept(sample, _) => LatchedFacts::Kept(sized(size(sample))),
+            Last::Kept(sample, _) => LatchedFacts::Kept(saturated_size(size(sample))),
             Last::TooLarge(bytes) => LatchedFacts::TooLarge(*bytes),
             Last::Paused => LatchedFacts::Paused,
             Last::NoRoom(bytes) => LatchedFacts::NoRoom(*bytes),
@@ -313,14 +313,14 @@ impl Latched {
         let (writer, bytes) = (sample.writer, size(&sample));
         self.replace(writer, Last::Unseen);
         let known = self.writers.get(&writer);
-        let is_watched = known.is_some_and(|known| known.about.is_watched);
+        let is_watched = known.is_some_and(|known| known.topic.is_watched);
         while bytes > self.bytes.room() {
             self.bytes.refuse();
             let Some((other, size)) = self.largest(is_watched, (writer.prefix, bytes)) else {
-                self.replace(writer, Last::NoRoom(sized(bytes)));
+                self.replace(writer, Last::NoRoom(saturated_size(bytes)));
                 return;
             };
-            self.replace(other, Last::NoRoom(sized(size)));
+            self.replace(other, Last::NoRoom(saturated_size(size)));
         }
         self.replace(writer, Last::Kept(sample, at));
     }
@@ -339,7 +339,7 @@ impl Latched {
                 let Last::Kept(sample, at) = &known.last else {
                     return None;
                 };
-                (is_watched || !known.about.is_watched).then_some((writer, sample, *at))
+                (is_watched || !known.topic.is_watched).then_some((writer, sample, *at))
             })
         };
         let mut sums: HashMap<_, _> = HashMap::from_iter([(newcomer, bytes)]);
@@ -371,7 +371,7 @@ impl Latched {
 impl LatchedWriter {
     /// Returns the maximum size of a message to keep.
     const fn most(&self) -> usize {
-        match self.about.is_watched {
+        match self.topic.is_watched {
             true => RetainedBytes::CAP,
             false => MESSAGE_BYTES,
         }
@@ -379,7 +379,7 @@ impl LatchedWriter {
 
     /// Returns whether a message is later than the last one, or is the last one and was not
     /// captured completely.
-    fn lacks(&self, about: (SequenceNumber, Option<Timestamp>)) -> bool {
+    fn is_newer_or_incomplete(&self, about: (SequenceNumber, Option<Timestamp>)) -> bool {
         let is_last = self.newest.is_some_and(|(number, _)| number == about.0);
         is_last && matches!(self.last, Last::Unseen | Last::Paused) || self.is_newer(about)
     }
@@ -401,6 +401,6 @@ fn size(sample: &Sample) -> usize {
     sample.payload.as_ref().map_or(0, bytes::Bytes::len)
 }
 
-fn sized(bytes: usize) -> u32 {
+fn saturated_size(bytes: usize) -> u32 {
     u32::try_from(bytes).unwrap_or(u32::MAX)
 }

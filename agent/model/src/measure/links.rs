@@ -88,7 +88,7 @@ impl Link {
     /// Returns how many of 1000 segments were retransmitted lately.
     fn permille(&self) -> u64 {
         let sent: u64 = self.recent.iter().map(|(sent, _)| sent).sum();
-        (self.again() * 1000).checked_div(sent).unwrap_or(0)
+        (self.recent_retransmissions() * 1000).checked_div(sent).unwrap_or(0)
     }
 
     /// Returns whether new segments were sent in the last seconds. A peer that is gone acknowledges
@@ -99,7 +99,7 @@ impl Link {
     }
 
     /// Returns the number of segments that were retransmitted lately.
-    fn again(&self) -> u64 {
+    fn recent_retransmissions(&self) -> u64 {
         self.recent.iter().map(|(_, again)| again).sum()
     }
 }
@@ -154,7 +154,7 @@ impl Links {
             let share = link.permille();
             let is_lossy = match link.is_lossy {
                 true => share >= RECOVERED_PERMILLE,
-                false => share >= LOSSY_PERMILLE && link.again() >= MIN_RETRANSMITTED && link.makes_progress(),
+                false => share >= LOSSY_PERMILLE && link.recent_retransmissions() >= MIN_RETRANSMITTED && link.makes_progress(),
             };
             self.revision += u64::from(is_lossy != link.is_lossy);
             link.is_lossy = is_lossy;

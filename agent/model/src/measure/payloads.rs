@@ -116,13 +116,13 @@ impl Payloads {
     }
 
     /// Returns the writers whose samples are requested.
-    pub fn wanted(&self) -> impl Iterator<Item = &Guid> {
+    pub fn requested_writers(&self) -> impl Iterator<Item = &Guid> {
         self.writers.keys()
     }
 
     /// Returns whether any writer's samples are dispatched for this request.
     #[must_use]
-    pub fn serves(&self, request: u64) -> bool {
+    pub fn has_request(&self, request: u64) -> bool {
         self.writers
             .values()
             .any(|known| known.to.contains(&request))
@@ -130,7 +130,7 @@ impl Payloads {
 
     /// Begins to dispatch the samples of this writer at `now`; the next sample has the number
     /// `next`.
-    pub fn want(
+    pub fn start_writer(
         &mut self,
         writer: Guid,
         topic: Topic,
@@ -193,11 +193,11 @@ impl Payloads {
 
     /// Returns whether samples of this writer are requested.
     #[must_use]
-    pub fn wants(&self, writer: Guid) -> bool {
+    pub fn is_requested(&self, writer: Guid) -> bool {
         self.writers.contains_key(&writer)
     }
 
-    /// Dispatches a counted sample. Returns the same as [`Self::turn`].
+    /// Dispatches a counted sample. Returns the same as [`Self::dispatch_ready`].
     pub fn counted(
         &mut self,
         writer: Guid,
@@ -236,7 +236,7 @@ impl Payloads {
         let is_complete = interested.order.is_idle() && counted.number < progress.complete;
         let is_known = is_complete && !counted.unconfirmed;
         let to = interested.without(to, |begin| {
-            begin.before == Some(counted.number) || is_known && begin.begins_after(counted.number)
+            begin.before == Some(counted.number) || is_known && begin.starts_after(counted.number)
         });
         for begin in &mut interested.begins {
             begin.arrived(&to, counted.number);
@@ -263,19 +263,19 @@ impl Payloads {
             before.push(queued);
             before
                 .into_iter()
-                .for_each(|queued| self.give_queued(queued));
+                .for_each(|queued| self.enqueue(queued));
             return None;
         }
         order.put(queued);
         before
             .into_iter()
-            .for_each(|queued| self.give_queued(queued));
-        self.turn(writer, progress, counted.at)
+            .for_each(|queued| self.enqueue(queued));
+        self.dispatch_ready(writer, progress, counted.at)
     }
 
     /// Returns whether a request receives this sample from before its start. The sample is then not
     /// dispatched when the writer repeats it. A recent sample may already have been dispatched.
-    pub fn give_before(
+    pub fn dispatch_latched(
         &mut self,
         writer: Guid,
         (id, number): (u64, SequenceNumber),
@@ -294,8 +294,8 @@ impl Payloads {
     }
 
     /// Dispatches a retransmitted sample from before the announcement. Returns the same as
-    /// [`Self::turn`].
-    pub fn came_again(
+    /// [`Self::dispatch_ready`].
+    pub fn dispatch_retransmitted(
         &mut self,
         writer: Guid,
         counted: &Counted,
@@ -313,11 +313,11 @@ impl Payloads {
     #[must_use]
     pub fn lacks(&self, writer: Guid, number: SequenceNumber) -> bool {
         let interested = self.writers.get(&writer);
-        interested.is_some_and(|interested| interested.order.lacks(number))
+        interested.is_some_and(|interested| interested.order.is_undispatched(number))
     }
 
     /// Records a counted sample of a writer without an announcement, with the current requests.
-    pub fn counted_of_unknown_writer(
+    pub fn note_unknown_writer(
         &mut self,
         writer: Guid,
         number: SequenceNumber,
@@ -338,7 +338,7 @@ impl Payloads {
     }
 
     /// Replaces the GUID of an unknown writer by the announced one.
-    pub fn rename(&mut self, before: Guid, guid: Guid) {
+    pub fn rename_unknown_writer(&mut self, before: Guid, guid: Guid) {
         if let Some(samples) = self.unknown_writers.remove(&before) {
             self.unknown_writers.insert(guid, samples);
         }
@@ -377,7 +377,7 @@ impl Payloads {
 
     /// Dispatches the samples of this writer that need not wait. If a bound ended the wait, returns
     /// the number below which no sample is awaited.
-    pub fn turn(
+    pub fn dispatch_ready(
         &mut self,
         writer: Guid,
         progress: &Progress,
@@ -388,13 +388,13 @@ impl Payloads {
         let interested = self.writers.get_mut(&writer)?;
         let order = &mut interested.order;
         let room = room + order.bytes();
-        let forgone = order.forgone(progress, now);
+        let forgone = order.take_expired(progress, now);
         let mut queued = Vec::new();
         let skip = order.turn(progress, now, room, &mut |each| queued.push(each));
         self.unannounced(writer, &forgone, now);
         queued
             .into_iter()
-            .for_each(|queued| self.give_queued(queued));
+            .for_each(|queued| self.enqueue(queued));
         skip
     }
 
@@ -405,15 +405,15 @@ impl Payloads {
         let Some(interested) = self.writers.get_mut(&writer) else {
             return;
         };
-        let forgone = interested.order.forgone(&nothing_awaited, now);
+        let forgone = interested.order.take_expired(&nothing_awaited, now);
         let mut queued = Vec::new();
         interested
             .order
-            .give_all(now, &mut |each| queued.push(each));
+            .dispatch_all(now, &mut |each| queued.push(each));
         self.unannounced(writer, &forgone, now);
         queued
             .into_iter()
-            .for_each(|queued| self.give_queued(queued));
+            .for_each(|queued| self.enqueue(queued));
     }
 
     /// Reports samples that will not arrive, at `now`.
@@ -489,7 +489,7 @@ impl Payloads {
         missed.into_iter().for_each(|missed| self.give(missed, 0));
     }
 
-    fn give_queued(&mut self, queued: QueuedSample) {
+    fn enqueue(&mut self, queued: QueuedSample) {
         let bytes = queued.bytes();
         self.waiting_bytes -= queued.cost();
         if !queued.to.is_empty() {
@@ -536,7 +536,7 @@ impl WantedWriter {
     ) -> Vec<QueuedDispatch> {
         let mut missed: Vec<(SequenceNumber, Vec<u64>)> = Vec::new();
         for begin in &self.begins {
-            let Some(from) = begin.misses_from(reason, now, payload_delay) else {
+            let Some(from) = begin.first_missed(reason, now, payload_delay) else {
                 continue;
             };
             let first = first.max(from);

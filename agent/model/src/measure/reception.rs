@@ -249,7 +249,7 @@ impl Reception {
                 return;
             }
             self.samples.forget(number, budget);
-            sequence.excuse(number, number.next());
+            sequence.mark_irrelevant(number, number.next());
         }
     }
 
@@ -263,7 +263,7 @@ impl Reception {
         decide: &mut impl FnMut(Decision),
     ) {
         let Self { sequence, samples } = self;
-        let hold = samples.growing(now, window, sequence.settled());
+        let hold = samples.lowest_growing(now, window, sequence.settled());
         sequence.advance(now, (window, grace), hold, &mut |settled| {
             decide(decision(settled, samples, budget));
         });
@@ -349,7 +349,7 @@ impl Reception {
             Progress::TooMany => {
                 self.sequence.begin(number);
                 self.exists(number, now, budget, decide);
-                self.sequence.excuse(number, number.next());
+                self.sequence.mark_irrelevant(number, number.next());
                 return Outcome::Open;
             }
             Progress::Partial | Progress::Complete(_) => {}

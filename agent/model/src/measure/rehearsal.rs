@@ -1,4 +1,4 @@
-//! Evaluates expectations on seconds that were counted earlier, as [`Judgement`] evaluates them
+//! Evaluates expectations on seconds that were counted earlier, as [`TopicEvaluation`] evaluates them
 //! live. Thresholds that were learnt from a robot are checked on the counts of the same robot.
 
 use std::time::Duration;
@@ -10,7 +10,7 @@ use crate::facts::model_time::ModelTime;
 use crate::facts::rate::Slot;
 use crate::facts::watch::Expectations;
 use crate::facts::watch::WatchState;
-use crate::measure::expectation::{Evidence, Judgement};
+use crate::measure::expectation::{Evidence, TopicEvaluation};
 
 pub use crate::facts::rate::SECONDS;
 pub use crate::measure::expectation::{STARTUP_GRACE_SECONDS, window};
@@ -44,7 +44,7 @@ pub struct Second {
 /// second without a publisher violates nothing.
 #[must_use]
 pub fn violations(expectations: &Expectations, seconds: &[Second]) -> Vec<&'static str> {
-    let mut judgement = Judgement::default();
+    let mut judgement = TopicEvaluation::default();
     let mut violated = Vec::new();
     let first = seconds.iter().position(|second| second.messages > 0);
     let (mut since, mut observed) = (0, 0);
@@ -68,7 +68,7 @@ pub fn violations(expectations: &Expectations, seconds: &[Second]) -> Vec<&'stat
                 publishers: second.publishers.into(),
                 subscriptions: second.subscriptions.into(),
                 last_message: second.silence.map(|silence| now - duration(silence)),
-                seeming_silence: &|_| Duration::ZERO,
+                max_unseen_time: &|_| Duration::ZERO,
                 since: instant(since),
                 observed: instant(observed),
                 recent: &recent,

@@ -69,7 +69,7 @@ pub struct Sequence {
     /// Number of restarts.
     incarnation: u32,
     received: Bitmap,
-    excused: Bitmap,
+    irrelevant: Bitmap,
     /// The numbers in `received` that only arrived by another route, if any did.
     elsewhere: Option<Box<Bitmap>>,
     /// Earlier values of `next` with their times, oldest first.
@@ -268,7 +268,7 @@ impl Sequence {
             let first = number.0 % 64;
             let bits = (self.next - number).min(64 - first);
             let mask = (u64::MAX >> (64 - bits)) << first;
-            let decided = self.received.word(number) | self.excused.word(number);
+            let decided = self.received.word(number) | self.irrelevant.word(number);
             undecided += u64::from((!decided & mask).count_ones());
             number += bits;
         }
@@ -348,7 +348,7 @@ impl Sequence {
         let decided = self.settled.max(self.available).max(self.floor());
         self.complete = self.complete.max(decided);
         while self.complete < self.next
-            && (self.received.get(self.complete) || self.excused.get(self.complete))
+            && (self.received.get(self.complete) || self.irrelevant.get(self.complete))
         {
             self.complete += 1;
         }
@@ -437,7 +437,7 @@ impl Sequence {
             complete: number,
             incarnation: self.incarnation.wrapping_add(1),
             received: Bitmap::with_len(MIN_WINDOW),
-            excused: Bitmap::with_len(MIN_WINDOW),
+            irrelevant: Bitmap::with_len(MIN_WINDOW),
             ..Self::default()
         };
     }
@@ -458,7 +458,7 @@ impl Sequence {
         if undecided > self.received.len() && self.received.len() < MAX_WINDOW {
             let len = undecided.next_power_of_two().min(MAX_WINDOW);
             self.received.grow(len, self.floor(), self.next);
-            self.excused.grow(len, self.floor(), self.next);
+            self.irrelevant.grow(len, self.floor(), self.next);
             if let Some(mut elsewhere) = self.elsewhere.take() {
                 elsewhere.grow(len, self.floor(), self.next);
                 self.elsewhere = Some(elsewhere);
@@ -474,7 +474,7 @@ impl Sequence {
             }
         }
         self.received.clear(self.next, end);
-        self.excused.clear(self.next, end);
+        self.irrelevant.clear(self.next, end);
         if let Some(elsewhere) = &mut self.elsewhere {
             elsewhere.clear(self.next, end);
         }
@@ -514,7 +514,7 @@ impl Sequence {
     fn settle(&mut self, limit: SequenceNumber, settled: &mut impl FnMut(Settled)) {
         for number in self.settled.until(limit.min(self.next)) {
             if !self.received.get(number) {
-                let excused = self.excused.get(number);
+                let excused = self.irrelevant.get(number);
                 settled(if excused {
                     Settled::Irrelevant(number)
                 } else {

@@ -223,7 +223,7 @@ impl Writer {
     /// ones.
     pub const fn refuses(&mut self, acknack: &AckNack) -> bool {
         let sequence = self.reception.sequence_mut();
-        sequence.refuses(acknack.base())
+        sequence.is_too_far_ahead(acknack.base())
     }
 
     /// Returns the number of messages counted.
@@ -252,7 +252,7 @@ impl Writer {
     #[must_use]
     pub fn seeming_silence(&self, slowest: Duration) -> Duration {
         let sampled = self.sampled.as_ref();
-        sampled.map_or(Duration::ZERO, |sampled| sampled.seeming_silence(slowest))
+        sampled.map_or(Duration::ZERO, |sampled| sampled.max_unseen_time(slowest))
     }
 
     /// Returns whether no view has shown any of its samples, or none since the uprobe's view ended.
@@ -350,7 +350,7 @@ impl Writer {
         let sequence = self.reception.sequence_mut();
         if next > SequenceNumber::ZERO && advanced < opened && sequence.next() > next {
             // The newest sample is excused too, which has no effect once it is received.
-            sequence.excuse(next, sequence.next());
+            sequence.mark_irrelevant(next, sequence.next());
         }
         counted
     }

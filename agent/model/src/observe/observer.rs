@@ -256,7 +256,7 @@ impl Observer {
             Input::SharedMemoryGap(now) => self
                 .measure
                 .profiler
-                .uncertain(self.graph.wall_clock.model_time(now)),
+                .note_uncertain(self.graph.wall_clock.model_time(now)),
             Input::StreamGap(destination, at) => {
                 let at = self.graph.wall_clock.model_time(at);
                 self.measure.profiler.missed(destination, at);
@@ -343,7 +343,7 @@ impl Observer {
     #[must_use]
     pub fn wanted_of_shared_memory(&self) -> Wanted {
         let may_share = |guid: &Guid| may_share_memory(&self.graph.discovery, *guid);
-        if self.measure.payloads.wanted().any(may_share) || self.awaits_writers() {
+        if self.measure.payloads.requested_writers().any(may_share) || self.awaits_writers() {
             Wanted::EverySample
         } else if self
             .measure
@@ -364,7 +364,7 @@ impl Observer {
     fn awaits_writers(&self) -> bool {
         let mut requests = self.requested.sample_requests.iter();
         requests
-            .any(|request| request.selection.is_open() || !self.measure.payloads.serves(request.id))
+            .any(|request| request.selection.is_open() || !self.measure.payloads.has_request(request.id))
     }
 
     /// Processes a truncated datagram of a capture file: submessage headers count, payloads are not
@@ -384,17 +384,17 @@ impl Observer {
     }
 
     /// Records that the participant that sent this RTPS message uses TCP, if the message came so.
-    fn note_tcp(&mut self, envelope: &Envelope, payload: &[u8]) {
+    fn note_tcp_sender(&mut self, envelope: &Envelope, payload: &[u8]) {
         if envelope.logical_port != 0
             && let Some(prefix) = payload.get(8..20)
             && let Ok(prefix) = prefix.try_into()
         {
-            self.graph.discovery.came_by_tcp(GuidPrefix(prefix));
+            self.graph.discovery.note_tcp(GuidPrefix(prefix));
         }
     }
 
     fn message_beginning(&mut self, envelope: &Envelope, payload: &[u8], length: u32) {
-        self.note_tcp(envelope, payload);
+        self.note_tcp_sender(envelope, payload);
         let outcome = walk::beginning(payload, length, envelope, |found| {
             let clock = self.graph.wall_clock;
             Observation::each(&found.record, clock, |observation| {
@@ -428,7 +428,7 @@ impl Observer {
             topic: &endpoint.topic,
         });
         self.zenoh.restore(&memory.zenoh, endpoints, now);
-        self.follow_up(now);
+        self.apply_discovery_changes(now);
     }
 
     /// Returns the discovery state to save for the next start.
@@ -487,7 +487,7 @@ impl Observer {
         }
         self.renew_lease(observation);
         self.compare_clocks(observation);
-        self.judge_stamp(observation);
+        self.check_stamp(observation);
         if writer.entity.is_builtin() {
             return;
         }
@@ -513,7 +513,7 @@ impl Observer {
                 Path::Wire | Path::SharedMemory { .. }
                     if self.settings.directed && head.leaves() =>
                 {
-                    self.graph.receivers.found_here(sender)
+                    self.graph.receivers.note_local(sender)
                 }
                 _ => self.graph.receivers.learn(observation),
             },
@@ -524,7 +524,7 @@ impl Observer {
             if self.graph.discovery.learn(sender, evidence, at, journal) {
                 self.announce(sender);
             }
-            self.follow_up(at);
+            self.apply_discovery_changes(at);
         }
     }
 
@@ -560,19 +560,19 @@ impl Observer {
         // ordinary topics skip this lookup.
         let measures_calls = self.derive.services.has_measured();
         if let Some(sample) = sample.filter(|_| measures_calls) {
-            self.call_seen(sample);
+            self.count_call(sample);
         }
         let journal = &mut self.journal;
         match (self.measure.profiler).observe(observation, journal, &self.graph) {
             ObservationOutcome::Unmeasured => {
                 if let Some(sample) = sample.filter(|_| !measures_calls) {
-                    self.call_seen(sample);
+                    self.count_call(sample);
                 }
                 self.measure_unknown_writer(observation);
             }
             ObservationOutcome::Measured => {
                 if let Some(sample) = sample {
-                    self.chain_seen(sample, None);
+                    self.add_to_chains(sample, None);
                 }
                 if self.measure.payloads.is_unsettled(writer) {
                     if let Some(sample) = sample {
@@ -584,7 +584,7 @@ impl Observer {
             ObservationOutcome::Counted(counted) => {
                 self.report_missing();
                 if let Some(sample) = sample {
-                    self.chain_seen(sample, Some(&counted));
+                    self.add_to_chains(sample, Some(&counted));
                 }
                 self.counted(writer, &counted);
             }
@@ -629,7 +629,7 @@ impl Observer {
 
     /// Reads the announcements and payloads of a datagram, and observes every submessage.
     fn walk(&mut self, captured: Captured<'_>, payload: &[u8], handover: Option<&Handover>) {
-        self.note_tcp(captured.envelope, payload);
+        self.note_tcp_sender(captured.envelope, payload);
         let outcome = walk::datagram(payload, captured.envelope, handover, |found| {
             self.submessage(captured, &found, UserData::Here);
         });
@@ -661,7 +661,7 @@ impl Observer {
     }
 
     /// Applies changes of discovery to topics, interest and measurement.
-    fn follow_up(&mut self, now: ModelTime) {
+    fn apply_discovery_changes(&mut self, now: ModelTime) {
         for change in self.graph.discovery.changes() {
             self.graph.receivers.changed();
             match change {

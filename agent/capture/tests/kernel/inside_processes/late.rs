@@ -170,7 +170,7 @@ fn a_call_beside_a_real_time_thread_names_that_thread() {
     let _hog = Hog::real_time("0");
     let calls = late(&mut robot, &mut process, "compute 10 60000");
     let is_named = |call: &LateCall| {
-        let culprit = call.culprit(Stage::Callback);
+        let culprit = call.longest_other_thread(Stage::Callback);
         culprit.is_some_and(|culprit| {
             &*culprit.name == "sh" && culprit.priority == Some(Priority::RealTime(50))
         })

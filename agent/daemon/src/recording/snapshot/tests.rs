@@ -369,7 +369,7 @@ fn a_new_finding_triggers_the_snapshots_of_its_kind() {
             calls: 3,
             stage: late::Stage::Callback,
             cause: late::Cause::Runnable,
-            by: Some(other_thread::Culprit {
+            by: Some(other_thread::ThreadLabel {
                 name: "chromium".into(),
                 unit: Some("kiosk.service".into()),
             }),

@@ -200,7 +200,7 @@ fn late(facts: &TopicFacts, snapshot: &Snapshot) -> Option<RecentLateCalls<'stat
     for entry in recent {
         calls += 1;
         longest = longest.max(entry.total);
-        *causes.entry((entry.cause, &entry.culprit)).or_insert(0) += 1;
+        *causes.entry((entry.cause, &entry.other_thread)).or_insert(0) += 1;
     }
     let ((cause, culprit), _) = causes.into_iter().max_by_key(|(_, calls)| *calls)?;
     Some(RecentLateCalls {

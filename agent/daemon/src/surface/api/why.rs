@@ -35,7 +35,7 @@ const LONGEST_MS: f64 = 3_600_000.0;
 const LONGEST_S: f64 = 1e9;
 
 /// A cause with the thread that it names.
-type Named = (late::Stage, late::Cause, Option<other_thread::Culprit>);
+type Named = (late::Stage, late::Cause, Option<other_thread::ThreadLabel>);
 
 /// Query parameters that select late calls.
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
@@ -181,7 +181,7 @@ fn causes(callbacks: &[&facts::LateCallback], since: ModelTime) -> Vec<Cause<'st
     let mut sums: BTreeMap<Named, (u64, Duration)> = BTreeMap::new();
     for callback in callbacks {
         for entry in callback.history.iter().filter(|entry| entry.at >= since) {
-            let key = (entry.stage, entry.cause, entry.culprit.clone());
+            let key = (entry.stage, entry.cause, entry.other_thread.clone());
             let (calls, longest) = sums.entry(key).or_default();
             *calls += 1;
             *longest = (*longest).max(entry.total);
@@ -247,7 +247,7 @@ fn moment(entry: &facts::LateEntry, clock: WallClock) -> LateCallSummary<'_> {
         cause: entry.cause.label().into(),
         words: entry
             .cause
-            .in_words(entry.culprit.as_ref().map(|by| by as _))
+            .in_words(entry.other_thread.as_ref().map(|by| by as _))
             .into(),
     }
 }

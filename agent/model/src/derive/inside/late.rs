@@ -94,7 +94,7 @@ impl LateCalls {
     pub(super) fn judge(&mut self, at: ModelTime) -> bool {
         let mut has_changed = false;
         for lateness in self.callbacks.values_mut() {
-            let found = lateness.prevailing(at).map(|(_, calls)| (calls, 0));
+            let found = lateness.most_frequent_cause(at).map(|(_, calls)| (calls, 0));
             has_changed |= lateness.alarm.judge(found);
         }
         has_changed
@@ -107,7 +107,7 @@ impl LateCalls {
             Some((lateness, calls))
         });
         raised.filter_map(move |(lateness, calls)| {
-            let ((stage, cause), _) = lateness.prevailing(at).or_else(|| lateness.last())?;
+            let ((stage, cause), _) = lateness.most_frequent_cause(at).or_else(|| lateness.last())?;
             let of_cause = |example: &&Arc<LateExample>| {
                 let main = example.main.as_ref();
                 main.is_some_and(|main| (main.stage, main.cause) == (stage, cause))
@@ -171,7 +171,7 @@ impl Lateness {
                 stage,
                 cause,
                 total: call.total(),
-                culprit: culprit.map(OtherThread::culprit),
+                other_thread: culprit.map(OtherThread::label),
             });
         }
         let example = Arc::new(LateExample {
@@ -180,11 +180,11 @@ impl Lateness {
             call,
         });
         self.latest.push_back(Arc::clone(&example));
-        self.keep_if_long(Arc::clone(&example));
+        self.keep_longest(Arc::clone(&example));
         example
     }
 
-    fn keep_if_long(&mut self, example: Arc<LateExample>) {
+    fn keep_longest(&mut self, example: Arc<LateExample>) {
         if self.longest.is_full() {
             let rank = |kept: &LateExample| {
                 let is_recent = example.at - kept.at < LONGEST_CALL_LIFETIME;
@@ -204,7 +204,7 @@ impl Lateness {
 
     /// Returns the most frequent cause of the window that ends at `at`, and its late calls; `None`
     /// if they are few.
-    fn prevailing(&self, at: ModelTime) -> Option<((Stage, Cause), u64)> {
+    fn most_frequent_cause(&self, at: ModelTime) -> Option<((Stage, Cause), u64)> {
         let recent = self.history.iter().rev();
         let recent = recent.take_while(|entry| at - entry.at < WINDOW);
         let mut counts: BTreeMap<(Stage, Cause), usize> = BTreeMap::new();

@@ -129,7 +129,7 @@ impl Process {
             let takes = takes.or_insert_with(|| Takes {
                 handles: Vec::new(),
                 taken: 0,
-                since: self.born,
+                since: self.counted_since,
                 published: tracked.published,
                 last: tracked.figures.last,
             });

@@ -64,7 +64,7 @@ pub(super) struct Process {
     pub(super) facts: ObservedProcess,
     /// Time of the report before the first one with this process: all its calls since then are
     /// counted.
-    pub(super) born: Option<ModelTime>,
+    pub(super) counted_since: Option<ModelTime>,
     /// Its participants.
     pub(super) participants: BTreeSet<GuidPrefix>,
     /// Its domain according to its environment.
@@ -301,7 +301,7 @@ impl Inside {
             },
             reported_domain_id: report.domain_id,
             reported: Bounded::default(),
-            born: began,
+            counted_since: began,
             participants: BTreeSet::new(),
             cpu: report.cpu,
             marks: [mark, mark],
@@ -612,7 +612,7 @@ impl Inside {
             calls: late.calls,
             stage: late.stage,
             cause: late.cause,
-            by: by.map(OtherThread::culprit),
+            by: by.map(OtherThread::label),
             longest: call.total(),
         }
     }

@@ -75,7 +75,7 @@ impl Frames {
         let mut unknown: BTreeMap<(DomainId, &Arc<str>), Vec<&TopicName>> = BTreeMap::new();
         for writer in self.writers.values_mut() {
             let frame = writer.frame.as_ref().filter(|frame| !frame.is_empty());
-            let Some(frame) = frame.filter(|frame| transforms.lack(writer.domain_id, frame)) else {
+            let Some(frame) = frame.filter(|frame| transforms.is_unknown_frame(writer.domain_id, frame)) else {
                 writer.unknown = None;
                 continue;
             };

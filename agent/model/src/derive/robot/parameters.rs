@@ -49,7 +49,7 @@ pub struct Parameters {
     /// The latest requests, oldest first.
     requests: Bounded<Counted<ParameterRequests>, VecDeque<Request>>,
     /// Parameters in the latest requests for values, oldest first.
-    asked: Bounded<Counted<AskedParameters>, VecDeque<Asked>>,
+    requested_values: Bounded<Counted<AskedParameters>, VecDeque<RequestedParameter>>,
     /// Changes of each node since the agent started.
     counts: Bounded<Counted<ChangedNodes>, BTreeMap<(DomainId, NodeName), u64>>,
     /// What the configuration expects.
@@ -93,7 +93,7 @@ struct Request {
 
 /// A parameter in a request for values.
 #[derive(Clone, Debug)]
-struct Asked {
+struct RequestedParameter {
     call: CallId,
     /// Its place in the request and in the reply.
     index: usize,
@@ -243,7 +243,7 @@ impl Parameters {
         let before = self.known.get(&key).map(|known| Arc::clone(&known.value));
         let value = (kind != ChangeKind::Deleted).then(|| text(&change.parameter.value));
         match &value {
-            Some(value) => self.know(origin, key.clone(), Arc::clone(value)),
+            Some(value) => self.set_value(origin, key.clone(), Arc::clone(value)),
             None => {
                 self.known.remove(&key);
             }
@@ -271,7 +271,7 @@ impl Parameters {
     }
 
     /// Records the last known value of a parameter.
-    fn know(&mut self, origin: &Origin<'_>, key: Key, value: Arc<str>) {
+    fn set_value(&mut self, origin: &Origin<'_>, key: Key, value: Arc<str>) {
         let known = Known {
             value,
             at: origin.at,
@@ -286,7 +286,7 @@ impl Parameters {
     ///
     /// # Errors
     /// Fails if the request is malformed. The names before the error are added.
-    pub fn ask(
+    pub fn add_get_request(
         &mut self,
         call: Option<CallId>,
         names: RequestedNames<'_>,
@@ -296,7 +296,7 @@ impl Parameters {
         };
         for (index, name) in names.enumerate() {
             let name = bounded(name?, MAX_NAME).into();
-            self.asked.push_back(Asked { call, index, name });
+            self.requested_values.push_back(RequestedParameter { call, index, name });
         }
         Ok(())
     }
@@ -316,7 +316,7 @@ impl Parameters {
             return Ok(());
         };
         let mut names = BTreeMap::new();
-        self.asked.retain(|asked| {
+        self.requested_values.retain(|asked| {
             if asked.call == call {
                 names.insert(asked.index, Arc::clone(&asked.name));
             }
@@ -331,7 +331,7 @@ impl Parameters {
                 matches!(value, ParameterValue::NotSet),
             ) {
                 let key = (origin.domain_id, node.clone(), name);
-                self.know(origin, key, text(&value));
+                self.set_value(origin, key, text(&value));
             }
         }
         Ok(())
@@ -414,7 +414,7 @@ impl Parameters {
             self.known.facts(),
             self.changes.facts(),
             self.requests.facts(),
-            self.asked.facts(),
+            self.requested_values.facts(),
             self.counts.facts(),
         ]
     }

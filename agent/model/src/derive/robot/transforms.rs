@@ -47,7 +47,7 @@ pub struct Transforms {
 struct StaticBroadcaster {
     domain_id: DomainId,
     namespace: Arc<str>,
-    is_heard: bool,
+    is_received: bool,
 }
 
 /// The frames of one domain and namespace.
@@ -94,7 +94,7 @@ impl Transforms {
             let new = || StaticBroadcaster {
                 domain_id,
                 namespace: namespace.into(),
-                is_heard: false,
+                is_received: false,
             };
             self.broadcasters.get_or_insert_with(writer, new);
         }
@@ -112,7 +112,7 @@ impl Transforms {
     ) -> Result<(), WireError> {
         let (namespace, is_static) = namespace(origin.topic);
         if let Some(broadcaster) = self.broadcasters.get_mut(&origin.writer) {
-            broadcaster.is_heard = true;
+            broadcaster.is_received = true;
         }
         let is_this =
             |tree: &Tree| (tree.domain_id, &*tree.namespace) == (origin.domain_id, namespace);
@@ -162,7 +162,7 @@ impl Transforms {
             };
             let mut static_broadcasters = self.broadcasters.values();
             // Without all static transforms, a tree only seems to be in parts.
-            let is_whole = static_broadcasters.all(|each| each.is_heard || !of_tree(each));
+            let is_whole = static_broadcasters.all(|each| each.is_received || !of_tree(each));
             if tree.end_second(now, is_whole, &is_paused) {
                 self.revision += 1;
             }
@@ -171,12 +171,12 @@ impl Transforms {
 
     /// Returns whether the domain has transforms, and none of them has this frame. A static one that
     /// was sent before the agent started may have it.
-    pub(super) fn lack(&self, domain_id: DomainId, frame: &str) -> bool {
+    pub(super) fn is_unknown_frame(&self, domain_id: DomainId, frame: &str) -> bool {
         let of_domain = || self.trees.iter().filter(|tree| tree.domain_id == domain_id);
         let mut unread = self.broadcasters.values();
         of_domain().next().is_some()
             && !of_domain().any(|tree| tree.has(frame))
-            && unread.all(|each| each.is_heard || each.domain_id != domain_id)
+            && unread.all(|each| each.is_received || each.domain_id != domain_id)
     }
 
     /// Returns the number of changes of [`Self::findings`].
@@ -210,7 +210,7 @@ impl Transforms {
                 unread_static: 0,
             })
             .collect();
-        for unread in self.broadcasters.values().filter(|each| !each.is_heard) {
+        for unread in self.broadcasters.values().filter(|each| !each.is_received) {
             let key = (unread.domain_id, &unread.namespace);
             match trees
                 .iter_mut()

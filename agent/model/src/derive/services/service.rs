@@ -30,7 +30,7 @@ pub struct CallId {
 
 /// Where and when a request or reply was seen.
 #[derive(Clone, Copy, Debug)]
-pub struct Sighting {
+pub struct Capture {
     /// Time.
     pub at: ModelTime,
     /// Cookie of the socket; 0 = not seen at a socket.
@@ -108,7 +108,7 @@ struct Call {
 #[derive(Debug, Default)]
 struct Received {
     /// Writer and number of the reply.
-    of: Option<(Guid, SequenceNumber)>,
+    reply: Option<(Guid, SequenceNumber)>,
     /// Sorted half-open ranges of fragment numbers.
     runs: Bounded<ReplyRuns, Vec<(u32, u32)>>,
 }
@@ -128,7 +128,7 @@ impl Service {
         &mut self,
         id: CallId,
         writer: Guid,
-        sighting: Sighting,
+        sighting: Capture,
         goal: Option<[u8; 16]>,
     ) -> bool {
         let is_local = sighting.position == Position::Leaving;
@@ -165,7 +165,7 @@ impl Service {
         id: CallId,
         writer: Guid,
         sample: &Sample,
-        sighting: Sighting,
+        sighting: Capture,
     ) -> Option<Answered> {
         let call = self.calls.get_mut(&id)?;
         match sighting.position {
@@ -230,7 +230,7 @@ impl Service {
 
     /// Drops the oldest call of one client, because the search for the oldest call of all is too
     /// expensive in a flood of requests. Returns whether there was a call.
-    pub fn forget_one(&mut self) -> bool {
+    pub fn drop_oldest_call(&mut self) -> bool {
         self.calls.pop_first().is_some()
     }
 
@@ -300,8 +300,8 @@ impl Received {
             return true;
         };
         let of = Some((writer, sample.sequence_number));
-        if self.of != of {
-            (self.of, self.runs) = (of, Bounded::default());
+        if self.reply != of {
+            (self.reply, self.runs) = (of, Bounded::default());
         }
         let total = fragments.total();
         if total == 0 {

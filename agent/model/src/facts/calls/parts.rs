@@ -233,9 +233,9 @@ impl LateCall {
                 // The rest precedes an earlier call, and has no events.
                 let runnable = self.activity_before.as_ref()?.runnable;
                 let is_most = runnable * 2 >= part.duration;
-                is_most.then(|| self.culprit(part.stage)).flatten()
+                is_most.then(|| self.longest_other_thread(part.stage)).flatten()
             }
-            Cause::Runnable => self.culprit(part.stage),
+            Cause::Runnable => self.longest_other_thread(part.stage),
             Cause::Stopped if part.stage != Stage::Callback => {
                 self.stop.as_ref()?.wait.waker.as_ref()
             }
@@ -261,7 +261,7 @@ impl LateCall {
 
     /// Returns the thread that ran instead for longest in this stage. Idle CPUs are left out.
     #[must_use]
-    pub fn culprit(&self, stage: Stage) -> Option<&OtherThread> {
+    pub fn longest_other_thread(&self, stage: Stage) -> Option<&OtherThread> {
         let others = match (stage, &self.handoff, &self.delivery) {
             // Otherwise they may have run before the message was published. A wait is shorter than
             // the time since then, by that of the fastest message.

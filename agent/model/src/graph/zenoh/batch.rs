@@ -9,7 +9,7 @@ use ros2probe_wire::zenoh::{
 };
 
 use super::Place;
-use super::Shown;
+use super::ReportFact;
 use super::Zenoh;
 use super::messages::attachment;
 use super::stream::{StreamId, Unseen};
@@ -28,7 +28,7 @@ impl Zenoh {
         place: Place<'_>,
         batch: Batch<'_>,
         wants_bytes: bool,
-        show: &mut impl FnMut(Shown<'_>),
+        show: &mut impl FnMut(ReportFact<'_>),
     ) {
         let stream = place.stream;
         let is_known = self.directions.contains_key(stream);
@@ -38,17 +38,17 @@ impl Zenoh {
         direction.last_seen = place.time;
         if let Some(owner) = direction.owner(stream).filter(|_| !is_known) {
             // The connection is known from saved state.
-            show(Shown::Owner(stream.socket, owner.guid_prefix()));
+            show(ReportFact::Owner(stream.socket, owner.guid_prefix()));
         }
         if let Some(session) = direction.session() {
-            show(Shown::Alive(session));
+            show(ReportFact::Alive(session));
         }
         if direction
             .sender
             .is_some_and(|side| side.whatami == WhatAmI::Router)
         {
             for session in self.remembered.take_relayed() {
-                show(Shown::Relayed(session));
+                show(ReportFact::Relayed(session));
             }
         }
         for message in batch {
@@ -68,12 +68,12 @@ impl Zenoh {
                 }
                 // The capture omitted the end of the batch on purpose.
                 Err(error) if error.reason == Reason::Truncated => {}
-                Err(error) => show(Shown::Malformed(error.reason)),
+                Err(error) => show(ReportFact::Malformed(error.reason)),
             }
         }
     }
 
-    fn init(&mut self, stream: &StreamId, init: &Init<'_>, show: &mut impl FnMut(Shown<'_>)) {
+    fn init(&mut self, stream: &StreamId, init: &Init<'_>, show: &mut impl FnMut(ReportFact<'_>)) {
         let side = Side {
             zid: init.zid,
             whatami: init.whatami,
@@ -99,7 +99,7 @@ impl Zenoh {
         }
         self.join_transport(stream);
         if let Some(owner) = owner {
-            show(Shown::Owner(stream.socket, owner.guid_prefix()));
+            show(ReportFact::Owner(stream.socket, owner.guid_prefix()));
             self.has_begun = true;
         }
         self.revision += 1;
@@ -107,10 +107,10 @@ impl Zenoh {
 
     /// Gives up messages whose FRAGMENTs have stopped arriving, at most once a second.
     fn give_up_chains(&mut self, now: ModelTime) {
-        if now < self.gave_up + GIVE_UP_INTERVAL {
+        if now < self.last_stale_search + GIVE_UP_INTERVAL {
             return;
         }
-        self.gave_up = now;
+        self.last_stale_search = now;
         let before = now - STALE_AFTER;
         for direction in self.directions.values_mut() {
             let held = direction.held();
@@ -124,7 +124,7 @@ impl Zenoh {
         place: Place<'_>,
         fragment: &Fragment<'_>,
         wants_bytes: bool,
-        show: &mut impl FnMut(Shown<'_>),
+        show: &mut impl FnMut(ReportFact<'_>),
     ) {
         if self.chain_bytes.room() < MIN_FREE_BYTES {
             self.give_up_chains(place.time);
@@ -163,7 +163,7 @@ impl Zenoh {
         match message {
             Ok(message) => self.network(place, &message, show),
             Err(error) if error.reason == Reason::Truncated => self.counters.incomplete += 1,
-            Err(error) => show(Shown::Malformed(error.reason)),
+            Err(error) => show(ReportFact::Malformed(error.reason)),
         }
     }
 }

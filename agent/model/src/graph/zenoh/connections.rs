@@ -28,12 +28,12 @@ impl Zenoh {
     fn opposite_entry(&self, stream: &StreamId) -> Option<(&StreamId, &StreamState)> {
         match self.directions.get_key_value(&stream.reversed()) {
             Some((place, direction)) => Some((place, &**direction)),
-            None => self.elsewhere(stream),
+            None => self.opposite_of_flow(stream),
         }
     }
 
     /// Returns the opposite direction, and the stream in which it was last seen.
-    fn elsewhere(&self, stream: &StreamId) -> Option<(&StreamId, &StreamState)> {
+    fn opposite_of_flow(&self, stream: &StreamId) -> Option<(&StreamId, &StreamState)> {
         let place = self.flows.get(&stream.flow.reversed())?;
         Some((place, self.directions.get(place)?))
     }
@@ -41,7 +41,7 @@ impl Zenoh {
     /// Returns the receiving socket of a direction on the loopback interface, if its session is
     /// known; else 0.
     pub(super) fn receiving_socket(&self, stream: &StreamId) -> u64 {
-        let other = self.elsewhere(stream).filter(|_| stream.is_loopback());
+        let other = self.opposite_of_flow(stream).filter(|_| stream.is_loopback());
         let owned = other.filter(|(place, direction)| direction.owner(place).is_some());
         owned.map_or(0, |(place, _)| place.socket)
     }
@@ -93,13 +93,13 @@ impl Zenoh {
         {
             // No end of the silent direction will be captured.
             direction.has_ended = true;
-            self.leave_now(&silent, now);
+            self.end_connection(&silent, now);
         }
-        self.leave_now(stream, now);
+        self.end_connection(stream, now);
     }
 
     /// Does the same as [`Self::leave`], without a check whether the other end has been silent.
-    fn leave_now(&mut self, stream: &StreamId, now: ModelTime) {
+    fn end_connection(&mut self, stream: &StreamId, now: ModelTime) {
         if self.remembered.sender(stream.flow).is_some() {
             self.direction(stream);
         }

@@ -188,7 +188,7 @@ impl Graph {
     }
 
     /// Announces again a session that discovery has forgotten, at most once a second.
-    pub fn repeat(&mut self, session: ZenohId, now: ModelTime) {
+    pub fn announce_again(&mut self, session: ZenohId, now: ModelTime) {
         let Some(state) = self.sessions.get_mut(&session) else {
             return;
         };
@@ -327,30 +327,30 @@ impl Graph {
 
     /// Records that a router forwards this token of a session behind another router. Returns
     /// whether this was unknown.
-    pub fn pass_on(&mut self, token: &str, router: ZenohId) -> bool {
+    pub fn add_passage(&mut self, token: &str, router: ZenohId) -> bool {
         let Some(session) = self.tokens.get((), token).map(|token| token.session) else {
             return false;
         };
         if self.passages.get(router, &session).is_some() {
             return false;
         }
-        let has_room = self.passes_on(router) || self.routers() < MAX_PASSING_ROUTERS;
+        let has_room = self.has_passages(router) || self.routers() < MAX_PASSING_ROUTERS;
         has_room && self.passages.insert(router, session, (), 0)
     }
 
     /// Returns whether a router forwards tokens of sessions behind other routers.
-    pub fn passes_on(&self, router: ZenohId) -> bool {
+    pub fn has_passages(&self, router: ZenohId) -> bool {
         self.passages.of(router).next().is_some()
     }
 
     /// Returns the sessions whose tokens a router forwards.
-    pub fn passed_on_by(&self, router: ZenohId) -> BTreeSet<ZenohId> {
+    pub fn passages_of(&self, router: ZenohId) -> BTreeSet<ZenohId> {
         let sessions = self.passages.of(router);
         sessions.map(|(session, ())| *session).collect()
     }
 
     /// Removes a router that forwards tokens. Returns the sessions that no other router forwards.
-    pub fn pass_no_longer(&mut self, router: ZenohId) -> BTreeSet<ZenohId> {
+    pub fn remove_passages(&mut self, router: ZenohId) -> BTreeSet<ZenohId> {
         let mut sessions: BTreeSet<_> = self.passages.remove_owner(router).collect();
         for other in self.passages.owners() {
             sessions.retain(|session| self.passages.get(other, session).is_none());
@@ -362,7 +362,7 @@ impl Graph {
     pub fn passages(&self) -> BTreeMap<ZenohId, BTreeSet<ZenohId>> {
         let routers = self.passages.owners();
         routers
-            .map(|router| (router, self.passed_on_by(router)))
+            .map(|router| (router, self.passages_of(router)))
             .collect()
     }
 
@@ -388,7 +388,7 @@ impl Graph {
     }
 
     /// Removes the tokens of a session of this domain that no connection declares.
-    pub fn keep_declared(&mut self, session: ZenohId, domain: DomainId) {
+    pub fn drop_undeclared_tokens(&mut self, session: ZenohId, domain: DomainId) {
         let Some(state) = self.sessions.get(&session) else {
             if self.restored.get(&session) == Some(&domain) {
                 self.end(session);

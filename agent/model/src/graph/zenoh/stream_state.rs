@@ -121,7 +121,7 @@ impl Chain {
 
 impl Chain {
     /// Adds bytes to the message, as far as `room` bytes of further memory suffice.
-    fn keep(&mut self, bytes: &[u8], room: usize) {
+    fn append(&mut self, bytes: &[u8], room: usize) {
         let (length, capacity) = (self.bytes.len(), self.bytes.capacity());
         let bytes = bytes.get(..capacity - length + room).unwrap_or(bytes);
         let needed = length + bytes.len();
@@ -260,7 +260,7 @@ impl StreamState {
         let most = if chain.is_wanted { MAX_MESSAGE } else { MAX_HEAD };
         if is_whole_so_far {
             let kept = most.saturating_sub(chain.bytes.len());
-            chain.keep(captured.get(..kept).unwrap_or(captured), room);
+            chain.append(captured.get(..kept).unwrap_or(captured), room);
         }
         chain.last = time;
         chain.next = Resolution::DEFAULT.next(number);

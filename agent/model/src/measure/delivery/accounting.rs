@@ -90,7 +90,7 @@ impl Accounting<'_> {
         for (first, last, cause) in runs {
             if self.withheld.is_none() {
                 let events = &mut self.journal.events;
-                events.lose_delivery(self.writer, self.receiver, self.at, (first, last));
+                events.add_delivery_loss(self.writer, self.receiver, self.at, (first, last));
             }
             match cause {
                 Some(cause) => self.lose(cause, first, last),

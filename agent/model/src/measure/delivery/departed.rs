@@ -21,7 +21,7 @@ impl Delivery {
         context: &mut DeliveryContext<'_>,
     ) {
         if !self.reception.sequence().started() || newest < self.next() {
-            (self.waiting, self.presumed_lost, self.under_way) = (None, false, 0);
+            (self.waiting, self.presumed_lost, self.overdue) = (None, false, 0);
             return;
         }
         let since = *self.waiting.get_or_insert(context.now);
@@ -36,11 +36,11 @@ impl Delivery {
             self.connection = None;
             self.exists(number, context);
         }
-        self.under_way = due.map_or(0, |due| due.next().steps_since(self.next()));
+        self.overdue = due.map_or(0, |due| due.next().steps_since(self.next()));
     }
 
     /// Settles samples up to `newest`, which have left for this receiver and will not arrive.
-    pub fn expect_no_more(&mut self, newest: SequenceNumber, context: &mut DeliveryContext<'_>) {
+    pub fn settle_departed(&mut self, newest: SequenceNumber, context: &mut DeliveryContext<'_>) {
         if self.reception.sequence().started() && !self.presumed_lost {
             self.connection = None;
             self.exists(newest, context);
@@ -49,10 +49,10 @@ impl Delivery {
 
     /// Excuses samples that were written before the receiver's reader appeared. `next` and
     /// `advanced` describe the sequence before the current observation.
-    pub(super) fn excuse_unheard(&mut self, (next, advanced): (SequenceNumber, ModelTime)) {
+    pub(super) fn mark_unread_irrelevant(&mut self, (next, advanced): (SequenceNumber, ModelTime)) {
         let sequence = self.reception.sequence_mut();
         if next > SequenceNumber::ZERO && advanced < self.opened && sequence.next() > next {
-            sequence.excuse(next, sequence.next());
+            sequence.mark_irrelevant(next, sequence.next());
         }
     }
 }

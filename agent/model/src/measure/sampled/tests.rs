@@ -131,18 +131,18 @@ fn a_heartbeat_reveals_unseen_samples_and_a_gap_those_never_sent() {
     let now = ModelTime::from_nanoseconds(view.now);
     assert_eq!(
         view.sampled
-            .exist(SequenceNumber(7), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
+            .note_existing(SequenceNumber(7), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
         0
     );
     view.see(5);
     assert_eq!(
         view.sampled
-            .exist(SequenceNumber(7), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
+            .note_existing(SequenceNumber(7), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
         2
     );
     assert_eq!(
         view.sampled
-            .exist(SequenceNumber(6), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
+            .note_existing(SequenceNumber(6), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
         0
     );
     assert_eq!(view.counts(), (1, 3));
@@ -164,7 +164,7 @@ fn a_heartbeat_reveals_unseen_samples_and_a_gap_those_never_sent() {
     assert_eq!(view.counts(), (3, 5));
     let forged = view
         .sampled
-        .exist(SequenceNumber(1 << 40), MAX_ANNOUNCED_JUMP, now, &mut view.sequence);
+        .note_existing(SequenceNumber(1 << 40), MAX_ANNOUNCED_JUMP, now, &mut view.sequence);
     assert_eq!((forged, view.counts()), (0, (3, 5)));
     assert_eq!(view.losses(), []);
 }
@@ -187,7 +187,7 @@ fn a_late_sample_that_a_heartbeat_announced_is_not_a_restart() {
     let now = ModelTime::from_nanoseconds(view.now);
     assert_eq!(
         view.sampled
-            .exist(SequenceNumber(5), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
+            .note_existing(SequenceNumber(5), MAX_ANNOUNCED_JUMP, now, &mut view.sequence),
         4
     );
     view.now += SECOND;
@@ -223,7 +223,7 @@ fn an_unseen_message_is_reported_once_after_the_arrival_timeout() {
     view.part(6, Completeness::Partial);
     let now = ModelTime::from_nanoseconds(view.now);
     view.sampled
-        .exist(SequenceNumber(8), MAX_ANNOUNCED_JUMP, now, &mut view.sequence);
+        .note_existing(SequenceNumber(8), MAX_ANNOUNCED_JUMP, now, &mut view.sequence);
     // Numbers skipped by a GAP are not missing.
     view.sampled.skip(
         (SequenceNumber(9), SequenceNumber(200)),
@@ -296,7 +296,7 @@ fn a_forged_number_far_ahead_counts_as_one_message_and_affects_no_other() {
     let now = ModelTime::from_nanoseconds(view.now);
     let messages = view
         .sampled
-        .exist(SequenceNumber(3000), MAX_TRUSTED_JUMP, now, &mut view.sequence);
+        .note_existing(SequenceNumber(3000), MAX_TRUSTED_JUMP, now, &mut view.sequence);
     let passed = view.sampled.skip(
         (SequenceNumber(2000), SequenceNumber(3000)),
         MAX_TRUSTED_JUMP,
@@ -337,7 +337,7 @@ fn possibly_missed(seen: impl Iterator<Item = u64>) -> u64 {
         view.see(number);
     });
     let interval = Duration::from_secs(100);
-    view.sampled.seeming_silence(interval).as_secs() / interval.as_secs()
+    view.sampled.max_unseen_time(interval).as_secs() / interval.as_secs()
 }
 
 #[test]
@@ -353,12 +353,12 @@ fn consecutive_missed_messages_explain_a_longer_silence() {
     // On a busy machine, polling can pause for seconds.
     let mut view = View::new();
     view.see(1);
-    let short = view.sampled.seeming_silence(Duration::from_millis(1));
+    let short = view.sampled.max_unseen_time(Duration::from_millis(1));
     assert_eq!(short, MAX_POLLING_GAP);
     view.sampled.end();
     assert!(
         view.sampled
-            .seeming_silence(Duration::from_secs(1))
+            .max_unseen_time(Duration::from_secs(1))
             .is_zero()
     );
 }

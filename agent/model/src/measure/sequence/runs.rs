@@ -103,7 +103,7 @@ impl Sequence {
             }
         }
         let (start, end) = run.gap;
-        self.excuse(start, end);
+        self.mark_irrelevant(start, end);
     }
 
     /// Makes the unconfirmed run live: the numbers jump to it or restart.

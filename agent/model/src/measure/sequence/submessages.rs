@@ -53,7 +53,7 @@ impl Sequence {
     ) -> (bool, Option<Run>) {
         let live = self.next;
         let unconfirmed = self.unconfirmed.as_mut();
-        if unconfirmed.is_some_and(|unconfirmed| unconfirmed.agrees(next, live, now)) {
+        if unconfirmed.is_some_and(|unconfirmed| unconfirmed.confirms(next, live, now)) {
             return (true, Some(self.confirm()));
         }
         let ahead = next.steps_since(live);
@@ -73,7 +73,7 @@ impl Sequence {
 
     /// Returns whether an ACKNACK is refused because it acknowledges numbers far above the known
     /// ones.
-    pub const fn refuses(&mut self, base: SequenceNumber) -> bool {
+    pub const fn is_too_far_ahead(&mut self, base: SequenceNumber) -> bool {
         let refuses = self.started() && base.steps_since(self.next) > MAX_ANNOUNCED_JUMP;
         self.jumps += refuses as u64;
         refuses
@@ -83,7 +83,7 @@ impl Sequence {
     /// samples that the writer had withdrawn before.
     pub fn acknowledged(&mut self, base: SequenceNumber) {
         if self.started() {
-            self.excuse(self.available, base);
+            self.mark_irrelevant(self.available, base);
             self.acknowledged = self.acknowledged.max(base);
         }
     }
@@ -106,7 +106,7 @@ impl Sequence {
             if ahead <= MAX_JUMP {
                 self.unconfirmed
                     .get_or_insert_default()
-                    .pass_over(start, base);
+                    .note_gap(start, base);
             }
             return;
         }
@@ -117,7 +117,7 @@ impl Sequence {
                 }
                 sequence.extend(end.previous(), end, now, settled);
             }
-            sequence.excuse(start.max(sequence.settled), end);
+            sequence.mark_irrelevant(start.max(sequence.settled), end);
         };
         one(self, start, base);
         for number in set {
@@ -140,8 +140,8 @@ impl Sequence {
     }
 
     /// Excuses `start..end`, so that no number in it is lost.
-    pub fn excuse(&mut self, start: SequenceNumber, end: SequenceNumber) {
+    pub fn mark_irrelevant(&mut self, start: SequenceNumber, end: SequenceNumber) {
         let start = start.max(self.floor()).max(self.settled);
-        self.excused.set_all(start, end.min(self.next));
+        self.irrelevant.set_all(start, end.min(self.next));
     }
 }

@@ -95,7 +95,7 @@ impl UnconfirmedRun {
 
     /// Returns whether a HEARTBEAT with lastSN `next - 1` confirms the run, where `live` is the
     /// live run's next number. A HEARTBEAT that reaches `live` never confirms a run below it.
-    pub(super) fn agrees(
+    pub(super) fn confirms(
         &self,
         next: SequenceNumber,
         live: SequenceNumber,
@@ -122,7 +122,7 @@ impl UnconfirmedRun {
     }
 
     /// Records the numbers that a GAP skips.
-    pub(super) const fn pass_over(&mut self, start: SequenceNumber, end: SequenceNumber) {
+    pub(super) const fn note_gap(&mut self, start: SequenceNumber, end: SequenceNumber) {
         self.run.gap = (start, end);
     }
 

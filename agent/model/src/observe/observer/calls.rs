@@ -67,7 +67,7 @@ impl Observer {
     }
 
     /// Counts a copy of a request or reply.
-    pub(super) fn call_seen(&mut self, sample: &Sample) {
+    pub(super) fn count_call(&mut self, sample: &Sample) {
         if self.derive.services.follows(sample.head.writer) {
             let (receivers, discovery) = (&self.graph.receivers, &self.graph.discovery);
             let services = &mut self.derive.services;

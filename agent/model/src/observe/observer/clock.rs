@@ -89,7 +89,7 @@ impl Observer {
                 let Some(receivers) = &mut measured.subscribers else {
                     continue;
                 };
-                topic.loss.leave(receivers.take_departed());
+                topic.loss.note_departed(receivers.take_departed());
                 for (receiver, recent) in receivers.losses() {
                     let (window, last) = subscribers.entry(receiver).or_default();
                     window.add(recent.window());
@@ -123,7 +123,7 @@ impl Observer {
 
     pub(super) fn tick(&mut self, now: ModelTime) {
         self.graph.discovery.advance(now, &mut self.journal);
-        self.follow_up(now);
+        self.apply_discovery_changes(now);
         let graph = &self.graph;
         let unknown_writers = self.measure.profiler.advance(now, &mut self.journal, graph);
         for guid in unknown_writers.metered {
@@ -140,11 +140,11 @@ impl Observer {
             self.measure.links.end_second(now);
             self.measure.payloads.expire(now);
             for writer in self.measure.latched.advance(now) {
-                self.apply_again(writer, now);
+                self.apply_lists_to_latched(writer, now);
             }
             self.end_second_of_clocks(now);
             for writer in self.derive.robot.end_second(now, &mut self.journal.events) {
-                self.apply_again(writer, now);
+                self.apply_lists_to_latched(writer, now);
             }
             let profiler = &self.measure.profiler;
             self.measure.payloads.retain_unknown_writers(|writer| {
@@ -154,12 +154,12 @@ impl Observer {
             self.graph.topics.expire(now, self.settings.topic_grace);
             self.link_sessions();
             self.end_unreachable_sessions(now);
-            self.graph.receivers.tidy(&self.graph.discovery);
+            self.graph.receivers.remove_unknown(&self.graph.discovery);
             self.graph
                 .discovery
-                .locate(|prefix| self.graph.receivers.is_local(prefix));
+                .update_locality(|prefix| self.graph.receivers.is_local(prefix));
             self.settle_inside(now);
-            self.promote();
+            self.assign_free_slots();
             self.end_second_of_losses();
             self.judge(now);
             self.advance_calls(now);
@@ -254,7 +254,7 @@ impl Observer {
                 };
                 let mut unseen = topic.writers.iter().filter(is_unseen);
                 match unseen.any(|guid| is_polled(&self.graph.discovery, *guid, &topic.readers)) {
-                    true => longest.max(Sampled::seeming_silence_of_unseen(slowest)),
+                    true => longest.max(Sampled::max_unseen_time_of_new_writer(slowest)),
                     false => longest,
                 }
             };
@@ -268,7 +268,7 @@ impl Observer {
                 publishers: topic.writers.len().max(publishers),
                 subscriptions: topic.readers.len().max(subscriptions),
                 last_message,
-                seeming_silence,
+                max_unseen_time: seeming_silence,
                 since: topic.published,
                 observed: topic.published.max(topic.subscribed).max(self.view_began),
                 recent,

@@ -46,7 +46,7 @@ impl Observer {
     }
 
     /// Compares the stamp of a measured message with the time of its publication.
-    pub(super) fn judge_stamp(&mut self, observation: &Observation) {
+    pub(super) fn check_stamp(&mut self, observation: &Observation) {
         let Observation::Sample(sample) = observation else {
             return;
         };
@@ -89,7 +89,7 @@ impl Observer {
         let head = &sample.head;
         if head.leaves() {
             let number = sample.sequence_number;
-            self.derive.clocks.left(head.writer, number, head.at);
+            self.derive.clocks.note_sent(head.writer, number, head.at);
             return;
         }
         // Announcements are repeated with old stamps, and only the first fragment follows its stamp
@@ -137,7 +137,7 @@ impl Observer {
             && let Some(address) = self.remote_address(&sample.head.writer.prefix)
         {
             let now = sample.head.at;
-            self.derive.clocks.replied(address, stamp, sent, now);
+            self.derive.clocks.note_reply(address, stamp, sent, now);
         }
     }
 

@@ -228,7 +228,7 @@ impl Observer {
                         let next = known.map_or(SequenceNumber::ZERO, |known| known.writer.next());
                         self.measure
                             .payloads
-                            .want(guid, topic, requested, (next, now));
+                            .start_writer(guid, topic, requested, (next, now));
                     }
                     _ => self.measure.payloads.release(guid, now),
                 }
@@ -246,7 +246,7 @@ impl Observer {
     }
 
     /// Applies the decision about its topic to a writer whose last message is kept.
-    pub(super) fn apply_again(&mut self, writer: Guid, now: ModelTime) {
+    pub(super) fn apply_lists_to_latched(&mut self, writer: Guid, now: ModelTime) {
         let endpoint = self.graph.discovery.endpoints().get(&writer);
         let id = endpoint.and_then(|endpoint| {
             let naming = endpoint.naming()?;
@@ -307,7 +307,7 @@ impl Observer {
     }
 
     /// Assigns free measuring slots, and those of vanished topics, to rejected topics.
-    pub(super) fn promote(&mut self) {
+    pub(super) fn assign_free_slots(&mut self) {
         if !self.graph.topics.has_place(self.settings.topics) {
             return;
         }

@@ -593,8 +593,8 @@ fn the_longest_and_the_last_calls_are_kept_after_the_process_has_ended() {
         .sum::<Duration>();
     assert_eq!(sum, history, "103 calls fit into the history");
     assert_eq!(
-        late.history.back().unwrap().culprit,
-        Some(other("chromium", 3121, 90).culprit())
+        late.history.back().unwrap().other_thread,
+        Some(other("chromium", 3121, 90).label())
     );
 }
 
@@ -621,7 +621,7 @@ fn another_thread_is_named_with_its_unit_and_an_unusual_priority() {
     assert_eq!(thread.to_string(), "chromium (3121, real-time 50)");
     thread.priority = Priority::of_kernel(120);
     assert_eq!(thread.to_string(), "chromium (3121)");
-    assert_eq!(thread.culprit().to_string(), "chromium");
+    assert_eq!(thread.label().to_string(), "chromium");
 }
 
 #[test]

@@ -156,7 +156,7 @@ impl Edge {
             Some(last) if last.parent.as_bytes() == transform.parent => Arc::clone(&last.parent),
             _ => without_slash(&bounded(transform.parent, NAME)).into(),
         };
-        let went_back = self.heard(origin, transform.stamp);
+        let went_back = self.note_broadcaster(origin, transform.stamp);
         self.count += 1;
         if let Some(current) = self.seconds.last_mut() {
             *current = current.saturating_add(1);
@@ -198,7 +198,7 @@ impl Edge {
     }
 
     /// Notes the broadcaster. Returns whether its stamp went back.
-    fn heard(&mut self, origin: &Origin<'_>, stamp: (i32, u32)) -> bool {
+    fn note_broadcaster(&mut self, origin: &Origin<'_>, stamp: (i32, u32)) -> bool {
         let place = self
             .broadcasters
             .iter()
